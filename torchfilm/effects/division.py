@@ -1,0 +1,199 @@
+"""Division: every cell that is due becomes two, end to end in its parent's place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.effect import DIVISION, Distribution, Effect, draw, parameter
+from torchfilm.physics import capsule
+from torchfilm.state import CELL, Births, Ended, Field, State
+from torchfilm.tools import checks
+from torchfilm.tools.ragged import offsets
+
+CRITERIA = ("length", "volume", "added")
+
+
+@dataclass(frozen=True)
+class Division(Effect):
+    """Cells divide, by one criterion or by flag.
+
+    length: centreline length, µm, at which a cell divides; volume: µm³; added: µm of centreline grown since birth (the adder).
+    Each one number, one per colony, or a distribution drawn for each cell at birth. None of them: only cells whose `divide_flag` a
+    rule sets divide; the flag works beside a criterion too.
+    fraction: share of the length that the first daughter (at the −axis end) gets. axis_noise: standard deviation of the noise on each
+    component of a daughter's axis.
+    """
+
+    length: float | Tensor | Distribution | None = None
+    volume: float | Tensor | Distribution | None = None
+    added: float | Tensor | Distribution | None = None
+    fraction: float | Tensor | Distribution = 0.5
+    axis_noise: float = 0.001
+
+    stage = DIVISION
+    title = "division"
+
+    def __post_init__(self) -> None:
+        given = [name for name in CRITERIA if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise checks.InputError(f"Division got {' and '.join(given)}: give one criterion (length, volume or added), or none and a rule.")
+        for name in given:
+            object.__setattr__(self, name, parameter(f"Division.{name}", getattr(self, name), above=0.0))
+        fraction = parameter("Division.fraction", self.fraction, above=0.0, most=1.0)
+        object.__setattr__(self, "fraction", fraction)
+        greatest = fraction.greatest() if isinstance(fraction, Distribution) else float(torch.as_tensor(fraction).max())
+        if greatest >= 1.0:
+            raise checks.refuse("Division.fraction", self.fraction, "between 0 and 1, both excluded")
+        checks.number("Division.axis_noise", self.axis_noise, least=0.0, most=0.5)
+
+    @property
+    def criterion(self) -> str | None:
+        return next((name for name in CRITERIA if getattr(self, name) is not None), None)
+
+    def declares(self, dim: int) -> tuple[Field, ...]:
+        fields = [Field("divide_flag", "divides at the next opportunity", dtype=torch.bool, at_division="reset")]
+        name = self.criterion
+        if name is not None:
+            threshold = getattr(self, name)
+            fields.append(
+                Field(
+                    "division_threshold", f"{name} at which the cell divides", "µm³" if name == "volume" else "µm",
+                    initial=lambda state, rows: draw(f"Division.{name}", threshold, state, rows),
+                    at_division="reset" if isinstance(threshold, Distribution) else "copy",
+                )
+            )  # fmt: skip
+        if name == "added":
+            fields.append(
+                Field("birth_length", "centreline length at birth", "µm", initial=_length_of_rows, at_division="reset")
+            )
+        return tuple(fields)
+
+    def reads(self) -> tuple[str, ...]:
+        more = {"length": ("division_threshold",), "volume": ("division_threshold",), "added": ("division_threshold", "birth_length")}
+        return ("divide_flag", "length", "radius", "position", "axis", *more.get(self.criterion or "", ()))
+
+    def writes(self) -> tuple[str, ...]:
+        return ("cells", "position", "axis", "length", "divide_flag")
+
+    def check(self, state: State) -> None:
+        if self.criterion is None or state.cells == 0:
+            return
+        threshold = state.division_threshold
+        start = {"length": state.length, "volume": state.volume, "added": torch.zeros_like(state.length)}[self.criterion]
+        below = torch.nonzero(threshold <= start).squeeze(1)
+        if below.numel():
+            k = int(below[0])
+            raise checks.InputError(
+                f"Division.{self.criterion}: threshold {float(threshold[k]):g} of cell {int(state.uid[k])} in colony "
+                f"{int(state.own_colony_id[k])} is not above its {self.criterion} at birth, {float(start[k]):g}. Raise the threshold or start from smaller cells."
+            )
+        given = getattr(self, self.criterion)
+        least = given.least() if isinstance(given, Distribution) else float(torch.as_tensor(given).min())
+        radius = float(state.radius.max())
+        needed = 2 * radius
+        if self.criterion == "volume":
+            needed = float(capsule.volume(torch.tensor(needed), torch.tensor(radius)))
+        if self.criterion != "added" and least < needed:
+            raise checks.InputError(
+                f"Division.{self.criterion} can be {least:g}: it must be at least {needed:g} for radius {radius:g} µm, or the daughters would be "
+                "shorter than nothing (each loses a new cap). Raise the threshold."
+            )
+
+    def due(self, state: State) -> Tensor:
+        """Which cells divide now, (N,) bool."""
+        due = state.divide_flag
+        if self.criterion == "length":
+            return due | (state.length >= state.division_threshold)
+        if self.criterion == "volume":
+            return due | (state.volume >= state.division_threshold)
+        if self.criterion == "added":
+            return due | (state.length - state.birth_length >= state.division_threshold)
+        return due
+
+    def step(self, state: State, dt: float) -> State:
+        with torch.no_grad():
+            due = self.due(state)
+            if not bool(due.any()):
+                return state
+            self._check_long_enough(state, due)
+        return divide(state, due, self.fraction, self.axis_noise)
+
+    def _check_long_enough(self, state: State, due: Tensor) -> None:
+        short = due & (state.length < 2 * state.radius)
+        if bool(short.any()):
+            k = int(torch.nonzero(short)[0])
+            raise checks.SimulationError(
+                f"cell {int(state.uid[k])} of colony {int(state.own_colony_id[k])} is due to divide at length {float(state.length[k]):g} µm, but needs "
+                f"at least {2 * float(state.radius[k]):g} µm for two new caps. Divide later, or start from longer cells.",
+                sorted(set(state.own_colony_id[short].tolist())),
+            )
+
+
+def divide(state: State, due: Tensor, fraction: float | Tensor | Distribution, axis_noise: float) -> State:
+    """The state in which each cell that is due (N,) bool has become two neighbours in the batch, first daughter at its −axis end.
+
+    Lengths (l − 2r)f and (l − 2r)(1 − f), outer ends where the parent's were; gradients pass through.
+    """
+    copies = due.long() + 1
+    source = torch.repeat_interleave(torch.arange(state.cells, device=state.device), copies)
+    parent_rows = torch.nonzero(due).squeeze(1)
+    first = torch.cumsum(copies, 0).index_select(0, parent_rows) - 2
+    second = first + 1
+    parents = state.take(parent_rows)
+    new = state.take(source)
+
+    everyone = torch.arange(parents.cells, device=state.device)
+    share = draw("Division.fraction", fraction, parents, everyone)
+    rest = parents.length - 2 * parents.radius
+    length_1, length_2 = rest * share, rest * (1 - share)
+    shift_1, shift_2 = 0.5 * (length_1 - parents.length), 0.5 * (parents.length - length_2)
+    daughters = torch.cat([first, second])
+    length = new.length.index_copy(0, daughters, torch.cat([length_1, length_2]))
+    shift = torch.cat([shift_1.unsqueeze(1) * parents.axis, shift_2.unsqueeze(1) * parents.axis])
+    position = new.position.index_add(0, daughters, shift.to(new.position.dtype))
+
+    uid, parent, next_uid = _new_ids(new, daughters, parents)
+    new = new.replace(length=length, position=position, uid=uid, parent=parent, next_uid=next_uid)
+    new = new.replace(axis=_with_noise(new, daughters, axis_noise))
+    note = Ended(parents.own_colony_id, parents.uid, "divided")
+    new = new.replace(births=(*new.births, Births(first, second, new.uid.index_select(0, daughters), parents)), ended=(*new.ended, note))
+    return _reset_fields(new, daughters)
+
+
+def _new_ids(new: State, daughters: Tensor, parents: State) -> tuple[Tensor, Tensor, Tensor]:
+    """Fresh uids counted on within each colony, the parents' uids, and each colony's next uid."""
+    is_new = torch.zeros(new.cells, dtype=torch.int64, device=new.device)
+    is_new[daughters] = 1
+    before = torch.cumsum(is_new, 0) - is_new
+    # cumulative count of new cells at each colony's first row
+    per_colony = new.groups.sum(is_new.double()).long()
+    base = new.next_uid - offsets(per_colony)[:-1]
+    uid = torch.where(is_new > 0, base.index_select(0, new.colony) + before, new.uid)
+    parent = new.parent.clone()
+    parent[daughters] = torch.cat([parents.uid, parents.uid])
+    return uid, parent, new.next_uid + per_colony
+
+
+def _with_noise(new: State, daughters: Tensor, axis_noise: float) -> Tensor:
+    if axis_noise == 0:
+        return new.axis
+    noise = axis_noise * new.normal(daughters, "Division.axis_noise")[:, : new.dim]
+    axis = new.axis.index_select(0, daughters) + noise
+    axis = axis / (axis * axis).sum(1, keepdim=True).sqrt()
+    return new.axis.index_copy(0, daughters, axis)
+
+
+def _reset_fields(new: State, daughters: Tensor) -> State:
+    """Each field's own rule: "copy" has happened already; "reset" starts anew."""
+    changed = {}
+    for name, declared in new.declared.items():
+        if declared.scope == CELL and declared.at_division == "reset":
+            changed[name] = new.fields[name].index_copy(0, daughters, declared.start(new, daughters))
+    return new.with_fields(**changed)
+
+
+def _length_of_rows(state: State, rows: Tensor) -> Tensor:
+    return state.length.index_select(0, rows)

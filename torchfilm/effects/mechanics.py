@@ -1,0 +1,290 @@
+"""Contact mechanics: growing cells push each other, and walls, apart in a viscous medium (the paper's equations 1–4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.effect import MECHANICS, Effect, per_cell
+from torchfilm.physics import capsule
+from torchfilm.physics.contacts import Bodies, Contacts, find_contacts
+from torchfilm.physics.neighbours import find_pairs
+from torchfilm.physics.rows import ContactRows
+from torchfilm.physics.solve import NOT_FINITE, ContactProblem, SolveReport, solve
+from torchfilm.physics.walls import Wall, WallContacts, find_wall_contacts
+from torchfilm.state import Field, State
+from torchfilm.tools import checks
+from torchfilm.tools.ragged import offsets
+
+# No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing. The whole colony's
+# move is shortened, so that forces still balance, and the colony is passed again.
+MAX_TURN = 0.5
+
+
+@dataclass(frozen=True)
+class MechanicsReport:
+    """What the last step's contact solves did, per colony (B,). `status` of the worst solve, `iterations` of CG in all, `residual` the
+    worst true one; `passes` and `substeps` taken; `limited`: the last pass still had to be shortened (see MAX_TURN)."""
+
+    status: Tensor
+    iterations: Tensor
+    residual: Tensor
+    passes: Tensor
+    substeps: Tensor
+    limited: Tensor
+
+
+@dataclass(frozen=True)
+class Mechanics(Effect):
+    """Cells are capsules that push each other apart; their length is a degree of freedom, so pressure holds growth back.
+
+    walls: what confines them. dim: 3, or 2 for strict 2-D (four degrees of freedom; nothing can leave the plane).
+    viscosity: μ. length_drag: γ, resistance to a change of length, in units of μ·µm. A state field `drag` multiplies μ cell by cell.
+    alpha: how far contacts give way to drag, the penalty's accuracy knob: α → 0 is the hard limit. Default 0.1/γ, the knee between
+    overlap and cost; 1/γ is the paper's. Or stiffness: μ·µm/h, physical softness of cells: α = 1/(stiffness·Δt), so that a smaller Δt
+    converges to the motion of soft cells, where with α fixed it stiffens the contact. Each may be one number or one per colony.
+    unilateral: contacts only push. False (default, the paper's least squares) also holds an overlapping pair that wants to part until the
+    next step: measured, the overlap is the same or less, at a third to a tenth of the CG iterations.
+    passes: at most this many times a step contacts are found and solved again: in colonies where the move made new contacts, or left an
+    overlap deeper than `overlap` (µm).
+    tolerance: of the solve, worst residual relative to the worst at rest. max_iterations: CG iterations a solve.
+    margin: µm; contacts this far from touching take part in a unilateral solve, so that it sees what a move would run into.
+    max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
+    """
+
+    walls: Sequence[Wall] = ()
+    dim: int = 3
+    viscosity: float | Tensor = 1.0
+    length_drag: float | Tensor = 10.0
+    alpha: float | Tensor | None = None
+    stiffness: float | Tensor | None = None
+    unilateral: bool = False
+    passes: int = 2
+    overlap: float | None = None
+    tolerance: float = 0.05
+    max_iterations: int = 2000
+    margin: float = 0.1
+    max_elongation: float = 0.25
+
+    stage = MECHANICS
+    title = "mechanics"
+
+    def __post_init__(self) -> None:
+        checks.choice("Mechanics.dim", self.dim, (2, 3))
+        for name in ("viscosity", "length_drag"):
+            object.__setattr__(self, name, checks.value(f"Mechanics.{name}", getattr(self, name), above=0.0))
+        if self.alpha is not None and self.stiffness is not None:
+            raise checks.InputError("Mechanics got alpha and stiffness: α = 1/(stiffness·Δt), so give one of the two.")
+        for name in ("alpha", "stiffness"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, checks.value(f"Mechanics.{name}", getattr(self, name), above=0.0))
+        for wall in self.walls:
+            if not isinstance(wall, Wall):
+                raise checks.refuse("Mechanics.walls", wall, "a list of Plane, Sphere, Box or Channel")
+        for name, least in (("passes", 1), ("max_iterations", 1)):
+            given = getattr(self, name)
+            if not isinstance(given, int) or given < least:
+                raise checks.refuse(f"Mechanics.{name}", given, f"a whole number from {least}")
+        checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
+        checks.number("Mechanics.margin", self.margin, least=0.0)
+        checks.number("Mechanics.max_elongation", self.max_elongation, above=0.0)
+        if self.overlap is not None:
+            checks.number("Mechanics.overlap", self.overlap, above=0.0)
+        object.__setattr__(self, "walls", tuple(self.walls))
+        object.__setattr__(self, "surfaces", [s for wall in self.walls for s in wall.surfaces(self.dim)])
+
+    @property
+    def degrees(self) -> int:
+        """Degrees of freedom of a cell: 4 in strict 2-D, 7 in 3-D."""
+        return 4 if self.dim == 2 else 7
+
+    def declares(self, dim: int) -> tuple[Field, ...]:
+        return (
+            Field(
+                "displacement", "move of the last step's first solve (Δc, Δθ, Δl), from which the next starts", "µm, rad, µm",
+                shape=(self.degrees,),
+            ),
+        )  # fmt: skip
+
+    def reads(self) -> tuple[str, ...]:
+        return ("position", "axis", "length", "radius", "elongation", "drag", "displacement")
+
+    def writes(self) -> tuple[str, ...]:
+        return ("position", "axis", "length", "elongation", "displacement")
+
+    def check(self, state: State) -> None:
+        if state.dim != self.dim:
+            raise checks.refuse("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
+        for surface in self.surfaces:  # type: ignore[attr-defined]
+            distance, _ = surface.gap_of_points(state.position, state.own_colony_id)
+            beyond = torch.nonzero(distance < 0).squeeze(1)
+            if beyond.numel():
+                k = int(beyond[0])
+                raise checks.InputError(
+                    f"{type(surface.wall).__name__}: cell {int(state.uid[k])} of colony {int(state.own_colony_id[k])} starts at "
+                    f"{[round(x, 3) for x in state.position[k].tolist()]}, {-float(distance[k]):.3g} µm behind it ({beyond.numel()} such cells). "
+                    "Is the wall inside out? Turn it (facing, normal, inside), or move the cells."
+                )
+
+    def step(self, state: State, dt: float) -> State:
+        if state.cells == 0:
+            return state
+        elongation = state.fields.get("elongation", torch.zeros_like(state.length))
+        with torch.no_grad():
+            most = state.groups.max(elongation.detach())
+            steps = torch.ceil(most / self.max_elongation * (1 - 1e-6)).nan_to_num(1.0).clamp(min=1, max=1e6).long()
+        base = state.length - elongation
+        run = _Run(self, state, dt, steps)
+        for k in range(int(steps.max())):
+            share = elongation / steps.index_select(0, state.colony)
+            run.substep(base, share, k < steps)
+            base = run.length
+        fields = {"displacement": run.first_move}
+        if "elongation" in state.fields:
+            fields["elongation"] = run.length - (state.length - elongation)
+        state = state.replace(position=run.position, axis=run.axis, length=run.length)
+        return state.with_fields(**fields).replace(reports={**state.reports, "mechanics": run.report})
+
+
+class _Run:
+    """The moving parts of one step: geometry, and what is reported of each colony."""
+
+    def __init__(self, settings: Mechanics, state: State, dt: float, substeps: Tensor):
+        self.settings, self.state = settings, state
+        self.position, self.axis, self.length = state.position, state.axis, state.length
+        self.first_move = state.displacement
+        count = state.colonies
+        zero = torch.zeros(count, dtype=torch.int64, device=state.device)
+        self.report = MechanicsReport(zero, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero > 0)
+        start = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
+        self.reference = state.position.detach().index_select(0, start).index_select(0, state.colony)
+        drag_factor = state.fields.get("drag")
+        self.viscosity = per_cell(settings.viscosity, state) * (1.0 if drag_factor is None else drag_factor)
+        self.length_drag = per_cell(settings.length_drag, state)
+        self.colony_ids = state.own_colony_id
+        # dt of each cell's own sub-step, h
+        self.dt = dt / substeps.index_select(0, state.colony).to(state.dtype)
+        if settings.stiffness is not None:
+            self.alpha = 1.0 / (per_cell(settings.stiffness, state) * self.dt)
+        elif settings.alpha is not None:
+            self.alpha = per_cell(settings.alpha, state).expand(state.cells)
+        else:
+            self.alpha = (0.1 / self.length_drag).expand(state.cells)
+
+    def substep(self, base: Tensor, growth: Tensor, active: Tensor) -> None:
+        """Grow by `growth` (N,) from `base` (N,), and pass over contacts, in the colonies that are active (B,) bool."""
+        moving = active.index_select(0, self.state.colony)
+        self.length = torch.where(moving, base + growth, base)
+        seen: Tensor | None = None
+        for number in range(self.settings.passes):
+            contacts, walls = self._detect()
+            if seen is not None:
+                active = active & self._again(contacts, walls, seen)
+                if not bool(active.any()):
+                    return
+            moving = active.index_select(0, self.state.colony)
+            if not bool(active.all()):
+                contacts, walls = _only(contacts, walls, moving)
+            move, report = self._solve(contacts, walls, base, moving, first=number == 0)
+            self._move(move, base, moving, report, active)
+            seen = self._keys(contacts) if number + 1 < self.settings.passes else None
+            self.report = self._noted(report, active)
+            if number == 0:
+                self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
+
+    def _detect(self) -> tuple[Contacts, WallContacts]:
+        state, margin = self.state, self.settings.margin if self.settings.unilateral else 0.0
+        local = (self.position - self.reference).to(state.dtype)
+        first, second = find_pairs(local.detach(), self.axis.detach(), self.length.detach(), state.radius, state.colony, state.colonies, margin)
+        bodies = Bodies(local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius)
+        contacts = find_contacts(bodies, first, second, margin)
+        walls = find_wall_contacts(
+            self.settings.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids, margin  # type: ignore[attr-defined]
+        )
+        return contacts, walls
+
+    def _keys(self, contacts: Contacts) -> Tensor:
+        low, high = torch.minimum(contacts.first, contacts.second), torch.maximum(contacts.first, contacts.second)
+        return low * self.state.cells + high
+
+    def _again(self, contacts: Contacts, walls: WallContacts, seen: Tensor) -> Tensor:
+        """Which colonies need another pass, (B,): a new contact that overlaps, an overlap over the limit, or a move cut short."""
+        groups, colony = self.state.groups, self.state.colony
+        new = ~torch.isin(self._keys(contacts), seen) & (contacts.gap < 0)
+        again = torch.zeros_like(colony, dtype=torch.bool)
+        again[contacts.first[new]] = True
+        if self.settings.overlap is not None:
+            again[contacts.first[contacts.gap < -self.settings.overlap]] = True
+            again[walls.cell[walls.gap < -self.settings.overlap]] = True
+        return groups.any(again) | self.report.limited
+
+    def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, first: bool):
+        state, settings = self.state, self.settings
+        across, turning, _ = capsule.drag(self.length, state.radius, self.viscosity)
+        d, turns = state.dim, settings.degrees - state.dim - 1
+        drag = [across] * d + [turning] * turns + [self.length_drag.expand(state.cells)]
+        scale = torch.stack(drag, 1).rsqrt()
+        root = contacts.weight.sqrt().unsqueeze(1)
+        wall_root, wall_soft = self._wall_weights(walls)
+        rows = ContactRows(
+            contacts.first, contacts.second,
+            contacts.row_first * scale.index_select(0, contacts.first) * root,
+            contacts.row_second * scale.index_select(0, contacts.second) * root,
+            walls.cell, walls.row * scale.index_select(0, walls.cell) * wall_root.unsqueeze(1), state.cells,
+        )  # fmt: skip
+        gap = torch.cat([contacts.gap * root.squeeze(1), walls.gap * wall_root])
+        # a soft row's force acts once a step: later passes only correct it (hard rows are numerics, each pass a closer limit)
+        soft = torch.cat([torch.full_like(contacts.first, settings.stiffness is not None, dtype=torch.bool), wall_soft])
+        held = torch.zeros_like(gap) if first else torch.where(soft, gap.clamp(max=0), 0.0)
+        lower = (base - self.length) / scale[:, -1]
+        problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1), lower, scale, state.groups, settings.unilateral)
+        start = state.displacement if first else None
+        return solve(problem, start, settings.tolerance, settings.max_iterations)
+
+    def _wall_weights(self, walls: WallContacts) -> tuple[Tensor, Tensor]:
+        """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
+        root = torch.ones_like(walls.gap)
+        soft = torch.zeros_like(walls.cell, dtype=torch.bool)
+        for number, surface in enumerate(self.settings.surfaces):  # type: ignore[attr-defined]
+            here = walls.surface == number
+            if surface.wall.soft:
+                stiffness = per_cell(surface.wall.stiffness, self.state) * self.alpha * self.dt
+                root = torch.where(here, stiffness.index_select(0, walls.cell).sqrt(), root)
+                soft = soft | here
+            elif surface.wall.weight is not None:
+                weight = per_cell(surface.wall.weight, self.state).expand(self.state.cells)
+                root = torch.where(here, weight.index_select(0, walls.cell), root)
+        return root, soft
+
+    def _move(self, move: Tensor, base: Tensor, moving: Tensor, report: SolveReport, active: Tensor) -> None:
+        """Carry the solve's move out in the colonies that are moving, shortened where a cell would turn too far."""
+        state, d = self.state, self.state.dim
+        with torch.no_grad():
+            turn = state.groups.max(move[:, d:-1].detach().abs().amax(1))
+            self.limited = active & (turn > MAX_TURN)
+            share = torch.where(self.limited, MAX_TURN / turn, 1.0)
+            sound = moving & (report.status != NOT_FINITE).index_select(0, state.colony)
+            share = share.index_select(0, state.colony).unsqueeze(1)
+        move = torch.where(sound.unsqueeze(1), move * share, 0.0)
+        self.position = self.position + move[:, :d].to(self.position.dtype)
+        self.axis = torch.where(sound.unsqueeze(1), capsule.rotate(self.axis, move[:, d:-1]), self.axis)
+        self.length = torch.maximum(self.length + move[:, -1], base)
+
+    def _noted(self, new: SolveReport, active: Tensor) -> MechanicsReport:
+        old = self.report
+        return MechanicsReport(
+            torch.where(active, torch.maximum(old.status, new.status), old.status),
+            old.iterations + torch.where(active, new.iterations, 0),
+            torch.where(active, torch.maximum(old.residual, new.residual), old.residual),
+            old.passes + active, old.substeps, self.limited,
+        )  # fmt: skip
+
+
+def _only(contacts: Contacts, walls: WallContacts, cells: Tensor) -> tuple[Contacts, WallContacts]:
+    """The rows whose cells are marked, (N,) bool."""
+    keep = torch.nonzero(cells.index_select(0, contacts.first)).squeeze(1)
+    keep_wall = torch.nonzero(cells.index_select(0, walls.cell)).squeeze(1)
+    return contacts.take(keep), walls.take(keep_wall)

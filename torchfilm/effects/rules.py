@@ -1,0 +1,358 @@
+"""Rules, the paper's way: `update(cells)` and `divide(parent, daughter1, daughter2)` with Table 1's names, on whole tensors.
+
+    def update(cells):
+        cells.growth_rate = 2.1
+        cells.divide_flag = cells.volume > 3
+
+Rules are the user's own Python. `update` is tried once on the first state, before anything runs: names that it sets and
+that nothing declares become variables, and what it reads and writes is noted, so that the scene knows who drives whom.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.effect import DIVISION, RULES, Effect
+from torchfilm.physics.contacts import Bodies, contact_gaps
+from torchfilm.physics.neighbours import find_pairs
+from torchfilm.state import CELL, Field, State
+from torchfilm.tools import checks
+
+# The paper's spellings (Table 1) beside ours.
+PAPER_NAMES = {"pos": "position", "dir": "axis", "cellType": "cell_type", "growthRate": "growth_rate", "divideFlag": "divide_flag"}
+GEOMETRY = ("position", "axis", "length", "radius", "volume", "area")
+IDENTITY = ("uid", "parent", "colony")
+KNOWN_FIELDS = {
+    "cell_type": Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64),
+    "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
+}
+
+
+class CellsView:
+    """What a rule sees: every name a tensor over all cells, (N,) or (N, d); `for cell in cells` gives them one by one (slow).
+
+    Read position (pos), axis (dir), length, radius, volume, area, uid, parent, colony, and every field of the scene; write fields, `divide_flag`,
+    `remove_flag`, and new names, which become variables of the cell. A tensor that was read may be changed in place.
+    """
+
+    def __init__(self, state: State, dt: float, declaring: bool = False):
+        object.__setattr__(self, "_state", state)
+        object.__setattr__(self, "_dt", dt)
+        object.__setattr__(self, "_work", {})
+        object.__setattr__(self, "_read", set())
+        object.__setattr__(self, "_declaring", declaring)
+        object.__setattr__(self, "_draws", 0)
+
+    @property
+    def time(self) -> float:
+        """h."""
+        return self._state.time
+
+    @property
+    def dt(self) -> float:
+        """Step, h."""
+        return self._dt
+
+    @property
+    def count(self) -> int:
+        """Cells in all colonies."""
+        return self._state.cells
+
+    def __len__(self) -> int:
+        return self._state.cells
+
+    def __getattr__(self, name: str) -> Tensor:
+        name = PAPER_NAMES.get(name, name)
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name in self._work:
+            return self._work[name]
+        state = self._state
+        if name in GEOMETRY or name in IDENTITY:
+            self._read.add(name)
+            return getattr(state, name)
+        if name == "remove_flag":
+            self._work[name] = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
+        elif name in state.fields:
+            self._read.add(name)
+            # a copy, so that a rule may write into it: states are frozen
+            self._work[name] = state.fields[name].clone()
+        elif self._declaring and name in KNOWN_FIELDS:
+            self._work[name] = KNOWN_FIELDS[name].start(state, torch.arange(state.cells, device=state.device))
+        else:
+            raise AttributeError(
+                f"cells have no {name!r}; they have {', '.join([*GEOMETRY, *IDENTITY, *state.fields])}. A variable of your own needs a first value: "
+                f"give Rules(…, variables={{{name!r}: 0.0}})."
+            )
+        return self._work[name]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        name = PAPER_NAMES.get(name, name)
+        state = self._state
+        if name in GEOMETRY or name in IDENTITY or isinstance(getattr(type(self), name, None), property):
+            raise AttributeError(f"cells.{name} can only be read (Table 1 of the paper): rules change fields, flags and variables.")
+        declared = KNOWN_FIELDS.get(name, state.declared.get(name)) if name != "remove_flag" else None
+        dtype = torch.bool if name == "remove_flag" else (declared.dtype or state.dtype) if declared is not None else None
+        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device=state.device)
+        if dtype is None:
+            dtype = state.dtype if tensor.is_floating_point() else tensor.dtype
+        shape = state.fields[name].shape if name in state.fields else (state.cells, *tensor.shape[1:])
+        try:
+            self._work[name] = tensor.to(device=state.device, dtype=dtype).broadcast_to(shape).clone()
+        except RuntimeError as error:
+            raise ValueError(f"cells.{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or {tuple(shape)}.") from error
+
+    def __iter__(self):
+        return (CellView(self, k) for k in range(self._state.cells))
+
+    def random(self) -> Tensor:
+        """A draw from (0, 1) for each cell, (N,), keyed by seed, colony, cell and step: the same whatever the batch. Each call draws anew."""
+        object.__setattr__(self, "_draws", self._draws + 1)
+        return self._state.uniform(torch.arange(self._state.cells, device=self._state.device), f"rule {self._draws}")
+
+    def colony_max(self, value: Tensor) -> Tensor:
+        """The greatest value in each cell's own colony, (N,) -> (N,)."""
+        return self._state.groups.max(value).index_select(0, self._state.colony)
+
+    def colony_min(self, value: Tensor) -> Tensor:
+        """The smallest value in each cell's own colony, (N,) -> (N,)."""
+        return -self.colony_max(-value)
+
+    def colony_sum(self, value: Tensor) -> Tensor:
+        """The sum over each cell's own colony, (N,) -> (N,)."""
+        return self._state.groups.sum(value.unsqueeze(1)).squeeze(1).index_select(0, self._state.colony)
+
+    def contacts(self, within: float = 0.05) -> tuple[Tensor, Tensor]:
+        """Pairs of cells whose surfaces are at most `within` µm apart: two (P,) index tensors, each pair once. Found only when asked for."""
+        s = self._state
+        i, j = find_pairs(s.position, s.axis.double(), s.length.double(), s.radius.double(), s.colony, s.colonies, within)
+        bodies = Bodies(s.position.T.contiguous(), s.axis.T.double().contiguous(), 0.5 * s.length.double(), s.radius.double())
+        keep = torch.nonzero(contact_gaps(bodies, i, j) <= within).squeeze(1)
+        return i.index_select(0, keep), j.index_select(0, keep)
+
+    def contact_count(self, within: float = 0.05) -> Tensor:
+        """How many cells each cell touches, (N,) int64."""
+        i, j = self.contacts(within)
+        return torch.bincount(torch.cat([i, j]), minlength=self._state.cells)
+
+
+class CellView:
+    """One cell of a CellsView: the same names, one value each. For loops as in the paper; whole tensors are a thousand times faster."""
+
+    def __init__(self, cells: CellsView, index: int):
+        object.__setattr__(self, "_cells", cells)
+        object.__setattr__(self, "_index", index)
+
+    def __getattr__(self, name: str) -> Tensor:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._cells, name)[self._index]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        name = PAPER_NAMES.get(name, name)
+        cells = self._cells
+        if name in cells._state.fields or name in ("remove_flag", *KNOWN_FIELDS) or name in cells._work:
+            getattr(cells, name)[self._index] = value
+        elif cells._declaring:
+            setattr(cells, name, torch.zeros(len(cells), dtype=torch.as_tensor(value).dtype, device=cells._state.device))
+            getattr(cells, name)[self._index] = value
+        else:
+            setattr(cells, name, value)  # raises, with the reason
+
+
+class DivisionView:
+    """The parents or daughters of one step's divisions, M of each: names as in CellsView; daughters' fields may be written."""
+
+    def __init__(self, state: State, rows: Tensor | None, purpose: str):
+        object.__setattr__(self, "_state", state)
+        object.__setattr__(self, "_rows", rows)
+        object.__setattr__(self, "_purpose", purpose)
+        object.__setattr__(self, "_work", {})
+        object.__setattr__(self, "_draws", 0)
+
+    def __getattr__(self, name: str) -> Tensor:
+        name = PAPER_NAMES.get(name, name)
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name not in self._work:
+            if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
+                raise AttributeError(f"cells have no {name!r}; they have {', '.join([*GEOMETRY, *IDENTITY, *self._state.fields])}")
+            value = getattr(self._state, name)
+            self._work[name] = value.clone() if self._rows is None else value.index_select(0, self._rows)
+        return self._work[name]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        name = PAPER_NAMES.get(name, name)
+        if self._rows is None:
+            raise AttributeError(f"parent.{name} can only be read: the parent is gone; set daughter1.{name} and daughter2.{name}.")
+        if name not in self._state.fields:
+            raise AttributeError(f"daughters have no field {name!r} to write; they have {', '.join(self._state.fields)}")
+        like = getattr(self, name)
+        self._work[name] = torch.as_tensor(value, dtype=like.dtype, device=like.device).broadcast_to(like.shape).clone()
+
+    def random(self) -> Tensor:
+        """A draw from (0, 1) for each division, (M,), keyed by seed, colony, cell and step."""
+        object.__setattr__(self, "_draws", self._draws + 1)
+        rows = self._rows if self._rows is not None else torch.arange(self._state.cells, device=self._state.device)
+        return self._state.uniform(rows, f"{self._purpose} {self._draws}")
+
+
+class Source:
+    """Where the rule functions come from: functions, or a file that may be edited while a run is going."""
+
+    def __init__(self, path: Path | None, functions: dict[str, Callable[..., None] | None]):
+        self.path, self.functions = path, functions
+        self.stamp = path.stat().st_mtime_ns if path else 0
+        self.watching = False
+        self.messages: list[str] = []
+
+    def refresh(self, attempt: Callable[[Callable[..., None]], None]) -> None:
+        """Take up an edited file if it loads and `attempt(update)` passes; else report and keep the last good rules."""
+        if not self.watching or self.path is None:
+            return
+        try:
+            stamp = self.path.stat().st_mtime_ns
+        except OSError:
+            return  # an editor is just replacing the file
+        if stamp == self.stamp:
+            return
+        self.stamp = stamp
+        try:
+            functions = load_rules(self.path)
+            if functions["update"] is not None:
+                attempt(functions["update"])
+        except Exception as error:  # the user's own code may fail in any way; the run goes on
+            self.messages.append(f"{self.path.name} is broken, still running the last good rules: {type(error).__name__}: {error}")
+            return
+        self.functions = functions
+        self.messages.append(f"{self.path.name} taken up")
+
+
+def load_rules(path: Path) -> dict[str, Callable[..., None] | None]:
+    """Run a rules file and return its `update` and `divide`."""
+    module = types.ModuleType(path.stem)
+    exec(compile(path.read_text(), str(path), "exec"), module.__dict__)
+    found = {name: getattr(module, name, None) for name in ("update", "divide")}
+    if not any(map(callable, found.values())):
+        raise checks.InputError(f"{path} defines neither update(cells) nor divide(parent, daughter1, daughter2).")
+    return found
+
+
+@dataclass(frozen=True)
+class Rules(Effect):
+    """The user's rules: `update(cells)` at the start of each step, `divide(parent, daughter1, daughter2)` after divisions.
+
+    update: a function, or the path of a Python file that defines `update` and, if wanted, `divide`. variables: first values
+    of variables of the user's own, one number each.
+    """
+
+    update: Callable[[CellsView], None] | str | Path | None = None
+    divide: Callable[[DivisionView, DivisionView, DivisionView], None] | None = None
+    variables: Mapping[str, float] = field(default_factory=dict)
+
+    stage = RULES
+    title = "rules"
+
+    def __post_init__(self) -> None:
+        path = None
+        functions: dict[str, Any] = {"update": self.update, "divide": self.divide}
+        if isinstance(self.update, (str, Path)):
+            path = Path(self.update)
+            if not path.is_file():
+                raise checks.refuse("Rules.update", str(path), "a function or the path of a Python file", "No such file.")
+            functions = load_rules(path)
+        for name, given in functions.items():
+            if given is not None and not callable(given):
+                raise checks.refuse(f"Rules.{name}", given, "a function")
+        if not any(functions.values()):
+            raise checks.InputError("Rules() has neither update nor divide: give at least one, such as tf.Rules(update).")
+        for name, value in self.variables.items():
+            checks.number(f"Rules.variables[{name!r}]", value)
+        object.__setattr__(self, "source", Source(path, functions))
+        object.__setattr__(self, "noted", {"reads": (), "writes": ()})
+
+    def parts(self) -> tuple[Effect, ...]:
+        return (self, DivisionRule(self)) if self.source.functions["divide"] or self.source.path else (self,)  # type: ignore[attr-defined]
+
+    def declares(self, dim: int) -> tuple[Field, ...]:
+        return tuple(Field(name, "variable of the user's rules", initial=value) for name, value in self.variables.items())
+
+    def reads(self) -> tuple[str, ...]:
+        return self.noted["reads"]  # type: ignore[attr-defined]
+
+    def writes(self) -> tuple[str, ...]:
+        return self.noted["writes"]  # type: ignore[attr-defined]
+
+    def prepare(self, state: State) -> State:
+        """Try `update` once on the first state: new names become fields, and what is read and written is noted."""
+        update = self.source.functions["update"]  # type: ignore[attr-defined]
+        if update is None:
+            return state
+        view = CellsView(state, 0.0, declaring=True)
+        update(view)
+        for name, value in view._work.items():
+            if name not in state.fields and name != "remove_flag":
+                known = KNOWN_FIELDS.get(name)
+                new = known or Field(name, "variable of the user's rules", dtype=value.dtype, shape=tuple(value.shape[1:]))
+                state = state.declare(new)
+        changed = [n for n, v in view._work.items() if n != "remove_flag" and not torch.equal(v, state.fields[n])]
+        writes = [n for n in view._work if n in changed or n not in view._read]
+        self.noted["reads"] = tuple(sorted(view._read))  # type: ignore[attr-defined]
+        self.noted["writes"] = tuple("cells" if n == "remove_flag" else n for n in sorted(writes))  # type: ignore[attr-defined]
+        return state
+
+    def step(self, state: State, dt: float) -> State:
+        self.source.refresh(lambda update: _apply(update, state, dt))  # type: ignore[attr-defined]
+        update = self.source.functions["update"]  # type: ignore[attr-defined]
+        return state if update is None or state.cells == 0 else _apply(update, state, dt)
+
+
+def _apply(update: Callable[[CellsView], None], state: State, dt: float) -> State:
+    view = CellsView(state, dt)
+    update(view)
+    work = dict(view._work)
+    gone = work.pop("remove_flag", None)
+    for name in work:
+        if name not in state.fields:
+            if name not in KNOWN_FIELDS:
+                raise checks.SimulationError(f"rules set the variable {name!r} for the first time in mid-run: give Rules(…, variables={{{name!r}: 0.0}}).")
+            state = state.declare(KNOWN_FIELDS[name])
+    state = state.with_fields(**work)
+    return state if gone is None else state.remove(gone, "removed")
+
+
+@dataclass(frozen=True)
+class DivisionRule(Effect):
+    """The part of Rules that acts after division: the user's `divide(parent, daughter1, daughter2)`."""
+
+    rules: Rules
+
+    stage = DIVISION + 1
+    title = "rules at division"
+
+    def reads(self) -> tuple[str, ...]:
+        return ("cells",)
+
+    def step(self, state: State, dt: float) -> State:
+        act = self.rules.source.functions["divide"]  # type: ignore[attr-defined]
+        if act is None:
+            return state
+        for births in state.births:
+            parent = DivisionView(births.parents, None, "divide parent")
+            first = DivisionView(state, births.first, "divide first")
+            second = DivisionView(state, births.second, "divide second")
+            act(parent, first, second)
+            changed: dict[str, Tensor] = {}
+            for daughter, rows in ((first, births.first), (second, births.second)):
+                for name, value in daughter._work.items():
+                    if name in state.fields and state.declared[name].scope == CELL:
+                        changed[name] = changed.get(name, state.fields[name]).index_copy(0, rows, value)
+            state = state.with_fields(**changed)
+        return state

@@ -1,0 +1,198 @@
+"""Narrow phase: where two capsules touch, and how the gap there changes with each cell's seven (or four) degrees of freedom.
+
+Everything is component first: a vector over P pairs is (d, P).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
+
+# Sine of the angle between two axes at which a line of contact has shrunk to a point (see `contact_points`).
+LINE_CONTACT_SINE = 0.1
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Capsules, component first: centre (d, N) µm, axis (d, N) unit, half (N,) half centreline µm, radius (N,) µm."""
+
+    centre: Tensor
+    axis: Tensor
+    half: Tensor
+    radius: Tensor
+
+    def take(self, index: Tensor) -> Bodies:
+        return Bodies(
+            self.centre.index_select(1, index), self.axis.index_select(1, index),
+            self.half.index_select(0, index), self.radius.index_select(0, index),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Rows of the contact problem, K pairs' rows; first and second cell (K,), gap (K,) µm, weight D² (K,).
+
+    `row_first`, `row_second`: (K, 4) in 2-D [n, q×n, ∂] and (K, 7) in 3-D: the gap after moves x is gap − row_first·x_first −
+    row_second·x_second. `normal` (d, K) from first to second.
+    """
+
+    first: Tensor
+    second: Tensor
+    gap: Tensor
+    weight: Tensor
+    row_first: Tensor
+    row_second: Tensor
+    normal: Tensor
+
+    def take(self, index: Tensor) -> Contacts:
+        """The rows at `index`."""
+        pick = lambda x: x.index_select(0, index)  # noqa: E731
+        return Contacts(
+            pick(self.first), pick(self.second), pick(self.gap), pick(self.weight),
+            pick(self.row_first), pick(self.row_second), self.normal.index_select(1, index),
+        )  # fmt: skip
+
+
+def closest_points(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor]:
+    """Arc lengths (s, t), each (P,) µm from its centre, of the closest points of two centrelines.
+
+    The least of five candidates: each of the four ends against the other segment, and the common perpendicular of the two lines.
+    The last one alone loses all accuracy as the lines become parallel; the least of the five never does.
+    """
+    between = b.centre - a.centre
+    cosine = dot(a.axis, b.axis)
+    on_a, on_b = dot(between, a.axis), dot(between, b.axis)
+    normal = cross(a.axis, b.axis)
+    sine2 = dot(normal, normal)
+    parallel = sine2 < 1e-12
+    divisor = torch.where(parallel, 1.0, sine2)
+    s = torch.where(parallel, 0.0, (on_a - cosine * on_b) / divisor)
+    s = torch.minimum(torch.maximum(s, -a.half), a.half)
+    t = _clamp(cosine * s - on_b, b.half)
+    s = _clamp(cosine * t + on_a, a.half)
+    best_s, best_t = s, t
+    best = _distance2(between, a.axis, b.axis, s, t)
+    for sign in (1.0, -1.0):
+        for end_of_a in (True, False):
+            if end_of_a:
+                s = sign * a.half
+                t = _clamp(cosine * s - on_b, b.half)
+            else:
+                t = sign * b.half
+                s = _clamp(cosine * t + on_a, a.half)
+            d2 = _distance2(between, a.axis, b.axis, s, t)
+            # an end wins a tie, by more than rounding, so that which end is found does not depend on the last bit
+            closer = d2 < best
+            best = torch.where(closer, d2, best)
+            best_s, best_t = torch.where(closer, s, best_s), torch.where(closer, t, best_t)
+    return best_s, best_t
+
+
+def _clamp(x: Tensor, half: Tensor) -> Tensor:
+    return torch.minimum(torch.maximum(x, -half), half)
+
+
+def _distance2(between: Tensor, axis_a: Tensor, axis_b: Tensor, s: Tensor, t: Tensor) -> Tensor:
+    d = between + t * axis_b - s * axis_a
+    return dot(d, d)
+
+
+def contact_points(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """One or two touching points of each pair: ((2, P) s, (2, P) t, (2, P) end of a, (2, P) end of b, (P,) is a line).
+
+    Two capsules side by side touch along a line, two at an angle at a point. Between the two the ends of the line slide
+    towards the closest point as the sine of the angle grows to `LINE_CONTACT_SINE`, and have met there when the line is given
+    up; each carries half the weight (D = 1/√2), so neither force nor torque jumps. An `end` is −1, 0 or +1, or between
+    while it slides: how much of ½ l the point moves with when the cell grows.
+    """
+    s0, t0 = closest_points(a, b)
+    end_a0, end_b0 = _end(s0, a.half), _end(t0, b.half)
+    turn = cross(a.axis, b.axis)
+    sine2 = dot(turn, turn)
+    slide = 1.0 - sine2 / LINE_CONTACT_SINE**2
+    # the common part of the two segments, measured along the mean axis so that neither cell is preferred
+    sign = torch.where(dot(a.axis, b.axis) < 0, -1.0, 1.0).to(a.half.dtype)
+    mean = a.axis + sign * b.axis
+    mean = mean / safe_norm(mean)
+    project = dot(a.axis, mean)
+    offset = dot(b.centre - a.centre, mean)
+    low = torch.maximum(-a.half * project, offset - b.half * project)
+    high = torch.minimum(a.half * project, offset + b.half * project)
+    line = (slide > 0) & (high > low)
+    slide = torch.where(line, slide, 0.0) ** 2
+    s_all, t_all, end_a, end_b = [], [], [], []
+    for at in (low, high):
+        s1 = _clamp(at / project, a.half)
+        t1 = _clamp(sign * (at - offset) / project, b.half)
+        s_all.append(s0 + slide * (s1 - s0))
+        t_all.append(t0 + slide * (t1 - t0))
+        end_a.append(end_a0 + slide * (_end(s1, a.half) - end_a0))
+        end_b.append(end_b0 + slide * (_end(t1, b.half) - end_b0))
+    return torch.stack(s_all), torch.stack(t_all), torch.stack(end_a), torch.stack(end_b), line
+
+
+def _end(s: Tensor, half: Tensor) -> Tensor:
+    """Which end of the centreline a point is: +1, −1, or 0 for neither (or for a sphere, whose ends are one)."""
+    slack = 1e-6 * half + 1e-9
+    return (s >= half - slack).to(s.dtype) - (s <= slack - half).to(s.dtype)
+
+
+def find_contacts(bodies: Bodies, first: Tensor, second: Tensor, margin: float) -> Contacts:
+    """All rows with a gap under `margin` µm among the given pairs (P,), (P,)."""
+    a, b = bodies.take(first), bodies.take(second)
+    s, t, end_a, end_b, line = contact_points(a, b)
+    # cull before the expensive part, without a gradient: a point row for every pair, a second one where there is a line
+    with torch.no_grad():
+        gap0 = _gap(a, b, s[0], t[0])
+        gap1 = _gap(a, b, s[1], t[1])
+        keep0 = torch.nonzero(gap0 < margin).squeeze(1)
+        keep1 = torch.nonzero(line & (gap1 < margin)).squeeze(1)
+    keep = torch.cat([keep0, keep1])
+    which = lambda x: torch.cat([x[0].index_select(0, keep0), x[1].index_select(0, keep1)])  # noqa: E731
+    a, b = a.take(keep), b.take(keep)
+    row = _rows(a, b, which(s), which(t), which(end_a), which(end_b))
+    weight = torch.where(line.index_select(0, keep), 0.5, 1.0).to(row[0].dtype)
+    return Contacts(first.index_select(0, keep), second.index_select(0, keep), row[0], weight, *row[1:])
+
+
+def _gap(a: Bodies, b: Bodies, s: Tensor, t: Tensor) -> Tensor:
+    return safe_sqrt(_distance2(b.centre - a.centre, a.axis, b.axis, s, t)) - a.radius - b.radius
+
+
+def contact_gaps(bodies: Bodies, first: Tensor, second: Tensor) -> Tensor:
+    """Signed gap of each pair at its closest points, (P,) µm; negative where they overlap."""
+    a, b = bodies.take(first), bodies.take(second)
+    return _gap(a, b, *closest_points(a, b))
+
+
+def _rows(a: Bodies, b: Bodies, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tensor):
+    """Gap, the two cells' rows and the normal at points s and t of the centrelines."""
+    lever_a, lever_b = s * a.axis, t * b.axis
+    between = b.centre - a.centre + lever_b - lever_a
+    distance = safe_norm(between)
+    touching = distance <= 1e-5 * (a.radius + b.radius)
+    normal = torch.where(touching, _fallback_normal(a, b), between / torch.where(touching, 1.0, distance))
+    gap = distance - a.radius - b.radius
+    along_a, along_b = dot(normal, a.axis), dot(normal, b.axis)
+    # a sphere grows from both ends at once: the one nearer the contact counts
+    end_a = torch.where(a.half <= 1e-9, torch.sign(along_a), end_a)
+    end_b = torch.where(b.half <= 1e-9, -torch.sign(along_b), end_b)
+    row_a = torch.cat([normal, cross(lever_a, normal), (0.5 * end_a * along_a).unsqueeze(0)])
+    row_b = torch.cat([-normal, -cross(lever_b, normal), (-0.5 * end_b * along_b).unsqueeze(0)])
+    return gap, row_a.T.contiguous(), row_b.T.contiguous(), normal
+
+
+def _fallback_normal(a: Bodies, b: Bodies) -> Tensor:
+    """A direction to part two cells whose centrelines cross: both axes' common perpendicular; any perpendicular when parallel or in 2-D."""
+    way = perpendicular(a.axis)
+    if a.axis.shape[0] == 3:
+        common = cross(a.axis, b.axis)
+        size = safe_norm(common)
+        parallel = size < 1e-6
+        way = torch.where(parallel, way, common / torch.where(parallel, 1.0, size))
+    # whichever of the two ways takes the centres apart
+    return torch.where(dot(way, b.centre - a.centre) < 0, -way, way)

@@ -1,0 +1,163 @@
+"""Broad phase: pairs of cells near enough to touch, found on the tensors' own device.
+
+Every cell has a reach: half its length plus its radius plus half the margin asked for. Cells are sorted into rows (of the
+plane) or columns of rows (of space), each row about as high as cells reach, and by place along the row; the partners
+that a cell has in one row are then one contiguous run, found by bisection. Cells of very different reach go into classes,
+each with a grid of its own, so that one filament among a thousand rods costs the rods nothing. There is no capacity
+to overflow: the list is as long as it must be. All sizes are taken colony by colony, so that a colony's pairs, and their
+order, do not depend on what else is in the batch.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchfilm.tools.ragged import Groups, expand_ranges, offsets
+
+# A place along a row is kept to within this share of the row's height; finer costs nothing but room in the keys.
+SLICES = 64
+# Cells whose reach is over this many times the smallest of their colony go into the next class.
+CLASS_RATIO = 4.0
+
+
+@torch.no_grad()
+def find_pairs(
+    position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float
+) -> tuple[Tensor, Tensor]:
+    """Pairs (i, j), i ≠ j, of one colony, whose bounding spheres and bounding boxes come within `margin` µm of each other.
+
+    position, axis (N, d) µm and unit; length, radius (N,) µm; colony (N,) int64. Every pair stands once; no pair whose
+    surfaces are within `margin` is missing. Returns two (P,) int64 tensors.
+    """
+    if colony.numel() < 2:
+        return colony.new_empty(0), colony.new_empty(0)
+    groups = Groups(colony, colonies)
+    reach = 0.5 * length + radius + 0.5 * margin
+    smallest = -groups.max(-reach)
+    ratio = reach / smallest.index_select(0, colony)
+    level = torch.floor(torch.log(ratio) / math.log(CLASS_RATIO) + 1e-3).long()
+    found = []
+    for k in range(int(level.max()) + 1):
+        members = torch.nonzero(level == k).squeeze(1)
+        if members.numel():
+            grid = _Grid.build(position, reach, colony, colonies, members)
+            found.append(grid.pairs_within())
+            larger = torch.nonzero(level > k).squeeze(1)
+            if larger.numel():
+                found.append(grid.pairs_with(larger))
+    first, second = torch.cat([f[0] for f in found]), torch.cat([f[1] for f in found])
+    return _near(position, axis, length, radius, reach, margin, first, second)
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Rows of one class of cells, in units of the rows' height."""
+
+    at: Tensor  # (d, N) where each cell is: along the row, then across rows
+    shape: Tensor  # (d, B) int64: slices along a row, then numbers of rows
+    base: Tensor  # (B,) int64: first key of each colony
+    window: Tensor  # (N,) how far a partner of each cell may be: its own reach and the greatest of the members
+    colony: Tensor
+    members: Tensor  # sorted by key
+    keys: Tensor
+
+    @staticmethod
+    def build(position: Tensor, reach: Tensor, colony: Tensor, colonies: int, members: Tensor) -> _Grid:
+        greatest = Groups(colony.index_select(0, members), colonies).max(reach.index_select(0, members), empty=1.0)
+        # narrow rows leave fewer strangers to look at, but in space there are many more of them
+        height = (greatest if position.shape[1] == 2 else 2.0 * greatest).index_select(0, colony)
+        groups = Groups(colony, colonies)
+        at, shape = [], []
+        for k in range(position.shape[1]):
+            x = position[:, k]
+            low = -groups.max(-x)
+            at.append((x - low.index_select(0, colony)) / height)
+            shape.append(groups.max(torch.floor(at[k] * (SLICES if k == 0 else 1)).long()) + 1)
+        numbers = shape[0]
+        for k in range(1, len(shape)):
+            numbers = numbers * shape[k]
+        window = (reach + greatest.index_select(0, colony)) / height * (1 + 1e-5)
+        grid = _Grid(torch.stack(at), torch.stack(shape), offsets(numbers)[:-1], window, colony, members, members)
+        mine = grid.at.index_select(1, members)
+        key = grid._key(colony.index_select(0, members), torch.floor(mine[1:]).long(), torch.floor(mine[0] * SLICES).long())
+        keys, order = torch.sort(key, stable=True)
+        return replace(grid, members=members.index_select(0, order), keys=keys)
+
+    def _key(self, colony: Tensor, rows: Tensor, along: Tensor) -> Tensor:
+        row = rows[-1]
+        for k in range(rows.shape[0] - 1, 0, -1):
+            row = row * self.shape[k].index_select(0, colony) + rows[k - 1]
+        return self.base.index_select(0, colony) + row * self.shape[0].index_select(0, colony) + along
+
+    def _run(self, cells: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the possible partners of each of `cells` (Q,) in the row numbered `rows` (d − 1, Q) stand in the sorted list: start and count."""
+        colony, at = self.colony.index_select(0, cells), self.at.index_select(1, cells)
+        window = self.window.index_select(0, cells)
+        # of a row some way off only a part is within the window
+        away = torch.maximum(rows - at[1:], at[1:] - rows - 1).clamp(min=0)
+        left = window * window - (away * away).sum(0)
+        width = left.clamp(min=0).sqrt()
+        last = self.shape.index_select(1, colony) - 1
+        inside = ((rows >= 0) & (rows <= last[1:])).all(0) & (left >= 0)
+        low = torch.floor((at[0] - width) * SLICES).long().clamp(min=0)
+        high = torch.minimum(torch.floor((at[0] + width) * SLICES).long(), last[0])
+        start = torch.searchsorted(self.keys, self._key(colony, rows, low))
+        stop = torch.searchsorted(self.keys, self._key(colony, rows, high), right=True)
+        return start, torch.where(inside, (stop - start).clamp(min=0), 0)
+
+    def pairs_within(self) -> tuple[Tensor, Tensor]:
+        """Every pair of members that may touch, once: the rest of a member's own row, and the rows after it."""
+        members = self.members.sort().values
+        own = torch.floor(self.at[1:].index_select(1, members)).long()
+        rank = torch.empty_like(self.colony)
+        rank[self.members] = torch.arange(self.members.numel(), device=rank.device)
+        reaches = 2 if own.shape[0] == 1 else 1
+        first, second = [], []
+        for step in itertools.product(range(-reaches, reaches + 1), repeat=own.shape[0]):
+            if step[::-1] < (0,) * len(step):
+                continue
+            start, count = self._run(members, own + torch.tensor(step, device=own.device).unsqueeze(1))
+            if not any(step):
+                stop = start + count
+                start = rank.index_select(0, members) + 1
+                count = (stop - start).clamp(min=0)
+            owner, run = expand_ranges(start, count)
+            first.append(members.index_select(0, owner))
+            second.append(self.members.index_select(0, run))
+        return torch.cat(first), torch.cat(second)
+
+    def pairs_with(self, larger: Tensor) -> tuple[Tensor, Tensor]:
+        """Every pair of a larger cell (of another class) and a member."""
+        rows_each_way = torch.ceil(self.window.index_select(0, larger)).long()
+        query, found = torch.arange(larger.numel(), device=larger.device), []
+        for own_row in torch.floor(self.at[1:].index_select(1, larger)).long():
+            each = rows_each_way.index_select(0, query)
+            owner, row = expand_ranges(own_row.index_select(0, query) - each, 2 * each + 1)
+            found = [earlier.index_select(0, owner) for earlier in found] + [row]
+            query = query.index_select(0, owner)
+        cells = larger.index_select(0, query)
+        start, count = self._run(cells, torch.stack(found))
+        owner, run = expand_ranges(start, count)
+        return cells.index_select(0, owner), self.members.index_select(0, run)
+
+
+def _near(position, axis, length, radius, reach, margin, i, j):
+    """Keep the pairs whose bounding spheres and boxes, each grown by half the margin, meet."""
+    place = position.T.contiguous()
+    between = place.index_select(1, j) - place.index_select(1, i)
+    sum_reach = reach.index_select(0, i) + reach.index_select(0, j)
+    squared = between[0] * between[0]
+    for k in range(1, between.shape[0]):
+        squared = squared + between[k] * between[k]
+    # a hair more than the reach: rounding must not lose a pair that touches exactly
+    keep = torch.nonzero(squared <= sum_reach * sum_reach * (1 + 1e-5)).squeeze(1)
+    i, j, between = i.index_select(0, keep), j.index_select(0, keep), between.index_select(1, keep)
+    box = (0.5 * length * axis.abs().T + radius + 0.5 * margin) * (1 + 1e-5)
+    apart = (between.abs() > box.index_select(1, i) + box.index_select(1, j)).any(0)
+    keep = torch.nonzero(~apart).squeeze(1)
+    return i.index_select(0, keep), j.index_select(0, keep)

@@ -1,0 +1,80 @@
+"""The contact rows of a batch as one linear operator, J, never multiplied out into JᵀJ."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchfilm.tools.ragged import Groups, csr
+
+
+class ContactRows:
+    """R rows over N cells with D degrees of freedom: K rows of two cells, then W rows of a cell and a wall.
+
+    `first`, `second` (K,), `at_wall` (W,) int64: the cells; `row_first`, `row_second` (K, D), `row_wall` (W, D): J's entries,
+    already scaled by row weights and by drag as the solve wants them.
+    """
+
+    def __init__(
+        self, first: Tensor, second: Tensor, row_first: Tensor, row_second: Tensor, at_wall: Tensor, row_wall: Tensor, cells: int
+    ):
+        self.first, self.second, self.at_wall = first, second, at_wall
+        self.row_first, self.row_second, self.row_wall = row_first, row_second, row_wall
+        self.cells, self.pairs, self.walls = cells, first.numel(), at_wall.numel()
+        self.half_rows = Groups(torch.cat([first, second, at_wall]), cells)
+        self._matrix: Tensor | None = None
+        self._work: Tensor | None = None
+
+    @property
+    def rows(self) -> int:
+        return self.pairs + self.walls
+
+    def apply(self, x: Tensor) -> Tensor:
+        """J x: (N, D) -> (R,)."""
+        if x.device.type != "cpu" or self._needs_grad(x) or not self.rows:
+            pair = (self.row_first * x.index_select(0, self.first)).sum(1) + (self.row_second * x.index_select(0, self.second)).sum(1)
+            return torch.cat([pair, (self.row_wall * x.index_select(0, self.at_wall)).sum(1)])
+        if self._matrix is None:
+            self._matrix = self._assemble(x.shape[1])
+        return torch.mm(self._matrix, x.reshape(-1, 1)).squeeze(1)
+
+    def apply_transpose(self, e: Tensor) -> Tensor:
+        """Jᵀ e: (R,) -> (N, D)."""
+        e = e.unsqueeze(1)
+        pair, wall = e[: self.pairs], e[self.pairs :]
+        if self._needs_grad(e):
+            return self.half_rows.sum(torch.cat([self.row_first * pair, self.row_second * pair, self.row_wall * wall]))
+        width = self.row_first.shape[1]
+        if self._work is None:
+            self._work = e.new_empty(2 * self.pairs + self.walls, width)
+        # one buffer for the life of the rows: fresh memory for every product would cost more than the product
+        torch.mul(self.row_first, pair, out=self._work[: self.pairs])
+        torch.mul(self.row_second, pair, out=self._work[self.pairs : 2 * self.pairs])
+        torch.mul(self.row_wall, wall, out=self._work[2 * self.pairs :])
+        return self.half_rows.sum_into(self._work, e.new_empty(self.cells, width))
+
+    def blocks(self, active: Tensor) -> Tensor:
+        """The diagonal blocks of Jᵀ diag(active) J: (R,) -> (N, D, D)."""
+        width = self.row_first.shape[1]
+        rows = torch.cat([self.row_first, self.row_second, self.row_wall])
+        pair, wall = active[: self.pairs], active[self.pairs :]
+        scaled = rows * torch.cat([pair, pair, wall]).unsqueeze(1)
+        outer = (scaled.unsqueeze(2) * rows.unsqueeze(1)).reshape(-1, width * width)
+        return self.half_rows.sum_into(outer, rows.new_empty(self.cells, width * width)).reshape(-1, width, width)
+
+    def _needs_grad(self, x: Tensor) -> bool:
+        return torch.is_grad_enabled() and (x.requires_grad or self.row_first.requires_grad or self.row_wall.requires_grad)
+
+    def _assemble(self, width: int) -> Tensor:
+        dof = torch.arange(width, device=self.first.device)
+        column = lambda cell: cell.unsqueeze(1) * width + dof  # noqa: E731
+        columns = torch.cat([torch.cat([column(self.first), column(self.second)], 1).reshape(-1), column(self.at_wall).reshape(-1)])
+        values = torch.cat([torch.cat([self.row_first, self.row_second], 1).reshape(-1), self.row_wall.reshape(-1)])
+        pair_end = 2 * width * self.pairs
+        start = torch.cat(
+            [
+                torch.arange(self.pairs, device=dof.device) * (2 * width),
+                pair_end + torch.arange(self.walls + 1, device=dof.device) * width,
+            ]
+        )
+        return csr(start, columns, values.detach(), (self.rows, self.cells * width))

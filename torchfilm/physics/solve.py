@@ -1,0 +1,238 @@
+"""The contact solve: minimise ‖D(Jx − g)‖² + α xᵀMx, every colony converged by itself.
+
+| paper, model        | here                                                                  |
+|---------------------|-----------------------------------------------------------------------|
+| x = (Δc, Δθ, Δl)    | `x`, (N, 7), or (N, 4) in strict 2-D                                  |
+| M                   | diagonal: `drag` (N, D). A contact on a centreline exerts no torque about it, so the one direction in which |
+|                     | rotational drag differs (about the axis) is never entered             |
+| D J M^(−½)          | `ContactRows`, so that the system is JᵀJ + α and x = M^(−½) y         |
+| bilateral           | every row holds: one linear system                                    |
+| unilateral          | only rows with g − Jx < 0 push: semismooth Newton with a line search  |
+| Δl ≥ −growth        | projected Newton: a cell at its bound leaves the system               |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.physics.rows import ContactRows
+from torchfilm.tools.cg import conjugate_gradients, worst_of
+from torchfilm.tools.ragged import Groups
+
+CONVERGED, ITERATION_LIMIT, NOT_FINITE = 0, 1, 2
+STATUS = {CONVERGED: "converged", ITERATION_LIMIT: "iteration limit", NOT_FINITE: "not finite"}
+
+# The share of the present residual that one Newton step's CG is asked to leave, where contacts may switch.
+FORCING = 0.1
+NEWTON_LIMIT = 40
+HALVINGS = 8
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """For each colony, (B,): `status` (see STATUS), CG `iterations`, and the true `residual`, recomputed from x: the worst
+    preconditioned residual over the worst at x = 0."""
+
+    status: Tensor
+    iterations: Tensor
+    residual: Tensor
+
+
+@dataclass(frozen=True)
+class ContactProblem:
+    """One linearised contact problem, R rows over N cells in B colonies.
+
+    rows: J scaled by weights and drag. gap: (R,) D g. held: (R,) force of each row already spent in this step (soft rows in
+    later passes), D min(0, g) or 0. alpha: (N, 1). lower: (N,) least scaled Δl. scale: (N, D) M^(−½).
+    """
+
+    rows: ContactRows
+    gap: Tensor
+    held: Tensor
+    alpha: Tensor
+    lower: Tensor
+    scale: Tensor
+    colonies: Groups
+    unilateral: bool
+
+    def violation(self, y: Tensor) -> Tensor:
+        """What is left of each overlap after the move, (R,), negative; rows that do not push are 0."""
+        after = self.gap - self.rows.apply(y)
+        return after.clamp(max=0.0) if self.unilateral else after
+
+    def gradient(self, y: Tensor, violation: Tensor) -> Tensor:
+        return self.alpha * y - self.rows.apply_transpose(violation - self.held)
+
+    def energy(self, y: Tensor, violation: Tensor) -> Tensor:
+        """The function that is minimised, per colony (B,), in float64 so that a line search can compare."""
+        rows = self.rows
+        owner = torch.cat([rows.first, rows.at_wall])
+        spring = 0.5 * violation.double() ** 2
+        if bool((self.held != 0).any()):
+            spring = spring + self.held.double() * rows.apply(y).double()
+        per_cell = torch.zeros(rows.cells, dtype=torch.float64, device=y.device)
+        per_cell = Groups(owner, rows.cells).sum_into(spring.unsqueeze(1), per_cell.unsqueeze(1))
+        per_cell = per_cell + 0.5 * (self.alpha * y * y).sum(1, keepdim=True)
+        return self.colonies.sum(per_cell).squeeze(1)
+
+
+def solve(
+    problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int
+) -> tuple[Tensor, SolveReport]:
+    """Solve for x (N, D) from `start` (an earlier x, or None for 0). Differentiable by the adjoint: one more solve with the same operator.
+
+    A colony has converged when its worst preconditioned residual is at most `tolerance` times the worst at x = 0.
+    """
+    with torch.no_grad():
+        y, free, active, report, precondition = _minimise(_detached(problem), start, tolerance, max_iterations)
+    tracked = (problem.gap, problem.rows.row_first, problem.rows.row_wall, problem.alpha, problem.lower, problem.scale)
+    if torch.is_grad_enabled() and any(t.requires_grad for t in tracked):
+        y = _attach_gradient(problem, y, free, active, precondition, tolerance, max_iterations)
+    return y * problem.scale, report
+
+
+def _detached(p: ContactProblem) -> ContactProblem:
+    r = p.rows
+    if not torch.is_grad_enabled() and not r.row_first.requires_grad:
+        return p
+    rows = ContactRows(r.first, r.second, r.row_first.detach(), r.row_second.detach(), r.at_wall, r.row_wall.detach(), r.cells)
+    return ContactProblem(
+        rows, p.gap.detach(), p.held.detach(), p.alpha.detach(), p.lower.detach(), p.scale.detach(), p.colonies, p.unilateral
+    )
+
+
+def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int):
+    rows, colonies, owner = problem.rows, problem.colonies, problem.colonies.owner
+    zero = torch.zeros_like(problem.scale)
+    violation0 = problem.violation(zero)
+    gradient0 = problem.gradient(zero, violation0)
+    precondition = _block_inverse(problem, (violation0 < 0).to(zero.dtype) if problem.unilateral else torch.ones_like(violation0))
+    scale = worst_of(precondition(gradient0), colonies)
+    still = scale == 0  # nothing pushes: such a colony does not move at all
+    y = zero
+    if start is not None:
+        y = torch.where(still.index_select(0, owner).unsqueeze(1), zero, start / problem.scale)
+        y[:, -1] = torch.maximum(y[:, -1], problem.lower)
+    violation = problem.violation(y)
+    target = tolerance * scale
+    iterations = torch.zeros(colonies.size, dtype=torch.int64, device=y.device)
+    newton_target = target if not problem.unilateral else None
+    for _ in range(NEWTON_LIMIT):
+        gradient = problem.gradient(y, violation)
+        free = _free(y, gradient, problem.lower)
+        steepest = precondition(gradient * free)
+        worst = worst_of(steepest * free, colonies)
+        going = (worst > target) & torch.isfinite(worst) & (iterations < max_iterations)
+        if not bool(going.any()):
+            break
+        active = (violation < 0).to(y.dtype) if problem.unilateral else torch.ones_like(violation)
+        apply = _operator(problem, active, free)
+        inner = torch.maximum(0.5 * target, FORCING * worst) if newton_target is None else 0.5 * target
+        inner = torch.where(going, inner, torch.inf)
+        result = conjugate_gradients(
+            apply, -gradient * free, lambda r, f=free: precondition(r * f) * f, colonies, inner, max_iterations
+        )
+        iterations += result.iterations
+        y, violation = _line_search(problem, y, violation, gradient, result.x, going)
+    status = torch.where(worst <= target, CONVERGED, ITERATION_LIMIT)
+    status = torch.where(torch.isfinite(worst), status, NOT_FINITE)
+    residual = worst / torch.where(still, 1.0, scale)
+    active = (violation < 0).to(y.dtype) if problem.unilateral else torch.ones_like(violation)
+    return y, free, active, SolveReport(status, iterations, residual), precondition
+
+
+def _operator(problem: ContactProblem, active: Tensor, free: Tensor):
+    rows, alpha = problem.rows, problem.alpha
+
+    def apply(v: Tensor) -> Tensor:
+        out = rows.apply_transpose(active * rows.apply(v))
+        return out.addcmul_(alpha, v).mul_(free)
+
+    return apply
+
+
+def _free(y: Tensor, gradient: Tensor, lower: Tensor) -> Tensor:
+    """1 for every degree of freedom that may move, 0 for a length at its bound that is pushed further down. (N, D)"""
+    free = torch.ones_like(y)
+    free[:, -1] = (~((y[:, -1] <= lower) & (gradient[:, -1] > 0))).to(y.dtype)
+    return free
+
+
+def _line_search(problem: ContactProblem, y, violation, gradient, direction, going):
+    """Take the full step; halve it in the colonies where the energy does not fall enough.
+
+    Where every row holds and no length meets its bound, the full step is the minimum and needs no looking at.
+    """
+    owner = problem.colonies.owner
+    length = going.to(y.dtype)
+
+    def move(share: Tensor):
+        new = torch.addcmul(y, share.index_select(0, owner).unsqueeze(1), direction)
+        new[:, -1] = torch.maximum(new[:, -1], problem.lower)
+        return new, problem.violation(new)
+
+    new, after = move(length)
+    if not problem.unilateral and bool((new[:, -1] > problem.lower).all()):
+        return new, after
+    before = problem.energy(y, violation)
+    for _ in range(HALVINGS):
+        decrease = problem.colonies.sum((gradient * (new - y)).double().sum(1, keepdim=True)).squeeze(1)
+        slack = 1e-6 * before.abs()
+        bad = going & (problem.energy(new, after) > before + 1e-4 * decrease + slack)
+        if not bool(bad.any()):
+            break
+        length = torch.where(bad, 0.5 * length, length)
+        new, after = move(length)
+    return new, after
+
+
+def _block_inverse(problem: ContactProblem, active: Tensor):
+    """Block Jacobi: each cell's own D × D block, inverted."""
+    blocks = problem.rows.blocks(active)
+    blocks.diagonal(dim1=1, dim2=2).add_(problem.alpha)
+    # a colony that is not finite must not stop the others: it is reported as such by its residual
+    sound = torch.isfinite(blocks).all(2).all(1)
+    identity = torch.eye(blocks.shape[1], dtype=blocks.dtype, device=blocks.device)
+    inverse = torch.linalg.inv(torch.where(sound[:, None, None], blocks, identity)) if blocks.numel() else blocks
+    inverse = torch.where(sound[:, None, None], inverse, torch.nan)
+    return lambda r: torch.bmm(inverse, r.unsqueeze(2)).squeeze(2)
+
+
+def _attach_gradient(problem, y, free, active, precondition, tolerance, max_iterations):
+    """y as a differentiable function of the problem: r(y, θ) = 0 gives dy = −A⁻¹ dr, with contacts and bounds as they were found."""
+    at_bound = free[:, -1] == 0
+    length = torch.where(at_bound, problem.lower, y[:, -1])
+    held = torch.cat([y[:, :-1], length.unsqueeze(1)], 1)
+    after = (problem.gap - problem.rows.apply(held)) * active
+    residual = problem.gradient(held, after) * free
+    solve_again = _AdjointSolve(_detached(problem), active, free, precondition, tolerance, max_iterations)
+    return held + _Implicit.apply(residual, solve_again)
+
+
+class _AdjointSolve:
+    def __init__(self, problem, active, free, precondition, tolerance, max_iterations):
+        self.problem, self.active, self.free = problem, active, free
+        self.precondition, self.tolerance, self.max_iterations = precondition, tolerance, max_iterations
+
+    def __call__(self, grad: Tensor) -> Tensor:
+        free, colonies = self.free, self.problem.colonies
+        precondition = lambda r: self.precondition(r * free) * free  # noqa: E731
+        b = grad * free
+        target = self.tolerance * worst_of(precondition(b), colonies)
+        return conjugate_gradients(
+            _operator(self.problem, self.active, free), b, precondition, colonies, target, self.max_iterations
+        ).x
+
+
+class _Implicit(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, residual: Tensor, solve_again: _AdjointSolve) -> Tensor:
+        ctx.solve_again = solve_again
+        return torch.zeros_like(residual)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        return -ctx.solve_again(grad.contiguous()), None

@@ -1,0 +1,207 @@
+"""The scene: an ordered list of effects. What it does not list does not exist."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.cells import Cells
+from torchfilm.effect import BUILT_IN, STAGES, Distribution, Effect
+from torchfilm.physics.walls import Wall
+from torchfilm.state import State
+from torchfilm.tools import checks
+from torchfilm.tools.timing import Timings
+
+
+class Scene:
+    """Effects that act on a state, step by step, in the paper's order (rules, division, growth, mechanics, …) whatever
+    order they are listed in.
+
+    name: for results. dt: step that fits the scene, h. founders: cells that a colony starts from; by default one cell, 2 µm long.
+    recipe: (name, parameters) of a ready-made scene, from which `resume` builds it again.
+    """
+
+    def __init__(
+        self,
+        *effects: Effect,
+        name: str = "scene",
+        dt: float = 0.025,
+        founders: Cells | None = None,
+        recipe: tuple[str, dict[str, Any]] | None = None,
+    ):
+        for effect in effects:
+            if not isinstance(effect, Effect):
+                raise checks.refuse("Scene", effect, "made of effects such as Growth(), Division(), Mechanics()", "Did you forget the brackets?")
+        if not effects:
+            raise checks.InputError("Scene() has no effect: nothing would happen. List at least one, such as tf.Growth(rate=1.0).")
+        names = [e.title for e in effects]
+        for title in names:
+            if names.count(title) > 1 and title in ("growth", "division", "mechanics"):
+                raise checks.InputError(f"Scene lists {title} {names.count(title)} times: one is allowed. Put all of it into one.")
+        self.listed = effects
+        self.effects: tuple[Effect, ...] = tuple(sorted((p for e in effects for p in e.parts()), key=lambda p: p.stage))
+        self.name, self.recipe = name, recipe
+        self.dt = checks.number("Scene.dt", dt, above=0.0)
+        self.dim = next((e.dim for e in effects if hasattr(e, "dim")), founders.dim if founders is not None else 3)
+        self.founders = founders if founders is not None else Cells.single(self.dim)
+        if self.founders.dim != self.dim:
+            raise checks.refuse("Scene.founders", f"{self.founders.dim}-D cells", f"{self.dim}-D, as the mechanics are")
+        self._check_fields()
+
+    def _check_fields(self) -> None:
+        """Every field that is read or written exists, and is declared once or alike."""
+        declared: dict[str, str] = {}
+        for effect in self.effects:
+            for f in effect.declares(self.dim):
+                if f.name in declared:
+                    raise checks.InputError(f"field {f.name!r} is declared by {declared[f.name]} and by {effect.title}: rename one.")
+                declared[f.name] = effect.title
+        self.declared_by = declared
+        for effect in self.effects:
+            for name in effect.needs():
+                if name not in declared and name not in BUILT_IN and name not in self.founders.extra:
+                    raise checks.InputError(
+                        f"{effect.title} needs the field {name!r}, which nothing in this scene provides. It has: {', '.join(declared) or 'no field'}."
+                    )
+
+    def seed(
+        self,
+        colonies: int = 1,
+        *,
+        seed: int = 0,
+        cells: Cells | None = None,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> State:
+        """The first state: `colonies` independent colonies, each from a copy of the founders (or of `cells`, which may carry a
+        colony number for each cell instead). Checked here, before anything runs.
+        """
+        if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < 1:
+            raise checks.refuse("colonies", colonies, "a whole number from 1", "A batch has at least one colony.")
+        if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+            raise checks.refuse("seed", seed, "a whole number from 0")
+        if dtype not in (torch.float32, torch.float64):
+            raise checks.refuse("dtype", dtype, "torch.float32 or torch.float64")
+        _check_device(device)
+        start = cells if cells is not None else self.founders
+        if start.dim != self.dim:
+            raise checks.refuse("cells", f"{start.dim}-D", f"{self.dim}-D, as the scene is")
+        state = start.state(colonies, seed, torch.device(device), dtype)
+        for effect in self.effects:
+            for f in effect.declares(self.dim):
+                if f.name not in state.fields:
+                    state = state.declare(f)
+        for effect in self.effects:
+            state = effect.prepare(state)
+        self.check(state)
+        return state
+
+    def check(self, state: State) -> None:
+        """Raise InputError if this scene cannot run from this state."""
+        if state.dim != self.dim:
+            raise checks.refuse("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
+        for effect in self.effects:
+            for path, tensor in parameters(effect):
+                if tensor.dim() == 1 and tensor.numel() <= int(state.colony_id.max()):
+                    raise checks.InputError(
+                        f"{path} has {tensor.numel()} values, but the batch has a colony number {int(state.colony_id.max())}: "
+                        "give one number, or one per colony."
+                    )
+            missing = [n for n in effect.needs() if n not in state.fields and n not in BUILT_IN]
+            if missing:
+                raise checks.InputError(f"{effect.title} needs the field {missing[0]!r}, which this state lacks. Make the state with this scene's seed().")
+            effect.check(state)
+
+    def step(self, state: State, dt: float, timings: Timings | None = None) -> State:
+        """The state dt hours later: each effect in turn."""
+        state = state.replace(births=(), ended=())
+        for effect in self.effects:
+            if timings is None:
+                state = effect.step(state, dt)
+            else:
+                with timings.of(effect.title, state.device):
+                    state = effect.step(state, dt)
+        # time is counted in steps, so that it does not gather rounding
+        return state.replace(step=state.step + 1, time=state.time + dt)
+
+    def couplings(self) -> list[tuple[str, str, str]]:
+        """Who drives whom: (writer, name, reader) for every name that one effect writes and another reads."""
+        return [
+            (w.title, name, r.title)
+            for w in self.effects
+            for r in self.effects
+            if w is not r
+            for name in w.writes()
+            if name in r.reads() or name in r.needs()
+        ]
+
+    def explain(self) -> str:
+        """What this scene simulates, in the order in which it acts, and who drives whom."""
+        lines = [f"{self.name}: {self.dim}-D, step {self.dt:g} h, {self.founders.count} founder(s)"]
+        for effect in self.effects:
+            lines.append(f"  {STAGES[effect.stage] if effect.stage in STAGES else effect.stage:<10} {summary(effect)}")
+            lines.append(f"             reads  {', '.join(effect.reads()) or '-'}")
+            lines.append(f"             writes {', '.join(effect.writes()) or '-'}")
+            for f in effect.declares(self.dim):
+                lines.append(f"             field  {f.name} ({f.unit or '1'}, per {f.scope}; daughters: {f.at_division}): {f.meaning}")
+        lines.append("  who drives whom:")
+        drives: dict[tuple[str, str], list[str]] = {}
+        for writer, name, reader in self.couplings():
+            drives.setdefault((writer, reader), []).append(name)
+        lines += [f"    {w} -> {r}: {', '.join(names)}" for (w, r), names in drives.items()] or ["    nobody"]
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"Scene({', '.join(summary(e) for e in self.listed)}, name={self.name!r})"
+
+
+def summary(effect: Effect) -> str:
+    """The effect with the parameters that differ from their defaults."""
+    shown = []
+    for f in dataclasses.fields(effect):  # type: ignore[arg-type]
+        value = getattr(effect, f.name)
+        if f.repr and not _same(value, f.default):
+            shown.append(f"{f.name}={_short(value)}")
+    return f"{type(effect).__name__}({', '.join(shown)})"
+
+
+def _same(a: object, b: object) -> bool:
+    return a is b or (not isinstance(a, Tensor) and not isinstance(b, Tensor) and a == b)
+
+
+def _short(value: object) -> str:
+    if isinstance(value, Tensor):
+        return f"{float(value):g}" if value.dim() == 0 else f"<{value.numel()} values, {float(value.min()):g} to {float(value.max()):g}>"
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        inner = [f"{f.name}={_short(getattr(value, f.name))}" for f in dataclasses.fields(value) if not _same(getattr(value, f.name), f.default)]
+        return f"{type(value).__name__}({', '.join(inner)})"
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(_short(v) for v in value) + "]"
+    return getattr(value, "__name__", None) or repr(value)
+
+
+def parameters(part: object, path: str = "") -> list[tuple[str, Tensor]]:
+    """Every tensor among an effect's parameters, with its name, those of its distributions and walls included."""
+    if isinstance(part, Tensor):
+        return [(path, part)]
+    if isinstance(part, (tuple, list)):
+        return [found for k, item in enumerate(part) for found in parameters(item, f"{path}[{k}]")]
+    if isinstance(part, (Effect, Distribution, Wall)):
+        path = path or type(part).__name__
+        return [found for f in dataclasses.fields(part) for found in parameters(getattr(part, f.name), f"{path}.{f.name}")]  # type: ignore[arg-type]
+    return []
+
+
+def _check_device(device: str | torch.device) -> None:
+    try:
+        wanted = torch.device(device)
+    except RuntimeError as error:
+        raise checks.refuse("device", device, 'a torch device such as "cpu" or "cuda"') from error
+    if wanted.type == "cuda" and not torch.cuda.is_available():
+        raise checks.refuse("device", str(device), "a device that this machine has", 'torch sees no CUDA GPU; use device="cpu".')
+
+

@@ -1,0 +1,101 @@
+"""The loop: a step folds the state through the scene's effects, observers look on, failures are raised once."""
+
+from __future__ import annotations
+
+import math
+from contextlib import nullcontext
+from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+
+from torchfilm.physics.solve import CONVERGED, STATUS
+from torchfilm.results import Recorder
+from torchfilm.scene import Scene
+from torchfilm.state import State
+from torchfilm.tools import checks
+from torchfilm.tools.checks import SimulationError
+from torchfilm.tools.timing import Timings
+
+Observer = Callable[[State], None]
+
+
+def simulate(
+    scene: Scene,
+    state: State,
+    *,
+    until: float | None = None,
+    cells: int | None = None,
+    dt: float | None = None,
+    record: str | Path | Recorder | None = None,
+    observers: Sequence[Observer] = (),
+    on_failure: str = "raise",
+    timings: Timings | None = None,
+) -> Iterator[State]:
+    """Run the scene from `state`, yielding the state after each step.
+
+    until: time to stop at, h. cells: stop once every colony has this many cells. At least one of the two; the first reached ends the run.
+    dt: step, h; by default the scene's. record: path of a new results file (every tenth step and the last), or a Recorder. observers: called with the first state and after every step.
+    on_failure: "raise" a SimulationError that names the colonies whose solve failed, or "drop" their cells, note it, and go on.
+    """
+    dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
+    if until is None and cells is None:
+        raise checks.InputError("simulate needs an end: give until=… (hours) or cells=… (per colony).")
+    checks.choice("on_failure", on_failure, ("raise", "drop"))
+    if cells is not None and (isinstance(cells, bool) or not isinstance(cells, int) or cells < 1):
+        raise checks.refuse("cells", cells, "a whole number from 1")
+    last = math.inf if until is None else _last_step(state, checks.number("until", until), dt)
+    scene.check(state)
+    recorder = Recorder(record, scene) if isinstance(record, (str, Path)) else record
+    return _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings)
+
+
+def _last_step(state: State, until: float, dt: float) -> int:
+    steps = (until - state.time) / dt
+    if steps < 0:
+        raise checks.refuse("until", until, f"at least the state's own time, {state.time:g} h")
+    if abs(steps - round(steps)) > 1e-6 * max(1.0, steps):
+        raise checks.refuse("until", until, f"a whole number of steps of dt = {dt:g} h from {state.time:g} h")
+    return state.step + round(steps)
+
+
+def _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings):
+    try:
+        for observe in (*([recorder] if recorder else []), *observers):
+            observe(state)
+        while state.step < last and not (cells is not None and bool((state.counts >= cells).all())):
+            state = scene.step(state, dt, timings)
+            state = handle_failures(state, on_failure)
+            if recorder:
+                with timings.of("recording", state.device) if timings else nullcontext():
+                    recorder(state)
+            for observe in observers:
+                observe(state)
+            yield state
+    finally:
+        if recorder:
+            recorder.close()
+
+
+def handle_failures(state: State, on_failure: str) -> State:
+    """Raise for the colonies whose last step failed, all at once, or drop their cells."""
+    failed = torch.zeros(state.colonies, dtype=torch.bool, device=state.device)
+    reasons = []
+    for name, report in state.reports.items():
+        bad = report.status != CONVERGED
+        failed = failed | bad
+        for place in torch.nonzero(bad).squeeze(1).tolist():
+            reasons.append(
+                f"colony {int(state.colony_id[place])} ({int(state.counts[place])} cells): {name} solve {STATUS[int(report.status[place])]} after "
+                f"{int(report.iterations[place])} iterations, residual {float(report.residual[place]):.2g}"
+            )
+    if not reasons:
+        return state
+    if on_failure == "raise":
+        raise SimulationError(
+            f"step {state.step} (t = {state.time:g} h) failed in {len(reasons)} of {state.colonies} colonies:\n  "
+            + "\n  ".join(reasons[:20])
+            + '\nA smaller dt, a larger alpha or more max_iterations may help; on_failure="drop" goes on without them.',
+            state.colony_id[failed].tolist(),
+        )
+    return state.remove(failed.index_select(0, state.colony), "failed")

@@ -1,0 +1,235 @@
+"""The state: one flat batch of cells over many colonies."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.physics import capsule
+from torchfilm.tools import checks, random
+from torchfilm.tools.ragged import Groups, offsets
+
+CELL, COLONY = "cell", "colony"
+
+# How daughters get a field: as the parent had it, as the field's initial value, or by a function.
+DivisionRule = str | Callable[["State", "Tensor"], "Tensor"]
+
+
+@dataclass(frozen=True)
+class Field:
+    """A named quantity that an effect declares. What no effect declares does not exist.
+
+    scope: "cell" (one row a cell) or "colony" (one row a colony). shape: of one row. unit and meaning: for people.
+    initial: a number, or a function (state, rows) -> (M, *shape) tensor, called for new rows: at the start and,
+    where at_division = "reset", for daughters. at_division: "copy" or "reset".
+    """
+
+    name: str
+    meaning: str
+    unit: str = ""
+    scope: str = CELL
+    shape: tuple[int, ...] = ()
+    dtype: torch.dtype | None = None  # None: the state's own
+    initial: float | Callable[[State, Tensor], Tensor] = 0.0
+    at_division: str = "copy"
+
+    def __post_init__(self) -> None:
+        checks.choice(f"Field({self.name!r}).scope", self.scope, (CELL, COLONY))
+        checks.choice(f"Field({self.name!r}).at_division", self.at_division, ("copy", "reset"))
+        if not self.name.isidentifier() or self.name in RESERVED:
+            raise checks.refuse("Field.name", self.name, "an identifier that the state does not use itself")
+
+    def start(self, state: State, rows: Tensor) -> Tensor:
+        """Initial values for the given rows (M,) of the state: (M, *shape)."""
+        dtype = self.dtype or state.dtype
+        if callable(self.initial):
+            return self.initial(state, rows).to(dtype)
+        return torch.full((rows.numel(), *self.shape), self.initial, dtype=dtype, device=state.device)
+
+
+@dataclass(frozen=True)
+class Births:
+    """Divisions of one step: rows (M,) of both daughters in the state right after, their uids (2M,), first daughters first, and the
+    parents, M cells, as they were."""
+
+    first: Tensor
+    second: Tensor
+    uid: Tensor
+    parents: State
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Cells that left in one step: colony ids and uids (M,) int64, and why ("divided", "removed", "left", "failed")."""
+
+    colony_id: Tensor
+    uid: Tensor
+    fate: str
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Cells of B colonies, N in all, those of one colony side by side. Frozen: a step returns a new one.
+
+    colony (N,) int64, place of its colony in this batch · uid, parent (N,) int64, unique within a colony, founders have
+    parent −1 · position (N, d) µm, always float64, so that a colony far from the origin keeps its resolution · axis (N, d)
+    unit · length (N,) µm, of the centreline · radius (N,) µm · fields, by name.
+    colony_id (B,): which colony of the scene each is; parameters per colony and random numbers go by it. next_uid (B,).
+    A field is also an attribute: `state.growth_rate`.
+    """
+
+    colony: Tensor
+    uid: Tensor
+    parent: Tensor
+    position: Tensor
+    axis: Tensor
+    length: Tensor
+    radius: Tensor
+    colony_id: Tensor
+    next_uid: Tensor
+    seed: int
+    step: int = 0
+    time: float = 0.0
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
+    declared: Mapping[str, Field] = field(default_factory=dict)
+    births: tuple[Births, ...] = ()
+    ended: tuple[Ended, ...] = ()
+    reports: Mapping[str, Any] = field(default_factory=dict)
+
+    def __getattr__(self, name: str) -> Tensor:
+        fields = self.__dict__.get("fields", {})
+        if name in fields:
+            return fields[name]
+        raise AttributeError(f"the state has no {name!r}; its fields are {', '.join(fields) or 'none'}")
+
+    @property
+    def cells(self) -> int:
+        """Number of cells in all colonies."""
+        return self.colony.numel()
+
+    @property
+    def colonies(self) -> int:
+        return self.colony_id.numel()
+
+    @property
+    def dim(self) -> int:
+        return self.position.shape[1]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.length.dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self.length.device
+
+    @cached_property
+    def groups(self) -> Groups:
+        """The cells of each colony, for sums and maxima over colonies."""
+        return Groups(self.colony, self.colonies, is_sorted=True)
+
+    @cached_property
+    def counts(self) -> Tensor:
+        """Cells in each colony, (B,) int64."""
+        return self.groups.counts
+
+    @property
+    def volume(self) -> Tensor:
+        """(N,) µm³."""
+        return capsule.volume(self.length, self.radius)
+
+    @property
+    def area(self) -> Tensor:
+        """(N,) µm²."""
+        return capsule.area(self.length, self.radius)
+
+    @property
+    def own_colony_id(self) -> Tensor:
+        """The id of each cell's colony, (N,)."""
+        return self.colony_id.index_select(0, self.colony)
+
+    def replace(self, **changes: Any) -> State:
+        """A state with some of its parts replaced."""
+        return dataclasses.replace(self, **changes)
+
+    def with_fields(self, **values: Tensor) -> State:
+        """A state with some of its fields replaced; each must have been declared."""
+        unknown = set(values) - set(self.declared)
+        if unknown:
+            raise checks.refuse("field", sorted(unknown), f"declared; known are {', '.join(self.declared) or 'none'}")
+        return self.replace(fields={**self.fields, **values})
+
+    def declare(self, field: Field) -> State:
+        """A state that has one more field, at its initial value."""
+        declared = self.replace(declared={**self.declared, field.name: field})
+        rows = self.cells if field.scope == CELL else self.colonies
+        start = field.start(declared, torch.arange(rows, device=self.device))
+        if start.shape[0] != rows:
+            raise checks.refuse(f"initial value of {field.name}", tuple(start.shape), f"of {rows} rows")
+        return declared.with_fields(**{field.name: start})
+
+    def take(self, index: Tensor) -> State:
+        """The cells at `index` (M,), which keeps colonies side by side; colonies stay, if need be empty."""
+        fields = {
+            name: value.index_select(0, index) if self.declared[name].scope == CELL else value for name, value in self.fields.items()
+        }
+        part = {name: getattr(self, name).index_select(0, index) for name in PER_CELL}
+        return self.replace(**part, fields=fields)
+
+    def remove(self, gone: Tensor, fate: str) -> State:
+        """The state without the cells where `gone` (N,) is true, whose end is noted."""
+        if not bool(gone.any()):
+            return self
+        lost, kept = torch.nonzero(gone).squeeze(1), torch.nonzero(~gone).squeeze(1)
+        note = Ended(self.own_colony_id.index_select(0, lost), self.uid.index_select(0, lost), fate)
+        return self.take(kept).replace(ended=(*self.ended, note))
+
+    def select(self, colonies: Tensor | list[int]) -> State:
+        """Some colonies of the batch, by their places, in the order given. Each goes on as it would have in the whole."""
+        places = torch.as_tensor(colonies, dtype=torch.int64, device=self.device).reshape(-1)
+        if places.numel() == 0 or bool((places < 0).any()) or bool((places >= self.colonies).any()):
+            raise checks.refuse("colonies", places.tolist(), f"places from 0 to {self.colonies - 1}, at least one")
+        if torch.unique(places).numel() != places.numel():
+            raise checks.refuse("colonies", places.tolist(), "different places")
+        start = offsets(self.counts)
+        counts = self.counts.index_select(0, places)
+        owner = torch.repeat_interleave(torch.arange(places.numel(), device=self.device), counts)
+        within = torch.arange(owner.numel(), device=self.device) - offsets(counts)[:-1].index_select(0, owner)
+        taken = self.take(start.index_select(0, places).index_select(0, owner) + within)
+        fields = {n: v if self.declared[n].scope == CELL else v.index_select(0, places) for n, v in taken.fields.items()}
+        return taken.replace(
+            colony=owner, fields=fields, births=(), ended=(), reports={},
+            colony_id=self.colony_id.index_select(0, places), next_uid=self.next_uid.index_select(0, places),
+        )  # fmt: skip
+
+    def to(self, device: str | torch.device) -> State:
+        """The same state on another device."""
+        move = {name: getattr(self, name).to(device) for name in (*PER_CELL, "colony_id", "next_uid")}
+        return self.replace(**move, fields={n: v.to(device) for n, v in self.fields.items()}, births=(), ended=(), reports={})
+
+    def uniform(self, rows: Tensor, purpose: str) -> Tensor:
+        """A draw from (0, 1) for each of the given cells (M,), the same whatever the batch: keyed by seed, colony, uid, step, purpose."""
+        return random.uniform(self.seed, self._ids(rows), self.uid.index_select(0, rows), self.step, purpose, self.dtype)
+
+    def normal(self, rows: Tensor, purpose: str) -> Tensor:
+        """Four standard normal draws for each of the given cells, (M, 4), keyed as `uniform`."""
+        return random.normal(self.seed, self._ids(rows), self.uid.index_select(0, rows), self.step, purpose, self.dtype)
+
+    def _ids(self, rows: Tensor) -> Tensor:
+        return self.own_colony_id.index_select(0, rows)
+
+    def __repr__(self) -> str:
+        return (
+            f"State({self.colonies} colonies, {self.cells} cells, {self.dim}-D, t = {self.time:g} h, step {self.step}, "
+            f"{str(self.dtype)[6:]} on {self.device}, fields: {', '.join(self.fields) or 'none'})"
+        )
+
+
+PER_CELL = ("colony", "uid", "parent", "position", "axis", "length", "radius")
+RESERVED = frozenset(f.name for f in dataclasses.fields(State)) | {n for n in vars(State) if not n.startswith("__")}

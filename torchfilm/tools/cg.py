@@ -1,0 +1,74 @@
+"""Preconditioned conjugate gradients for many independent systems at once, each converged by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.tools.ragged import Groups
+
+# How often the host asks whether every system is done. Asking stalls a GPU's queue; the answer never changes a
+# result, because a finished system no longer moves.
+CHECK_EVERY = {"cpu": 1, "cuda": 8}
+
+
+@dataclass(frozen=True)
+class CGResult:
+    """x (N, D); iterations (B,) int64 spent on each system; worst (B,) greatest preconditioned residual left, as recurred."""
+
+    x: Tensor
+    iterations: Tensor
+    worst: Tensor
+
+
+def worst_of(value: Tensor, groups: Groups) -> Tensor:
+    """Greatest |entry| of (N, D) in each group, (B,); a NaN counts as infinite."""
+    size = torch.nan_to_num(value.abs().amax(1), nan=torch.inf, posinf=torch.inf)
+    return groups.max(size)
+
+
+@torch.no_grad()
+def conjugate_gradients(
+    apply: Callable[[Tensor], Tensor],
+    b: Tensor,
+    precondition: Callable[[Tensor], Tensor],
+    groups: Groups,
+    target: Tensor,
+    max_iterations: int,
+) -> CGResult:
+    """Solve A x = b from x = 0 for symmetric positive definite A, rows of each group in `groups` a system of its own.
+
+    b: (N, D). `apply` and `precondition` map (N, D) to (N, D) and keep groups apart. A system stops when its greatest
+    preconditioned residual is at most target (B,), or is not finite, or after `max_iterations`; the others go on.
+    """
+    owner = groups.owner
+    x = torch.zeros_like(b)
+    r = b.clone()
+    z = precondition(r)
+    p = z.clone()
+    rz = groups.sum((r * z).sum(1, keepdim=True))
+    worst = worst_of(z, groups)
+    going = (worst > target) & torch.isfinite(worst)
+    iterations = torch.zeros(groups.size, dtype=torch.int64, device=b.device)
+    every = CHECK_EVERY.get(b.device.type, 8)
+    for k in range(max_iterations):
+        if k % every == 0 and not bool(going.any()):
+            break
+        q = apply(p)
+        curvature = groups.sum((p * q).sum(1, keepdim=True))
+        moves = going.unsqueeze(1) & (curvature > 0)
+        step = torch.where(moves, rz / torch.where(moves, curvature, 1.0), 0.0).index_select(0, owner)
+        x.addcmul_(step, p)
+        r.addcmul_(step, q, value=-1)
+        z = precondition(r)
+        new = groups.sum((r * z).sum(1, keepdim=True))
+        iterations += going
+        worst = torch.where(going, worst_of(z, groups), worst)
+        ratio = torch.where(moves, new / torch.where(rz == 0, 1.0, rz), 0.0).index_select(0, owner)
+        p = torch.addcmul(z, ratio, p)
+        rz = new
+        going = going & (worst > target) & torch.isfinite(worst) & moves.squeeze(1)
+    return CGResult(x, iterations, worst)

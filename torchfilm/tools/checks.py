@@ -1,0 +1,96 @@
+"""Checks of input, all in one voice: which name, which value, what is allowed, what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+Number = float | int
+Value = float | Tensor | Sequence[float]
+
+
+class InputError(ValueError):
+    """Something given to torchfilm is not allowed; raised before anything runs."""
+
+
+class SimulationError(RuntimeError):
+    """A run cannot go on. `colonies` holds the ids of the colonies that failed."""
+
+    def __init__(self, message: str, colonies: Sequence[int] = ()):
+        super().__init__(message)
+        self.colonies = tuple(colonies)
+
+
+def refuse(name: str, value: object, allowed: str, mend: str = "") -> InputError:
+    """The error for a value that is not allowed; raise what this returns."""
+    shown = repr(value) if len(repr(value)) < 120 else repr(value)[:117] + "..."
+    return InputError(f"{name} = {shown} is not allowed: it must be {allowed}." + (f" {mend}" if mend else ""))
+
+
+def number(name: str, value: object, *, above: float = -math.inf, least: float = -math.inf, most: float = math.inf, mend: str = "") -> float:
+    """One finite number within bounds."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise refuse(name, value, "a number", mend)
+    rule = _rule(above, least, most)
+    if not (math.isfinite(value) and value > above and least <= value <= most):
+        raise refuse(name, value, rule, mend)
+    return float(value)
+
+
+def value(name: str, given: object, *, above: float = -math.inf, least: float = -math.inf, most: float = math.inf) -> float | Tensor:
+    """One number, or one per colony: a float or a 1-D tensor of floats, each within bounds. A tensor keeps its gradient."""
+    if isinstance(given, (list, tuple)):
+        try:
+            given = torch.tensor(given, dtype=torch.float64)
+        except (TypeError, ValueError) as error:
+            raise refuse(name, given, "a number or one number per colony") from error
+    if hasattr(given, "__array__") and not isinstance(given, Tensor):
+        given = torch.as_tensor(given)
+    if not isinstance(given, Tensor):
+        return number(name, given, above=above, least=least, most=most, mend="Give one number, or one per colony.")
+    if given.dim() > 1 or not (given.is_floating_point() or given.dtype in (torch.int32, torch.int64)):
+        raise refuse(name, tuple(given.shape), "one number, or a 1-D tensor with one number per colony")
+    if not given.is_floating_point():
+        given = given.double()
+    seen = given.detach()
+    good = torch.isfinite(seen) & (seen > above) & (seen >= least) & (seen <= most)
+    if not bool(good.all()):
+        where = torch.nonzero(~good.reshape(-1)).reshape(-1)
+        at = int(where[0])
+        raise InputError(
+            f"{name}[{at}] = {float(seen.reshape(-1)[at])} is not allowed ({len(where)} of {seen.numel()} values): "
+            f"each must be {_rule(above, least, most)}."
+        )
+    return given
+
+
+def _rule(above: float, least: float, most: float) -> str:
+    parts = ["finite"]
+    if above > -math.inf:
+        parts.append(f"above {above:g}")
+    if least > -math.inf:
+        parts.append(f"at least {least:g}")
+    if most < math.inf:
+        parts.append(f"at most {most:g}")
+    return " and ".join(parts)
+
+
+def choice(name: str, given: object, allowed: Sequence[object]) -> None:
+    if given not in allowed:
+        raise refuse(name, given, "one of " + ", ".join(repr(a) for a in allowed))
+
+
+def vector(name: str, given: object, size: int | None = None) -> tuple[float, ...]:
+    """A short tuple of finite numbers."""
+    try:
+        out = tuple(float(x) for x in given)  # type: ignore[attr-defined]
+    except (TypeError, ValueError) as error:
+        raise refuse(name, given, "a sequence of numbers") from error
+    if size is not None and len(out) != size:
+        raise refuse(name, given, f"a sequence of {size} numbers")
+    if not all(map(math.isfinite, out)):
+        raise refuse(name, given, "finite")
+    return out

@@ -1,0 +1,58 @@
+"""Random numbers that belong to a cell, not to a moment of the program: Philox4x32-10 (Salmon et al. 2011), counter based.
+
+A draw is a pure function of (seed, colony, cell uid, step, purpose), so it is the same whatever the batch, the
+order of colonies or a restart in between. 32-bit arithmetic is carried out in int64, where products wrap harmlessly.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+
+import torch
+from torch import Tensor
+
+MASK = 0xFFFFFFFF
+MULTIPLIER = (0xD2511F53, 0xCD9E8D57)
+WEYL = (0x9E3779B9, 0xBB67AE85)
+
+
+def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor | int, Tensor | int]) -> tuple[Tensor, ...]:
+    """Ten rounds of Philox4x32: four words in [0, 2³²) as int64 in, four out, elementwise."""
+    c0, c1, c2, c3 = counter
+    k0, k1 = key
+    for _ in range(10):
+        p0, p1 = c0 * MULTIPLIER[0], c2 * MULTIPLIER[1]
+        c0, c1, c2, c3 = ((p1 >> 32) & MASK) ^ c1 ^ k0, p1 & MASK, ((p0 >> 32) & MASK) ^ c3 ^ k1, p0 & MASK
+        k0, k1 = (k0 + WEYL[0]) & MASK, (k1 + WEYL[1]) & MASK
+    return c0, c1, c2, c3
+
+
+def purpose_code(purpose: str) -> int:
+    """A stable 32-bit code of a purpose's name."""
+    return zlib.crc32(purpose.encode())
+
+
+def words(seed: int, colony: Tensor, uid: Tensor, step: int, purpose: str) -> tuple[Tensor, ...]:
+    """Four independent 32-bit words for each cell: colony, uid (M,) int64 -> four (M,) int64."""
+    fill = torch.zeros_like(uid)
+    counter = (uid & MASK, (uid >> 32) & MASK, colony & MASK, fill + (step & MASK))
+    mixed = (seed ^ (purpose_code(purpose) << 32)) & (2**64 - 1)
+    return philox(counter, (mixed & MASK, (mixed >> 32) & MASK))
+
+
+def uniform(seed: int, colony: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:
+    """One draw per cell from the open interval (0, 1)."""
+    w = words(seed, colony, uid, step, purpose)
+    # 24 bits fill a float32; half a unit keeps the draw off both ends
+    return ((w[0] >> 8).to(torch.float64) + 0.5).mul(2.0**-24).to(dtype)
+
+
+def normal(seed: int, colony: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:
+    """Four standard normal draws per cell, (M, 4), by Box and Muller from four words."""
+    w = [(x.to(torch.float64) + 0.5) * 2.0**-32 for x in words(seed, colony, uid, step, purpose)]
+    out = []
+    for u, v in ((w[0], w[1]), (w[2], w[3])):
+        size = torch.sqrt(-2.0 * torch.log(u))
+        out += [size * torch.cos(2 * math.pi * v), size * torch.sin(2 * math.pi * v)]
+    return torch.stack(out, 1).to(dtype)

@@ -1,0 +1,47 @@
+"""Small vector algebra, components first: an array of K vectors in d dimensions is (d, K).
+
+Components first keeps every operation a plain pass over contiguous memory, and fixes the order of the two or three
+additions of a dot product, so that results do not depend on how many vectors stand side by side.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def dot(u: Tensor, v: Tensor) -> Tensor:
+    """u · v for (d, K), (d, K) -> (K,)."""
+    out = u[0] * v[0]
+    for k in range(1, u.shape[0]):
+        out = out + u[k] * v[k]
+    return out
+
+
+def cross(u: Tensor, v: Tensor) -> Tensor:
+    """u × v: (3, K) in 3-D; in 2-D its one component out of the plane, as (1, K)."""
+    if u.shape[0] == 2:
+        return (u[0] * v[1] - u[1] * v[0]).unsqueeze(0)
+    return torch.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+
+
+def perpendicular(u: Tensor) -> Tensor:
+    """A unit vector perpendicular to unit u, (d, K): the left-hand normal in 2-D; in 3-D built on the axis that u is least along."""
+    if u.shape[0] == 2:
+        return torch.stack([-u[1], u[0]])
+    x, y, z = u.unbind(0)
+    least = torch.argmin(torch.stack([x.abs(), y.abs(), z.abs()]), dim=0)
+    e = torch.stack([(least == k).to(u.dtype) for k in range(3)])
+    w = cross(u, e)
+    return w / safe_norm(w)
+
+
+def safe_norm(u: Tensor, eps: float = 1e-30) -> Tensor:
+    """|u| for (d, K) -> (K,), with a zero gradient instead of a NaN where u = 0."""
+    return safe_sqrt(dot(u, u), eps)
+
+
+def safe_sqrt(x: Tensor, eps: float = 1e-30) -> Tensor:
+    """√x, and 0 with zero gradient where x ≤ eps."""
+    positive = x > eps
+    return torch.where(positive, torch.where(positive, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x))
