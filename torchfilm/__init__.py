@@ -1,20 +1,25 @@
 """torchfilm: synthetic microbial biofilms, many colonies at once, in PyTorch."""
 
+from torchfilm import measure, scenes
 from torchfilm.cells import Cells
 from torchfilm.effect import Effect, LogNormal, Normal, Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.removal import Removal
+from torchfilm.effects.rules import Rules
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
+from torchfilm.pictures import show
+from torchfilm.results import Recorder, Results
 from torchfilm.scene import Scene
 from torchfilm.simulate import simulate
 from torchfilm.state import Field, State
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.timing import Timings
+from torchfilm.version import __version__
 
-__version__ = "0.1.0"
 __all__ = [
-    "Box", "Cells", "Channel", "Division", "Effect", "Field", "Growth", "InputError", "LogNormal", "Mechanics", "Normal",
-    "Plane", "Removal", "Scene", "SimulationError", "Sphere", "State", "Timings", "Uniform", "simulate",
+    "Box", "Cells", "Channel", "Division", "Effect", "Field", "Growth", "InputError", "LogNormal", "Mechanics", "Normal", "Plane",
+    "Recorder", "Removal", "Results", "Rules", "Scene", "SimulationError", "Sphere", "State", "Timings", "Uniform",
+    "__version__", "measure", "scenes", "show", "simulate",
 ]  # fmt: skip

@@ -29,11 +29,11 @@ from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError, SimulationError
+from torchfilm.version import __version__
 
 FORMAT, VERSION = "torchfilm results", 1
 FATES = ("divided", "removed", "left", "failed")
 CHUNK_ROWS = 8192
-CODE_VERSION = "0.1.0"
 LINEAGE = {"births": ("colony_id", "uid", "parent", "step"), "ends": ("colony_id", "uid", "step", "fate")}
 # step last: it commits the frame
 FRAME_COLUMNS = ("first_row", "counts", "next_uid", "births", "ends", "time", "step")
@@ -106,7 +106,7 @@ class Recorder:
         attributes = {
             "format": FORMAT, "version": VERSION, "seed": state.seed, "dim": state.dim, "dtype": str(state.dtype)[6:],
             "device": str(state.device), "dt": scene.dt, "every": self.every,
-            "scene": scene.explain(), "recipe": json.dumps(scene.recipe), "torchfilm": CODE_VERSION, "torch": str(torch.__version__),
+            "scene": scene.explain(), "recipe": json.dumps(scene.recipe), "torchfilm": __version__, "torch": str(torch.__version__),
             "declared": json.dumps({f.name: [f.meaning, f.unit, f.scope, list(f.shape), f.at_division] for f in state.declared.values()}),
         }  # fmt: skip
         for name, value in attributes.items():

@@ -1,0 +1,284 @@
+"""The command line: `torchfilm run SCENE`, `resume FILE`, `show FILE`, `info SCENE-or-FILE`."""
+
+from __future__ import annotations
+
+import ast
+import os
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+# Threads that spin while they wait double the time of a step as soon as anything else runs on the machine. torch reads
+# this when it is first imported, so it stands before.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import torch
+
+from torchfilm import measure, pictures, scenes
+from torchfilm.effects.mechanics import Mechanics
+from torchfilm.effects.rules import Rules
+from torchfilm.results import Recorder, Results
+from torchfilm.scene import Scene
+from torchfilm.simulate import simulate
+from torchfilm.state import State
+from torchfilm.tools import checks
+from torchfilm.tools.checks import InputError, SimulationError
+from torchfilm.tools.timing import Timings
+
+try:
+    import tyro
+    from tqdm import tqdm
+except ImportError as missing:  # pragma: no cover - depends on what is installed
+    raise SystemExit(f'The command line needs {missing.name}: pip install "torchfilm[app]".') from missing
+
+
+@dataclass
+class Run:
+    """Run a scene: a ready-made one by name, or your own Python file that defines `scene` (a Scene, or a function that returns one)."""
+
+    scene: Annotated[str, tyro.conf.Positional]
+    """microcolony, programmed_growth, channel, …, or the path of a Python file."""
+    set: list[str] = field(default_factory=list)
+    """Parameters of the scene, as NAME=VALUE, such as --set dim=3 rate=0.8."""
+    colonies: int = 1
+    """Independent colonies in the batch."""
+    cells: int | None = None
+    """Stop once every colony has this many cells (500 if no end is given)."""
+    until: float | None = None
+    """Stop at this time, h."""
+    dt: float | None = None
+    """Step, h; by default the scene's."""
+    seed: int = 0
+    """Seed of all random numbers."""
+    start: Path | None = None
+    """CSV or HDF5 file of cells to start from."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    double: bool = False
+    """Compute in float64."""
+    out: Path | None = None
+    """Results file; by default SCENE.h5 here."""
+    every: int = 10
+    """Steps from one recorded frame to the next."""
+    overwrite: bool = False
+    """Replace the results file if it exists."""
+    watch: bool = False
+    """Take up edits of the rules file (Rules("file.py")) while running."""
+    picture: bool = True
+    """Draw the last frame beside the results."""
+
+    def __call__(self) -> None:
+        scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
+        cells = self.cells if self.cells is not None or self.until is not None else 500
+        start = None if self.start is None else read_cells(self.start)
+        state = scene.seed(self.colonies, seed=self.seed, cells=start, device=self.device, dtype=torch.float64 if self.double else torch.float32)
+        if start is not None:
+            report_overlaps(start)
+        out = self.out if self.out is not None else Path(f"{scene.name}.h5")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        recorder = Recorder(out, scene, every=self.every, overwrite=self.overwrite)
+        go(scene, state, recorder, cells=cells, until=self.until, dt=self.dt, watch=self.watch, picture=self.picture)
+
+
+@dataclass
+class Resume:
+    """Go on with a run from the last frame of its results file, bit for bit."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """Results file."""
+    scene: Path | None = None
+    """The Python file of the scene, unless it was a ready-made one (a results file holds data only, so it cannot bring its own)."""
+    cells: int | None = None
+    """Stop once every colony has this many cells."""
+    until: float | None = None
+    """Stop at this time, h."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    watch: bool = False
+    """Take up edits of the rules file while running."""
+    picture: bool = True
+    """Draw the last frame beside the results."""
+
+    def __call__(self) -> None:
+        if self.cells is None and self.until is None:
+            raise InputError("resume needs an end: --cells or --until.")
+        with Results(self.file) as results:
+            if self.scene is not None:
+                scene = load_scene(str(self.scene), {})
+            elif results.recipe is not None:
+                scene = scenes.build(*results.recipe)
+            else:
+                raise InputError(f"{self.file} was made by a scene of your own: give its file with --scene.")
+            state = results.state(scene, device=self.device)
+            dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
+        recorder = Recorder(self.file, scene, every=every, append=True)
+        go(scene, state, recorder, cells=self.cells, until=self.until, dt=dt, watch=self.watch, picture=self.picture)
+
+
+@dataclass
+class Show:
+    """Draw a frame of a results file."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """Results file; it may still be growing."""
+    frame: int = -1
+    """Which frame; -1 is the last."""
+    colour: str = "angle"
+    """What colours the cells: angle, growth_rate, cell_type, length, or any other quantity per cell."""
+    view: str = "xy"
+    """xy, xz or yz."""
+    out: Path | None = None
+    """The picture; by default the results file's name with .png."""
+
+    def __call__(self) -> None:
+        print(pictures.show(self.file, frame=self.frame, colour=self.colour, view=self.view, out=self.out))
+
+
+@dataclass
+class Info:
+    """Say what a scene simulates and who drives whom, or what a results file holds."""
+
+    what: Annotated[str, tyro.conf.Positional]
+    """Scene name, Python file, or results file."""
+    set: list[str] = field(default_factory=list)
+    """Parameters of the scene, as NAME=VALUE."""
+
+    def __call__(self) -> None:
+        if self.what.endswith((".h5", ".hdf5")):
+            return self._of_results()
+        scene = load_scene(self.what, dict(map(parse_setting, self.set)))
+        scene.seed(1)  # rules are tried on a first state, so that what they read and write is known
+        print(scene.explain())
+
+    def _of_results(self) -> None:
+        with Results(self.what) as results:
+            a, counts = results.attributes, results.counts
+            print(f"{self.what}: {len(results)} frames, t = {results.times[0]:g} to {results.times[-1]:g} h, {counts.shape[1]} colonies")
+            print(f"cells in the last frame: {counts[-1].sum()} ({counts[-1].min()} to {counts[-1].max()} a colony)")
+            print(f"seed {a['seed']}, {a['dtype']}, dt {a['dt']:g} h, torchfilm {a['torchfilm']}, torch {a['torch']}, {a['device']}")
+            print("quantities per cell: " + ", ".join(results.file["cells"]))
+            print(a["scene"])
+
+
+def load_scene(what: str, parameters: dict[str, Any]) -> Scene:
+    """A ready-made scene by name, or the `scene` of a Python file."""
+    if not what.endswith(".py"):
+        return scenes.build(what, parameters)
+    path = Path(what)
+    if not path.is_file():
+        raise checks.refuse("scene", what, "a Python file", "No such file.")
+    names: dict[str, Any] = {"__name__": path.stem, "__file__": str(path)}
+    sys.path.insert(0, str(path.parent.resolve()))
+    exec(compile(path.read_text(), str(path), "exec"), names)
+    if "scene" not in names:
+        raise InputError(f"{what} does not define `scene`: write `scene = torchfilm.Scene(…)`, or a function `scene(…)` that returns one.")
+    made = names["scene"]
+    if isinstance(made, Scene):
+        if parameters:
+            raise checks.refuse("--set", list(parameters), f"left out: `scene` in {what} is a Scene, not a function with parameters")
+    else:
+        made = made(**parameters)
+    if not isinstance(made, Scene):
+        raise checks.refuse(f"scene in {what}", made, "a Scene, or a function that returns one")
+    if made.name == "scene":
+        made.name = path.stem
+    return made
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """NAME=VALUE; a value that is no Python literal is taken as text."""
+    name, equals, value = text.partition("=")
+    if not equals or not name.isidentifier():
+        raise checks.refuse("--set", text, "NAME=VALUE")
+    try:
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        return name, value
+
+
+def read_cells(path: Path):
+    from torchfilm.cells import Cells
+
+    return Cells.from_csv(path) if path.suffix == ".csv" else Cells.from_hdf5(path)
+
+
+def report_overlaps(cells) -> None:
+    found = cells.overlaps(0.01)
+    if found:
+        i, j, deep = found[0]
+        print(f"note: {len(found)} pairs of the given cells overlap by over 0.01 µm, worst cells {i} and {j} by {deep:.3g} µm; the first steps part them.")
+
+
+def go(scene: Scene, state: State, recorder: Recorder, *, cells: int | None, until: float | None, dt: float | None, watch: bool, picture: bool) -> None:
+    """Run with a progress bar, then say where things are and how they went."""
+    rules = [e for e in scene.effects if isinstance(e, Rules)]
+    for rule in rules:
+        rule.source.watching = watch  # type: ignore[attr-defined]
+    timings, begun = Timings(), time.perf_counter()
+    form = "{desc} |{bar}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}"
+    with tqdm(total=_size(state, cells, until), bar_format=form, disable=None, mininterval=0.3) as bar:
+        bar.set_description(f"{scene.name}: {state.colonies} colonies")
+        bar.update(_done(state, cells, until))
+        for state in simulate(scene, state, until=until, cells=cells, dt=dt, record=recorder, timings=timings):
+            bar.update(_done(state, cells, until) - bar.n)
+            seconds = time.perf_counter() - begun
+            bar.set_postfix_str(f"{state.cells} cells, t = {state.time:.2f} h, {(state.step) / seconds:.0f} steps/s", refresh=False)
+            for rule in rules:
+                while rule.source.messages:  # type: ignore[attr-defined]
+                    bar.write(rule.source.messages.pop(0))  # type: ignore[attr-defined]
+    seconds = time.perf_counter() - begun
+    print(f"results  {recorder.path}")
+    if picture and state.cells:
+        print(f"picture  {pictures.show(recorder.path)}")
+    print(table(scene, state, timings, seconds))
+
+
+def _size(state: State, cells: int | None, until: float | None) -> float:
+    return float(torch.log2(torch.tensor(float(cells)))) if cells is not None else float(until or 0)
+
+
+def _done(state: State, cells: int | None, until: float | None) -> float:
+    """Progress: doublings of the smallest colony on the way to `cells`, or hours."""
+    if cells is not None:
+        smallest = max(1, int(state.counts.min()))
+        return min(float(torch.log2(torch.tensor(float(smallest)))), _size(state, cells, until))
+    return state.time
+
+
+def table(scene: Scene, state: State, timings: Timings, seconds: float) -> str:
+    """What the run came to: cells, size, overlaps, and where the time went."""
+    walls = next((e.walls for e in scene.effects if isinstance(e, Mechanics)), ())
+    found = measure.overlaps(state, walls)
+    pairs = found.count.sum().clamp(min=1)
+    counts, radius = state.counts, measure.colony_radius(state)
+    lines = [
+        f"{'colonies':<22}{state.colonies}",
+        f"{'cells':<22}{state.cells} ({int(counts.min())} to {int(counts.max())} a colony)",
+        f"{'time':<22}{state.time:g} h in {state.step} steps, {seconds:.1f} s",
+        f"{'colony radius':<22}{float(radius.nanmean()):.1f} µm (mean)",
+        f"{'overlap':<22}mean {float((found.mean * found.count).sum() / pairs):.4f} µm, worst {float(found.worst.max()):.3f} µm",
+    ]
+    if walls:
+        lines.append(f"{'overlap with walls':<22}worst {float(found.walls.max()):.3f} µm")
+    total = sum(timings.seconds.values()) or 1.0
+    lines += [f"{'time for ' + name:<22}{s:.2f} s ({100 * s / total:.0f} %)" for name, s in timings.seconds.items()]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Entry point of the `torchfilm` command."""
+    command = tyro.extras.subcommand_cli_from_dict(
+        {"run": Run, "resume": Resume, "show": Show, "info": Info}, prog="torchfilm", description="Synthetic microbial biofilms, many colonies at once."
+    )
+    try:
+        command()
+    except (InputError, SimulationError) as error:
+        raise SystemExit(f"torchfilm: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("stopped; what was recorded is safe, `torchfilm resume` goes on from it.") from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""What one measures on a state: overlaps, radius, depth, alignment, per colony."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.physics.contacts import Bodies, contact_gaps
+from torchfilm.physics.neighbours import find_pairs
+from torchfilm.physics.walls import Wall
+from torchfilm.state import State
+from torchfilm.tools.ragged import Groups
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """For each colony, (B,): `mean` and `worst` overlap of the pairs that overlap, µm (0 where none does), `count` of such pairs, and `walls`, the worst
+    overlap with a wall."""
+
+    mean: Tensor
+    worst: Tensor
+    count: Tensor
+    walls: Tensor
+
+
+@torch.no_grad()
+def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
+    """Overlaps between cells, and with the given walls, in float64."""
+    axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
+    i, j = find_pairs(state.position, axis, length, radius, state.colony, state.colonies, 0.0)
+    depth = -contact_gaps(Bodies(state.position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius), i, j)
+    deep = depth > 0
+    pairs = Groups(state.colony.index_select(0, i[deep]), state.colonies)
+    count = pairs.counts
+    mean = pairs.sum(depth[deep].unsqueeze(1)).squeeze(1) / count.clamp(min=1)
+    at_walls = torch.zeros_like(length)
+    for surface in (s for wall in walls for s in wall.surfaces(state.dim)):
+        for sign in (0.5, -0.5):
+            distance, _ = surface.gap_of_points(state.position + sign * length.unsqueeze(1) * axis, state.own_colony_id)
+            at_walls = torch.maximum(at_walls, radius - distance)
+    return Overlap(mean, pairs.max(depth[deep]), count, state.groups.max(at_walls))
+
+
+@torch.no_grad()
+def colony_centre(state: State) -> Tensor:
+    """Centre of volume of each colony, (B, d) µm; NaN where it has no cell."""
+    volume = state.volume.double().unsqueeze(1)
+    return state.groups.sum(state.position * volume) / state.groups.sum(volume)
+
+
+@torch.no_grad()
+def colony_radius(state: State) -> Tensor:
+    """Radius of the disc (2-D, or seen from above) with the same second moment as the cells, (B,) µm: √2 · RMS distance from the centre."""
+    from_centre = (state.position - colony_centre(state).index_select(0, state.colony))[:, :2]
+    square = (from_centre * from_centre).sum(1, keepdim=True)
+    return (2.0 * state.groups.sum(square).squeeze(1) / state.counts).sqrt()
+
+
+@torch.no_grad()
+def depth(state: State) -> Tensor:
+    """Extent of each colony along z, caps included, (B,) µm; one cell diameter in 2-D."""
+    if state.dim == 2:
+        return 2.0 * state.groups.max(state.radius)
+    half = 0.5 * state.length * state.axis[:, 2].abs() + state.radius
+    z = state.position[:, 2]
+    return state.groups.max(z + half) + state.groups.max(half - z)
+
+
+@torch.no_grad()
+def nematic_order(state: State) -> Tensor:
+    """How well the axes of each colony agree in the plane, (B,): 0 at random, 1 all parallel."""
+    x, y = state.axis[:, 0].double(), state.axis[:, 1].double()
+    q = torch.stack([x * x - y * y, 2 * x * y, x * x + y * y], 1)
+    total = state.groups.sum(q)
+    return (total[:, 0] ** 2 + total[:, 1] ** 2).sqrt() / total[:, 2]
+
+
+@torch.no_grad()
+def tilt(state: State) -> Tensor:
+    """Angle of each cell's axis out of the plane, (N,) rad, 0 … π/2."""
+    if state.dim == 2:
+        return torch.zeros_like(state.length)
+    return torch.asin(state.axis[:, 2].abs().clamp(max=1))

@@ -1,0 +1,47 @@
+"""Ready-made scenes: each a function from parameters to a Scene. `torchfilm info NAME` prints what one simulates."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from torch import Tensor
+
+from torchfilm.scene import Scene
+from torchfilm.scenes import channels, colonies
+from torchfilm.tools import checks
+
+
+def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
+    """Note the name and the parameters in the scene, so that a results file can say how to build it again."""
+
+    @functools.wraps(make)
+    def build(*args: Any, **parameters: Any) -> Scene:
+        bound = inspect.signature(make).bind(*args, **parameters)
+        bound.apply_defaults()
+        scene = make(*args, **parameters)
+        plain = {n: v.tolist() if isinstance(v, Tensor) else v for n, v in bound.arguments.items()}
+        scene.name, scene.recipe = make.__name__, (make.__name__, plain)
+        return scene
+
+    return build
+
+
+microcolony = _ready(colonies.microcolony)
+programmed_growth = _ready(colonies.programmed_growth)
+channel = _ready(channels.channel)
+
+READY: dict[str, Callable[..., Scene]] = {f.__name__: f for f in (microcolony, programmed_growth, channel)}
+
+
+def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
+    """The ready-made scene of that name."""
+    if name not in READY:
+        raise checks.refuse("scene", name, "one of " + ", ".join(READY) + ", or the path of a Python file that defines `scene`")
+    allowed = inspect.signature(READY[name]).parameters
+    for given in parameters or {}:
+        if given not in allowed:
+            raise checks.refuse(f"parameter of {name}", given, "one of " + ", ".join(allowed))
+    return READY[name](**(parameters or {}))
