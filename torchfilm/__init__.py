@@ -1,6 +1,6 @@
 """torchfilm: synthetic microbial biofilms, many colonies at once, in PyTorch."""
 
-from torchfilm import measure, scenes
+from torchfilm import effect, measure, pictures, scenes
 from torchfilm.cells import Cells
 from torchfilm.effect import Effect, LogNormal, Normal, Uniform
 from torchfilm.effects.division import Division
@@ -21,5 +21,5 @@ from torchfilm.version import __version__
 __all__ = [
     "Box", "Cells", "Channel", "Division", "Effect", "Field", "Growth", "InputError", "LogNormal", "Mechanics", "Normal", "Plane",
     "Recorder", "Removal", "Results", "Rules", "Scene", "SimulationError", "Sphere", "State", "Timings", "Uniform",
-    "__version__", "measure", "scenes", "show", "simulate",
+    "__version__", "effect", "measure", "pictures", "scenes", "show", "simulate",
 ]  # fmt: skip

@@ -56,7 +56,7 @@ class Effect:
         return state
 
     def check(self, state: State) -> None:
-        """Raise InputError if this effect cannot run from this state; called once, before the first step."""
+        """Raise InputError if this effect cannot start from this seeded state; a state in mid-run is not asked again."""
 
     def step(self, state: State, dt: float) -> State:
         """The state after this effect has acted for dt hours."""

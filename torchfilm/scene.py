@@ -98,10 +98,12 @@ class Scene:
         for effect in self.effects:
             state = effect.prepare(state)
         self.check(state)
+        for effect in self.effects:
+            effect.check(state)
         return state
 
     def check(self, state: State) -> None:
-        """Raise InputError if this scene cannot run from this state."""
+        """Raise InputError if this is not a state of this scene."""
         if state.dim != self.dim:
             raise checks.refuse("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
         for effect in self.effects:
@@ -114,7 +116,6 @@ class Scene:
             missing = [n for n in effect.needs() if n not in state.fields and n not in BUILT_IN]
             if missing:
                 raise checks.InputError(f"{effect.title} needs the field {missing[0]!r}, which this state lacks. Make the state with this scene's seed().")
-            effect.check(state)
 
     def step(self, state: State, dt: float, timings: Timings | None = None) -> State:
         """The state dt hours later: each effect in turn."""

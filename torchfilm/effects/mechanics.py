@@ -22,6 +22,7 @@ from torchfilm.tools.ragged import offsets
 # No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing. The whole colony's
 # move is shortened, so that forces still balance, and the colony is passed again.
 MAX_TURN = 0.5
+MOST_SUBSTEPS = 1000
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,11 @@ class Mechanics(Effect):
     alpha: how far contacts give way to drag, the penalty's accuracy knob: α → 0 is the hard limit. Default 0.1/γ, the knee between
     overlap and cost; 1/γ is the paper's. Or stiffness: μ·µm/h, physical softness of cells: α = 1/(stiffness·Δt), so that a smaller Δt
     converges to the motion of soft cells, where with α fixed it stiffens the contact. Each may be one number or one per colony.
-    unilateral: contacts only push. False (default, the paper's least squares) also holds an overlapping pair that wants to part until the
-    next step: measured, the overlap is the same or less, at a third to a tenth of the CG iterations.
-    passes: at most this many times a step contacts are found and solved again: in colonies where the move made new contacts, or left an
-    overlap deeper than `overlap` (µm).
+    unilateral: contacts only push. False (default, the paper's least squares) also holds an overlapping pair that wants to part, until
+    the next pass: measured, the overlap is the same or less, at half the CG iterations or fewer.
+    passes: at most this many times a step contacts are found and solved: again in colonies where the move made new contacts, or left an
+    overlap deeper than `overlap` (µm). Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other.
     tolerance: of the solve, worst residual relative to the worst at rest. max_iterations: CG iterations a solve.
-    margin: µm; contacts this far from touching take part in a unilateral solve, so that it sees what a move would run into.
     max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
     """
 
@@ -62,11 +62,10 @@ class Mechanics(Effect):
     alpha: float | Tensor | None = None
     stiffness: float | Tensor | None = None
     unilateral: bool = False
-    passes: int = 2
+    passes: int | None = None
     overlap: float | None = None
     tolerance: float = 0.05
     max_iterations: int = 2000
-    margin: float = 0.1
     max_elongation: float = 0.25
 
     stage = MECHANICS
@@ -84,12 +83,13 @@ class Mechanics(Effect):
         for wall in self.walls:
             if not isinstance(wall, Wall):
                 raise checks.refuse("Mechanics.walls", wall, "a list of Plane, Sphere, Box or Channel")
-        for name, least in (("passes", 1), ("max_iterations", 1)):
+        if self.passes is None:
+            object.__setattr__(self, "passes", 1 if self.dim == 2 else 2)
+        for name in ("passes", "max_iterations"):
             given = getattr(self, name)
-            if not isinstance(given, int) or given < least:
-                raise checks.refuse(f"Mechanics.{name}", given, f"a whole number from {least}")
+            if not isinstance(given, int) or given < 1:
+                raise checks.refuse(f"Mechanics.{name}", given, "a whole number from 1")
         checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
-        checks.number("Mechanics.margin", self.margin, least=0.0)
         checks.number("Mechanics.max_elongation", self.max_elongation, above=0.0)
         if self.overlap is not None:
             checks.number("Mechanics.overlap", self.overlap, above=0.0)
@@ -133,9 +133,7 @@ class Mechanics(Effect):
         if state.cells == 0:
             return state
         elongation = state.fields.get("elongation", torch.zeros_like(state.length))
-        with torch.no_grad():
-            most = state.groups.max(elongation.detach())
-            steps = torch.ceil(most / self.max_elongation * (1 - 1e-6)).nan_to_num(1.0).clamp(min=1, max=1e6).long()
+        steps = self._substeps(state, elongation)
         base = state.length - elongation
         run = _Run(self, state, dt, steps)
         for k in range(int(steps.max())):
@@ -147,6 +145,21 @@ class Mechanics(Effect):
             fields["elongation"] = run.length - (state.length - elongation)
         state = state.replace(position=run.position, axis=run.axis, length=run.length)
         return state.with_fields(**fields).replace(reports={**state.reports, "mechanics": run.report})
+
+    @torch.no_grad()
+    def _substeps(self, state: State, elongation: Tensor) -> Tensor:
+        """How many sub-steps each colony takes, (B,), so that no cell grows by more than `max_elongation` in one."""
+        most = state.groups.max(elongation)
+        steps = torch.ceil(most / self.max_elongation * (1 - 1e-6)).nan_to_num(1.0).clamp(min=1)  # a NaN is the solve's to report
+        far = torch.nonzero(steps > MOST_SUBSTEPS).squeeze(1)
+        if far.numel():
+            ids = state.colony_id.index_select(0, far).tolist()
+            raise checks.SimulationError(
+                f"colonies {ids[:10]}: a cell wants to grow by {float(most.max()):.3g} µm in one step, over {MOST_SUBSTEPS} sub-steps of "
+                f"{self.max_elongation:g} µm. Check the growth rate and dt, or let cells divide sooner.",
+                ids,
+            )
+        return steps.long()
 
 
 class _Run:
@@ -196,13 +209,13 @@ class _Run:
                 self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
 
     def _detect(self) -> tuple[Contacts, WallContacts]:
-        state, margin = self.state, self.settings.margin if self.settings.unilateral else 0.0
+        state = self.state
         local = (self.position - self.reference).to(state.dtype)
-        first, second = find_pairs(local.detach(), self.axis.detach(), self.length.detach(), state.radius, state.colony, state.colonies, margin)
+        first, second = find_pairs(local.detach(), self.axis.detach(), self.length.detach(), state.radius, state.colony, state.colonies, 0.0)
         bodies = Bodies(local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius)
-        contacts = find_contacts(bodies, first, second, margin)
+        contacts = find_contacts(bodies, first, second)
         walls = find_wall_contacts(
-            self.settings.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids, margin  # type: ignore[attr-defined]
+            self.settings.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids  # type: ignore[attr-defined]
         )
         return contacts, walls
 

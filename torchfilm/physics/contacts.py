@@ -141,16 +141,16 @@ def _end(s: Tensor, half: Tensor) -> Tensor:
     return (s >= half - slack).to(s.dtype) - (s <= slack - half).to(s.dtype)
 
 
-def find_contacts(bodies: Bodies, first: Tensor, second: Tensor, margin: float) -> Contacts:
-    """All rows with a gap under `margin` µm among the given pairs (P,), (P,)."""
+def find_contacts(bodies: Bodies, first: Tensor, second: Tensor) -> Contacts:
+    """All rows that overlap (gap < 0) among the given pairs (P,), (P,)."""
     a, b = bodies.take(first), bodies.take(second)
     s, t, end_a, end_b, line = contact_points(a, b)
     # cull before the expensive part, without a gradient: a point row for every pair, a second one where there is a line
     with torch.no_grad():
         gap0 = _gap(a, b, s[0], t[0])
         gap1 = _gap(a, b, s[1], t[1])
-        keep0 = torch.nonzero(gap0 < margin).squeeze(1)
-        keep1 = torch.nonzero(line & (gap1 < margin)).squeeze(1)
+        keep0 = torch.nonzero(gap0 < 0).squeeze(1)
+        keep1 = torch.nonzero(line & (gap1 < 0)).squeeze(1)
     keep = torch.cat([keep0, keep1])
     which = lambda x: torch.cat([x[0].index_select(0, keep0), x[1].index_select(0, keep1)])  # noqa: E731
     a, b = a.take(keep), b.take(keep)

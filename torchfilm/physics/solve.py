@@ -58,12 +58,16 @@ class ContactProblem:
     colonies: Groups
     unilateral: bool
 
-    def violation(self, y: Tensor) -> Tensor:
-        """What is left of each overlap after the move, (R,), negative; rows that do not push are 0."""
-        after = self.gap - self.rows.apply(y)
-        return after.clamp(max=0.0) if self.unilateral else after
+    def after(self, y: Tensor) -> Tensor:
+        """The scaled gap of each row after the move y, (R,)."""
+        return self.gap - self.rows.apply(y)
+
+    def acting(self, after: Tensor) -> Tensor:
+        """1 for each row that acts, (R,): all, or if contacts only push, those that overlap after the move."""
+        return (after < 0).to(after.dtype) if self.unilateral else torch.ones_like(after)
 
     def gradient(self, y: Tensor, violation: Tensor) -> Tensor:
+        """Of the function that is minimised, (N, D); violation (R,): the gap after the move of the rows that act, else 0."""
         return self.alpha * y - self.rows.apply_transpose(violation - self.held)
 
     def energy(self, y: Tensor, violation: Tensor) -> Tensor:
@@ -105,42 +109,37 @@ def _detached(p: ContactProblem) -> ContactProblem:
 
 
 def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int):
-    rows, colonies, owner = problem.rows, problem.colonies, problem.colonies.owner
+    colonies, owner = problem.colonies, problem.colonies.owner
     zero = torch.zeros_like(problem.scale)
-    violation0 = problem.violation(zero)
-    gradient0 = problem.gradient(zero, violation0)
-    precondition = _block_inverse(problem, (violation0 < 0).to(zero.dtype) if problem.unilateral else torch.ones_like(violation0))
-    scale = worst_of(precondition(gradient0), colonies)
+    active = problem.acting(problem.gap)
+    precondition = _block_inverse(problem, active)
+    scale = worst_of(precondition(problem.gradient(zero, problem.gap * active)), colonies)
     still = scale == 0  # nothing pushes: such a colony does not move at all
-    y = zero
+    y, after = zero, problem.gap
     if start is not None:
         y = torch.where(still.index_select(0, owner).unsqueeze(1), zero, start / problem.scale)
         y[:, -1] = torch.maximum(y[:, -1], problem.lower)
-    violation = problem.violation(y)
+        after = problem.after(y)
+        active = problem.acting(after)
     target = tolerance * scale
     iterations = torch.zeros(colonies.size, dtype=torch.int64, device=y.device)
-    newton_target = target if not problem.unilateral else None
     for _ in range(NEWTON_LIMIT):
-        gradient = problem.gradient(y, violation)
+        gradient = problem.gradient(y, after * active)
         free = _free(y, gradient, problem.lower)
-        steepest = precondition(gradient * free)
-        worst = worst_of(steepest * free, colonies)
-        going = (worst > target) & torch.isfinite(worst) & (iterations < max_iterations)
+        worst = worst_of(precondition(gradient * free) * free, colonies)
+        going = (worst > target) & (worst < torch.inf) & (iterations < max_iterations)
         if not bool(going.any()):
             break
-        active = (violation < 0).to(y.dtype) if problem.unilateral else torch.ones_like(violation)
-        apply = _operator(problem, active, free)
-        inner = torch.maximum(0.5 * target, FORCING * worst) if newton_target is None else 0.5 * target
-        inner = torch.where(going, inner, torch.inf)
+        inner = torch.where(going, torch.maximum(0.5 * target, FORCING * worst), torch.inf)
         result = conjugate_gradients(
-            apply, -gradient * free, lambda r, f=free: precondition(r * f) * f, colonies, inner, max_iterations
+            _operator(problem, active, free), -gradient * free, lambda r, f=free: precondition(r * f) * f, colonies, inner, max_iterations
         )
         iterations += result.iterations
-        y, violation = _line_search(problem, y, violation, gradient, result.x, going)
+        y, after = _line_search(problem, y, after, gradient, result.x, going)
+        active = problem.acting(after)
     status = torch.where(worst <= target, CONVERGED, ITERATION_LIMIT)
-    status = torch.where(torch.isfinite(worst), status, NOT_FINITE)
+    status = torch.where(worst < torch.inf, status, NOT_FINITE)
     residual = worst / torch.where(still, 1.0, scale)
-    active = (violation < 0).to(y.dtype) if problem.unilateral else torch.ones_like(violation)
     return y, free, active, SolveReport(status, iterations, residual), precondition
 
 
@@ -161,7 +160,7 @@ def _free(y: Tensor, gradient: Tensor, lower: Tensor) -> Tensor:
     return free
 
 
-def _line_search(problem: ContactProblem, y, violation, gradient, direction, going):
+def _line_search(problem: ContactProblem, y, after, gradient, direction, going):
     """Take the full step; halve it in the colonies where the energy does not fall enough.
 
     Where every row holds and no length meets its bound, the full step is the minimum and needs no looking at.
@@ -172,21 +171,23 @@ def _line_search(problem: ContactProblem, y, violation, gradient, direction, goi
     def move(share: Tensor):
         new = torch.addcmul(y, share.index_select(0, owner).unsqueeze(1), direction)
         new[:, -1] = torch.maximum(new[:, -1], problem.lower)
-        return new, problem.violation(new)
+        return new, problem.after(new)
 
-    new, after = move(length)
+    def energy(at: Tensor, gap: Tensor):
+        return problem.energy(at, gap.clamp(max=0) if problem.unilateral else gap)
+
+    new, then = move(length)
     if not problem.unilateral and bool((new[:, -1] > problem.lower).all()):
-        return new, after
-    before = problem.energy(y, violation)
+        return new, then
+    before = energy(y, after)
     for _ in range(HALVINGS):
         decrease = problem.colonies.sum((gradient * (new - y)).double().sum(1, keepdim=True)).squeeze(1)
-        slack = 1e-6 * before.abs()
-        bad = going & (problem.energy(new, after) > before + 1e-4 * decrease + slack)
+        bad = going & (energy(new, then) > before + 1e-4 * decrease + 1e-6 * before.abs())
         if not bool(bad.any()):
             break
         length = torch.where(bad, 0.5 * length, length)
-        new, after = move(length)
-    return new, after
+        new, then = move(length)
+    return new, then
 
 
 def _block_inverse(problem: ContactProblem, active: Tensor):
@@ -206,8 +207,7 @@ def _attach_gradient(problem, y, free, active, precondition, tolerance, max_iter
     at_bound = free[:, -1] == 0
     length = torch.where(at_bound, problem.lower, y[:, -1])
     held = torch.cat([y[:, :-1], length.unsqueeze(1)], 1)
-    after = (problem.gap - problem.rows.apply(held)) * active
-    residual = problem.gradient(held, after) * free
+    residual = problem.gradient(held, problem.after(held) * active) * free
     solve_again = _AdjointSolve(_detached(problem), active, free, precondition, tolerance, max_iterations)
     return held + _Implicit.apply(residual, solve_again)
 

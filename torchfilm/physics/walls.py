@@ -223,9 +223,9 @@ class WallContacts:
 
 
 def find_wall_contacts(
-    surfaces: Sequence[_Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony_id: Tensor, margin: float
+    surfaces: Sequence[_Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony_id: Tensor
 ) -> WallContacts:
-    """One row for each capsule end (and, at a sphere met from outside, for the nearest point between) with a gap under `margin`.
+    """One row for each capsule end (and, at a sphere met from outside, for the nearest point between) that overlaps (gap < 0).
 
     position (N, d) float64 absolute; axis (N, d), length, radius (N,); colony_id (N,), by which a wall's value per colony is found.
     """
@@ -241,7 +241,7 @@ def find_wall_contacts(
             point = position + (s.unsqueeze(1) * axis).to(position.dtype)
             distance, way = surface.gap_of_points(point, colony_id)
             gap = distance.to(length.dtype) - radius
-            near = gap < margin
+            near = gap < 0
             if end == 0.0:  # the ends have rows of their own
                 near = near & (s.abs() < half)
             keep = torch.nonzero(near).squeeze(1)

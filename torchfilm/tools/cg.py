@@ -25,9 +25,8 @@ class CGResult:
 
 
 def worst_of(value: Tensor, groups: Groups) -> Tensor:
-    """Greatest |entry| of (N, D) in each group, (B,); a NaN counts as infinite."""
-    size = torch.nan_to_num(value.abs().amax(1), nan=torch.inf, posinf=torch.inf)
-    return groups.max(size)
+    """Greatest |entry| of (N, D) in each group, (B,); NaN where one is."""
+    return groups.max(value.abs().amax(1))
 
 
 @torch.no_grad()
@@ -51,7 +50,7 @@ def conjugate_gradients(
     p = z.clone()
     rz = groups.sum((r * z).sum(1, keepdim=True))
     worst = worst_of(z, groups)
-    going = (worst > target) & torch.isfinite(worst)
+    going = (worst > target) & (worst < torch.inf)  # neither holds for a NaN
     iterations = torch.zeros(groups.size, dtype=torch.int64, device=b.device)
     every = CHECK_EVERY.get(b.device.type, 8)
     for k in range(max_iterations):
@@ -70,5 +69,5 @@ def conjugate_gradients(
         ratio = torch.where(moves, new / torch.where(rz == 0, 1.0, rz), 0.0).index_select(0, owner)
         p = torch.addcmul(z, ratio, p)
         rz = new
-        going = going & (worst > target) & torch.isfinite(worst) & moves.squeeze(1)
+        going = moves.squeeze(1) & (worst > target) & (worst < torch.inf)
     return CGResult(x, iterations, worst)

@@ -1,0 +1,139 @@
+"""How long growth takes: one colony to N cells, and B colonies to N cells each, in 2-D and in 3-D between agarose and coverslip.
+
+    python experiments/benchmarks/growth.py                     # the full set, some minutes
+    python experiments/benchmarks/growth.py --quick             # small sizes
+    python experiments/benchmarks/growth.py --case 2d-32000 --device cuda
+
+Growth 1/h by the length law, Δt 0.025 h, division at 3.5–4.0 µm, μ = 1, γ = 10, α = 0.1/γ; everything else is the default.
+Each case is appended to a JSON file with its machine, versions and commit. `floor_seconds` is the least that the solver could
+take: the contact rows read once for every product with J or its transpose, at the speed at which this machine copies memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import subprocess
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import torch
+
+import torchfilm as tf
+from torchfilm.physics.rows import ContactRows
+
+CASES = {
+    "2d-3000": (2, 1, 3000), "2d-10000": (2, 1, 10000), "2d-32000": (2, 1, 32000),
+    "3d-3000": (3, 1, 3000), "3d-10000": (3, 1, 10000), "3d-32000": (3, 1, 32000),
+    "2d-32x1000": (2, 32, 1000), "3d-32x1000": (3, 32, 1000),
+}  # fmt: skip
+QUICK = ("2d-3000", "3d-3000")
+
+
+def scene(dim: int) -> tf.Scene:
+    walls = [] if dim == 2 else [tf.Plane(z=-0.5, facing="+z", stiffness=16.0), tf.Plane(z=0.5, facing="-z")]
+    return tf.Scene(
+        tf.Growth(rate=1.0, law="length"), tf.Division(length=tf.Uniform(3.5, 4.0)), tf.Mechanics(dim=dim, walls=walls), dt=0.025, name=f"growth {dim}-D"
+    )
+
+
+class RowCounter:
+    """Counts bytes of contact rows that products with J and its transpose read."""
+
+    def __init__(self) -> None:
+        self.bytes, self.products = 0, 0
+        self._apply, self._transpose = ContactRows.apply, ContactRows.apply_transpose
+
+    def __enter__(self) -> RowCounter:
+        def counted(method):
+            def call(rows, x):
+                self.products += 1
+                self.bytes += rows.row_first.nbytes + rows.row_second.nbytes + rows.row_wall.nbytes
+                return method(rows, x)
+
+            return call
+
+        ContactRows.apply, ContactRows.apply_transpose = counted(self._apply), counted(self._transpose)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        ContactRows.apply, ContactRows.apply_transpose = self._apply, self._transpose
+
+
+def copy_speed(device: str) -> float:
+    """Bytes read per second by a plain copy of 16 MB, best of 20."""
+    source = torch.ones(4_000_000, device=device)
+    target, best = torch.empty_like(source), float("inf")
+    for _ in range(20):
+        begun = time.perf_counter()
+        target.copy_(source)
+        if source.is_cuda:
+            torch.cuda.synchronize()
+        best = min(best, time.perf_counter() - begun)
+    return source.nbytes / best
+
+
+def run(name: str, device: str, seed: int) -> dict:
+    dim, colonies, cells = CASES[name]
+    made = scene(dim)
+    state = made.seed(colonies, seed=seed, device=device)
+    timings, marks, iterations, passes, cell_steps = tf.Timings(), [], 0, 0, 0
+    begun = time.perf_counter()
+    with RowCounter() as counter:
+        for state in tf.simulate(made, state, cells=cells, timings=timings):
+            report = state.reports["mechanics"]
+            iterations += int(report.iterations.max())
+            passes += int(report.passes.max())
+            cell_steps += state.cells
+            if state.cells >= 100 * 2 ** len(marks) * colonies:
+                marks.append({"cells": state.cells, "seconds": round(time.perf_counter() - begun, 2), "time_h": round(state.time, 3)})
+    seconds = time.perf_counter() - begun
+    found = tf.measure.overlaps(state)
+    mean = float((found.mean * found.count).sum() / found.count.sum().clamp(min=1))
+    return {
+        "case": name, "device": device, "cells": state.cells, "colonies": colonies, "seconds": round(seconds, 2),
+        "simulated_h": round(state.time, 3), "steps": state.step, "cell_steps": cell_steps, "us_per_cell_step": round(1e6 * seconds / cell_steps, 2),
+        "cg_iterations": iterations, "passes": passes, "effects_s": {k: round(v, 2) for k, v in timings.seconds.items()},
+        "overlap_mean_um": round(mean, 5), "overlap_worst_um": round(float(found.worst.max()), 4),
+        "depth_um": round(float(tf.measure.depth(state).max()), 2), "radius_um": round(float(tf.measure.colony_radius(state).mean()), 1),
+        "products": counter.products, "floor_seconds": round(counter.bytes / copy_speed(device), 3), "marks": marks,
+    }  # fmt: skip
+
+
+def machine() -> dict:
+    try:
+        commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "unknown"
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit, "torch": str(torch.__version__), "python": platform.python_version(),
+        "threads": torch.get_num_threads(), "processor": platform.processor() or platform.machine(), "gpu": gpu,
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--case", action="append", choices=sorted(CASES), help="one case; may be given again")
+    parser.add_argument("--quick", action="store_true", help="small sizes only")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("growth.json"))
+    chosen = parser.parse_args()
+    records = json.loads(chosen.out.read_text()) if chosen.out.exists() else []
+    for name in chosen.case or (QUICK if chosen.quick else CASES):
+        result = run(name, chosen.device, chosen.seed)
+        print(
+            f"{name:<12} {result['seconds']:>7.1f} s  {result['cells']:>6} cells  {result['steps']:>5} steps  {result['us_per_cell_step']:>6.2f} µs/cell/step  "
+            f"overlap {result['overlap_mean_um']:.4f} / {result['overlap_worst_um']:.3f} µm  CG {result['cg_iterations'] / result['steps']:.1f} a step  "
+            f"floor {result['floor_seconds']:.1f} s  {result['effects_s']}",
+            flush=True,
+        )
+        records.append(machine() | result)
+        chosen.out.write_text(json.dumps(records, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

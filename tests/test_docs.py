@@ -1,0 +1,22 @@
+"""The code in the documentation runs: every page's Python blocks, in order, as one program in an empty folder."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def test_there_are_pages_with_code():
+    assert sum(bool(BLOCK.search(page.read_text())) for page in PAGES) >= 6
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=lambda p: p.name)
+def test_blocks_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict = {"__name__": "docs"}
+    for number, code in enumerate(BLOCK.findall(page.read_text())):
+        exec(compile(code, f"{page.name}, block {number}", "exec"), names)
