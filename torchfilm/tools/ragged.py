@@ -9,6 +9,7 @@ for one column.) On CUDA ``index_add_`` is fast, and ordered when torch's determ
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import torch
@@ -68,7 +69,7 @@ class Groups:
 
     def sum(self, value: Tensor) -> Tensor:
         """Sum rows (K, …) into groups (size, …); differentiable."""
-        flat = value.reshape(value.shape[0], -1)
+        flat = value.reshape(value.shape[0], math.prod(value.shape[1:]))
         return _GroupSum.apply(flat, self).reshape(self.size, *value.shape[1:])
 
     def sum_into(self, value: Tensor, out: Tensor) -> Tensor:
