@@ -52,10 +52,19 @@ class Cells:
             raise checks.refuse(f"Cells.axis[{int(np.argmin(size))}]", axis[int(np.argmin(size))].tolist(), "a direction that is not zero")
         parts: dict[str, Any] = {"position": position, "axis": axis / size[:, None]}
         for name, above in (("length", False), ("radius", True)):
-            values = np.broadcast_to(_array(name, getattr(self, name), np.float64), (count,)) if np.ndim(getattr(self, name)) == 0 else _column(name, getattr(self, name), count)
+            values: np.ndarray = (
+                np.broadcast_to(_array(name, getattr(self, name), np.float64), (count,))
+                if np.ndim(getattr(self, name)) == 0
+                else _column(name, getattr(self, name), count)
+            )
             bad = np.flatnonzero(values <= 0 if above else values < 0)
             if bad.size:
-                raise checks.refuse(f"Cells.{name}[{bad[0]}]", float(values[bad[0]]), "above 0" if above else "at least 0", "In µm; length is the centreline's, without caps.")
+                raise checks.refuse(
+                    f"Cells.{name}[{bad[0]}]",
+                    float(values[bad[0]]),
+                    "above 0" if above else "at least 0",
+                    "In µm; length is the centreline's, without caps.",
+                )
             parts[name] = values
         for name in ("cell_type", "colony"):
             if getattr(self, name) is not None:
@@ -183,7 +192,7 @@ CELL_TYPE = Field("cell_type", "kind of cell, a whole number that rules and circ
 
 def _array(name: str, given: Any, dtype: type) -> np.ndarray:
     try:
-        values = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given, dtype=dtype)
+        values: np.ndarray = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given, dtype=dtype)
     except (TypeError, ValueError) as error:
         raise checks.refuse(f"Cells.{name}", given, "an array of numbers") from error
     bad = np.argwhere(~np.isfinite(values))

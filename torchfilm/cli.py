@@ -211,23 +211,24 @@ def report_overlaps(cells) -> None:
         print(f"note: {len(found)} pairs of the given cells overlap by over 0.01 µm, worst cells {i} and {j} by {deep:.3g} µm; the first steps part them.")
 
 
-def go(scene: Scene, state: State, recorder: Recorder, *, cells: int | None, until: float | None, dt: float | None, watch: bool, picture: bool) -> None:
+def go(scene: Scene, start: State, recorder: Recorder, *, cells: int | None, until: float | None, dt: float | None, watch: bool, picture: bool) -> None:
     """Run with a progress bar, then say where things are and how they went."""
     rules = [e for e in scene.effects if isinstance(e, Rules)]
     for rule in rules:
-        rule.source.watching = watch  # type: ignore[attr-defined]
+        rule.source.watching = watch
     timings, begun = Timings(), time.perf_counter()
     form = "{desc} |{bar}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}"
-    with tqdm(total=_size(state, cells, until), bar_format=form, disable=None, mininterval=0.3) as bar:
-        bar.set_description(f"{scene.name}: {state.colonies} colonies")
-        bar.update(_done(state, cells, until))
-        for state in simulate(scene, state, until=until, cells=cells, dt=dt, record=recorder, timings=timings):
+    with tqdm(total=_size(start, cells, until), bar_format=form, disable=None, mininterval=0.3) as bar:
+        bar.set_description(f"{scene.name}: {start.colonies} colonies")
+        bar.update(_done(start, cells, until))
+        state = start
+        for state in simulate(scene, start, until=until, cells=cells, dt=dt, record=recorder, timings=timings):
             bar.update(_done(state, cells, until) - bar.n)
             seconds = time.perf_counter() - begun
-            bar.set_postfix_str(f"{state.cells} cells, t = {state.time:.2f} h, {(state.step) / seconds:.0f} steps/s", refresh=False)
+            bar.set_postfix_str(f"{state.cells} cells, t = {state.time:.2f} h, {(state.step - start.step) / seconds:.0f} steps/s", refresh=False)
             for rule in rules:
-                while rule.source.messages:  # type: ignore[attr-defined]
-                    bar.write(rule.source.messages.pop(0))  # type: ignore[attr-defined]
+                while rule.source.messages:
+                    bar.write(rule.source.messages.pop(0))
     seconds = time.perf_counter() - begun
     print(f"results  {recorder.path}")
     if picture and state.cells:
@@ -270,7 +271,9 @@ def table(scene: Scene, state: State, timings: Timings, seconds: float) -> str:
 def main() -> None:
     """Entry point of the `torchfilm` command."""
     command = tyro.extras.subcommand_cli_from_dict(
-        {"run": Run, "resume": Resume, "show": Show, "info": Info}, prog="torchfilm", description="Synthetic microbial biofilms, many colonies at once."
+        {"run": Run, "resume": Resume, "show": Show, "info": Info},
+        prog="torchfilm",
+        description="Synthetic microbial biofilms, many colonies at once.",
     )
     try:
         command()

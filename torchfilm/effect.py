@@ -6,6 +6,7 @@ An effect is a frozen dataclass with a `stage`, the fields it `declares`, what i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -96,7 +97,6 @@ class Distribution:
         raise NotImplementedError
 
 
-
 @dataclass(frozen=True)
 class Uniform(Distribution):
     """Evenly between low and high; each one number or one per colony."""
@@ -146,7 +146,7 @@ class Normal(Distribution):
 
 @dataclass(frozen=True)
 class LogNormal(Distribution):
-    """The exponential of a Gaussian: median and the standard deviation of the logarithm; each one number or one per colony."""
+    """The exponential of a Gaussian: its median, and sigma of the logarithm; each one number or one per colony."""
 
     median: float | Tensor
     sigma: float | Tensor
@@ -166,13 +166,13 @@ class LogNormal(Distribution):
         return float((torch.as_tensor(self.median) * torch.exp(4 * torch.as_tensor(self.sigma))).max())
 
 
-def parameter(name: str, value: object, **bounds: float) -> float | Tensor | Distribution:
+def parameter(name: str, value: object, *, above: float = -math.inf, least: float = -math.inf, most: float = math.inf) -> float | Tensor | Distribution:
     """Check a parameter that may be one number, one per colony, or a distribution over cells."""
     if isinstance(value, Distribution):
-        checks.number(f"least value of {name}", value.least(), **bounds)
-        checks.number(f"greatest value of {name}", value.greatest(), **bounds)
+        checks.number(f"least value of {name}", value.least(), above=above, least=least, most=most)
+        checks.number(f"greatest value of {name}", value.greatest(), above=above, least=least, most=most)
         return value
-    return checks.value(name, value, **bounds)
+    return checks.value(name, value, above=above, least=least, most=most)
 
 
 def draw(name: str, value: float | Tensor | Distribution, state: State, rows: Tensor) -> Tensor:

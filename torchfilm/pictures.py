@@ -96,7 +96,14 @@ def scale_bar(ax: Axes) -> None:
 
 
 def sheet(
-    cells: dict[str, np.ndarray], path: str | Path, *, colour: str = "angle", view: str = "xy", title: str = "", most: int = 36, ids: np.ndarray | None = None
+    cells: dict[str, np.ndarray],
+    path: str | Path,
+    *,
+    colour: str = "angle",
+    view: str = "xy",
+    title: str = "",
+    most: int = 36,
+    ids: np.ndarray | None = None,
 ) -> Path:
     """A sheet of the colonies of one frame (see `Results.frame`), one panel each, all to one scale; written to `path`.
 

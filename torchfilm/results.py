@@ -190,7 +190,13 @@ def _colony_columns(state: State) -> dict[str, np.ndarray]:
 
 def _growing(file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk: int) -> None:
     file.create_dataset(
-        name, shape=(0, *shape), maxshape=(None, *shape), dtype=dtype, chunks=(chunk, *(max(1, s) for s in shape)), compression="gzip", compression_opts=1
+        name,
+        shape=(0, *shape),
+        maxshape=(None, *shape),
+        dtype=dtype,
+        chunks=(chunk, *(max(1, s) for s in shape)),
+        compression="gzip",
+        compression_opts=1,
     )
 
 
@@ -339,7 +345,7 @@ class Results:
                 if value.ndim == 1:
                     columns[name] = value
                 else:
-                    letters = "xyz" if name in ("position", "axis") else range(value.shape[1])
+                    letters = "xyz" if name in ("position", "axis") else map(str, range(value.shape[1]))
                     for j, letter in zip(range(value.shape[1]), letters, strict=False):
                         columns[letter if name == "position" else f"{name}_{letter}"] = value[:, j]
             parts.append(columns)
@@ -376,7 +382,9 @@ class Results:
         colony_fields = {n: d[k] for n, d in self.file["frames/colony"].items()} if "frames/colony" in self.file else {}
         missing = [n for n in template.fields if n not in recorded and n not in colony_fields]
         if missing:
-            raise InputError(f"{self.path} lacks the field {missing[0]!r} that this scene has: it was made by another scene, {self.file.attrs['scene'].splitlines()[0]!r}.")
+            raise InputError(
+                f"{self.path} lacks the field {missing[0]!r} that this scene has: it was made by another scene, {self.file.attrs['scene'].splitlines()[0]!r}."
+            )
         declared = dict(template.declared)
         for name, (meaning, unit, scope, shape, at_division) in json.loads(self.file.attrs["declared"]).items():
             if name not in declared:

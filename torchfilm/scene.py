@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -132,19 +131,14 @@ class Scene:
     def couplings(self) -> list[tuple[str, str, str]]:
         """Who drives whom: (writer, name, reader) for every name that one effect writes and another reads."""
         return [
-            (w.title, name, r.title)
-            for w in self.effects
-            for r in self.effects
-            if w is not r
-            for name in w.writes()
-            if name in r.reads() or name in r.needs()
+            (w.title, name, r.title) for w in self.effects for r in self.effects if w is not r for name in w.writes() if name in r.reads() or name in r.needs()
         ]
 
     def explain(self) -> str:
         """What this scene simulates, in the order in which it acts, and who drives whom."""
         lines = [f"{self.name}: {self.dim}-D, step {self.dt:g} h, {self.founders.count} founder(s)"]
         for effect in self.effects:
-            lines.append(f"  {STAGES[effect.stage] if effect.stage in STAGES else effect.stage:<10} {summary(effect)}")
+            lines.append(f"  {STAGES.get(effect.stage, str(effect.stage)):<10} {summary(effect)}")
             lines.append(f"             reads  {', '.join(effect.reads()) or '-'}")
             lines.append(f"             writes {', '.join(effect.writes()) or '-'}")
             for f in effect.declares(self.dim):
@@ -204,5 +198,3 @@ def _check_device(device: str | torch.device) -> None:
         raise checks.refuse("device", device, 'a torch device such as "cpu" or "cuda"') from error
     if wanted.type == "cuda" and not torch.cuda.is_available():
         raise checks.refuse("device", str(device), "a device that this machine has", 'torch sees no CUDA GPU; use device="cpu".')
-
-

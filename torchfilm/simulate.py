@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from collections.abc import Callable, Iterator, Sequence
 
 import torch
 
@@ -35,7 +35,8 @@ def simulate(
     """Run the scene from `state`, yielding the state after each step.
 
     until: time to stop at, h. cells: stop once every colony has this many cells. At least one of the two; the first reached ends the run.
-    dt: step, h; by default the scene's. record: path of a new results file (every tenth step and the last), or a Recorder. observers: called with the first state and after every step.
+    dt: step, h; by default the scene's. record: path of a new results file (every tenth step and the last), or a Recorder.
+    observers: called with the first state and after every step.
     on_failure: "raise" a SimulationError that names the colonies whose solve failed, or "drop" their cells, note it, and go on.
     """
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)

@@ -176,9 +176,7 @@ class State:
 
     def take(self, index: Tensor) -> State:
         """The cells at `index` (M,), which keeps colonies side by side; colonies stay, if need be empty."""
-        fields = {
-            name: value.index_select(0, index) if self.declared[name].scope == CELL else value for name, value in self.fields.items()
-        }
+        fields = {name: value.index_select(0, index) if self.declared[name].scope == CELL else value for name, value in self.fields.items()}
         part = {name: getattr(self, name).index_select(0, index) for name in PER_CELL}
         return self.replace(**part, fields=fields)
 

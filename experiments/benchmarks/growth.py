@@ -35,7 +35,11 @@ QUICK = ("2d-3000", "3d-3000")
 def scene(dim: int) -> tf.Scene:
     walls = [] if dim == 2 else [tf.Plane(z=-0.5, facing="+z", stiffness=16.0), tf.Plane(z=0.5, facing="-z")]
     return tf.Scene(
-        tf.Growth(rate=1.0, law="length"), tf.Division(length=tf.Uniform(3.5, 4.0)), tf.Mechanics(dim=dim, walls=walls), dt=0.025, name=f"growth {dim}-D"
+        tf.Growth(rate=1.0, law="length"),
+        tf.Division(length=tf.Uniform(3.5, 4.0)),
+        tf.Mechanics(dim=dim, walls=walls),
+        dt=0.025,
+        name=f"growth {dim}-D",
     )
 
 
@@ -78,11 +82,11 @@ def copy_speed(device: str) -> float:
 def run(name: str, device: str, seed: int) -> dict:
     dim, colonies, cells = CASES[name]
     made = scene(dim)
-    state = made.seed(colonies, seed=seed, device=device)
+    start = made.seed(colonies, seed=seed, device=device)
     timings, marks, iterations, passes, cell_steps = tf.Timings(), [], 0, 0, 0
     begun = time.perf_counter()
     with RowCounter() as counter:
-        for state in tf.simulate(made, state, cells=cells, timings=timings):
+        for state in tf.simulate(made, start, cells=cells, timings=timings):
             report = state.reports["mechanics"]
             iterations += int(report.iterations.max())
             passes += int(report.passes.max())

@@ -66,9 +66,7 @@ class Division(Effect):
                 )
             )  # fmt: skip
         if name == "added":
-            fields.append(
-                Field("birth_length", "centreline length at birth", "µm", initial=_length_of_rows, at_division="reset")
-            )
+            fields.append(Field("birth_length", "centreline length at birth", "µm", initial=_length_of_rows, at_division="reset"))
         return tuple(fields)
 
     def reads(self) -> tuple[str, ...]:
@@ -88,7 +86,8 @@ class Division(Effect):
             k = int(below[0])
             raise checks.InputError(
                 f"Division.{self.criterion}: threshold {float(threshold[k]):g} of cell {int(state.uid[k])} in colony "
-                f"{int(state.own_colony_id[k])} is not above its {self.criterion} at birth, {float(start[k]):g}. Raise the threshold or start from smaller cells."
+                f"{int(state.own_colony_id[k])} is not above its {self.criterion} at birth, {float(start[k]):g}. "
+                "Raise the threshold or start from smaller cells."
             )
         given = getattr(self, self.criterion)
         least = given.least() if isinstance(given, Distribution) else float(torch.as_tensor(given).min())

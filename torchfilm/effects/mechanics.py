@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torchfilm.physics.contacts import Bodies, Contacts, find_contacts
 from torchfilm.physics.neighbours import find_pairs
 from torchfilm.physics.rows import ContactRows
 from torchfilm.physics.solve import NOT_FINITE, ContactProblem, SolveReport, solve
-from torchfilm.physics.walls import Wall, WallContacts, find_wall_contacts
+from torchfilm.physics.walls import Surface, Wall, WallContacts, find_wall_contacts
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
@@ -67,6 +67,7 @@ class Mechanics(Effect):
     tolerance: float = 0.05
     max_iterations: int = 2000
     max_elongation: float = 0.25
+    surfaces: tuple[Surface, ...] = field(init=False, repr=False, compare=False)
 
     stage = MECHANICS
     title = "mechanics"
@@ -83,10 +84,10 @@ class Mechanics(Effect):
         for wall in self.walls:
             if not isinstance(wall, Wall):
                 raise checks.refuse("Mechanics.walls", wall, "a list of Plane, Sphere, Box or Channel")
-        if self.passes is None:
-            object.__setattr__(self, "passes", 1 if self.dim == 2 else 2)
         for name in ("passes", "max_iterations"):
             given = getattr(self, name)
+            if (name, given) == ("passes", None):
+                continue
             if not isinstance(given, int) or given < 1:
                 raise checks.refuse(f"Mechanics.{name}", given, "a whole number from 1")
         checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
@@ -94,12 +95,17 @@ class Mechanics(Effect):
         if self.overlap is not None:
             checks.number("Mechanics.overlap", self.overlap, above=0.0)
         object.__setattr__(self, "walls", tuple(self.walls))
-        object.__setattr__(self, "surfaces", [s for wall in self.walls for s in wall.surfaces(self.dim)])
+        object.__setattr__(self, "surfaces", tuple(s for wall in self.walls for s in wall.surfaces(self.dim)))
 
     @property
     def degrees(self) -> int:
         """Degrees of freedom of a cell: 4 in strict 2-D, 7 in 3-D."""
         return 4 if self.dim == 2 else 7
+
+    @property
+    def most_passes(self) -> int:
+        """`passes`, or its default for the dimension."""
+        return self.passes if self.passes is not None else self.dim - 1
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (
@@ -118,7 +124,7 @@ class Mechanics(Effect):
     def check(self, state: State) -> None:
         if state.dim != self.dim:
             raise checks.refuse("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
-        for surface in self.surfaces:  # type: ignore[attr-defined]
+        for surface in self.surfaces:
             distance, _ = surface.gap_of_points(state.position, state.own_colony_id)
             beyond = torch.nonzero(distance < 0).squeeze(1)
             if beyond.numel():
@@ -192,7 +198,7 @@ class _Run:
         moving = active.index_select(0, self.state.colony)
         self.length = torch.where(moving, base + growth, base)
         seen: Tensor | None = None
-        for number in range(self.settings.passes):
+        for number in range(self.settings.most_passes):
             contacts, walls = self._detect()
             if seen is not None:
                 active = active & self._again(contacts, walls, seen)
@@ -203,7 +209,7 @@ class _Run:
                 contacts, walls = _only(contacts, walls, moving)
             move, report = self._solve(contacts, walls, base, moving, first=number == 0)
             self._move(move, base, moving, report, active)
-            seen = self._keys(contacts) if number + 1 < self.settings.passes else None
+            seen = self._keys(contacts) if number + 1 < self.settings.most_passes else None
             self.report = self._noted(report, active)
             if number == 0:
                 self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
@@ -214,9 +220,7 @@ class _Run:
         first, second = find_pairs(local.detach(), self.axis.detach(), self.length.detach(), state.radius, state.colony, state.colonies, 0.0)
         bodies = Bodies(local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius)
         contacts = find_contacts(bodies, first, second)
-        walls = find_wall_contacts(
-            self.settings.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids  # type: ignore[attr-defined]
-        )
+        walls = find_wall_contacts(self.settings.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids)
         return contacts, walls
 
     def _keys(self, contacts: Contacts) -> Tensor:
@@ -261,9 +265,9 @@ class _Run:
         """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
         root = torch.ones_like(walls.gap)
         soft = torch.zeros_like(walls.cell, dtype=torch.bool)
-        for number, surface in enumerate(self.settings.surfaces):  # type: ignore[attr-defined]
+        for number, surface in enumerate(self.settings.surfaces):
             here = walls.surface == number
-            if surface.wall.soft:
+            if surface.wall.stiffness is not None:
                 stiffness = per_cell(surface.wall.stiffness, self.state) * self.alpha * self.dt
                 root = torch.where(here, stiffness.index_select(0, walls.cell).sqrt(), root)
                 soft = soft | here

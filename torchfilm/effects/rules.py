@@ -42,6 +42,13 @@ class CellsView:
     `remove_flag`, and new names, which become variables of the cell. A tensor that was read may be changed in place.
     """
 
+    _state: State
+    _dt: float
+    _work: dict[str, Tensor]
+    _read: set[str]
+    _declaring: bool
+    _draws: int
+
     def __init__(self, state: State, dt: float, declaring: bool = False):
         object.__setattr__(self, "_state", state)
         object.__setattr__(self, "_dt", dt)
@@ -146,6 +153,9 @@ class CellsView:
 class CellView:
     """One cell of a CellsView: the same names, one value each. For loops as in the paper; whole tensors are a thousand times faster."""
 
+    _cells: CellsView
+    _index: int
+
     def __init__(self, cells: CellsView, index: int):
         object.__setattr__(self, "_cells", cells)
         object.__setattr__(self, "_index", index)
@@ -169,6 +179,12 @@ class CellView:
 
 class DivisionView:
     """The parents or daughters of one step's divisions, M of each: names as in CellsView; daughters' fields may be written."""
+
+    _state: State
+    _rows: Tensor | None
+    _purpose: str
+    _work: dict[str, Tensor]
+    _draws: int
 
     def __init__(self, state: State, rows: Tensor | None, purpose: str):
         object.__setattr__(self, "_state", state)
@@ -213,7 +229,7 @@ class Source:
         self.watching = False
         self.messages: list[str] = []
 
-    def refresh(self, attempt: Callable[[Callable[..., None]], None]) -> None:
+    def refresh(self, attempt: Callable[[Callable[..., None]], object]) -> None:
         """Take up an edited file if it loads and `attempt(update)` passes; else report and keep the last good rules."""
         if not self.watching or self.path is None:
             return
@@ -256,6 +272,8 @@ class Rules(Effect):
     update: Callable[[CellsView], None] | str | Path | None = None
     divide: Callable[[DivisionView, DivisionView, DivisionView], None] | None = None
     variables: Mapping[str, float] = field(default_factory=dict)
+    source: Source = field(init=False, repr=False, compare=False)
+    noted: dict[str, tuple[str, ...]] = field(init=False, repr=False, compare=False)
 
     stage = RULES
     title = "rules"
@@ -279,20 +297,20 @@ class Rules(Effect):
         object.__setattr__(self, "noted", {"reads": (), "writes": ()})
 
     def parts(self) -> tuple[Effect, ...]:
-        return (self, DivisionRule(self)) if self.source.functions["divide"] or self.source.path else (self,)  # type: ignore[attr-defined]
+        return (self, DivisionRule(self)) if self.source.functions["divide"] or self.source.path else (self,)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return tuple(Field(name, "variable of the user's rules", initial=value) for name, value in self.variables.items())
 
     def reads(self) -> tuple[str, ...]:
-        return self.noted["reads"]  # type: ignore[attr-defined]
+        return self.noted["reads"]
 
     def writes(self) -> tuple[str, ...]:
-        return self.noted["writes"]  # type: ignore[attr-defined]
+        return self.noted["writes"]
 
     def prepare(self, state: State) -> State:
         """Try `update` once on the first state: new names become fields, and what is read and written is noted."""
-        update = self.source.functions["update"]  # type: ignore[attr-defined]
+        update = self.source.functions["update"]
         if update is None:
             return state
         view = CellsView(state, 0.0, declaring=True)
@@ -304,13 +322,13 @@ class Rules(Effect):
                 state = state.declare(new)
         changed = [n for n, v in view._work.items() if n != "remove_flag" and not torch.equal(v, state.fields[n])]
         writes = [n for n in view._work if n in changed or n not in view._read]
-        self.noted["reads"] = tuple(sorted(view._read))  # type: ignore[attr-defined]
-        self.noted["writes"] = tuple("cells" if n == "remove_flag" else n for n in sorted(writes))  # type: ignore[attr-defined]
+        self.noted["reads"] = tuple(sorted(view._read))
+        self.noted["writes"] = tuple("cells" if n == "remove_flag" else n for n in sorted(writes))
         return state
 
     def step(self, state: State, dt: float) -> State:
-        self.source.refresh(lambda update: _apply(update, state, dt))  # type: ignore[attr-defined]
-        update = self.source.functions["update"]  # type: ignore[attr-defined]
+        self.source.refresh(lambda update: _apply(update, state, dt))
+        update = self.source.functions["update"]
         return state if update is None or state.cells == 0 else _apply(update, state, dt)
 
 
@@ -341,7 +359,7 @@ class DivisionRule(Effect):
         return ("cells",)
 
     def step(self, state: State, dt: float) -> State:
-        act = self.rules.source.functions["divide"]  # type: ignore[attr-defined]
+        act = self.rules.source.functions["divide"]
         if act is None:
             return state
         for births in state.births:

@@ -26,9 +26,7 @@ CLASS_RATIO = 4.0
 
 
 @torch.no_grad()
-def find_pairs(
-    position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float
-) -> tuple[Tensor, Tensor]:
+def find_pairs(position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float) -> tuple[Tensor, Tensor]:
     """Pairs (i, j), i ≠ j, of one colony, whose bounding spheres and bounding boxes come within `margin` µm of each other.
 
     position, axis (N, d) µm and unit; length, radius (N,) µm; colony (N,) int64. Every pair stands once; no pair whose
@@ -134,7 +132,8 @@ class _Grid:
     def pairs_with(self, larger: Tensor) -> tuple[Tensor, Tensor]:
         """Every pair of a larger cell (of another class) and a member."""
         rows_each_way = torch.ceil(self.window.index_select(0, larger)).long()
-        query, found = torch.arange(larger.numel(), device=larger.device), []
+        found: list[Tensor] = []
+        query = torch.arange(larger.numel(), device=larger.device)
         for own_row in torch.floor(self.at[1:].index_select(1, larger)).long():
             each = rows_each_way.index_select(0, query)
             owner, row = expand_ranges(own_row.index_select(0, query) - each, 2 * each + 1)

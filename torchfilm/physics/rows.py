@@ -15,9 +15,7 @@ class ContactRows:
     already scaled by row weights and by drag as the solve wants them.
     """
 
-    def __init__(
-        self, first: Tensor, second: Tensor, row_first: Tensor, row_second: Tensor, at_wall: Tensor, row_wall: Tensor, cells: int
-    ):
+    def __init__(self, first: Tensor, second: Tensor, row_first: Tensor, row_second: Tensor, at_wall: Tensor, row_wall: Tensor, cells: int):
         self.first, self.second, self.at_wall = first, second, at_wall
         self.row_first, self.row_second, self.row_wall = row_first, row_second, row_wall
         self.cells, self.pairs, self.walls = cells, first.numel(), at_wall.numel()

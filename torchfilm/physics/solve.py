@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -21,6 +22,8 @@ from torch import Tensor
 from torchfilm.physics.rows import ContactRows
 from torchfilm.tools.cg import conjugate_gradients, worst_of
 from torchfilm.tools.ragged import Groups
+
+Map = Callable[[Tensor], Tensor]
 
 CONVERGED, ITERATION_LIMIT, NOT_FINITE = 0, 1, 2
 STATUS = {CONVERGED: "converged", ITERATION_LIMIT: "iteration limit", NOT_FINITE: "not finite"}
@@ -83,9 +86,7 @@ class ContactProblem:
         return self.colonies.sum(per_cell).squeeze(1)
 
 
-def solve(
-    problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int
-) -> tuple[Tensor, SolveReport]:
+def solve(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int) -> tuple[Tensor, SolveReport]:
     """Solve for x (N, D) from `start` (an earlier x, or None for 0). Differentiable by the adjoint: one more solve with the same operator.
 
     A colony has converged when its worst preconditioned residual is at most `tolerance` times the worst at x = 0.
@@ -103,9 +104,7 @@ def _detached(p: ContactProblem) -> ContactProblem:
     if not torch.is_grad_enabled() and not r.row_first.requires_grad:
         return p
     rows = ContactRows(r.first, r.second, r.row_first.detach(), r.row_second.detach(), r.at_wall, r.row_wall.detach(), r.cells)
-    return ContactProblem(
-        rows, p.gap.detach(), p.held.detach(), p.alpha.detach(), p.lower.detach(), p.scale.detach(), p.colonies, p.unilateral
-    )
+    return ContactProblem(rows, p.gap.detach(), p.held.detach(), p.alpha.detach(), p.lower.detach(), p.scale.detach(), p.colonies, p.unilateral)
 
 
 def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int):
@@ -131,9 +130,7 @@ def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, m
         if not bool(going.any()):
             break
         inner = torch.where(going, torch.maximum(0.5 * target, FORCING * worst), torch.inf)
-        result = conjugate_gradients(
-            _operator(problem, active, free), -gradient * free, lambda r, f=free: precondition(r * f) * f, colonies, inner, max_iterations
-        )
+        result = conjugate_gradients(_operator(problem, active, free), -gradient * free, _within(free, precondition), colonies, inner, max_iterations)
         iterations += result.iterations
         y, after = _line_search(problem, y, after, gradient, result.x, going)
         active = problem.acting(after)
@@ -141,6 +138,11 @@ def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, m
     status = torch.where(worst < torch.inf, status, NOT_FINITE)
     residual = worst / torch.where(still, 1.0, scale)
     return y, free, active, SolveReport(status, iterations, residual), precondition
+
+
+def _within(free: Tensor, precondition: Map) -> Map:
+    """The preconditioner among the degrees of freedom that are free."""
+    return lambda r: precondition(r * free) * free
 
 
 def _operator(problem: ContactProblem, active: Tensor, free: Tensor):
@@ -219,12 +221,10 @@ class _AdjointSolve:
 
     def __call__(self, grad: Tensor) -> Tensor:
         free, colonies = self.free, self.problem.colonies
-        precondition = lambda r: self.precondition(r * free) * free  # noqa: E731
+        precondition = _within(free, self.precondition)
         b = grad * free
         target = self.tolerance * worst_of(precondition(b), colonies)
-        return conjugate_gradients(
-            _operator(self.problem, self.active, free), b, precondition, colonies, target, self.max_iterations
-        ).x
+        return conjugate_gradients(_operator(self.problem, self.active, free), b, precondition, colonies, target, self.max_iterations).x
 
 
 class _Implicit(torch.autograd.Function):

@@ -40,7 +40,7 @@ class Wall:
     def soft(self) -> bool:
         return self.stiffness is not None
 
-    def surfaces(self, dim: int) -> list[_Surface]:
+    def surfaces(self, dim: int) -> list[Surface]:
         """The wall as planes and spheres in `dim` dimensions."""
         raise NotImplementedError
 
@@ -66,27 +66,25 @@ class Plane(Wall):
         if (self.point is None) != (self.normal is None):
             raise checks.InputError("Plane needs both point and normal, or neither. Example: Plane(point=(0, 0), normal=(1, 1)).")
         if len(named) + (self.point is not None) != 1:
-            raise checks.InputError(
-                f"Plane got {named or 'no place'}: give exactly one of x, y, z, or point and normal. Example: Plane(z=-0.5, facing=\"+z\")."
-            )
+            raise checks.InputError(f'Plane got {named or "no place"}: give exactly one of x, y, z, or point and normal. Example: Plane(z=-0.5, facing="+z").')
         if self.point is not None:
             point, normal = checks.vector("Plane.point", self.point), checks.vector("Plane.normal", self.normal)
             if len(point) != len(normal):
                 raise checks.refuse("Plane.normal", normal, f"as long as point ({len(point)} numbers)")
-            if not any(normal):
+            if not any(n != 0 for n in normal):
                 raise checks.refuse("Plane.normal", normal, "a direction that is not zero")
             return
         axis = named[0]
         checks.choice(f"Plane.facing (with {axis})", self.facing, ("+" + axis, "-" + axis))
         object.__setattr__(self, axis, checks.value(f"Plane.{axis}", getattr(self, axis)))
 
-    def surfaces(self, dim: int) -> list[_Surface]:
+    def surfaces(self, dim: int) -> list[Surface]:
         if self.point is not None:
             if len(self.point) != dim:
                 raise checks.refuse("Plane.point", tuple(self.point), f"of {dim} numbers in a {dim}-D scene")
             size = math.sqrt(sum(n * n for n in self.normal))  # type: ignore[union-attr]
             normal = tuple(n / size for n in self.normal)  # type: ignore[union-attr]
-            return [_Flat(self, normal, sum(p * n for p, n in zip(self.point, normal, strict=True)))]
+            return [_Flat(self, normal, math.fsum(float(p) * n for p, n in zip(self.point, normal, strict=True)))]
         axis = next(k for k, a in enumerate(AXES) if getattr(self, a) is not None)
         if axis >= dim:
             raise checks.refuse(f"Plane.{AXES[axis]}", getattr(self, AXES[axis]), f"a place along {AXES[:dim]} in a {dim}-D scene")
@@ -108,7 +106,7 @@ class Sphere(Wall):
         checks.vector("Sphere.center", self.center)
         object.__setattr__(self, "radius", checks.value("Sphere.radius", self.radius, above=0.0))
 
-    def surfaces(self, dim: int) -> list[_Surface]:
+    def surfaces(self, dim: int) -> list[Surface]:
         if len(tuple(self.center)) != dim:
             raise checks.refuse("Sphere.center", tuple(self.center), f"of {dim} numbers in a {dim}-D scene")
         return [_Round(self, tuple(map(float, self.center)), self.radius, self.inside)]
@@ -130,10 +128,10 @@ class Box(Wall):
             if not lo < hi:
                 raise checks.refuse(f"Box.low, Box.high along {a}", (lo, hi), "low < high", "This box is inside out.")
 
-    def surfaces(self, dim: int) -> list[_Surface]:
+    def surfaces(self, dim: int) -> list[Surface]:
         if len(tuple(self.low)) != dim:
             raise checks.refuse("Box.low", tuple(self.low), f"of {dim} numbers in a {dim}-D scene")
-        out: list[_Surface] = []
+        out: list[Surface] = []
         for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             for sign, at in ((1.0, low), (-1.0, high)):
                 if math.isfinite(at):
@@ -158,7 +156,7 @@ class Channel(Wall):
         if self.low_end is not None and self.high_end is not None and not self.low_end < self.high_end:
             raise checks.refuse("Channel.low_end, Channel.high_end", (self.low_end, self.high_end), "low_end < high_end", "This channel is inside out.")
 
-    def surfaces(self, dim: int) -> list[_Surface]:
+    def surfaces(self, dim: int) -> list[Surface]:
         if self.height is not None and dim == 2:
             raise checks.refuse("Channel.height", self.height, "left out in a 2-D scene")
         half = (math.inf, self.width / 2, math.inf if self.height is None else self.height / 2)
@@ -198,7 +196,7 @@ class _Round:
         return (radius - distance, way) if self.inside else (distance - radius, -way)
 
 
-_Surface = _Flat | _Round
+Surface = _Flat | _Round  # what a wall is made of
 
 
 def _per_cell(given: float | Tensor, colony: Tensor, like: Tensor) -> Tensor | float:
@@ -222,9 +220,7 @@ class WallContacts:
         return WallContacts(*(x.index_select(0, index) for x in (self.cell, self.gap, self.row, self.surface)))
 
 
-def find_wall_contacts(
-    surfaces: Sequence[_Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony_id: Tensor
-) -> WallContacts:
+def find_wall_contacts(surfaces: Sequence[Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony_id: Tensor) -> WallContacts:
     """One row for each capsule end (and, at a sphere met from outside, for the nearest point between) that overlaps (gap < 0).
 
     position (N, d) float64 absolute; axis (N, d), length, radius (N,); colony_id (N,), by which a wall's value per colony is found.

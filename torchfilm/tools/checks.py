@@ -61,8 +61,7 @@ def value(name: str, given: object, *, above: float = -math.inf, least: float = 
         where = torch.nonzero(~good.reshape(-1)).reshape(-1)
         at = int(where[0])
         raise InputError(
-            f"{name}[{at}] = {float(seen.reshape(-1)[at])} is not allowed ({len(where)} of {seen.numel()} values): "
-            f"each must be {_rule(above, least, most)}."
+            f"{name}[{at}] = {float(seen.reshape(-1)[at])} is not allowed ({len(where)} of {seen.numel()} values): each must be {_rule(above, least, most)}."
         )
     return given
 

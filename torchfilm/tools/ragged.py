@@ -58,11 +58,7 @@ class Groups:
 
     def _incidence(self, dtype: torch.dtype) -> Tensor:
         if dtype not in self._matrix:
-            order = (
-                torch.arange(self.owner.numel(), device=self.owner.device)
-                if self._is_sorted
-                else torch.argsort(self.owner, stable=True)
-            )
+            order = torch.arange(self.owner.numel(), device=self.owner.device) if self._is_sorted else torch.argsort(self.owner, stable=True)
             ones = torch.ones(order.numel(), dtype=dtype, device=order.device)
             self._matrix[dtype] = csr(offsets(self.counts), order, ones, (self.size, order.numel()))
         return self._matrix[dtype]
