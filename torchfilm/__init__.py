@@ -15,11 +15,12 @@ from torchfilm.scene import Scene
 from torchfilm.simulate import simulate
 from torchfilm.state import Field, State
 from torchfilm.tools.checks import InputError, SimulationError
+from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.timing import Timings
 from torchfilm.version import __version__
 
 __all__ = [
     "Box", "Cells", "Channel", "Division", "Effect", "Field", "Growth", "InputError", "LogNormal", "Mechanics", "Normal", "Plane",
     "Recorder", "Removal", "Results", "Rules", "Scene", "SimulationError", "Sphere", "State", "Timings", "Uniform",
-    "__version__", "effect", "measure", "pictures", "scenes", "show", "simulate",
+    "__version__", "effect", "keep_memory", "measure", "pictures", "scenes", "show", "simulate",
 ]  # fmt: skip

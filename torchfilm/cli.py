@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import ast
-import os
 import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
-
-# Threads that spin while they wait double the time of a step as soon as anything else runs on the machine. torch reads
-# this when it is first imported, so it stands before.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
 
@@ -25,6 +20,7 @@ from torchfilm.simulate import simulate
 from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError, SimulationError
+from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.timing import Timings
 
 try:
@@ -275,6 +271,7 @@ def main() -> None:
         prog="torchfilm",
         description="Synthetic microbial biofilms, many colonies at once.",
     )
+    keep_memory()
     try:
         command()
     except (InputError, SimulationError) as error:

@@ -132,7 +132,7 @@ class State:
     @cached_property
     def groups(self) -> Groups:
         """The cells of each colony, for sums and maxima over colonies."""
-        return Groups(self.colony, self.colonies, is_sorted=True)
+        return Groups(self.colony, self.colonies)
 
     @cached_property
     def counts(self) -> Tensor:

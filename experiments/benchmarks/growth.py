@@ -126,6 +126,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("growth.json"))
     chosen = parser.parse_args()
+    tf.keep_memory()
     records = json.loads(chosen.out.read_text()) if chosen.out.exists() else []
     for name in chosen.case or (QUICK if chosen.quick else CASES):
         result = run(name, chosen.device, chosen.seed)

@@ -19,8 +19,8 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
 
-# No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing. The whole colony's
-# move is shortened, so that forces still balance, and the colony is passed again.
+# No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing. Such cells are counted,
+# and their colony is passed again if passes are left.
 MAX_TURN = 0.5
 MOST_SUBSTEPS = 1000
 
@@ -28,7 +28,7 @@ MOST_SUBSTEPS = 1000
 @dataclass(frozen=True)
 class MechanicsReport:
     """What the last step's contact solves did, per colony (B,). `status` of the worst solve, `iterations` of CG in all, `residual` the
-    worst true one; `passes` and `substeps` taken; `limited`: the last pass still had to be shortened (see MAX_TURN)."""
+    worst true one; `passes` and `substeps` taken; `limited`: cells that the last pass kept from turning further (see MAX_TURN)."""
 
     status: Tensor
     iterations: Tensor
@@ -177,7 +177,8 @@ class _Run:
         self.first_move = state.displacement
         count = state.colonies
         zero = torch.zeros(count, dtype=torch.int64, device=state.device)
-        self.report = MechanicsReport(zero, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero > 0)
+        self.limited = zero
+        self.report = MechanicsReport(zero, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero)
         start = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
         self.reference = state.position.detach().index_select(0, start).index_select(0, state.colony)
         drag_factor = state.fields.get("drag")
@@ -236,7 +237,7 @@ class _Run:
         if self.settings.overlap is not None:
             again[contacts.first[contacts.gap < -self.settings.overlap]] = True
             again[walls.cell[walls.gap < -self.settings.overlap]] = True
-        return groups.any(again) | self.report.limited
+        return groups.any(again) | (self.limited > 0)
 
     def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, first: bool):
         state, settings = self.state, self.settings
@@ -277,17 +278,17 @@ class _Run:
         return root, soft
 
     def _move(self, move: Tensor, base: Tensor, moving: Tensor, report: SolveReport, active: Tensor) -> None:
-        """Carry the solve's move out in the colonies that are moving, shortened where a cell would turn too far."""
+        """Carry the solve's move out in the colonies that are moving; a cell that would turn too far turns as far as it may."""
         state, d = self.state, self.state.dim
+        sound = (moving & (report.status != NOT_FINITE).index_select(0, state.colony)).unsqueeze(1)
+        move = torch.where(sound, move, 0.0)
         with torch.no_grad():
-            turn = state.groups.max(move[:, d:-1].detach().abs().amax(1))
-            self.limited = active & (turn > MAX_TURN)
-            share = torch.where(self.limited, MAX_TURN / turn, 1.0)
-            sound = moving & (report.status != NOT_FINITE).index_select(0, state.colony)
-            share = share.index_select(0, state.colony).unsqueeze(1)
-        move = torch.where(sound.unsqueeze(1), move * share, 0.0)
+            size = (move[:, d:-1] * move[:, d:-1]).sum(1, keepdim=True).sqrt()
+            too_far = size > MAX_TURN
+            share = torch.where(too_far, MAX_TURN / size, 1.0)
+            self.limited = torch.where(active, state.groups.sum(too_far.to(state.dtype)).squeeze(1).long(), self.limited)
         self.position = self.position + move[:, :d].to(self.position.dtype)
-        self.axis = torch.where(sound.unsqueeze(1), capsule.rotate(self.axis, move[:, d:-1]), self.axis)
+        self.axis = torch.where(sound, capsule.rotate(self.axis, move[:, d:-1] * share), self.axis)
         self.length = torch.maximum(self.length + move[:, -1], base)
 
     def _noted(self, new: SolveReport, active: Tensor) -> MechanicsReport:

@@ -20,6 +20,7 @@ class ContactRows:
         self.row_first, self.row_second, self.row_wall = row_first, row_second, row_wall
         self.cells, self.pairs, self.walls = cells, first.numel(), at_wall.numel()
         self.half_rows = Groups(torch.cat([first, second, at_wall]), cells)
+        self.row_owner = torch.cat([first, at_wall])
         self._matrix: Tensor | None = None
         self._work: Tensor | None = None
 
@@ -57,8 +58,11 @@ class ContactRows:
         rows = torch.cat([self.row_first, self.row_second, self.row_wall])
         pair, wall = active[: self.pairs], active[self.pairs :]
         scaled = rows * torch.cat([pair, pair, wall]).unsqueeze(1)
-        outer = (scaled.unsqueeze(2) * rows.unsqueeze(1)).reshape(-1, width * width)
-        return self.half_rows.sum_into(outer, rows.new_empty(self.cells, width * width)).reshape(-1, width, width)
+        i, j = torch.triu_indices(width, width, device=rows.device)
+        upper = self.half_rows.sum_into(rows.index_select(1, i) * scaled.index_select(1, j), rows.new_empty(self.cells, i.numel()))
+        whole = torch.empty(width, width, dtype=torch.int64, device=rows.device)
+        whole[i, j] = whole[j, i] = torch.arange(i.numel(), device=rows.device)
+        return upper.index_select(1, whole.reshape(-1)).reshape(-1, width, width)
 
     def _needs_grad(self, x: Tensor) -> bool:
         return torch.is_grad_enabled() and (x.requires_grad or self.row_first.requires_grad or self.row_wall.requires_grad)

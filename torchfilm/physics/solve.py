@@ -73,17 +73,14 @@ class ContactProblem:
         """Of the function that is minimised, (N, D); violation (R,): the gap after the move of the rows that act, else 0."""
         return self.alpha * y - self.rows.apply_transpose(violation - self.held)
 
-    def energy(self, y: Tensor, violation: Tensor) -> Tensor:
-        """The function that is minimised, per colony (B,), in float64 so that a line search can compare."""
+    def energy(self, y: Tensor, after: Tensor) -> Tensor:
+        """The function that is minimised, per colony (B,), in float64 so that a line search can compare; after (R,): the gap left."""
         rows = self.rows
-        owner = torch.cat([rows.first, rows.at_wall])
-        spring = 0.5 * violation.double() ** 2
-        if bool((self.held != 0).any()):
-            spring = spring + self.held.double() * rows.apply(y).double()
-        per_cell = torch.zeros(rows.cells, dtype=torch.float64, device=y.device)
-        per_cell = Groups(owner, rows.cells).sum_into(spring.unsqueeze(1), per_cell.unsqueeze(1))
-        per_cell = per_cell + 0.5 * (self.alpha * y * y).sum(1, keepdim=True)
-        return self.colonies.sum(per_cell).squeeze(1)
+        violation = (after.clamp(max=0) if self.unilateral else after).double()
+        spring = 0.5 * violation * violation + self.held * (self.gap - after)
+        owner = Groups(self.colonies.owner.index_select(0, rows.row_owner), self.colonies.size)
+        drag = (0.5 * self.alpha * (y * y).sum(1, keepdim=True)).double()
+        return (owner.sum(spring.unsqueeze(1)) + self.colonies.sum(drag)).squeeze(1)
 
 
 def solve(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int) -> tuple[Tensor, SolveReport]:
@@ -129,7 +126,8 @@ def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, m
         going = (worst > target) & (worst < torch.inf) & (iterations < max_iterations)
         if not bool(going.any()):
             break
-        inner = torch.where(going, torch.maximum(0.5 * target, FORCING * worst), torch.inf)
+        least = torch.maximum(0.5 * target, FORCING * worst) if problem.unilateral else 0.5 * target
+        inner = torch.where(going, least, torch.inf)
         result = conjugate_gradients(_operator(problem, active, free), -gradient * free, _within(free, precondition), colonies, inner, max_iterations)
         iterations += result.iterations
         y, after = _line_search(problem, y, after, gradient, result.x, going)
@@ -165,30 +163,28 @@ def _free(y: Tensor, gradient: Tensor, lower: Tensor) -> Tensor:
 def _line_search(problem: ContactProblem, y, after, gradient, direction, going):
     """Take the full step; halve it in the colonies where the energy does not fall enough.
 
-    Where every row holds and no length meets its bound, the full step is the minimum and needs no looking at.
+    Where every row holds and no length is cut short by its bound, the full step is the minimum and needs no looking at.
     """
     owner = problem.colonies.owner
     length = going.to(y.dtype)
 
     def move(share: Tensor):
         new = torch.addcmul(y, share.index_select(0, owner).unsqueeze(1), direction)
+        cut = bool((new[:, -1] < problem.lower).any())
         new[:, -1] = torch.maximum(new[:, -1], problem.lower)
-        return new, problem.after(new)
+        return new, problem.after(new), cut
 
-    def energy(at: Tensor, gap: Tensor):
-        return problem.energy(at, gap.clamp(max=0) if problem.unilateral else gap)
-
-    new, then = move(length)
-    if not problem.unilateral and bool((new[:, -1] > problem.lower).all()):
+    new, then, cut = move(length)
+    if not problem.unilateral and not cut:
         return new, then
-    before = energy(y, after)
+    before = problem.energy(y, after)
     for _ in range(HALVINGS):
         decrease = problem.colonies.sum((gradient * (new - y)).double().sum(1, keepdim=True)).squeeze(1)
-        bad = going & (energy(new, then) > before + 1e-4 * decrease + 1e-6 * before.abs())
+        bad = going & (problem.energy(new, then) > before + 1e-4 * decrease + 1e-6 * before.abs())
         if not bool(bad.any()):
             break
         length = torch.where(bad, 0.5 * length, length)
-        new, then = move(length)
+        new, then, _ = move(length)
     return new, then
 
 
@@ -196,11 +192,8 @@ def _block_inverse(problem: ContactProblem, active: Tensor):
     """Block Jacobi: each cell's own D × D block, inverted."""
     blocks = problem.rows.blocks(active)
     blocks.diagonal(dim1=1, dim2=2).add_(problem.alpha)
-    # a colony that is not finite must not stop the others: it is reported as such by its residual
-    sound = torch.isfinite(blocks).all(2).all(1)
-    identity = torch.eye(blocks.shape[1], dtype=blocks.dtype, device=blocks.device)
-    inverse = torch.linalg.inv(torch.where(sound[:, None, None], blocks, identity)) if blocks.numel() else blocks
-    inverse = torch.where(sound[:, None, None], inverse, torch.nan)
+    # no check here: where a colony is not finite so is its inverse, and its residual says so without stopping the others
+    inverse = torch.linalg.inv_ex(blocks).inverse
     return lambda r: torch.bmm(inverse, r.unsqueeze(2)).squeeze(2)
 
 

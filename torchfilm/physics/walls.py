@@ -82,8 +82,9 @@ class Plane(Wall):
         if self.point is not None:
             if len(self.point) != dim:
                 raise checks.refuse("Plane.point", tuple(self.point), f"of {dim} numbers in a {dim}-D scene")
-            size = math.sqrt(sum(n * n for n in self.normal))  # type: ignore[union-attr]
-            normal = tuple(n / size for n in self.normal)  # type: ignore[union-attr]
+            assert self.normal is not None
+            size = math.sqrt(math.fsum(n * n for n in self.normal))
+            normal = tuple(n / size for n in self.normal)
             return [_Flat(self, normal, math.fsum(float(p) * n for p, n in zip(self.point, normal, strict=True)))]
         axis = next(k for k, a in enumerate(AXES) if getattr(self, a) is not None)
         if axis >= dim:

@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 import warnings
 
+import numpy as np
+import scipy.sparse
 import torch
 from torch import Tensor
 
@@ -44,11 +46,11 @@ def expand_ranges(start: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
 class Groups:
     """Rows 0 … K − 1 that belong to groups 0 … size − 1, in any order: sums and maxima over each group.
 
-    `owner`: (K,) int64, the group of each row; `is_sorted` saves a sort.
+    `owner`: (K,) int64, the group of each row.
     """
 
-    def __init__(self, owner: Tensor, size: int, is_sorted: bool = False):
-        self.owner, self.size, self._is_sorted = owner, size, is_sorted
+    def __init__(self, owner: Tensor, size: int):
+        self.owner, self.size = owner, size
         self._matrix: dict[torch.dtype, Tensor] = {}
 
     @property
@@ -58,9 +60,15 @@ class Groups:
 
     def _incidence(self, dtype: torch.dtype) -> Tensor:
         if dtype not in self._matrix:
-            order = torch.arange(self.owner.numel(), device=self.owner.device) if self._is_sorted else torch.argsort(self.owner, stable=True)
-            ones = torch.ones(order.numel(), dtype=dtype, device=order.device)
-            self._matrix[dtype] = csr(offsets(self.counts), order, ones, (self.size, order.numel()))
+            count = self.owner.numel()
+            if self.owner.device.type == "cpu":
+                # linear time and stable, where a sort would cost more than all the sums of a solve
+                entries = (np.ones(count, np.int8), (self.owner.int().numpy(), np.arange(count, dtype=np.int32)))
+                found = scipy.sparse.coo_array(entries, shape=(self.size, count)).tocsr()
+                start, order = torch.from_numpy(found.indptr), torch.from_numpy(found.indices)
+            else:
+                start, order = offsets(self.counts), torch.argsort(self.owner, stable=True)
+            self._matrix[dtype] = csr(start, order, torch.ones(count, dtype=dtype, device=self.owner.device), (self.size, count))
         return self._matrix[dtype]
 
     def sum(self, value: Tensor) -> Tensor:
