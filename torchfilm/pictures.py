@@ -52,6 +52,14 @@ def outlines(position: np.ndarray, axis: np.ndarray, length: np.ndarray, radius:
     return np.concatenate(parts, 1)
 
 
+def _wheel() -> Any:
+    """A cyclic colour map of even, muted colours: one that passes through white or black would hide cells of one direction."""
+    from matplotlib.colors import ListedColormap, hsv_to_rgb
+
+    hue = np.linspace(0, 1, 256, endpoint=False)
+    return ListedColormap(hsv_to_rgb(np.stack([hue, np.full(256, 0.55), np.full(256, 0.85)], 1)))
+
+
 def draw_cells(ax: Axes, cells: dict[str, np.ndarray], *, colour: str = "angle", view: str = "xy", limits: tuple[float, float] | None = None) -> Any:
     """Draw one colony's cells on matplotlib axes, in µm.
 
@@ -61,12 +69,10 @@ def draw_cells(ax: Axes, cells: dict[str, np.ndarray], *, colour: str = "angle",
     from matplotlib.collections import PolyCollection
 
     u, v = VIEWS[view]
-    if max(u, v) >= cells["position"].shape[1]:
-        raise checks.refuse("view", view, '"xy" for 2-D cells')
     order = np.argsort(cells["position"][:, 3 - u - v]) if cells["position"].shape[1] == 3 else np.arange(len(cells["uid"]))
     axis = cells["axis"][order][:, [u, v]]
     if colour == "angle":
-        values, cmap, limits = np.mod(np.arctan2(axis[:, 1], axis[:, 0]), math.pi), "twilight", (0.0, math.pi)
+        values, cmap, limits = np.mod(np.arctan2(axis[:, 1], axis[:, 0]), math.pi), _wheel(), (0.0, math.pi)
     elif colour in cells and cells[colour].ndim == 1:
         values, cmap = cells[colour][order].astype(float), "viridis"
     else:
@@ -121,19 +127,23 @@ def sheet_figure(cells: dict[str, np.ndarray], *, colour: str, view: str, title:
     total, shown = len(present), present[:most]
     if total == 0:
         raise checks.InputError("there is no cell to draw in this frame.")
-    columns = math.ceil(math.sqrt(len(shown)))
+    u, v = VIEWS[view]
+    if max(u, v) >= cells["position"].shape[1]:
+        raise checks.refuse("view", view, '"xy" for 2-D cells')
+    spans = [np.ptp(cells["position"][cells["colony"] == c][:, [u, v]], 0) + 4.0 for c in shown]
+    width, height = np.max(spans, 0)
+    # as many columns as make the whole sheet about square
+    columns = min(len(shown), max(1, round(math.sqrt(len(shown) * height / width))))
     rows = math.ceil(len(shown) / columns)
-    panel = 2.2 if len(shown) > 1 else 7.0
-    figure = figure_class(figsize=(columns * panel + (0.9 if colour != "angle" else 0), rows * panel + 0.5), layout="constrained")
+    panel = min(8.0 / columns, 8.0 * width / (rows * height)) if len(shown) > 1 else min(8.0, 8.0 * width / height)
+    figure = figure_class(figsize=(columns * panel + (0.9 if colour != "angle" else 0.1), rows * (panel * height / width + 0.2) + 0.5), layout="constrained")
     axes = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).reshape(-1)
     limits = None if colour == "angle" or colour not in cells else (float(cells[colour].min()), float(cells[colour].max()))
-    spans, last = [], None
+    last = None
     for ax, colony in zip(axes, shown, strict=False):
         mine = {n: v[cells["colony"] == colony] for n, v in cells.items()}
         last = draw_cells(ax, mine, colour=colour, view=view, limits=limits)
-        spans.append((np.diff(ax.get_xlim())[0], np.diff(ax.get_ylim())[0]))
         ax.set_title(f"colony {colony if ids is None else ids[colony]}: {len(mine['uid'])} cells", fontsize=7, pad=2)
-    width, height = np.max(spans, 0)
     for ax in axes[: len(shown)]:  # one scale for all
         x, y = np.mean(ax.get_xlim()), np.mean(ax.get_ylim())
         ax.set(xlim=(x - width / 2, x + width / 2), ylim=(y - height / 2, y + height / 2))

@@ -64,7 +64,7 @@ class Mechanics(Effect):
     unilateral: bool = False
     passes: int | None = None
     overlap: float | None = None
-    tolerance: float = 0.05
+    tolerance: float = 0.1
     max_iterations: int = 2000
     max_elongation: float = 0.25
     surfaces: tuple[Surface, ...] = field(init=False, repr=False, compare=False)
