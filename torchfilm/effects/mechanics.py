@@ -19,9 +19,11 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
 
-# No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing. Such cells are counted,
-# and their colony is passed again if passes are left.
+# No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing. Where one would, the
+# whole colony's move is shortened, since other cells counted on that turn, but not below LEAST_SHARE of it: one bad cell must
+# not hold the rest for long. What still turns too far is cut, and counted.
 MAX_TURN = 0.5
+LEAST_SHARE = 0.5
 MOST_SUBSTEPS = 1000
 
 
@@ -237,7 +239,7 @@ class _Run:
         if self.settings.overlap is not None:
             again[contacts.first[contacts.gap < -self.settings.overlap]] = True
             again[walls.cell[walls.gap < -self.settings.overlap]] = True
-        return groups.any(again) | (self.limited > 0)
+        return groups.any(again) | self.shortened
 
     def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, first: bool):
         state, settings = self.state, self.settings
@@ -262,6 +264,11 @@ class _Run:
         start = state.displacement if first else None
         return solve(problem, start, settings.tolerance, settings.max_iterations)
 
+    def _turn(self, move: Tensor) -> Tensor:
+        """How far each cell turns, (N,) rad."""
+        turns = move[:, self.state.dim : -1].detach()
+        return (turns * turns).sum(1).sqrt()
+
     def _wall_weights(self, walls: WallContacts) -> tuple[Tensor, Tensor]:
         """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
         root = torch.ones_like(walls.gap)
@@ -278,17 +285,19 @@ class _Run:
         return root, soft
 
     def _move(self, move: Tensor, base: Tensor, moving: Tensor, report: SolveReport, active: Tensor) -> None:
-        """Carry the solve's move out in the colonies that are moving; a cell that would turn too far turns as far as it may."""
+        """Carry the solve's move out in the colonies that are moving, shortened where a cell would turn too far."""
         state, d = self.state, self.state.dim
         sound = (moving & (report.status != NOT_FINITE).index_select(0, state.colony)).unsqueeze(1)
         move = torch.where(sound, move, 0.0)
-        with torch.no_grad():
-            size = (move[:, d:-1] * move[:, d:-1]).sum(1, keepdim=True).sqrt()
-            too_far = size > MAX_TURN
-            share = torch.where(too_far, MAX_TURN / size, 1.0)
-            self.limited = torch.where(active, state.groups.sum(too_far.to(state.dtype)).squeeze(1).long(), self.limited)
+        share = (MAX_TURN / state.groups.max(self._turn(move))).clamp(min=LEAST_SHARE, max=1.0)
+        move = move * share.index_select(0, state.colony).unsqueeze(1)
+        turn = self._turn(move).unsqueeze(1)
+        too_far = turn > MAX_TURN * (1 + 1e-5)
+        cut = torch.where(too_far, MAX_TURN / turn, 1.0)
+        self.shortened = active & (share < 1)
+        self.limited = torch.where(active, state.groups.sum(too_far.to(state.dtype)).squeeze(1).long(), self.limited)
         self.position = self.position + move[:, :d].to(self.position.dtype)
-        self.axis = torch.where(sound, capsule.rotate(self.axis, move[:, d:-1] * share), self.axis)
+        self.axis = torch.where(sound, capsule.rotate(self.axis, move[:, d:-1] * cut), self.axis)
         self.length = torch.maximum(self.length + move[:, -1], base)
 
     def _noted(self, new: SolveReport, active: Tensor) -> MechanicsReport:

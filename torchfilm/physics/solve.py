@@ -49,7 +49,7 @@ class ContactProblem:
     """One linearised contact problem, R rows over N cells in B colonies.
 
     rows: J scaled by weights and drag. gap: (R,) D g. held: (R,) force of each row already spent in this step (soft rows in
-    later passes), D min(0, g) or 0. alpha: (N, 1). lower: (N,) least scaled Δl. scale: (N, D) M^(−½).
+    later passes), D min(0, g) or 0. alpha: (N, 1) or (N, D). lower: (N,) least scaled Δl. scale: (N, D) M^(−½).
     """
 
     rows: ContactRows
@@ -79,7 +79,7 @@ class ContactProblem:
         violation = (after.clamp(max=0) if self.unilateral else after).double()
         spring = 0.5 * violation * violation + self.held * (self.gap - after)
         owner = Groups(self.colonies.owner.index_select(0, rows.row_owner), self.colonies.size)
-        drag = (0.5 * self.alpha * (y * y).sum(1, keepdim=True)).double()
+        drag = (0.5 * self.alpha * y * y).sum(1, keepdim=True).double()
         return (owner.sum(spring.unsqueeze(1)) + self.colonies.sum(drag)).squeeze(1)
 
 
