@@ -87,7 +87,7 @@ def handle_failures(state: State, on_failure: str) -> State:
         failed = failed | bad
         for place in torch.nonzero(bad).squeeze(1).tolist():
             reasons.append(
-                f"colony {int(state.colony_id[place])} ({int(state.counts[place])} cells): {name} solve {STATUS[int(report.status[place])]} after "
+                f"colony {int(state.colony_id[place])} ({int(state.counts[place])} cells): the {name} solve {STATUS[int(report.status[place])]} after "
                 f"{int(report.iterations[place])} iterations, residual {float(report.residual[place]):.2g}"
             )
     if not reasons:

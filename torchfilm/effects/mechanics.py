@@ -13,7 +13,7 @@ from torchfilm.physics import capsule
 from torchfilm.physics.contacts import Bodies, Contacts, find_contacts
 from torchfilm.physics.neighbours import find_pairs
 from torchfilm.physics.rows import ContactRows
-from torchfilm.physics.solve import NOT_FINITE, ContactProblem, SolveReport, solve
+from torchfilm.physics.solve import CONVERGED, NOT_FINITE, TOO_FAST, ContactProblem, SolveReport, solve
 from torchfilm.physics.walls import Surface, Wall, WallContacts, find_wall_contacts
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
@@ -25,6 +25,7 @@ from torchfilm.tools.ragged import offsets
 MAX_TURN = 0.5
 LEAST_SHARE = 0.5
 MOST_SUBSTEPS = 1000
+COARSE_PASSES, COARSE_OVERLAP = 6, 0.02
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ class Mechanics(Effect):
     unilateral: contacts only push. False (default, the paper's least squares) also holds an overlapping pair that wants to part, until
     the next pass: measured, the overlap is the same or less, at half the CG iterations or fewer.
     passes: at most this many times a step contacts are found and solved: again in colonies where the move made new contacts, or left an
-    overlap deeper than `overlap` (µm). Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other.
+    overlap deeper than `overlap` (µm). Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other; twice as many
+    for unilateral contacts, since a push at one end may drive in the other; 6, down to 0.02 µm, for colonies that take sub-steps.
     tolerance: of the solve, worst residual relative to the worst at rest. max_iterations: CG iterations a solve.
     max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
     """
@@ -106,8 +108,8 @@ class Mechanics(Effect):
 
     @property
     def most_passes(self) -> int:
-        """`passes`, or its default for the dimension."""
-        return self.passes if self.passes is not None else self.dim - 1
+        """`passes`, or its default for the dimension and the kind of contact."""
+        return self.passes if self.passes is not None else (self.dim - 1) * (2 if self.unilateral else 1)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (
@@ -141,12 +143,12 @@ class Mechanics(Effect):
         if state.cells == 0:
             return state
         elongation = state.fields.get("elongation", torch.zeros_like(state.length))
-        steps = self._substeps(state, elongation)
+        steps, status = self._plan(state, elongation)
+        run = _Run(self, state, dt, steps, status)
         base = state.length - elongation
-        run = _Run(self, state, dt, steps)
+        share = elongation / steps.index_select(0, state.colony)
         for k in range(int(steps.max())):
-            share = elongation / steps.index_select(0, state.colony)
-            run.substep(base, share, k < steps)
+            run.substep(base, share, (k < steps) & (status == CONVERGED))
             base = run.length
         fields = {"displacement": run.first_move}
         if "elongation" in state.fields:
@@ -155,32 +157,27 @@ class Mechanics(Effect):
         return state.with_fields(**fields).replace(reports={**state.reports, "mechanics": run.report})
 
     @torch.no_grad()
-    def _substeps(self, state: State, elongation: Tensor) -> Tensor:
-        """How many sub-steps each colony takes, (B,), so that no cell grows by more than `max_elongation` in one."""
-        most = state.groups.max(elongation)
-        steps = torch.ceil(most / self.max_elongation * (1 - 1e-6)).nan_to_num(1.0).clamp(min=1)  # a NaN is the solve's to report
-        far = torch.nonzero(steps > MOST_SUBSTEPS).squeeze(1)
-        if far.numel():
-            ids = state.colony_id.index_select(0, far).tolist()
-            raise checks.SimulationError(
-                f"colonies {ids[:10]}: a cell wants to grow by {float(most.max()):.3g} µm in one step, over {MOST_SUBSTEPS} sub-steps of "
-                f"{self.max_elongation:g} µm. Check the growth rate and dt, or let cells divide sooner.",
-                ids,
-            )
-        return steps.long()
+    def _plan(self, state: State, elongation: Tensor) -> tuple[Tensor, Tensor]:
+        """How many sub-steps each colony takes, (B,), so that no cell grows by more than `max_elongation` in one; and which colonies cannot be stepped."""
+        every = torch.cat([state.position, state.axis, state.length.unsqueeze(1), elongation.unsqueeze(1)], 1)
+        broken = state.groups.any(~torch.isfinite(every).all(1))
+        steps = torch.ceil(state.groups.max(elongation) / self.max_elongation * (1 - 1e-6))
+        status = torch.where(steps > MOST_SUBSTEPS, TOO_FAST, CONVERGED)
+        status = torch.where(broken, NOT_FINITE, status)
+        return torch.where(status == CONVERGED, steps.clamp(min=1), 1).long(), status
 
 
 class _Run:
     """The moving parts of one step: geometry, and what is reported of each colony."""
 
-    def __init__(self, settings: Mechanics, state: State, dt: float, substeps: Tensor):
+    def __init__(self, settings: Mechanics, state: State, dt: float, substeps: Tensor, status: Tensor):
         self.settings, self.state = settings, state
         self.position, self.axis, self.length = state.position, state.axis, state.length
         self.first_move = state.displacement
         count = state.colonies
         zero = torch.zeros(count, dtype=torch.int64, device=state.device)
         self.limited = zero
-        self.report = MechanicsReport(zero, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero)
+        self.report = MechanicsReport(status, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero)
         start = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
         self.reference = state.position.detach().index_select(0, start).index_select(0, state.colony)
         drag_factor = state.fields.get("drag")
@@ -189,6 +186,11 @@ class _Run:
         self.colony_ids = state.own_colony_id
         # dt of each cell's own sub-step, h
         self.dt = dt / substeps.index_select(0, state.colony).to(state.dtype)
+        # a step that needs sub-steps is a coarse one: unless told otherwise, it is looked at more closely
+        coarse = substeps > 1
+        self.passes = torch.where(coarse & (settings.passes is None), COARSE_PASSES, settings.most_passes)
+        limit = torch.full_like(self.report.residual, torch.inf if settings.overlap is None else settings.overlap)
+        self.overlap = torch.where(coarse & (settings.overlap is None), COARSE_OVERLAP, limit).index_select(0, state.colony)
         if settings.stiffness is not None:
             self.alpha = 1.0 / (per_cell(settings.stiffness, state) * self.dt)
         elif settings.alpha is not None:
@@ -201,34 +203,42 @@ class _Run:
         moving = active.index_select(0, self.state.colony)
         self.length = torch.where(moving, base + growth, base)
         seen: Tensor | None = None
-        for number in range(self.settings.most_passes):
-            contacts, walls = self._detect()
+        for number in range(int(self.passes.max())):
+            contacts, walls = self._detect(active)
             if seen is not None:
-                active = active & self._again(contacts, walls, seen)
+                active = active & (number < self.passes) & self._again(contacts, walls, seen)
                 if not bool(active.any()):
                     return
             moving = active.index_select(0, self.state.colony)
-            if not bool(active.all()):
-                contacts, walls = _only(contacts, walls, moving)
+            contacts, walls = _only(contacts, walls, moving)
             move, report = self._solve(contacts, walls, base, moving, first=number == 0)
             self._move(move, base, moving, report, active)
-            seen = self._keys(contacts) if number + 1 < self.settings.most_passes else None
+            seen = self._keys(contacts) if number + 1 < int(self.passes.max()) else None
             self.report = self._noted(report, active)
             if number == 0:
                 self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
 
-    def _detect(self) -> tuple[Contacts, WallContacts]:
+    def _detect(self, active: Tensor) -> tuple[Contacts, WallContacts]:
+        """All contacts of the present geometry; those of colonies that cannot be stepped are of no use to anyone and are left out."""
         state = self.state
         local = (self.position - self.reference).to(state.dtype)
-        first, second = find_pairs(local.detach(), self.axis.detach(), self.length.detach(), state.radius, state.colony, state.colonies, 0.0)
+        with torch.no_grad():
+            axis, length, radius, colony = self.axis, self.length, state.radius, state.colony
+            if bool(active.all()):
+                first, second = find_pairs(local, axis, length, radius, colony, state.colonies)
+            else:
+                rows = torch.nonzero(active.index_select(0, colony)).squeeze(1)
+                pick = lambda x: x.index_select(0, rows)  # noqa: E731
+                found = find_pairs(pick(local), pick(axis), pick(length), pick(radius), pick(colony), state.colonies)
+                first, second = rows.index_select(0, found[0]), rows.index_select(0, found[1])
         bodies = Bodies(local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius)
-        contacts = find_contacts(bodies, first, second)
+        contacts = find_contacts(bodies, first, second, whole_lines=self.settings.unilateral)
         walls = find_wall_contacts(self.settings.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids)
         return contacts, walls
 
     def _keys(self, contacts: Contacts) -> Tensor:
         low, high = torch.minimum(contacts.first, contacts.second), torch.maximum(contacts.first, contacts.second)
-        return low * self.state.cells + high
+        return (low * self.state.cells + high) * 9 + contacts.where
 
     def _again(self, contacts: Contacts, walls: WallContacts, seen: Tensor) -> Tensor:
         """Which colonies need another pass, (B,): a new contact that overlaps, an overlap over the limit, or a move cut short."""
@@ -236,9 +246,8 @@ class _Run:
         new = ~torch.isin(self._keys(contacts), seen) & (contacts.gap < 0)
         again = torch.zeros_like(colony, dtype=torch.bool)
         again[contacts.first[new]] = True
-        if self.settings.overlap is not None:
-            again[contacts.first[contacts.gap < -self.settings.overlap]] = True
-            again[walls.cell[walls.gap < -self.settings.overlap]] = True
+        again[contacts.first[contacts.gap < -self.overlap.index_select(0, contacts.first)]] = True
+        again[walls.cell[walls.gap < -self.overlap.index_select(0, walls.cell)]] = True
         return groups.any(again) | self.shortened
 
     def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, first: bool):
@@ -312,6 +321,8 @@ class _Run:
 
 def _only(contacts: Contacts, walls: WallContacts, cells: Tensor) -> tuple[Contacts, WallContacts]:
     """The rows whose cells are marked, (N,) bool."""
+    if bool(cells.all()):
+        return contacts, walls
     keep = torch.nonzero(cells.index_select(0, contacts.first)).squeeze(1)
     keep_wall = torch.nonzero(cells.index_select(0, walls.cell)).squeeze(1)
     return contacts.take(keep), walls.take(keep_wall)

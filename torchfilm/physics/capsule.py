@@ -46,8 +46,8 @@ def rotate(axis: Tensor, turn: Tensor) -> Tensor:
     no library sine whose last bit may depend on where an element stands.
     """
     t2 = (turn * turn).sum(1, keepdim=True)
-    sinc = 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72 * (1 - t2 / 110 * (1 - t2 / 156 * (1 - t2 / 210))))))
-    versine = 0.5 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56 * (1 - t2 / 90 * (1 - t2 / 132 * (1 - t2 / 182))))))
+    sinc = 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72 * (1 - t2 / 110 * (1 - t2 / 156 * (1 - t2 / 210 * (1 - t2 / 272)))))))
+    versine = 0.5 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56 * (1 - t2 / 90 * (1 - t2 / 132 * (1 - t2 / 182 * (1 - t2 / 240)))))))
     if axis.shape[1] == 2:
         first = turn * torch.stack([-axis[:, 1], axis[:, 0]], 1)
         second = -t2 * axis

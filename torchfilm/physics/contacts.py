@@ -37,7 +37,8 @@ class Contacts:
     """Rows of the contact problem, K pairs' rows; first and second cell (K,), gap (K,) µm, weight D² (K,).
 
     `row_first`, `row_second`: (K, 4) in 2-D [n, q×n, ∂] and (K, 7) in 3-D: the gap after moves x is gap − row_first·x_first −
-    row_second·x_second. `normal` (d, K) from first to second.
+    row_second·x_second. `normal` (d, K) from first to second. `where` (K,) int64: at which end or middle the two
+    cells touch, 0 … 8, so that a contact at another place of the same pair is told apart.
     """
 
     first: Tensor
@@ -47,13 +48,14 @@ class Contacts:
     row_first: Tensor
     row_second: Tensor
     normal: Tensor
+    where: Tensor
 
     def take(self, index: Tensor) -> Contacts:
         """The rows at `index`."""
         pick = lambda x: x.index_select(0, index)  # noqa: E731
         return Contacts(
             pick(self.first), pick(self.second), pick(self.gap), pick(self.weight),
-            pick(self.row_first), pick(self.row_second), self.normal.index_select(1, index),
+            pick(self.row_first), pick(self.row_second), self.normal.index_select(1, index), pick(self.where),
         )  # fmt: skip
 
 
@@ -123,7 +125,9 @@ def contact_points(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor, Tensor, Tensor
     low = torch.maximum(-a.half * project, offset - b.half * project)
     high = torch.minimum(a.half * project, offset + b.half * project)
     line = (slide > 0) & (high > low)
-    slide = torch.where(line, slide, 0.0) ** 2
+    # a line shorter than the cells are thick counts as less of one, so that it ends as smoothly as it turns away
+    share = ((high - low) / (0.5 * (a.radius + b.radius))).clamp(max=1.0)
+    slide = torch.where(line, slide * slide * share, 0.0)
     s_all, t_all, end_a, end_b = [], [], [], []
     for at in (low, high):
         s1 = _clamp(at / project, a.half)
@@ -141,22 +145,30 @@ def _end(s: Tensor, half: Tensor) -> Tensor:
     return (s >= half - slack).to(s.dtype) - (s <= slack - half).to(s.dtype)
 
 
-def find_contacts(bodies: Bodies, first: Tensor, second: Tensor) -> Contacts:
-    """All rows that overlap (gap < 0) among the given pairs (P,), (P,)."""
+def find_contacts(bodies: Bodies, first: Tensor, second: Tensor, whole_lines: bool = False) -> Contacts:
+    """All rows that overlap (gap < 0) among the given pairs (P,), (P,). whole_lines: both ends of a line of contact if one of them overlaps,
+    so that a solve in which contacts only push sees what it would push the other end into."""
     a, b = bodies.take(first), bodies.take(second)
     s, t, end_a, end_b, line = contact_points(a, b)
     # cull before the expensive part, without a gradient: a point row for every pair, a second one where there is a line
     with torch.no_grad():
         gap0 = _gap(a, b, s[0], t[0])
         gap1 = _gap(a, b, s[1], t[1])
-        keep0 = torch.nonzero(gap0 < 0).squeeze(1)
-        keep1 = torch.nonzero(line & (gap1 < 0)).squeeze(1)
+        deep0, deep1 = gap0 < 0, line & (gap1 < 0)
+        either = line & (deep0 | deep1) & whole_lines
+        keep0, keep1 = torch.nonzero(deep0 | either).squeeze(1), torch.nonzero(deep1 | either).squeeze(1)
     keep = torch.cat([keep0, keep1])
     which = lambda x: torch.cat([x[0].index_select(0, keep0), x[1].index_select(0, keep1)])  # noqa: E731
-    a, b = a.take(keep), b.take(keep)
-    row = _rows(a, b, which(s), which(t), which(end_a), which(end_b))
+    a, b, s, t = a.take(keep), b.take(keep), which(s), which(t)
+    row = _rows(a, b, s, t, which(end_a), which(end_b))
+    where = 3 * _third(s, a.half) + _third(t, b.half)
     weight = torch.where(line.index_select(0, keep), 0.5, 1.0).to(row[0].dtype)
-    return Contacts(first.index_select(0, keep), second.index_select(0, keep), row[0], weight, *row[1:])
+    return Contacts(first.index_select(0, keep), second.index_select(0, keep), row[0], weight, *row[1:], where)
+
+
+def _third(s: Tensor, half: Tensor) -> Tensor:
+    """0, 1 or 2 for a point near the −axis end, in the middle, near the +axis end."""
+    return torch.round(s.detach() / half.detach().clamp(min=1e-9)).clamp(-1, 1).long() + 1
 
 
 def _gap(a: Bodies, b: Bodies, s: Tensor, t: Tensor) -> Tensor:

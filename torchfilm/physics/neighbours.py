@@ -26,7 +26,7 @@ CLASS_RATIO = 4.0
 
 
 @torch.no_grad()
-def find_pairs(position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float) -> tuple[Tensor, Tensor]:
+def find_pairs(position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float = 0.0) -> tuple[Tensor, Tensor]:
     """Pairs (i, j), i ≠ j, of one colony, whose bounding spheres and bounding boxes come within `margin` µm of each other.
 
     position, axis (N, d) µm and unit; length, radius (N,) µm; colony (N,) int64. Every pair stands once; no pair whose

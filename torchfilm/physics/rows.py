@@ -52,6 +52,17 @@ class ContactRows:
         torch.mul(self.row_wall, wall, out=self._work[2 * self.pairs :])
         return self.half_rows.sum_into(self._work, e.new_empty(self.cells, width))
 
+    def sizes_of(self, x: Tensor) -> Tensor:
+        """|J| |x|: (N, D) -> (R,)."""
+        pick = lambda row, cell: (row.abs() * x.abs().index_select(0, cell)).sum(1)  # noqa: E731
+        return torch.cat([pick(self.row_first, self.first) + pick(self.row_second, self.second), pick(self.row_wall, self.at_wall)])
+
+    def transpose_of_sizes(self, e: Tensor) -> Tensor:
+        """|J|ᵀ |e|: (R,) -> (N, D)."""
+        pair, wall = e.abs().unsqueeze(1)[: self.pairs], e.abs().unsqueeze(1)[self.pairs :]
+        parts = torch.cat([self.row_first.abs() * pair, self.row_second.abs() * pair, self.row_wall.abs() * wall])
+        return self.half_rows.sum_into(parts, parts.new_empty(self.cells, parts.shape[1]))
+
     def blocks(self, active: Tensor) -> Tensor:
         """The diagonal blocks of Jᵀ diag(active) J: (R,) -> (N, D, D)."""
         width = self.row_first.shape[1]

@@ -25,8 +25,13 @@ from torchfilm.tools.ragged import Groups
 
 Map = Callable[[Tensor], Tensor]
 
-CONVERGED, ITERATION_LIMIT, NOT_FINITE = 0, 1, 2
-STATUS = {CONVERGED: "converged", ITERATION_LIMIT: "iteration limit", NOT_FINITE: "not finite"}
+CONVERGED, ITERATION_LIMIT, NOT_FINITE, TOO_FAST = 0, 1, 2, 3
+STATUS = {
+    CONVERGED: "converged",
+    ITERATION_LIMIT: "reached its iteration limit",
+    NOT_FINITE: "is not finite",
+    TOO_FAST: "would have to follow too much growth in one step",
+}
 
 # The share of the present residual that one Newton step's CG is asked to leave, where contacts may switch.
 FORCING = 0.1
@@ -37,7 +42,7 @@ HALVINGS = 8
 @dataclass(frozen=True)
 class SolveReport:
     """For each colony, (B,): `status` (see STATUS), CG `iterations`, and the true `residual`, recomputed from x: the worst
-    preconditioned residual over the worst at x = 0."""
+    preconditioned residual over the worst at x = 0 (or, where opposing forces cancel, over the least that rounding resolves)."""
 
     status: Tensor
     iterations: Tensor
@@ -119,13 +124,22 @@ def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, m
         active = problem.acting(after)
     target = tolerance * scale
     iterations = torch.zeros(colonies.size, dtype=torch.int64, device=y.device)
-    for _ in range(NEWTON_LIMIT):
+    previous = torch.full_like(scale, torch.inf)
+    for number in range(NEWTON_LIMIT + 1):
         gradient = problem.gradient(y, after * active)
         free = _free(y, gradient, problem.lower)
         worst = worst_of(precondition(gradient * free) * free, colonies)
         going = (worst > target) & (worst < torch.inf) & (iterations < max_iterations)
-        if not bool(going.any()):
+        stalled = going & (worst > 0.9 * previous)
+        if bool(stalled.any()):
+            # opposing forces on a cell may leave less at rest than rounding lets anyone resolve
+            least = _rounding(problem, precondition, y) / tolerance
+            scale = torch.where(stalled, torch.maximum(scale, least), scale)
+            target = tolerance * scale
+            going = going & (worst > target)
+        if number == NEWTON_LIMIT or not bool(going.any()):
             break
+        previous = worst
         least = torch.maximum(0.5 * target, FORCING * worst) if problem.unilateral else 0.5 * target
         inner = torch.where(going, least, torch.inf)
         result = conjugate_gradients(_operator(problem, active, free), -gradient * free, _within(free, precondition), colonies, inner, max_iterations)
@@ -136,6 +150,12 @@ def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, m
     status = torch.where(worst < torch.inf, status, NOT_FINITE)
     residual = worst / torch.where(still, 1.0, scale)
     return y, free, active, SolveReport(status, iterations, residual), precondition
+
+
+def _rounding(problem: ContactProblem, precondition: Map, y: Tensor) -> Tensor:
+    """The residual that rounding alone may leave in each colony, (B,): a few units in the last place of the forces on a cell, opposing ones not set off."""
+    forces = problem.rows.transpose_of_sizes(problem.gap.abs() + problem.rows.sizes_of(y)) + problem.alpha * y.abs()
+    return 2 * torch.finfo(y.dtype).eps * worst_of(precondition(forces), problem.colonies)
 
 
 def _within(free: Tensor, precondition: Map) -> Map:

@@ -44,8 +44,8 @@ def words(seed: int, colony: Tensor, uid: Tensor, step: int, purpose: str) -> tu
 def uniform(seed: int, colony: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:
     """One draw per cell from the open interval (0, 1)."""
     w = words(seed, colony, uid, step, purpose)
-    # 24 bits fill a float32; half a unit keeps the draw off both ends
-    return ((w[0] >> 8).to(torch.float64) + 0.5).mul(2.0**-24).to(dtype)
+    # 23 bits and half a unit: the most that a float32 holds without rounding a draw to 1
+    return ((w[0] >> 9).to(torch.float64) + 0.5).mul(2.0**-23).to(dtype)
 
 
 def normal(seed: int, colony: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:

@@ -1,0 +1,162 @@
+"""Who may import whom. The imports are read, not run, and the test fails where a lower room imports a higher one."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import torchfilm
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "torchfilm"
+
+
+@dataclass(frozen=True)
+class Room:
+    """A room of the package: its level, and the modules in it (a package stands for all its modules)."""
+
+    level: int
+    modules: tuple[str, ...]
+    # modules of a higher room that this one may use all the same
+    besides: tuple[str, ...] = ()
+    # may its modules import each other?
+    talk: bool = True
+
+
+# To add a room, or a module to one, write it here. A module that is not listed belongs to the last.
+ROOMS = {
+    "tools": Room(0, ("torchfilm.tools", "torchfilm.version")),
+    # a state tells its cells' volume and area, so it knows the capsule
+    "state": Room(1, ("torchfilm.state",), besides=("torchfilm.physics.capsule",)),
+    "effect": Room(2, ("torchfilm.effect",)),
+    "kernels": Room(3, ("torchfilm.physics", "torchfilm.signals", "torchfilm.circuits")),
+    "effects": Room(4, ("torchfilm.effects",), talk=False),
+    "scene": Room(5, ("torchfilm.scene", "torchfilm.cells")),
+    "simulate": Room(6, ("torchfilm.simulate",)),
+    "the rest": Room(7, ("torchfilm",)),
+}
+# Kernels take tensors: they never see a state, nor what is built on one.
+TENSORS_ONLY = "kernels"
+NOT_FOR_KERNELS = ("torchfilm.state", "torchfilm.effect")
+
+
+def name_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {name_of(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def within(module: str, package: str) -> bool:
+    return module == package or module.startswith(package + ".")
+
+
+def room_of(module: str) -> str:
+    """The room with the longest name that fits."""
+    fits = [(len(m), room) for room, r in ROOMS.items() for m in r.modules if within(module, m)]
+    return max(fits)[1]
+
+
+def imports(source: str, module: str, is_package: bool = False) -> set[str]:
+    """Every module of the package that the source imports, at the top, in a function or under TYPE_CHECKING."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = module.split(".") if is_package else module.split(".")[:-1]
+                above = above[: len(above) - (node.level - 1)]
+                base = ".".join([*above, *([base] if base else [])])
+            # `from torchfilm.tools import checks` imports a module, `from torchfilm.state import State` a name
+            found |= {f"{base}.{alias.name}" if f"{base}.{alias.name}" in MODULES else base for alias in node.names}
+    return {name for name in found if within(name, "torchfilm")}
+
+
+def crossings(module: str, imported: set[str]) -> list[str]:
+    """What is wrong with what a module imports."""
+    name, wrong = room_of(module), []
+    room = ROOMS[name]
+    for other in sorted(imported - {module}):
+        there = room_of(other)
+        if ROOMS[there].level > room.level and other not in room.besides:
+            wrong.append(f"{module} ({name}, level {room.level}) imports {other} ({there}, level {ROOMS[there].level})")
+        elif there == name and not room.talk and other not in room.modules:
+            wrong.append(f"{module} imports {other}: {name} never import each other")
+        elif name == TENSORS_ONLY and any(within(other, m) for m in NOT_FOR_KERNELS):
+            wrong.append(f"{module} imports {other}: kernels take tensors, never a state")
+    return wrong
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_room_imports_a_higher_one(module):
+    path = MODULES[module]
+    assert crossings(module, imports(path.read_text(), module, path.name == "__init__.py")) == []
+
+
+@pytest.mark.parametrize(
+    "module, source",
+    [
+        ("torchfilm.tools.checks", "from torchfilm.state import State"),
+        ("torchfilm.state", "from torchfilm import scene"),
+        ("torchfilm.state", "from torchfilm.physics.contacts import Bodies"),
+        ("torchfilm.physics.walls", "from torchfilm.state import State"),
+        ("torchfilm.physics.walls", "def f():\n    import torchfilm.effect"),
+        ("torchfilm.effects.growth", "from torchfilm.effects.division import Division"),
+        ("torchfilm.effects.growth", "from .division import Division"),
+        ("torchfilm.effects.growth", "from torchfilm.effects import division"),
+        ("torchfilm.effects.growth", "import torchfilm"),
+        ("torchfilm.scene", "if TYPE_CHECKING:\n    from torchfilm.simulate import simulate"),
+        ("torchfilm.simulate", "from torchfilm import cli"),
+    ],
+)
+def test_crossings_are_noticed(module, source):
+    assert len(crossings(module, imports(source, module))) == 1
+
+
+@pytest.mark.parametrize(
+    "module, source",
+    [
+        ("torchfilm.state", "from torchfilm.physics import capsule\nfrom torchfilm.tools import checks, random"),
+        ("torchfilm.effects.growth", "import torch\nfrom torchfilm.effect import Effect\nfrom torchfilm.physics import capsule"),
+        ("torchfilm.physics.solve", "from torchfilm.physics.rows import ContactRows\nfrom torchfilm.tools.cg import worst_of"),
+        ("torchfilm.cli", "from torchfilm import scenes, measure\nfrom torchfilm.simulate import simulate"),
+    ],
+)
+def test_what_is_allowed_passes(module, source):
+    assert crossings(module, imports(source, module)) == []
+
+
+def test_design_uses_public_names_only():
+    """design/ is written as its users would write: `import torchfilm as tf`, or names that the package lists as its own."""
+    wrong = []
+    for path in sorted((ROOT / "design").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names = [a.name for a in node.names if a.name.startswith("torchfilm.")]
+            elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "torchfilm":
+                names = [a.name for a in node.names if node.module != "torchfilm" or a.name not in torchfilm.__all__]
+            else:
+                continue
+            wrong += [f"{path.relative_to(ROOT)}: {name}" for name in names]
+    assert wrong == []
+
+
+def test_public_names_exist():
+    assert [name for name in torchfilm.__all__ if not hasattr(torchfilm, name)] == []
+    assert len(set(torchfilm.__all__)) == len(torchfilm.__all__)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_files_are_small_enough_to_read(module):
+    """Files up to about 400 lines, functions up to about 60: a tenth more is not a tenth too many."""
+    source = MODULES[module].read_text()
+    assert len(source.splitlines()) <= 440
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            assert node.end_lineno - node.lineno + 1 <= 66, f"{module}.{node.name}"

@@ -1,0 +1,222 @@
+"""Pictures: outlines of capsules, sheets of colonies, and what cannot be drawn."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.pictures import frame_of, outlines, sheet
+
+
+def outline(axis, length=2.0, radius=0.5, position=(0.0, 0.0)) -> np.ndarray:
+    """One polygon, (2·CAP_POINTS, 2)."""
+    return outlines(np.array([position]), np.array([axis], dtype=float), np.array([length]), np.array([radius]))[0]
+
+
+def area(polygon: np.ndarray) -> float:
+    """Signed, by the shoelace formula."""
+    x, y = polygon.T
+    return 0.5 * float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
+
+
+def distance_to_segment(points: np.ndarray, half: float, axis: np.ndarray) -> np.ndarray:
+    s = np.clip(points @ axis, -half, half)
+    return np.linalg.norm(points - s[:, None] * axis, axis=1)
+
+
+# --- outlines -------------------------------------------------------------------------------------------------------------
+
+
+def test_an_upright_cell_is_a_circle():
+    """Seen end on: every point of the outline lies at the radius, whatever the length, and all around."""
+    polygon = outline((0.0, 0.0), length=7.0, radius=0.4, position=(3.0, -2.0))
+    from_centre = polygon - (3.0, -2.0)
+    assert np.allclose(np.linalg.norm(from_centre, axis=1), 0.4, rtol=1e-12)
+    angles = np.sort(np.arctan2(from_centre[:, 1], from_centre[:, 0]))
+    assert np.diff(angles).max() < math.pi / 5
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, math.pi / 2, 2.5, math.pi])
+def test_a_lying_cell_is_a_capsule(angle):
+    axis = np.array([math.cos(angle), math.sin(angle)])
+    polygon = outline(axis, 3.0, 0.5)
+    assert np.allclose(distance_to_segment(polygon, 1.5, axis), 0.5, rtol=1e-12), "points of the outline lie at the radius"
+    assert (polygon @ axis).max() == pytest.approx(2.0) and (polygon @ axis).min() == pytest.approx(-2.0)
+    # rectangle 2rl and two half circles, as polygons of the 6 chords that 7 points make: 2 · 6 · ½ r² sin 30° = 3 r²
+    assert abs(area(polygon)) == pytest.approx(2 * 0.5 * 3.0 + 3 * 0.25, rel=1e-12), "or the polygon crosses itself"
+
+
+def test_a_tilted_cell_is_foreshortened():
+    """Half out of the plane: the projection of the centreline is half as long, the caps are as round as ever."""
+    assert abs(area(outline((0.5, 0.0), 3.0, 0.5))) == pytest.approx(2 * 0.5 * 1.5 + 3 * 0.25, rel=1e-12)
+
+
+def test_many_outlines_at_once_are_each_their_own():
+    rng = np.random.default_rng(0)
+    position, axis, length, radius = rng.normal(size=(5, 2)), rng.normal(size=(5, 2)), rng.uniform(0, 3, 5), rng.uniform(0.3, 1, 5)
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True) * 1.3
+    together = outlines(position, axis, length, radius)
+    assert together.shape[0] == 5
+    for k in range(5):
+        assert np.array_equal(together[k], outlines(*(x[k : k + 1] for x in (position, axis, length, radius)))[0])
+    assert np.isfinite(outlines(position, 0 * axis, 0 * length, radius)).all()
+
+
+# --- sheets ---------------------------------------------------------------------------------------------------------------
+
+
+def cells_of(state: tf.State) -> dict[str, np.ndarray]:
+    return frame_of(state)
+
+
+@pytest.fixture(scope="module")
+def grown() -> tf.State:
+    scene = tf.scenes.microcolony(dim=3)
+    for state in tf.simulate(scene, scene.seed(3), until=3.0):  # noqa: B007
+        pass
+    return state
+
+
+def coloured(path) -> float:
+    """The share of the picture's pixels that are coloured, which only cells are."""
+    image = matplotlib.image.imread(path)[..., :3]
+    return float(((image.max(2) - image.min(2)) > 0.15).mean())
+
+
+@pytest.mark.parametrize("view", ["xy", "xz", "yz"])
+@pytest.mark.parametrize("colour", ["angle", "length", "uid", "growth_rate", "divide_flag"])
+def test_a_sheet_is_written(grown, tmp_path, view, colour):
+    path = sheet(cells_of(grown), tmp_path / "sheet.png", view=view, colour=colour, title="three colonies")
+    assert path == tmp_path / "sheet.png" and path.stat().st_size > 2000
+    assert coloured(path) > 0.01
+
+
+def test_a_frame_of_a_state_is_that_of_its_file(grown, tmp_path):
+    scene = tf.scenes.microcolony(dim=3)
+    for _ in tf.simulate(scene, grown, until=grown.time + 0.025, record=tf.Recorder(tmp_path / "run.h5", scene)):
+        pass
+    with tf.Results(tmp_path / "run.h5") as results:
+        recorded = results.frame(0)
+    made = cells_of(grown)
+    assert set(made) == set(recorded)
+    assert all(np.array_equal(made[n], recorded[n]) for n in made)
+
+
+def test_one_cell_is_as_large_as_it_should_be(tmp_path):
+    """A rod of 4 × 1 µm in a picture of its own: about its share of a square around it, and four times as wide as high."""
+    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 3.0)).seed()
+    path = sheet(cells_of(state), tmp_path / "one.png")
+    image = matplotlib.image.imread(path)[..., :3]
+    y, x = np.nonzero((image.max(2) - image.min(2)) > 0.15)
+    assert (np.ptp(x) + 1) / (np.ptp(y) + 1) == pytest.approx(4.0, rel=0.05), "the scale differs along x and y"
+
+
+@pytest.mark.parametrize("away", [(1e4, -1e4), (-50.0, 0.0), (0.0, 300.0)])
+def test_a_colony_far_from_the_origin_is_drawn(tmp_path, away):
+    near = tf.Cells([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]], [1.0, 0.0])
+    far = tf.Cells(near.position + np.array(away), [1.0, 0.0])
+    shares = []
+    for name, cells in (("near", near), ("far", far)):
+        state = tf.Scene(tf.Growth(), founders=cells).seed()
+        shares.append(coloured(sheet(cells_of(state), tmp_path / f"{name}.png")))
+    assert shares[0] > 0.02
+    assert shares[1] == pytest.approx(shares[0], rel=0.05), "it is the same colony and should look the same"
+
+
+def test_colonies_far_apart_are_each_in_the_middle_of_their_panel(tmp_path):
+    cells = tf.Cells([[0.0, 0.0], [500.0, 0.0]], [1.0, 0.0], colony=[0, 1])
+    one = tf.Cells([[0.0, 0.0]], [1.0, 0.0])
+    two = tf.Scene(tf.Growth(), founders=cells).seed()
+    both = tf.Scene(tf.Growth(), founders=one).seed(2)
+    shares = [coloured(sheet(cells_of(s), tmp_path / f"{k}.png")) for k, s in enumerate((two, both))]
+    assert shares[0] == pytest.approx(shares[1], rel=0.05)
+
+
+def test_a_colony_without_cells_is_left_out(grown, tmp_path):
+    gone = grown.remove(grown.colony == 1, "removed")
+    assert coloured(sheet(cells_of(gone), tmp_path / "sheet.png")) > 0.01
+
+
+def test_too_many_colonies_are_cut_and_it_is_said(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    titles = []
+    real = Figure.suptitle
+    monkeypatch.setattr(Figure, "suptitle", lambda self, text, **options: titles.append(text) or real(self, text, **options))
+    state = tf.Scene(tf.Growth(), founders=tf.Cells.single(2)).seed(40)
+    sheet(cells_of(state), tmp_path / "sheet.png", title="many")
+    sheet(cells_of(state), tmp_path / "few.png", title="few", most=4)
+    assert titles[0].startswith("many") and "first 36 of 40" in titles[0] and "first 4 of 40" in titles[1]
+
+
+def test_axes_of_a_2_d_state_need_no_third_coordinate(tmp_path):
+    state = tf.scenes.microcolony().seed(2)
+    assert coloured(sheet(cells_of(state), tmp_path / "sheet.png")) > 0.02
+
+
+# --- show -----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("pictures") / "run.h5"
+    scene = tf.scenes.microcolony()
+    for _ in tf.simulate(scene, scene.seed(2), until=3.0, record=path):
+        pass
+    return path
+
+
+def test_show_draws_the_last_frame_beside_the_file(recorded):
+    made = tf.show(recorded)
+    assert made == recorded.with_suffix(".png")
+    assert coloured(made) > 0.02
+
+
+def test_show_draws_any_frame_anywhere(recorded, tmp_path):
+    first, last = (tf.show(str(recorded), frame=k, out=tmp_path / f"{k}.png") for k in (0, -1))
+    assert first.read_bytes() != last.read_bytes()
+    assert tf.show(recorded, out=str(tmp_path / "a.svg")).read_text().lstrip().startswith("<?xml")
+
+
+def test_the_same_frame_makes_the_same_picture(recorded, tmp_path):
+    a, b = (matplotlib.image.imread(tf.show(recorded, out=tmp_path / f"{k}.png")) for k in "ab")
+    assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"colour": "nonsense"}, r"colour.*'nonsense'.*angle.*length"),
+        ({"colour": "position"}, r"colour.*'position'"),
+        ({"view": "up"}, r"view.*'up'.*'xy'"),
+        ({"view": "xz"}, r"view.*'xz'.*2-D"),
+        ({"frame": 99}, r"frame = 99"),
+    ],
+)
+def test_what_cannot_be_drawn_is_told(recorded, tmp_path, options, message):
+    with pytest.raises(tf.InputError, match=message):
+        tf.show(recorded, out=tmp_path / "a.png", **options)
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_a_frame_without_cells_is_told(tmp_path):
+    state = tf.scenes.microcolony().seed()
+    empty = state.remove(torch.tensor([True]), "removed")
+    with pytest.raises(tf.InputError, match="no cell"):
+        sheet(cells_of(empty), tmp_path / "a.png")
+
+
+def test_a_place_that_is_not_there_is_told(recorded, tmp_path):
+    with pytest.raises((tf.InputError, FileNotFoundError), match="nowhere"):
+        tf.show(recorded, out=tmp_path / "nowhere" / "a.png")
+
+
+def test_a_kind_of_picture_that_is_not_known_is_told(recorded, tmp_path):
+    with pytest.raises((tf.InputError, ValueError), match="nonsense"):
+        tf.show(recorded, out=tmp_path / "a.nonsense")

@@ -1,0 +1,316 @@
+"""The loop: where it ends, what it does when a solve fails, who is called, restarts and batches bit for bit."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.physics.solve import CONVERGED
+from torchfilm.state import PER_CELL
+
+
+def scene_of(**mechanics) -> tf.Scene:
+    return tf.Scene(tf.Growth(rate=tf.Uniform(0.8, 1.2)), tf.Division(length=tf.Uniform(3.0, 4.0)), tf.Mechanics(**{"dim": 2, **mechanics}), dt=0.05)
+
+
+def alone() -> tf.Scene:
+    return tf.Scene(tf.Growth(rate=1.0), dt=0.1)
+
+
+def assert_same(a: tf.State, b: tf.State) -> None:
+    for name in (*PER_CELL, "colony_id", "next_uid"):
+        assert torch.equal(getattr(a, name), getattr(b, name)), name
+    for name, value in a.fields.items():
+        assert torch.equal(value, b.fields[name]), name
+    assert (a.step, a.time) == (b.step, b.time)
+
+
+# --- where it ends --------------------------------------------------------------------------------------------------------
+
+
+def test_until_a_time():
+    scene = alone()
+    states = list(tf.simulate(scene, scene.seed(), until=1.0))
+    assert [s.step for s in states] == list(range(1, 11))
+    assert states[-1].time == pytest.approx(1.0, rel=1e-12)
+
+
+def test_dt_of_its_own():
+    scene = alone()
+    states = list(tf.simulate(scene, scene.seed(), until=1.0, dt=0.25))
+    assert [s.time for s in states] == [0.25, 0.5, 0.75, 1.0]
+
+
+def test_until_every_colony_has_so_many_cells():
+    scene = scene_of()
+    states = list(tf.simulate(scene, scene.seed(3), cells=8))
+    assert (states[-1].counts >= 8).all()
+    assert not (states[-2].counts >= 8).all(), "it should have stopped before"
+
+
+@pytest.mark.parametrize(("until", "cells", "by_time"), [(0.5, 1000, True), (50.0, 4, False)])
+def test_the_first_end_reached_ends_the_run(until, cells, by_time):
+    scene = scene_of()
+    last = list(tf.simulate(scene, scene.seed(2), until=until, cells=cells))[-1]
+    assert (last.time == pytest.approx(until, rel=1e-12)) == by_time
+    assert bool((last.counts >= cells).all()) != by_time
+
+
+def test_a_run_that_is_at_its_end_does_nothing():
+    scene = alone()
+    last = list(tf.simulate(scene, scene.seed(), until=0.5))[-1]
+    assert list(tf.simulate(scene, last, until=0.5)) == []
+    assert list(tf.simulate(scene, scene.seed(), cells=1)) == []
+
+
+@pytest.mark.parametrize(("dt", "until"), [(0.025, 0.5), (0.05, 3.0), (0.1, 0.8), (0.01, 1.0), (0.3, 2.7)])
+def test_an_end_that_has_been_reached_is_not_in_the_past(dt, until):
+    """Whatever rounding the time has gathered, a run to 0.5 h has reached 0.5 h."""
+    scene = alone()
+    last = list(tf.simulate(scene, scene.seed(), until=until, dt=dt))[-1]
+    assert list(tf.simulate(scene, last, until=until, dt=dt)) == []
+
+
+def test_many_steps_end_on_time():
+    """0.1 is not exact in binary: 1000 of them must still be 1000 steps."""
+    scene = tf.Scene(tf.Growth(rate=0.0))
+    last = list(tf.simulate(scene, scene.seed(), until=100.0, dt=0.1))[-1]
+    assert last.step == 1000 and last.time == pytest.approx(100.0, rel=1e-12)
+    assert len(list(tf.simulate(scene, last, until=100.3, dt=0.1))) == 3
+
+
+@pytest.mark.parametrize("until", [0.55, 1.01, 0.05])
+def test_an_end_between_two_steps_is_refused(until):
+    scene = alone()
+    with pytest.raises(tf.InputError, match=r"until.*whole number of steps.*0\.1"):
+        tf.simulate(scene, scene.seed(), until=until)
+
+
+def test_an_end_in_the_past_is_refused():
+    scene = alone()
+    last = list(tf.simulate(scene, scene.seed(), until=1.0))[-1]
+    with pytest.raises(tf.InputError, match=r"until.*at least"):
+        tf.simulate(scene, last, until=0.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({}, "end"),
+        ({"until": math.nan}, "until"),
+        ({"until": math.inf}, "until"),
+        ({"until": "long"}, "until"),
+        ({"cells": 0}, "cells"),
+        ({"cells": 2.5}, "cells"),
+        ({"cells": True}, "cells"),
+        ({"until": 1.0, "dt": 0.0}, "dt"),
+        ({"until": 1.0, "dt": -0.1}, "dt"),
+        ({"until": 1.0, "on_failure": "ignore"}, "on_failure"),
+    ],
+)
+def test_bad_options_are_refused_before_anything_runs(options, word):
+    scene = alone()
+    with pytest.raises(tf.InputError, match=word):
+        tf.simulate(scene, scene.seed(), **options)
+
+
+def test_a_state_of_another_scene_is_refused_before_anything_runs():
+    state = alone().seed(cells=tf.Cells.single(3))
+    with pytest.raises(tf.InputError, match="2-D"):
+        tf.simulate(scene_of(), state, until=1.0)
+    with pytest.raises(tf.InputError, match=r"divide_flag|division_threshold"):
+        tf.simulate(tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0)), state, until=1.0)
+    with pytest.raises(tf.InputError, match="displacement"):
+        tf.simulate(tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=3)), state, until=1.0)
+
+
+# --- failures -------------------------------------------------------------------------------------------------------------
+
+
+def lonely_and_crowded() -> tf.Cells:
+    """Colonies 0 and 2: one cell, at rest. Colony 1: a heap that no solve settles in one iteration."""
+    heap = [[0.3 * k, 0.45 * (k % 3)] for k in range(8)]
+    position = [[0.0, 0.0], *heap, [0.0, 0.0]]
+    axis = [[1.0, 0.0], *([math.cos(k), math.sin(k)] for k in range(8)), [1.0, 0.0]]
+    return tf.Cells(position, axis, 2.0, colony=[0] + [1] * 8 + [2])
+
+
+def failing() -> tuple[tf.Scene, tf.State]:
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6), dt=0.1)
+    return scene, scene.seed(cells=lonely_and_crowded())
+
+
+def test_a_failed_solve_is_raised_and_names_the_colony():
+    scene, state = failing()
+    with pytest.raises(tf.SimulationError, match=r"1 of 3 colonies.*\n.*colony 1 \(8 cells\).*iteration limit") as caught:
+        list(tf.simulate(scene, state, until=1.0))
+    assert caught.value.colonies == (1,)
+    assert "colony 0" not in str(caught.value)
+
+
+def test_a_selected_colony_is_named_by_its_own_id():
+    scene, state = failing()
+    with pytest.raises(tf.SimulationError) as caught:
+        list(tf.simulate(scene, state.select([2, 1]), until=1.0))
+    assert caught.value.colonies == (1,)
+
+
+def test_all_failed_colonies_are_named_at_once():
+    scene, _ = failing()
+    heap = lonely_and_crowded()
+    three = scene.seed(3, cells=tf.Cells(heap.position[1:9], heap.axis[1:9], 2.0))
+    with pytest.raises(tf.SimulationError, match="3 of 3") as caught:
+        list(tf.simulate(scene, three, until=1.0))
+    assert caught.value.colonies == (0, 1, 2)
+
+
+def test_dropping_a_failed_colony_goes_on_with_the_others(tmp_path):
+    scene, state = failing()
+    states = list(tf.simulate(scene, state, until=1.0, on_failure="drop", record=tmp_path / "run.h5"))
+    assert len(states) == 10 and states[0].counts.tolist() == [1, 0, 1] and states[-1].counts.tolist() == [1, 0, 1]
+    (note,) = states[0].ended
+    assert note.fate == "failed" and note.colony_id.tolist() == [1] * 8 and note.uid.tolist() == list(range(8))
+    others = list(tf.simulate(scene, state.select([0, 2]), until=1.0))[-1]
+    assert torch.equal(states[-1].length, others.length), "the others go on as if it had not been there"
+    with tf.Results(tmp_path / "run.h5") as results:
+        found = results.lineage()
+    assert found["fate"].tolist() == ["alive"] + ["failed"] * 8 + ["alive"]
+    assert found["ended"].tolist() == [-1] + [1] * 8 + [-1]
+
+
+def with_nan(state: tf.State, colony: int) -> tf.State:
+    position = state.position.clone()
+    position[int(torch.nonzero(state.colony == colony)[0]), 0] = math.nan
+    return state.replace(position=position)
+
+
+@pytest.mark.parametrize("unilateral", [False, True])
+def test_a_colony_that_is_not_finite_fails_alone(unilateral, dtype):
+    """NaN in one of three colonies: it is named, and dropped the other two go on to the same bits as without it."""
+    scene = scene_of(unilateral=unilateral)
+    good = list(tf.simulate(scene, scene.seed(3, dtype=dtype), until=2.0))[-1]
+    assert (good.counts >= 4).all()
+    with pytest.raises(tf.SimulationError, match=r"colony 1 .*not finite") as caught:
+        list(tf.simulate(scene, with_nan(good, 1), until=2.5))
+    assert caught.value.colonies == (1,)
+    dropped = list(tf.simulate(scene, with_nan(good, 1), until=2.5, on_failure="drop"))[-1]
+    assert dropped.counts[1] == 0
+    alone = list(tf.simulate(scene, good.select([0, 2]), until=2.5))[-1]
+    assert_same(dropped.select([0, 2]), alone.select([0, 1]))
+    assert torch.isfinite(dropped.position).all()
+
+
+def test_a_failed_step_says_what_may_help():
+    scene, state = failing()
+    with pytest.raises(tf.SimulationError, match=r"smaller dt.*on_failure"):
+        list(tf.simulate(scene, state, until=1.0))
+
+
+def test_a_healthy_run_reports_every_colony_converged():
+    scene = scene_of()
+    for state in tf.simulate(scene, scene.seed(4), until=2.0):
+        report = state.reports["mechanics"]
+        assert (report.status == CONVERGED).all() and report.status.shape == (4,)
+
+
+# --- observers and timings ------------------------------------------------------------------------------------------------
+
+
+def test_observers_see_the_first_state_and_every_step_in_order():
+    scene, seen = alone(), []
+    first = scene.seed()
+    yielded = list(tf.simulate(scene, first, until=0.3, observers=[lambda s: seen.append(("a", s)), lambda s: seen.append(("b", s))]))
+    assert [name for name, _ in seen] == ["a", "b"] * 4
+    assert [s for name, s in seen if name == "a"] == [first, *yielded]
+
+
+def test_an_observers_error_closes_the_file(tmp_path):
+    def fail(state):
+        if state.step == 2:
+            raise RuntimeError("no luck")
+
+    scene = alone()
+    with pytest.raises(RuntimeError, match="no luck"):
+        list(tf.simulate(scene, scene.seed(), until=1.0, record=tmp_path / "run.h5", observers=[fail]))
+    with tf.Results(tmp_path / "run.h5") as results:
+        assert results.steps.tolist() == [0, 2], "what was done until then is kept"
+
+
+def test_timings_are_filled(tmp_path):
+    timings, scene = tf.Timings(), scene_of()
+    list(tf.simulate(scene, scene.seed(), until=0.5, timings=timings, record=tmp_path / "run.h5"))
+    assert set(timings.seconds) == {"division", "growth", "mechanics", "recording"}
+    assert all(0 < s < 60 for s in timings.seconds.values())
+
+
+def test_nothing_runs_before_the_first_state_is_asked_for(tmp_path):
+    scene = alone()
+    run = tf.simulate(scene, scene.seed(), until=1.0, record=tmp_path / "run.h5")
+    assert not (tmp_path / "run.h5").exists()
+    next(run)
+    assert (tmp_path / "run.h5").exists()
+
+
+# --- restarts and batches -------------------------------------------------------------------------------------------------
+
+
+def every_step(scene: tf.Scene, state: tf.State, until: float) -> list[tf.State]:
+    return [state, *tf.simulate(scene, state, until=until)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"unilateral": True}, {"dim": 3}], ids=["bilateral", "unilateral", "3-D"])
+def test_going_on_from_any_state_is_bit_for_bit_the_same(options):
+    """From every tenth step, cells that are just due to divide included; through a fresh scene, as after a restart."""
+    scene = scene_of(**options)
+    states = every_step(scene, scene.seed(2, seed=5), 3.0)
+    assert states[-1].cells > 12
+    starts = {10, 25, 40, 55} | {s.step for s in states[:-1] if bool((s.length >= s.division_threshold).any())}
+    for start in sorted(starts)[:8]:
+        again = list(tf.simulate(scene_of(**options), states[start], until=3.0))[-1]
+        assert_same(again, states[-1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"unilateral": True}, {"dim": 3}], ids=["bilateral", "unilateral", "3-D"])
+def test_one_by_one_equals_the_batch_bit_for_bit(options, dtype):
+    scene = scene_of(**options)
+    first = scene.seed(4, seed=2, dtype=dtype)
+    batch = list(tf.simulate(scene, first, until=2.5))[-1]
+    assert (batch.counts > 4).all()
+    for k in range(4):
+        alone = list(tf.simulate(scene, first.select([k]), until=2.5))[-1]
+        assert_same(alone, batch.select([k]))
+        for name in ("iterations", "residual", "passes", "substeps"):
+            assert torch.equal(getattr(alone.reports["mechanics"], name)[0], getattr(batch.reports["mechanics"], name)[k]), name
+
+
+def test_the_order_of_colonies_does_not_matter():
+    scene = scene_of()
+    first = scene.seed(4, seed=2)
+    batch = list(tf.simulate(scene, first, until=2.0))[-1]
+    shuffled = list(tf.simulate(scene, first.select([2, 0, 3, 1]), until=2.0))[-1]
+    assert_same(shuffled.select([1, 3, 0, 2]), batch.select([0, 1, 2, 3]))
+
+
+def test_a_smaller_batch_is_the_beginning_of_a_larger_one():
+    """Colony 0 … 2 of a batch of 5 are those of a batch of 3 with the same seed."""
+    scene = scene_of()
+    few, many = (list(tf.simulate(scene, scene.seed(n, seed=3), until=2.0))[-1] for n in (3, 5))
+    assert_same(many.select([0, 1, 2]), few.select([0, 1, 2]))
+
+
+def test_the_same_seed_twice_and_another_seed():
+    scene = scene_of()
+    a, b, c = (list(tf.simulate(scene, scene.seed(2, seed=s), until=2.0))[-1] for s in (1, 1, 2))
+    assert_same(a, b)
+    assert not torch.equal(a.length[:2], c.length[:2])
+
+
+def test_colonies_of_one_batch_differ():
+    scene = scene_of()
+    state = list(tf.simulate(scene, scene.seed(2), until=2.0))[-1]
+    assert not torch.equal(state.length[state.colony == 0][:2], state.length[state.colony == 1][:2])

@@ -1,0 +1,212 @@
+"""The state: a frozen flat batch; selecting, taking, removing, declaring, moving."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.state import PER_CELL
+
+
+def batch(counts: tuple[int, ...] = (2, 0, 3, 1), **options) -> tf.State:
+    """A bare state with colonies of these sizes; cell k of colony c stands at (10 c, k)."""
+    colony = [c for c, n in enumerate(counts) for _ in range(n)]
+    within = [k for n in counts for k in range(n)]
+    cells = tf.Cells([[10.0 * c, 1.0 * k] for c, k in zip(colony, within, strict=True)], [[1.0, 0.0]] * len(colony), colony=colony)
+    return tf.Scene(tf.Growth(rate=1.0), founders=cells).seed(len(counts), **options)
+
+
+def test_sizes():
+    state = batch()
+    assert (state.cells, state.colonies, state.dim) == (6, 4, 2)
+    assert state.counts.tolist() == [2, 0, 3, 1]
+    assert state.colony.tolist() == [0, 0, 2, 2, 2, 3]
+    assert state.uid.tolist() == [0, 1, 0, 1, 2, 0] and state.parent.tolist() == [-1] * 6
+    assert state.next_uid.tolist() == [2, 0, 3, 1]
+
+
+def test_dtype_and_device(device, dtype):
+    state = batch(device=device, dtype=dtype)
+    assert state.dtype == dtype and state.device.type == device.type
+    assert state.axis.dtype == state.radius.dtype == state.growth_rate.dtype == dtype
+    assert state.position.dtype == torch.float64, "positions keep their resolution far from the origin"
+    assert state.uid.dtype == state.colony.dtype == torch.int64
+
+
+def test_volume_and_area(dtype):
+    state = batch(dtype=dtype)
+    eps = 4 * torch.finfo(dtype).eps
+    assert float(state.volume[0]) == pytest.approx(math.pi * 0.25 * (2 + 2 / 3), rel=eps)
+    assert float(state.area[0]) == pytest.approx(2 * math.pi * 0.5 * 3, rel=eps)
+
+
+def test_frozen():
+    state = batch()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        state.length = state.length * 2
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        del state.uid
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        state.growth_rate = state.growth_rate * 2
+
+
+def test_fields_are_attributes_and_unknown_names_are_told():
+    state = batch()
+    assert state.growth_rate is state.fields["growth_rate"]
+    with pytest.raises(AttributeError, match=r"'grwth_rate'.*growth_rate, elongation"):
+        state.grwth_rate  # noqa: B018
+    assert not hasattr(state, "displacement")
+
+
+def test_replace_leaves_the_old_one():
+    state = batch()
+    new = state.replace(length=state.length * 2)
+    assert state.length[0] == 2 and new.length[0] == 4
+    assert new.uid is state.uid
+
+
+def test_counts_follow_a_replaced_colony():
+    """What a state works out once must not be carried over to another."""
+    state = batch((2, 2))
+    assert state.counts.tolist() == [2, 2]
+    assert state.take(torch.tensor([0, 2, 3])).counts.tolist() == [1, 2]
+
+
+# --- select, take, remove -------------------------------------------------------------------------------------------------
+
+
+def test_select_in_the_order_given():
+    part = batch().select([3, 0, 1])
+    assert part.counts.tolist() == [1, 2, 0] and part.colony.tolist() == [0, 1, 1]
+    assert part.position.tolist() == [[30.0, 0.0], [0.0, 0.0], [0.0, 1.0]]
+    assert part.colony_id.tolist() == [3, 0, 1] and part.next_uid.tolist() == [1, 2, 0]
+    assert part.own_colony_id.tolist() == [3, 0, 0]
+
+
+def test_select_of_a_selection_keeps_the_first_ids():
+    assert batch().select([3, 2, 0]).select([1]).colony_id.tolist() == [2]
+
+
+def test_select_takes_fields_per_colony_along():
+    field = tf.Field("medium", "of a colony", scope="colony", initial=lambda s, rows: rows.double() * 10)
+    part = batch().declare(field).select([2, 0])
+    assert part.medium.tolist() == [20.0, 0.0]
+    assert part.growth_rate.tolist() == [1.0] * 5
+
+
+def test_select_takes_tensors():
+    assert batch().select(torch.tensor([2])).counts.tolist() == [3]
+
+
+@pytest.mark.parametrize("places", [[4], [-1], [], [0, 0]])
+def test_select_refuses_places_that_are_not_there(places):
+    with pytest.raises(tf.InputError, match="colonies"):
+        batch().select(places)
+
+
+def test_take_keeps_every_colony():
+    part = batch().take(torch.tensor([1, 5]))
+    assert part.colonies == 4 and part.counts.tolist() == [1, 0, 0, 1]
+    assert part.uid.tolist() == [1, 0]
+
+
+def test_take_may_repeat_a_cell():
+    assert batch().take(torch.tensor([0, 0, 1])).position.tolist() == [[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]]
+
+
+def test_take_passes_gradients():
+    state = batch()
+    length = state.length.clone().requires_grad_()
+    state.replace(length=length).take(torch.tensor([0, 0, 3])).length.sum().backward()
+    assert length.grad.tolist() == [2.0, 0.0, 0.0, 1.0, 0.0, 0.0]
+
+
+def test_remove_notes_the_end():
+    state = batch()
+    gone = torch.tensor([False, True, False, False, True, False])
+    left = state.remove(gone, "removed")
+    assert left.cells == 4 and left.counts.tolist() == [1, 0, 2, 1]
+    assert left.uid.tolist() == [0, 0, 1, 0] and left.next_uid.tolist() == [2, 0, 3, 1], "ids are not given out again"
+    (note,) = left.ended
+    assert (note.fate, note.colony_id.tolist(), note.uid.tolist()) == ("removed", [0, 2], [1, 2])
+    again = left.remove(torch.tensor([True, False, False, False]), "left")
+    assert [n.fate for n in again.ended] == ["removed", "left"]
+
+
+def test_remove_nobody_is_the_same_state():
+    state = batch()
+    assert state.remove(torch.zeros(6, dtype=torch.bool), "removed") is state
+
+
+def test_remove_in_a_selection_names_the_colonies_own_ids():
+    (note,) = batch().select([3, 0]).remove(torch.tensor([True, False, False]), "left").ended
+    assert note.colony_id.tolist() == [3] and note.uid.tolist() == [0]
+
+
+# --- declare and with_fields ----------------------------------------------------------------------------------------------
+
+
+def test_declare_fields_of_every_kind():
+    state = batch()
+    state = state.declare(tf.Field("heat", "a number", initial=2.5))
+    state = state.declare(tf.Field("pair", "two numbers", shape=(2,), initial=1.0))
+    state = state.declare(tf.Field("kind", "a whole number", dtype=torch.int64, initial=3))
+    state = state.declare(tf.Field("plate", "per colony", scope="colony"))
+    state = state.declare(tf.Field("own", "worked out", initial=lambda s, rows: s.position[rows, 1]))
+    assert state.heat.tolist() == [2.5] * 6 and state.heat.dtype == state.dtype
+    assert state.pair.shape == (6, 2) and state.kind.dtype == torch.int64 and state.plate.shape == (4,)
+    assert state.own.tolist() == [0.0, 1.0, 0.0, 1.0, 2.0, 0.0] and state.own.dtype == state.dtype
+
+
+def test_declare_refuses_a_first_value_of_wrong_length():
+    with pytest.raises(tf.InputError, match="heat"):
+        batch().declare(tf.Field("heat", "three numbers", initial=lambda s, rows: torch.ones(3)))
+
+
+@pytest.mark.parametrize("name", ["length", "uid", "volume", "select", "fields", "two words", "3rd"])
+def test_field_names_that_cannot_be_used_are_refused(name):
+    with pytest.raises(tf.InputError, match=r"Field\.name"):
+        tf.Field(name, "no good")
+
+
+@pytest.mark.parametrize("options", [{"scope": "grid"}, {"at_division": "halve"}])
+def test_unknown_options_of_a_field_are_refused(options):
+    with pytest.raises(tf.InputError, match="heat"):
+        tf.Field("heat", "no good", **options)
+
+
+def test_with_fields_refuses_what_is_not_declared():
+    with pytest.raises(tf.InputError, match=r"'heat'.*growth_rate"):
+        batch().with_fields(heat=torch.zeros(6))
+
+
+# --- device and draws -----------------------------------------------------------------------------------------------------
+
+
+def test_to_moves_everything(device):
+    state = batch().to(device)
+    for name in (*PER_CELL, "colony_id", "next_uid"):
+        assert getattr(state, name).device.type == device.type
+    assert all(v.device.type == device.type for v in state.fields.values())
+    scene = tf.Scene(tf.Growth(rate=1.0), founders=tf.Cells.single(2))
+    assert scene.step(state, 0.1).length.device.type == device.type
+
+
+def test_draws_are_keyed_by_seed_colony_cell_step_and_purpose():
+    state = batch((2, 2))
+    rows = torch.arange(4)
+    drawn = state.uniform(rows, "test")
+    assert torch.unique(drawn).numel() == 4 and ((drawn > 0) & (drawn < 1)).all()
+    assert torch.equal(drawn, state.uniform(rows, "test")), "a draw is a function, not an event"
+    assert torch.equal(state.select([1]).uniform(torch.arange(2), "test"), drawn[2:])
+    assert torch.equal(state.uniform(torch.tensor([3]), "test"), drawn[3:])
+    for other in (state.uniform(rows, "another"), state.replace(step=1).uniform(rows, "test"), state.replace(seed=1).uniform(rows, "test")):
+        assert not (other == drawn).any()
+
+
+def test_repr_is_one_line_of_what_matters():
+    assert repr(batch()) == "State(4 colonies, 6 cells, 2-D, t = 0 h, step 0, float32 on cpu, fields: growth_rate, elongation)"

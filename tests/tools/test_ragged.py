@@ -1,0 +1,118 @@
+"""Sums and maxima over ragged groups, against plain loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from helpers import array
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchfilm.tools.ragged import Groups, expand_ranges, offsets
+
+
+def loop(owner: np.ndarray, size: int, value: np.ndarray, what, empty: float = 0.0) -> np.ndarray:
+    out = np.full((size, *value.shape[1:]), empty)
+    for k in range(size):
+        if (owner == k).any():
+            out[k] = what(value[owner == k], 0)
+    return out
+
+
+@settings(deadline=None, derandomize=True, max_examples=100)
+@given(
+    owner=st.lists(st.integers(0, 6), max_size=40),
+    more=st.integers(0, 3),
+    width=st.sampled_from([(), (1,), (3,), (2, 2)]),
+    in_order=st.booleans(),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+def test_sums_and_maxima_against_loops(owner, more, width, in_order, dtype):
+    """Groups without a row included, at the front, between and at the end. float32: forty terms of 1e-7."""
+    owner = np.array(sorted(owner) if in_order else owner, dtype=np.int64)
+    value = np.random.default_rng(len(owner)).normal(size=(len(owner), *width))
+    groups = Groups(torch.as_tensor(owner), 7 + more)
+    given_value = torch.as_tensor(value, dtype=dtype)
+    close = {torch.float32: 1e-5, torch.float64: 1e-13}[dtype]
+    found = groups.sum(given_value)
+    assert found.shape == (7 + more, *width) and found.dtype == dtype
+    assert np.abs(array(found) - loop(owner, 7 + more, value, np.sum)).max(initial=0) <= close
+    assert array(groups.counts).tolist() == np.bincount(owner, minlength=7 + more).tolist()
+    if width == ():
+        rounded = array(given_value)
+        assert (array(groups.max(given_value)) == loop(owner, 7 + more, rounded, np.max)).all()
+        assert (array(groups.max(given_value, empty=-5.0)) == loop(owner, 7 + more, rounded, np.max, -5.0)).all()
+        assert (groups.any(given_value > 1).numpy() == loop(owner, 7 + more, rounded > 1, np.max).astype(bool)).all()
+
+
+def test_no_rows_and_no_groups(device, dtype):
+    none = torch.zeros(0, dtype=torch.int64, device=device)
+    empty = torch.zeros(0, 3, dtype=dtype, device=device)
+    assert torch.equal(Groups(none, 4).sum(empty), torch.zeros(4, 3, dtype=dtype, device=device))
+    assert Groups(none, 0).sum(empty).shape == (0, 3)
+    assert torch.equal(Groups(none, 2).max(empty[:, 0], empty=7.0), torch.full((2,), 7.0, dtype=dtype, device=device))
+    assert not Groups(none, 3).any(none > 0).any()
+
+
+def test_maxima_of_negative_numbers_and_infinities(device, dtype):
+    """Zero has no part in it unless it is there; NaN comes out as NaN."""
+    groups = Groups(torch.tensor([0, 0, 1, 2, 2], device=device), 4)
+    found = groups.max(torch.tensor([-3.0, -1.0, -torch.inf, 1.0, torch.nan], dtype=dtype, device=device))
+    assert found[:2].tolist() == [-1.0, -torch.inf]
+    assert bool(found[2].isnan()) and float(found[3]) == 0.0
+
+
+@pytest.mark.parametrize("width", [(), (1,), (3,)])
+def test_gradient_of_a_sum(width):
+    owner = torch.tensor([2, 0, 2, 1, 2, 4])
+    value = torch.randn(6, *width, dtype=torch.float64, generator=torch.Generator().manual_seed(1), requires_grad=True)
+    assert torch.autograd.gradcheck(lambda v: Groups(owner, 5).sum(v), (value,))
+
+
+@pytest.mark.parametrize("width", [1, 3, 7, 28])
+@pytest.mark.parametrize("count", [1, 5, 63, 1000])
+def test_a_group_has_the_same_sum_in_any_company(device, dtype, width, count, deterministic):
+    """Bitwise: alone, behind others, in front of others, with its rows scattered among theirs; numbers of all sizes, so order shows."""
+    rng = np.random.default_rng(count + width)
+
+    def rows(n):
+        sized = rng.normal(size=(n, width)) * 10.0 ** rng.uniform(-6, 6, (n, 1))
+        return torch.as_tensor(sized, dtype=dtype, device=device)
+
+    def summed(owner, values, size, group):
+        return Groups(torch.as_tensor(np.array(owner), device=device), size).sum(values)[group]
+
+    mine = rows(count)
+    alone = summed(np.zeros(count, dtype=np.int64), mine, 1, 0)
+    for others in (1, 40, 5000):
+        strange = rows(others)
+        before = summed(np.r_[np.zeros(others, np.int64), np.ones(count, np.int64)], torch.cat([strange, mine]), 2, 1)
+        after = summed(np.r_[np.zeros(count, np.int64), 3 * np.ones(others, np.int64)], torch.cat([mine, strange]), 9, 0)
+        assert torch.equal(before, alone) and torch.equal(after, alone)
+        place = np.sort(rng.permutation(count + others)[:count])
+        owner, mixed = np.ones(count + others, np.int64), torch.empty(count + others, width, dtype=dtype, device=device)
+        owner[place] = 0
+        mixed[torch.as_tensor(owner == 0, device=device)], mixed[torch.as_tensor(owner == 1, device=device)] = mine, strange
+        assert torch.equal(summed(owner, mixed, 2, 0), alone)
+
+
+def test_not_a_number_stays_in_its_group(device, dtype):
+    value = torch.tensor([[1.0], [torch.nan], [2.0], [torch.inf]], dtype=dtype, device=device)
+    found = Groups(torch.tensor([0, 1, 0, 2], device=device), 4).sum(value).squeeze(1)
+    assert float(found[0]) == 3.0 and bool(found[1].isnan()) and bool(found[2].isinf()) and float(found[3]) == 0.0
+
+
+def test_offsets(device):
+    counts = torch.tensor([2, 0, 3], device=device)
+    assert offsets(counts).tolist() == [0, 2, 2, 5]
+    assert offsets(counts[:0]).tolist() == [0]
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(ranges=st.lists(st.tuples(st.integers(0, 20), st.integers(0, 6)), max_size=10))
+def test_expand_ranges(ranges):
+    start, count = (torch.tensor([r[k] for r in ranges], dtype=torch.int64) for k in range(2))
+    owner, value = expand_ranges(start, count)
+    expected = [(k, v) for k, (s, c) in enumerate(ranges) for v in range(s, s + c)]
+    assert list(zip(owner.tolist(), value.tolist(), strict=True)) == expected
