@@ -35,8 +35,10 @@ ROOMS = {
     "kernels": Room(3, ("torchfilm.physics", "torchfilm.signals", "torchfilm.circuits")),
     "effects": Room(4, ("torchfilm.effects",), talk=False),
     "scene": Room(5, ("torchfilm.scene", "torchfilm.cells")),
-    "simulate": Room(6, ("torchfilm.simulate",)),
-    "the rest": Room(7, ("torchfilm",)),
+    # simulate takes a path to record to, so results lie below it
+    "results": Room(6, ("torchfilm.results",)),
+    "simulate": Room(7, ("torchfilm.simulate",)),
+    "the rest": Room(8, ("torchfilm",)),
 }
 # Kernels take tensors: they never see a state, nor what is built on one.
 TENSORS_ONLY = "kernels"

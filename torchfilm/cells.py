@@ -90,6 +90,11 @@ class Cells:
         return self.position.shape[0]
 
     @property
+    def colonies(self) -> int:
+        """How many colonies the cells name, at least; 1 if they name none."""
+        return int(self.colony.max()) + 1 if self.colony is not None and self.count else 1
+
+    @property
     def dim(self) -> int:
         return self.position.shape[1]
 
@@ -99,7 +104,7 @@ class Cells:
             index = np.tile(np.arange(self.count), colonies)
             colony = np.repeat(np.arange(colonies), self.count)
         else:
-            greatest = int(self.colony.max()) + 1 if self.count else 0
+            greatest = self.colonies
             if colonies not in (1, greatest) and colonies < greatest:
                 raise checks.refuse("colonies", colonies, f"at least {greatest}, since the cells name colony {greatest - 1}")
             colonies = max(colonies, greatest)
@@ -144,6 +149,9 @@ class Cells:
         cell_type, colony; any other column becomes a field.
         """
         left = dict(columns)
+        sizes = {n: len(v) for n, v in left.items()}
+        if len(set(sizes.values())) > 1:
+            raise checks.InputError(f"{source}: all columns must be equally long; they are {', '.join(f'{n} {k}' for n, k in sizes.items())}.")
         dim = 3 if "z" in left else 2
         missing = [n for n in POSITION[:dim] if n not in left] + [n for n in ("length",) if n not in left]
         if missing:
@@ -162,12 +170,18 @@ class Cells:
     @staticmethod
     def from_csv(path: str | Path) -> Cells:
         """From a CSV file with a header line; columns as in `from_table`."""
-        with open(path, newline="") as file:
-            reader = csv.DictReader(file)
-            rows = list(reader)
-            names = reader.fieldnames or []
-        columns: dict[str, list[float]] = {n: [] for n in names}
-        for number, row in enumerate(rows, start=2):
+        columns: dict[str, list[float]] = {}
+        with _readable(path, "r", encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            names = [n.strip() for n in reader.fieldnames or []]
+            reader.fieldnames = names
+            columns = {n: [] for n in names}
+            rows = [(reader.line_num, row) for row in reader]
+        for number, row in rows:
+            if None in row:
+                raise checks.InputError(
+                    f"{path}, line {number}: more values than the {len(names)} columns of the header. Decimal commas? Write decimal points."
+                )
             for name in names:
                 try:
                     columns[name].append(float(row[name]))
@@ -180,7 +194,13 @@ class Cells:
         """From an HDF5 file with one data set a column (as in `from_table`) in `group`."""
         import h5py
 
-        with h5py.File(path, "r") as file:
+        with _readable(path, "rb"):
+            pass
+        try:
+            opened = h5py.File(path, "r")
+        except OSError as error:
+            raise checks.InputError(f"{path} cannot be read as HDF5 ({error}).") from error
+        with opened as file:
             if group not in file:
                 raise checks.refuse("group", group, f"a group of {path}")
             columns = {n: np.asarray(d) for n, d in file[group].items() if isinstance(d, h5py.Dataset)}
@@ -188,6 +208,13 @@ class Cells:
 
 
 CELL_TYPE = Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64)
+
+
+def _readable(path: str | Path, mode: str, **options: Any) -> Any:
+    try:
+        return open(path, mode, **options)
+    except OSError as error:
+        raise checks.InputError(f"{path} cannot be read: {error.strerror or error}.") from error
 
 
 def _array(name: str, given: Any, dtype: type) -> np.ndarray:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ast
+import inspect
+import signal
 import sys
+import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,7 +76,10 @@ class Run:
         if start is not None:
             report_overlaps(start)
         out = self.out if self.out is not None else Path(f"{scene.name}.h5")
-        out.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise checks.refuse("--out", str(out), "in a folder that can be made", f"{error.strerror}.") from error
         recorder = Recorder(out, scene, every=self.every, overwrite=self.overwrite)
         go(scene, state, recorder, cells=cells, until=self.until, dt=self.dt, watch=self.watch, picture=self.picture)
 
@@ -102,7 +108,7 @@ class Resume:
             raise InputError("resume needs an end: --cells or --until.")
         with Results(self.file) as results:
             if self.scene is not None:
-                scene = load_scene(str(self.scene), {})
+                scene = load_scene(str(self.scene), results.settings)
             elif results.recipe is not None:
                 scene = scenes.build(*results.recipe)
             else:
@@ -142,10 +148,10 @@ class Info:
     """Parameters of the scene, as NAME=VALUE."""
 
     def __call__(self) -> None:
-        if self.what.endswith((".h5", ".hdf5")):
+        if not self.what.endswith(".py") and Path(self.what).is_file():
             return self._of_results()
         scene = load_scene(self.what, dict(map(parse_setting, self.set)))
-        scene.seed(1)  # rules are tried on a first state, so that what they read and write is known
+        scene.unchecked(1)  # rules are tried on a first state, so that what they read and write is known
         print(scene.explain())
 
     def _of_results(self) -> None:
@@ -167,19 +173,26 @@ def load_scene(what: str, parameters: dict[str, Any]) -> Scene:
         raise checks.refuse("scene", what, "a Python file", "No such file.")
     names: dict[str, Any] = {"__name__": path.stem, "__file__": str(path)}
     sys.path.insert(0, str(path.parent.resolve()))
-    exec(compile(path.read_text(), str(path), "exec"), names)
+    try:
+        exec(compile(path.read_text(), str(path), "exec"), names)
+    except (SyntaxError, ImportError) as error:
+        raise InputError(f"{what} cannot be run: {type(error).__name__}: {error}") from error
     if "scene" not in names:
         raise InputError(f"{what} does not define `scene`: write `scene = torchfilm.Scene(…)`, or a function `scene(…)` that returns one.")
     made = names["scene"]
-    if isinstance(made, Scene):
-        if parameters:
-            raise checks.refuse("--set", list(parameters), f"left out: `scene` in {what} is a Scene, not a function with parameters")
-    else:
+    if callable(made) and not isinstance(made, Scene):
+        try:
+            inspect.signature(made).bind(**parameters)
+        except TypeError as error:
+            raise InputError(f"scene(…) in {what}: {error}. Its parameters are {inspect.signature(made)}; give them with --set.") from error
         made = made(**parameters)
+    elif parameters:
+        raise checks.refuse("--set", list(parameters), f"left out: `scene` in {what} is a Scene, not a function with parameters")
     if not isinstance(made, Scene):
         raise checks.refuse(f"scene in {what}", made, "a Scene, or a function that returns one")
     if made.name == "scene":
         made.name = path.stem
+    made.settings = parameters
     return made
 
 
@@ -213,6 +226,7 @@ def go(scene: Scene, start: State, recorder: Recorder, *, cells: int | None, unt
     for rule in rules:
         rule.source.watching = watch
     timings, begun = Timings(), time.perf_counter()
+    interrupted = catch_interrupt()
     form = "{desc} |{bar}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}"
     with tqdm(total=_size(start, cells, until), bar_format=form, disable=None, mininterval=0.3) as bar:
         bar.set_description(f"{scene.name}: {start.colonies} colonies")
@@ -225,11 +239,26 @@ def go(scene: Scene, start: State, recorder: Recorder, *, cells: int | None, unt
             for rule in rules:
                 while rule.source.messages:
                     bar.write(rule.source.messages.pop(0))
+            if interrupted.is_set():
+                raise KeyboardInterrupt
     seconds = time.perf_counter() - begun
     print(f"results  {recorder.path}")
     if picture and state.cells:
         print(f"picture  {pictures.show(recorder.path)}")
     print(table(scene, state, timings, seconds))
+
+
+def catch_interrupt() -> threading.Event:
+    """Ctrl-C sets the event, for the loop to see between two steps: raised just anywhere, it may be swallowed or cut a frame short. A second one is raised at once."""
+    event = threading.Event()
+
+    def note(*_: object) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, note)
+    return event
 
 
 def _size(state: State, cells: int | None, until: float | None) -> float:

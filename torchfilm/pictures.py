@@ -81,7 +81,7 @@ def draw_cells(ax: Axes, cells: dict[str, np.ndarray], *, colour: str = "angle",
     collection = PolyCollection(list(shapes), array=values, cmap=cmap, edgecolors="black", linewidths=0.0)
     collection.set_clim(*(limits if limits is not None else (float(values.min(initial=0)), float(values.max(initial=1)))))
     ax.add_collection(collection)
-    low, high = shapes.reshape(-1, 2).min(0, initial=-1), shapes.reshape(-1, 2).max(0, initial=1)
+    low, high = shapes.reshape(-1, 2).min(0), shapes.reshape(-1, 2).max(0)
     pad = 0.04 * float((high - low).max())
     ax.set(xlim=(low[0] - pad, high[0] + pad), ylim=(low[1] - pad, high[1] + pad), aspect="equal", xticks=[], yticks=[])
     width_px = ax.get_window_extent().width
@@ -116,7 +116,12 @@ def sheet(
     More than `most` colonies: the first ones, and the title says so.
     """
     figure = sheet_figure(cells, colour=colour, view=view, title=title, most=most, ids=ids)
-    figure.savefig(path, dpi=160)
+    try:
+        figure.savefig(path, dpi=160)
+    except (OSError, ValueError) as error:  # no such folder; no such kind of picture
+        raise checks.InputError(
+            f"{path} cannot be written as a picture: {error}. Choose a folder that exists and a name that ends in .png, .pdf or .svg."
+        ) from error
     return Path(path)
 
 

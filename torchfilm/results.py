@@ -52,22 +52,27 @@ class Recorder:
         self.path, self.scene, self.every, self.append = Path(path), scene, every, append
         if append and not self.path.exists():
             raise checks.refuse("record", str(path), "an existing results file to append to", "No such file.")
+        if self.path.is_dir():
+            raise checks.refuse("record", str(path), "a file, not a folder")
         if self.path.exists() and not append and not overwrite:
             raise checks.refuse("record", str(path), "a path where there is no file yet", "Choose another, or say overwrite, or resume from it.")
         if not self.path.parent.is_dir():
             raise checks.refuse("record", str(path), "in a folder that exists", f"Make {self.path.parent} first.")
         self.file: h5py.File | None = None
+        self.dt = scene.dt  # `simulate` sets the one that it uses
+        self.tables: dict[str, h5py.Dataset] = {}
         self.births: list[tuple[np.ndarray, ...]] = []
         self.ends: list[tuple[np.ndarray, ...]] = []
         self.last: State | None = None
         self.written = -1
 
     def __call__(self, state: State) -> None:
-        self._note_events(state)
         self.last = state
         if self.file is None:
-            self._open(state)
-        elif (state.step - self.first_step) % self.every == 0:
+            self._open(state)  # what happened before the first frame is not this run's
+            return
+        self._note_events(state)
+        if (state.step - self.first_step) % self.every == 0:
             self._write(state)
 
     def close(self) -> None:
@@ -78,6 +83,7 @@ class Recorder:
             if self.last is not None and -1 < self.written != self.last.step:
                 self._write(self.last)
         finally:
+            self.tables.clear()
             self.file.close()
             self.file = None
 
@@ -105,8 +111,9 @@ class Recorder:
         assert file is not None
         attributes = {
             "format": FORMAT, "version": VERSION, "seed": state.seed, "dim": state.dim, "dtype": str(state.dtype)[6:],
-            "device": str(state.device), "dt": scene.dt, "every": self.every,
-            "scene": scene.explain(), "recipe": json.dumps(scene.recipe), "torchfilm": __version__, "torch": str(torch.__version__),
+            "device": str(state.device), "dt": self.dt, "every": self.every,
+            "scene": scene.explain(), "recipe": json.dumps(scene.recipe), "settings": json.dumps(scene.settings),
+            "torchfilm": __version__, "torch": str(torch.__version__),
             "declared": json.dumps({f.name: [f.meaning, f.unit, f.scope, list(f.shape), f.at_division] for f in state.declared.values()}),
         }  # fmt: skip
         for name, value in attributes.items():
@@ -137,12 +144,22 @@ class Recorder:
         assert self.file is not None
         try:
             self._write_frame(self.file, state)
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # HDF5 reports a failed flush as a RuntimeError
+            self.last = None  # nothing more is written: the file ends with the last whole frame
             raise SimulationError(
                 f"could not write step {state.step} to {self.path}: {error}. Is the disk full? Frames up to step {self.written} are safe; "
                 "free some room and resume."
             ) from error
         self.written = state.step
+
+    def _append(self, name: str, value: np.ndarray, at: int) -> None:
+        """Put rows at `at`, and see them to the disk: a handle dropped with rows in its cache would lose a failure to write them."""
+        assert self.file is not None
+        table = self.tables.setdefault(name, self.file[name])
+        table.resize(at + len(value), axis=0)
+        if len(value):
+            table[at:] = value
+        table.flush()
 
     def _write_frame(self, file: h5py.File, state: State) -> None:
         columns = _cell_columns(state)
@@ -153,13 +170,13 @@ class Recorder:
             )
         first_row = _committed(file)["rows"]
         for name, value in columns.items():
-            _append(file[f"cells/{name}"], value, first_row)
+            self._append(f"cells/{name}", value, first_row)
         lineage = _committed(file)
         for table, events in (("births", self.births), ("ends", self.ends)):
             names = list(LINEAGE[table])
             merged = [np.concatenate(c) for c in zip(*events, strict=True)] if events else [np.empty(0, np.int64)] * len(names)
             for name, value in zip(names, merged, strict=True):
-                _append(file[f"lineage/{table}/{name}"], value, lineage[table])
+                self._append(f"lineage/{table}/{name}", value, lineage[table])
             lineage[table] += len(merged[0])
         frame = lineage["frames"]
         row = {
@@ -167,10 +184,10 @@ class Recorder:
             "ends": lineage["ends"], "time": state.time, "step": state.step,
         }  # fmt: skip
         for name, value in _colony_columns(state).items():
-            _append(file[f"frames/colony/{name}"], value[None], frame)
+            self._append(f"frames/colony/{name}", value[None], frame)
         file.flush()
         for name in FRAME_COLUMNS:
-            _append(file[f"frames/{name}"], np.asarray(row[name])[None], frame)
+            self._append(f"frames/{name}", np.asarray(row[name])[None], frame)
         file.flush()
         self.births, self.ends = [], []
 
@@ -200,12 +217,6 @@ def _growing(file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk
     )
 
 
-def _append(dataset: h5py.Dataset, value: np.ndarray, at: int) -> None:
-    dataset.resize(at + len(value), axis=0)
-    if len(value):
-        dataset[at:] = value
-
-
 def _committed(file: h5py.File) -> dict[str, int]:
     """How much of the file counts: frames, rows, births, ends."""
     frames = file["frames/step"].shape[0]
@@ -221,6 +232,11 @@ def _open_to_read(path: Path) -> h5py.File:
     if not path.is_file():
         raise checks.refuse("results", str(path), "a results file", "No such file.")
     error: Exception | None = None
+    with open(path, "rb") as raw:
+        head = raw.read(36)
+    # a single-writer open of a file that was cut would wait for the rest for ever: its superblock says how long it should be
+    if head[:8] == b"\x89HDF\r\n\x1a\n" and head[8] >= 2 and int.from_bytes(head[28:36], "little") > path.stat().st_size:
+        raise InputError(f"{path} is truncated: it has {path.stat().st_size} of {int.from_bytes(head[28:36], 'little')} bytes. Use a whole copy of it.")
     for options in ({"swmr": True, "libver": "latest"}, {}):
         try:
             return h5py.File(path, "r", **options)
@@ -310,6 +326,11 @@ class Results:
         found = json.loads(self.file.attrs["recipe"])
         return None if found is None else (found[0], found[1])
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The parameters that a scene of the user's own was made with."""
+        return json.loads(self.file.attrs["settings"])
+
     def refresh(self) -> None:
         """See what a run has written since."""
         for item in ("step", *FRAME_COLUMNS):
@@ -375,7 +396,7 @@ class Results:
         k = self._index(frame)
         dtype = getattr(torch, str(self.file.attrs["dtype"]))
         device = torch.device(device if device is not None else "cpu")
-        template = scene.seed(int(self.colony_id.max()) + 1, seed=int(self.file.attrs["seed"]), dtype=dtype, device=device)
+        template = scene.unchecked(int(self.colony_id.max()) + 1, seed=int(self.file.attrs["seed"]), dtype=dtype, device=device)
         if template.dim != int(self.file.attrs["dim"]):
             raise checks.refuse("scene", f"{template.dim}-D", f"{self.file.attrs['dim']}-D, as {self.path} is")
         recorded = self.frame(k)

@@ -15,6 +15,8 @@ from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.timing import Timings
 
+CPU = torch.device("cpu")
+
 
 class Scene:
     """Effects that act on a state, step by step, in the paper's order (rules, division, growth, mechanics, …) whatever
@@ -44,6 +46,7 @@ class Scene:
         self.listed = effects
         self.effects: tuple[Effect, ...] = tuple(sorted((p for e in effects for p in e.parts()), key=lambda p: p.stage))
         self.name, self.recipe = name, recipe
+        self.settings: dict[str, Any] = {}  # what a user's own scene function was given
         self.dt = checks.number("Scene.dt", dt, above=0.0)
         self.dim = next((e.dim for e in effects if hasattr(e, "dim")), founders.dim if founders is not None else 3)
         self.founders = founders if founders is not None else Cells.single(self.dim)
@@ -85,36 +88,47 @@ class Scene:
             raise checks.refuse("seed", seed, "a whole number from 0")
         if dtype not in (torch.float32, torch.float64):
             raise checks.refuse("dtype", dtype, "torch.float32 or torch.float64")
-        _check_device(device)
         start = cells if cells is not None else self.founders
         if start.dim != self.dim:
             raise checks.refuse("cells", f"{start.dim}-D", f"{self.dim}-D, as the scene is")
-        state = start.state(colonies, seed, torch.device(device), dtype)
+        count = max(colonies, start.colonies)
+        for path, tensor in self._per_colony():
+            if tensor.numel() != count:
+                raise checks.InputError(
+                    f"{path} has {tensor.numel()} values, but the batch has {count} colonies: give one number, or one for each of scene.seed(colonies=…)."
+                )
+        state = self.unchecked(colonies, seed=seed, cells=cells, device=_known_device(device), dtype=dtype)
+        self.check(state)
+        for effect in self.effects:
+            effect.check(state)
+        return state
+
+    def unchecked(self, colonies: int, *, seed: int = 0, cells: Cells | None = None, device: torch.device = CPU, dtype: torch.dtype = torch.float32) -> State:
+        """A first state whose cells are not asked whether they may stand where they do: to be filled from a file, or only looked at."""
+        state = (cells if cells is not None else self.founders).state(colonies, seed, device, dtype)
         for effect in self.effects:
             for f in effect.declares(self.dim):
                 if f.name not in state.fields:
                     state = state.declare(f)
         for effect in self.effects:
             state = effect.prepare(state)
-        self.check(state)
-        for effect in self.effects:
-            effect.check(state)
         return state
+
+    def _per_colony(self) -> list[tuple[str, Tensor]]:
+        return [(path, tensor) for effect in self.effects for path, tensor in parameters(effect) if tensor.dim() == 1]
 
     def check(self, state: State) -> None:
         """Raise InputError if this is not a state of this scene."""
         if state.dim != self.dim:
             raise checks.refuse("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
+        most = int(state.colony_id.max())
+        for path, tensor in self._per_colony():
+            if tensor.numel() <= most:
+                raise checks.InputError(f"{path} has {tensor.numel()} values, but the batch has a colony number {most}: it is not of this scene.")
         for effect in self.effects:
-            for path, tensor in parameters(effect):
-                if tensor.dim() == 1 and tensor.numel() <= int(state.colony_id.max()):
-                    raise checks.InputError(
-                        f"{path} has {tensor.numel()} values, but the batch has a colony number {int(state.colony_id.max())}: "
-                        "give one number, or one per colony."
-                    )
-            missing = [n for n in effect.needs() if n not in state.fields and n not in BUILT_IN]
-            if missing:
-                raise checks.InputError(f"{effect.title} needs the field {missing[0]!r}, which this state lacks. Make the state with this scene's seed().")
+            for name in (*effect.needs(), *(f.name for f in effect.declares(self.dim))):
+                if name not in state.fields and name not in BUILT_IN:
+                    raise checks.InputError(f"{effect.title} needs the field {name!r}, which this state lacks. Make the state with this scene's seed().")
 
     def step(self, state: State, dt: float, timings: Timings | None = None) -> State:
         """The state dt hours later: each effect in turn."""
@@ -125,8 +139,9 @@ class Scene:
             else:
                 with timings.of(effect.title, state.device):
                     state = effect.step(state, dt)
-        # time is counted in steps, so that it does not gather rounding
-        return state.replace(step=state.step + 1, time=state.time + dt)
+        # with an even step, time is counted in steps, so that it does not gather rounding
+        even = abs(state.step * dt - state.time) < 1e-9 * max(1.0, state.time)
+        return state.replace(step=state.step + 1, time=(state.step + 1) * dt if even else state.time + dt)
 
     def couplings(self) -> list[tuple[str, str, str]]:
         """Who drives whom: (writer, name, reader) for every name that one effect writes and another reads."""
@@ -191,10 +206,13 @@ def parameters(part: object, path: str = "") -> list[tuple[str, Tensor]]:
     return []
 
 
-def _check_device(device: str | torch.device) -> None:
+def _known_device(device: str | torch.device) -> torch.device:
     try:
         wanted = torch.device(device)
-    except RuntimeError as error:
-        raise checks.refuse("device", device, 'a torch device such as "cpu" or "cuda"') from error
+    except (RuntimeError, TypeError) as error:
+        raise checks.refuse("device", device, '"cpu" or "cuda"') from error
+    if wanted.type not in ("cpu", "cuda"):
+        raise checks.refuse("device", str(device), '"cpu" or "cuda"', "Other devices lack the sparse products and float64 that a step needs.")
     if wanted.type == "cuda" and not torch.cuda.is_available():
         raise checks.refuse("device", str(device), "a device that this machine has", 'torch sees no CUDA GPU; use device="cpu".')
+    return wanted

@@ -48,12 +48,14 @@ def simulate(
     last = math.inf if until is None else _last_step(state, checks.number("until", until), dt)
     scene.check(state)
     recorder = Recorder(record, scene) if isinstance(record, (str, Path)) else record
+    if recorder is not None:
+        recorder.dt = dt
     return _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings)
 
 
 def _last_step(state: State, until: float, dt: float) -> int:
     steps = (until - state.time) / dt
-    if steps < 0:
+    if steps < -1e-6:
         raise checks.refuse("until", until, f"at least the state's own time, {state.time:g} h")
     if abs(steps - round(steps)) > 1e-6 * max(1.0, steps):
         raise checks.refuse("until", until, f"a whole number of steps of dt = {dt:g} h from {state.time:g} h")

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -101,6 +102,10 @@ class State:
     births: tuple[Births, ...] = ()
     ended: tuple[Ended, ...] = ()
     reports: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("fields", "declared", "reports"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     def __getattr__(self, name: str) -> Tensor:
         fields = self.__dict__.get("fields", {})

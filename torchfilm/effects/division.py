@@ -31,7 +31,7 @@ class Division(Effect):
     volume: float | Tensor | Distribution | None = None
     added: float | Tensor | Distribution | None = None
     fraction: float | Tensor | Distribution = 0.5
-    axis_noise: float = 0.001
+    axis_noise: float | Tensor = 0.001
 
     stage = DIVISION
     title = "division"
@@ -47,7 +47,7 @@ class Division(Effect):
         greatest = fraction.greatest() if isinstance(fraction, Distribution) else float(torch.as_tensor(fraction).max())
         if greatest >= 1.0:
             raise checks.refuse("Division.fraction", self.fraction, "between 0 and 1, both excluded")
-        checks.number("Division.axis_noise", self.axis_noise, least=0.0, most=0.5)
+        object.__setattr__(self, "axis_noise", checks.value("Division.axis_noise", self.axis_noise, least=0.0, most=0.5))
 
     @property
     def criterion(self) -> str | None:
@@ -79,17 +79,18 @@ class Division(Effect):
     def check(self, state: State) -> None:
         if self.criterion is None or state.cells == 0:
             return
-        threshold = state.division_threshold
+        given = getattr(self, self.criterion)
+        # cells from a micrograph may be past the threshold drawn for them, and then divide at once; none may be past all that can be drawn
+        most = given.greatest() if isinstance(given, Distribution) else state.division_threshold
         start = {"length": state.length, "volume": state.volume, "added": torch.zeros_like(state.length)}[self.criterion]
-        below = torch.nonzero(threshold <= start).squeeze(1)
+        below = torch.nonzero(start >= most).squeeze(1)
         if below.numel():
             k = int(below[0])
             raise checks.InputError(
-                f"Division.{self.criterion}: threshold {float(threshold[k]):g} of cell {int(state.uid[k])} in colony "
+                f"Division.{self.criterion}: threshold {float(state.division_threshold[k]):g} of cell {int(state.uid[k])} in colony "
                 f"{int(state.own_colony_id[k])} is not above its {self.criterion} at birth, {float(start[k]):g}. "
                 "Raise the threshold or start from smaller cells."
             )
-        given = getattr(self, self.criterion)
         least = given.least() if isinstance(given, Distribution) else float(torch.as_tensor(given).min())
         radius = float(state.radius.max())
         needed = 2 * radius
@@ -131,7 +132,7 @@ class Division(Effect):
             )
 
 
-def divide(state: State, due: Tensor, fraction: float | Tensor | Distribution, axis_noise: float) -> State:
+def divide(state: State, due: Tensor, fraction: float | Tensor | Distribution, axis_noise: float | Tensor) -> State:
     """The state in which each cell that is due (N,) bool has become two neighbours in the batch, first daughter at its −axis end.
 
     Lengths (l − 2r)f and (l − 2r)(1 − f), outer ends where the parent's were; gradients pass through.
@@ -176,10 +177,10 @@ def _new_ids(new: State, daughters: Tensor, parents: State) -> tuple[Tensor, Ten
     return uid, parent, new.next_uid + per_colony
 
 
-def _with_noise(new: State, daughters: Tensor, axis_noise: float) -> Tensor:
-    if axis_noise == 0:
+def _with_noise(new: State, daughters: Tensor, axis_noise: float | Tensor) -> Tensor:
+    if not isinstance(axis_noise, Tensor) and axis_noise == 0:
         return new.axis
-    noise = axis_noise * new.normal(daughters, "Division.axis_noise")[:, : new.dim]
+    noise = draw("axis_noise", axis_noise, new, daughters).unsqueeze(1) * new.normal(daughters, "Division.axis_noise")[:, : new.dim]
     axis = new.axis.index_select(0, daughters) + noise
     axis = axis / (axis * axis).sum(1, keepdim=True).sqrt()
     return new.axis.index_copy(0, daughters, axis)

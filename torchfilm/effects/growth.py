@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import GROWTH, Distribution, Effect, draw, parameter
-from torchfilm.physics import capsule
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 
@@ -63,15 +62,14 @@ class Growth(Effect):
             elongation = torch.expm1(wanted) * state.length
         else:
             elongation = wanted
-        return state.replace(length=state.length + elongation).with_fields(elongation=elongation)
-
-
-def doubling_time(rate: float, law: str, division_length: float, radius: float) -> float:
-    """Hours from birth to division at centreline `division_length` for equal daughters: for planning runs."""
-    born = (division_length - 2 * radius) / 2
-    if law == "volume":
-        volumes = [capsule.volume(torch.tensor(x, dtype=torch.float64), torch.tensor(radius, dtype=torch.float64)) for x in (born, division_length)]
-        return float(torch.log(volumes[1] / volumes[0])) / rate
-    if law == "length":
-        return float(torch.log(torch.tensor(division_length / born))) / rate
-    return (division_length - born) / rate
+        length = state.length + elongation
+        shrunk = length < 0
+        if bool(shrunk.any()):
+            k = int(torch.nonzero(shrunk)[0])
+            ids = sorted(set(state.own_colony_id[shrunk].tolist()))
+            raise checks.SimulationError(
+                f"growth_rate {float(state.growth_rate[k]):g} of cell {int(state.uid[k])} in colony {int(state.own_colony_id[k])} would make its length "
+                f"negative ({int(shrunk.sum())} such cells, colonies {ids[:10]}). Keep growth rates at least 0, or remove such cells.",
+                ids,
+            )
+        return state.replace(length=length).with_fields(elongation=elongation)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -71,7 +71,6 @@ class Mechanics(Effect):
     tolerance: float = 0.1
     max_iterations: int = 2000
     max_elongation: float = 0.25
-    surfaces: tuple[Surface, ...] = field(init=False, repr=False, compare=False)
 
     stage = MECHANICS
     title = "mechanics"
@@ -85,6 +84,8 @@ class Mechanics(Effect):
         for name in ("alpha", "stiffness"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, checks.value(f"Mechanics.{name}", getattr(self, name), above=0.0))
+        if isinstance(self.walls, Wall):
+            raise checks.refuse("Mechanics.walls", self.walls, "a list of walls", f"Write walls=[{type(self.walls).__name__}(…)].")
         for wall in self.walls:
             if not isinstance(wall, Wall):
                 raise checks.refuse("Mechanics.walls", wall, "a list of Plane, Sphere, Box or Channel")
@@ -99,7 +100,11 @@ class Mechanics(Effect):
         if self.overlap is not None:
             checks.number("Mechanics.overlap", self.overlap, above=0.0)
         object.__setattr__(self, "walls", tuple(self.walls))
-        object.__setattr__(self, "surfaces", tuple(s for wall in self.walls for s in wall.surfaces(self.dim)))
+        self.surfaces()  # raises for a wall that does not fit the dimension
+
+    def surfaces(self) -> list[Surface]:
+        """What the walls are made of; asked for anew each step, so that a gradient to a wall's place is too."""
+        return [s for wall in self.walls for s in wall.surfaces(self.dim)]
 
     @property
     def degrees(self) -> int:
@@ -128,7 +133,7 @@ class Mechanics(Effect):
     def check(self, state: State) -> None:
         if state.dim != self.dim:
             raise checks.refuse("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
-        for surface in self.surfaces:
+        for surface in self.surfaces():
             distance, _ = surface.gap_of_points(state.position, state.own_colony_id)
             beyond = torch.nonzero(distance < 0).squeeze(1)
             if beyond.numel():
@@ -171,7 +176,7 @@ class _Run:
     """The moving parts of one step: geometry, and what is reported of each colony."""
 
     def __init__(self, settings: Mechanics, state: State, dt: float, substeps: Tensor, status: Tensor):
-        self.settings, self.state = settings, state
+        self.settings, self.state, self.surfaces = settings, state, settings.surfaces()
         self.position, self.axis, self.length = state.position, state.axis, state.length
         self.first_move = state.displacement
         count = state.colonies
@@ -233,7 +238,7 @@ class _Run:
                 first, second = rows.index_select(0, found[0]), rows.index_select(0, found[1])
         bodies = Bodies(local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius)
         contacts = find_contacts(bodies, first, second, whole_lines=self.settings.unilateral)
-        walls = find_wall_contacts(self.settings.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids)
+        walls = find_wall_contacts(self.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids)
         return contacts, walls
 
     def _keys(self, contacts: Contacts) -> Tensor:
@@ -282,7 +287,7 @@ class _Run:
         """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
         root = torch.ones_like(walls.gap)
         soft = torch.zeros_like(walls.cell, dtype=torch.bool)
-        for number, surface in enumerate(self.settings.surfaces):
+        for number, surface in enumerate(self.surfaces):
             here = walls.surface == number
             if surface.wall.stiffness is not None:
                 stiffness = per_cell(surface.wall.stiffness, self.state) * self.alpha * self.dt

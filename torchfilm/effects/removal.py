@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
-from torchfilm.effect import REMOVAL, Effect
+from torchfilm.effect import REMOVAL, Effect, per_cell
 from torchfilm.state import State
 from torchfilm.tools import checks
 
 
 @dataclass(frozen=True)
 class Removal(Effect):
-    """Cells whose centre leaves the box from `low` to `high` (µm; ±inf leaves a side out) are removed, as at a channel's open end."""
+    """Cells whose centre leaves the box from `low` to `high` are removed, as at a channel's open end.
 
-    low: Sequence[float]
-    high: Sequence[float]
+    low, high: µm, each entry one number or one per colony; ±inf leaves a side out.
+    """
+
+    low: Sequence[float | Tensor]
+    high: Sequence[float | Tensor]
 
     stage = REMOVAL
     title = "removal"
 
     def __post_init__(self) -> None:
-        low, high = tuple(map(float, self.low)), tuple(map(float, self.high))
-        if len(low) != len(high) or any(math.isnan(v) for v in low + high) or not all(a < b for a, b in zip(low, high, strict=False)):
-            raise checks.refuse("Removal.low, Removal.high", (low, high), "two corners with low < high along every axis")
-        object.__setattr__(self, "low", low)
-        object.__setattr__(self, "high", high)
+        for name, corner in zip(("low", "high"), checks.corners("Removal", self.low, self.high), strict=True):
+            object.__setattr__(self, name, corner)
 
     def reads(self) -> tuple[str, ...]:
         return ("position",)
@@ -48,8 +48,11 @@ class Removal(Effect):
             )
 
     def _outside(self, state: State) -> torch.Tensor:
-        low, high = state.position.new_tensor(self.low), state.position.new_tensor(self.high)
-        return ((state.position < low) | (state.position > high)).any(1)
+        outside = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
+        for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+            x = state.position[:, k]
+            outside = outside | (x < per_cell(low, state)) | (x > per_cell(high, state))
+        return outside
 
     def step(self, state: State, dt: float) -> State:
         return state.remove(self._outside(state), "left")

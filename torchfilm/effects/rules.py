@@ -10,9 +10,11 @@ that nothing declares become variables, and what it reads and writes is noted, s
 
 from __future__ import annotations
 
+import sys
 import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +24,16 @@ from torch import Tensor
 from torchfilm.effect import DIVISION, RULES, Effect
 from torchfilm.physics.contacts import Bodies, contact_gaps
 from torchfilm.physics.neighbours import find_pairs
-from torchfilm.state import CELL, Field, State
+from torchfilm.state import CELL, Births, Field, State
 from torchfilm.tools import checks
 
 # The paper's spellings (Table 1) beside ours.
 PAPER_NAMES = {"pos": "position", "dir": "axis", "cellType": "cell_type", "growthRate": "growth_rate", "divideFlag": "divide_flag"}
 GEOMETRY = ("position", "axis", "length", "radius", "volume", "area")
+# What reading a name means in terms of what other effects write.
+MEANS = {"volume": ("length", "radius"), "area": ("length", "radius"), "uid": ("cells",), "parent": ("cells",), "colony": ("cells",)}
 IDENTITY = ("uid", "parent", "colony")
+Functions = dict[str, Callable[..., None] | None]
 KNOWN_FIELDS = {
     "cell_type": Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64),
     "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
@@ -46,6 +51,7 @@ class CellsView:
     _dt: float
     _work: dict[str, Tensor]
     _read: set[str]
+    _shown: dict[str, Tensor]
     _declaring: bool
     _draws: int
 
@@ -54,6 +60,7 @@ class CellsView:
         object.__setattr__(self, "_dt", dt)
         object.__setattr__(self, "_work", {})
         object.__setattr__(self, "_read", set())
+        object.__setattr__(self, "_shown", {})
         object.__setattr__(self, "_declaring", declaring)
         object.__setattr__(self, "_draws", 0)
 
@@ -83,8 +90,10 @@ class CellsView:
             return self._work[name]
         state = self._state
         if name in GEOMETRY or name in IDENTITY:
-            self._read.add(name)
-            return getattr(state, name)
+            self._read.update(MEANS.get(name, (name,)))
+            # a copy, so that a rule that writes into it is found out and the state stays as it was
+            self._shown[name] = getattr(state, name).clone()
+            return self._shown[name]
         if name == "remove_flag":
             self._work[name] = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
         elif name in state.fields:
@@ -107,7 +116,7 @@ class CellsView:
             raise AttributeError(f"cells.{name} can only be read (Table 1 of the paper): rules change fields, flags and variables.")
         declared = KNOWN_FIELDS.get(name, state.declared.get(name)) if name != "remove_flag" else None
         dtype = torch.bool if name == "remove_flag" else (declared.dtype or state.dtype) if declared is not None else None
-        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device=state.device)
+        tensor = _as_tensor(f"cells.{name}", value, state.device)
         if dtype is None:
             dtype = state.dtype if tensor.is_floating_point() else tensor.dtype
         shape = state.fields[name].shape if name in state.fields else (state.cells, *tensor.shape[1:])
@@ -138,11 +147,18 @@ class CellsView:
 
     def contacts(self, within: float = 0.05) -> tuple[Tensor, Tensor]:
         """Pairs of cells whose surfaces are at most `within` µm apart: two (P,) index tensors, each pair once. Found only when asked for."""
+        self._read.update(("position", "axis", "length", "radius"))
         s = self._state
         i, j = find_pairs(s.position, s.axis.double(), s.length.double(), s.radius.double(), s.colony, s.colonies, within)
         bodies = Bodies(s.position.T.contiguous(), s.axis.T.double().contiguous(), 0.5 * s.length.double(), s.radius.double())
         keep = torch.nonzero(contact_gaps(bodies, i, j) <= within).squeeze(1)
         return i.index_select(0, keep), j.index_select(0, keep)
+
+    def check_unharmed(self) -> None:
+        """Raise if a rule wrote into something that can only be read."""
+        for name, shown in self._shown.items():
+            if not torch.equal(shown, getattr(self._state, name)):
+                raise AttributeError(f"the rule changed cells.{name} in place, which can only be read: rules change fields, flags and variables.")
 
     def contact_count(self, within: float = 0.05) -> Tensor:
         """How many cells each cell touches, (N,) int64."""
@@ -183,6 +199,7 @@ class DivisionView:
     _state: State
     _rows: Tensor | None
     _purpose: str
+    _set: set[str]
     _work: dict[str, Tensor]
     _draws: int
 
@@ -190,6 +207,7 @@ class DivisionView:
         object.__setattr__(self, "_state", state)
         object.__setattr__(self, "_rows", rows)
         object.__setattr__(self, "_purpose", purpose)
+        object.__setattr__(self, "_set", set())
         object.__setattr__(self, "_work", {})
         object.__setattr__(self, "_draws", 0)
 
@@ -211,7 +229,12 @@ class DivisionView:
         if name not in self._state.fields:
             raise AttributeError(f"daughters have no field {name!r} to write; they have {', '.join(self._state.fields)}")
         like = getattr(self, name)
-        self._work[name] = torch.as_tensor(value, dtype=like.dtype, device=like.device).broadcast_to(like.shape).clone()
+        tensor = _as_tensor(f"daughter.{name}", value, like.device).to(like.dtype)
+        try:
+            self._work[name] = tensor.broadcast_to(like.shape).clone()
+        except RuntimeError as error:
+            raise ValueError(f"daughter.{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or {tuple(like.shape)}.") from error
+        self._set.add(name)
 
     def random(self) -> Tensor:
         """A draw from (0, 1) for each division, (M,), keyed by seed, colony, cell and step."""
@@ -220,17 +243,24 @@ class DivisionView:
         return self._state.uniform(rows, f"{self._purpose} {self._draws}")
 
 
+def _as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
+    try:
+        return value if isinstance(value, Tensor) else torch.as_tensor(value, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} was set to {value!r}: it must be a number or a tensor.") from error
+
+
 class Source:
     """Where the rule functions come from: functions, or a file that may be edited while a run is going."""
 
-    def __init__(self, path: Path | None, functions: dict[str, Callable[..., None] | None]):
-        self.path, self.functions = path, functions
+    def __init__(self, path: Path | None, functions: Functions):
+        self.path, self.functions, self.good = path, functions, functions
         self.stamp = path.stat().st_mtime_ns if path else 0
         self.watching = False
         self.messages: list[str] = []
 
-    def refresh(self, attempt: Callable[[Callable[..., None]], object]) -> None:
-        """Take up an edited file if it loads and `attempt(update)` passes; else report and keep the last good rules."""
+    def refresh(self) -> None:
+        """Take up an edited file if it loads; else report and keep the last good rules."""
         if not self.watching or self.path is None:
             return
         try:
@@ -241,17 +271,30 @@ class Source:
             return
         self.stamp = stamp
         try:
-            functions = load_rules(self.path)
-            if functions["update"] is not None:
-                attempt(functions["update"])
+            self.functions = load_rules(self.path)
+            self.messages.append(f"{self.path.name} taken up")
         except Exception as error:  # the user's own code may fail in any way; the run goes on
-            self.messages.append(f"{self.path.name} is broken, still running the last good rules: {type(error).__name__}: {error}")
-            return
-        self.functions = functions
-        self.messages.append(f"{self.path.name} taken up")
+            self._report(error)
+
+    def call(self, name: str, act: Callable[[Callable[..., None]], State], state: State) -> State:
+        """`act` on the function of that name; if a new edit of it fails, report, and act on the last good one. The state as it is where there is none."""
+        function = self.functions[name]
+        try:
+            return state if function is None else act(function)
+        except Exception as error:
+            if not self.watching or self.functions is self.good:
+                raise
+            self._report(error)
+            self.functions = self.good
+            function = self.good[name]
+            return state if function is None else act(function)
+
+    def _report(self, error: Exception) -> None:
+        assert self.path is not None
+        self.messages.append(f"{self.path.name} is broken, still running the last good rules: {type(error).__name__}: {error}")
 
 
-def load_rules(path: Path) -> dict[str, Callable[..., None] | None]:
+def load_rules(path: Path) -> Functions:
     """Run a rules file and return its `update` and `divide`."""
     module = types.ModuleType(path.stem)
     exec(compile(path.read_text(), str(path), "exec"), module.__dict__)
@@ -282,7 +325,9 @@ class Rules(Effect):
         path = None
         functions: dict[str, Any] = {"update": self.update, "divide": self.divide}
         if isinstance(self.update, (str, Path)):
-            path = Path(self.update)
+            # as given, or beside the scene file or wherever else Python looks for modules
+            places = [Path(self.update), *(Path(p) / self.update for p in sys.path)]
+            path = next((p for p in places if p.is_file()), places[0])
             if not path.is_file():
                 raise checks.refuse("Rules.update", str(path), "a function or the path of a Python file", "No such file.")
             functions = load_rules(path)
@@ -294,7 +339,7 @@ class Rules(Effect):
         for name, value in self.variables.items():
             checks.number(f"Rules.variables[{name!r}]", value)
         object.__setattr__(self, "source", Source(path, functions))
-        object.__setattr__(self, "noted", {"reads": (), "writes": ()})
+        object.__setattr__(self, "noted", {"reads": (), "writes": (), "divide reads": (), "divide writes": ()})
 
     def parts(self) -> tuple[Effect, ...]:
         return (self, DivisionRule(self)) if self.source.functions["divide"] or self.source.path else (self,)
@@ -311,30 +356,44 @@ class Rules(Effect):
     def prepare(self, state: State) -> State:
         """Try `update` once on the first state: new names become fields, and what is read and written is noted."""
         update = self.source.functions["update"]
-        if update is None:
-            return state
-        view = CellsView(state, 0.0, declaring=True)
-        update(view)
-        for name, value in view._work.items():
-            if name not in state.fields and name != "remove_flag":
-                known = KNOWN_FIELDS.get(name)
-                new = known or Field(name, "variable of the user's rules", dtype=value.dtype, shape=tuple(value.shape[1:]))
-                state = state.declare(new)
-        changed = [n for n, v in view._work.items() if n != "remove_flag" and not torch.equal(v, state.fields[n])]
-        writes = [n for n in view._work if n in changed or n not in view._read]
-        self.noted["reads"] = tuple(sorted(view._read))
-        self.noted["writes"] = tuple("cells" if n == "remove_flag" else n for n in sorted(writes))
+        if update is not None:
+            view = CellsView(state, 0.0, declaring=True)
+            update(view)
+            view.check_unharmed()
+            for name, value in view._work.items():
+                if name not in state.fields and name != "remove_flag":
+                    new = KNOWN_FIELDS.get(name) or Field(name, "variable of the user's rules", dtype=value.dtype, shape=tuple(value.shape[1:]))
+                    state = state.declare(new)
+            changed = [n for n, v in view._work.items() if n != "remove_flag" and not torch.equal(v, state.fields[n])]
+            writes = [n for n in view._work if n in changed or n not in view._read]
+            self.noted["reads"] = tuple(sorted(view._read))
+            self.noted["writes"] = tuple("cells" if n == "remove_flag" else n for n in sorted(writes))
+        divide = self.source.functions["divide"]
+        if divide is not None and state.cells:
+            self._try_division(divide, state)
         return state
 
+    def _try_division(self, divide: Callable[..., None], state: State) -> None:
+        """Try `divide` on a first cell and two copies of it, and note what it reads and writes."""
+        one = torch.zeros(1, dtype=torch.int64, device=state.device)
+        twice = state.take(torch.cat([one, one]))
+        births = Births(one, one + 1, torch.cat([one, one]), state.take(one))
+        views = _division_views(twice, births)
+        divide(*views)
+        self.noted["divide reads"] = tuple(sorted({MEANS.get(n, (n,))[0] for view in views for n in view._work}))
+        self.noted["divide writes"] = tuple(sorted(views[1]._set | views[2]._set))
+
     def step(self, state: State, dt: float) -> State:
-        self.source.refresh(lambda update: _apply(update, state, dt))
-        update = self.source.functions["update"]
-        return state if update is None or state.cells == 0 else _apply(update, state, dt)
+        if state.cells == 0:
+            return state
+        self.source.refresh()
+        return self.source.call("update", lambda update: _apply(update, state, dt), state)
 
 
 def _apply(update: Callable[[CellsView], None], state: State, dt: float) -> State:
     view = CellsView(state, dt)
     update(view)
+    view.check_unharmed()
     work = dict(view._work)
     gone = work.pop("remove_flag", None)
     for name in work:
@@ -356,21 +415,34 @@ class DivisionRule(Effect):
     title = "rules at division"
 
     def reads(self) -> tuple[str, ...]:
-        return ("cells",)
+        return ("cells", *self.rules.noted["divide reads"])
+
+    def writes(self) -> tuple[str, ...]:
+        return self.rules.noted["divide writes"]
 
     def step(self, state: State, dt: float) -> State:
-        act = self.rules.source.functions["divide"]
-        if act is None:
-            return state
+        source = self.rules.source
         for births in state.births:
-            parent = DivisionView(births.parents, None, "divide parent")
-            first = DivisionView(state, births.first, "divide first")
-            second = DivisionView(state, births.second, "divide second")
-            act(parent, first, second)
-            changed: dict[str, Tensor] = {}
-            for daughter, rows in ((first, births.first), (second, births.second)):
-                for name, value in daughter._work.items():
-                    if name in state.fields and state.declared[name].scope == CELL:
-                        changed[name] = changed.get(name, state.fields[name]).index_copy(0, rows, value)
-            state = state.with_fields(**changed)
+            state = source.call("divide", partial(_divide, state=state, births=births), state)
+        # both functions have now done a step without a fault
+        source.good = source.functions
         return state
+
+
+def _division_views(state: State, births: Births) -> tuple[DivisionView, DivisionView, DivisionView]:
+    return (
+        DivisionView(births.parents, None, "divide parent"),
+        DivisionView(state, births.first, "divide first"),
+        DivisionView(state, births.second, "divide second"),
+    )
+
+
+def _divide(act: Callable[..., None], state: State, births: Births) -> State:
+    parent, first, second = _division_views(state, births)
+    act(parent, first, second)
+    changed: dict[str, Tensor] = {}
+    for daughter, rows in ((first, births.first), (second, births.second)):
+        for name, value in daughter._work.items():
+            if name in state.fields and state.declared[name].scope == CELL:
+                changed[name] = changed.get(name, state.fields[name]).index_copy(0, rows, value)
+    return state.with_fields(**changed)

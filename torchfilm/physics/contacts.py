@@ -160,10 +160,10 @@ def find_contacts(bodies: Bodies, first: Tensor, second: Tensor, whole_lines: bo
     keep = torch.cat([keep0, keep1])
     which = lambda x: torch.cat([x[0].index_select(0, keep0), x[1].index_select(0, keep1)])  # noqa: E731
     a, b, s, t = a.take(keep), b.take(keep), which(s), which(t)
-    row = _rows(a, b, s, t, which(end_a), which(end_b))
+    gap, row_first, row_second, normal = _rows(a, b, s, t, which(end_a), which(end_b))
     where = 3 * _third(s, a.half) + _third(t, b.half)
-    weight = torch.where(line.index_select(0, keep), 0.5, 1.0).to(row[0].dtype)
-    return Contacts(first.index_select(0, keep), second.index_select(0, keep), row[0], weight, *row[1:], where)
+    weight = torch.where(line.index_select(0, keep), 0.5, 1.0).to(gap.dtype)
+    return Contacts(first.index_select(0, keep), second.index_select(0, keep), gap, weight, row_first, row_second, normal, where)
 
 
 def _third(s: Tensor, half: Tensor) -> Tensor:

@@ -115,19 +115,15 @@ class Sphere(Wall):
 
 @dataclass(frozen=True)
 class Box(Wall):
-    """An axis-parallel box that cells stay inside of. low, high: opposite corners, µm; ±inf leaves a side open."""
+    """An axis-parallel box that cells stay inside of. low, high: opposite corners, µm, each entry one number or one per colony; ±inf leaves a side open."""
 
-    low: Sequence[float]
-    high: Sequence[float]
+    low: Sequence[float | Tensor]
+    high: Sequence[float | Tensor]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = tuple(map(float, self.low)), tuple(map(float, self.high))
-        if len(low) != len(high) or any(math.isnan(v) for v in low + high):
-            raise checks.refuse("Box.low, Box.high", (low, high), "two corners of equally many numbers")
-        for a, lo, hi in zip(AXES, low, high, strict=False):
-            if not lo < hi:
-                raise checks.refuse(f"Box.low, Box.high along {a}", (lo, hi), "low < high", "This box is inside out.")
+        for name, corner in zip(("low", "high"), checks.corners("Box", self.low, self.high, "This box is inside out."), strict=True):
+            object.__setattr__(self, name, corner)
 
     def surfaces(self, dim: int) -> list[Surface]:
         if len(tuple(self.low)) != dim:
@@ -135,7 +131,7 @@ class Box(Wall):
         out: list[Surface] = []
         for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             for sign, at in ((1.0, low), (-1.0, high)):
-                if math.isfinite(at):
+                if isinstance(at, Tensor) or math.isfinite(at):
                     out.append(_Flat(self, tuple(sign if m == k else 0.0 for m in range(dim)), sign * at))
         return out
 
@@ -144,25 +140,25 @@ class Box(Wall):
 class Channel(Wall):
     """A growth channel along x: walls at y = ±width/2, in 3-D also at z = ±height/2; `low_end`, `high_end` close it at that x (None: open)."""
 
-    width: float
-    height: float | None = None
-    low_end: float | None = None
-    high_end: float | None = None
+    width: float | Tensor
+    height: float | Tensor | None = None
+    low_end: float | Tensor | None = None
+    high_end: float | Tensor | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.number("Channel.width", self.width, above=0.0)
-        if self.height is not None:
-            checks.number("Channel.height", self.height, above=0.0)
-        if self.low_end is not None and self.high_end is not None and not self.low_end < self.high_end:
+        for name, above in (("width", 0.0), ("height", 0.0), ("low_end", -math.inf), ("high_end", -math.inf)):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, checks.value(f"Channel.{name}", getattr(self, name), above=above))
+        if self.low_end is not None and self.high_end is not None and not checks.below(self.low_end, self.high_end):
             raise checks.refuse("Channel.low_end, Channel.high_end", (self.low_end, self.high_end), "low_end < high_end", "This channel is inside out.")
 
     def surfaces(self, dim: int) -> list[Surface]:
         if self.height is not None and dim == 2:
             raise checks.refuse("Channel.height", self.height, "left out in a 2-D scene")
         half = (math.inf, self.width / 2, math.inf if self.height is None else self.height / 2)
-        low = [-math.inf if self.low_end is None else float(self.low_end)] + [-h for h in half[1:dim]]
-        high = [math.inf if self.high_end is None else float(self.high_end)] + [h for h in half[1:dim]]
+        low = [-math.inf if self.low_end is None else self.low_end] + [-h for h in half[1:dim]]
+        high = [math.inf if self.high_end is None else self.high_end] + [h for h in half[1:dim]]
         return Box(low, high, stiffness=self.stiffness, weight=self.weight).surfaces(dim)
 
 

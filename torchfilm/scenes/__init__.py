@@ -7,8 +7,6 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from torch import Tensor
-
 from torchfilm.scene import Scene
 from torchfilm.scenes import channels, colonies
 from torchfilm.tools import checks
@@ -22,7 +20,7 @@ def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
         bound = inspect.signature(make).bind(*args, **parameters)
         bound.apply_defaults()
         scene = make(*args, **parameters)
-        plain = {n: v.tolist() if isinstance(v, Tensor) else v for n, v in bound.arguments.items()}
+        plain = {n: v.tolist() if hasattr(v, "tolist") else v for n, v in bound.arguments.items()}
         scene.name, scene.recipe = make.__name__, (make.__name__, plain)
         return scene
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -64,6 +65,35 @@ def value(name: str, given: object, *, above: float = -math.inf, least: float = 
             f"{name}[{at}] = {float(seen.reshape(-1)[at])} is not allowed ({len(where)} of {seen.numel()} values): each must be {_rule(above, least, most)}."
         )
     return given
+
+
+def below(low: float | Tensor, high: float | Tensor) -> bool:
+    """Whether low < high, everywhere."""
+    return bool((torch.as_tensor(low).detach() < torch.as_tensor(high).detach()).all())
+
+
+def corners(name: str, low: object, high: object, mend: str = "") -> tuple[tuple[float | Tensor, ...], tuple[float | Tensor, ...]]:
+    """Two opposite corners, low < high along every axis; entries are numbers (±inf allowed) or one number per colony."""
+    if not all(isinstance(corner, (tuple, list, Tensor)) or hasattr(corner, "__array__") for corner in (low, high)):
+        raise refuse(f"{name}.low, {name}.high", (low, high), "two corners, such as (0, 0) and (10, 5)")
+    lows: tuple[Any, ...] = tuple(low)  # type: ignore[arg-type]
+    highs: tuple[Any, ...] = tuple(high)  # type: ignore[arg-type]
+    if len(lows) != len(highs) or len(lows) not in (2, 3):
+        raise refuse(f"{name}.low, {name}.high", (low, high), "two corners of 2 or 3 numbers each")
+    checked = []
+    for corner, side in ((lows, "low"), (highs, "high")):
+        entries: list[float | Tensor] = []
+        for k, entry in enumerate(corner):
+            single = isinstance(entry, (int, float)) or getattr(entry, "ndim", 1) == 0
+            if single and math.isinf(float(entry)):
+                entries.append(float(entry))
+            else:
+                entries.append(value(f"{name}.{side}[{k}]", float(entry) if single and not isinstance(entry, Tensor) else entry))
+        checked.append(tuple(entries))
+    for axis, a, b in zip("xyz", checked[0], checked[1], strict=False):
+        if not below(a, b):
+            raise refuse(f"{name}.low, {name}.high along {axis}", (a, b), "low < high", mend)
+    return checked[0], checked[1]
 
 
 def _rule(above: float, least: float, most: float) -> str:
