@@ -36,7 +36,7 @@ ROOMS = {
     "effects": Room(4, ("torchfilm.effects",), talk=False),
     "scene": Room(5, ("torchfilm.scene", "torchfilm.cells")),
     # simulate takes a path to record to, so results lie below it
-    "results": Room(6, ("torchfilm.results",)),
+    "results": Room(6, ("torchfilm.results", "torchfilm.recorder")),
     "simulate": Room(7, ("torchfilm.simulate",)),
     "the rest": Room(8, ("torchfilm",)),
 }

@@ -10,7 +10,8 @@ from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
 from torchfilm.pictures import show
-from torchfilm.results import Recorder, Results
+from torchfilm.recorder import Recorder
+from torchfilm.results import Results
 from torchfilm.scene import Scene
 from torchfilm.simulate import simulate
 from torchfilm.state import Field, State

@@ -149,13 +149,13 @@ class Cells:
         cell_type, colony; any other column becomes a field.
         """
         left = dict(columns)
-        sizes = {n: len(v) for n, v in left.items()}
-        if len(set(sizes.values())) > 1:
-            raise checks.InputError(f"{source}: all columns must be equally long; they are {', '.join(f'{n} {k}' for n, k in sizes.items())}.")
         dim = 3 if "z" in left else 2
         missing = [n for n in POSITION[:dim] if n not in left] + [n for n in ("length",) if n not in left]
         if missing:
             raise checks.InputError(f"{source} lacks the column {missing[0]!r}; it has {', '.join(columns)}.")
+        sizes = {n: len(v) for n, v in left.items()}
+        if len(set(sizes.values())) > 1:
+            raise checks.InputError(f"{source}: all columns must be equally long; they are {', '.join(f'{n} {k}' for n, k in sizes.items())}.")
         position = np.stack([np.asarray(left.pop(n), dtype=np.float64) for n in POSITION[:dim]], 1)
         if "angle" in left:
             angle = np.asarray(left.pop("angle"), dtype=np.float64)

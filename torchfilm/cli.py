@@ -17,7 +17,8 @@ import torch
 from torchfilm import measure, pictures, scenes
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.rules import Rules
-from torchfilm.results import Recorder, Results
+from torchfilm.recorder import Recorder
+from torchfilm.results import Results
 from torchfilm.scene import Scene
 from torchfilm.simulate import simulate
 from torchfilm.state import State
@@ -166,11 +167,11 @@ class Info:
 
 def load_scene(what: str, parameters: dict[str, Any]) -> Scene:
     """A ready-made scene by name, or the `scene` of a Python file."""
-    if not what.endswith(".py"):
-        return scenes.build(what, parameters)
     path = Path(what)
-    if not path.is_file():
-        raise checks.refuse("scene", what, "a Python file", "No such file.")
+    if not path.suffix and path.name == what:
+        return scenes.build(what, parameters)
+    if not path.is_file() or path.suffix != ".py":
+        raise checks.refuse("scene", what, "the name of a ready scene or the path of a Python file", "" if path.exists() else "No such file.")
     names: dict[str, Any] = {"__name__": path.stem, "__file__": str(path)}
     sys.path.insert(0, str(path.parent.resolve()))
     try:
@@ -249,7 +250,10 @@ def go(scene: Scene, start: State, recorder: Recorder, *, cells: int | None, unt
 
 
 def catch_interrupt() -> threading.Event:
-    """Ctrl-C sets the event, for the loop to see between two steps: raised just anywhere, it may be swallowed or cut a frame short. A second one is raised at once."""
+    """Ctrl-C sets the event, for the loop to see between two steps: raised just anywhere, it may be swallowed or cut a frame short.
+
+    A second one is raised at once.
+    """
     event = threading.Event()
 
     def note(*_: object) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from torchfilm.physics.solve import CONVERGED, STATUS
-from torchfilm.results import Recorder
+from torchfilm.recorder import Recorder
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools import checks

@@ -9,7 +9,6 @@ import torch
 from helpers import seeded
 
 import torchfilm as tf
-from torchfilm.effects.growth import doubling_time
 from torchfilm.physics import capsule
 
 
@@ -87,20 +86,6 @@ def test_elongation_is_what_was_added():
     second = scene.step(first, 0.1)
     assert torch.equal(second.length, first.length + second.elongation)
     assert float(second.elongation) > 0
-
-
-@pytest.mark.parametrize("law", ["volume", "length", "linear"])
-def test_doubling_time_is_the_time_from_birth_to_division(law):
-    born = (3.75 - 1.0) / 2
-    scene = scene_of(0.9, law, one_cell(born))
-    hours = doubling_time(0.9, law, 3.75, 0.5)
-    state = grown(scene, scene.seed(dtype=torch.float64), 1, hours)
-    assert float(state.length) == pytest.approx(3.75, rel=1e-12)
-
-
-def test_doubling_times_of_the_model():
-    """The guide's numbers, given to three digits: 0.693/g by volume is exact only for whole volumes; by length 1.003/g."""
-    assert doubling_time(1.0, "length", 3.75, 0.5) == pytest.approx(1.003, abs=5e-4)
 
 
 # --- rates ----------------------------------------------------------------------------------------------------------------

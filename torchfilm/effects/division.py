@@ -180,9 +180,10 @@ def _new_ids(new: State, daughters: Tensor, parents: State) -> tuple[Tensor, Ten
 def _with_noise(new: State, daughters: Tensor, axis_noise: float | Tensor) -> Tensor:
     if not isinstance(axis_noise, Tensor) and axis_noise == 0:
         return new.axis
-    noise = draw("axis_noise", axis_noise, new, daughters).unsqueeze(1) * new.normal(daughters, "Division.axis_noise")[:, : new.dim]
+    sd = draw("axis_noise", axis_noise, new, daughters).unsqueeze(1)
+    noise = sd * new.normal(daughters, "Division.axis_noise")[:, : new.dim]
     axis = new.axis.index_select(0, daughters) + noise
-    axis = axis / (axis * axis).sum(1, keepdim=True).sqrt()
+    axis = torch.where(sd > 0, axis / (axis * axis).sum(1, keepdim=True).sqrt(), axis)
     return new.axis.index_copy(0, daughters, axis)
 
 

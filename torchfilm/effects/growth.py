@@ -62,14 +62,4 @@ class Growth(Effect):
             elongation = torch.expm1(wanted) * state.length
         else:
             elongation = wanted
-        length = state.length + elongation
-        shrunk = length < 0
-        if bool(shrunk.any()):
-            k = int(torch.nonzero(shrunk)[0])
-            ids = sorted(set(state.own_colony_id[shrunk].tolist()))
-            raise checks.SimulationError(
-                f"growth_rate {float(state.growth_rate[k]):g} of cell {int(state.uid[k])} in colony {int(state.own_colony_id[k])} would make its length "
-                f"negative ({int(shrunk.sum())} such cells, colonies {ids[:10]}). Keep growth rates at least 0, or remove such cells.",
-                ids,
-            )
-        return state.replace(length=length).with_fields(elongation=elongation)
+        return state.replace(length=state.length + elongation).with_fields(elongation=elongation)

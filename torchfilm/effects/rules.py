@@ -11,7 +11,6 @@ that nothing declares become variables, and what it reads and writes is noted, s
 from __future__ import annotations
 
 import sys
-import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,6 +25,7 @@ from torchfilm.physics.contacts import Bodies, contact_gaps
 from torchfilm.physics.neighbours import find_pairs
 from torchfilm.state import CELL, Births, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.watched import Watched, load_functions
 
 # The paper's spellings (Table 1) beside ours.
 PAPER_NAMES = {"pos": "position", "dir": "axis", "cellType": "cell_type", "growthRate": "growth_rate", "divideFlag": "divide_flag"}
@@ -33,11 +33,14 @@ GEOMETRY = ("position", "axis", "length", "radius", "volume", "area")
 # What reading a name means in terms of what other effects write.
 MEANS = {"volume": ("length", "radius"), "area": ("length", "radius"), "uid": ("cells",), "parent": ("cells",), "colony": ("cells",)}
 IDENTITY = ("uid", "parent", "colony")
-Functions = dict[str, Callable[..., None] | None]
 KNOWN_FIELDS = {
     "cell_type": Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64),
     "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
 }
+
+
+class RuleError(checks.InputError, AttributeError):
+    """A rule asked for something that is not there, or set something to what it cannot be."""
 
 
 class CellsView:
@@ -103,7 +106,7 @@ class CellsView:
         elif self._declaring and name in KNOWN_FIELDS:
             self._work[name] = KNOWN_FIELDS[name].start(state, torch.arange(state.cells, device=state.device))
         else:
-            raise AttributeError(
+            raise RuleError(
                 f"cells have no {name!r}; they have {', '.join([*GEOMETRY, *IDENTITY, *state.fields])}. A variable of your own needs a first value: "
                 f"give Rules(…, variables={{{name!r}: 0.0}})."
             )
@@ -113,7 +116,7 @@ class CellsView:
         name = PAPER_NAMES.get(name, name)
         state = self._state
         if name in GEOMETRY or name in IDENTITY or isinstance(getattr(type(self), name, None), property):
-            raise AttributeError(f"cells.{name} can only be read (Table 1 of the paper): rules change fields, flags and variables.")
+            raise RuleError(f"cells.{name} can only be read (Table 1 of the paper): rules change fields, flags and variables.")
         declared = KNOWN_FIELDS.get(name, state.declared.get(name)) if name != "remove_flag" else None
         dtype = torch.bool if name == "remove_flag" else (declared.dtype or state.dtype) if declared is not None else None
         tensor = _as_tensor(f"cells.{name}", value, state.device)
@@ -123,7 +126,7 @@ class CellsView:
         try:
             self._work[name] = tensor.to(device=state.device, dtype=dtype).broadcast_to(shape).clone()
         except RuntimeError as error:
-            raise ValueError(f"cells.{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or {tuple(shape)}.") from error
+            raise RuleError(f"cells.{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or {tuple(shape)}.") from error
 
     def __iter__(self):
         return (CellView(self, k) for k in range(self._state.cells))
@@ -158,7 +161,7 @@ class CellsView:
         """Raise if a rule wrote into something that can only be read."""
         for name, shown in self._shown.items():
             if not torch.equal(shown, getattr(self._state, name)):
-                raise AttributeError(f"the rule changed cells.{name} in place, which can only be read: rules change fields, flags and variables.")
+                raise RuleError(f"the rule changed cells.{name} in place, which can only be read: rules change fields, flags and variables.")
 
     def contact_count(self, within: float = 0.05) -> Tensor:
         """How many cells each cell touches, (N,) int64."""
@@ -217,7 +220,7 @@ class DivisionView:
             raise AttributeError(name)
         if name not in self._work:
             if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
-                raise AttributeError(f"cells have no {name!r}; they have {', '.join([*GEOMETRY, *IDENTITY, *self._state.fields])}")
+                raise RuleError(f"cells have no {name!r}; they have {', '.join([*GEOMETRY, *IDENTITY, *self._state.fields])}")
             value = getattr(self._state, name)
             self._work[name] = value.clone() if self._rows is None else value.index_select(0, self._rows)
         return self._work[name]
@@ -225,15 +228,15 @@ class DivisionView:
     def __setattr__(self, name: str, value: Any) -> None:
         name = PAPER_NAMES.get(name, name)
         if self._rows is None:
-            raise AttributeError(f"parent.{name} can only be read: the parent is gone; set daughter1.{name} and daughter2.{name}.")
+            raise RuleError(f"parent.{name} can only be read: the parent is gone; set daughter1.{name} and daughter2.{name}.")
         if name not in self._state.fields:
-            raise AttributeError(f"daughters have no field {name!r} to write; they have {', '.join(self._state.fields)}")
+            raise RuleError(f"daughters have no field {name!r} to write; they have {', '.join(self._state.fields)}")
         like = getattr(self, name)
         tensor = _as_tensor(f"daughter.{name}", value, like.device).to(like.dtype)
         try:
             self._work[name] = tensor.broadcast_to(like.shape).clone()
         except RuntimeError as error:
-            raise ValueError(f"daughter.{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or {tuple(like.shape)}.") from error
+            raise RuleError(f"daughter.{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or {tuple(like.shape)}.") from error
         self._set.add(name)
 
     def random(self) -> Tensor:
@@ -247,61 +250,7 @@ def _as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
     try:
         return value if isinstance(value, Tensor) else torch.as_tensor(value, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{name} was set to {value!r}: it must be a number or a tensor.") from error
-
-
-class Source:
-    """Where the rule functions come from: functions, or a file that may be edited while a run is going."""
-
-    def __init__(self, path: Path | None, functions: Functions):
-        self.path, self.functions, self.good = path, functions, functions
-        self.stamp = path.stat().st_mtime_ns if path else 0
-        self.watching = False
-        self.messages: list[str] = []
-
-    def refresh(self) -> None:
-        """Take up an edited file if it loads; else report and keep the last good rules."""
-        if not self.watching or self.path is None:
-            return
-        try:
-            stamp = self.path.stat().st_mtime_ns
-        except OSError:
-            return  # an editor is just replacing the file
-        if stamp == self.stamp:
-            return
-        self.stamp = stamp
-        try:
-            self.functions = load_rules(self.path)
-            self.messages.append(f"{self.path.name} taken up")
-        except Exception as error:  # the user's own code may fail in any way; the run goes on
-            self._report(error)
-
-    def call(self, name: str, act: Callable[[Callable[..., None]], State], state: State) -> State:
-        """`act` on the function of that name; if a new edit of it fails, report, and act on the last good one. The state as it is where there is none."""
-        function = self.functions[name]
-        try:
-            return state if function is None else act(function)
-        except Exception as error:
-            if not self.watching or self.functions is self.good:
-                raise
-            self._report(error)
-            self.functions = self.good
-            function = self.good[name]
-            return state if function is None else act(function)
-
-    def _report(self, error: Exception) -> None:
-        assert self.path is not None
-        self.messages.append(f"{self.path.name} is broken, still running the last good rules: {type(error).__name__}: {error}")
-
-
-def load_rules(path: Path) -> Functions:
-    """Run a rules file and return its `update` and `divide`."""
-    module = types.ModuleType(path.stem)
-    exec(compile(path.read_text(), str(path), "exec"), module.__dict__)
-    found = {name: getattr(module, name, None) for name in ("update", "divide")}
-    if not any(map(callable, found.values())):
-        raise checks.InputError(f"{path} defines neither update(cells) nor divide(parent, daughter1, daughter2).")
-    return found
+        raise RuleError(f"{name} was set to {value!r}: it must be a number or a tensor.") from error
 
 
 @dataclass(frozen=True)
@@ -315,7 +264,7 @@ class Rules(Effect):
     update: Callable[[CellsView], None] | str | Path | None = None
     divide: Callable[[DivisionView, DivisionView, DivisionView], None] | None = None
     variables: Mapping[str, float] = field(default_factory=dict)
-    source: Source = field(init=False, repr=False, compare=False)
+    source: Watched = field(init=False, repr=False, compare=False)
     noted: dict[str, tuple[str, ...]] = field(init=False, repr=False, compare=False)
 
     stage = RULES
@@ -330,7 +279,7 @@ class Rules(Effect):
             path = next((p for p in places if p.is_file()), places[0])
             if not path.is_file():
                 raise checks.refuse("Rules.update", str(path), "a function or the path of a Python file", "No such file.")
-            functions = load_rules(path)
+            functions = load_functions(path, ("update", "divide"))
         for name, given in functions.items():
             if given is not None and not callable(given):
                 raise checks.refuse(f"Rules.{name}", given, "a function")
@@ -338,7 +287,7 @@ class Rules(Effect):
             raise checks.InputError("Rules() has neither update nor divide: give at least one, such as tf.Rules(update).")
         for name, value in self.variables.items():
             checks.number(f"Rules.variables[{name!r}]", value)
-        object.__setattr__(self, "source", Source(path, functions))
+        object.__setattr__(self, "source", Watched(path, functions))
         object.__setattr__(self, "noted", {"reads": (), "writes": (), "divide reads": (), "divide writes": ()})
 
     def parts(self) -> tuple[Effect, ...]:
@@ -395,6 +344,8 @@ def _apply(update: Callable[[CellsView], None], state: State, dt: float) -> Stat
     update(view)
     view.check_unharmed()
     work = dict(view._work)
+    if "growth_rate" in work and bool((work["growth_rate"] < 0).any()):
+        raise RuleError(f"cells.growth_rate was set to {float(work['growth_rate'].min()):g}: it must be at least 0. To let cells vanish, set remove_flag.")
     gone = work.pop("remove_flag", None)
     for name in work:
         if name not in state.fields:
@@ -424,8 +375,6 @@ class DivisionRule(Effect):
         source = self.rules.source
         for births in state.births:
             state = source.call("divide", partial(_divide, state=state, births=births), state)
-        # both functions have now done a step without a fault
-        source.good = source.functions
         return state
 
 
