@@ -55,7 +55,8 @@ class Mechanics(Effect):
     passes: at most this many times a step contacts are found and solved: again in colonies where the move made new contacts, or left an
     overlap deeper than `overlap` (µm). Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other; twice as many
     for unilateral contacts, since a push at one end may drive in the other; 6, down to 0.02 µm, for colonies that take sub-steps.
-    tolerance: of the solve, worst residual relative to the worst at rest. max_iterations: CG iterations a solve.
+    tolerance: of the solve, worst residual relative to the worst at rest; default 0.1 in the plane, where it changes no overlap, and 0.05 in space,
+    where cells that buckle amplify what is left. max_iterations: CG iterations a solve.
     max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
     """
 
@@ -68,7 +69,7 @@ class Mechanics(Effect):
     unilateral: bool = False
     passes: int | None = None
     overlap: float | None = None
-    tolerance: float = 0.1
+    tolerance: float | None = None
     max_iterations: int = 2000
     max_elongation: float = 0.25
 
@@ -95,7 +96,8 @@ class Mechanics(Effect):
                 continue
             if not isinstance(given, int) or given < 1:
                 raise checks.refuse(f"Mechanics.{name}", given, "a whole number from 1")
-        checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
+        if self.tolerance is not None:
+            checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
         checks.number("Mechanics.max_elongation", self.max_elongation, above=0.0)
         if self.overlap is not None:
             checks.number("Mechanics.overlap", self.overlap, above=0.0)
@@ -115,6 +117,11 @@ class Mechanics(Effect):
     def most_passes(self) -> int:
         """`passes`, or its default for the dimension and the kind of contact."""
         return self.passes if self.passes is not None else (self.dim - 1) * (2 if self.unilateral else 1)
+
+    @property
+    def least_accuracy(self) -> float:
+        """`tolerance`, or its default for the dimension."""
+        return self.tolerance if self.tolerance is not None else (0.1 if self.dim == 2 else 0.05)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (
@@ -276,7 +283,7 @@ class _Run:
         lower = (base - self.length) / scale[:, -1]
         problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1), lower, scale, state.groups, settings.unilateral)
         start = state.displacement if first else None
-        return solve(problem, start, settings.tolerance, settings.max_iterations)
+        return solve(problem, start, settings.least_accuracy, settings.max_iterations)
 
     def _turn(self, move: Tensor) -> Tensor:
         """How far each cell turns, (N,) rad."""
