@@ -48,6 +48,7 @@ class Recorder:
             raise checks.refuse("record", str(path), "a path where there is no file yet", "Choose another, or say overwrite, or resume from it.")
         if not self.path.parent.is_dir():
             raise checks.refuse("record", str(path), "in a folder that exists", f"Make {self.path.parent} first.")
+        self.overwrite = overwrite
         self.file: h5py.File | None = None
         self.dt = scene.dt  # `simulate` sets the one that it uses
         self.tables: dict[str, h5py.Dataset] = {}
@@ -83,14 +84,23 @@ class Recorder:
             _copy_committed(self.path, rebuilt)
             os.replace(rebuilt, self.path)
             self.file = h5py.File(self.path, "r+", libver="latest")
+            mine = (state.seed, str(state.dtype)[6:], state.dim, state.colony_id.tolist())
+            there = (int(self.file.attrs["seed"]), str(self.file.attrs["dtype"]), int(self.file.attrs["dim"]), self.file["colony_id"][...].tolist())
+            if mine != there:
+                self.file.close()
+                self.file = None
+                raise checks.refuse("state", f"of (seed, dtype, dim, colonies) {mine}", f"of {there}, as {self.path} is", "Record to a file of its own.")
             last = int(self.file["frames/step"][-1])
             if last != state.step:
                 self.file.close()
+                self.file = None
                 raise checks.refuse("state", f"at step {state.step}", f"the last frame of {self.path}, at step {last}", "Start from its last frame.")
             self.file.swmr_mode = True
             self.written, self.first_step = last, int(self.file["frames/step"][0])
             return
         self.first_step = state.step
+        if self.path.exists() and not self.overwrite:
+            raise checks.refuse("record", str(self.path), "a path where there is no file yet", "A Recorder writes one run; make another for the next.")
         self.file = h5py.File(self.path, "w", libver="latest")
         self._create(state)
         self.file.swmr_mode = True
@@ -145,7 +155,7 @@ class Recorder:
 
     def _check_room(self, state: State) -> None:
         """Stop while the file is still whole: HDF5 does not survive a disk that fills under it."""
-        needed = sum(v.nbytes for v in _cell_columns(state).values()) + ROOM_TO_SPARE
+        needed = sum(v.nbytes for v in _cell_columns(state).values()) + sum(c.nbytes for e in (*self.births, *self.ends) for c in e) + ROOM_TO_SPARE
         room = shutil.disk_usage(self.path.parent).free
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0] if resource else -1
         if limit >= 0:

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.scene import Scene
-from torchfilm.state import CELL, PER_CELL, Field, State
+from torchfilm.state import PER_CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 
@@ -134,9 +134,9 @@ class Results:
 
     def refresh(self) -> None:
         """See what a run has written since."""
-        for item in ("step", *FRAME_COLUMNS):
-            self.file[f"frames/{item}"].id.refresh()
-        for dataset in (*self.file["cells"].values(), *self.file["lineage/births"].values(), *self.file["lineage/ends"].values()):
+        self.file["frames/step"].id.refresh()  # first: what it counts has been written before it
+        groups = ("cells", "lineage/births", "lineage/ends", "frames/colony", "frames")
+        for dataset in (d for g in groups if g in self.file for n, d in self.file[g].items() if isinstance(d, h5py.Dataset) and n != "step"):
             dataset.id.refresh()
 
     def _index(self, frame: int) -> int:
@@ -210,12 +210,20 @@ class Results:
         declared = dict(template.declared)
         for name, (meaning, unit, scope, shape, at_division) in json.loads(self.file.attrs["declared"]).items():
             if name not in declared:
-                declared[name] = Field(name, meaning, unit, scope, tuple(shape), torch.from_numpy(recorded[name]).dtype, at_division=at_division)
+                declared[name] = Field(
+                    name,
+                    meaning,
+                    unit,
+                    scope,
+                    tuple(shape),
+                    torch.from_numpy(recorded[name] if name in recorded else np.atleast_1d(colony_fields[name])).dtype,
+                    at_division=at_division,
+                )
 
         def tensor(value: np.ndarray) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(value)).to(device)
 
-        fields = {n: tensor(recorded[n] if declared[n].scope == CELL else colony_fields[n]) for n in declared}
+        fields = {n: tensor(recorded[n] if n in recorded else colony_fields[n]) for n in declared}
         return template.replace(
             **{n: tensor(recorded[n]) for n in PER_CELL}, colony_id=tensor(self.colony_id), next_uid=tensor(self.file["frames/next_uid"][k]),
             step=int(self.steps[k]), time=float(self.times[k]), fields=fields, declared=declared,

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchfilm.cells import Cells
 from torchfilm.effect import BUILT_IN, STAGES, Distribution, Effect
 from torchfilm.physics.walls import Wall
-from torchfilm.state import State
+from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.timing import Timings
 
@@ -41,7 +41,7 @@ class Scene:
             raise checks.InputError("Scene() has no effect: nothing would happen. List at least one, such as tf.Growth(rate=1.0).")
         names = [e.title for e in effects]
         for title in names:
-            if names.count(title) > 1 and title in ("growth", "division", "mechanics"):
+            if names.count(title) > 1 and title in ("rules", "growth", "division", "mechanics"):
                 raise checks.InputError(f"Scene lists {title} {names.count(title)} times: one is allowed. Put all of it into one.")
         self.listed = effects
         self.effects: tuple[Effect, ...] = tuple(sorted((p for e in effects for p in e.parts()), key=lambda p: p.stage))
@@ -108,8 +108,7 @@ class Scene:
         state = (cells if cells is not None else self.founders).state(colonies, seed, device, dtype)
         for effect in self.effects:
             for f in effect.declares(self.dim):
-                if f.name not in state.fields:
-                    state = state.declare(f)
+                state = _with_given(state, f) if f.name in state.fields else state.declare(f)
         for effect in self.effects:
             state = effect.prepare(state)
         return state
@@ -132,7 +131,7 @@ class Scene:
 
     def step(self, state: State, dt: float, timings: Timings | None = None) -> State:
         """The state dt hours later: each effect in turn."""
-        state = state.replace(births=(), ended=())
+        state = state.replace(births=(), ended=(), reports={})
         for effect in self.effects:
             if timings is None:
                 state = effect.step(state, dt)
@@ -167,6 +166,16 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(summary(e) for e in self.listed)}, name={self.name!r})"
+
+
+def _with_given(state: State, wanted: Field) -> State:
+    """A field that came with the first cells, under the effect's own declaration: its rule at division and its dtype are the effect's."""
+    values = state.fields[wanted.name]
+    shape = (state.cells, *wanted.shape)
+    if wanted.scope != CELL or tuple(values.shape) != shape:
+        raise checks.refuse(f"cells column {wanted.name}", f"values of shape {tuple(values.shape)}", f"left out, or of shape {shape}")
+    declared = state.replace(declared={**state.declared, wanted.name: wanted})
+    return declared.with_fields(**{wanted.name: values.to(wanted.dtype or state.dtype)})
 
 
 def summary(effect: Effect) -> str:

@@ -34,7 +34,7 @@ def simulate(
 ) -> Iterator[State]:
     """Run the scene from `state`, yielding the state after each step.
 
-    until: time to stop at, h. cells: stop once every colony has this many cells. At least one of the two; the first reached ends the run.
+    until: time to stop at, h. cells: stop once every colony has this many cells, or none at all. At least one of the two; the first reached ends the run.
     dt: step, h; by default the scene's. record: path of a new results file (every tenth step and the last), or a Recorder.
     observers: called with the first state and after every step.
     on_failure: "raise" a SimulationError that names the colonies whose solve failed, or "drop" their cells, note it, and go on.
@@ -66,7 +66,7 @@ def _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings
     try:
         for observe in (*([recorder] if recorder else []), *observers):
             observe(state)
-        while state.step < last and not (cells is not None and bool((state.counts >= cells).all())):
+        while state.step < last and not (cells is not None and bool(((state.counts >= cells) | (state.counts == 0)).all())):
             state = scene.step(state, dt, timings)
             state = handle_failures(state, on_failure)
             if recorder:

@@ -319,7 +319,8 @@ class _Run:
         self.limited = torch.where(active, state.groups.sum(too_far.to(state.dtype)).squeeze(1).long(), self.limited)
         self.position = self.position + move[:, :d].to(self.position.dtype)
         self.axis = torch.where(sound, capsule.rotate(self.axis, move[:, d:-1] * cut), self.axis)
-        self.length = torch.maximum(self.length + move[:, -1], base)
+        length = self.length + move[:, -1]
+        self.length = torch.where(length >= base, length, base)  # unlike a maximum, whole gradient at a tie
 
     def _noted(self, new: SolveReport, active: Tensor) -> MechanicsReport:
         old = self.report

@@ -33,10 +33,21 @@ GEOMETRY = ("position", "axis", "length", "radius", "volume", "area")
 # What reading a name means in terms of what other effects write.
 MEANS = {"volume": ("length", "radius"), "area": ("length", "radius"), "uid": ("cells",), "parent": ("cells",), "colony": ("cells",)}
 IDENTITY = ("uid", "parent", "colony")
+TRIAL_STEP = 0.025  # h, the step that a rule sees when it is tried
 KNOWN_FIELDS = {
     "cell_type": Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64),
     "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
 }
+
+
+def _quantity(state: State, name: str) -> Tensor:
+    """A quantity by the name that rules use; a colony goes by its id, which does not depend on the batch."""
+    return state.own_colony_id if name == "colony" else getattr(state, name)
+
+
+def _check_whole(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
+    if tensor.is_floating_point() and not dtype.is_floating_point and dtype != torch.bool and not bool((tensor == tensor.round()).all()):
+        raise RuleError(f"{name} holds whole numbers, and was set to broken ones. Give it a first value such as 0.0 if it is to hold any number.")
 
 
 class RuleError(checks.InputError, AttributeError):
@@ -55,6 +66,7 @@ class CellsView:
     _work: dict[str, Tensor]
     _read: set[str]
     _shown: dict[str, Tensor]
+    _written: set[str]
     _declaring: bool
     _draws: int
 
@@ -64,6 +76,7 @@ class CellsView:
         object.__setattr__(self, "_work", {})
         object.__setattr__(self, "_read", set())
         object.__setattr__(self, "_shown", {})
+        object.__setattr__(self, "_written", set())
         object.__setattr__(self, "_declaring", declaring)
         object.__setattr__(self, "_draws", 0)
 
@@ -94,8 +107,9 @@ class CellsView:
         state = self._state
         if name in GEOMETRY or name in IDENTITY:
             self._read.update(MEANS.get(name, (name,)))
-            # a copy, so that a rule that writes into it is found out and the state stays as it was
-            self._shown[name] = getattr(state, name).clone()
+            if name not in self._shown:
+                # a copy, so that a rule that writes into it is found out and the state stays as it was
+                self._shown[name] = _quantity(state, name).clone()
             return self._shown[name]
         if name == "remove_flag":
             self._work[name] = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
@@ -121,7 +135,12 @@ class CellsView:
         dtype = torch.bool if name == "remove_flag" else (declared.dtype or state.dtype) if declared is not None else None
         tensor = _as_tensor(f"cells.{name}", value, state.device)
         if dtype is None:
-            dtype = state.dtype if tensor.is_floating_point() else tensor.dtype
+            known = state.fields.get(name)
+            # a plain number makes a variable that can hold any number
+            plain = tensor.is_floating_point() or (not isinstance(value, (bool, Tensor)) and tensor.dtype != torch.bool)
+            dtype = known.dtype if known is not None else state.dtype if plain else tensor.dtype
+        _check_whole(f"cells.{name}", tensor, dtype)
+        self._written.add(name)
         shape = state.fields[name].shape if name in state.fields else (state.cells, *tensor.shape[1:])
         try:
             self._work[name] = tensor.to(device=state.device, dtype=dtype).broadcast_to(shape).clone()
@@ -160,7 +179,7 @@ class CellsView:
     def check_unharmed(self) -> None:
         """Raise if a rule wrote into something that can only be read."""
         for name, shown in self._shown.items():
-            if not torch.equal(shown, getattr(self._state, name)):
+            if not torch.equal(shown, _quantity(self._state, name)):
                 raise RuleError(f"the rule changed cells.{name} in place, which can only be read: rules change fields, flags and variables.")
 
     def contact_count(self, within: float = 0.05) -> Tensor:
@@ -188,9 +207,12 @@ class CellView:
         name = PAPER_NAMES.get(name, name)
         cells = self._cells
         if name in cells._state.fields or name in ("remove_flag", *KNOWN_FIELDS) or name in cells._work:
-            getattr(cells, name)[self._index] = value
+            column = getattr(cells, name)
+            _check_whole(f"cell.{name}", torch.as_tensor(value), column.dtype)
+            column[self._index] = value
+            cells._written.add(name)
         elif cells._declaring:
-            setattr(cells, name, torch.zeros(len(cells), dtype=torch.as_tensor(value).dtype, device=cells._state.device))
+            setattr(cells, name, False if isinstance(value, bool) else 0.0)
             getattr(cells, name)[self._index] = value
         else:
             setattr(cells, name, value)  # raises, with the reason
@@ -221,7 +243,7 @@ class DivisionView:
         if name not in self._work:
             if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
                 raise RuleError(f"cells have no {name!r}; they have {', '.join([*GEOMETRY, *IDENTITY, *self._state.fields])}")
-            value = getattr(self._state, name)
+            value = _quantity(self._state, name)
             self._work[name] = value.clone() if self._rows is None else value.index_select(0, self._rows)
         return self._work[name]
 
@@ -232,7 +254,9 @@ class DivisionView:
         if name not in self._state.fields:
             raise RuleError(f"daughters have no field {name!r} to write; they have {', '.join(self._state.fields)}")
         like = getattr(self, name)
-        tensor = _as_tensor(f"daughter.{name}", value, like.device).to(like.dtype)
+        tensor = _as_tensor(f"daughter.{name}", value, like.device)
+        _check_whole(f"daughter.{name}", tensor, like.dtype)
+        tensor = tensor.to(like.dtype)
         try:
             self._work[name] = tensor.broadcast_to(like.shape).clone()
         except RuntimeError as error:
@@ -306,7 +330,7 @@ class Rules(Effect):
         """Try `update` once on the first state: new names become fields, and what is read and written is noted."""
         update = self.source.functions["update"]
         if update is not None:
-            view = CellsView(state, 0.0, declaring=True)
+            view = CellsView(state, TRIAL_STEP, declaring=True)
             update(view)
             view.check_unharmed()
             for name, value in view._work.items():
@@ -314,7 +338,7 @@ class Rules(Effect):
                     new = KNOWN_FIELDS.get(name) or Field(name, "variable of the user's rules", dtype=value.dtype, shape=tuple(value.shape[1:]))
                     state = state.declare(new)
             changed = [n for n, v in view._work.items() if n != "remove_flag" and not torch.equal(v, state.fields[n])]
-            writes = [n for n in view._work if n in changed or n not in view._read]
+            writes = view._written | set(changed)
             self.noted["reads"] = tuple(sorted(view._read))
             self.noted["writes"] = tuple("cells" if n == "remove_flag" else n for n in sorted(writes))
         divide = self.source.functions["divide"]
@@ -344,6 +368,8 @@ def _apply(update: Callable[[CellsView], None], state: State, dt: float) -> Stat
     update(view)
     view.check_unharmed()
     work = dict(view._work)
+    if "drag" in work and not bool((work["drag"] > 0).all()):
+        raise RuleError(f"cells.drag was set to {float(work['drag'].min()):g}: it must be above 0.")
     if "growth_rate" in work and bool((work["growth_rate"] < 0).any()):
         raise RuleError(f"cells.growth_rate was set to {float(work['growth_rate'].min()):g}: it must be at least 0. To let cells vanish, set remove_flag.")
     gone = work.pop("remove_flag", None)

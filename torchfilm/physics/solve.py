@@ -190,12 +190,14 @@ def _line_search(problem: ContactProblem, y, after, gradient, direction, going):
 
     def move(share: Tensor):
         new = torch.addcmul(y, share.index_select(0, owner).unsqueeze(1), direction)
-        cut = bool((new[:, -1] < problem.lower).any())
+        cut = problem.colonies.any(new[:, -1] < problem.lower)
         new[:, -1] = torch.maximum(new[:, -1], problem.lower)
         return new, problem.after(new), cut
 
     new, then, cut = move(length)
-    if not problem.unilateral and not cut:
+    # asked of each colony by itself: one that needs no looking at must not change because another does
+    going = going & (cut | problem.unilateral)
+    if not bool(going.any()):
         return new, then
     before = problem.energy(y, after)
     for _ in range(HALVINGS):
@@ -236,7 +238,9 @@ class _AdjointSolve:
         free, colonies = self.free, self.problem.colonies
         precondition = _within(free, self.precondition)
         b = grad * free
-        target = self.tolerance * worst_of(precondition(b), colonies)
+        # the forward solve's tolerance is a matter of overlaps; a gradient wants more
+        tolerance = min(self.tolerance, 1e-4 if grad.dtype == torch.float32 else 1e-8)
+        target = tolerance * worst_of(precondition(b), colonies)
         return conjugate_gradients(_operator(self.problem, self.active, free), b, precondition, colonies, target, self.max_iterations).x
 
 

@@ -36,10 +36,6 @@ class Wall:
         if self.weight is not None:
             object.__setattr__(self, "weight", checks.value(f"{name}.weight", self.weight, above=0.0, most=1.0))
 
-    @property
-    def soft(self) -> bool:
-        return self.stiffness is not None
-
     def surfaces(self, dim: int) -> list[Surface]:
         """The wall as planes and spheres in `dim` dimensions."""
         raise NotImplementedError

@@ -16,7 +16,7 @@ T = TypeVar("T")
 def load_functions(path: Path, names: tuple[str, ...]) -> Functions:
     """Run a Python file of the user's and return those of its functions that have one of the names."""
     module = types.ModuleType(path.stem)
-    exec(compile(path.read_text(), str(path), "exec"), module.__dict__)
+    exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
     found = {name: getattr(module, name, None) for name in names}
     if not any(map(callable, found.values())):
         raise checks.InputError(f"{path} defines neither {' nor '.join(names)}.")
