@@ -345,7 +345,7 @@ def test_writing_into_what_is_read_only_never_reaches_the_state(name):
     state = state.replace(**{name: getattr(state, name) + 3})
     before = {n: getattr(state, n).clone() for n in ("position", "axis", "length", "radius", "uid", "parent", "colony")}
     ruled = tf.Rules(update)
-    with contextlib.suppress(AttributeError, RuntimeError, TypeError):
+    with contextlib.suppress(AttributeError, RuntimeError, TypeError, IndexError):  # a colony that the batch has not is refused too
         ruled.step(state, 0.1)
     for n, value in before.items():
         assert torch.equal(getattr(state, n), value), f"the rule changed {n} of the frozen state"

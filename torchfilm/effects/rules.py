@@ -62,6 +62,7 @@ class CellsView:
     """
 
     _state: State
+    _label: str
     _dt: float
     _work: dict[str, Tensor]
     _read: set[str]
@@ -70,7 +71,8 @@ class CellsView:
     _declaring: bool
     _draws: int
 
-    def __init__(self, state: State, dt: float, declaring: bool = False):
+    def __init__(self, state: State, dt: float, label: str, declaring: bool = False):
+        object.__setattr__(self, "_label", label)
         object.__setattr__(self, "_state", state)
         object.__setattr__(self, "_dt", dt)
         object.__setattr__(self, "_work", {})
@@ -153,7 +155,7 @@ class CellsView:
     def random(self) -> Tensor:
         """A draw from (0, 1) for each cell, (N,), keyed by seed, colony, cell and step: the same whatever the batch. Each call draws anew."""
         object.__setattr__(self, "_draws", self._draws + 1)
-        return self._state.uniform(torch.arange(self._state.cells, device=self._state.device), f"rule {self._draws}")
+        return self._state.uniform(torch.arange(self._state.cells, device=self._state.device), f"{self._label} {self._draws}")
 
     def colony_max(self, value: Tensor) -> Tensor:
         """The greatest value in each cell's own colony, (N,) -> (N,)."""
@@ -330,7 +332,7 @@ class Rules(Effect):
         """Try `update` once on the first state: new names become fields, and what is read and written is noted."""
         update = self.source.functions["update"]
         if update is not None:
-            view = CellsView(state, TRIAL_STEP, declaring=True)
+            view = CellsView(state, TRIAL_STEP, _label(update), declaring=True)
             update(view)
             view.check_unharmed()
             for name, value in view._work.items():
@@ -363,8 +365,13 @@ class Rules(Effect):
         return self.source.call("update", lambda update: _apply(update, state, dt), state)
 
 
+def _label(rule: Callable[..., None]) -> str:
+    """What keeps the random draws of one rule apart from another's."""
+    return f"rule {getattr(rule, '__module__', '')} {getattr(rule, '__qualname__', type(rule).__name__)}"
+
+
 def _apply(update: Callable[[CellsView], None], state: State, dt: float) -> State:
-    view = CellsView(state, dt)
+    view = CellsView(state, dt, _label(update))
     update(view)
     view.check_unharmed()
     work = dict(view._work)
