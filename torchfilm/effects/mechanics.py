@@ -126,7 +126,7 @@ class Mechanics(Effect):
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (
             Field(
-                "displacement", "move of the last step's first solve (Δc, Δθ, Δl), from which the next starts", "µm, rad, µm",
+                "displacement", "move of the last first solve of a step or sub-step (Δc, Δθ, Δl), from which the next starts", "µm, rad, µm",
                 shape=(self.degrees,),
             ),
         )  # fmt: skip

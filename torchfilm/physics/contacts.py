@@ -87,7 +87,6 @@ def closest_points(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor]:
                 t = sign * b.half
                 s = _clamp(cosine * t + on_a, a.half)
             d2 = _distance2(between, a.axis, b.axis, s, t)
-            # an end wins a tie, by more than rounding, so that which end is found does not depend on the last bit
             closer = d2 < best
             best = torch.where(closer, d2, best)
             best_s, best_t = torch.where(closer, s, best_s), torch.where(closer, t, best_t)
