@@ -1,0 +1,1 @@
+"""Kernels: tensors in and out, never a State."""
