@@ -31,7 +31,8 @@ COARSE_PASSES, COARSE_OVERLAP = 6, 0.02
 @dataclass(frozen=True)
 class MechanicsReport:
     """What the last step's contact solves did, per colony (B,). `status` of the worst solve, `iterations` of CG in all, `residual` the
-    worst true one; `passes` and `substeps` taken; `limited`: cells that the last pass kept from turning further (see MAX_TURN)."""
+    worst true one; `passes` and `substeps` taken; `limited`: cells that the last pass kept from turning further, `share`: how much of the
+    last pass's move was carried out (see MAX_TURN)."""
 
     status: Tensor
     iterations: Tensor
@@ -39,6 +40,7 @@ class MechanicsReport:
     passes: Tensor
     substeps: Tensor
     limited: Tensor
+    share: Tensor
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,8 @@ class _Run:
         count = state.colonies
         zero = torch.zeros(count, dtype=torch.int64, device=state.device)
         self.limited = zero
-        self.report = MechanicsReport(status, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero)
+        self.share = torch.ones(count, dtype=state.dtype, device=state.device)
+        self.report = MechanicsReport(status, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero, self.share)
         start = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
         self.reference = state.position.detach().index_select(0, start).index_select(0, state.colony)
         drag_factor = state.fields.get("drag")
@@ -260,7 +263,7 @@ class _Run:
         again[contacts.first[new]] = True
         again[contacts.first[contacts.gap < -self.overlap.index_select(0, contacts.first)]] = True
         again[walls.cell[walls.gap < -self.overlap.index_select(0, walls.cell)]] = True
-        return groups.any(again) | self.shortened
+        return groups.any(again) | (self.share < 1)
 
     def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, first: bool):
         state, settings = self.state, self.settings
@@ -315,7 +318,7 @@ class _Run:
         turn = self._turn(move).unsqueeze(1)
         too_far = turn > MAX_TURN * (1 + 1e-5)
         cut = torch.where(too_far, MAX_TURN / turn, 1.0)
-        self.shortened = active & (share < 1)
+        self.share = torch.where(active, share, self.share)
         self.limited = torch.where(active, state.groups.sum(too_far.to(state.dtype)).squeeze(1).long(), self.limited)
         self.position = self.position + move[:, :d].to(self.position.dtype)
         self.axis = torch.where(sound, capsule.rotate(self.axis, move[:, d:-1] * cut), self.axis)
@@ -328,7 +331,7 @@ class _Run:
             torch.where(active, torch.maximum(old.status, new.status), old.status),
             old.iterations + torch.where(active, new.iterations, 0),
             torch.where(active, torch.maximum(old.residual, new.residual), old.residual),
-            old.passes + active, old.substeps, self.limited,
+            old.passes + active, old.substeps, self.limited, self.share,
         )  # fmt: skip
 
 
