@@ -284,16 +284,16 @@ def table(scene: Scene, state: State, timings: Timings, seconds: float) -> str:
     pairs = found.count.sum().clamp(min=1)
     counts, radius = state.counts, measure.colony_radius(state)
     lines = [
-        f"{'colonies':<22}{state.colonies}",
-        f"{'cells':<22}{state.cells} ({int(counts.min())} to {int(counts.max())} a colony)",
-        f"{'time':<22}{state.time:g} h in {state.step} steps, {seconds:.1f} s",
-        f"{'colony radius':<22}{float(radius.nanmean()):.1f} µm (mean)",
-        f"{'overlap':<22}mean {float((found.mean * found.count).sum() / pairs):.4f} µm, worst {float(found.worst.max()):.3f} µm",
+        f"{'colonies':<28}{state.colonies}",
+        f"{'cells':<28}{state.cells} ({int(counts.min())} to {int(counts.max())} a colony)",
+        f"{'time':<28}{state.time:g} h in {state.step} steps, {seconds:.1f} s",
+        f"{'colony radius':<28}{float(radius.nanmean()):.1f} µm (mean)",
+        f"{'overlap':<28}mean {float((found.mean * found.count).sum() / pairs):.4f} µm, worst {float(found.worst.max()):.3f} µm",
     ]
     if walls:
-        lines.append(f"{'overlap with walls':<22}worst {float(found.walls.max()):.3f} µm")
+        lines.append(f"{'overlap with walls':<28}(soft ones yield) worst {float(found.walls.max()):.3f} µm")
     total = sum(timings.seconds.values()) or 1.0
-    lines += [f"{'time for ' + name:<22}{s:.2f} s ({100 * s / total:.0f} %)" for name, s in timings.seconds.items()]
+    lines += [f"{'time for ' + name:<28}{s:.2f} s ({100 * s / total:.0f} %)" for name, s in timings.seconds.items()]
     return "\n".join(lines)
 
 

@@ -31,6 +31,7 @@ class Effect:
 
     stage: ClassVar[int]
     title: ClassVar[str]
+    writes_anything: ClassVar[bool] = False  # what it writes is not known before it runs
 
     def parts(self) -> Sequence[Effect]:
         """The effects that really run; one for most."""
@@ -50,6 +51,10 @@ class Effect:
 
     def writes(self) -> Sequence[str]:
         """Names of what `step` changes."""
+        return ()
+
+    def waits_for(self) -> Sequence[str]:
+        """Fields without a value of their own, which another effect, a rule or the first cells must set."""
         return ()
 
     def prepare(self, state: State) -> State:

@@ -45,7 +45,12 @@ class Recorder:
         if self.path.is_dir():
             raise checks.refuse("record", str(path), "a file, not a folder")
         if self.path.exists() and not append and not overwrite:
-            raise checks.refuse("record", str(path), "a path where there is no file yet", "Choose another, or say overwrite, or resume from it.")
+            raise checks.refuse(
+                "record",
+                str(path),
+                "a path where there is no file yet",
+                "Choose another (--out), replace it (--overwrite; in Python tf.Recorder(path, scene, overwrite=True)), or resume from it.",
+            )
         if not self.path.parent.is_dir():
             raise checks.refuse("record", str(path), "in a folder that exists", f"Make {self.path.parent} first.")
         self.overwrite = overwrite

@@ -129,6 +129,17 @@ class Scene:
                 if name not in state.fields and name not in BUILT_IN:
                     raise checks.InputError(f"{effect.title} needs the field {name!r}, which this state lacks. Make the state with this scene's seed().")
 
+    def check_moves(self, state: State) -> None:
+        """Raise InputError if an effect waits for a field that is 0 everywhere and that nothing sets: a run to a number of cells would never end."""
+        for effect in self.effects:
+            for name in effect.waits_for():
+                set_by_another = any(e.writes_anything or name in e.writes() for e in self.effects if e is not effect)
+                if not set_by_another and not bool((state.fields[name] != 0).any()):
+                    raise checks.InputError(
+                        f"{effect.title} waits for {name!r}, which is 0 and which nothing in this scene sets. Give {type(effect).__name__} its own "
+                        "parameter (such as rate=1.0), or a rule that sets it; or end the run by until=…"
+                    )
+
     def step(self, state: State, dt: float, timings: Timings | None = None) -> State:
         """The state dt hours later: each effect in turn."""
         state = state.replace(births=(), ended=(), reports={})

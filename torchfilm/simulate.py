@@ -47,6 +47,8 @@ def simulate(
         raise checks.refuse("cells", cells, "a whole number from 1")
     last = math.inf if until is None else _last_step(state, checks.number("until", until), dt)
     scene.check(state)
+    if until is None:
+        scene.check_moves(state)
     recorder = Recorder(record, scene) if isinstance(record, (str, Path)) else record
     if recorder is not None:
         recorder.dt = dt

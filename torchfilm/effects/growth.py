@@ -50,6 +50,9 @@ class Growth(Effect):
     def reads(self) -> tuple[str, ...]:
         return ("growth_rate", "length", "radius")
 
+    def waits_for(self) -> tuple[str, ...]:
+        return ("growth_rate",) if self.rate is None else ()
+
     def writes(self) -> tuple[str, ...]:
         return ("length", "elongation")
 

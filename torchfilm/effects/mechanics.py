@@ -149,7 +149,7 @@ class Mechanics(Effect):
                 k = int(beyond[0])
                 raise checks.InputError(
                     f"{type(surface.wall).__name__}: cell {int(state.uid[k])} of colony {int(state.own_colony_id[k])} starts at "
-                    f"{[round(x, 3) for x in state.position[k].tolist()]}, {-float(distance[k]):.3g} µm behind it ({beyond.numel()} such cells). "
+                    f"{[round(x, 3) for x in state.position[k].tolist()]}, {-float(distance[k]):.3g} µm behind it (cells behind it: {beyond.numel()}). "
                     "Is the wall inside out? Turn it (facing, normal, inside), or move the cells."
                 )
 

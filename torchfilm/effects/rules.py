@@ -10,6 +10,7 @@ that nothing declares become variables, and what it reads and writes is noted, s
 
 from __future__ import annotations
 
+import difflib
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -141,6 +142,10 @@ class CellsView:
             # a plain number makes a variable that can hold any number
             plain = tensor.is_floating_point() or (not isinstance(value, (bool, Tensor)) and tensor.dtype != torch.bool)
             dtype = known.dtype if known is not None else state.dtype if plain else tensor.dtype
+        if self._declaring and name not in (*state.fields, *KNOWN_FIELDS, "remove_flag"):
+            near = difflib.get_close_matches(name, [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES], 1, cutoff=0.85)
+            if near:
+                raise RuleError(f"cells.{name} is new: did you mean {near[0]!r}? If it is a variable of your own, give Rules(…, variables={{{name!r}: 0.0}}).")
         _check_whole(f"cells.{name}", tensor, dtype)
         self._written.add(name)
         shape = state.fields[name].shape if name in state.fields else (state.cells, *tensor.shape[1:])
@@ -295,6 +300,7 @@ class Rules(Effect):
 
     stage = RULES
     title = "rules"
+    writes_anything = True
 
     def __post_init__(self) -> None:
         path = None
