@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.physics.contacts import Bodies, contact_gaps
-from torchfilm.physics.neighbours import find_pairs
-from torchfilm.state import RESERVED, Field, State
+from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks
 
 # What a column of a table may be called.
@@ -138,8 +137,7 @@ class Cells:
         t = lambda x: torch.as_tensor(np.array(x))  # noqa: E731
         position, axis, length, radius = t(self.position), t(self.axis), t(self.length), t(self.radius)
         colony = t(self.colony) if self.colony is not None else torch.zeros(self.count, dtype=torch.int64)
-        i, j = find_pairs(position, axis, length, radius, colony, int(colony.max()) + 1 if self.count else 1, 0.0)
-        gap = contact_gaps(Bodies(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius), i, j)
+        i, j, gap = gaps_nearby(position, axis, length, radius, colony, self.colonies)
         order = torch.argsort(gap)
         return [(int(i[k]), int(j[k]), -float(gap[k])) for k in order.tolist() if gap[k] < -depth]
 
@@ -205,9 +203,6 @@ class Cells:
                 raise checks.refuse("group", group, f"a group of {path}")
             columns = {n: np.asarray(d) for n, d in file[group].items() if isinstance(d, h5py.Dataset)}
         return Cells.from_table(columns, str(path))
-
-
-CELL_TYPE = Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64)
 
 
 def _readable(path: str | Path, mode: str, **options: Any) -> Any:

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfilm.physics.contacts import Bodies, contact_gaps
-from torchfilm.physics.neighbours import find_pairs
+from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.physics.walls import Wall
 from torchfilm.state import State
 from torchfilm.tools.ragged import Groups
@@ -30,8 +29,8 @@ class Overlap:
 def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     """Overlaps between cells, and with the given walls, in float64."""
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
-    i, j = find_pairs(state.position, axis, length, radius, state.colony, state.colonies, 0.0)
-    depth = -contact_gaps(Bodies(state.position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius), i, j)
+    i, _, gap = gaps_nearby(state.position, axis, length, radius, state.colony, state.colonies)
+    depth = -gap
     deep = depth > 0
     pairs = Groups(state.colony.index_select(0, i[deep]), state.colonies)
     count = pairs.counts

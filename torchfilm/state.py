@@ -236,3 +236,5 @@ class State:
 
 PER_CELL = ("colony", "uid", "parent", "position", "axis", "length", "radius")
 RESERVED = frozenset(f.name for f in dataclasses.fields(State)) | {n for n in vars(State) if not n.startswith("__")}
+# A field that first cells may bring and rules may set.
+CELL_TYPE = Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64)

@@ -22,9 +22,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import DIVISION, RULES, Effect
-from torchfilm.physics.contacts import Bodies, contact_gaps
-from torchfilm.physics.neighbours import find_pairs
-from torchfilm.state import CELL, Births, Field, State
+from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.state import CELL, CELL_TYPE, Births, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.watched import Watched, load_functions
 
@@ -36,7 +35,7 @@ MEANS = {"volume": ("length", "radius"), "area": ("length", "radius"), "uid": ("
 IDENTITY = ("uid", "parent", "colony")
 TRIAL_STEP = 0.025  # h, the step that a rule sees when it is tried
 KNOWN_FIELDS = {
-    "cell_type": Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64),
+    "cell_type": CELL_TYPE,
     "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
 }
 
@@ -178,9 +177,8 @@ class CellsView:
         """Pairs of cells whose surfaces are at most `within` µm apart: two (P,) index tensors, each pair once. Found only when asked for."""
         self._read.update(("position", "axis", "length", "radius"))
         s = self._state
-        i, j = find_pairs(s.position, s.axis.double(), s.length.double(), s.radius.double(), s.colony, s.colonies, within)
-        bodies = Bodies(s.position.T.contiguous(), s.axis.T.double().contiguous(), 0.5 * s.length.double(), s.radius.double())
-        keep = torch.nonzero(contact_gaps(bodies, i, j) <= within).squeeze(1)
+        i, j, gap = gaps_nearby(s.position, s.axis, s.length, s.radius, s.colony, s.colonies, within)
+        keep = torch.nonzero(gap <= within).squeeze(1)
         return i.index_select(0, keep), j.index_select(0, keep)
 
     def check_unharmed(self) -> None:

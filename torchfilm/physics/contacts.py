@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfilm.physics.neighbours import find_pairs
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
 
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see `contact_points`).
@@ -178,6 +179,20 @@ def contact_gaps(bodies: Bodies, first: Tensor, second: Tensor) -> Tensor:
     """Signed gap of each pair at its closest points, (P,) µm; negative where they overlap."""
     a, b = bodies.take(first), bodies.take(second)
     return _gap(a, b, *closest_points(a, b))
+
+
+@torch.no_grad()
+def gaps_nearby(
+    position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, within: float = 0.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pairs of one colony that may be within `within` µm, and their gaps, in float64: (first, second, gap), each (P,).
+
+    position, axis (N, d); length, radius (N,); colony (N,) int64.
+    """
+    position, axis, length, radius = position.double(), axis.double(), length.double(), radius.double()
+    first, second = find_pairs(position, axis, length, radius, colony, colonies, within)
+    bodies = Bodies(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
+    return first, second, contact_gaps(bodies, first, second)
 
 
 def _rows(a: Bodies, b: Bodies, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tensor):

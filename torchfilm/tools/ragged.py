@@ -59,16 +59,14 @@ class Groups:
         return torch.bincount(self.owner, minlength=self.size)
 
     def _incidence(self, dtype: torch.dtype) -> Tensor:
+        """The (size, K) matrix of ones that sums rows into groups, on the CPU."""
         if dtype not in self._matrix:
             count = self.owner.numel()
-            if self.owner.device.type == "cpu":
-                # linear time and stable, where a sort would cost more than all the sums of a solve
-                entries = (np.ones(count, np.int8), (self.owner.int().numpy(), np.arange(count, dtype=np.int32)))
-                found = scipy.sparse.coo_array(entries, shape=(self.size, count)).tocsr()
-                start, order = torch.from_numpy(found.indptr), torch.from_numpy(found.indices)
-            else:
-                start, order = offsets(self.counts), torch.argsort(self.owner, stable=True)
-            self._matrix[dtype] = csr(start, order, torch.ones(count, dtype=dtype, device=self.owner.device), (self.size, count))
+            # linear time and stable, where a sort would cost more than all the sums of a solve
+            entries = (np.ones(count, np.int8), (self.owner.int().numpy(), np.arange(count, dtype=np.int32)))
+            found = scipy.sparse.coo_array(entries, shape=(self.size, count)).tocsr()
+            start, order = torch.from_numpy(found.indptr), torch.from_numpy(found.indices)
+            self._matrix[dtype] = csr(start, order, torch.ones(count, dtype=dtype), (self.size, count))
         return self._matrix[dtype]
 
     def sum(self, value: Tensor) -> Tensor:
