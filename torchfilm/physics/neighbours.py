@@ -19,8 +19,11 @@ from torch import Tensor
 
 from torchfilm.tools.ragged import Groups, expand_ranges, offsets
 
-# A place along a row is kept to within this share of the row's height; finer costs nothing but room in the keys.
-SLICES = 64
+# Slices of a row, to each reach of a cell: finer ones leave fewer strangers to look at, coarser ones make the table of their starts shorter.
+SLICES = 8
+# A table may have this many entries a cell; cells strewn more thinly are found by bisection.
+TABLE_SHARE = 64
+MOST_ROWS = 2**17
 # Cells whose reach is over this many times the smallest of their colony go into the next class.
 CLASS_RATIO = 4.0
 
@@ -63,28 +66,37 @@ class _Grid:
     colony: Tensor
     members: Tensor  # sorted by key
     keys: Tensor
+    slices: int  # to a row's height
+    table: Tensor | None = None  # how many members stand before each key
 
     @staticmethod
     def build(position: Tensor, reach: Tensor, colony: Tensor, colonies: int, members: Tensor) -> _Grid:
         greatest = Groups(colony.index_select(0, members), colonies).max(reach.index_select(0, members), empty=1.0)
         # narrow rows leave fewer strangers to look at, but in space there are many more of them
-        height = (greatest if position.shape[1] == 2 else 2.0 * greatest).index_select(0, colony)
+        wide = 1 if position.shape[1] == 2 else 2
         groups = Groups(colony, colonies)
+        extent = torch.stack([groups.max(x) + groups.max(-x) for x in position.unbind(1)]).amax(0)
+        # rows no lower than this: keys must fit 64 bits even for cells that are strewn over metres
+        height = torch.maximum(wide * greatest, extent / MOST_ROWS).index_select(0, colony)
+        slices = wide * SLICES
         at, shape = [], []
         for k in range(position.shape[1]):
             x = position[:, k]
             low = -groups.max(-x)
             at.append((x - low.index_select(0, colony)) / height)
-            shape.append(groups.max(torch.floor(at[k] * (SLICES if k == 0 else 1)).long()) + 1)
+            shape.append(groups.max(torch.floor(at[k] * (slices if k == 0 else 1)).long()) + 1)
         numbers = shape[0]
         for k in range(1, len(shape)):
             numbers = numbers * shape[k]
         window = (reach + greatest.index_select(0, colony)) / height * (1 + 1e-5)
-        grid = _Grid(torch.stack(at), torch.stack(shape), offsets(numbers)[:-1], window, colony, members, members)
+        grid = _Grid(torch.stack(at), torch.stack(shape), offsets(numbers)[:-1], window, colony, members, members, slices)
         mine = grid.at.index_select(1, members)
-        key = grid._key(colony.index_select(0, members), torch.floor(mine[1:]).long(), torch.floor(mine[0] * SLICES).long())
+        key = grid._key(colony.index_select(0, members), torch.floor(mine[1:]).long(), torch.floor(mine[0] * slices).long())
         keys, order = torch.sort(key, stable=True)
-        return replace(grid, members=members.index_select(0, order), keys=keys)
+        table, size = None, int(numbers.sum())
+        if size <= TABLE_SHARE * colony.numel():
+            table = offsets(torch.bincount(keys, minlength=size))
+        return replace(grid, members=members.index_select(0, order), keys=keys, table=table)
 
     def _key(self, colony: Tensor, rows: Tensor, along: Tensor) -> Tensor:
         row = rows[-1]
@@ -102,18 +114,22 @@ class _Grid:
         width = left.clamp(min=0).sqrt()
         last = self.shape.index_select(1, colony) - 1
         inside = ((rows >= 0) & (rows <= last[1:])).all(0) & (left >= 0)
-        low = torch.floor((at[0] - width) * SLICES).long().clamp(min=0)
-        high = torch.minimum(torch.floor((at[0] + width) * SLICES).long(), last[0])
-        start = torch.searchsorted(self.keys, self._key(colony, rows, low))
-        stop = torch.searchsorted(self.keys, self._key(colony, rows, high), right=True)
+        low = torch.floor((at[0] - width) * self.slices).long().clamp(min=0)
+        high = torch.minimum(torch.floor((at[0] + width) * self.slices).long(), last[0])
+        # a row outside has no key of its own; any that exists will do, since nothing is taken from it
+        rows = torch.minimum(rows.clamp(min=0), last[1:])
+        start = self._before(self._key(colony, rows, torch.minimum(low, last[0])))
+        stop = self._before(self._key(colony, rows, high.clamp(min=0)) + 1)
         return start, torch.where(inside, (stop - start).clamp(min=0), 0)
+
+    def _before(self, key: Tensor) -> Tensor:
+        """How many members stand before each key."""
+        return torch.searchsorted(self.keys, key) if self.table is None else self.table.index_select(0, key)
 
     def pairs_within(self) -> tuple[Tensor, Tensor]:
         """Every pair of members that may touch, once: the rest of a member's own row, and the rows after it."""
-        members = self.members.sort().values
+        members = self.members  # asked in their own order, so that neighbours in space are neighbours in memory
         own = torch.floor(self.at[1:].index_select(1, members)).long()
-        rank = torch.empty_like(self.colony)
-        rank[self.members] = torch.arange(self.members.numel(), device=rank.device)
         reaches = 2 if own.shape[0] == 1 else 1
         first, second = [], []
         for step in itertools.product(range(-reaches, reaches + 1), repeat=own.shape[0]):
@@ -122,7 +138,7 @@ class _Grid:
             start, count = self._run(members, own + torch.tensor(step, device=own.device).unsqueeze(1))
             if not any(step):
                 stop = start + count
-                start = rank.index_select(0, members) + 1
+                start = torch.arange(1, members.numel() + 1, device=members.device)
                 count = (stop - start).clamp(min=0)
             owner, run = expand_ranges(start, count)
             first.append(members.index_select(0, owner))

@@ -28,6 +28,16 @@ class ContactRows:
     def rows(self) -> int:
         return self.pairs + self.walls
 
+    def part(self, rows: Tensor, number: Tensor, cells: int) -> ContactRows:
+        """Some of the rows (M,), in their order, over `cells` cells; number: (N,) the new number of each cell that they touch."""
+        pair, wall = rows[rows < self.pairs], rows[rows >= self.pairs] - self.pairs
+        of_pairs = [x.index_select(0, pair) for x in (self.first, self.second, self.row_first, self.row_second)]
+        at_wall, row_wall = self.at_wall.index_select(0, wall), self.row_wall.index_select(0, wall)
+        return ContactRows(
+            number.index_select(0, of_pairs[0]), number.index_select(0, of_pairs[1]), of_pairs[2], of_pairs[3],
+            number.index_select(0, at_wall), row_wall, cells,
+        )  # fmt: skip
+
     def apply(self, x: Tensor) -> Tensor:
         """J x: (N, D) -> (R,)."""
         if x.device.type != "cpu" or self._needs_grad(x) or not self.rows:
@@ -63,17 +73,21 @@ class ContactRows:
         parts = torch.cat([self.row_first.abs() * pair, self.row_second.abs() * pair, self.row_wall.abs() * wall])
         return self.half_rows.sum_into(parts, parts.new_empty(self.cells, parts.shape[1]))
 
-    def blocks(self, active: Tensor) -> Tensor:
-        """The diagonal blocks of Jᵀ diag(active) J: (R,) -> (N, D, D)."""
+    def blocks(self, active: Tensor | None = None) -> Tensor:
+        """The diagonal blocks of Jᵀ diag(active) J, or of JᵀJ: (R,) -> (N, D, D)."""
         width = self.row_first.shape[1]
         rows = torch.cat([self.row_first, self.row_second, self.row_wall])
-        pair, wall = active[: self.pairs], active[self.pairs :]
-        scaled = rows * torch.cat([pair, pair, wall]).unsqueeze(1)
+        scaled = rows
+        if active is not None:
+            pair, wall = active[: self.pairs], active[self.pairs :]
+            scaled = rows * torch.cat([pair, pair, wall]).unsqueeze(1)
+        # the upper half of each square, row by row of it: slices are cheap, picking columns is not
+        upper = torch.cat([rows[:, k : k + 1] * scaled[:, k:] for k in range(width)], 1)
+        summed = self.half_rows.sum_into(upper, rows.new_empty(self.cells, upper.shape[1]))
         i, j = torch.triu_indices(width, width, device=rows.device)
-        upper = self.half_rows.sum_into(rows.index_select(1, i) * scaled.index_select(1, j), rows.new_empty(self.cells, i.numel()))
         whole = torch.empty(width, width, dtype=torch.int64, device=rows.device)
         whole[i, j] = whole[j, i] = torch.arange(i.numel(), device=rows.device)
-        return upper.index_select(1, whole.reshape(-1)).reshape(-1, width, width)
+        return summed.index_select(1, whole.reshape(-1)).reshape(-1, width, width)
 
     def _needs_grad(self, x: Tensor) -> bool:
         return torch.is_grad_enabled() and (x.requires_grad or self.row_first.requires_grad or self.row_wall.requires_grad)

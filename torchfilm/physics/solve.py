@@ -14,7 +14,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -78,26 +79,43 @@ class ContactProblem:
         """Of the function that is minimised, (N, D); violation (R,): the gap after the move of the rows that act, else 0."""
         return self.alpha * y - self.rows.apply_transpose(violation - self.held)
 
+    def part(self, which: Selection) -> ContactProblem:
+        """The problem of some of its colonies."""
+        cells, rows = which.cells, which.rows
+        number = torch.empty(self.rows.cells, dtype=torch.int64, device=cells.device)
+        number[cells] = torch.arange(cells.numel(), device=cells.device)
+        place = torch.empty(self.colonies.size, dtype=torch.int64, device=cells.device)
+        place[which.colonies] = torch.arange(which.colonies.numel(), device=cells.device)
+        owner = place.index_select(0, self.colonies.owner.index_select(0, cells))
+        return ContactProblem(
+            self.rows.part(rows, number, cells.numel()), self.gap.index_select(0, rows), self.held.index_select(0, rows),
+            self.alpha.index_select(0, cells), self.lower.index_select(0, cells), self.scale.index_select(0, cells),
+            Groups(owner, which.colonies.numel()), self.unilateral,
+        )  # fmt: skip
+
+    @cached_property
+    def of_rows(self) -> Groups:
+        """The rows of each colony."""
+        return Groups(self.colonies.owner.index_select(0, self.rows.row_owner), self.colonies.size)
+
     def energy(self, y: Tensor, after: Tensor) -> Tensor:
         """The function that is minimised, per colony (B,), in float64 so that a line search can compare; after (R,): the gap left."""
-        rows = self.rows
         violation = (after.clamp(max=0) if self.unilateral else after).double()
         spring = 0.5 * violation * violation + self.held * (self.gap - after)
-        owner = Groups(self.colonies.owner.index_select(0, rows.row_owner), self.colonies.size)
         drag = (0.5 * self.alpha * y * y).sum(1, keepdim=True).double()
-        return (owner.sum(spring.unsqueeze(1)) + self.colonies.sum(drag)).squeeze(1)
+        return (self.of_rows.sum(spring.unsqueeze(1)) + self.colonies.sum(drag)).squeeze(1)
 
 
-def solve(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int) -> tuple[Tensor, SolveReport]:
+def solve(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int, floor=None) -> tuple[Tensor, SolveReport]:
     """Solve for x (N, D) from `start` (an earlier x, or None for 0). Differentiable by the adjoint: one more solve with the same operator.
 
     A colony has converged when its worst preconditioned residual is at most `tolerance` times the worst at x = 0.
     """
     with torch.no_grad():
-        y, free, active, report, precondition = _minimise(_detached(problem), start, tolerance, max_iterations)
+        y, free, active, report, inverse = _minimise(_detached(problem), start, tolerance, max_iterations, floor)
     tracked = (problem.gap, problem.rows.row_first, problem.rows.row_wall, problem.alpha, problem.lower, problem.scale)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tracked):
-        y = _attach_gradient(problem, y, free, active, precondition, tolerance, max_iterations)
+        y = _attach_gradient(problem, y, free, active, inverse, tolerance, max_iterations)
     return y * problem.scale, report
 
 
@@ -109,66 +127,141 @@ def _detached(p: ContactProblem) -> ContactProblem:
     return ContactProblem(rows, p.gap.detach(), p.held.detach(), p.alpha.detach(), p.lower.detach(), p.scale.detach(), p.colonies, p.unilateral)
 
 
-def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int):
-    colonies, owner = problem.colonies, problem.colonies.owner
+def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int, floor=None):
+    colonies = problem.colonies
     zero = torch.zeros_like(problem.scale)
     active = problem.acting(problem.gap)
-    precondition = _block_inverse(problem, active)
-    scale = worst_of(precondition(problem.gradient(zero, problem.gap * active)), colonies)
+    inverse = _block_inverse(problem, active)
+    scale = worst_of(_times(inverse, problem.gradient(zero, problem.gap * active)), colonies)
+    global SCALE
+    if floor is None: SCALE=scale
+    else: 
+        if __import__('os').environ.get('VERB'): print(scale/floor)
+        scale=torch.maximum(scale,floor)
     still = scale == 0  # nothing pushes: such a colony does not move at all
     y, after = zero, problem.gap
     if start is not None:
-        y = torch.where(still.index_select(0, owner).unsqueeze(1), zero, start / problem.scale)
+        y = torch.where(still.index_select(0, colonies.owner).unsqueeze(1), zero, start / problem.scale)
         y[:, -1] = torch.maximum(y[:, -1], problem.lower)
         after = problem.after(y)
         active = problem.acting(after)
-    target = tolerance * scale
-    iterations = torch.zeros(colonies.size, dtype=torch.int64, device=y.device)
-    previous = torch.full_like(scale, torch.inf)
-    for number in range(NEWTON_LIMIT + 1):
+    unknown = torch.full_like(scale, torch.inf)
+    begun = _Iterate(y, after, active, torch.ones_like(y), scale, unknown, torch.zeros_like(scale, dtype=torch.int64))
+    end = _newton(problem, inverse, begun, tolerance, max_iterations, 0)
+    status = torch.where(end.worst <= tolerance * end.scale, CONVERGED, ITERATION_LIMIT)
+    status = torch.where(end.worst < torch.inf, status, NOT_FINITE)
+    residual = end.worst / torch.where(still, 1.0, end.scale)
+    return end.y, end.free, end.active, SolveReport(status, end.iterations, residual), inverse
+
+
+@dataclass(frozen=True)
+class _Iterate:
+    """Where Newton's method stands: the move y and which of it is free (N, D), each row's gap after it and whether the row acts (R,);
+    per colony (B,) the scale and the worst of its residual, and the CG iterations spent."""
+
+    y: Tensor
+    after: Tensor
+    active: Tensor
+    free: Tensor
+    scale: Tensor
+    worst: Tensor
+    iterations: Tensor
+
+    def part(self, which: Selection) -> _Iterate:
+        return _Iterate(*(getattr(self, f.name).index_select(0, index) for f, index in zip(fields(self), which.by_field(), strict=True)))
+
+    def with_part(self, part: _Iterate, which: Selection) -> _Iterate:
+        return _Iterate(
+            *(getattr(self, f.name).index_copy(0, index, getattr(part, f.name)) for f, index in zip(fields(self), which.by_field(), strict=True))
+        )
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Some colonies of a problem: their places, their cells and their rows."""
+
+    colonies: Tensor
+    cells: Tensor
+    rows: Tensor
+
+    def by_field(self) -> tuple[Tensor, ...]:
+        """What indexes each field of an _Iterate."""
+        return (self.cells, self.rows, self.rows, self.cells, self.colonies, self.colonies, self.colonies)
+
+
+def _newton(problem: ContactProblem, inverse: Tensor, at: _Iterate, tolerance: float, max_iterations: int, number: int) -> _Iterate:
+    """Rounds of Newton's method from the iterate `at`, the round `number` first, until every colony has converged."""
+    colonies = problem.colonies
+    y, after, active, scale, previous, iterations = at.y, at.after, at.active, at.scale, at.worst, at.iterations
+    while True:
         gradient = problem.gradient(y, after * active)
         free = _free(y, gradient, problem.lower)
-        worst = worst_of(precondition(gradient * free) * free, colonies)
+        precondition = _within(free, inverse)
+        worst = worst_of(precondition(gradient), colonies)
+        target = tolerance * scale
         going = (worst > target) & (worst < torch.inf) & (iterations < max_iterations)
         stalled = going & (worst > 0.9 * previous)
         if bool(stalled.any()):
             # opposing forces on a cell may leave less at rest than rounding lets anyone resolve
-            least = _rounding(problem, precondition, y) / tolerance
+            least = _rounding(problem, inverse, y) / tolerance
             scale = torch.where(stalled, torch.maximum(scale, least), scale)
             target = tolerance * scale
             going = going & (worst > target)
+        here = _Iterate(y, after, active, free, scale, worst, iterations)
         if number == NEWTON_LIMIT or not bool(going.any()):
-            break
+            return here
+        which = _minority(problem, going)
+        if which is not None:  # the few that go on need not carry the others along
+            part = replace(here.part(which), worst=previous.index_select(0, which.colonies))
+            end = _newton(problem.part(which), inverse.index_select(0, which.cells), part, tolerance, max_iterations, number)
+            return here.with_part(end, which)
         previous = worst
         least = torch.maximum(0.5 * target, FORCING * worst) if problem.unilateral else 0.5 * target
         inner = torch.where(going, least, torch.inf)
-        result = conjugate_gradients(_operator(problem, active, free), -gradient * free, _within(free, precondition), colonies, inner, max_iterations)
-        iterations += result.iterations
+        result = conjugate_gradients(_operator(problem, active), -gradient, precondition, colonies, inner, max_iterations)
+        iterations = iterations + result.iterations
         y, after = _line_search(problem, y, after, gradient, result.x, going)
         active = problem.acting(after)
-    status = torch.where(worst <= target, CONVERGED, ITERATION_LIMIT)
-    status = torch.where(worst < torch.inf, status, NOT_FINITE)
-    residual = worst / torch.where(still, 1.0, scale)
-    return y, free, active, SolveReport(status, iterations, residual), precondition
+        number += 1
 
 
-def _rounding(problem: ContactProblem, precondition: Map, y: Tensor) -> Tensor:
+def _minority(problem: ContactProblem, going: Tensor) -> Selection | None:
+    """The colonies that go on, if they hold less than half of the cells."""
+    owner = problem.colonies.owner
+    moving = going.index_select(0, owner)
+    cells = torch.nonzero(moving).squeeze(1)
+    if 2 * cells.numel() >= owner.numel():
+        return None
+    rows = torch.nonzero(moving.index_select(0, problem.rows.row_owner)).squeeze(1)
+    return Selection(torch.nonzero(going).squeeze(1), cells, rows)
+
+
+def _rounding(problem: ContactProblem, inverse: Tensor, y: Tensor) -> Tensor:
     """The residual that rounding alone may leave in each colony, (B,): a few units in the last place of the forces on a cell, opposing ones not set off."""
     forces = problem.rows.transpose_of_sizes(problem.gap.abs() + problem.rows.sizes_of(y)) + problem.alpha * y.abs()
-    return 2 * torch.finfo(y.dtype).eps * worst_of(precondition(forces), problem.colonies)
+    return 2 * torch.finfo(y.dtype).eps * worst_of(_times(inverse, forces), problem.colonies)
 
 
-def _within(free: Tensor, precondition: Map) -> Map:
-    """The preconditioner among the degrees of freedom that are free."""
-    return lambda r: precondition(r * free) * free
+def _within(free: Tensor, inverse: Tensor) -> Map:
+    """The preconditioner among the degrees of freedom that are free: what it is given elsewhere it does not look at, and leaves at 0."""
+    among = inverse.clone()
+    length = free[:, -1:]  # the only one that may be held
+    among[:, -1] *= length
+    among[:, :, -1] *= length
+    return lambda r: _times(among, r)
 
 
-def _operator(problem: ContactProblem, active: Tensor, free: Tensor):
-    rows, alpha = problem.rows, problem.alpha
+def _times(blocks: Tensor, r: Tensor) -> Tensor:
+    return torch.bmm(blocks, r.unsqueeze(2)).squeeze(2)
+
+
+def _operator(problem: ContactProblem, active: Tensor) -> Map:
+    """The system's matrix. What it gives for a degree of freedom that is not free is for the preconditioner to drop."""
+    rows, alpha, unilateral = problem.rows, problem.alpha, problem.unilateral
 
     def apply(v: Tensor) -> Tensor:
-        out = rows.apply_transpose(active * rows.apply(v))
-        return out.addcmul_(alpha, v).mul_(free)
+        change = rows.apply(v)
+        return rows.apply_transpose(active * change if unilateral else change).addcmul_(alpha, v)
 
     return apply
 
@@ -210,38 +303,36 @@ def _line_search(problem: ContactProblem, y, after, gradient, direction, going):
     return new, then
 
 
-def _block_inverse(problem: ContactProblem, active: Tensor):
-    """Block Jacobi: each cell's own D × D block, inverted."""
-    blocks = problem.rows.blocks(active)
+def _block_inverse(problem: ContactProblem, active: Tensor) -> Tensor:
+    """Block Jacobi: each cell's own D × D block, inverted, (N, D, D)."""
+    blocks = problem.rows.blocks(active if problem.unilateral else None)
     blocks.diagonal(dim1=1, dim2=2).add_(problem.alpha)
     # no check here: where a colony is not finite so is its inverse, and its residual says so without stopping the others
-    inverse = torch.linalg.inv_ex(blocks).inverse
-    return lambda r: torch.bmm(inverse, r.unsqueeze(2)).squeeze(2)
+    return torch.linalg.inv_ex(blocks).inverse
 
 
-def _attach_gradient(problem, y, free, active, precondition, tolerance, max_iterations):
+def _attach_gradient(problem, y, free, active, inverse, tolerance, max_iterations):
     """y as a differentiable function of the problem: r(y, θ) = 0 gives dy = −A⁻¹ dr, with contacts and bounds as they were found."""
     at_bound = free[:, -1] == 0
     length = torch.where(at_bound, problem.lower, y[:, -1])
     held = torch.cat([y[:, :-1], length.unsqueeze(1)], 1)
     residual = problem.gradient(held, problem.after(held) * active) * free
-    solve_again = _AdjointSolve(_detached(problem), active, free, precondition, tolerance, max_iterations)
+    solve_again = _AdjointSolve(_detached(problem), active, free, inverse, tolerance, max_iterations)
     return held + _Implicit.apply(residual, solve_again)
 
 
 class _AdjointSolve:
-    def __init__(self, problem, active, free, precondition, tolerance, max_iterations):
+    def __init__(self, problem, active, free, inverse, tolerance, max_iterations):
         self.problem, self.active, self.free = problem, active, free
-        self.precondition, self.tolerance, self.max_iterations = precondition, tolerance, max_iterations
+        self.inverse, self.tolerance, self.max_iterations = inverse, tolerance, max_iterations
 
     def __call__(self, grad: Tensor) -> Tensor:
-        free, colonies = self.free, self.problem.colonies
-        precondition = _within(free, self.precondition)
-        b = grad * free
+        colonies, b = self.problem.colonies, grad * self.free
+        precondition = _within(self.free, self.inverse)
         # the forward solve's tolerance is a matter of overlaps; a gradient wants more
         tolerance = min(self.tolerance, 1e-4 if grad.dtype == torch.float32 else 1e-8)
         target = tolerance * worst_of(precondition(b), colonies)
-        return conjugate_gradients(_operator(self.problem, self.active, free), b, precondition, colonies, target, self.max_iterations).x
+        return conjugate_gradients(_operator(self.problem, self.active), b, precondition, colonies, target, self.max_iterations).x
 
 
 class _Implicit(torch.autograd.Function):

@@ -29,10 +29,10 @@ def perpendicular(u: Tensor) -> Tensor:
     """A unit vector perpendicular to unit u, (d, K): the left-hand normal in 2-D; in 3-D built on the axis that u is least along."""
     if u.shape[0] == 2:
         return torch.stack([-u[1], u[0]])
-    x, y, z = u.unbind(0)
-    least = torch.argmin(torch.stack([x.abs(), y.abs(), z.abs()]), dim=0)
-    e = torch.stack([(least == k).to(u.dtype) for k in range(3)])
-    w = cross(u, e)
+    x, y, z = u.detach().abs().unbind(0)
+    on_x = (x <= y) & (x <= z)
+    on_y = ~on_x & (y <= z)
+    w = cross(u, torch.stack([on_x, on_y, ~(on_x | on_y)]).to(u.dtype))
     return w / safe_norm(w)
 
 
