@@ -29,8 +29,8 @@ class Room:
 # To add a room, or a module to one, write it here. A module that is not listed belongs to the last.
 ROOMS = {
     "tools": Room(0, ("torchfilm.tools", "torchfilm.version")),
-    # a state tells its cells' volume and area, so it knows the capsule
-    "state": Room(1, ("torchfilm.state",), besides=("torchfilm.physics.capsule",)),
+    # a state tells its cells' volume and area, so it knows the capsule; its signals' values mean nothing without their layout
+    "state": Room(1, ("torchfilm.state",), besides=("torchfilm.physics.capsule", "torchfilm.signals.layout")),
     "effect": Room(2, ("torchfilm.effect",)),
     "kernels": Room(3, ("torchfilm.physics", "torchfilm.signals", "torchfilm.circuits")),
     "effects": Room(4, ("torchfilm.effects",), talk=False),

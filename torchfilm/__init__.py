@@ -2,10 +2,14 @@
 
 from torchfilm import effect, measure, pictures, scenes
 from torchfilm.cells import Cells
+from torchfilm.circuits import kinetics, parts
+from torchfilm.circuits.reactions import Reaction
 from torchfilm.effect import Effect, LogNormal, Normal, Uniform
+from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
+from torchfilm.effects.medium import Medium, Signal
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
@@ -13,6 +17,7 @@ from torchfilm.pictures import show
 from torchfilm.recorder import Recorder
 from torchfilm.results import Results
 from torchfilm.scene import Scene
+from torchfilm.signals.faces import Faces, Fixed, NoFlux, Open, Periodic
 from torchfilm.simulate import simulate
 from torchfilm.state import Field, State
 from torchfilm.tools.checks import InputError, SimulationError
@@ -21,7 +26,7 @@ from torchfilm.tools.timing import Timings
 from torchfilm.version import __version__
 
 __all__ = [
-    "Box", "Cells", "Channel", "Division", "Effect", "Field", "Growth", "InputError", "LogNormal", "Mechanics", "Normal", "Plane",
-    "Recorder", "Removal", "Results", "Rules", "Scene", "SimulationError", "Sphere", "State", "Timings", "Uniform",
-    "__version__", "effect", "keep_memory", "measure", "pictures", "scenes", "show", "simulate",
+    "Box", "Cells", "Channel", "Circuit", "Division", "Effect", "Faces", "Field", "Fixed", "Growth", "InputError", "LogNormal", "Mechanics", "Medium",
+    "NoFlux", "Normal", "Open", "Periodic", "Plane", "Reaction", "Recorder", "Removal", "Results", "Rules", "Scene", "Signal", "SimulationError", "Sphere",
+    "State", "Timings", "Uniform", "__version__", "effect", "keep_memory", "kinetics", "measure", "parts", "pictures", "scenes", "show", "simulate",
 ]  # fmt: skip

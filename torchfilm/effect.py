@@ -17,9 +17,12 @@ from torch import Tensor
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 
-# The paper's five stages, in its order; an effect says where it belongs.
-RULES, DIVISION, GROWTH, MECHANICS, REMOVAL = 10, 20, 30, 40, 90
-STAGES = {RULES: "rules", DIVISION: "division", GROWTH: "growth", MECHANICS: "mechanics", REMOVAL: "removal"}
+# The paper's stages, in its order; an effect says where it belongs.
+RULES, DIVISION, NUTRITION, GROWTH, MECHANICS, COVER, CIRCUIT, TRANSPORT, REMOVAL = 10, 20, 25, 30, 40, 45, 50, 60, 90
+STAGES = {
+    RULES: "rules", DIVISION: "division", NUTRITION: "nutrition", GROWTH: "growth", MECHANICS: "mechanics", COVER: "cover", CIRCUIT: "circuit",
+    TRANSPORT: "transport", REMOVAL: "removal",
+}  # fmt: skip
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.
@@ -56,6 +59,10 @@ class Effect:
     def waits_for(self) -> Sequence[str]:
         """Fields without a value of their own, which another effect, a rule or the first cells must set."""
         return ()
+
+    def begin(self, state: State) -> State:
+        """The first cells made ready for this effect's fields, before any field is declared."""
+        return state
 
     def prepare(self, state: State) -> State:
         """The seeded state made ready for this effect, once, after all fields are declared."""

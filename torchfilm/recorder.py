@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.results import CHUNK_ROWS, FATES, FORMAT, FRAME_COLUMNS, LINEAGE, VERSION, Results, committed
+from torchfilm.results import CHUNK_ROWS, CHUNK_VOXELS, FATES, FORMAT, FRAME_COLUMNS, LINEAGE, VERSION, Results, committed
 from torchfilm.scene import Scene
-from torchfilm.state import CELL, PER_CELL, State
+from torchfilm.state import CELL, COLONY, PER_CELL, State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import SimulationError
 from torchfilm.version import __version__
@@ -133,6 +133,12 @@ class Recorder:
             _growing(file, f"frames/{name}", dtype, shape, 64)
         for name, value in _colony_columns(state).items():
             _growing(file, f"frames/colony/{name}", value.dtype, value.shape, 64)
+        if state.layout is not None:
+            file.attrs["spacing"] = state.layout.grid.spacing
+            for name, value in _voxels(state).items():
+                _growing(file, f"signals/{name}", value.dtype, (), CHUNK_VOXELS)
+            for name, value in _grid_columns(state).items():
+                _growing(file, f"frames/grid/{name}", value.dtype, value.shape, 64)
         for table, columns in LINEAGE.items():
             for name in columns:
                 _growing(file, f"lineage/{table}/{name}", np.int64, (), CHUNK_ROWS)
@@ -160,7 +166,8 @@ class Recorder:
 
     def _check_room(self, state: State) -> None:
         """Stop while the file is still whole: HDF5 does not survive a disk that fills under it."""
-        needed = sum(v.nbytes for v in _cell_columns(state).values()) + sum(c.nbytes for e in (*self.births, *self.ends) for c in e) + ROOM_TO_SPARE
+        columns = (*_cell_columns(state).values(), *_voxels(state).values())
+        needed = sum(v.nbytes for v in columns) + sum(c.nbytes for e in (*self.births, *self.ends) for c in e) + ROOM_TO_SPARE
         room = shutil.disk_usage(self.path.parent).free
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0] if resource else -1
         if limit >= 0:
@@ -192,10 +199,11 @@ class Recorder:
             raise SimulationError(
                 f"the field {unknown[0]!r} came up in mid-run, after {self.path} was laid out: give it a first value in Rules(…, variables=…) and start anew."
             )
-        first_row = committed(file)["rows"]
+        counted = committed(file)
+        first_row, first_voxel = counted["rows"], counted["voxels"]
         for name, value in columns.items():
             self._append(f"cells/{name}", value, first_row)
-        lineage = committed(file)
+        lineage = counted
         for table, events in (("births", self.births), ("ends", self.ends)):
             names = list(LINEAGE[table])
             merged = [np.concatenate(c) for c in zip(*events, strict=True)] if events else [np.empty(0, np.int64)] * len(names)
@@ -209,6 +217,10 @@ class Recorder:
         }  # fmt: skip
         for name, value in _colony_columns(state).items():
             self._append(f"frames/colony/{name}", value[None], frame)
+        for name, value in _voxels(state).items():
+            self._append(f"signals/{name}", value, first_voxel)
+        for name, value in _grid_columns(state, first_voxel).items():
+            self._append(f"frames/grid/{name}", value[None], frame)
         file.flush()
         for name in FRAME_COLUMNS:
             self._append(f"frames/{name}", np.asarray(row[name])[None], frame)
@@ -226,7 +238,19 @@ def _cell_columns(state: State) -> dict[str, np.ndarray]:
 
 
 def _colony_columns(state: State) -> dict[str, np.ndarray]:
-    return {n: _numpy(v) for n, v in state.fields.items() if state.declared[n].scope != CELL}
+    return {n: _numpy(v) for n, v in state.fields.items() if state.declared[n].scope == COLONY}
+
+
+def _voxels(state: State) -> dict[str, np.ndarray]:
+    return {n: _numpy(v) for n, v in state.signals.items()}
+
+
+def _grid_columns(state: State, first_voxel: int = 0) -> dict[str, np.ndarray]:
+    """What a frame says of its grids."""
+    if state.layout is None:
+        return {}
+    grid = state.layout.grid
+    return {"origin": _numpy(grid.origin), "shape": _numpy(grid.shape), "first_voxel": np.asarray(first_voxel, np.int64)}
 
 
 def _growing(file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk: int) -> None:
@@ -248,7 +272,7 @@ def _copy_committed(source: Path, target: Path) -> None:
         keep = committed(file)
         for name, value in file.attrs.items():
             out.attrs[name] = value
-        sizes = {"cells": keep["rows"], "frames": keep["frames"], "lineage/births": keep["births"], "lineage/ends": keep["ends"]}
+        sizes = {"cells": keep["rows"], "signals": keep["voxels"], "frames": keep["frames"], "lineage/births": keep["births"], "lineage/ends": keep["ends"]}
 
         def copy(name: str, item: Any) -> None:
             if not isinstance(item, h5py.Dataset):

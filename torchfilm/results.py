@@ -4,6 +4,7 @@
     /colony_id        (B,)
     /cells/NAME       rows of all frames one after the other: colony, uid, parent, position, axis, length, radius, fields per cell
     /frames/NAME      a row a frame: first_row, counts (B), next_uid (B), births, ends, time, step; /frames/colony/NAME fields per colony
+    /signals/NAME     (in scenes with a medium) voxels of all colonies and frames one after the other; /frames/grid/origin, shape (B, 3), first_voxel
     /lineage/births   colony_id, uid, parent, step · /lineage/ends   colony_id, uid, step, fate
 
 A frame holds the whole state, so every frame is a checkpoint. `frames/step` is written last: what is not counted there did
@@ -23,13 +24,14 @@ import torch
 from torch import Tensor
 
 from torchfilm.scene import Scene
-from torchfilm.state import PER_CELL, Field, State
+from torchfilm.signals.grid import Grid
+from torchfilm.state import OUTSIDE, PER_CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 
-FORMAT, VERSION = "torchfilm results", 1
+FORMAT, VERSION = "torchfilm results", 2
 FATES = ("divided", "removed", "left", "failed")
-CHUNK_ROWS = 8192
+CHUNK_ROWS, CHUNK_VOXELS = 8192, 32768
 LINEAGE = {"births": ("colony_id", "uid", "parent", "step"), "ends": ("colony_id", "uid", "step", "fate")}
 # step last: it commits the frame
 FRAME_COLUMNS = ("first_row", "counts", "next_uid", "births", "ends", "time", "step")
@@ -48,10 +50,13 @@ def committed(file: h5py.File) -> dict[str, int]:
     """How much of the file counts: frames, rows, births, ends."""
     frames = _frames(file)
     if frames == 0:
-        return {"frames": 0, "rows": 0, "births": 0, "ends": 0}
+        return {"frames": 0, "rows": 0, "voxels": 0, "births": 0, "ends": 0}
     at = frames - 1
     rows = int(file["frames/first_row"][at]) + int(file["frames/counts"][at].sum())
-    return {"frames": frames, "rows": rows, "births": int(file["frames/births"][at]), "ends": int(file["frames/ends"][at])}
+    voxels = 0
+    if "grid" in file["frames"]:
+        voxels = int(file["frames/grid/first_voxel"][at]) + int(file["frames/grid/shape"][at].prod(1).sum())
+    return {"frames": frames, "rows": rows, "voxels": voxels, "births": int(file["frames/births"][at]), "ends": int(file["frames/ends"][at])}
 
 
 def _open_to_read(path: Path) -> h5py.File:
@@ -135,7 +140,7 @@ class Results:
     def refresh(self) -> None:
         """See what a run has written since."""
         self.file["frames/step"].id.refresh()  # first: what it counts has been written before it
-        groups = ("cells", "lineage/births", "lineage/ends", "frames/colony", "frames")
+        groups = ("cells", "signals", "lineage/births", "lineage/ends", "frames/colony", "frames/grid", "frames")
         for dataset in (d for g in groups if g in self.file for n, d in self.file[g].items() if isinstance(d, h5py.Dataset) and n != "step"):
             dataset.id.refresh()
 
@@ -150,6 +155,28 @@ class Results:
         start = int(self.file["frames/first_row"][k])
         stop = start + int(self.file["frames/counts"][k].sum())
         return {name: dataset[start:stop] for name, dataset in self.file["cells"].items()}
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """The signals of the medium, if there is one."""
+        return tuple(self.file["signals"]) if "signals" in self.file else ()
+
+    def grid(self, frame: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the voxels of a frame are: lower corners (B, 3) µm, numbers of voxels (B, 3), and their spacing (3,) µm."""
+        if not self.signal_names:
+            raise InputError(f"{self.path} has no medium, so no grid.")
+        k = self._index(frame)
+        return self.file["frames/grid/origin"][k], self.file["frames/grid/shape"][k], np.asarray(self.file.attrs["spacing"])
+
+    def signal(self, name: str, frame: int = -1) -> list[np.ndarray]:
+        """Concentrations of a signal at a frame, one array (nx, ny, nz) a colony."""
+        if name not in self.signal_names:
+            raise checks.refuse("signal", name, "one of " + (", ".join(self.signal_names) or "none: the scene has no medium"))
+        k = self._index(frame)
+        _, shapes, _ = self.grid(k)
+        ends = int(self.file["frames/grid/first_voxel"][k]) + np.concatenate([[0], np.cumsum(shapes.prod(1))])
+        flat = self.file[f"signals/{name}"]
+        return [flat[a:b].reshape(tuple(shape)) for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)]
 
     def table(self, frame: int | None = None) -> dict[str, np.ndarray]:
         """One column a quantity, one row a cell, for `pandas.DataFrame(results.table())`: of one frame, or of all with time and frame."""
@@ -201,6 +228,14 @@ class Results:
         if template.dim != int(self.file.attrs["dim"]):
             raise checks.refuse("scene", f"{template.dim}-D", f"{self.file.attrs['dim']}-D, as {self.path} is")
         recorded = self.frame(k)
+        layout = template.layout
+        if (layout is None) != (not self.signal_names):
+            raise checks.refuse("scene", f"{'without' if layout is None else 'with'} a medium", f"as {self.path} is, which is not")
+        if layout is not None:
+            origin, shape, spacing = self.grid(k)
+            corner, voxels = torch.from_numpy(origin).to(device), torch.from_numpy(shape).to(device)
+            layout = layout.on(Grid(corner, voxels, (float(spacing[0]), float(spacing[1]), float(spacing[2]))))
+            recorded |= {OUTSIDE + n: np.concatenate([x.reshape(-1) for x in self.signal(n, k)]) for n in self.signal_names}
         colony_fields = {n: d[k] for n, d in self.file["frames/colony"].items()} if "frames/colony" in self.file else {}
         missing = [n for n in template.fields if n not in recorded and n not in colony_fields]
         if missing:
@@ -226,7 +261,7 @@ class Results:
         fields = {n: tensor(recorded[n] if n in recorded else colony_fields[n]) for n in declared}
         return template.replace(
             **{n: tensor(recorded[n]) for n in PER_CELL}, colony_id=tensor(self.colony_id), next_uid=tensor(self.file["frames/next_uid"][k]),
-            step=int(self.steps[k]), time=float(self.times[k]), fields=fields, declared=declared,
+            step=int(self.steps[k]), time=float(self.times[k]), fields=fields, declared=declared, layout=layout,
         )  # fmt: skip
 
 

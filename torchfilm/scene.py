@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchfilm.cells import Cells
-from torchfilm.effect import BUILT_IN, STAGES, Distribution, Effect
-from torchfilm.physics.walls import Wall
+from torchfilm.effect import BUILT_IN, STAGES, Effect
 from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.timing import Timings
@@ -41,7 +41,7 @@ class Scene:
             raise checks.InputError("Scene() has no effect: nothing would happen. List at least one, such as tf.Growth(rate=1.0).")
         names = [e.title for e in effects]
         for title in names:
-            if names.count(title) > 1 and title in ("growth", "division", "mechanics"):
+            if names.count(title) > 1 and title in ("growth", "division", "mechanics", "circuit", "transport"):
                 raise checks.InputError(f"Scene lists {title} {names.count(title)} times: one is allowed. Put all of it into one.")
         self.listed = effects
         self.effects: tuple[Effect, ...] = tuple(sorted((p for e in effects for p in e.parts()), key=lambda p: p.stage))
@@ -106,6 +106,8 @@ class Scene:
     def unchecked(self, colonies: int, *, seed: int = 0, cells: Cells | None = None, device: torch.device = CPU, dtype: torch.dtype = torch.float32) -> State:
         """A first state whose cells are not asked whether they may stand where they do: to be filled from a file, or only looked at."""
         state = (cells if cells is not None else self.founders).state(colonies, seed, device, dtype)
+        for effect in self.effects:
+            state = effect.begin(state)
         for effect in self.effects:
             for f in effect.declares(self.dim):
                 state = _with_given(state, f) if f.name in state.fields else state.declare(f)
@@ -220,7 +222,9 @@ def parameters(part: object, path: str = "") -> list[tuple[str, Tensor]]:
         return [(path, part)]
     if isinstance(part, (tuple, list)):
         return [found for k, item in enumerate(part) for found in parameters(item, f"{path}[{k}]")]
-    if isinstance(part, (Effect, Distribution, Wall)):
+    if isinstance(part, Mapping):
+        return [found for name, item in part.items() for found in parameters(item, f"{path}[{name!r}]")]
+    if dataclasses.is_dataclass(part) and not isinstance(part, type):
         path = path or type(part).__name__
         return [found for f in dataclasses.fields(part) for found in parameters(getattr(part, f.name), f"{path}.{f.name}")]  # type: ignore[arg-type]
     return []

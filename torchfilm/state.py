@@ -13,10 +13,13 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics import capsule
+from torchfilm.signals.layout import Layout
 from torchfilm.tools import checks, random
 from torchfilm.tools.ragged import Groups, offsets
 
-CELL, COLONY = "cell", "colony"
+CELL, COLONY, GRID = "cell", "colony", "grid"
+# Signals stand among the fields under "out.NAME", beside what cells hold under the same name.
+OUTSIDE = "out."
 
 # How daughters get a field: as the parent had it, as the field's initial value, or by a function.
 DivisionRule = str | Callable[["State", "Tensor"], "Tensor"]
@@ -26,9 +29,9 @@ DivisionRule = str | Callable[["State", "Tensor"], "Tensor"]
 class Field:
     """A named quantity that an effect declares. What no effect declares does not exist.
 
-    scope: "cell" (one row a cell) or "colony" (one row a colony). shape: of one row. unit and meaning: for people.
-    initial: a number, or a function (state, rows) -> (M, *shape) tensor, called for new rows: at the start and,
-    where at_division = "reset", for daughters. at_division: "copy" or "reset".
+    scope: "cell" (one row a cell), "colony" (one row a colony) or "grid" (one row a voxel of the state's layout; the name begins with
+    "out."). shape: of one row. unit and meaning: for people. initial: a number, or a function (state, rows) -> (M, *shape) tensor, called for
+    new rows: at the start and, where at_division = "reset", for daughters, when `state.births[-1]` tells of their parents. at_division: "copy" or "reset".
     """
 
     name: str
@@ -41,9 +44,10 @@ class Field:
     at_division: str = "copy"
 
     def __post_init__(self) -> None:
-        checks.choice(f"Field({self.name!r}).scope", self.scope, (CELL, COLONY))
+        checks.choice(f"Field({self.name!r}).scope", self.scope, (CELL, COLONY, GRID))
         checks.choice(f"Field({self.name!r}).at_division", self.at_division, ("copy", "reset"))
-        if not self.name.isidentifier() or self.name in RESERVED:
+        plain = self.name.removeprefix(OUTSIDE) if self.scope == GRID else self.name
+        if not plain.isidentifier() or self.name in RESERVED:
             raise checks.refuse("Field.name", self.name, "an identifier that the state does not use itself")
 
     def start(self, state: State, rows: Tensor) -> Tensor:
@@ -82,7 +86,8 @@ class State:
     parent −1 · position (N, d) µm, always float64, so that a colony far from the origin keeps its resolution · axis (N, d)
     unit · length (N,) µm, of the centreline · radius (N,) µm · fields, by name.
     colony_id (B,): which colony of the scene each is; parameters per colony and random numbers go by it. next_uid (B,).
-    A field is also an attribute: `state.growth_rate`.
+    A field is also an attribute: `state.growth_rate`. layout: where the voxels of signals are, in a scene that has a medium; a signal's values are
+    `state.signals["ahl"]`, (nodes,).
     """
 
     colony: Tensor
@@ -99,6 +104,7 @@ class State:
     time: float = 0.0
     fields: Mapping[str, Tensor] = field(default_factory=dict)
     declared: Mapping[str, Field] = field(default_factory=dict)
+    layout: Layout | None = None
     births: tuple[Births, ...] = ()
     ended: tuple[Ended, ...] = ()
     reports: Mapping[str, Any] = field(default_factory=dict)
@@ -155,6 +161,11 @@ class State:
         return capsule.area(self.length, self.radius)
 
     @property
+    def signals(self) -> dict[str, Tensor]:
+        """Values of each signal by name, (nodes,), laid out as `layout.grid` says."""
+        return {name.removeprefix(OUTSIDE): value for name, value in self.fields.items() if name.startswith(OUTSIDE)}
+
+    @property
     def own_colony_id(self) -> Tensor:
         """The id of each cell's colony, (N,)."""
         return self.colony_id.index_select(0, self.colony)
@@ -173,7 +184,9 @@ class State:
     def declare(self, field: Field) -> State:
         """A state that has one more field, at its initial value."""
         declared = self.replace(declared={**self.declared, field.name: field})
-        rows = self.cells if field.scope == CELL else self.colonies
+        if field.scope == GRID and self.layout is None:
+            raise checks.InputError(f"the field {field.name!r} needs a grid, and this state has none: list a Medium in the scene.")
+        rows = self.cells if field.scope == CELL else self.colonies if field.scope == COLONY else self.layout.grid.nodes  # type: ignore[union-attr]
         start = field.start(declared, torch.arange(rows, device=self.device))
         if start.shape[0] != rows:
             raise checks.refuse(f"initial value of {field.name}", tuple(start.shape), f"of {rows} rows")
@@ -205,16 +218,19 @@ class State:
         owner = torch.repeat_interleave(torch.arange(places.numel(), device=self.device), counts)
         within = torch.arange(owner.numel(), device=self.device) - offsets(counts)[:-1].index_select(0, owner)
         taken = self.take(start.index_select(0, places).index_select(0, owner) + within)
-        fields = {n: v if self.declared[n].scope == CELL else v.index_select(0, places) for n, v in taken.fields.items()}
+        layout, nodes = (None, None) if self.layout is None else self.layout.take(places)
+        kept = {CELL: None, COLONY: places, GRID: nodes}
+        fields = {n: v if (index := kept[self.declared[n].scope]) is None else v.index_select(0, index) for n, v in taken.fields.items()}
         return taken.replace(
-            colony=owner, fields=fields, births=(), ended=(), reports={},
+            colony=owner, fields=fields, layout=layout, births=(), ended=(), reports={},
             colony_id=self.colony_id.index_select(0, places), next_uid=self.next_uid.index_select(0, places),
         )  # fmt: skip
 
     def to(self, device: str | torch.device) -> State:
         """The same state on another device."""
         move = {name: getattr(self, name).to(device) for name in (*PER_CELL, "colony_id", "next_uid")}
-        return self.replace(**move, fields={n: v.to(device) for n, v in self.fields.items()}, births=(), ended=(), reports={})
+        layout = None if self.layout is None else self.layout.to(device)
+        return self.replace(**move, fields={n: v.to(device) for n, v in self.fields.items()}, layout=layout, births=(), ended=(), reports={})
 
     def uniform(self, rows: Tensor, purpose: str) -> Tensor:
         """A draw from (0, 1) for each of the given cells (M,), the same whatever the batch: keyed by seed, colony, uid, step, purpose."""

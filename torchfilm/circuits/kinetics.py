@@ -1,0 +1,36 @@
+"""Rate laws that hold everywhere: below zero they are as at zero, far above they do not overflow, and at zero their derivatives are finite.
+
+x, half and power are tensors that broadcast, or numbers; half > 0, power ≥ 1.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchfilm.tools.powers import power as steady_power
+
+
+def activation(x: Tensor, half: float | Tensor, power: float | Tensor = 1.0) -> Tensor:
+    """xⁿ/(Kⁿ + xⁿ), with K = half and n = power."""
+    big, p = _ratio(x, half, power)
+    return torch.where(big, torch.ones_like(p), p) / (1.0 + p)
+
+
+def repression(x: Tensor, half: float | Tensor, power: float | Tensor = 1.0) -> Tensor:
+    """Kⁿ/(Kⁿ + xⁿ) = 1 − activation, but exact also where it is small."""
+    big, p = _ratio(x, half, power)
+    return torch.where(big, p, torch.ones_like(p)) / (1.0 + p)
+
+
+def michaelis_menten(x: Tensor, half: float | Tensor) -> Tensor:
+    """x/(K + x), with K = half."""
+    return activation(x, half, 1.0)
+
+
+def _ratio(x: Tensor, half: float | Tensor, power: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Whether x > K, and (x/K)ⁿ, or (K/x)ⁿ where it is: a number from 0 to 1 that neither overflows nor divides by 0."""
+    r = (x / half).clamp(min=0.0)
+    big = r.detach() > 1.0
+    inner = torch.where(big, torch.where(big, r, 1.0).reciprocal(), r)
+    return big, steady_power(inner, power)

@@ -1,0 +1,63 @@
+"""Names for columns: what a user's rate function gets as u, s, p and cell."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from torchfilm.tools import checks
+
+
+class UnknownName(checks.InputError, AttributeError):
+    """A rate function asked for a name that is not there."""
+
+
+class Names:
+    """Read-only names for columns: `u.ahl`, or `u["ahl"]` for a name that is made up at run time.
+
+    order: the names. columns: one for each of them, in a tensor (M, K) or a sequence of tensors or numbers. label: what to call this in a message.
+    """
+
+    __slots__ = ("__dict__", "_label")
+    _label: str
+
+    def __init__(self, order: Sequence[str], columns: Tensor | Sequence[Any], label: str = "this"):
+        object.__setattr__(self, "_label", label)
+        # the columns are the instance's own attributes, so that finding one costs what any attribute costs
+        self.__dict__.update(zip(order, columns.unbind(1) if isinstance(columns, Tensor) else columns, strict=True))
+
+    def __getattr__(self, name: str) -> Any:
+        # only called for what is not there
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise UnknownName(unknown(f"{self._label} has no {name!r}", name, list(self.__dict__)))
+
+    def __getitem__(self, name: str) -> Any:
+        return getattr(self, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise UnknownName(f"{self._label}.{name} can only be read: a rate function returns rates and changes nothing.")
+
+    def __delattr__(self, name: str) -> None:
+        raise UnknownName(f"{self._label}.{name} can only be read.")
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.__dict__
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.__dict__)
+
+    def __len__(self) -> int:
+        return len(self.__dict__)
+
+    def __repr__(self) -> str:
+        return f"Names({', '.join(self.__dict__) or 'none'})"
+
+
+def unknown(what: str, name: str, known: Sequence[str]) -> str:
+    """The message for a name that is not there: what is, and what may have been meant."""
+    near = difflib.get_close_matches(name, known, 1, cutoff=0.6)
+    return f"{what}; known are {', '.join(known) or 'none'}." + (f" Did you mean {near[0]!r}?" if near else "")

@@ -1,0 +1,136 @@
+"""A list of reactions made ready to run: checked against the species and signals that there are, with its stoichiometry as a tensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.circuits.names import Names, unknown
+from torchfilm.circuits.reactions import OUTSIDE, Reaction, concentration, falling, per_cell
+from torchfilm.tools import checks
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """R reactions over S species and M signals.
+
+    stoichiometry (R, S + M) float64: molecules gained by each event, species before signals. orders (S + M,) float64: the highest order in which
+    a rate depends on each. parameters: the names that constants refer to.
+    """
+
+    reactions: tuple[Reaction, ...]
+    species: tuple[str, ...]
+    signals: tuple[str, ...]
+    stoichiometry: Tensor
+    orders: Tensor
+    parameters: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Columns of the stoichiometry: species, then signals as "out.name"."""
+        return (*self.species, *(OUTSIDE + s for s in self.signals))
+
+    def concentration_rates(self, u: Names, s: Names, p: Names, cell: Names) -> list[Tensor]:
+        """R rates, each (n,) conc/h in the cell's volume; differentiable. `cell` holds volume, area and colony (the id that constants per colony go by)."""
+        out = []
+        for reaction in self.reactions:
+            if callable(reaction.rate):
+                out.append(reaction.rate(u, s, p, cell))
+                continue
+            rate = torch.as_tensor(per_cell(reaction.rate, p, cell, cell.volume), dtype=cell.volume.dtype, device=cell.volume.device).expand_as(cell.volume)
+            for name, order in reaction.consumes.items():
+                x = concentration(name, u, s)
+                for _ in range(order):
+                    rate = rate * x
+            out.append(rate)
+        return out
+
+    def changes(self, rates: Sequence[Tensor]) -> list[Tensor]:
+        """What R rates (n,) change: S + M tensors (n,), conc/h referred to the cell's volume; a signal's, times the volume, is an amount per hour."""
+        out = [torch.zeros_like(rates[0]) for _ in self.names]
+        place = {n: k for k, n in enumerate(self.names)}
+        for reaction, rate in zip(self.reactions, rates, strict=True):
+            for name, count in reaction.change().items():
+                k = place[name]
+                out[k] = out[k] + (rate if count == 1 else -rate if count == -1 else count * rate)
+        return out
+
+    def propensities(self, counts: Tensor, p: Names, cell: Names, *, copies: float | Tensor = 1.0, pool: Tensor | None = None) -> Tensor:
+        """Events per hour, (n, R), at molecule numbers `counts` (n, S + M); copies: molecules in a unit of concentration × µm³.
+
+        pool: µm³ outside that each cell may draw signals from, (n,) or (n, M), where there are signals. Mass action counts combinations, k Ω n (n − 1)/Ω²
+        for 2 a with Ω = volume × copies; a function's rate is used as it is, times Ω.
+        """
+        volumes = [cell.volume * copies] * len(self.species)
+        if self.signals:
+            if pool is None:
+                raise checks.refuse("pool", pool, "the volume outside of each cell, for the signals " + ", ".join(self.signals))
+            volumes += [(pool if pool.dim() == 1 else pool[:, k]) * copies for k in range(len(self.signals))]
+        columns = counts.unbind(1)
+        density = [n / v for n, v in zip(columns, volumes, strict=True)]
+        u = Names(self.species, density[: len(self.species)], "u")
+        s = Names(self.signals, density[len(self.species) :], "s")
+        place = {n: k for k, n in enumerate(self.names)}
+        size = cell.volume * copies
+        out = []
+        for reaction in self.reactions:
+            if callable(reaction.rate):
+                out.append(reaction.rate(u, s, p, cell) * size)
+                continue
+            rate = per_cell(reaction.rate, p, cell, size) * size
+            for name, order in reaction.consumes.items():
+                # what is less than a molecule cannot react
+                rate = rate * falling(columns[place[name]].floor(), order)
+                for _ in range(order):
+                    rate = rate / volumes[place[name]]
+            out.append(rate)
+        return torch.stack(out, 1)
+
+
+def network(reactions: Sequence[Reaction | Sequence[Reaction]], species: Sequence[str], signals: Sequence[str] = ()) -> Network:
+    """Reactions, or parts (lists of reactions), checked and put together over the given species and signals."""
+    flat: list[Reaction] = []
+    for entry in reactions:
+        flat += [entry] if isinstance(entry, Reaction) else list(entry)
+    if not flat:
+        raise checks.refuse("reactions", list(reactions), "at least one reaction")
+    names = [*species, *(OUTSIDE + s for s in signals)]
+    _check_names(species, signals)
+    seen: set[str] = set()
+    stoichiometry, orders = torch.zeros(len(flat), len(names), dtype=torch.float64), torch.zeros(len(names), dtype=torch.float64)
+    for row, reaction in enumerate(flat):
+        if reaction.name and reaction.name in seen:
+            raise checks.refuse("reaction", reaction.name, "there only once", "Give each reaction a name of its own, or none.")
+        seen.add(reaction.name)
+        for name in (*reaction.consumes, *reaction.produces, *getattr(reaction.rate, "reads", ())):
+            if name not in names:
+                raise checks.InputError(unknown(f"the reaction {reaction.name or str(reaction)!r} has the unknown name {name!r}", name, names))
+        for name, count in reaction.change().items():
+            stoichiometry[row, names.index(name)] = count
+        # what a user's own function reads is not known, so it may be anything
+        steep = dict.fromkeys(getattr(reaction.rate, "reads", names), reaction.order) if callable(reaction.rate) else reaction.consumes
+        for name, order in steep.items():
+            k = names.index(name)
+            orders[k] = max(float(orders[k]), order)
+    parameters = _parameters(flat)
+    return Network(tuple(flat), tuple(species), tuple(signals), stoichiometry, orders, parameters)
+
+
+def _check_names(species: Sequence[str], signals: Sequence[str]) -> None:
+    for what, given in (("species", species), ("signals", signals)):
+        if isinstance(given, str) or not all(isinstance(n, str) and n.isidentifier() for n in given):
+            raise checks.refuse(what, given, "a sequence of names")
+        if len(set(given)) != len(given):
+            raise checks.refuse(what, list(given), "different names", "One stands there twice.")
+
+
+def _parameters(reactions: Sequence[Reaction]) -> tuple[str, ...]:
+    """Names of parameters that constants refer to, in order; what a user's own function reads is not known."""
+    found: list[str] = []
+    for reaction in reactions:
+        given = [getattr(reaction.rate, c, None) for c in ("rate", "half", "power")] if callable(reaction.rate) else [reaction.rate]
+        found += [c for c in given if isinstance(c, str) and c not in found]
+    return tuple(found)

@@ -1,0 +1,241 @@
+"""One circuit in the cells of one type, over one step: rates by a user's function or by reactions, with the medium about each cell as its pool.
+
+What a cell exchanges with the medium is solved together with what happens inside it: the circuit's variables are the species and, for each
+signal that it gives or takes, the concentration in the cell's own pool, the part of the medium from which it may draw in this step. So however
+fast the exchange, neither side falls below zero, and what one gives the other has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.circuits import integrators, rosenbrock, stochastic
+from torchfilm.circuits.columns import Columns, column
+from torchfilm.circuits.draws import Draw
+from torchfilm.circuits.names import Names, unknown
+from torchfilm.circuits.network import Network
+from torchfilm.tools import checks
+from torchfilm.tools.checks import InputError
+from torchfilm.tools.powers import steady_functions
+
+# rates of change of species by name, conc/h, and amounts per hour given to signals by name, conc·µm³/h
+RateFunction = Callable[[Names, Names, Names, Names], Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """How circuits are stepped: method, its `steps` or tolerances, and molecules per unit of concentration × µm³, (N,) or one number."""
+
+    method: str
+    steps: int
+    rtol: float
+    atol: float
+    copies: float | Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Circuit:
+    """A circuit in M of N cells. part: a rate function, or reactions made ready. species: its variables. given: the signals it exchanges.
+
+    rows: (M,) int64. cell, p: columns over the N cells by name. signals: what each cell finds outside, (N,) by name. pool: (N,) µm³, the part of the
+    medium that is each cell's own, if anything is exchanged. beyond: (N,) bool, cells whose pool is a reservoir that nothing changes, or None.
+    """
+
+    part: RateFunction | Network
+    species: tuple[str, ...]
+    given: tuple[str, ...]
+    rows: Tensor
+    cell: Mapping[str, Any]
+    p: Mapping[str, Any]
+    signals: Mapping[str, Tensor]
+    pool: Tensor | None = None
+    beyond: Tensor | None = None
+    label: str = "circuit"
+    seen: dict[str, set[str]] = field(default_factory=dict)
+
+    def names(self, u: Tensor, rows: Tensor) -> tuple[Names, Names, Names, Names]:
+        """What a rate function is called with, at the variables u (m, ≥ S + E) of the cells `rows` (m,) among the N."""
+        size = len(self.species)
+        columns = u.unbind(1)
+        outside: dict[str, Any] = dict(self.signals)
+        s = Columns(outside, rows, "s", self.seen.get("s"))
+        for name, value in zip(self.given, columns[size:], strict=False):
+            s.__dict__[name] = value
+        return (
+            Names(self.species, columns[:size], "u"), s,
+            Columns(self.p, rows, "p", self.seen.get("p")), Columns(self.cell, rows, "cell", self.seen.get("cell")),
+        )  # fmt: skip
+
+    def changes(self, u: Tensor, rows: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Rates of species (m,), conc/h, and amounts given to signals (m,), conc·µm³/h, by name; u (m, …), rows (m,) among the N cells."""
+        u_, s, p, cell = self.names(u, rows)
+        with steady_functions():
+            if isinstance(self.part, Network):
+                found = self.part.changes(self.part.concentration_rates(u_, s, p, cell))
+                split = len(self.species)
+                inside = dict(zip(self.species, found[:split], strict=True))
+                return inside, {n: x * cell.volume for n, x in zip(self.part.signals, found[split:], strict=True)}
+            returned = self.part(u_, s, p, cell)
+        inside, outside = returned if isinstance(returned, tuple) and len(returned) == 2 else (returned, {})
+        return self._checked(inside, self.species, "species", u, rows), self._checked(outside, tuple(self.signals), "signal", u, rows)
+
+    def _checked(self, found: object, known: Sequence[str], what: str, u: Tensor, rows: Tensor) -> dict[str, Tensor]:
+        if not isinstance(found, Mapping):
+            raise InputError(f"{self.label} returned {type(found).__name__}: it must return a dict of rates by species, and, for signals, a second one.")
+        out = {}
+        for name, value in found.items():
+            if name not in known:
+                raise InputError(unknown(f"{self.label} returned a rate for {name!r}, which is no {what}", str(name), list(known)))
+            made = column(value, rows.numel(), u)
+            if made is None:
+                shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                raise InputError(f"{self.label} returned a rate of shape {shape} for the {what} {name!r}: it must be one number a cell, ({rows.numel()},).")
+            out[name] = made
+        return out
+
+    def rates(self, u: Tensor, rows: Tensor) -> Tensor:
+        """du/dt of all variables, (m, S + E), or (m, S + 3E) where there is a reservoir; rows (m,) among the M."""
+        rows = self.rows.index_select(0, rows)
+        inside, outside = self.changes(u, rows)
+        none = torch.zeros_like(u[:, 0])
+        columns = [inside.get(n, none) for n in self.species]
+        if self.given:
+            assert self.pool is not None
+            pool = self.pool.index_select(0, rows)
+            flux = [outside.get(n, none) for n in self.given]
+            if self.beyond is None:
+                columns += [x / pool for x in flux]
+            else:
+                away = self.beyond.index_select(0, rows)
+                columns += [torch.where(away, 0.0, x / pool) for x in flux]
+                columns += [torch.where(away, x.clamp(min=0.0), 0.0) for x in flux]
+                columns += [torch.where(away, (-x).clamp(min=0.0), 0.0) for x in flux]
+        return torch.stack(columns, 1)
+
+    def start(self, concentrations: Tensor) -> Tensor:
+        """The variables at the start: concentrations (M, S), then pools, then what went to a reservoir and what came from it."""
+        columns = [self.signals[n].index_select(0, self.rows) for n in self.given]
+        if self.beyond is not None:
+            columns += [torch.zeros_like(c) for c in columns] * 2
+        return torch.cat([concentrations, *(c.unsqueeze(1) for c in columns)], 1) if columns else concentrations
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """After a step: concentrations (M, S); amounts given to the pools and beyond, conc·µm³, (M,) by signal; whether a cell failed (M,) bool and
+    why, (M,) codes for `words`; steps taken (M,) int64."""
+
+    concentrations: Tensor
+    pools: dict[str, Tensor]
+    beyond: dict[str, Tensor]
+    failed: Tensor
+    code: Tensor
+    steps: Tensor
+
+
+def step(circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings, draw: Draw | None = None) -> Outcome:
+    """The circuit `dt` hours later, from concentrations (M, S). Raises nothing for a cell that fails; it is marked."""
+    if settings.method in ("tau_leap", "direct"):
+        assert draw is not None
+        return _molecules(circuit, concentrations, dt, settings, draw)
+    start = circuit.start(concentrations)
+    count = start.shape[0]
+    steps = torch.full((count,), settings.steps, dtype=torch.int64, device=start.device)
+    if settings.method == "rosenbrock":
+        end, report = rosenbrock.rosenbrock(circuit.rates, start, dt, rtol=settings.rtol, atol=settings.atol)
+        code, steps = report.status, report.accepted + report.rejected
+    else:
+        if settings.method == "euler":
+            end = integrators.euler(circuit.rates, start, dt, settings.steps)
+        else:
+            end = integrators.runge_kutta(circuit.rates, start, dt, settings.steps, settings.method)
+        code = torch.where(torch.isfinite(end).all(1), rosenbrock.DONE, rosenbrock.NOT_FINITE)
+    size, more = len(circuit.species), len(circuit.given)
+    pools, beyond = {}, {}
+    for k, name in enumerate(circuit.given):
+        assert circuit.pool is not None
+        pools[name] = (end[:, size + k] - start[:, size + k]) * circuit.pool.index_select(0, circuit.rows)
+        if circuit.beyond is not None:
+            beyond[name] = end[:, size + more + k] - end[:, size + 2 * more + k]
+    return Outcome(end[:, :size], pools, beyond, code != 0, code, steps)
+
+
+def _molecules(circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings, draw: Draw) -> Outcome:
+    """The same molecule by molecule. A reservoir is a pool so large that what is given to it or taken does not show."""
+    assert isinstance(circuit.part, Network)
+    network, rows = circuit.part, circuit.rows
+    volume = circuit.cell["volume"].index_select(0, rows).double()
+    copies = settings.copies.index_select(0, rows).double() if isinstance(settings.copies, Tensor) and settings.copies.dim() else settings.copies
+    parts = [torch.round(concentrations.double() * (volume * copies).unsqueeze(1))]
+    pool = None
+    if network.signals:
+        assert circuit.pool is not None
+        pool = circuit.pool.index_select(0, rows).double()
+        if circuit.beyond is not None:
+            pool = torch.where(circuit.beyond.index_select(0, rows), 1e9 * volume, pool)
+        parts += [(circuit.signals[n].index_select(0, rows).double() * pool * copies).unsqueeze(1) for n in network.signals]
+    start = torch.cat(parts, 1)
+
+    def propensities(counts: Tensor, mine: Tensor) -> Tensor:
+        _, _, p, cell = circuit.names(counts, rows.index_select(0, mine))
+        scale = copies.index_select(0, mine) if isinstance(copies, Tensor) and copies.dim() else copies
+        with steady_functions():
+            return network.propensities(counts, p, cell, copies=scale, pool=None if pool is None else pool.index_select(0, mine))
+
+    if settings.method == "direct":
+        end, report = stochastic.direct(start, propensities, network.stoichiometry, dt, draw)
+    else:
+        end, report = stochastic.tau_leap(start, propensities, network.stoichiometry, dt, draw, orders=network.orders)
+    size = len(circuit.species)
+    amount = {n: (end[:, size + k] - start[:, size + k]) / copies for k, n in enumerate(network.signals)}
+    away = None if circuit.beyond is None else circuit.beyond.index_select(0, rows)
+    pools = {n: (x if away is None else torch.where(away, 0.0, x)).to(concentrations.dtype) for n, x in amount.items()}
+    beyond = {} if away is None else {n: torch.where(away, x, 0.0).to(concentrations.dtype) for n, x in amount.items()}
+    found = (end[:, :size] / (volume * copies).unsqueeze(1)).to(concentrations.dtype)
+    # a code of its own for each reaction that went wrong, apart from those of the smooth methods
+    code = torch.where(report.status == 0, 0, torch.where(report.reaction >= 0, MOLECULES + report.reaction, report.status))
+    return Outcome(found, pools, beyond, report.status != 0, code, report.steps)
+
+
+MOLECULES = 100
+
+
+def words(circuit: Circuit, outcome: Outcome, concentrations: Tensor, k: int, method: str) -> str:
+    """What went wrong in the k-th of the M cells."""
+    code = int(outcome.code[k])
+    if method in ("tau_leap", "direct"):
+        assert isinstance(circuit.part, Network)
+        if code >= MOLECULES:
+            reaction = circuit.part.reactions[code - MOLECULES]
+            return f"the reaction {reaction.name or str(reaction)!r} has a {stochastic.STATUS[stochastic.BAD_PROPENSITY].removeprefix('a ')}"
+        return stochastic.STATUS[code]
+    said = rosenbrock.STATUS[code]
+    if code == rosenbrock.NOT_FINITE:
+        one = torch.tensor([k], device=concentrations.device)
+        start = circuit.start(concentrations).index_select(0, torch.arange(concentrations.shape[0], device=one.device)).index_select(0, one)
+        inside, outside = circuit.changes(start, circuit.rows.index_select(0, one))
+        bad = [f"the species {n!r}" for n, x in inside.items() if not bool(torch.isfinite(x).all())]
+        bad += [f"the signal {n!r}" for n, x in outside.items() if not bool(torch.isfinite(x).all())]
+        at = ", ".join(f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True))
+        said = f"the rate of {' and '.join(bad) or 'a species, on the way,'} is not a finite number, at {at}"
+    return said
+
+
+def trial(circuit: Circuit, concentrations: Tensor) -> tuple[str, ...]:
+    """Try the circuit once at concentrations (M, S): raise InputError for what it returns wrongly; the signals that it exchanges."""
+    inside, outside = circuit.changes(concentrations, circuit.rows)
+    for what, found in (("species", inside), ("signal", outside)):
+        for name, value in found.items():
+            if not bool(torch.isfinite(value.detach()).all()):
+                k = int(torch.nonzero(~torch.isfinite(value.detach()))[0])
+                at = ", ".join(f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True))
+                raise checks.InputError(f"{circuit.label} gives {float(value[k])} for the {what} {name!r} at the start ({at}): every rate must be a finite number.")
+    if isinstance(circuit.part, Network):
+        exchanged = {n.removeprefix("out.") for r in circuit.part.reactions for n in r.change() if n.startswith("out.")}
+        return tuple(n for n in circuit.part.signals if n in exchanged)
+    return tuple(n for n in circuit.signals if n in outside)

@@ -1,0 +1,226 @@
+"""Reactions molecule by molecule: Gillespie's direct method, and tau-leaping with a safe step for every cell by itself.
+
+Tau-leaping after Cao, Gillespie and Petzold, J. Chem. Phys. 124, 044109 (2006): a step that changes no propensity by more than about ε of it;
+reactions that are few events from using up what they consume are critical, and fire at most once a step; where steps would hold
+few events, the exact method is used. Cells that have reached the end leave the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.circuits.draws import Draw, poisson
+
+# events per hour (M, R) of the cells `rows` (M,) with molecule numbers counts (M, S)
+Propensities = Callable[[Tensor, Tensor], Tensor]
+
+DONE, TOO_MANY_EVENTS, BAD_PROPENSITY = 0, 1, 2
+STATUS = {DONE: "done", TOO_MANY_EVENTS: "too many events", BAD_PROPENSITY: "a propensity is negative or not a finite number"}
+FEW_EVENTS = 10.0  # a leap that would hold fewer is not worth it
+MOST_HALVINGS = 60
+
+
+@dataclass(frozen=True)
+class Report:
+    """For each cell, (N,) int64: `steps` (leaps and single events), `status`, one of STATUS, and the `reaction` that went wrong, −1 for none."""
+
+    steps: Tensor
+    status: Tensor
+    reaction: Tensor
+
+
+def tau_leap(
+    counts: Tensor,
+    propensities: Propensities,
+    stoichiometry: Tensor,
+    dt: float,
+    draw: Draw,
+    *,
+    epsilon: float = 0.03,
+    critical: int = 10,
+    orders: Tensor | None = None,
+    max_steps: int = 100_000,
+) -> tuple[Tensor, Report]:
+    """Molecule numbers (N, S) after dt hours by tau-leaping, single events where leaps do not pay.
+
+    stoichiometry (R, S): molecules gained by each event. draw: see `draws.keyed_draws`. epsilon: relative change of a propensity that a leap may bring.
+    critical: a reaction that could fire fewer times than this fires alone. orders (S,): highest order in which a propensity depends on each
+    species, 0 for none; default 2. Numbers stay whole (a remainder given in stays) and never negative. Not differentiable; raises nothing.
+    """
+    run = _Run(propensities, stoichiometry, draw, counts)
+    leap = _Leap(run, epsilon, critical, orders)
+    return run.advance(counts, dt, leap.step, max_steps)
+
+
+def direct(counts: Tensor, propensities: Propensities, stoichiometry: Tensor, dt: float, draw: Draw, *, max_steps: int = 1_000_000) -> tuple[Tensor, Report]:
+    """Molecule numbers (N, S) after dt hours, event by event: exact, all cells side by side. Arguments as in `tau_leap`."""
+    run = _Run(propensities, stoichiometry, draw, counts)
+    return run.advance(counts, dt, run.single, max_steps)
+
+
+def _total(parts: Tensor) -> Tensor:
+    """Sum over the first axis in its order, (R, M) -> (M,), so that bits do not depend on M."""
+    out = parts[0].clone()
+    for k in range(1, parts.shape[0]):
+        out += parts[k]
+    return out
+
+
+def _choose(parts: Tensor, u: Tensor) -> Tensor:
+    """Which of R, in proportion to parts (R, M) ≥ 0: (M,) int64; one with parts = 0 is never chosen where another is not."""
+    bounds = parts.clone()
+    for k in range(1, parts.shape[0]):
+        bounds[k] += bounds[k - 1]
+    aim = (u * bounds[-1]).unsqueeze(0)
+    chosen = (bounds <= aim).sum(0)
+    # u < 1, but u times the sum may round up to it: then the last that can fire
+    last = parts.shape[0] - 1 - (parts > 0).flip(0).to(torch.uint8).argmax(0)
+    return torch.minimum(chosen, last)
+
+
+class _Run:
+    """What both methods share. Within, arrays are float64 with cells last: counts (S, M), propensities (R, M)."""
+
+    def __init__(self, propensities: Propensities, stoichiometry: Tensor, draw: Draw, counts: Tensor):
+        self.propensities, self.draw, self.dtype = propensities, draw, counts.dtype
+        self.gain = stoichiometry.to(device=counts.device, dtype=torch.float64)
+        self.taken = (-self.gain).clamp(min=0.0)
+        self.takers = torch.nonzero((self.taken > 0).any(1)).squeeze(1).tolist()
+
+    def rates(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Propensities (R, M), 0 where an event would take more than there is, and for each cell the first that is not allowed or −1."""
+        a = self.propensities(x.to(self.dtype).t(), rows).t().to(torch.float64).contiguous()
+        good = (a >= 0) & (a < torch.inf)
+        bad = torch.where(good.all(0), -1, good.to(torch.uint8).argmin(0))
+        a = torch.where(good, a, 0.0)
+        whole = x.floor()
+        for j in self.takers:
+            enough = (whole >= self.taken[j].unsqueeze(1)).all(0)
+            a[j] = torch.where(enough, a[j], 0.0)
+        return a, bad
+
+    def fire(self, x: Tensor, events: Tensor) -> Tensor:
+        """Molecule numbers after `events` (R, M) of each reaction."""
+        for j in range(events.shape[0]):
+            x = torch.addcmul(x, self.gain[j].unsqueeze(1), events[j].unsqueeze(0))
+        return x
+
+    def after_one(self, x: Tensor, which: Tensor) -> Tensor:
+        """Molecule numbers after one event of the reaction `which` (M,)."""
+        return x + self.gain.index_select(0, which).t()
+
+    def single(self, x: Tensor, a: Tensor, left: Tensor, rows: Tensor, event: int) -> tuple[Tensor, Tensor]:
+        """One event, or the end if it would come after it: molecule numbers, and the time that passed."""
+        u = self.draw(rows, event, "single", 2)
+        wait = -torch.log(u[0]) / _total(a)  # infinite where nothing can happen
+        happens = wait < left
+        return torch.where(happens, self.after_one(x, _choose(a, u[1])), x), torch.where(happens, wait, left)
+
+    @torch.no_grad()
+    def advance(self, counts: Tensor, dt: float, step: Callable[..., tuple[Tensor, Tensor]], most: int) -> tuple[Tensor, Report]:
+        """All cells to the end, each at its own pace: `step` gives a cell's numbers and how much time passed."""
+        cells = counts.shape[0]
+        rows = torch.arange(cells, device=counts.device)
+        steps, status, wrong = torch.zeros_like(rows), torch.full_like(rows, TOO_MANY_EVENTS), torch.full_like(rows, -1)
+        x, left = counts.t().to(torch.float64).contiguous(), torch.full((cells,), float(dt), dtype=torch.float64, device=counts.device)
+        out = counts.clone()
+        for event in range(most):
+            if rows.numel() == 0:
+                break
+            a, bad = self.rates(x, rows)
+            x, passed = step(x, a, left, rows, event)
+            faulty = bad >= 0
+            steps.index_add_(0, rows, (~faulty).long())
+            left = left - passed
+            ends = faulty | (left <= 0)
+            if not bool(ends.any()):
+                continue
+            gone, stay = torch.nonzero(ends).squeeze(1), torch.nonzero(~ends).squeeze(1)
+            who = rows.index_select(0, gone)
+            out.index_copy_(0, who, x.index_select(1, gone).t().to(self.dtype))
+            status.index_copy_(0, who, torch.where(faulty, BAD_PROPENSITY, DONE).index_select(0, gone))
+            wrong.index_copy_(0, who, bad.index_select(0, gone))
+            rows, x, left = rows.index_select(0, stay), x.index_select(1, stay), left.index_select(0, stay)
+        out.index_copy_(0, rows, x.t().to(self.dtype))
+        return out, Report(steps, status, wrong)
+
+
+class _Leap:
+    """The leaps of `tau_leap`."""
+
+    def __init__(self, run: _Run, epsilon: float, critical: int, orders: Tensor | None):
+        self.run, self.epsilon, self.critical = run, epsilon, critical
+        order = torch.full_like(run.gain[0], 2.0) if orders is None else orders.to(run.gain)
+        self.read, self.order = (order > 0).unsqueeze(1), order.clamp(min=1.0).unsqueeze(1)
+
+    def rare(self, x: Tensor, a: Tensor) -> Tensor:
+        """(R, M): reactions that can happen, and fewer than `critical` times before something that they take is used up."""
+        out = torch.zeros_like(a, dtype=torch.bool)
+        whole = x.floor()
+        for j in self.run.takers:
+            taken = self.run.taken[j].unsqueeze(1)
+            out[j] = ((taken > 0) & (whole < self.critical * taken)).any(0)
+        return out & (a > 0)
+
+    def longest(self, x: Tensor, a: Tensor) -> Tensor:
+        """(M,): the time in which no propensity is expected to change by more than ε of it, for the propensities a (R, M) of what may leap."""
+        mean, spread = torch.zeros_like(x), torch.zeros_like(x)
+        for j in range(a.shape[0]):
+            gain = self.run.gain[j].unsqueeze(1)
+            mean = torch.addcmul(mean, gain, a[j].unsqueeze(0))
+            spread = torch.addcmul(spread, gain * gain, a[j].unsqueeze(0))
+        # g of the paper is the order, and more where few molecules of one kind meet one another: 2 + 1/(x − 1) for a pair
+        steep = self.order + torch.where(self.order > 1, (self.order - 1) / (x - 1).clamp(min=1.0), 0.0)
+        change = (self.epsilon * x / steep).clamp(min=1.0)
+        time = torch.minimum(change / mean.abs(), change * change / spread)
+        return torch.where(self.read & (spread > 0), time, torch.inf).amin(0)
+
+    def step(self, x: Tensor, a: Tensor, left: Tensor, rows: Tensor, event: int) -> tuple[Tensor, Tensor]:
+        """One leap, or one event: molecule numbers, and the time that passed."""
+        rare = self.rare(x, a)
+        often, seldom = torch.where(rare, 0.0, a), torch.where(rare, a, 0.0)
+        longest = self.longest(x, often)
+        all_in_all = _total(a)
+        # a leap that reaches the end is worth it however few events it holds? No: exact steps are as few then
+        leaps = torch.minimum(longest, left) * all_in_all >= FEW_EVENTS
+        after, passed = x, left
+        if not bool(leaps.all()):
+            after, passed = self.run.single(x, a, left, rows, event)
+        at = torch.nonzero(leaps).squeeze(1)
+        if at.numel() == 0:
+            return after, passed
+        pick = lambda v: v.index_select(-1, at)  # noqa: E731
+        jumped, took = self.leap(pick(x), pick(often), pick(seldom), pick(longest), pick(left), rows.index_select(0, at), event)
+        return after.index_copy(1, at, jumped), passed.index_copy(0, at, took)
+
+    def leap(self, x: Tensor, often: Tensor, seldom: Tensor, longest: Tensor, left: Tensor, rows: Tensor, event: int) -> tuple[Tensor, Tensor]:
+        """Poisson numbers of what is frequent, and at most one event of what is rare; half as far again where that would leave less than nothing."""
+        size = often.shape[0]
+        u = self.run.draw(rows, event, "rare", 2)
+        until_rare = -torch.log(u[0]) / _total(seldom)
+        which = _choose(seldom, u[1])
+        after, took = x, left
+        open_ = torch.arange(rows.numel(), device=rows.device)
+        for trial in range(MOST_HALVINGS):
+            pick = lambda v: v.index_select(-1, open_)  # noqa: B023, E731
+            far = torch.minimum(pick(longest) * 0.5**trial, pick(left))
+            wait = pick(until_rare)
+            fires = wait < far
+            time = torch.minimum(far, wait)
+            uniform = self.run.draw(rows.index_select(0, open_), event, f"leap {trial}", size)
+            ahead = self.run.fire(pick(x), poisson(pick(often) * time, uniform))
+            ahead = torch.where(fires, self.run.after_one(ahead, pick(which)), ahead)
+            good = (ahead >= 0).all(0)
+            done = torch.nonzero(good).squeeze(1)
+            to = open_.index_select(0, done)
+            after = after.index_copy(1, to, ahead.index_select(1, done))
+            took = took.index_copy(0, to, time.index_select(0, done))
+            open_ = open_.index_select(0, torch.nonzero(~good).squeeze(1))
+            if open_.numel() == 0:
+                break
+        # not seen to happen: after 60 halvings no event is left to come
+        return after, took.index_fill(0, open_, 0.0)

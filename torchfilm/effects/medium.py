@@ -1,0 +1,356 @@
+"""The medium: signals that diffuse, flow and decay on a grid about each colony (the paper's equations 6 and 7)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.effect import COVER, TRANSPORT, Effect, per_colony
+from torchfilm.signals.faces import Faces
+from torchfilm.signals.grid import Batch, Grid
+from torchfilm.signals.layout import Layout
+from torchfilm.signals.operator import operator
+from torchfilm.signals.transport import METHODS, Stepper, choose, prepare
+from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
+from torchfilm.tools import checks
+
+# A value on the grid: a number, one per colony, or a function from places (M, 3) µm to (M,).
+OnGrid = float | Tensor | Callable[[Tensor], Tensor]
+BEYOND = ("error", "grow", "open")
+# A grid that grows with its colony does so by this many voxels at a time, and keeps this many between the cells and its faces.
+BLOCK, MARGIN = 8, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """A substance outside the cells.
+
+    diffusion: K, µm²/h; decay: 1/h; each one number or one per colony; decay may also be a function from places (M, 3) µm to (M,), a sink. initial:
+    concentration at the start, and source: concentration/h made everywhere, each a number, one per colony, or such a function.
+    faces: what happens at the faces of the box, if not as the medium says. beyond: the concentration that cells beyond an open box find there.
+    """
+
+    diffusion: float | Tensor
+    decay: OnGrid = 0.0
+    initial: OnGrid = 0.0
+    source: OnGrid = 0.0
+    faces: Faces | None = None
+    beyond: float | Tensor = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("diffusion", "beyond"):
+            object.__setattr__(self, name, checks.value(f"Signal.{name}", getattr(self, name), least=0.0))
+        for name in ("decay", "initial", "source"):
+            if not callable(getattr(self, name)):
+                object.__setattr__(self, name, checks.value(f"Signal.{name}", getattr(self, name), least=0.0))
+
+
+@dataclass(frozen=True)
+class MediumReport:
+    """`status` (B,): 1 where cells of a colony are beyond the box. `left` (B,) how many, `first` (B, 3) where one of them is, µm."""
+
+    status: Tensor
+    left: Tensor
+    first: Tensor
+    mend = "Make the box of the Medium larger, or let it grow with the colony: Medium(…, beyond='grow')"
+
+    def reason(self, place: int) -> str:
+        where = ", ".join(f"{x:.4g}" for x in self.first[place].tolist())
+        return f"{int(self.left[place])} cell(s) are beyond the box of the medium or inside an obstacle, one at ({where}) µm"
+
+
+@dataclass(frozen=True, init=False, eq=False)
+class Medium(Effect):
+    """Signals about the cells, on one grid per colony: `Medium(ahl=Signal(diffusion=10.0), box=((-64, -64), (64, 64)), spacing=4.0)`.
+
+    box: lower and upper corner, µm, in 2 or 3 dimensions; a flat box is one layer `depth` µm thick (by default as thick as a voxel is wide). Cells of
+    a 2-D scene may lie in a box with three: in the plane z = `height`. spacing: of voxels, µm, one number or one an axis.
+    faces: of the box; without, nothing passes them. flow: velocity of the medium, µm/h: two or three numbers (or one per colony each), or a function from
+    places (M, 3) µm to velocities (M, 3). obstacles: a function from places (M, 3) to (M,) bool, true where there is none of the medium.
+    beyond: what cells beyond the box mean: "error"; "grow": the box grows with its colony; "open": the box stands in a reservoir in which each
+    signal is at its `beyond`, and what cells give to it and take from it is kept count of in the fields NAME_beyond.
+    method: "exponential" (exact, where the box is all medium and the flow uniform), "implicit" (positive at any step; elsewhere), "crank_nicolson" (the
+    paper's) or "euler"; by default the first of them that the scene allows.
+    """
+
+    signals: Mapping[str, Signal]
+    box: tuple[tuple[float, ...], tuple[float, ...]]
+    spacing: tuple[float, ...]
+    depth: float | None
+    height: float
+    faces: Faces
+    flow: Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
+    obstacles: Callable[[Tensor], Tensor] | None
+    beyond: str
+    method: str | None
+
+    stage = TRANSPORT
+    title = "transport"
+
+    def __init__(
+        self,
+        *,
+        box: tuple[Sequence[float], Sequence[float]],
+        spacing: float | Sequence[float],
+        depth: float | None = None,
+        height: float = 0.0,
+        faces: Faces | None = None,
+        flow: Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None = None,
+        obstacles: Callable[[Tensor], Tensor] | None = None,
+        beyond: str = "error",
+        method: str | None = None,
+        **signals: Signal,
+    ):
+        if not signals:
+            raise checks.InputError("Medium() has no signal: name at least one, such as ahl=tf.Signal(diffusion=10.0).")
+        for name, signal in signals.items():
+            if not isinstance(signal, Signal):
+                raise checks.refuse(f"Medium.{name}", signal, "a Signal", f"Write {name}=tf.Signal(diffusion=…), or check the spelling of an option.")
+        try:
+            low, high = (tuple(float(x) for x in corner) for corner in box)
+        except (TypeError, ValueError) as error:
+            raise checks.refuse("Medium.box", box, "two corners, such as ((-64, -64), (64, 64))") from error
+        if len(low) != len(high) or len(low) not in (2, 3) or not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True)):
+            raise checks.refuse("Medium.box", (low, high), "two corners of 2 or 3 finite numbers, the first below the second along every axis")
+        steps = checks.vector("Medium.spacing", (spacing,) * len(low) if isinstance(spacing, (int, float)) else spacing, len(low))
+        if min(steps) <= 0:
+            raise checks.refuse("Medium.spacing", spacing, "above 0")
+        for letter, a, b, h in zip("xyz", low, high, steps, strict=False):
+            count = (b - a) / h
+            if abs(count - round(count)) > 1e-6:
+                whole = max(1, round(count)) * h
+                raise checks.refuse(
+                    f"Medium.box along {letter}", (a, b), f"a whole number of voxels of {h:g} µm", f"It is {count:g}; make it {whole:g} µm long."
+                )
+        if depth is not None:
+            checks.number("Medium.depth", depth, above=0.0)
+            if len(low) == 3:
+                raise checks.refuse("Medium.depth", depth, "left out where the box has three dimensions")
+        checks.number("Medium.height", height)
+        if len(low) == 3 and not low[2] <= height <= high[2]:
+            raise checks.refuse("Medium.height", height, f"within the box, from {low[2]:g} to {high[2]:g} µm")
+        checks.choice("Medium.beyond", beyond, BEYOND)
+        if method is not None:
+            checks.choice("Medium.method", method, tuple(METHODS))
+        for name, value in (("obstacles", obstacles), ("flow", None if isinstance(flow, (tuple, list, Tensor)) else flow)):
+            if value is not None and not callable(value):
+                raise checks.refuse(f"Medium.{name}", value, "a function of places" + (", or two or three numbers" if name == "flow" else ""))
+        given = {
+            "signals": dict(signals), "box": (low, high), "spacing": steps, "depth": depth, "height": float(height),
+            "faces": faces if faces is not None else Faces(), "flow": _flow(flow), "obstacles": obstacles, "beyond": beyond, "method": method,
+        }  # fmt: skip
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
+        periodic = {self.faces_of(name).periodic for name in signals}
+        if len(periodic) > 1:
+            raise checks.InputError("Medium: a face is periodic for one signal and not for another; space closes on itself for all or for none.")
+        if True in next(iter(periodic)) and beyond == "grow":
+            raise checks.refuse("Medium.beyond", beyond, '"error" or "open" with periodic faces', "A box that closes on itself cannot grow.")
+
+    def faces_of(self, name: str) -> Faces:
+        """The faces that a signal meets."""
+        own = self.signals[name].faces
+        return self.faces if own is None else own
+
+    @property
+    def corners(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, float, float]]:
+        """Lower and upper corner and spacing in three dimensions, µm."""
+        low, high = self.box
+        x, y = self.spacing[:2]
+        if len(low) == 3:
+            return low, high, (x, y, self.spacing[2])
+        depth = x if self.depth is None else self.depth
+        return (*low, self.height - depth / 2), (*high, self.height + depth / 2), (x, y, depth)
+
+    def parts(self) -> tuple[Effect, ...]:
+        return (Cover(self), self)
+
+    def declares(self, dim: int) -> tuple[Field, ...]:
+        fields = [
+            Field(OUTSIDE + name, "signal in the medium", "conc", scope=GRID, initial=lambda state, rows, s=signal: self._values(s.initial, state).index_select(0, rows))
+            for name, signal in self.signals.items()
+        ]
+        if self.beyond == "open":
+            fields += [Field(f"{name}_beyond", "amount given to the reservoir beyond the box, less what was taken", "conc·µm³", scope=COLONY) for name in self.signals]
+        return tuple(fields)
+
+    def lay(self, state: State) -> State:
+        """The state with its grids, all as the box says."""
+        low, high, step = self.corners
+        count = [round((b - a) / h) for a, b, h in zip(low, high, step, strict=True)]
+        places = (state.colonies, 3)
+        grid = Grid(
+            torch.tensor(low, dtype=torch.float64, device=state.device).expand(places).clone(),
+            torch.tensor(count, device=state.device).expand(places).clone(), step,
+        )  # fmt: skip
+        reservoir = {name: s.beyond for name, s in self.signals.items()} if self.beyond == "open" else None
+        return state.replace(layout=Layout(grid, self.faces_of(next(iter(self.signals))).periodic, self.height, self.obstacles, reservoir))
+
+    def _values(self, given: OnGrid, state: State) -> Tensor:
+        """A value on every voxel, (nodes,); 0 in obstacles."""
+        layout = state.layout
+        assert layout is not None
+        if callable(given):
+            found = given(layout.grid.centres())
+            shape = tuple(found.shape) if isinstance(found, Tensor) else found
+            if shape != (layout.grid.nodes,) or not bool(torch.isfinite(found).all()) or bool((found < 0).any()):
+                raise checks.refuse("a value on the grid", shape, f"a tensor of {layout.grid.nodes} finite numbers ≥ 0, one for each place")
+            value = found.to(dtype=state.dtype, device=state.device)
+        else:
+            value = per_colony(given, state).expand(state.colonies).index_select(0, layout.grid.owner)
+        return value if layout.mask is None else value * layout.mask
+
+    def reads(self) -> tuple[str, ...]:
+        return tuple(OUTSIDE + name for name in self.signals)
+
+    def writes(self) -> tuple[str, ...]:
+        return tuple(OUTSIDE + name for name in self.signals)
+
+    def check(self, state: State) -> None:
+        for name in self.signals:
+            self._stepper(name, state, state.layout.grid.batches[0], 1.0)  # type: ignore[union-attr]
+
+    def step(self, state: State, dt: float) -> State:
+        assert state.layout is not None
+        grid = state.layout.grid
+        changed = {}
+        for name in self.signals:
+            values = state.fields[OUTSIDE + name]
+            parts = [self._stepper(name, state, batch, dt).step(batch.of(values)) for batch in grid.batches]
+            changed[OUTSIDE + name] = grid.join(parts)
+        return state.with_fields(**changed)
+
+    def _stepper(self, name: str, state: State, batch: Batch, dt: float) -> Stepper:
+        """The step of a signal on the grids of one shape, made once for as long as they stay."""
+        assert state.layout is not None
+        key = (self, name, batch.shape, dt, state.dtype)
+        found = state.layout.work.get(key)
+        if found is None:
+            found = self._prepare(name, state, batch, dt)
+            if not (torch.is_grad_enabled() and any(isinstance(p, Tensor) and p.requires_grad for p in self._numbers(name))):
+                state.layout.work[key] = found
+        return found
+
+    def _numbers(self, name: str) -> list[Any]:
+        """What a signal's transport depends on, tensors among it."""
+        signal, flow = self.signals[name], self.flow
+        faces = [face.outside_value() for pair in self.faces_of(name).pairs for face in pair]
+        moving = [True] if callable(flow) else list(flow or ())
+        return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
+
+    def _prepare(self, name: str, state: State, batch: Batch, dt: float) -> Stepper:
+        signal, layout = self.signals[name], state.layout
+        assert layout is not None
+        ids = state.colony_id.index_select(0, batch.places)
+        own = lambda x: x.to(state.device).index_select(0, ids) if isinstance(x, Tensor) and x.dim() == 1 else x  # noqa: E731
+        spread = lambda x: batch.of(self._values(x, state)) if callable(x) else own(x)  # noqa: E731
+        made = operator(
+            batch.shape, layout.grid.spacing, diffusion=own(signal.diffusion), decay=spread(signal.decay), velocity=self._velocity(layout, batch, own),
+            faces=self.faces_of(name).take(ids), mask=None if layout.mask is None else batch.of(layout.mask),
+            source=None if not callable(signal.source) and not isinstance(signal.source, Tensor) and signal.source == 0 else spread(signal.source),
+            colonies=batch.places.numel(), dtype=state.dtype, device=state.device,
+        )  # fmt: skip
+        return prepare(made, dt, self.method or choose(made))
+
+    def _velocity(self, layout: Layout, batch: Batch, own: Callable[[Any], Any]) -> Any:
+        if self.flow is None:
+            return None
+        if not callable(self.flow):
+            parts = [torch.as_tensor(own(v), dtype=torch.float64).reshape(-1).expand(batch.places.numel()) for v in (*self.flow, 0.0)[:3]]
+            return torch.stack(parts, 1)
+        out = []
+        step, origin = layout.grid.step, layout.grid.origin.index_select(0, batch.places)
+        for axis in range(3):
+            counts = [n + (k == axis) for k, n in enumerate(batch.shape)]
+            lines = [(torch.arange(n, device=origin.device) + (0.0 if k == axis else 0.5)) * step[k] for k, n in enumerate(counts)]
+            faces = torch.stack(torch.meshgrid(*lines, indexing="ij"), -1) + origin.reshape(-1, 1, 1, 1, 3)
+            found = self.flow(faces.reshape(-1, 3))
+            if not isinstance(found, Tensor) or found.dim() != 2 or found.shape[0] != faces[..., 0].numel() or found.shape[1] not in (2, 3):
+                raise checks.refuse("flow(places)", tuple(getattr(found, "shape", ())), f"velocities of shape ({faces[..., 0].numel()}, 3)")
+            part = found[:, axis] if axis < found.shape[1] else torch.zeros_like(found[:, 0])
+            out.append(part.reshape(faces.shape[:-1]))
+        return tuple(out)
+
+
+def _flow(given: Any) -> Any:
+    if given is None or callable(given):
+        return given
+    if len(given) not in (2, 3):
+        raise checks.refuse("Medium.flow", given, "two or three numbers, or a function of places")
+    return tuple(checks.value(f"Medium.flow[{k}]", v) for k, v in enumerate(given))
+
+
+@dataclass(frozen=True, eq=False)
+class Cover(Effect):
+    """The part of Medium that sees to it that every cell is on the grid, before anything is exchanged."""
+
+    medium: Medium = field(repr=False)
+
+    stage = COVER
+    title = "cover"
+
+    def reads(self) -> tuple[str, ...]:
+        return ("position",)
+
+    def writes(self) -> tuple[str, ...]:
+        return tuple(OUTSIDE + name for name in self.medium.signals) if self.medium.beyond == "grow" else ()
+
+    def begin(self, state: State) -> State:
+        return self.medium.lay(state)
+
+    def prepare(self, state: State) -> State:
+        return self._grown(state) if self.medium.beyond == "grow" else state
+
+    def check(self, state: State) -> None:
+        report = self._look(state)
+        if report is not None and bool(report.status.any()):
+            place = int(torch.nonzero(report.status)[0])
+            raise checks.InputError(f"Medium.box = {self.medium.box} is too small for colony {int(state.colony_id[place])}: {report.reason(place)}. {report.mend}.")
+
+    def step(self, state: State, dt: float) -> State:
+        if self.medium.beyond == "grow":
+            state = self._grown(state)
+        report = self._look(state)
+        return state if report is None else state.replace(reports={**state.reports, "medium": report})
+
+    @torch.no_grad()
+    def _look(self, state: State) -> MediumReport | None:
+        """Which cells are where no medium is; None where that is no failure."""
+        layout = state.layout
+        if layout is None or layout.reservoir is not None:
+            return None
+        away = layout.stencil(state.position, state.colony, torch.float64).outside
+        left = torch.bincount(state.colony[away], minlength=state.colonies)
+        first = torch.zeros(state.colonies, 3, dtype=torch.float64, device=state.device)
+        first[state.colony[away]] = layout.places(state.position)[away]
+        return MediumReport((left > 0).long(), left, first)
+
+    @torch.no_grad()
+    def _span(self, state: State) -> tuple[Tensor, Tensor]:
+        """The box that cells need, (B, 3) twice."""
+        assert state.layout is not None
+        places, groups, step = state.layout.places(state.position), state.groups, state.layout.grid.step
+        high = torch.stack([groups.max(x, empty=-torch.inf) for x in places.unbind(1)], 1)
+        low = -torch.stack([groups.max(-x, empty=-torch.inf) for x in places.unbind(1)], 1)
+        flat = torch.tensor([n == 1 for n in state.layout.grid.shapes[0]], device=state.device)  # a layer stays one
+        margin = torch.where(flat, 0.0, MARGIN * step)
+        return low - margin, high + margin
+
+    def _grown(self, state: State) -> State:
+        layout = state.layout
+        assert layout is not None
+        low, high = self._span(state)
+        names = [OUTSIDE + name for name in self.medium.signals]
+        here = [state.fields[n] for n in names]
+        grid, values = layout.grid.extended([*here, torch.ones_like(here[0])], low, high, block=BLOCK)
+        if grid is layout.grid:
+            return state
+        state = state.replace(layout=layout.on(grid))
+        old = values.pop() > 0
+        new = {n: torch.where(old, v, self.medium._values(self.medium.signals[n.removeprefix(OUTSIDE)].initial, state)) for n, v in zip(names, values, strict=True)}
+        return state.with_fields(**new)

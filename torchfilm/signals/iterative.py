@@ -1,0 +1,210 @@
+"""Transport over a step by repeated application of the operator: the paper's Crank–Nicolson, and explicit Euler.
+
+Both are here to compare with. Crank–Nicolson is second order, but its factor for the shortest waves tends to −1: on sharp data it rings
+for many steps and goes below zero. Euler is first order and positive, with as many sub-steps as that needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.signals.operator import Operator, apply
+from torchfilm.tools import checks
+
+Map = Callable[[Tensor], Tensor]
+# Of the right-hand side's norm, what may be left. The solve is worked in float64, where this is far above rounding.
+TOLERANCE = 1e-10
+MAX_ITERATIONS = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Euler:
+    """u ↦ (I + δT)^m u, in m equal sub-steps δ = Δt/m, for each colony the least m for which δ × the greatest loss rate is at most 1.
+
+    substeps: (B or 1,) int64. Then every entry of I + δT is ≥ 0 and no amount can grow.
+    """
+
+    operator: Operator
+    dt: float
+    substeps: Tensor
+
+    def step(self, u: Tensor) -> Tensor:
+        """u (B, nx, ny, nz) a step later."""
+        part = self.dt / self.substeps.double()
+        for k in range(int(self.substeps.max())):
+            now = torch.where(self.substeps > k, part, 0.0).to(u.dtype).reshape(-1, 1, 1, 1)
+            u = torch.addcmul(u, now, apply(self.operator, u))
+        return u
+
+
+def prepare_euler(operator: Operator, dt: float) -> Euler:
+    worst = operator.loss.detach().flatten(1).amax(1)
+    return Euler(operator, dt, torch.ceil(dt * worst).clamp(min=1.0).to(torch.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class SolveReport:
+    """For each colony, (B,): `iterations`, the true relative `residual`, and whether it is `converged` (bool)."""
+
+    iterations: Tensor
+    residual: Tensor
+    converged: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class CrankNicolson:
+    """u ↦ (I − Δt/2 T)⁻¹ [(I + Δt/2 T) u + Δt gain], by conjugate gradients, or BiCGStab where something flows; each colony converged by itself."""
+
+    operator: Operator
+    dt: float
+
+    def step(self, u: Tensor) -> Tensor:
+        """u (B, nx, ny, nz) a step later; NaN in a colony whose solve did not converge."""
+        out, report = self.solve(u)
+        return torch.where(report.converged.reshape(-1, 1, 1, 1), out, torch.nan)
+
+    def solve(self, u: Tensor) -> tuple[Tensor, SolveReport]:
+        """u a step later, as far as the solve came, and its report."""
+        wide = u.double()
+        linear = lambda x: apply(self.operator, x, gain=False)  # noqa: E731
+        left = lambda x: x - 0.5 * self.dt * linear(x)  # noqa: E731
+        right = wide + 0.5 * self.dt * linear(wide)
+        if self.operator.gain is not None:
+            right = right + self.dt * self.operator.gain
+        with torch.no_grad():
+            x, report = krylov(left, right, wide, self.operator.symmetric)
+        if torch.is_grad_enabled():
+            remainder = right - left(x)
+            if remainder.requires_grad:
+                x = _Attach.apply(remainder, x, left, self.operator.symmetric)
+        return x.to(u.dtype), report
+
+
+class _Attach(torch.autograd.Function):
+    """The solution x of A x = b given with the remainder b − A x ≈ 0, whose derivative is that of the equation: dx = A⁻¹ d(b − A x)."""
+
+    @staticmethod
+    def forward(ctx, remainder: Tensor, x: Tensor, left: Map, symmetric: bool) -> Tensor:
+        ctx.left, ctx.symmetric = left, symmetric
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        left = ctx.left
+        if not ctx.symmetric:
+            with torch.enable_grad():
+                at = torch.zeros_like(grad, requires_grad=True)
+                value = ctx.left(at)
+
+            def left(x: Tensor) -> Tensor:
+                return torch.autograd.grad(value, at, x, retain_graph=True)[0]
+
+        with torch.no_grad():
+            found, report = krylov(left, grad, torch.zeros_like(grad), ctx.symmetric)
+        return torch.where(report.converged.reshape(-1, 1, 1, 1), found, torch.nan), None, None, None
+
+
+def prepare_crank_nicolson(operator: Operator, dt: float) -> CrankNicolson:
+    return CrankNicolson(operator, dt)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """(B, …), (B, …) -> (B, 1, 1, 1)."""
+    return (a * b).reshape(a.shape[0], -1).sum(1).reshape(-1, 1, 1, 1)
+
+
+def _ratio(a: Tensor, b: Tensor) -> Tensor:
+    return torch.where(b == 0, 0.0, a / torch.where(b == 0, 1.0, b))
+
+
+def krylov(apply: Map, b: Tensor, start: Tensor, symmetric: bool) -> tuple[Tensor, SolveReport]:
+    """Solve A x = b, (B, nx, ny, nz), one system for each colony, each until it has converged; float64. No gradient."""
+    size = _dot(b, b)
+    target = TOLERANCE**2 * size
+    x, iterations = start.clone(), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
+    # what rounding made of the residual on the way is put right by starting again from the true one
+    for _ in range(3):
+        r = b - apply(x)
+        going = _dot(r, r) > target
+        if not bool(going.any()):
+            break
+        x, spent = (_conjugate_gradients if symmetric else _bicgstab)(apply, x, r, going, target)
+        iterations += spent
+    r = b - apply(x)
+    residual = _ratio(_dot(r, r), size).sqrt().reshape(-1)
+    # a right-hand side of zero has the answer zero, and a NaN has none
+    return x, SolveReport(iterations, residual, (_dot(r, r) <= 100 * target).reshape(-1))
+
+
+def _conjugate_gradients(apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
+    p, rr = r, _dot(r, r)
+    for _ in range(MAX_ITERATIONS):
+        q = apply(p)
+        alpha = torch.where(going, _ratio(rr, _dot(p, q)), 0.0)
+        x, r = torch.addcmul(x, alpha, p), torch.addcmul(r, alpha, q, value=-1.0)
+        spent += going.reshape(-1)
+        new = _dot(r, r)
+        going = going & (new > target)
+        if not bool(going.any()):
+            break
+        p, rr = torch.addcmul(r, torch.where(going, _ratio(new, rr), 0.0), p), new
+    return x, spent
+
+
+def _bicgstab(apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """van der Vorst's stabilised bi-conjugate gradients."""
+    spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
+    shadow, p, rho = r, r, _dot(r, r)
+    for _ in range(MAX_ITERATIONS):
+        v = apply(p)
+        alpha = torch.where(going, _ratio(rho, _dot(shadow, v)), 0.0)
+        s = torch.addcmul(r, alpha, v, value=-1.0)
+        t = apply(s)
+        omega = torch.where(going, _ratio(_dot(t, s), _dot(t, t)), 0.0)
+        x = torch.addcmul(torch.addcmul(x, alpha, p), omega, s)
+        r = torch.where(going, torch.addcmul(s, omega, t, value=-1.0), r)
+        spent += going.reshape(-1)
+        going = going & (_dot(r, r) > target)
+        if not bool(going.any()):
+            break
+        new = _dot(shadow, r)
+        beta = torch.where(going, _ratio(new, rho) * _ratio(alpha, omega), 0.0)
+        p, rho = torch.addcmul(r, beta, torch.addcmul(p, omega, v, value=-1.0)), new
+        # nothing left to go on with: let this colony start again from its true residual
+        going = going & (alpha != 0) & (omega != 0) & (new != 0)
+    return x, spent
+
+
+def convolve(operator: Operator, u: Tensor) -> Tensor:
+    """du/dt as `apply` gives it, by conv3d with a stencil of 3 × 3 × 3: the paper's equation 7, for rates that are the same everywhere.
+
+    A second way to the same numbers, to check the first by. On the CPU it is many times slower than differences of fluxes, and its last
+    bits depend on what else is in the batch.
+    """
+    if operator.interior is None:
+        raise checks.refuse("velocity", "one that varies from place to place", "uniform for a convolution", "Use apply.")
+    kernel = torch.zeros(operator.colonies, 1, 3, 3, 3, dtype=torch.float64, device=u.device)
+    inside = u if operator.mask is None else u * operator.mask
+    padded = inside
+    for axis, (up, down) in enumerate(operator.interior):
+        for side, rate in ((0, up), (2, down)):
+            place = [1, 1, 1]
+            place[axis] = side
+            weight = torch.zeros(3, 3, 3, dtype=torch.float64, device=u.device)
+            weight[tuple(place)] = 1.0
+            kernel = kernel + rate.reshape(-1, 1, 1, 1, 1) * weight
+        dim, own_neighbour = axis + 1, operator.axes[axis].own_neighbour
+        edge = padded.narrow(dim, -1, 1), padded.narrow(dim, 0, 1)
+        if not operator.axes[axis].periodic or own_neighbour:
+            edge = torch.zeros_like(edge[0]), torch.zeros_like(edge[1])
+        padded = torch.cat([edge[0], padded, edge[1]], dim)
+    out = torch.conv3d(padded.unsqueeze(0), kernel.to(u.dtype), groups=operator.colonies).squeeze(0)
+    if operator.mask is not None:
+        out = out * operator.mask
+    out = out - operator.loss.to(u.dtype) * u
+    return out if operator.gain is None else out + operator.gain.to(u.dtype)

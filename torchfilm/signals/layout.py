@@ -1,0 +1,67 @@
+"""Where the voxels of a scene's signals are, and what lies between them: the part of a medium that a state carries along."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.signals.exchange import Stencil, stencil
+from torchfilm.signals.grid import Grid
+from torchfilm.tools import checks
+from torchfilm.tools.ragged import expand_ranges
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """grid: one a colony. periodic: along which axes space closes on itself. height: z of the plane of 2-D cells, µm. obstacle: a function from
+    places (nodes, 3) µm to (nodes,) bool, true where no signal can be, or None. reservoir: None, or what cells beyond the box find there, the
+    concentration of each signal by name, one number or one per colony of the scene. work: what was made ready for this grid, to be used again."""
+
+    grid: Grid
+    periodic: tuple[bool, bool, bool] = (False, False, False)
+    height: float = 0.0
+    obstacle: Callable[[Tensor], Tensor] | None = None
+    reservoir: Mapping[str, float | Tensor] | None = None
+    work: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def mask(self) -> Tensor | None:
+        """(nodes,) bool, true in the medium; None without obstacles."""
+        if self.obstacle is None:
+            return None
+        solid = self.obstacle(self.grid.centres())
+        if not isinstance(solid, Tensor) or solid.shape != (self.grid.nodes,) or solid.dtype != torch.bool:
+            shown = (tuple(solid.shape), solid.dtype) if isinstance(solid, Tensor) else solid
+            raise checks.refuse("obstacles(places)", shown, f"a bool tensor of shape ({self.grid.nodes},), one value for each place")
+        if not bool((~solid).any()):
+            raise checks.InputError("obstacles(places) is true everywhere: nothing is left of the medium.")
+        return ~solid
+
+    def places(self, position: Tensor) -> Tensor:
+        """Where cells at (N, d) are in the three dimensions of the grid, (N, 3) float64, µm."""
+        if position.shape[1] == 3:
+            return position.double()
+        return torch.cat([position.double(), position.new_full((position.shape[0], 1), self.height, dtype=torch.float64)], 1)
+
+    def stencil(self, position: Tensor, colony: Tensor, dtype: torch.dtype) -> Stencil:
+        """Where cells at (N, d) µm of colonies (N,) meet the grid."""
+        return stencil(self.grid, self.places(position), colony, periodic=self.periodic, mask=self.mask, dtype=dtype)
+
+    def on(self, grid: Grid) -> Layout:
+        """The same medium on another grid."""
+        return self if grid is self.grid else replace(self, grid=grid, work={})
+
+    def take(self, places: Tensor) -> tuple[Layout, Tensor]:
+        """The layout of some colonies (b,), and the rows (nodes,) of their voxels in this one."""
+        grid = Grid(self.grid.origin.index_select(0, places), self.grid.shape.index_select(0, places), self.grid.spacing)
+        _, rows = expand_ranges(self.grid.offsets.index_select(0, places), self.grid.counts.index_select(0, places))
+        return self.on(grid), rows
+
+    def to(self, device: str | torch.device) -> Layout:
+        """The same layout on another device."""
+        return self.on(Grid(self.grid.origin.to(device), self.grid.shape.to(device), self.grid.spacing))

@@ -1,0 +1,52 @@
+"""A step of transport: the methods, which of them suits, and the one door to them.
+
+| method           | order in Δt | positive, conserves at any Δt | works for                                  |
+|------------------|-------------|-------------------------------|--------------------------------------------|
+| "exponential"    | exact       | yes                           | no obstacle, velocity the same everywhere  |
+| "implicit"       | 1           | yes                           | everything                                 |
+| "crank_nicolson" | 2           | rings, goes below 0           | everything; the paper's, for comparison    |
+| "euler"          | 1           | yes, by sub-steps             | everything; the oracle                     |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+from torch import Tensor
+
+from torchfilm.signals.exponential import prepare_exponential
+from torchfilm.signals.implicit import prepare_implicit
+from torchfilm.signals.iterative import prepare_crank_nicolson, prepare_euler
+from torchfilm.signals.operator import Operator
+from torchfilm.tools import checks
+
+
+class Stepper(Protocol):
+    """A step of fixed length, its factors worked out once."""
+
+    def step(self, u: Tensor) -> Tensor:
+        """u (B, nx, ny, nz) a step later."""
+        ...
+
+
+METHODS: dict[str, Callable[[Operator, float], Stepper]] = {
+    "exponential": prepare_exponential,
+    "implicit": prepare_implicit,
+    "crank_nicolson": prepare_crank_nicolson,
+    "euler": prepare_euler,
+}
+
+
+def choose(operator: Operator) -> str:
+    """The method that suits: "exponential" where it is possible, else "implicit"."""
+    return "exponential" if operator.separable else "implicit"
+
+
+def prepare(operator: Operator, dt: float, method: str | None = None) -> Stepper:
+    """A step of `dt` hours by `method`, or by the one that suits."""
+    if method is not None:
+        checks.choice("method", method, tuple(METHODS))
+    dt = checks.number("dt", dt, above=0.0, most=math.inf)
+    return METHODS[choose(operator) if method is None else method](operator, dt)
