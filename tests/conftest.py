@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 import torch
 
@@ -28,3 +30,38 @@ def deterministic():
     torch.use_deterministic_algorithms(True)
     yield
     torch.use_deterministic_algorithms(before)
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch):
+    """The command line without a new process: `command("run", "microcolony", …)` in a folder of its own."""
+    from torchfilm import cli
+
+    monkeypatch.chdir(tmp_path)
+    path = list(sys.path)
+
+    def call(*arguments: object) -> None:
+        monkeypatch.setattr(sys, "argv", ["torchfilm", *map(str, arguments)])
+        cli.main()
+
+    yield call
+    sys.path[:] = path
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory):
+    """A run of three colonies that nothing interrupted: (path, its states). To be read only."""
+    return _recorded(tmp_path_factory.mktemp("whole") / "run.h5")
+
+
+@pytest.fixture(scope="session")
+def every_step(tmp_path_factory):
+    """The same with every step recorded."""
+    return _recorded(tmp_path_factory.mktemp("every") / "run.h5", every=1)
+
+
+def _recorded(path, **options):
+    from recorded import make_scene, record
+
+    scene = make_scene()
+    return path, record(scene, scene.seed(3, seed=11), path, **options)

@@ -205,10 +205,19 @@ def test_bad_cells_are_refused_by_name(kind):
 BAD_CSV = {
     "text": ("x,y,angle,length\n0,0,0,2\n1,zero,0,2\n", r"line 3, column 'y'.*'zero'"),
     "blank": ("x,y,angle,length\n0,0,0,2\n1,,0,2\n", r"line 3, column 'y'"),
-    "short row": ("x,y,angle,length\n0,0,0,2\n1,0,0,2\n1,0,0\n", r"line 4, column 'length'"),
+    "short row": ("x,y,angle,length\n0,0,0,2\n1,0,0,2\n1,0,0\n", r"line 4, column 'length'.*3 values.*4 columns"),
+    "one word": ("x,y,angle,length\n0,0,0,2\nend\n", r"line 3, column 'y'.*1 value .*4 columns"),
     "long row": ("x,y,angle,length\n0,0,0,2\n1,0,0,2,9\n", r"line 3"),
     "decimal commas": ("x,y,angle,length\n0,0,0,2\n1,5,0,0,2,0\n", r"line 3"),
-    "empty file": ("", r"lacks the column 'x'"),
+    "empty file": ("", r"cells\.csv.*empty.*header.*x,y,angle,length"),
+    "blank lines only": ("\n\n", r"cells\.csv.*empty"),
+    "header only": ("x,y,angle,length\n", r"cells\.csv.*no cell.*header"),
+    "semicolons": ("x;y;angle;length\n0;0;0;2\n", r"cells\.csv, line 1.*semicolon.*comma"),
+    "semicolons and decimal commas": ("x;y;angle;length\n0,5;0;0;2,0\n", r"cells\.csv, line 1.*semicolon.*comma.*decimal point"),
+    "tabs": ("x\ty\tangle\tlength\n0\t0\t0\t2\n", r"cells\.csv, line 1.*tab.*comma"),
+    "angle and axis": ("x,y,angle,axis_x,axis_y,length\n0,0,0,1,0,2\n", r"cells\.csv.*'angle'.*'axis_x'.*one of the two"),
+    "angle and half an axis": ("x,y,angle,axis_y,length\n0,0,0,1,2\n", r"'angle'.*'axis_y'.*one of the two"),
+    "a name twice": ("x,y,angle,length,x\n0,0,0,2,1\n", r"cells\.csv, line 1.*'x' twice"),
     "no header": ("0,0,0,2\n1,0,0,2\n", r"lacks the column 'x'"),
     "nan": ("x,y,angle,length\n0,0,0,2\nnan,0,0,2\n", r"position\[1, 0\].*finite"),
     "negative": ("x,y,angle,length\n0,0,0,-2\n", r"length\[0\]"),
@@ -225,6 +234,19 @@ def test_bad_csv_files_are_refused_with_the_place(tmp_path, kind):
         tf.Cells.from_csv(path)
     if "line" in message or "lacks" in message:
         assert "cells.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize("data", [b"x,y,angle,length\n0,0,0,\xff\xfe\n", b"x,y,angle,length\n0,0,\x00,2\n"], ids=["not UTF-8", "a zero byte"])
+def test_a_csv_file_that_is_no_text_is_told(tmp_path, data):
+    path = tmp_path / "cells.csv"
+    path.write_bytes(data)
+    with pytest.raises(tf.InputError, match=r"cells\.csv"):
+        tf.Cells.from_csv(path)
+
+
+def test_a_table_without_cells_is_told():
+    with pytest.raises(tf.InputError, match=r"table.*no cell"):
+        tf.Cells.from_table({"x": [], "y": [], "angle": [], "length": []})
 
 
 def test_csv_lines_are_counted_as_an_editor_does(tmp_path):

@@ -1,4 +1,4 @@
-"""The command line: run, resume, show, info; own scene files; progress; and errors of one line."""
+"""The command line: run and resume, own scene files, edits taken up while running, and progress."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import fcntl
 import os
 import pty
 import re
-import shutil
 import signal
 import struct
 import subprocess
@@ -16,61 +15,11 @@ import time
 from pathlib import Path
 
 import h5py
-import matplotlib.image
 import numpy as np
 import pytest
-import torch
+from commands import ENVIRONMENT, OWN, assert_same, drawn, frames, shell
 
 import torchfilm as tf
-from torchfilm import cli
-
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
-
-
-def shell(*arguments: object, folder: Path, **options) -> subprocess.CompletedProcess:
-    """The command as a user types it."""
-    command = [sys.executable, "-m", "torchfilm.cli", *map(str, arguments)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, env=ENVIRONMENT, check=False, **options)
-
-
-@pytest.fixture
-def command(tmp_path, monkeypatch):
-    """The same without a new process: `command("run", "microcolony", …)` in a folder of its own."""
-    monkeypatch.chdir(tmp_path)
-    path = list(sys.path)
-
-    def call(*arguments: object) -> None:
-        monkeypatch.setattr(sys, "argv", ["torchfilm", *map(str, arguments)])
-        cli.main()
-
-    yield call
-    sys.path[:] = path
-
-
-OWN = """
-import torchfilm as tf
-
-def scene(rate=1.0, longest=4.0):
-    return tf.Scene(tf.Growth(rate=rate), tf.Division(length=tf.Uniform(3.0, longest)), tf.Mechanics(dim=2), dt=0.05)
-"""
-
-
-def frames(path) -> dict:
-    """The last frame and what led there."""
-    with tf.Results(path) as results:
-        return {"steps": results.steps.tolist(), "times": results.times.tolist(), **results.frame()}
-
-
-def assert_same(a: dict, b: dict) -> None:
-    for name in a:
-        assert np.array_equal(a[name], b[name]), name
-
-
-def drawn(path) -> float:
-    """The share of a picture's pixels that are coloured: cells, not paper, letters or lines."""
-    image = matplotlib.image.imread(path)[..., :3]
-    return float(((image.max(2) - image.min(2)) > 0.15).mean())
-
 
 # --- run ------------------------------------------------------------------------------------------------------------------
 
@@ -264,6 +213,8 @@ def test_watch_takes_up_an_edit_while_running(tmp_path):
     assert child.returncode == 0, errors
     said = out + errors
     assert said.index("rules.py is broken") < said.index("rules.py taken up")
+    times = [float(t) for t in re.findall(r"t = (\S+) h: rules\.py", said)]
+    assert len(times) == 2 and 0 < times[0] < times[1] < 1.5, "the simulated time of each edit"
     with tf.Results(tmp_path / "mine.h5") as results:
         rates = [float(results.frame(k)["growth_rate"][0]) for k in range(1, len(results))]
         assert results.steps[-1] == 150
@@ -296,181 +247,3 @@ def test_progress_shows_cells_time_rate_and_the_estimated_end(tmp_path, end):
     assert re.search(r"\d+ cells, t = \d+\.\d\d h, \d+ steps/s", text), text[-500:]
     assert re.search(r"\d\d:\d\d<\d\d:\d\d", text), "no estimated end"
     assert "100%" in text
-
-
-# --- show and info --------------------------------------------------------------------------------------------------------
-
-
-def test_show(command, capsys):
-    command("run", "microcolony", "--set", "dim=3", "--colonies", 2, "--until", 3, "--out", "a.h5", "--no-picture")
-    capsys.readouterr()
-    command("show", "a.h5")
-    assert capsys.readouterr().out.strip() == "a.png"
-    assert drawn("a.png") > 0.02
-    command("show", "a.h5", "--frame", 0, "--colour", "length", "--view", "xz", "--out", "side.png")
-    assert drawn("side.png") > 0.02
-    assert Path("side.png").read_bytes() != Path("a.png").read_bytes()
-
-
-@pytest.mark.parametrize("name", ["microcolony", "programmed_growth", "channel"])
-def test_info_of_a_ready_scene_says_who_drives_whom(command, capsys, name):
-    command("info", name)
-    out = capsys.readouterr().out
-    assert out.startswith(f"{name}: 2-D") and "growth -> mechanics: length, elongation" in out
-    if name == "programmed_growth":
-        assert "rules -> growth: growth_rate" in out and "mechanics -> rules: position" in out
-
-
-def test_info_of_a_scene_with_settings_and_of_a_file(command, capsys):
-    command("info", "microcolony", "--set", "dim=3", "rate=[0.5, 1.0]")
-    assert "3-D" in (out := capsys.readouterr().out) and "2 values" in out
-    Path("mine.py").write_text(OWN)
-    command("info", "mine.py")
-    assert capsys.readouterr().out.startswith("mine: 2-D")
-
-
-@pytest.mark.parametrize("name", ["a.h5", "results.dat"])
-def test_info_of_a_results_file(command, capsys, name):
-    command("run", "microcolony", "--colonies", 2, "--until", 0.5, "--seed", 3, "--out", name, "--no-picture")
-    capsys.readouterr()
-    command("info", name)
-    out = capsys.readouterr().out
-    for part in (name, "3 frames", "t = 0 to 0.5 h", "2 colonies", "seed 3", tf.__version__, str(torch.__version__), "microcolony: 2-D", "growth_rate"):
-        assert part in out, part
-
-
-# --- errors ---------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def spoilt(tmp_path_factory) -> Path:
-    """A folder with files of every unwelcome kind, and one good results file."""
-    folder = tmp_path_factory.mktemp("spoilt")
-    (folder / "text.h5").write_text("no numbers here\n" * 100)
-    (folder / "text.csv").write_text("x,y,angle,length\n0,zero,0,2\n")
-    (folder / "negative.csv").write_text("x,y,angle,length\n0,0,0,-2\n")
-    with h5py.File(folder / "foreign.h5", "w") as file:
-        file["x"] = [1.0]
-    (folder / "mine.py").write_text(OWN)
-    (folder / "fixed.py").write_text("import torchfilm as tf\nscene = tf.Scene(tf.Growth(rate=1.0))\n")
-    (folder / "empty.py").write_text("")
-    (folder / "number.py").write_text("scene = 3\n")
-    (folder / "syntax.py").write_text("scene = = 3\n")
-    (folder / "raises.py").write_text("import torchfilm as tf\nscene = tf.Scene(tf.Growth(rate=-1.0))\n")
-    (folder / "rule.py").write_text(
-        "import torchfilm as tf\ndef update(cells):\n    cells.growth_rate = cells.volumee\nscene = tf.Scene(tf.Rules(update), tf.Growth())\n"
-    )
-    (folder / "imports.py").write_text("import no_such_module\n")
-    scene = tf.scenes.microcolony()
-    for _ in tf.simulate(scene, scene.seed(), until=0.5, record=folder / "good.h5"):
-        pass
-    own = tf.Scene(tf.Growth(rate=1.0))
-    for _ in tf.simulate(own, own.seed(), until=0.5, record=folder / "own.h5"):
-        pass
-    return folder
-
-
-ERRORS = {
-    "run unknown": ("nothing_like_it", "microcolony, programmed_growth, channel"),
-    "run no_such_file.py": (r"no_such_file\.py", "No such file"),
-    "run empty.py": (r"empty\.py", "scene"),
-    "run number.py": (r"number\.py", "Scene"),
-    "run syntax.py --until 1": (r"syntax\.py", "line 1"),
-    "run imports.py --until 1": (r"imports\.py", "no_such_module"),
-    "run rule.py --until 1": ("volumee", "volume"),
-    "run raises.py --until 1": (r"Growth\.rate", "-1"),
-    "run fixed.py --set rate=2": ("--set", r"fixed\.py"),
-    "run mine.py --set speed=2": ("speed", r"rate|mine\.py"),
-    "run microcolony --set speed=2": ("speed", "rate"),
-    "run microcolony --set rate": ("--set", "NAME=VALUE"),
-    "run microcolony --set rate=-1": (r"Growth\.rate", "-1"),
-    "run microcolony --set rate=fast": (r"Growth\.rate", "fast"),
-    "run microcolony --set dim=two": (r"dim", "two"),
-    "run microcolony --set dim=4": (r"dim", "4"),
-    "run microcolony --set shortest=5": ("Uniform", "low"),
-    "run microcolony --set shortest=0.8": (r"Division\.length", r"0\.8"),
-    "run microcolony --set rate=[1.0,2.0] --colonies 3": (r"Growth\.rate|rate", "2 values"),
-    "run microcolony --colonies 0": ("colonies", "0"),
-    "run microcolony --cells 0": ("cells", "0"),
-    "run microcolony --until 0.33": ("until", r"0\.025"),
-    "run microcolony --until -1": ("until", "-1"),
-    "run microcolony --until 1 --dt 0": ("dt", "0"),
-    "run microcolony --every 0": ("every", "0"),
-    "run microcolony --seed -1": ("seed", "-1"),
-    "run microcolony --device banana": ("device", "banana"),
-    "run microcolony --start missing.csv": (r"missing\.csv", ""),
-    "run microcolony --start missing.h5": (r"missing\.h5", ""),
-    "run microcolony --start text.csv": (r"text\.csv, line 2, column 'y'", "zero"),
-    "run microcolony --start negative.csv": (r"length\[0\]", "-2"),
-    "run microcolony --start text.h5": (r"text\.h5", ""),
-    "run microcolony --start foreign.h5": (r"foreign\.h5", "'y'"),
-    "run microcolony --out good.h5": (r"good\.h5", "overwrite"),
-    "run microcolony --out text.csv/a.h5 --until 1": (r"text\.csv", ""),
-    "resume good.h5": ("--cells", "--until"),
-    "resume good.h5 --until 0.1": ("until", r"0\.1"),
-    "resume missing.h5 --until 1": (r"missing\.h5", "No such file"),
-    "resume text.h5 --until 1": (r"text\.h5", "not a results file"),
-    "resume foreign.h5 --until 1": (r"foreign\.h5", "not a torchfilm results file"),
-    "resume own.h5 --until 1": (r"own\.h5", "--scene"),
-    "resume own.h5 --until 1 --scene mine.py": (r"own\.h5|2-D", ""),
-    "show missing.h5": (r"missing\.h5", "No such file"),
-    "show text.h5": (r"text\.h5", "not a results file"),
-    "show foreign.h5": (r"foreign\.h5", "not a torchfilm results file"),
-    "show good.h5 --frame 99": ("frame", "99"),
-    "show good.h5 --colour nonsense": ("colour", "nonsense"),
-    "show good.h5 --colour position": ("colour", "position"),
-    "show good.h5 --view up": ("view", "up"),
-    "show good.h5 --view xz": ("view", "2-D"),
-    "show good.h5 --out nowhere/a.png": ("nowhere", ""),
-    "show good.h5 --out a.nonsense": ("nonsense", ""),
-    "info unknown": ("unknown", "microcolony"),
-    "info missing.h5": (r"missing\.h5", "No such file"),
-    "info text.h5": (r"text\.h5", "not a results file"),
-    "info no_such_file.py": (r"no_such_file\.py", "No such file"),
-}
-
-
-@pytest.mark.parametrize("line", list(ERRORS))
-def test_errors_are_one_line_that_names_the_cause(command, tmp_path, spoilt, line):
-    """No traceback: anything but SystemExit escaping from `main` would be one. And nothing new is left in the folder."""
-    shutil.copytree(spoilt, tmp_path, dirs_exist_ok=True)
-    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
-    with pytest.raises(SystemExit) as caught:
-        command(*line.replace("run unknown", "run nothing_like_it").split())
-    said = caught.value.code
-    assert isinstance(said, str), f"left with {said!r} and no word"
-    assert said.startswith("torchfilm: ") and "\n" not in said, said
-    for word in ERRORS[line]:
-        assert re.search(word, said), (word, said)
-    after = {p: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
-    assert {p for p in after if p not in before} == set(), "something was left lying about"
-    assert all(after[p] == data for p, data in before.items()), "a file was changed"
-
-
-@pytest.mark.parametrize("arguments", [["run"], ["run", "microcolony", "--colonies", "two"], ["fly"], []])
-def test_words_that_cannot_be_parsed_are_refused(command, arguments, capsys):
-    with pytest.raises(SystemExit) as caught:
-        command(*arguments)
-    assert caught.value.code not in (0, None)
-
-
-@pytest.mark.slow
-def test_an_error_in_the_shell(tmp_path):
-    """What the shell sees: status 1, one line on standard error, none on standard output."""
-    done = shell("run", "microcolony", "--set", "rate=-1", folder=tmp_path)
-    assert done.returncode == 1 and done.stdout == ""
-    assert len(done.stderr.strip().splitlines()) == 1 and done.stderr.startswith("torchfilm: Growth.rate")
-
-
-def test_a_failed_solve_in_the_command_line(command):
-    """The colonies that failed are named; the file holds what was there before."""
-    Path("mine.py").write_text(
-        "import torchfilm as tf\n"
-        "cells = tf.Cells([[0.3 * k, 0.45 * (k % 3)] for k in range(8)], [[1.0, 0.1 * k] for k in range(8)])\n"
-        "scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6), founders=cells, dt=0.1)\n"
-    )
-    with pytest.raises(SystemExit) as caught:
-        command("run", "mine.py", "--until", 1)
-    assert "colony 0" in caught.value.code and "iteration limit" in caught.value.code
-    with tf.Results("mine.h5") as results:
-        assert results.steps.tolist() == [0]

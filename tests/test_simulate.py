@@ -203,6 +203,60 @@ def test_a_colony_that_is_not_finite_fails_alone(unilateral, dtype):
     assert torch.isfinite(dropped.position).all()
 
 
+def too_short(*others: tf.Effect) -> tuple[tf.Scene, tf.State]:
+    """Three colonies of a long cell and a short one, all told to divide; only in colony 1 is the short one too short. A cell of colony 0 has 2 µm."""
+    cells = tf.Cells([[0.0, 0.0], [9.0, 0.0]] * 3, [0.0, 1.0], [3.0, 2.0, 3.0, 0.6, 3.0, 1.5], colony=[0, 0, 1, 1, 2, 2])
+    scene = tf.Scene(tf.Division(), *others, founders=cells, dt=0.1)
+    state = scene.seed()
+    return scene, state.with_fields(divide_flag=torch.ones_like(state.divide_flag))
+
+
+def test_a_cell_too_short_to_divide_is_raised_and_names_the_colony():
+    scene, state = too_short(tf.Growth(rate=0.1))
+    with pytest.raises(
+        tf.SimulationError, match=r"1 of 3 colonies.*\n.*colony 1 \(2 cells\): cell 1.*0\.6 µm.*1 µm.*\n.*[Ll]onger cells.*on_failure"
+    ) as caught:
+        list(tf.simulate(scene, state, until=1.0))
+    assert caught.value.colonies == (1,)
+    with pytest.raises(tf.SimulationError, match="cell 1 is due") as caught:
+        list(tf.simulate(scene, state.select([2, 1]), until=1.0))
+    assert caught.value.colonies == (1,)
+
+
+@pytest.mark.parametrize("others", [(tf.Growth(rate=0.1),), (tf.Growth(rate=0.1), tf.Mechanics(dim=2))], ids=["alone", "with contacts"])
+def test_dropping_a_colony_that_cannot_divide_goes_on_with_the_others(tmp_path, others):
+    scene, state = too_short(*others)
+    states = list(tf.simulate(scene, state, until=1.0, on_failure="drop", record=tmp_path / "run.h5"))
+    assert len(states) == 10 and states[0].counts.tolist() == [4, 0, 4] and states[-1].counts.tolist() == [4, 0, 4]
+    divided, failed = states[0].ended
+    assert divided.fate == "divided" and divided.colony_id.tolist() == [0, 0, 2, 2]
+    assert failed.fate == "failed" and failed.colony_id.tolist() == [1, 1] and failed.uid.tolist() == [0, 1], "nobody divides where one cannot"
+    without = list(tf.simulate(scene, state.select([0, 2]), until=1.0))[-1]
+    assert_same(states[-1].select([0, 2]), without.select([0, 1]))
+    with tf.Results(tmp_path / "run.h5") as results:
+        found = results.lineage()
+    assert found["fate"][:6].tolist() == ["divided", "divided", "failed", "failed", "divided", "divided"]
+
+
+def test_failures_of_two_kinds_are_raised_together():
+    """Colony 0 cannot divide, colony 1 cannot be solved, colony 2 neither."""
+    heap = lonely_and_crowded()
+    cells = tf.Cells(
+        [[-9.0, 0.0], *heap.position[1:9], [-9.0, 0.0], *heap.position[1:9]],
+        [[1.0, 0.0], *heap.axis[1:9], [1.0, 0.0], *heap.axis[1:9]],
+        [0.6] + [2.0] * 8 + [0.6] + [2.0] * 8,
+        colony=[0] + [1] * 8 + [2] * 9,
+    )
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(), tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6), founders=cells, dt=0.1)
+    state = scene.seed()
+    state = state.with_fields(divide_flag=state.length < 1)
+    with pytest.raises(tf.SimulationError, match=r"3 of 3 colonies") as caught:
+        list(tf.simulate(scene, state, until=1.0))
+    assert caught.value.colonies == (0, 1, 2)
+    said = str(caught.value)
+    assert said.count("two new caps") == 2 and said.count("iteration limit") == 2 and "smaller dt" in said and "longer cells" in said
+
+
 def test_a_failed_step_says_what_may_help():
     scene, state = failing()
     with pytest.raises(tf.SimulationError, match=r"smaller dt.*on_failure"):

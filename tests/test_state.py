@@ -173,7 +173,7 @@ def test_field_names_that_cannot_be_used_are_refused(name):
         tf.Field(name, "no good")
 
 
-@pytest.mark.parametrize("options", [{"scope": "grid"}, {"at_division": "halve"}])
+@pytest.mark.parametrize("options", [{"scope": "moon"}, {"at_division": "halve"}])
 def test_unknown_options_of_a_field_are_refused(options):
     with pytest.raises(tf.InputError, match="heat"):
         tf.Field("heat", "no good", **options)

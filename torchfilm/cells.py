@@ -154,6 +154,11 @@ class Cells:
         sizes = {n: len(v) for n, v in left.items()}
         if len(set(sizes.values())) > 1:
             raise checks.InputError(f"{source}: all columns must be equally long; they are {', '.join(f'{n} {k}' for n, k in sizes.items())}.")
+        if sizes["x"] == 0:
+            raise checks.InputError(f"{source} has no cell, only the names of its columns (a header). Give a line for each cell, at least one.")
+        given = [n for n in AXIS if n in left]
+        if "angle" in left and given:
+            raise checks.InputError(f"{source} has the columns 'angle' and {', '.join(map(repr, given))}: the direction is told twice. Give one of the two.")
         position = np.stack([np.asarray(left.pop(n), dtype=np.float64) for n in POSITION[:dim]], 1)
         if "angle" in left:
             angle = np.asarray(left.pop("angle"), dtype=np.float64)
@@ -167,24 +172,21 @@ class Cells:
 
     @staticmethod
     def from_csv(path: str | Path) -> Cells:
-        """From a CSV file with a header line; columns as in `from_table`."""
-        columns: dict[str, list[float]] = {}
-        with _readable(path, "r", encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            names = [n.strip() for n in reader.fieldnames or []]
-            reader.fieldnames = names
-            columns = {n: [] for n in names}
-            rows = [(reader.line_num, row) for row in reader]
+        """From a CSV file with a header line; columns as in `from_table`, separated by commas."""
+        names, rows = _read_csv(path)
+        columns: dict[str, list[float]] = {name: [] for name in names}
         for number, row in rows:
-            if None in row:
-                raise checks.InputError(
-                    f"{path}, line {number}: more values than the {len(names)} columns of the header. Decimal commas? Write decimal points."
-                )
-            for name in names:
+            line = f"{path}, line {number}"
+            if len(row) > len(names):
+                raise checks.InputError(f"{line}: more values than the {len(names)} columns of the header. Decimal commas? Write decimal points.")
+            if len(row) < len(names):
+                values = f"{len(row)} value{'s' if len(row) > 1 else ''}"
+                raise checks.InputError(f"{line}, column {names[len(row)]!r}: no value; the line has {values} for {len(names)} columns.")
+            for name, text in zip(names, row, strict=True):
                 try:
-                    columns[name].append(float(row[name]))
-                except (TypeError, ValueError) as error:
-                    raise checks.InputError(f"{path}, line {number}, column {name!r}: {row[name]!r} is not a number.") from error
+                    columns[name].append(float(text))
+                except ValueError as error:
+                    raise checks.InputError(f"{line}, column {name!r}: {text!r} is not a number.") from error
         return Cells.from_table(columns, str(path))
 
     @staticmethod
@@ -203,6 +205,26 @@ class Cells:
                 raise checks.refuse("group", group, f"a group of {path}")
             columns = {n: np.asarray(d) for n, d in file[group].items() if isinstance(d, h5py.Dataset)}
         return Cells.from_table(columns, str(path))
+
+
+def _read_csv(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The names in a CSV file's header, and its other lines with their numbers, as an editor counts them; blank lines are left out."""
+    with _readable(path, "r", encoding="utf-8-sig", newline="") as file:
+        reader = csv.reader(file, skipinitialspace=True)
+        try:
+            rows = [(reader.line_num, row) for row in reader if row]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise checks.InputError(f"{path} cannot be read as CSV: it must be text in UTF-8 ({error}).") from error
+    if not rows:
+        raise checks.InputError(f"{path} is empty: it needs a header, such as x,y,angle,length, and a line for each cell.")
+    line, names = rows[0][0], [name.strip() for name in rows[0][1]]
+    for mark, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(names) == 1 and mark in names[0]:
+            raise checks.InputError(f"{path}, line {line}: columns are separated by {word}. Write commas between them, and decimal points.")
+    for name in names:
+        if names.count(name) > 1 and "x" in names:  # a line of numbers is no header at all, which is told better elsewhere
+            raise checks.InputError(f"{path}, line {line}: the header has the column {name!r} twice. Leave one out.")
+    return names, rows[1:]
 
 
 def _readable(path: str | Path, mode: str, **options: Any) -> Any:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
+import os
 import signal
 import sys
 import threading
@@ -63,7 +65,7 @@ class Run:
     every: int = 10
     """Steps from one recorded frame to the next."""
     overwrite: bool = False
-    """Replace the results file if it exists."""
+    """Replace the results file, and the picture beside it, if they exist."""
     watch: bool = False
     """Take up edits of the rules file (Rules("file.py")) while running."""
     picture: bool = True
@@ -75,6 +77,7 @@ class Run:
         start = None if self.start is None else read_cells(self.start)
         state = scene.seed(self.colonies, seed=self.seed, cells=start, device=self.device, dtype=torch.float64 if self.double else torch.float32)
         if start is not None:
+            report_empty(str(self.start), start, state)
             report_overlaps(start)
         out = self.out if self.out is not None else Path(f"{scene.name}.h5")
         try:
@@ -82,12 +85,14 @@ class Run:
         except OSError as error:
             raise checks.refuse("--out", str(out), "in a folder that can be made", f"{error.strerror}.") from error
         recorder = Recorder(out, scene, every=self.every, overwrite=self.overwrite)
+        if self.picture:
+            check_new("picture", own_picture(out), self.overwrite, "Choose another --out, replace it (--overwrite), or draw none (--no-picture).")
         go(scene, state, recorder, cells=cells, until=self.until, dt=self.dt, watch=self.watch, picture=self.picture)
 
 
 @dataclass
 class Resume:
-    """Go on with a run from the last frame of its results file, bit for bit."""
+    """Go on with a run from the last frame of its results file, bit for bit. The picture beside it is drawn anew."""
 
     file: Annotated[Path, tyro.conf.Positional]
     """Results file."""
@@ -114,8 +119,11 @@ class Resume:
                 scene = scenes.build(*results.recipe)
             else:
                 raise InputError(f"{self.file} was made by a scene of your own: give its file with --scene.")
+            check_fields(scene, results)
             state = results.state(scene, device=self.device)
             dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
+        if self.picture:
+            own_picture(self.file)
         recorder = Recorder(self.file, scene, every=every, append=True)
         go(scene, state, recorder, cells=self.cells, until=self.until, dt=dt, watch=self.watch, picture=self.picture)
 
@@ -133,10 +141,15 @@ class Show:
     view: str = "xy"
     """xy, xz or yz."""
     out: Path | None = None
-    """The picture; by default the results file's name with .png."""
+    """The picture, a new file unless --overwrite is given; by default the run's own, the results file's name with .png, which is drawn anew."""
+    overwrite: bool = False
+    """Replace the file given with --out if it exists."""
 
     def __call__(self) -> None:
-        print(pictures.show(self.file, frame=self.frame, colour=self.colour, view=self.view, out=self.out))
+        if self.out is not None:
+            check_new("--out", self.out, self.overwrite, "Choose another, or replace it with --overwrite.")
+        target = own_picture(self.file, self.out)
+        print(pictures.show(self.file, frame=self.frame, colour=self.colour, view=self.view, out=target))
 
 
 @dataclass
@@ -163,6 +176,38 @@ class Info:
             print(f"seed {a['seed']}, {a['dtype']}, dt {a['dt']:g} h, torchfilm {a['torchfilm']}, torch {a['torch']}, {a['device']}")
             print("quantities per cell: " + ", ".join(results.file["cells"]))
             print(a["scene"])
+
+
+def check_new(name: str, path: Path, overwrite: bool, mend: str) -> None:
+    """Refuse to replace a file unasked."""
+    if path.exists() and not overwrite:
+        raise checks.refuse(name, str(path), "a path where there is no file yet", mend)
+
+
+def own_picture(results: Path, out: Path | None = None) -> Path:
+    """The picture that belongs to a results file, or `out`; never the results file itself."""
+    picture = results.with_suffix(".png") if out is None else out
+    if picture.absolute() == results.absolute():
+        mend = "Give the results a name that does not end in .png, or draw with show --out."
+        raise checks.refuse("picture", str(picture), "another file than the results", mend)
+    return picture
+
+
+def check_fields(scene: Scene, results: Results) -> None:
+    """Raise InputError that names the fields of an edited scene which a results file does not hold, or holds in another shape."""
+    if scene.dim != int(results.attributes["dim"]):
+        return  # told better where the state is read
+    there = {name: (scope, tuple(shape)) for name, (_, _, scope, shape, _) in json.loads(results.attributes["declared"]).items()}
+    here = {f.name: (f.scope, tuple(f.shape)) for f in scene.unchecked(1).declared.values()}
+    kinds = {
+        "it lacks": [n for n in here if n not in there],
+        "of another shape there:": [n for n in here if n in there and here[n] != there[n]],
+    }
+    if not any(kinds.values()):
+        return
+    kinds["not in this scene:"] = [n for n in there if n not in here]
+    told = "; ".join(f"{kind} {', '.join(map(repr, names))}" for kind, names in kinds.items() if names)
+    raise InputError(f"{results.path} was recorded with other fields than this scene has ({told}). Take the edit back to go on with it, or start a new run.")
 
 
 def load_scene(what: str, parameters: dict[str, Any]) -> Scene:
@@ -221,6 +266,19 @@ def report_overlaps(cells) -> None:
         print(f"note: {len(found)} pairs of the given cells overlap by over 0.01 µm, worst cells {i} and {j} by {deep:.3g} µm; the first steps part them.")
 
 
+def report_empty(path: str, cells, state: State) -> None:
+    """Say which colonies have no cell to start from, and why."""
+    empty = torch.nonzero(state.counts == 0).squeeze(1).tolist()
+    if empty:
+        there = sorted(set(cells.colony.tolist()))
+        print(f"note: {_colonies(empty)} of {state.colonies} {'stays' if len(empty) == 1 else 'stay'} empty: {path} has cells for {_colonies(there)} only.")
+
+
+def _colonies(numbers: list[int], most: int = 12) -> str:
+    listed = ", ".join(map(str, numbers[:most])) + (f", … ({len(numbers)} in all)" if len(numbers) > most else "")
+    return f"{'colony' if len(numbers) == 1 else 'colonies'} {listed}"
+
+
 def go(scene: Scene, start: State, recorder: Recorder, *, cells: int | None, until: float | None, dt: float | None, watch: bool, picture: bool) -> None:
     """Run with a progress bar, then say where things are and how they went."""
     rules = [e for e in scene.effects if isinstance(e, Rules)]
@@ -270,9 +328,9 @@ def _size(state: State, cells: int | None, until: float | None) -> float:
 
 
 def _done(state: State, cells: int | None, until: float | None) -> float:
-    """Progress: doublings of the smallest colony on the way to `cells`, or hours."""
+    """Progress: doublings of the smallest colony that is not empty on the way to `cells`, or hours."""
     if cells is not None:
-        smallest = max(1, int(state.counts.min()))
+        smallest = int(state.counts[state.counts > 0].min()) if state.cells else cells
         return min(float(torch.log2(torch.tensor(float(smallest)))), _size(state, cells, until))
     return state.time
 
@@ -299,6 +357,17 @@ def table(scene: Scene, state: State, timings: Timings, seconds: float) -> str:
 
 def main() -> None:
     """Entry point of the `torchfilm` command."""
+    try:
+        try:
+            _command()
+        finally:
+            sys.stdout.flush()  # a reader that is gone, as after `| head -1`, shows here and not at the interpreter's end
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+
+
+def _command() -> None:
     command = tyro.extras.subcommand_cli_from_dict(
         {"run": Run, "resume": Resume, "show": Show, "info": Info},
         prog="torchfilm",

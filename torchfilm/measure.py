@@ -27,7 +27,7 @@ class Overlap:
 
 @torch.no_grad()
 def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
-    """Overlaps between cells, and with the given walls, in float64."""
+    """Overlaps between cells, and with the given walls wherever along a cell they are deepest, in float64."""
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
     i, _, gap = gaps_nearby(state.position, axis, length, radius, state.colony, state.colonies)
     depth = -gap
@@ -35,11 +35,11 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     pairs = Groups(state.colony.index_select(0, i[deep]), state.colonies)
     count = pairs.counts
     mean = pairs.sum(depth[deep].unsqueeze(1)).squeeze(1) / count.clamp(min=1)
-    at_walls = torch.zeros_like(length)
+    at_walls, ids = torch.zeros_like(length), state.own_colony_id
     for surface in (s for wall in walls for s in wall.surfaces(state.dim)):
-        for sign in (0.5, -0.5):
-            distance, _ = surface.gap_of_points(state.position + sign * length.unsqueeze(1) * axis, state.own_colony_id)
-            at_walls = torch.maximum(at_walls, radius - distance)
+        s = surface.deepest(state.position, axis, 0.5 * length, ids)
+        distance, _ = surface.gap_of_points(state.position + s.unsqueeze(1) * axis, ids)
+        at_walls = torch.maximum(at_walls, radius - distance)
     return Overlap(mean, pairs.max(depth[deep]), count, state.groups.max(at_walls))
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -37,7 +38,8 @@ def simulate(
     until: time to stop at, h. cells: stop once every colony has this many cells, or none at all. At least one of the two; the first reached ends the run.
     dt: step, h; by default the scene's. record: path of a new results file (every tenth step and the last), or a Recorder.
     observers: called with the first state and after every step.
-    on_failure: "raise" a SimulationError that names the colonies whose solve failed, or "drop" their cells, note it, and go on.
+    on_failure: "raise" a SimulationError that names the colonies that failed (a solve that did not converge, a cell too short to divide), or "drop"
+    their cells, note it, and go on.
     """
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
     if until is None and cells is None:
@@ -83,24 +85,36 @@ def _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings
 
 
 def handle_failures(state: State, on_failure: str) -> State:
-    """Raise for the colonies whose last step failed, all at once, or drop their cells."""
+    """Raise for the colonies whose last step failed, all at once, or drop their cells.
+
+    Every report of the step has a `status` (B,), 0 where all is well. It may say itself what went wrong, `reason(place)`, and what helps, `mend`;
+    one that does not is a solve's.
+    """
     failed = torch.zeros(state.colonies, dtype=torch.bool, device=state.device)
-    reasons = []
+    reasons, mends = [], []
     for name, report in state.reports.items():
         bad = report.status != CONVERGED
         failed = failed | bad
         for place in torch.nonzero(bad).squeeze(1).tolist():
-            reasons.append(
-                f"colony {int(state.colony_id[place])} ({int(state.counts[place])} cells): the {name} solve {STATUS[int(report.status[place])]} after "
-                f"{int(report.iterations[place])} iterations, residual {float(report.residual[place]):.2g}"
-            )
+            reasons.append(f"colony {int(state.colony_id[place])} ({int(state.counts[place])} cells): {_reason(name, report, place)}")
+            mends.append(getattr(report, "mend", "A smaller dt, a larger alpha or more max_iterations may help"))
     if not reasons:
         return state
     if on_failure == "raise":
         raise SimulationError(
-            f"step {state.step} (t = {state.time:g} h) failed in {len(reasons)} of {state.colonies} colonies:\n  "
+            f"step {state.step} (t = {state.time:g} h) failed in {int(failed.sum())} of {state.colonies} colonies:\n  "
             + "\n  ".join(reasons[:20])
-            + '\nA smaller dt, a larger alpha or more max_iterations may help; on_failure="drop" goes on without them.',
+            + "\n"
+            + ". ".join(dict.fromkeys(mends))
+            + '; on_failure="drop" goes on without them.',
             state.colony_id[failed].tolist(),
         )
     return state.remove(failed.index_select(0, state.colony), "failed")
+
+
+def _reason(name: str, report: Any, place: int) -> str:
+    if hasattr(report, "reason"):
+        return report.reason(place)
+    return (
+        f"the {name} solve {STATUS[int(report.status[place])]} after {int(report.iterations[place])} iterations, residual {float(report.residual[place]):.2g}"
+    )

@@ -14,7 +14,7 @@ from torchfilm.effect import Effect
 from torchfilm.physics import capsule
 
 
-def row_of_cells(count: int, length: float = 2.0, dim: int = 2, radius: float = 0.5) -> tf.Cells:
+def row_of_cells(count: int, length: float | list[float] = 2.0, dim: int = 2, radius: float = 0.5) -> tf.Cells:
     """Cells far apart, at varied angles."""
     position = torch.zeros(count, dim, dtype=torch.float64)
     position[:, 0] = 10.0 * torch.arange(count)
@@ -377,9 +377,20 @@ def test_volume_threshold_that_leaves_no_room_for_caps_is_refused():
 
 def test_flagged_cell_too_short_to_divide_stops_the_run_and_names_it():
     scene = tf.Scene(tf.Division(), founders=row_of_cells(2, 0.6))
-    with pytest.raises(tf.SimulationError, match=r"cell 1 of colony 2.*0\.6") as caught:
-        scene.step(flagged(scene, 3, which=[5]), 0.1)
+    state = flagged(scene, 3, which=[5])
+    with pytest.raises(tf.SimulationError, match=r"colony 2 .*cell 1 .*0\.6") as caught:
+        list(tf.simulate(scene, state, until=0.1, dt=0.1))
     assert caught.value.colonies == (2,)
+
+
+def test_a_cell_too_short_to_divide_keeps_its_whole_colony_from_dividing():
+    """By the step itself a failure is no exception but a report for each colony, as a failed solve is."""
+    scene = tf.Scene(tf.Division(), founders=row_of_cells(2, [3.0, 0.6]))
+    after = scene.step(flagged(scene, 3, which=[0, 2, 3, 4]), 0.1)
+    assert after.counts.tolist() == [3, 2, 3] and after.divide_flag.tolist() == [False] * 3 + [True] * 2 + [False] * 3
+    assert after.reports["division"].status.tolist() == [0, 1, 0]
+    assert not scene.step(flagged(scene, 3, which=[3]), 0.1).births, "no division of no cell for a rule to see"
+    assert "division" not in scene.step(flagged(scene, 3, which=[0]), 0.1).reports
 
 
 def test_exactly_two_radii_may_divide():

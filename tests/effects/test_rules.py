@@ -1,37 +1,14 @@
-"""Rules: the paper's own listings, variables, contacts, removal, random draws, clear errors, and files edited in mid-run."""
+"""Rules: the paper's own listings, variables, contacts, removal, random draws, and clear errors."""
 
 from __future__ import annotations
 
 import contextlib
-import random
-from dataclasses import dataclass
 
 import pytest
 import torch
+from ruled import pair_of_cells, run, same, short_update
 
 import torchfilm as tf
-from torchfilm.effect import Effect
-
-
-def pair_of_cells(dim: int = 2, gap: float = 20.0) -> tf.Cells:
-    position = torch.zeros(2, dim)
-    position[1, 0] = gap
-    axis = torch.zeros(2, dim)
-    axis[:, 1] = 1.0
-    return tf.Cells(position, axis)
-
-
-def run(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.1) -> tf.State:
-    for _ in range(steps):
-        state = scene.step(state, dt)
-    return state
-
-
-def same(a: tf.State, b: tf.State) -> bool:
-    """Bit for bit the same cells and fields."""
-    names = ("colony", "uid", "parent", "position", "axis", "length", "radius", "next_uid")
-    return all(torch.equal(getattr(a, n), getattr(b, n)) for n in names) and all(torch.equal(v, b.fields[n]) for n, v in a.fields.items())
-
 
 # --- the paper's listings -------------------------------------------------------------------------------------------------
 
@@ -46,11 +23,6 @@ def paper_update(cells):
 def tensor_update(cells):
     cells.growthRate = 0.035
     cells.divideFlag = cells.volume > 3
-
-
-def short_update(cells):
-    cells.growth_rate = 0.035
-    cells.divide_flag = cells.volume > 3
 
 
 def minutes_scene(update) -> tf.Scene:
@@ -72,70 +44,6 @@ def test_loop_and_whole_tensors_do_the_same():
     states = [run(scene := minutes_scene(u), scene.seed(2, seed=4), 60, 1.0) for u in (paper_update, tensor_update, short_update)]
     assert states[0].cells >= 8
     assert same(states[0], states[1]) and same(states[1], states[2])
-
-
-@dataclass(frozen=True)
-class Species(Effect):
-    """Two species in each cell, for the paper's `divide`."""
-
-    stage = 50
-    title = "species"
-
-    def declares(self, dim):
-        return (tf.Field("species", "concentrations", shape=(2,), initial=1.0),)
-
-    def step(self, state, dt):
-        return state
-
-
-def test_the_papers_divide_partitions_at_random():
-    """As printed, but for the index of the species, which on whole tensors comes after the cells'."""
-
-    def divide(parent, daughter1, daughter2):
-        r1 = random.uniform(0.0, 1.0)
-        r2 = 1 - r1
-        daughter1.species[:, 0] = parent.species[:, 0] * r1
-        daughter2.species[:, 0] = parent.species[:, 0] * r2
-
-    scene = tf.Scene(tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells())
-    state = scene.seed(3)
-    state = state.with_fields(divide_flag=torch.tensor([True, False] * 3))
-    after = scene.step(state, 0.1)
-    first, second = after.species[[0, 3, 6]], after.species[[1, 4, 7]]
-    assert torch.allclose(first[:, 0] + second[:, 0], torch.ones(3), rtol=1e-6)
-    assert 0 < float(first[0, 0]) < 1
-    assert (after.species[:, 1] == 1).all(), "the other species is copied"
-    assert (after.species[[2, 5, 8]] == 1).all(), "the cell that did not divide keeps its own"
-    assert (state.species == 1).all(), "the state before is frozen"
-
-
-def test_divide_draws_for_each_division_and_not_for_the_batch():
-    def divide(parent, daughter1, daughter2):
-        r1 = parent.random()
-        daughter1.species = parent.species * r1.unsqueeze(1)
-        daughter2.species = parent.species * (1 - r1).unsqueeze(1)
-
-    scene = tf.Scene(tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells())
-    whole = scene.seed(4)
-    whole = whole.with_fields(divide_flag=torch.ones(8, dtype=torch.bool))
-    after = scene.step(whole, 0.1)
-    share = after.species[0::2, 0]
-    assert torch.unique(share).numel() == 8 and ((share > 0) & (share < 1)).all()
-    alone = scene.step(whole.select([2]), 0.1)
-    assert torch.equal(alone.species, after.species[after.colony == 2])
-
-
-def test_divide_may_set_flags_types_and_read_geometry():
-    def divide(parent, daughter1, daughter2):
-        daughter1.cellType = parent.cell_type + 1
-        daughter2.growth_rate = daughter2.length * 0.5
-
-    cells = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 3.0, cell_type=[4])
-    scene = tf.Scene(tf.Rules(divide=divide), tf.Growth(rate=0.0), tf.Division(), founders=cells)
-    state = scene.seed().with_fields(divide_flag=torch.tensor([True]))
-    after = scene.step(state, 0.1)
-    assert after.cell_type.tolist() == [5, 4] and after.cell_type.dtype == torch.int64
-    assert after.growth_rate.tolist() == [0.0, 0.5]
 
 
 # --- variables ------------------------------------------------------------------------------------------------------------
@@ -395,34 +303,6 @@ def test_a_variable_that_first_comes_up_in_mid_run_is_told():
         run(scene, scene.seed(), 3)
 
 
-def test_division_views_refuse_what_makes_no_sense():
-    def divided(divide):
-        scene = tf.Scene(tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells())
-        state = scene.seed()
-        scene.step(state.with_fields(divide_flag=torch.ones(2, dtype=torch.bool)), 0.1)
-
-    def write_parent(parent, daughter1, daughter2):
-        parent.species = 1.0
-
-    def write_length(parent, daughter1, daughter2):
-        daughter1.length = 1.0
-
-    def read_unknown(parent, daughter1, daughter2):
-        return parent.specis
-
-    def wrong_shape(parent, daughter1, daughter2):
-        daughter1.species = torch.ones(5)
-
-    with pytest.raises(AttributeError, match="can only be read"):
-        divided(write_parent)
-    with pytest.raises(AttributeError, match="length"):
-        divided(write_length)
-    with pytest.raises(AttributeError, match=r"'specis'.*species"):
-        divided(read_unknown)
-    with pytest.raises((ValueError, RuntimeError), match="species"):
-        divided(wrong_shape)
-
-
 @pytest.mark.parametrize(("given", "message"), [((), "neither"), ((3,), r"Rules\.update"), (("no_such_file.py",), "No such file")])
 def test_bad_rules_are_refused(given, message):
     with pytest.raises(tf.InputError, match=message):
@@ -476,131 +356,3 @@ def test_looking_for_contacts_is_reading_the_geometry():
     scene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=pair_of_cells())
     scene.seed()
     assert {"growth", "mechanics"} <= {w for w, _, r in scene.couplings() if r == "rules"}
-
-
-def test_what_a_divide_rule_writes_is_declared():
-    def divide(parent, daughter1, daughter2):
-        daughter1.growth_rate = parent.growth_rate * 2
-
-    scene = tf.Scene(tf.Rules(divide=divide), tf.Growth(rate=1.0), tf.Division(), founders=pair_of_cells())
-    scene.seed()
-    assert "growth" in {r for w, _, r in scene.couplings() if w.startswith("rules")}
-
-
-# --- files, edited while a run is going -----------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def rules_file(tmp_path):
-    path = tmp_path / "my_rules.py"
-    path.write_text("def update(cells):\n    cells.growth_rate = 1.0\n")
-    return path
-
-
-def watched(path, *effects: tf.Effect) -> tuple[tf.Rules, tf.Scene]:
-    rules = tf.Rules(path)
-    rules.source.watching = True
-    return rules, tf.Scene(rules, *(effects or (tf.Growth(),)), founders=pair_of_cells())
-
-
-def test_rules_from_a_file(rules_file):
-    for given in (rules_file, str(rules_file)):
-        scene = tf.Scene(tf.Rules(given), tf.Growth(), founders=pair_of_cells())
-        assert run(scene, scene.seed(), 1).growth_rate.tolist() == [1.0, 1.0]
-
-
-def test_an_edit_takes_effect_at_the_next_step(rules_file):
-    rules, scene = watched(rules_file)
-    rates = []
-    for state in tf.simulate(scene, scene.seed(), until=0.6, dt=0.1):
-        rates.append(float(state.growth_rate[0]))
-        if state.step == 3:
-            rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
-    assert rates == [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]
-    (message,) = rules.source.messages
-    assert "my_rules.py" in message and "taken up" in message
-
-
-def test_without_watching_an_edit_waits(rules_file):
-    rules, scene = watched(rules_file)
-    rules.source.watching = False
-    state = run(scene, scene.seed(), 1)
-    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
-    assert run(scene, state, 2).growth_rate.tolist() == [1.0, 1.0] and not rules.source.messages
-
-
-BROKEN = {
-    "syntax": ("def update(cells)\n    pass\n", "SyntaxError"),
-    "unknown name": ("def update(cells):\n    cells.growth_rate = speed\n", "NameError"),
-    "unknown field": ("def update(cells):\n    cells.growth_rate = cells.groth\n", "groth"),
-    "wrong shape": ("import torch\ndef update(cells):\n    cells.growth_rate = torch.ones(99)\n", "growth_rate"),
-    "read only": ("def update(cells):\n    cells.length = 3.0\n", "can only be read"),
-    "new variable": ("def update(cells):\n    cells.fresh = 3.0\n", "fresh"),
-    "empty": ("", "neither"),
-    "on import": ("raise RuntimeError('no luck')\n", "no luck"),
-}
-
-
-@pytest.mark.parametrize("kind", list(BROKEN))
-def test_a_broken_edit_is_told_and_the_run_goes_on_with_the_last_good_one(rules_file, kind):
-    text, word = BROKEN[kind]
-    rules, scene = watched(rules_file)
-    state = run(scene, scene.seed(), 2)
-    rules_file.write_text(text)
-    state = run(scene, state, 3)
-    assert state.growth_rate.tolist() == [1.0, 1.0] and state.step == 5
-    (message,) = rules.source.messages
-    assert "my_rules.py" in message and "broken" in message and word in message, message
-    rules_file.write_text("def update(cells):\n    cells.growth_rate = 3.0\n")
-    assert run(scene, state, 1).growth_rate.tolist() == [3.0, 3.0], "a mended file must be taken up"
-    assert len(rules.source.messages) == 2
-
-
-def test_a_file_that_is_gone_for_a_moment_is_no_error(rules_file):
-    _, scene = watched(rules_file)
-    state = run(scene, scene.seed(), 1)
-    rules_file.unlink()
-    state = run(scene, state, 1)
-    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
-    assert run(scene, state, 1).growth_rate.tolist() == [2.0, 2.0]
-
-
-def test_an_edit_that_breaks_only_later_does_not_end_the_run(rules_file):
-    """It passes when it is taken up and fails two steps after: the last good rules must carry on."""
-    rules, scene = watched(rules_file)
-    state = run(scene, scene.seed(), 1)
-    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0 if cells.time < 0.25 else speed\n")
-    state = run(scene, state, 5)
-    assert state.step == 6
-    assert any("broken" in m and "speed" in m for m in rules.source.messages)
-
-
-DIVIDE = "def divide(parent, daughter1, daughter2):\n    daughter1.growth_rate = {}\n"
-
-
-def grow_and_divide(path) -> tuple[tf.Rules, tf.Scene, tf.State]:
-    rules, scene = watched(path, tf.Growth(rate=1.0), tf.Division())
-    return rules, scene, scene.seed()
-
-
-def flagged(state: tf.State) -> tf.State:
-    return state.with_fields(divide_flag=torch.ones_like(state.divide_flag), growth_rate=torch.ones_like(state.growth_rate))
-
-
-def test_divide_in_a_file_and_its_edit(rules_file):
-    rules_file.write_text(DIVIDE.format(5.0))
-    _, scene, state = grow_and_divide(rules_file)
-    state = scene.step(flagged(state), 0.1)
-    assert state.growth_rate.tolist() == [5.0, 1.0] * 2
-    rules_file.write_text(DIVIDE.format(6.0))
-    long_enough = flagged(state).replace(length=torch.full_like(state.length, 3.0))
-    assert scene.step(long_enough, 0.1).growth_rate.tolist() == [6.0, 1.0] * 4
-
-
-def test_a_broken_divide_is_told_and_the_run_goes_on(rules_file):
-    rules_file.write_text(DIVIDE.format(5.0))
-    rules, scene, state = grow_and_divide(rules_file)
-    rules_file.write_text(DIVIDE.format("speed"))
-    state = scene.step(flagged(state), 0.1)
-    assert state.growth_rate.tolist() == [5.0, 1.0] * 2
-    assert any("broken" in m and "speed" in m for m in rules.source.messages)

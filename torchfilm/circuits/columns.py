@@ -61,7 +61,8 @@ class Lazy:
     """A column that is worked out when it is first asked for."""
 
     def __init__(self, make: Callable[[], Tensor]):
-        self.make, self.value = make, None
+        self.make = make
+        self.value: Tensor | None = None
 
     def __call__(self) -> Tensor:
         if self.value is None:

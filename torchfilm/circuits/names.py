@@ -53,6 +53,9 @@ class Names:
     def __len__(self) -> int:
         return len(self.__dict__)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Names, (tuple(self.__dict__), tuple(self.__dict__.values()), self._label)
+
     def __repr__(self) -> str:
         return f"Names({', '.join(self.__dict__) or 'none'})"
 

@@ -234,7 +234,9 @@ def trial(circuit: Circuit, concentrations: Tensor) -> tuple[str, ...]:
             if not bool(torch.isfinite(value.detach()).all()):
                 k = int(torch.nonzero(~torch.isfinite(value.detach()))[0])
                 at = ", ".join(f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True))
-                raise checks.InputError(f"{circuit.label} gives {float(value[k])} for the {what} {name!r} at the start ({at}): every rate must be a finite number.")
+                raise checks.InputError(
+                    f"{circuit.label} gives {float(value[k])} for the {what} {name!r} at the start ({at}): every rate must be a finite number."
+                )
     if isinstance(circuit.part, Network):
         exchanged = {n.removeprefix("out.") for r in circuit.part.reactions for n in r.change() if n.startswith("out.")}
         return tuple(n for n in circuit.part.signals if n in exchanged)

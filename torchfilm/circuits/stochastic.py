@@ -47,6 +47,8 @@ def tau_leap(
 ) -> tuple[Tensor, Report]:
     """Molecule numbers (N, S) after dt hours by tau-leaping, single events where leaps do not pay.
 
+    What limits a reaction must be a species that it takes: a gene that goes on from "off" is two species, on and off, or a leap could turn it on twice.
+
     stoichiometry (R, S): molecules gained by each event. draw: see `draws.keyed_draws`. epsilon: relative change of a propensity that a leap may bring.
     critical: a reaction that could fire fewer times than this fires alone. orders (S,): highest order in which a propensity depends on each
     species, 0 for none; default 2. Numbers stay whole (a remainder given in stays) and never negative. Not differentiable; raises nothing.
@@ -132,8 +134,9 @@ class _Run:
             if rows.numel() == 0:
                 break
             a, bad = self.rates(x, rows)
-            x, passed = step(x, a, left, rows, event)
             faulty = bad >= 0
+            after, passed = step(x, a, left, rows, event)
+            x = torch.where(faulty, x, after)
             steps.index_add_(0, rows, (~faulty).long())
             left = left - passed
             ends = faulty | (left <= 0)
@@ -185,7 +188,6 @@ class _Leap:
         often, seldom = torch.where(rare, 0.0, a), torch.where(rare, a, 0.0)
         longest = self.longest(x, often)
         all_in_all = _total(a)
-        # a leap that reaches the end is worth it however few events it holds? No: exact steps are as few then
         leaps = torch.minimum(longest, left) * all_in_all >= FEW_EVENTS
         after, passed = x, left
         if not bool(leaps.all()):
@@ -222,5 +224,5 @@ class _Leap:
             open_ = open_.index_select(0, torch.nonzero(~good).squeeze(1))
             if open_.numel() == 0:
                 break
-        # not seen to happen: after 60 halvings no event is left to come
+        # not seen to happen: after 60 halvings hardly an event is left to come
         return after, took.index_fill(0, open_, 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -107,7 +108,12 @@ class Circuit(Effect):
             raise checks.refuse("Circuit.steps", steps, "a whole number from 1")
         functions = [part for part in by_type.values() if callable(part)]
         if method in (LEAP, DIRECT) and functions:
-            raise checks.refuse("Circuit.method", method, f"for reactions; {getattr(functions[0], '__name__', 'a function')} gives rates", "Write the circuit as a list of reactions.")
+            raise checks.refuse(
+                "Circuit.method",
+                method,
+                f"for reactions; {getattr(functions[0], '__name__', 'a function')} gives rates",
+                "Write the circuit as a list of reactions.",
+            )
         given = {
             "rates": by_type, "species": names,
             "initial": {n: parameter(f"Circuit.initial[{n!r}]", v, least=0.0) for n, v in (initial or {}).items()},
@@ -126,9 +132,7 @@ class Circuit(Effect):
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         rule = "reset" if self.is_stochastic or self.daughters == "amount" else "copy"
-        fields = [
-            Field(n, "concentration in the cell", "conc", initial=lambda state, rows, n=n: self._first(state, rows, n), at_division=rule) for n in self.species
-        ]
+        fields = [Field(n, "concentration in the cell", "conc", initial=partial(self._first, name=n), at_division=rule) for n in self.species]
         fields.append(Field("circuit_volume", "volume that the concentrations refer to", "µm³", initial=_volume_of, at_division="reset"))
         return (*fields, CELL_TYPE) if EVERY not in self.rates else tuple(fields)
 
@@ -216,7 +220,6 @@ class Circuit(Effect):
         state = state.with_fields(**changed)
         return state.replace(reports={**state.reports, "circuit": report.report()})
 
-
     def _concentrations(self, state: State, rows: Tensor) -> Tensor:
         """Of the cells `rows` (M,), (M, S)."""
         return torch.stack([state.fields[n].index_select(0, rows) for n in self.species], 1)
@@ -239,8 +242,12 @@ def _cell_columns(state: State, species: Sequence[str]) -> dict[str, Any]:
     """What a rate function may ask of its cell, by name."""
     columns: dict[str, Any] = {n: v for n, v in state.fields.items() if state.declared[n].scope == CELL and n not in species}
     columns |= {"length": state.length, "radius": state.radius, "volume": Lazy(lambda: state.volume), "area": Lazy(lambda: state.area)}
-    columns |= {letter: Lazy(lambda k=k: state.position[:, k].to(state.dtype)) for k, letter in zip(range(state.dim), "xyz", strict=False)}
+    columns |= {letter: Lazy(partial(_place, state, k)) for k, letter in zip(range(state.dim), "xyz", strict=False)}
     return columns | {"colony": Lazy(lambda: state.own_colony_id), "time": state.time, "uid": state.uid}
+
+
+def _place(state: State, k: int) -> Tensor:
+    return state.position[:, k].to(state.dtype)
 
 
 class _Medium:

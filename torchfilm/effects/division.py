@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -14,6 +15,28 @@ from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
 
 CRITERIA = ("length", "volume", "added")
+
+TOO_SHORT = 1
+
+
+@dataclass(frozen=True)
+class DivisionReport:
+    """Why colonies could not divide, per colony (B,): `status`, 0 or TOO_SHORT; `uid` and `length` (µm) of the first cell that was due and too short,
+    and the length that it `needs`. Made only where there is such a cell; nobody divided in its colony."""
+
+    status: Tensor
+    uid: Tensor
+    length: Tensor
+    needs: Tensor
+
+    mend: ClassVar[str] = "Divide later, or start from longer cells"
+
+    def reason(self, place: int) -> str:
+        """What went wrong in the colony at this place of the batch."""
+        return (
+            f"cell {int(self.uid[place])} is due to divide at length {float(self.length[place]):g} µm, but needs at least "
+            f"{float(self.needs[place]):g} µm for two new caps"
+        )
 
 
 @dataclass(frozen=True)
@@ -118,18 +141,24 @@ class Division(Effect):
             due = self.due(state)
             if not bool(due.any()):
                 return state
-            self._check_long_enough(state, due)
+            short = due & (state.length < 2 * state.radius)
+            if bool(short.any()):
+                report = _too_short(state, short)
+                state = state.replace(reports={**state.reports, "division": report})
+                due = due & (report.status != TOO_SHORT).index_select(0, state.colony)
+                if not bool(due.any()):
+                    return state
         return divide(state, due, self.fraction, self.axis_noise)
 
-    def _check_long_enough(self, state: State, due: Tensor) -> None:
-        short = due & (state.length < 2 * state.radius)
-        if bool(short.any()):
-            k = int(torch.nonzero(short)[0])
-            raise checks.SimulationError(
-                f"cell {int(state.uid[k])} of colony {int(state.own_colony_id[k])} is due to divide at length {float(state.length[k]):g} µm, but needs "
-                f"at least {2 * float(state.radius[k]):g} µm for two new caps. Divide later, or start from longer cells.",
-                sorted(set(state.own_colony_id[short].tolist())),
-            )
+
+def _too_short(state: State, short: Tensor) -> DivisionReport:
+    """The report of the cells that are due and too short, (N,) bool."""
+    number = torch.arange(state.cells, device=state.device)
+    first = state.cells - state.groups.max(torch.where(short, state.cells - number, 0))
+    status = torch.where(first < state.cells, TOO_SHORT, 0)
+    row = first.clamp(max=state.cells - 1)
+    length, radius = state.length.detach(), state.radius.detach()
+    return DivisionReport(status, state.uid.index_select(0, row), length.index_select(0, row), 2 * radius.index_select(0, row))
 
 
 def divide(state: State, due: Tensor, fraction: float | Tensor | Distribution, axis_noise: float | Tensor) -> State:

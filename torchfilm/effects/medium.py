@@ -171,13 +171,15 @@ class Medium(Effect):
         return (Cover(self), self)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
-        fields = [
-            Field(OUTSIDE + name, "signal in the medium", "conc", scope=GRID, initial=lambda state, rows, s=signal: self._values(s.initial, state).index_select(0, rows))
-            for name, signal in self.signals.items()
-        ]
+        fields = [Field(OUTSIDE + name, "signal in the medium", "conc", scope=GRID, initial=self._first(name)) for name in self.signals]
         if self.beyond == "open":
-            fields += [Field(f"{name}_beyond", "amount given to the reservoir beyond the box, less what was taken", "conc·µm³", scope=COLONY) for name in self.signals]
+            fields += [
+                Field(f"{name}_beyond", "amount given to the reservoir beyond the box, less what was taken", "conc·µm³", scope=COLONY) for name in self.signals
+            ]
         return tuple(fields)
+
+    def _first(self, name: str) -> Callable[[State, Tensor], Tensor]:
+        return lambda state, rows: self._values(self.signals[name].initial, state).index_select(0, rows)
 
     def lay(self, state: State) -> State:
         """The state with its grids, all as the box says."""
@@ -310,7 +312,8 @@ class Cover(Effect):
         report = self._look(state)
         if report is not None and bool(report.status.any()):
             place = int(torch.nonzero(report.status)[0])
-            raise checks.InputError(f"Medium.box = {self.medium.box} is too small for colony {int(state.colony_id[place])}: {report.reason(place)}. {report.mend}.")
+            colony = int(state.colony_id[place])
+            raise checks.InputError(f"Medium.box = {self.medium.box} is too small for colony {colony}: {report.reason(place)}. {report.mend}.")
 
     def step(self, state: State, dt: float) -> State:
         if self.medium.beyond == "grow":
@@ -352,5 +355,5 @@ class Cover(Effect):
             return state
         state = state.replace(layout=layout.on(grid))
         old = values.pop() > 0
-        new = {n: torch.where(old, v, self.medium._values(self.medium.signals[n.removeprefix(OUTSIDE)].initial, state)) for n, v in zip(names, values, strict=True)}
-        return state.with_fields(**new)
+        first = [self.medium._values(signal.initial, state) for signal in self.medium.signals.values()]
+        return state.with_fields(**{n: torch.where(old, v, start) for n, v, start in zip(names, values, first, strict=True)})

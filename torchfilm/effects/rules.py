@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import difflib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,9 +23,9 @@ from torch import Tensor
 
 from torchfilm.effect import DIVISION, RULES, Effect
 from torchfilm.physics.contacts import gaps_nearby
-from torchfilm.state import CELL, CELL_TYPE, Births, Field, State
+from torchfilm.state import CELL, CELL_TYPE, COLONY, Births, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.watched import Watched, load_functions
+from torchfilm.tools.watched import Watched, load_functions, unchanged
 
 # The paper's spellings (Table 1) beside ours.
 PAPER_NAMES = {"pos": "position", "dir": "axis", "cellType": "cell_type", "growthRate": "growth_rate", "divideFlag": "divide_flag"}
@@ -34,10 +34,7 @@ GEOMETRY = ("position", "axis", "length", "radius", "volume", "area")
 MEANS = {"volume": ("length", "radius"), "area": ("length", "radius"), "uid": ("cells",), "parent": ("cells",), "colony": ("cells",)}
 IDENTITY = ("uid", "parent", "colony")
 TRIAL_STEP = 0.025  # h, the step that a rule sees when it is tried
-KNOWN_FIELDS = {
-    "cell_type": CELL_TYPE,
-    "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
-}
+KNOWN_FIELDS = {"cell_type": CELL_TYPE, "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0)}
 
 
 def _quantity(state: State, name: str) -> Tensor:
@@ -72,15 +69,8 @@ class CellsView:
     _draws: int
 
     def __init__(self, state: State, dt: float, label: str, declaring: bool = False):
-        object.__setattr__(self, "_label", label)
-        object.__setattr__(self, "_state", state)
-        object.__setattr__(self, "_dt", dt)
-        object.__setattr__(self, "_work", {})
-        object.__setattr__(self, "_read", set())
-        object.__setattr__(self, "_shown", {})
-        object.__setattr__(self, "_written", set())
-        object.__setattr__(self, "_declaring", declaring)
-        object.__setattr__(self, "_draws", 0)
+        # past __setattr__, which is the rule's
+        self.__dict__.update(_state=state, _label=label, _dt=dt, _work={}, _read=set(), _shown={}, _written=set(), _declaring=declaring, _draws=0)
 
     @property
     def time(self) -> float:
@@ -145,20 +135,16 @@ class CellsView:
             near = difflib.get_close_matches(name, [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES], 1, cutoff=0.85)
             if near:
                 raise RuleError(f"cells.{name} is new: did you mean {near[0]!r}? If it is a variable of your own, give Rules(…, variables={{{name!r}: 0.0}}).")
-        _check_whole(f"cells.{name}", tensor, dtype)
         self._written.add(name)
         shape = state.fields[name].shape if name in state.fields else (state.cells, *tensor.shape[1:])
-        try:
-            self._work[name] = tensor.to(device=state.device, dtype=dtype).broadcast_to(shape).clone()
-        except RuntimeError as error:
-            raise RuleError(f"cells.{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or {tuple(shape)}.") from error
+        self._work[name] = _fitted(f"cells.{name}", tensor.to(state.device), dtype, shape)
 
     def __iter__(self):
         return (CellView(self, k) for k in range(self._state.cells))
 
     def random(self) -> Tensor:
         """A draw from (0, 1) for each cell, (N,), keyed by seed, colony, cell and step: the same whatever the batch. Each call draws anew."""
-        object.__setattr__(self, "_draws", self._draws + 1)
+        self.__dict__["_draws"] += 1
         return self._state.uniform(torch.arange(self._state.cells, device=self._state.device), f"{self._label} {self._draws}")
 
     def colony_max(self, value: Tensor) -> Tensor:
@@ -184,7 +170,7 @@ class CellsView:
     def check_unharmed(self) -> None:
         """Raise if a rule wrote into something that can only be read."""
         for name, shown in self._shown.items():
-            if not torch.equal(shown, _quantity(self._state, name)):
+            if not unchanged(shown, _quantity(self._state, name)):
                 raise RuleError(f"the rule changed cells.{name} in place, which can only be read: rules change fields, flags and variables.")
 
     def contact_count(self, within: float = 0.05) -> Tensor:
@@ -200,8 +186,7 @@ class CellView:
     _index: int
 
     def __init__(self, cells: CellsView, index: int):
-        object.__setattr__(self, "_cells", cells)
-        object.__setattr__(self, "_index", index)
+        self.__dict__.update(_cells=cells, _index=index)
 
     def __getattr__(self, name: str) -> Tensor:
         if name.startswith("_"):
@@ -224,22 +209,18 @@ class CellView:
 
 
 class DivisionView:
-    """The parents or daughters of one step's divisions, M of each: names as in CellsView; daughters' fields may be written."""
+    """The parents or daughters of one step's divisions, M of each: names as in CellsView; daughters' fields may be written, or changed in place."""
 
     _state: State
     _rows: Tensor | None
+    _called: str
     _purpose: str
     _set: set[str]
     _work: dict[str, Tensor]
     _draws: int
 
-    def __init__(self, state: State, rows: Tensor | None, purpose: str):
-        object.__setattr__(self, "_state", state)
-        object.__setattr__(self, "_rows", rows)
-        object.__setattr__(self, "_purpose", purpose)
-        object.__setattr__(self, "_set", set())
-        object.__setattr__(self, "_work", {})
-        object.__setattr__(self, "_draws", 0)
+    def __init__(self, state: State, rows: Tensor | None, called: str, purpose: str):
+        self.__dict__.update(_state=state, _rows=rows, _called=called, _purpose=purpose, _set=set(), _work={}, _draws=0)
 
     def __getattr__(self, name: str) -> Tensor:
         name = PAPER_NAMES.get(name, name)
@@ -248,29 +229,42 @@ class DivisionView:
         if name not in self._work:
             if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
                 raise RuleError(f"cells have no {name!r}; they have {', '.join([*GEOMETRY, *IDENTITY, *self._state.fields])}")
-            value = _quantity(self._state, name)
-            self._work[name] = value.clone() if self._rows is None else value.index_select(0, self._rows)
+            self._work[name] = self._copy(name)
         return self._work[name]
+
+    def _copy(self, name: str) -> Tensor:
+        """The quantity as the state has it, a row for each division; of the colony's own, each division gets its colony's."""
+        state, value = self._state, _quantity(self._state, name)
+        if name in state.fields and state.declared[name].scope == COLONY:
+            value = value.index_select(0, state.colony)
+        return value.clone() if self._rows is None else value.index_select(0, self._rows)
+
+    def _writable(self, name: str) -> bool:
+        return self._rows is not None and name in self._state.fields and self._state.declared[name].scope == CELL
+
+    def check_unharmed(self) -> None:
+        """Raise if a rule wrote into something that can only be read."""
+        for name, shown in self._work.items():
+            if not self._writable(name) and not unchanged(shown, self._copy(name)):
+                raise RuleError(f"the rule changed {self._called}.{name} in place, which can only be read: rules set daughters' fields.")
 
     def __setattr__(self, name: str, value: Any) -> None:
         name = PAPER_NAMES.get(name, name)
         if self._rows is None:
             raise RuleError(f"parent.{name} can only be read: the parent is gone; set daughter1.{name} and daughter2.{name}.")
-        if name not in self._state.fields:
-            raise RuleError(f"daughters have no field {name!r} to write; they have {', '.join(self._state.fields)}")
+        if name in GEOMETRY or name in IDENTITY:
+            raise RuleError(f"{self._called}.{name} can only be read: Division places the daughters (its `fraction` shares the length); rules set fields.")
+        if not self._writable(name):
+            own = ", ".join(filter(self._writable, self._state.fields))
+            raise RuleError(f"daughters have no field {name!r} to write (a colony's can only be read); they have {own}")
         like = getattr(self, name)
-        tensor = _as_tensor(f"daughter.{name}", value, like.device)
-        _check_whole(f"daughter.{name}", tensor, like.dtype)
-        tensor = tensor.to(like.dtype)
-        try:
-            self._work[name] = tensor.broadcast_to(like.shape).clone()
-        except RuntimeError as error:
-            raise RuleError(f"daughter.{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or {tuple(like.shape)}.") from error
+        tensor = _as_tensor(f"{self._called}.{name}", value, like.device)
+        self._work[name] = _fitted(f"{self._called}.{name}", tensor, like.dtype, like.shape)
         self._set.add(name)
 
     def random(self) -> Tensor:
         """A draw from (0, 1) for each division, (M,), keyed by seed, colony, cell and step."""
-        object.__setattr__(self, "_draws", self._draws + 1)
+        self.__dict__["_draws"] += 1
         rows = self._rows if self._rows is not None else torch.arange(self._state.cells, device=self._state.device)
         return self._state.uniform(rows, f"{self._purpose} {self._draws}")
 
@@ -280,6 +274,15 @@ def _as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
         return value if isinstance(value, Tensor) else torch.as_tensor(value, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise RuleError(f"{name} was set to {value!r}: it must be a number or a tensor.") from error
+
+
+def _fitted(name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequence[int]) -> Tensor:
+    """A copy of that type and shape."""
+    _check_whole(name, tensor, dtype)
+    try:
+        return tensor.to(dtype).broadcast_to(shape).clone()
+    except RuntimeError as error:
+        raise RuleError(f"{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or {tuple(shape)}.") from error
 
 
 @dataclass(frozen=True)
@@ -357,15 +360,14 @@ class Rules(Effect):
         one = torch.zeros(1, dtype=torch.int64, device=state.device)
         twice = state.take(torch.cat([one, one]))
         births = Births(one, one + 1, torch.cat([one, one]), state.take(one))
-        views = _division_views(twice, births)
-        divide(*views)
+        views = _after_divide(divide, twice, births)
         self.noted["divide reads"] = tuple(sorted({MEANS.get(n, (n,))[0] for view in views for n in view._work}))
         self.noted["divide writes"] = tuple(sorted(views[1]._set | views[2]._set))
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
             return state
-        self.source.refresh()
+        self.source.refresh(state.time)
         return self.source.call("update", lambda update: _apply(update, state, dt), state)
 
 
@@ -415,20 +417,24 @@ class DivisionRule(Effect):
         return state
 
 
-def _division_views(state: State, births: Births) -> tuple[DivisionView, DivisionView, DivisionView]:
-    return (
-        DivisionView(births.parents, None, "divide parent"),
-        DivisionView(state, births.first, "divide first"),
-        DivisionView(state, births.second, "divide second"),
+def _after_divide(act: Callable[..., None], state: State, births: Births) -> tuple[DivisionView, DivisionView, DivisionView]:
+    """Parent, first and second daughter as the rule leaves them."""
+    views = (
+        DivisionView(births.parents, None, "parent", "divide parent"),
+        DivisionView(state, births.first, "daughter1", "divide first"),
+        DivisionView(state, births.second, "daughter2", "divide second"),
     )
+    act(*views)
+    for view in views:
+        view.check_unharmed()
+    return views
 
 
 def _divide(act: Callable[..., None], state: State, births: Births) -> State:
-    parent, first, second = _division_views(state, births)
-    act(parent, first, second)
+    _, first, second = _after_divide(act, state, births)
     changed: dict[str, Tensor] = {}
     for daughter, rows in ((first, births.first), (second, births.second)):
         for name, value in daughter._work.items():
-            if name in state.fields and state.declared[name].scope == CELL:
+            if daughter._writable(name):
                 changed[name] = changed.get(name, state.fields[name]).index_copy(0, rows, value)
     return state.with_fields(**changed)

@@ -18,11 +18,6 @@ def volume(length: Tensor, radius: Tensor) -> Tensor:
     return math.pi * radius * radius * (length + radius * (4.0 / 3.0))
 
 
-def length_of_volume(volume: Tensor, radius: Tensor) -> Tensor:
-    """The centreline length of a capsule of the given volume, µm."""
-    return volume / (math.pi * radius * radius) - radius * (4.0 / 3.0)
-
-
 def area(length: Tensor, radius: Tensor) -> Tensor:
     """A = 2π r L, µm²."""
     return 2.0 * math.pi * radius * total_length(length, radius)

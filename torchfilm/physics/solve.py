@@ -106,13 +106,13 @@ class ContactProblem:
         return (self.of_rows.sum(spring.unsqueeze(1)) + self.colonies.sum(drag)).squeeze(1)
 
 
-def solve(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int, floor=None) -> tuple[Tensor, SolveReport]:
+def solve(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int) -> tuple[Tensor, SolveReport]:
     """Solve for x (N, D) from `start` (an earlier x, or None for 0). Differentiable by the adjoint: one more solve with the same operator.
 
     A colony has converged when its worst preconditioned residual is at most `tolerance` times the worst at x = 0.
     """
     with torch.no_grad():
-        y, free, active, report, inverse = _minimise(_detached(problem), start, tolerance, max_iterations, floor)
+        y, free, active, report, inverse = _minimise(_detached(problem), start, tolerance, max_iterations)
     tracked = (problem.gap, problem.rows.row_first, problem.rows.row_wall, problem.alpha, problem.lower, problem.scale)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tracked):
         y = _attach_gradient(problem, y, free, active, inverse, tolerance, max_iterations)
@@ -127,17 +127,12 @@ def _detached(p: ContactProblem) -> ContactProblem:
     return ContactProblem(rows, p.gap.detach(), p.held.detach(), p.alpha.detach(), p.lower.detach(), p.scale.detach(), p.colonies, p.unilateral)
 
 
-def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int, floor=None):
+def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int):
     colonies = problem.colonies
     zero = torch.zeros_like(problem.scale)
     active = problem.acting(problem.gap)
     inverse = _block_inverse(problem, active)
     scale = worst_of(_times(inverse, problem.gradient(zero, problem.gap * active)), colonies)
-    global SCALE
-    if floor is None: SCALE=scale
-    else: 
-        if __import__('os').environ.get('VERB'): print(scale/floor)
-        scale=torch.maximum(scale,floor)
     still = scale == 0  # nothing pushes: such a colony does not move at all
     y, after = zero, problem.gap
     if start is not None:

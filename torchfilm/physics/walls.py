@@ -10,14 +10,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchfilm.tools import checks
-from torchfilm.tools.vectors import cross, dot, safe_norm
+from torchfilm.tools.vectors import cross, dot, safe_norm, safe_sqrt
 
 AXES = "xyz"
+
+# A place or a direction as walls keep it, by its entries: each one number or one per colony.
+Vector = tuple[float | Tensor, ...]
 
 
 @dataclass(frozen=True)
@@ -46,15 +51,15 @@ class Plane(Wall):
     """A half space that cells stay in: `Plane(z=-0.5, facing="+z")` keeps them above z = −0.5 µm, or `Plane(point=…, normal=…)`.
 
     One of x, y, z (µm; one number or one per colony) with facing "+x" … "-z", or a point and a normal that points to the
-    side of the cells.
+    side of the cells, each one vector or one per colony, an array of shape (B, d).
     """
 
     x: float | Tensor | None = field(default=None, kw_only=True)
     y: float | Tensor | None = field(default=None, kw_only=True)
     z: float | Tensor | None = field(default=None, kw_only=True)
     facing: str | None = field(default=None, kw_only=True)
-    point: Sequence[float] | None = field(default=None, kw_only=True)
-    normal: Sequence[float] | None = field(default=None, kw_only=True)
+    point: Sequence[float | Tensor] | Tensor | None = field(default=None, kw_only=True)
+    normal: Sequence[float | Tensor] | Tensor | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,11 +69,16 @@ class Plane(Wall):
         if len(named) + (self.point is not None) != 1:
             raise checks.InputError(f'Plane got {named or "no place"}: give exactly one of x, y, z, or point and normal. Example: Plane(z=-0.5, facing="+z").')
         if self.point is not None:
-            point, normal = checks.vector("Plane.point", self.point), checks.vector("Plane.normal", self.normal)
+            point, normal = _vector("Plane.point", self.point), _vector("Plane.normal", self.normal)
             if len(point) != len(normal):
                 raise checks.refuse("Plane.normal", normal, f"as long as point ({len(point)} numbers)")
-            if not any(n != 0 for n in normal):
+            if len(counts := _counts((*point, *normal))) > 1:
+                raise checks.refuse("Plane.point, Plane.normal", f"one for each of {' and of '.join(map(str, sorted(counts)))} colonies", "one for each colony")
+            zero = sum(torch.as_tensor(n).detach().abs() for n in normal) == 0
+            if bool(torch.as_tensor(zero).any()):
                 raise checks.refuse("Plane.normal", normal, "a direction that is not zero")
+            object.__setattr__(self, "point", point)
+            object.__setattr__(self, "normal", normal)
             return
         axis = named[0]
         checks.choice(f"Plane.facing (with {axis})", self.facing, ("+" + axis, "-" + axis))
@@ -79,9 +89,12 @@ class Plane(Wall):
             if len(self.point) != dim:
                 raise checks.refuse("Plane.point", tuple(self.point), f"of {dim} numbers in a {dim}-D scene")
             assert self.normal is not None
-            size = math.sqrt(math.fsum(n * n for n in self.normal))
-            normal = tuple(n / size for n in self.normal)
-            return [_Flat(self, normal, math.fsum(float(p) * n for p, n in zip(self.point, normal, strict=True)))]
+            point, normal = tuple(self.point), tuple(self.normal)
+            size = _inner(normal, normal)
+            # torch's root and Python's may differ in the last bit: one design must come out as it does among many
+            size = size.sqrt() if isinstance(size, Tensor) else float(torch.tensor(size, dtype=torch.float64).sqrt())
+            normal = tuple(n / size for n in normal)
+            return [_Flat(self, normal, _inner(point, normal))]
         axis = next(k for k, a in enumerate(AXES) if getattr(self, a) is not None)
         if axis >= dim:
             raise checks.refuse(f"Plane.{AXES[axis]}", getattr(self, AXES[axis]), f"a place along {AXES[:dim]} in a {dim}-D scene")
@@ -92,21 +105,21 @@ class Plane(Wall):
 
 @dataclass(frozen=True)
 class Sphere(Wall):
-    """A sphere (a circle in 2-D) that cells stay inside of, or outside of. center µm, radius µm."""
+    """A sphere (a circle in 2-D) that cells stay inside of, or outside of. center µm, one place or one per colony, an array of shape (B, d); radius µm."""
 
-    center: Sequence[float]
+    center: Sequence[float | Tensor] | Tensor
     radius: float | Tensor
     inside: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.vector("Sphere.center", self.center)
+        object.__setattr__(self, "center", _vector("Sphere.center", self.center))
         object.__setattr__(self, "radius", checks.value("Sphere.radius", self.radius, above=0.0))
 
     def surfaces(self, dim: int) -> list[Surface]:
         if len(tuple(self.center)) != dim:
             raise checks.refuse("Sphere.center", tuple(self.center), f"of {dim} numbers in a {dim}-D scene")
-        return [_Round(self, tuple(map(float, self.center)), self.radius, self.inside)]
+        return [_Round(self, tuple(self.center), self.radius, self.inside)]
 
 
 @dataclass(frozen=True)
@@ -161,25 +174,31 @@ class Channel(Wall):
 @dataclass(frozen=True)
 class _Flat:
     wall: Wall
-    normal: tuple[float, ...]  # to the side of the cells
+    normal: Vector  # unit, to the side of the cells
     offset: float | Tensor  # normal · x at the wall; one number or one per colony
 
     def gap_of_points(self, points: Tensor, colony: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (P,) of points (P, d), float64, and the direction to the wall (d, P)."""
-        normal = points.new_tensor(self.normal)
+        normal = _vectors(self.normal, colony, points)
         distance = (points * normal).sum(1) - _per_cell(self.offset, colony, points)
-        return distance, -normal.unsqueeze(1).expand(-1, points.shape[0])
+        return distance, (-normal).expand(points.shape).T
+
+    def deepest(self, position: Tensor, axis: Tensor, half: Tensor, colony: Tensor) -> Tensor:
+        """How far from its centre, µm (P,), each centreline of half length `half` (P,) comes nearest to the wall: exactly, at an end."""
+        rise = (_vectors(self.normal, colony, position) * axis).sum(1)
+        return torch.where(rise > 0, -half, half)
 
 
 @dataclass(frozen=True)
 class _Round:
     wall: Wall
-    center: tuple[float, ...]
+    center: Vector
     radius: float | Tensor
     inside: bool
 
     def gap_of_points(self, points: Tensor, colony: Tensor) -> tuple[Tensor, Tensor]:
-        out = (points - points.new_tensor(self.center)).T
+        """As of a flat wall."""
+        out = (points - _vectors(self.center, colony, points)).T
         distance = safe_norm(out)
         radius = _per_cell(self.radius, colony, points)
         # at the very centre every direction leads to the wall, equally far
@@ -188,8 +207,62 @@ class _Round:
         way = torch.where(distance > 1e-9, out / torch.where(distance > 1e-9, distance, 1.0), ahead)
         return (radius - distance, way) if self.inside else (distance - radius, -way)
 
+    def deepest(self, position: Tensor, axis: Tensor, half: Tensor, colony: Tensor) -> Tensor:
+        """As of a flat wall: the end that is farther out, or, met from outside, the foot of the centre on the centreline."""
+        foot = self.foot(position, axis, colony)
+        return torch.where(foot > 0, -half, half) if self.inside else torch.minimum(torch.maximum(foot, -half), half)
+
+    def foot(self, position: Tensor, axis: Tensor, colony: Tensor) -> Tensor:
+        """How far from its own centre, µm (P,), each cell's line passes nearest to the sphere's."""
+        return ((_vectors(self.center, colony, position) - position) * axis).sum(1)
+
 
 Surface = _Flat | _Round  # what a wall is made of
+
+
+def _vector(name: str, given: object) -> Vector:
+    """A vector, or one per colony as an array (B, d), by its entries, which keep a tensor's gradient and follow it when it is changed in place.
+
+    A sequence with tensors in it is taken for such entries already, each one number or one per colony, as a Box's corners are.
+    """
+    allowed = "a sequence of numbers, or one per colony as an array of shape (colonies, dimensions)"
+    if isinstance(given, (tuple, list)) and any(isinstance(entry, Tensor) for entry in given):
+        entries = tuple(checks.value(f"{name}[{k}]", entry) for k, entry in enumerate(given))
+        if len(_counts(entries)) > 1:
+            raise checks.refuse(name, given, "as many values for each entry")
+        return entries
+    if isinstance(given, Tensor):
+        seen = given if given.is_floating_point() else given.double()
+    else:
+        try:
+            seen = torch.as_tensor(np.asarray(given, dtype=np.float64))
+        except (TypeError, ValueError) as error:
+            raise checks.refuse(name, given, allowed) from error
+        if seen.dim() == 1:
+            return checks.vector(name, given)
+    if seen.dim() not in (1, 2) or seen.numel() == 0:
+        raise checks.refuse(name, f"an array of shape {tuple(seen.shape)}", allowed)
+    bad = torch.nonzero(~torch.isfinite(seen.detach()))
+    if bad.numel():
+        at = tuple(bad[0].tolist())
+        raise checks.refuse(f"{name}[{', '.join(map(str, at))}]", float(seen.detach()[at]), "finite")
+    with torch.enable_grad():
+        # views one by one: those that come from `unbind` forbid a change in place, such as an optimiser's
+        return tuple(seen.select(-1, k) for k in range(seen.shape[-1]))
+
+
+def _counts(entries: Vector) -> set[int]:
+    """For how many colonies each of the entries that differ between colonies is given."""
+    return {entry.numel() for entry in entries if isinstance(entry, Tensor) and entry.dim() > 0}
+
+
+def _inner(u: Vector, v: Vector) -> Any:
+    """u · v in float64: a number, or a tensor where either has one, 0-dim or one value per colony (B,); the same bits either way."""
+    wide = lambda x: x.double() if isinstance(x, Tensor) else x  # noqa: E731
+    total = wide(u[0]) * wide(v[0])
+    for a, b in zip(u[1:], v[1:], strict=True):
+        total = total + wide(a) * wide(b)
+    return total
 
 
 def _per_cell(given: float | Tensor, colony: Tensor, like: Tensor) -> Tensor | float:
@@ -199,9 +272,20 @@ def _per_cell(given: float | Tensor, colony: Tensor, like: Tensor) -> Tensor | f
     return given if given.dim() == 0 else given.index_select(0, colony)
 
 
+def _vectors(entries: Vector, colony: Tensor, like: Tensor) -> Tensor:
+    """(d,) where there is one vector for all, else one for each cell, (P, d)."""
+    if not any(isinstance(entry, Tensor) for entry in entries):
+        return like.new_tensor(entries)
+    found = [_per_cell(entry, colony, like) for entry in entries]
+    return torch.stack(torch.broadcast_tensors(*(f if isinstance(f, Tensor) else like.new_tensor(f) for f in found)), -1)
+
+
 @dataclass(frozen=True)
 class WallContacts:
-    """W rows of one cell and a wall: cell (W,), gap (W,) µm, row (W, D), surface (W,) number of the surface touched."""
+    """W rows of one cell and a wall: cell (W,), gap (W,) µm, row (W, D), surface (W,) number of the surface touched.
+
+    Where a contact is shared among rows (see `find_wall_contacts`), gap and row of each are multiplied by the root of its share.
+    """
 
     cell: Tensor
     gap: Tensor
@@ -214,35 +298,46 @@ class WallContacts:
 
 
 def find_wall_contacts(surfaces: Sequence[Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony_id: Tensor) -> WallContacts:
-    """One row for each capsule end (and, at a sphere met from outside, for the nearest point between) that overlaps (gap < 0).
+    """One row for each capsule end that overlaps (gap < 0), and at a sphere met from outside one for the nearest point, wherever it is.
 
     position (N, d) float64 absolute; axis (N, d), length, radius (N,); colony_id (N,), by which a wall's value per colony is found.
     """
     found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     half = 0.5 * length
     for number, surface in enumerate(surfaces):
-        reaches = [(half, 1.0), (-half, -1.0)]
-        if isinstance(surface, _Round) and not surface.inside:
-            to_center = position.new_tensor(surface.center) - position
-            between = (to_center * axis).sum(1).to(half.dtype)
-            reaches.append((torch.minimum(torch.maximum(between, -half), half), 0.0))
-        for s, end in reaches:
+        for s, end, root in _reaches(surface, position, axis, half, colony_id):
             point = position + (s.unsqueeze(1) * axis).to(position.dtype)
             distance, way = surface.gap_of_points(point, colony_id)
             gap = distance.to(length.dtype) - radius
-            near = gap < 0
-            if end == 0.0:  # the ends have rows of their own
-                near = near & (s.abs() < half)
-            keep = torch.nonzero(near).squeeze(1)
+            keep = torch.nonzero((gap < 0) & (root > 0)).squeeze(1)
             if keep.numel() == 0:
                 continue
+            pick = lambda x, keep=keep: x.index_select(0, keep)  # noqa: E731
             n = way.index_select(1, keep).to(axis.dtype)
-            a = axis.index_select(0, keep).T
-            lever = s.index_select(0, keep) * a
-            row = torch.cat([n, cross(lever, n), (0.5 * end * dot(n, a)).unsqueeze(0)]).T
-            found.append((keep, gap.index_select(0, keep), row, torch.full_like(keep, number)))
+            a = pick(axis).T
+            row = torch.cat([n, cross(pick(s) * a, n), (0.5 * pick(end) * dot(n, a)).unsqueeze(0)])
+            found.append((keep, pick(root) * pick(gap), (pick(root) * row).T, torch.full_like(keep, number)))
     if not found:
         degrees = 4 if axis.shape[1] == 2 else 7
         none = colony_id.new_empty(0)
         return WallContacts(none, length.new_empty(0), length.new_empty(0, degrees), none)
     return WallContacts(*(torch.cat(part) for part in zip(*found, strict=True)))
+
+
+def _reaches(surface: Surface, position: Tensor, axis: Tensor, half: Tensor, colony_id: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """The points of each capsule that may touch a surface: how far from the centre, which end moves along as it grows (±1, or 0), and the root
+    of the point's share; each (N,).
+
+    Of a sphere met from outside the nearest point slides along the cell, with a whole row; the ends share another by how far it is from each. When it
+    arrives at an end, that end has no share left and the other has it all, as at a plane: whatever a cell does, no force comes or goes all at once.
+    """
+    one = torch.ones_like(half)
+    if isinstance(surface, _Flat) or surface.inside:
+        return [(half, one, one), (-half, -one, one)]
+    # −1 … 1 along the cell; a sphere, which is all ends, has its nearest point at one of them
+    at = (surface.foot(position, axis, colony_id).to(half.dtype) / half.clamp(min=1e-9)).clamp(-1, 1)
+    return [
+        (at * half, torch.trunc(at.detach()), one),
+        (half, one, safe_sqrt(0.5 * (1 - at))),
+        (-half, -one, safe_sqrt(0.5 * (1 + at))),
+    ]

@@ -89,7 +89,10 @@ class Implicit:
 
 
 def prepare_implicit(operator: Operator, dt: float) -> Implicit:
-    """The factors of a step of `dt` hours. Decay is shared evenly among the axes that have more than one voxel, and exact for one axis at rest."""
+    """The factors of a step of `dt` hours.
+
+    Decay is shared evenly among the axes that have more than one voxel: on one axis a steady field is exact, on several its error is of order Δt.
+    """
     long = [axis for axis in range(3) if operator.shape[axis] > 1] or [0]
     decay = operator.decay if operator.mask is None else operator.decay * operator.mask
     chains: list[Chain | None] = []

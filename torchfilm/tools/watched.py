@@ -1,4 +1,4 @@
-"""The user's functions, from a file that may be edited while a run is going."""
+"""The user's functions, from a file that may be edited while a run is going, and what they must not do."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
 
 from torchfilm.tools import checks
 
@@ -23,23 +26,30 @@ def load_functions(path: Path, names: tuple[str, ...]) -> Functions:
     return found
 
 
+def unchanged(now: Tensor, then: Tensor) -> bool:
+    """Whether two tensors hold the same, a NaN taken for equal to itself: what is not finite is the driver's matter, not a rule's."""
+    return torch.equal(now, then) or bool(((now == then) | ((now != now) & (then != then))).all())
+
+
 class Watched:
     """Functions by name and the file, if any, that they came from.
 
     While `watching`, an edit is taken up at the next `refresh`; one that is broken is reported in `messages`, at once or when it first fails, and the
-    functions before it go on.
+    functions before it go on. Messages carry the simulated time of the last `refresh`.
     """
 
     def __init__(self, path: Path | None, functions: Functions):
         self.path, self.functions = path, functions
         self.watching = False
         self.messages: list[str] = []
+        self._time = 0.0
         self._stamp = path.stat().st_mtime_ns if path else 0
         self._previous: Functions | None = None
         self._proven = True
 
-    def refresh(self) -> None:
-        """Take up an edited file if it loads."""
+    def refresh(self, time: float) -> None:
+        """Take up an edited file if it loads. time: simulated, h."""
+        self._time = time
         if not self.watching or self.path is None:
             return
         try:
@@ -71,12 +81,12 @@ class Watched:
             return self.call(name, act, otherwise)
         if not self._proven:
             self._proven = True
-            self.messages.append(f"{self._name} taken up")
+            self._say("taken up")
         return result
 
-    @property
-    def _name(self) -> str:
-        return self.path.name if self.path is not None else "the rules"
-
     def _report(self, error: Any) -> None:
-        self.messages.append(f"{self._name} is broken, still running the last good rules: {type(error).__name__}: {error}")
+        self._say(f"is broken, still running the last good rules: {type(error).__name__}: {error}")
+
+    def _say(self, what: str) -> None:
+        name = self.path.name if self.path is not None else "the rules"
+        self.messages.append(f"t = {self._time:g} h: {name} {what}")

@@ -1,0 +1,124 @@
+"""Rules from a file, edited while a run is going."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from ruled import pair_of_cells, run
+
+import torchfilm as tf
+
+
+@pytest.fixture
+def rules_file(tmp_path):
+    path = tmp_path / "my_rules.py"
+    path.write_text("def update(cells):\n    cells.growth_rate = 1.0\n")
+    return path
+
+
+def watched(path, *effects: tf.Effect) -> tuple[tf.Rules, tf.Scene]:
+    rules = tf.Rules(path)
+    rules.source.watching = True
+    return rules, tf.Scene(rules, *(effects or (tf.Growth(),)), founders=pair_of_cells())
+
+
+def test_rules_from_a_file(rules_file):
+    for given in (rules_file, str(rules_file)):
+        scene = tf.Scene(tf.Rules(given), tf.Growth(), founders=pair_of_cells())
+        assert run(scene, scene.seed(), 1).growth_rate.tolist() == [1.0, 1.0]
+
+
+def test_an_edit_takes_effect_at_the_next_step(rules_file):
+    rules, scene = watched(rules_file)
+    rates = []
+    for state in tf.simulate(scene, scene.seed(), until=0.6, dt=0.1):
+        rates.append(float(state.growth_rate[0]))
+        if state.step == 3:
+            rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
+    assert rates == [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]
+    assert rules.source.messages == ["t = 0.3 h: my_rules.py taken up"], "it was the step from 0.3 to 0.4 h that first ran the new rules"
+
+
+def test_without_watching_an_edit_waits(rules_file):
+    rules, scene = watched(rules_file)
+    rules.source.watching = False
+    state = run(scene, scene.seed(), 1)
+    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
+    assert run(scene, state, 2).growth_rate.tolist() == [1.0, 1.0] and not rules.source.messages
+
+
+BROKEN = {
+    "syntax": ("def update(cells)\n    pass\n", "SyntaxError"),
+    "unknown name": ("def update(cells):\n    cells.growth_rate = speed\n", "NameError"),
+    "unknown field": ("def update(cells):\n    cells.growth_rate = cells.groth\n", "groth"),
+    "wrong shape": ("import torch\ndef update(cells):\n    cells.growth_rate = torch.ones(99)\n", "growth_rate"),
+    "read only": ("def update(cells):\n    cells.length = 3.0\n", "can only be read"),
+    "new variable": ("def update(cells):\n    cells.fresh = 3.0\n", "fresh"),
+    "empty": ("", "neither"),
+    "on import": ("raise RuntimeError('no luck')\n", "no luck"),
+}
+
+
+@pytest.mark.parametrize("kind", list(BROKEN))
+def test_a_broken_edit_is_told_and_the_run_goes_on_with_the_last_good_one(rules_file, kind):
+    text, word = BROKEN[kind]
+    rules, scene = watched(rules_file)
+    state = run(scene, scene.seed(), 2)
+    rules_file.write_text(text)
+    state = run(scene, state, 3)
+    assert state.growth_rate.tolist() == [1.0, 1.0] and state.step == 5
+    (message,) = rules.source.messages
+    assert message.startswith("t = 0.2 h: my_rules.py is broken") and word in message, message
+    rules_file.write_text("def update(cells):\n    cells.growth_rate = 3.0\n")
+    assert run(scene, state, 1).growth_rate.tolist() == [3.0, 3.0], "a mended file must be taken up"
+    assert len(rules.source.messages) == 2
+
+
+def test_a_file_that_is_gone_for_a_moment_is_no_error(rules_file):
+    _, scene = watched(rules_file)
+    state = run(scene, scene.seed(), 1)
+    rules_file.unlink()
+    state = run(scene, state, 1)
+    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
+    assert run(scene, state, 1).growth_rate.tolist() == [2.0, 2.0]
+
+
+def test_an_edit_that_breaks_only_later_does_not_end_the_run(rules_file):
+    """It passes when it is taken up and fails two steps after: the last good rules must carry on."""
+    rules, scene = watched(rules_file)
+    state = run(scene, scene.seed(), 1)
+    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0 if cells.time < 0.25 else speed\n")
+    state = run(scene, state, 5)
+    assert state.step == 6
+    assert any("t = 0.3 h" in m and "broken" in m and "speed" in m for m in rules.source.messages)
+
+
+DIVIDE = "def divide(parent, daughter1, daughter2):\n    daughter1.growth_rate = {}\n"
+
+
+def grow_and_divide(path) -> tuple[tf.Rules, tf.Scene, tf.State]:
+    rules, scene = watched(path, tf.Growth(rate=1.0), tf.Division())
+    return rules, scene, scene.seed()
+
+
+def flagged(state: tf.State) -> tf.State:
+    return state.with_fields(divide_flag=torch.ones_like(state.divide_flag), growth_rate=torch.ones_like(state.growth_rate))
+
+
+def test_divide_in_a_file_and_its_edit(rules_file):
+    rules_file.write_text(DIVIDE.format(5.0))
+    _, scene, state = grow_and_divide(rules_file)
+    state = scene.step(flagged(state), 0.1)
+    assert state.growth_rate.tolist() == [5.0, 1.0] * 2
+    rules_file.write_text(DIVIDE.format(6.0))
+    long_enough = flagged(state).replace(length=torch.full_like(state.length, 3.0))
+    assert scene.step(long_enough, 0.1).growth_rate.tolist() == [6.0, 1.0] * 4
+
+
+def test_a_broken_divide_is_told_and_the_run_goes_on(rules_file):
+    rules_file.write_text(DIVIDE.format(5.0))
+    rules, scene, state = grow_and_divide(rules_file)
+    rules_file.write_text(DIVIDE.format("speed"))
+    state = scene.step(flagged(state.replace(time=1.5)), 0.1)
+    assert state.growth_rate.tolist() == [5.0, 1.0] * 2
+    assert any("t = 1.5 h" in m and "broken" in m and "speed" in m for m in rules.source.messages)

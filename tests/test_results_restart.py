@@ -1,0 +1,150 @@
+"""Results files: a run goes on from any frame bit for bit, also after a kill."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from recorded import DT, UNTIL, assert_same_file, assert_same_state, make_scene, record
+
+import torchfilm as tf
+
+
+@pytest.mark.parametrize("frame", [0, 3, 8])
+def test_a_run_from_any_frame_is_the_run_itself(whole, frame):
+    path, states = whole
+    scene = make_scene()
+    with tf.Results(path) as results:
+        state = results.state(scene, frame)
+    last = list(tf.simulate(scene, state, until=UNTIL))[-1]
+    assert_same_state(last, states[-1])
+    assert all(torch.equal(getattr(last.reports["mechanics"], n), getattr(states[-1].reports["mechanics"], n)) for n in ("iterations", "residual"))
+
+
+@pytest.mark.parametrize("stop", [1.05, 1.3], ids=["on a frame", "between frames"])
+def test_resume_bit_for_bit(tmp_path, whole, stop):
+    """Stopped and resumed, the file holds what the uninterrupted run's file holds, and the lineage is the same."""
+    path, scene = tmp_path / "run.h5", make_scene()
+    record(scene, scene.seed(3, seed=11), path, until=stop)
+    scene = make_scene()
+    with tf.Results(path) as results:
+        state = results.state(scene)
+    states = record(scene, state, path, append=True)
+    assert_same_state(states[-1], whole[1][-1])
+    assert_same_file(whole[0], path)
+    assert not [p for p in tmp_path.iterdir() if p != path], "something was left lying about"
+
+
+def test_every_step_can_be_resumed_from(tmp_path):
+    """Also those in which a cell is due to divide but has not done so yet."""
+    scene = make_scene()
+    record(scene, scene.seed(3, seed=11), tmp_path / "run.h5", until=2.0, every=1)
+    with tf.Results(tmp_path / "run.h5") as results:
+        due = 0
+        for k in range(len(results)):
+            state = results.state(scene, k)
+            due += bool((state.length >= state.division_threshold).any())
+            scene.check(state)
+        assert due > 0, "the run has no such step; the test would prove nothing"
+
+
+def test_a_run_from_given_cells_can_be_resumed_where_the_founders_could_not_stand(tmp_path):
+    """The wall is at x = 5 and the default founder at 0: only the given cells matter, and they are on the right side."""
+
+    def scene_of():
+        return tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2, walls=[tf.Plane(x=5.0, facing="+x")]), dt=DT)
+
+    path, scene = tmp_path / "run.h5", scene_of()
+    states = record(scene, scene.seed(2, cells=tf.Cells([[8.0, 0.0]], [[1.0, 0.0]], extra={"gfp": [0.5]})), path, until=1.0)
+    with tf.Results(path) as results:
+        assert_same_state(results.state(scene_of()), states[-1])
+
+
+def test_a_colony_that_has_sunk_into_a_soft_wall_can_be_resumed(tmp_path):
+    """A soft wall yields, so a centre may come to lie behind its surface: physics, and no wall inside out."""
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(walls=[tf.Plane(z=-0.5, facing="+z", stiffness=0.5), tf.Plane(z=0.5, facing="-z")]), dt=DT)
+    states = record(scene, scene.seed(), tmp_path / "run.h5", until=0.5)
+    sunk = states[-1].replace(position=states[-1].position - torch.tensor([0.0, 0.0, 0.6], dtype=torch.float64))
+    assert len(list(tf.simulate(scene, sunk, until=sunk.time + 2 * DT))) == 2
+
+
+def test_another_scene_is_refused(whole, tmp_path):
+    with tf.Results(whole[0]) as results:
+        with pytest.raises(tf.InputError, match="2-D"):
+            results.state(tf.Scene(tf.Growth(rate=1.0), tf.Mechanics()))
+        with pytest.raises(tf.InputError, match=r"birth_length.*another scene"):
+            results.state(tf.Scene(tf.Growth(rate=1.0), tf.Division(added=1.0), tf.Mechanics(dim=2)))
+
+
+def test_appending_from_another_moment_is_refused_and_harms_nothing(whole, tmp_path):
+    path, scene = tmp_path / "run.h5", make_scene()
+    shutil.copy(whole[0], path)
+    with tf.Results(path) as results:
+        early = results.state(scene, 2)
+    with pytest.raises(tf.InputError, match="last frame"):
+        record(scene, early, path, append=True)
+    assert_same_file(whole[0], path)
+
+
+def test_numbers_of_a_ready_scene_come_back_as_its_recipe(tmp_path):
+    for given in (1.0, [1.0, 0.5], torch.tensor([1.0, 0.5]), np.array([1.0, 0.5])):
+        scene = tf.scenes.microcolony(rate=given)
+        path = tmp_path / f"{type(given).__name__}.h5"
+        states = record(scene, scene.seed(2), path, until=0.2, every=1)
+        with tf.Results(path) as results:
+            name, parameters = results.recipe
+            again = tf.scenes.build(name, parameters)
+            state = results.state(again, 0)
+        assert_same_state([state, *tf.simulate(again, state, until=0.2)][-1], states[-1])
+
+
+WRITE = """
+import sys, torchfilm as tf
+from recorded import make_scene
+scene = make_scene()
+for _ in tf.simulate(scene, scene.seed(3, seed=11), until=3.0, record=tf.Recorder(sys.argv[1], scene, every=1)):
+    pass
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attempt", range(3))
+def test_killed_at_any_moment_the_file_opens_and_the_run_resumes(tmp_path, every_step, attempt):
+    """kill −9 at a moment drawn at random: no frame that was finished is lost, and the resumed run ends as if nothing had happened."""
+    path = tmp_path / "run.h5"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.path.dirname(__file__)}
+    child = subprocess.Popen([sys.executable, "-c", WRITE, str(path)], env=environment)
+    try:
+        seen = 0
+        for _ in range(600):
+            time.sleep(0.02)
+            assert child.poll() is None, "the run ended by itself before it could be killed"
+            try:
+                with tf.Results(path) as results:
+                    seen = len(results)
+                break
+            except tf.InputError:
+                continue  # not there yet
+        time.sleep(random.uniform(0.0, 0.5))
+    finally:
+        if child.poll() is None:
+            child.send_signal(signal.SIGKILL)
+        child.wait()
+    assert child.returncode == -signal.SIGKILL, "the run was over before it was killed: nothing tested"
+    scene = make_scene()
+    with tf.Results(path) as results:
+        assert len(results) >= max(1, seen)
+        assert results.steps.tolist() == list(range(len(results)))
+        state = results.state(scene)
+    assert_same_state(state, every_step[1][state.step])
+    states = record(scene, state, path, every=1, append=True)
+    assert_same_state(states[-1], every_step[1][-1])
+    assert_same_file(every_step[0], path)
