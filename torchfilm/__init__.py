@@ -10,6 +10,7 @@ from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium, Signal
+from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
@@ -18,7 +19,7 @@ from torchfilm.recorder import Recorder
 from torchfilm.results import Results
 from torchfilm.scene import Scene
 from torchfilm.signals.faces import Faces, Fixed, NoFlux, Open, Periodic
-from torchfilm.simulate import simulate
+from torchfilm.simulate import rollout, simulate
 from torchfilm.state import Field, State
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.memory import keep_memory
@@ -26,7 +27,7 @@ from torchfilm.tools.timing import Timings
 from torchfilm.version import __version__
 
 __all__ = [
-    "Box", "Cells", "Channel", "Circuit", "Division", "Effect", "Faces", "Field", "Fixed", "Growth", "InputError", "LogNormal", "Mechanics", "Medium",
+    "Box", "Cells", "Channel", "Circuit", "Division", "Effect", "Faces", "Field", "Fixed", "Growth", "InputError", "LogNormal", "Mechanics", "Medium", "Monod",
     "NoFlux", "Normal", "Open", "Periodic", "Plane", "Reaction", "Recorder", "Removal", "Results", "Rules", "Scene", "Signal", "SimulationError", "Sphere",
-    "State", "Timings", "Uniform", "__version__", "effect", "keep_memory", "kinetics", "measure", "parts", "pictures", "scenes", "show", "simulate",
+    "State", "Timings", "Uniform", "__version__", "effect", "keep_memory", "kinetics", "measure", "parts", "pictures", "rollout", "scenes", "show", "simulate",
 ]  # fmt: skip

@@ -196,7 +196,8 @@ def summary(effect: Effect) -> str:
     shown = []
     for f in dataclasses.fields(effect):  # type: ignore[arg-type]
         value = getattr(effect, f.name)
-        if f.repr and not _same(value, f.default):
+        default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
+        if f.repr and not _same(value, default):
             shown.append(f"{f.name}={_short(value)}")
     return f"{type(effect).__name__}({', '.join(shown)})"
 
@@ -211,6 +212,8 @@ def _short(value: object) -> str:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         inner = [f"{f.name}={_short(getattr(value, f.name))}" for f in dataclasses.fields(value) if not _same(getattr(value, f.name), f.default)]
         return f"{type(value).__name__}({', '.join(inner)})"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{name}: {_short(v)}" for name, v in value.items()) + "}"
     if isinstance(value, (tuple, list)):
         return "[" + ", ".join(_short(v) for v in value) + "]"
     return getattr(value, "__name__", None) or repr(value)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.utils.checkpoint import checkpoint
 
 from torchfilm.physics.solve import CONVERGED, STATUS
 from torchfilm.recorder import Recorder
@@ -55,6 +56,27 @@ def simulate(
     if recorder is not None:
         recorder.dt = dt
     return _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings)
+
+
+def rollout(scene: Scene, state: State, *, until: float, dt: float | None = None, segment: int = 10) -> State:
+    """The state at `until` (h), for gradients through a long run: only every `segment`-th state is kept, and the steps between are taken again on the way
+    back (torch.utils.checkpoint), so that memory grows with the number of segments and not of steps. Failures are raised as in `simulate`.
+    """
+    dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
+    if isinstance(segment, bool) or not isinstance(segment, int) or segment < 1:
+        raise checks.refuse("segment", segment, "a whole number of steps from 1")
+    last = _last_step(state, checks.number("until", until), dt)
+    scene.check(state)
+
+    def advance(begin: State, steps: int) -> State:
+        for _ in range(steps):
+            begin = handle_failures(scene.step(begin, dt), "raise")
+        return begin
+
+    while state.step < last:
+        steps = min(segment, last - state.step)
+        state = checkpoint(advance, state, steps, use_reentrant=False)
+    return state
 
 
 def _last_step(state: State, until: float, dt: float) -> int:

@@ -109,7 +109,11 @@ class _Method:
         f = value[:count].t().to(torch.float64)
         if slope is None:
             return f, u.new_zeros(size, size, count)
-        return f, slope.t().to(torch.float64).reshape(size, size, count)
+        jacobian = slope.t().to(torch.float64).reshape(size, size, count)
+        if not bool(torch.isfinite(jacobian.sum())):
+            # the slope of a root at 0 is infinite; any finite one will do, only the error grows, and that is watched
+            jacobian = torch.nan_to_num(jacobian, 0.0, 0.0, 0.0)
+        return f, jacobian
 
     def step(self, u: Tensor, rows: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The concentrations after h (M,), their error (M,) in units of what is allowed (NaN where there is no result), and whether (M,) a

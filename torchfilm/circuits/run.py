@@ -63,7 +63,7 @@ class Circuit:
         size = len(self.species)
         columns = u.unbind(1)
         outside: dict[str, Any] = dict(self.signals)
-        s = Columns(outside, rows, "s", self.seen.get("s"))
+        s = Columns(outside, rows, "s" if outside else "s (there is no Medium in this scene: it)", self.seen.get("s"))
         for name, value in zip(self.given, columns[size:], strict=False):
             s.__dict__[name] = value
         return (
@@ -169,7 +169,7 @@ def _molecules(circuit: Circuit, concentrations: Tensor, dt: float, settings: Se
     """The same molecule by molecule. A reservoir is a pool so large that what is given to it or taken does not show."""
     assert isinstance(circuit.part, Network)
     network, rows = circuit.part, circuit.rows
-    volume = circuit.cell["volume"].index_select(0, rows).double()
+    volume = circuit.names(concentrations, rows)[3].volume.double()
     copies = settings.copies.index_select(0, rows).double() if isinstance(settings.copies, Tensor) and settings.copies.dim() else settings.copies
     parts = [torch.round(concentrations.double() * (volume * copies).unsqueeze(1))]
     pool = None

@@ -63,15 +63,15 @@ class Circuit(Effect):
 
     rates: Mapping[int, Part]
     species: tuple[str, ...]
-    initial: Mapping[str, float | Tensor | Distribution]
-    daughters: str
-    method: str
-    steps: int
-    rtol: float
-    atol: float
-    copies: float | Tensor
-    parameters: Mapping[str, float | Tensor]
-    noted: dict[str, Any] = field(repr=False)
+    initial: Mapping[str, float | Tensor | Distribution] = field(default_factory=dict)
+    daughters: str = "concentration"
+    method: str = STIFF
+    steps: int = 1
+    rtol: float = 1e-4
+    atol: float = 1e-9
+    copies: float | Tensor = 1.0
+    parameters: Mapping[str, float | Tensor] = field(default_factory=dict)
+    noted: dict[str, Any] = field(default_factory=dict, repr=False)
 
     stage = CIRCUIT
     title = "circuit"
@@ -174,6 +174,8 @@ class Circuit(Effect):
             given[kind] = run.trial(tried, self._concentrations(state, rows))
         self.noted["given"] = given
         geometry = {g for n in seen["cell"] for g in GEOMETRY.get(n, (n,) if n in state.fields else ())}
+        if seen["s"] or any(given.values()):
+            geometry.add("position")
         self.noted["reads"] = tuple(sorted({*geometry, *(OUTSIDE + n for n in seen["s"]), *(OUTSIDE + n for g in given.values() for n in g)}))
         return state
 

@@ -72,7 +72,7 @@ class Medium(Effect):
     a 2-D scene may lie in a box with three: in the plane z = `height`. spacing: of voxels, µm, one number or one an axis.
     faces: of the box; without, nothing passes them. flow: velocity of the medium, µm/h: two or three numbers (or one per colony each), or a function from
     places (M, 3) µm to velocities (M, 3). obstacles: a function from places (M, 3) to (M,) bool, true where there is none of the medium.
-    beyond: what cells beyond the box mean: "error"; "grow": the box grows with its colony; "open": the box stands in a reservoir in which each
+    beyond: what cells beyond the box mean: "error"; "grow": the box grows with its colony, along the axes that `grows` names; "open": the box stands in a reservoir in which each
     signal is at its `beyond`, and what cells give to it and take from it is kept count of in the fields NAME_beyond.
     method: "exponential" (exact, where the box is all medium and the flow uniform), "implicit" (positive at any step; elsewhere), "crank_nicolson" (the
     paper's) or "euler"; by default the first of them that the scene allows.
@@ -81,13 +81,14 @@ class Medium(Effect):
     signals: Mapping[str, Signal]
     box: tuple[tuple[float, ...], tuple[float, ...]]
     spacing: tuple[float, ...]
-    depth: float | None
-    height: float
-    faces: Faces
-    flow: Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
-    obstacles: Callable[[Tensor], Tensor] | None
-    beyond: str
-    method: str | None
+    depth: float | None = None
+    height: float = 0.0
+    faces: Faces = Faces()
+    flow: Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None = None
+    obstacles: Callable[[Tensor], Tensor] | None = None
+    beyond: str = "error"
+    grows: str = "xyz"
+    method: str | None = None
 
     stage = TRANSPORT
     title = "transport"
@@ -103,6 +104,7 @@ class Medium(Effect):
         flow: Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None = None,
         obstacles: Callable[[Tensor], Tensor] | None = None,
         beyond: str = "error",
+        grows: str = "xyz",
         method: str | None = None,
         **signals: Signal,
     ):
@@ -135,6 +137,8 @@ class Medium(Effect):
         if len(low) == 3 and not low[2] <= height <= high[2]:
             raise checks.refuse("Medium.height", height, f"within the box, from {low[2]:g} to {high[2]:g} µm")
         checks.choice("Medium.beyond", beyond, BEYOND)
+        if not isinstance(grows, str) or not grows or set(grows) - set("xyz"):
+            raise checks.refuse("Medium.grows", grows, 'some of the letters x, y and z, such as "x"')
         if method is not None:
             checks.choice("Medium.method", method, tuple(METHODS))
         for name, value in (("obstacles", obstacles), ("flow", None if isinstance(flow, (tuple, list, Tensor)) else flow)):
@@ -142,7 +146,7 @@ class Medium(Effect):
                 raise checks.refuse(f"Medium.{name}", value, "a function of places" + (", or two or three numbers" if name == "flow" else ""))
         given = {
             "signals": dict(signals), "box": (low, high), "spacing": steps, "depth": depth, "height": float(height),
-            "faces": faces if faces is not None else Faces(), "flow": _flow(flow), "obstacles": obstacles, "beyond": beyond, "method": method,
+            "faces": faces if faces is not None else Faces(), "flow": _flow(flow), "obstacles": obstacles, "beyond": beyond, "grows": grows, "method": method,
         }  # fmt: skip
         for name, value in given.items():
             object.__setattr__(self, name, value)
@@ -342,7 +346,8 @@ class Cover(Effect):
         low = -torch.stack([groups.max(-x, empty=-torch.inf) for x in places.unbind(1)], 1)
         flat = torch.tensor([n == 1 for n in state.layout.grid.shapes[0]], device=state.device)  # a layer stays one
         margin = torch.where(flat, 0.0, MARGIN * step)
-        return low - margin, high + margin
+        held = torch.tensor([letter not in self.medium.grows for letter in "xyz"], device=state.device)
+        return torch.where(held, torch.inf, low - margin), torch.where(held, -torch.inf, high + margin)
 
     def _grown(self, state: State) -> State:
         layout = state.layout

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from torchfilm.scene import Scene
-from torchfilm.scenes import channels, colonies
+from torchfilm.scenes import channels, circuits, colonies, nutrients, signalling
 from torchfilm.tools import checks
 
 
@@ -30,8 +30,19 @@ def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
 microcolony = _ready(colonies.microcolony)
 programmed_growth = _ready(colonies.programmed_growth)
 channel = _ready(channels.channel)
+quorum_sensing = _ready(signalling.quorum_sensing)
+boundary_detector = _ready(signalling.boundary_detector)
+random_partition = _ready(circuits.random_partition)
+repressilator = _ready(circuits.repressilator)
+toggle_switch = _ready(circuits.toggle_switch)
+nutrient_limited = _ready(nutrients.nutrient_limited)
 
-READY: dict[str, Callable[..., Scene]] = {f.__name__: f for f in (microcolony, programmed_growth, channel)}
+READY: dict[str, Callable[..., Scene]] = {
+    f.__name__: f
+    for f in (
+        microcolony, programmed_growth, channel, quorum_sensing, boundary_detector, random_partition, repressilator, toggle_switch, nutrient_limited,
+    )
+}  # fmt: skip
 
 
 def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:

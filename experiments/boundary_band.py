@@ -1,0 +1,104 @@
+"""The band of Fig. 5: where it stands, how wide and how strong it is, what AiiA does to it, and what flow does.
+
+    python experiments/boundary_band.py                     # 8 seeds of 5,000 cells in 8 conditions, about half an hour on two cores
+    python experiments/boundary_band.py --cells 500 --seeds 2
+
+Each condition is one batch of colonies. For every colony the sink cells are put into strips along the channel by their distance from the border, which is
+the place with the fewest cells on the wrong side of it; the profile of mean YFP over these strips gives the band's peak, its place, its full
+width at half maximum, and its contrast: the peak over the mean of sinks far inside (farther than 40 µm from the border).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import torchfilm as tf
+
+STRIP = 4.0  # µm
+FAR = 40.0  # µm
+CONDITIONS = {
+    "as published": {},
+    "no AiiA": {"d3": 0.0},
+    "10 × AiiA": {"d3": 1e-2},
+    "100 × AiiA": {"d3": 1e-1},
+    "1000 × AiiA": {"d3": 1.0},
+    "10000 × AiiA": {"d3": 10.0},
+    "flow 2 µm/h": {"flow": 2.0},
+    "flow 10 µm/h": {"flow": 10.0},
+}
+
+
+def border(x: np.ndarray, sink: np.ndarray) -> float:
+    """The place along the channel with the fewest cells on the wrong side: sinks before it, sources after it. µm."""
+    order = np.argsort(x)
+    sinks = sink[order]
+    wrong = np.cumsum(sinks) + (~sinks).sum() - np.cumsum(~sinks)
+    return float(x[order][np.argmin(wrong)])
+
+
+def band(state: tf.State, place: int) -> dict[str, float]:
+    """What the band of one colony of the batch is like."""
+    mine = state.colony == place
+    x, yfp = state.position[mine, 0].numpy(), state.yfp[mine].double().numpy()
+    cfp, sink = state.cfp[mine].double().numpy(), (state.cell_type[mine] == 1).numpy()
+    at = x - border(x, sink)
+    strip = np.floor(at[sink] / STRIP).astype(int)
+    low = strip.min()
+    count = np.bincount(strip - low)
+    profile = np.bincount(strip - low, weights=yfp[sink]) / np.maximum(count, 1)
+    centres = (np.arange(len(count)) + low + 0.5) * STRIP
+    kept = count >= 5
+    profile, centres = profile[kept], centres[kept]
+    top = int(np.argmax(profile))
+    high = profile >= 0.5 * profile[top]
+    left, right = top, top
+    while left > 0 and high[left - 1]:
+        left -= 1
+    while right < len(high) - 1 and high[right + 1]:
+        right += 1
+    inside, sources = at[sink] > FAR, at[~sink] < -FAR
+    return {
+        "cells": float(mine.sum()), "place_um": float(centres[top]), "width_um": float(centres[right] - centres[left] + STRIP), "peak": float(profile[top]),
+        "contrast": float(profile[top] / yfp[sink][inside].mean()) if inside.any() else float("nan"),
+        "cfp_inside": float(cfp[~sink][sources].mean()) if sources.any() else float("nan"),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=5000)
+    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--only", nargs="*", choices=list(CONDITIONS), default=list(CONDITIONS))
+    parser.add_argument("--out", type=Path, default=Path("boundary_band.json"))
+    parser.add_argument("--record", type=Path, help="folder for results files, one a condition")
+    options = parser.parse_args()
+    tf.keep_memory()
+    found = json.loads(options.out.read_text()) if options.out.exists() else {}
+    print(f"{'condition':<14} {'cells':>6} {'place µm':>14} {'width µm':>14} {'YFP peak':>20} {'contrast':>16} {'seconds':>8}")
+    for name in options.only:
+        scene = tf.scenes.boundary_detector(**CONDITIONS[name])
+        record = None if options.record is None else tf.Recorder(options.record / f"{name.replace(' ', '_')}.h5", scene, every=40, overwrite=True)
+        begun = time.perf_counter()
+        for state in tf.simulate(scene, scene.seed(options.seeds, seed=0), cells=options.cells, record=record):
+            pass
+        bands = [band(state, k) for k in range(options.seeds)]
+        row = {key: [b[key] for b in bands] for key in bands[0]}
+        found[name] = row | {"seconds": time.perf_counter() - begun, "time_h": state.time}
+        options.out.write_text(json.dumps(found, indent=1))
+        shown = {k: f"{np.mean(v):.4g} ± {np.std(v):.2g}" for k, v in row.items()}
+        print(
+            f"{name:<14} {np.mean(row['cells']):6.0f} {shown['place_um']:>14} {shown['width_um']:>14} {shown['peak']:>20} {shown['contrast']:>16} "
+            f"{found[name]['seconds']:8.1f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    torch.set_grad_enabled(False)
+    main()

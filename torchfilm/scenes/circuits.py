@@ -1,0 +1,83 @@
+"""Cells that compute on their own: random partition, an oscillator and a switch, molecule by molecule."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchfilm.circuits import parts
+from torchfilm.circuits.reactions import Reaction
+from torchfilm.effect import Uniform
+from torchfilm.effects.circuit import Circuit
+from torchfilm.effects.division import Division
+from torchfilm.effects.growth import Growth
+from torchfilm.effects.mechanics import Mechanics
+from torchfilm.effects.rules import DivisionView, Rules
+from torchfilm.scene import Scene
+
+Value = float | Tensor
+
+
+def _nothing(u, s, p, cell):
+    return {}
+
+
+def _share_out(parent: DivisionView, daughter1: DivisionView, daughter2: DivisionView) -> None:
+    """The paper's `divide`: what the parent had is shared at random, and none is lost."""
+    amount, share = parent.plasmid * parent.volume, parent.random()
+    daughter1.plasmid = amount * share / daughter1.volume
+    daughter2.plasmid = amount * (1 - share) / daughter2.volume
+
+
+def random_partition(rate: float = 1.0, start: float = 1.0) -> Scene:
+    """A species that nothing makes or destroys, shared between daughters in random parts (the paper's `divide` example): its amount stays, cells differ ever more."""
+    return Scene(
+        Rules(divide=_share_out), Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2),
+        Circuit(_nothing, species=("plasmid",), initial={"plasmid": start}),
+    )  # fmt: skip
+
+
+def repressilator(
+    alpha: Value = 216.0, basal: Value = 0.216, beta: Value = 5.0, power: float = 2.0, speed: Value = 3.0, copies: float = 5.0, noise: bool = True,
+    rate: float = 0.7,
+) -> Scene:  # fmt: skip
+    """Three genes that repress each other in a ring (Elowitz and Leibler 2000), in a growing colony: cells of one descent drift out of step.
+
+    alpha, basal, beta, power: the dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ − pᵢ); speed: its unit of time is 1/speed h, the mRNA's
+    lifetime. noise: molecule by molecule (tau-leaping), with `copies` of them in a unit of concentration × µm³; else smoothly.
+    """
+    names = ("laci", "tetr", "ci")
+    reactions = []
+    for name, by in zip(names, ("ci", "laci", "tetr"), strict=True):
+        message = f"m_{name}"
+        reactions += [
+            parts.repressed(message, by, rate="production", half=1.0, power=power), parts.constitutive(message, rate="leak"), parts.degradation(message, rate="speed"),
+            [Reaction({message: 1}, {message: 1, name: 1}, "turnover", f"{name} translated")], parts.degradation(name, rate="turnover"),
+        ]  # fmt: skip
+    return Scene(
+        Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2),
+        Circuit(
+            reactions, species=(*names, *(f"m_{n}" for n in names)), method="tau_leap" if noise else "rosenbrock", copies=copies,
+            initial={"laci": 20.0, "m_laci": 20.0}, production=alpha * speed, leak=basal * speed, speed=speed, turnover=beta * speed,
+        ),
+    )  # fmt: skip
+
+
+def toggle_switch(
+    strength: Value = 10.0, power: float = 2.0, speed: Value = 4.0, start: float = 2.0, copies: float = 4.0, noise: bool = True, rate: float = 0.7,
+) -> Scene:  # fmt: skip
+    """Two genes that repress each other (Gardner et al. 2000): cells near the tipping point fall to one side or the other, and their descendants stay there,
+    so that the colony forms sectors.
+
+    x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y = `start`. noise: molecule by molecule, with `copies` of them in a unit of
+    concentration × µm³. Growth dilutes beside the decay.
+    """
+    reactions = []
+    for name, by in (("red", "green"), ("green", "red")):
+        reactions += [parts.repressed(name, by, rate="production", half=1.0, power=power), parts.degradation(name, rate="speed")]
+    return Scene(
+        Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2),
+        Circuit(
+            reactions, species=("red", "green"), method="tau_leap" if noise else "rosenbrock", copies=copies,
+            initial={"red": start, "green": start}, production=strength * speed, speed=speed,
+        ),
+    )  # fmt: skip
