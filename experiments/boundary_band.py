@@ -85,7 +85,8 @@ def main() -> None:
         scene = tf.scenes.boundary_detector(**CONDITIONS[name])
         record = None if options.record is None else tf.Recorder(options.record / f"{name.replace(' ', '_')}.h5", scene, every=40, overwrite=True)
         begun = time.perf_counter()
-        for state in tf.simulate(scene, scene.seed(options.seeds, seed=0), cells=options.cells, record=record):
+        state = scene.seed(options.seeds, seed=0)
+        for state in tf.simulate(scene, state, cells=options.cells, record=record):  # noqa: B007
             pass
         bands = [band(state, k) for k in range(options.seeds)]
         row = {key: [b[key] for b in bands] for key in bands[0]}

@@ -26,6 +26,112 @@ def test_show(command, capsys):
     assert Path("side.png").read_bytes() != Path("a.png").read_bytes()
 
 
+SIGNAL = """
+import torchfilm as tf
+
+def shine(cells):
+    cells.yfp = 0 * cells.yfp + cells.time
+
+scene = tf.Scene(
+    tf.Rules(shine, variables={"yfp": 0.0, "cfp": 1.0}), tf.Growth(rate=1.0), tf.Mechanics(dim=2),
+    tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=1.0), box=((-16, -8, -4), (16, 8, 4)), spacing=4.0), dt=0.1,
+)
+"""
+
+
+@pytest.fixture
+def shining(command, capsys):
+    """Two colonies with something to show: three frames of yfp, cfp and ahl."""
+    Path("mine.py").write_text(SIGNAL)
+    command("run", "mine.py", "--colonies", 2, "--until", 0.6, "--every", 3, "--out", "a.h5", "--no-picture")
+    capsys.readouterr()
+
+
+def asked(monkeypatch, name: str) -> list[dict]:
+    """What the command asks of a function of `torchfilm.pictures`, in place of drawing it."""
+    seen: list[dict] = []
+
+    def note(path, out=None, **options):
+        seen.append({"out": out, **options})
+        return out
+
+    monkeypatch.setattr(tf.pictures, name, note)
+    return seen
+
+
+def test_show_passes_on_what_is_asked(command, shining, monkeypatch):
+    seen = asked(monkeypatch, "show")
+    command("show", "a.h5", "--channels", "cfp=cyan", "yfp=#ffff00", "--background", "ahl", "--limits", "yfp=0:2", "out.ahl=1e-3:0.5", "--section", "-2.5",
+            "--whole", "--colonies", 1, "--frame", 1)  # fmt: skip
+    assert seen == [{
+        "out": Path("a.png"), "frame": 1, "colour": None, "channels": {"cfp": "cyan", "yfp": "#ffff00"}, "background": "ahl",
+        "limits": {"yfp": (0.0, 2.0), "out.ahl": (1e-3, 0.5)}, "view": "xy", "section": -2.5, "whole": True, "colonies": [1],
+    }]  # fmt: skip
+    command("show", "a.h5")
+    assert seen[1] == {
+        "out": Path("a.png"), "frame": -1, "colour": None, "channels": None, "background": None, "limits": {}, "view": "xy", "section": "cells",
+        "whole": False, "colonies": None,
+    }  # fmt: skip
+
+
+def test_strips_and_films_pass_on_what_is_asked(command, shining, monkeypatch):
+    strips, films = asked(monkeypatch, "strip"), asked(monkeypatch, "movie")
+    look = ["--colour", "yfp", "--background", "ahl", "--limits", "yfp=0:2", "--section", "mean", "--colonies", 0, 1]
+    wanted = {
+        "colour": "yfp", "channels": None, "background": "ahl", "limits": {"yfp": (0.0, 2.0)}, "view": "xy", "section": "mean", "whole": False,
+        "colonies": [0, 1],
+    }  # fmt: skip
+    command("show", "a.h5", "--strip", 3, *look)
+    command("show", "a.h5", "--times", 0.1, 0.5, "--out", "b.png", *look)
+    command("show", "a.h5", "--movie", "b.gif", "--fps", 4, *look)
+    assert strips == [{"out": Path("a_strip.png"), "frames": 3, "times": None, **wanted}, {"out": Path("b.png"), "frames": None, "times": [0.1, 0.5], **wanted}]
+    assert films == [{"out": Path("b.gif"), "fps": 4.0, **wanted}]
+
+
+def test_pictures_strips_and_films_are_drawn(command, shining, capsys):
+    command("show", "a.h5", "--channels", "cfp=blue", "yfp=red", "--background", "ahl")
+    command("show", "a.h5", "--colour", "yfp", "--strip", 2)
+    command("show", "a.h5", "--colour", "yfp", "--movie", "a.gif")
+    assert capsys.readouterr().out.split() == ["a.png", "a_strip.png", "a.gif"]
+    assert drawn("a.png") > 0.01 and drawn("a_strip.png") > 0.005 and Path("a.gif").read_bytes().startswith(b"GIF89a")
+
+
+@pytest.mark.parametrize(
+    "line, message",
+    [
+        ("--limits yfp=2", r"--limits = 'yfp=2'.*LOW:HIGH"),
+        ("--limits yfp=0:1:2", r"--limits.*LOW:HIGH"),
+        ("--limits yfp", r"--limits = 'yfp'"),
+        ("--channels cfp", r"--channels = 'cfp'.*NAME=COLOUR"),
+        ("--channels cfp=cian", r"'cian'"),
+        ("--colour yfp --channels cfp=cyan", r"colour and channels"),
+        ("--background food", r"background = 'food'.*ahl"),
+        ("--section middle --background ahl", r"section = 'middle'"),
+        ("--strip 2 --movie b.gif", r"--strip or --times, --movie: give one of them"),
+        ("--strip 2 --frame 0", r"--frame, --strip or --times: give one of them"),
+        ("--strip 2 --times 0.1", r"times and frames"),
+        ("--movie b.gif --out b.png", r"--movie, --out: give one of them"),
+        ("--movie b.avi", r"\.mp4 or \.gif"),
+        ("--times 9", r"times = 9\.0.*0 to 0\.6 h"),
+        ("--colonies 5", r"colonies = \[5\]"),
+    ],
+)
+def test_show_tells_what_it_cannot_draw(command, shining, line, message):
+    with pytest.raises(SystemExit, match=message):
+        command("show", "a.h5", *line.split())
+    assert {p.name for p in Path().iterdir()} <= {"a.h5", "mine.py", "__pycache__"}
+
+
+@pytest.mark.parametrize("line, name", [("--strip 2", "a_strip.png"), ("--strip 2 --out b.png", "b.png"), ("--movie b.gif", "b.gif")])
+def test_strips_and_films_replace_nothing_unasked(command, shining, line, name):
+    Path(name).write_text("my holidays")
+    with pytest.raises(SystemExit, match=rf"{name}.*no file yet.*--overwrite"):
+        command("show", "a.h5", *line.split())
+    assert Path(name).read_text() == "my holidays"
+    command("show", "a.h5", *line.split(), "--overwrite")
+    assert Path(name).read_bytes()[:4] in (b"\x89PNG", b"GIF8")
+
+
 @pytest.mark.parametrize("name", ["microcolony", "programmed_growth", "channel"])
 def test_info_of_a_ready_scene_says_who_drives_whom(command, capsys, name):
     command("info", name)

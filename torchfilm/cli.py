@@ -19,6 +19,7 @@ import torch
 from torchfilm import measure, pictures, scenes
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.rules import Rules
+from torchfilm.pictures import words
 from torchfilm.recorder import Recorder
 from torchfilm.results import Results
 from torchfilm.scene import Scene
@@ -130,26 +131,70 @@ class Resume:
 
 @dataclass
 class Show:
-    """Draw a frame of a results file."""
+    """Draw a frame of a results file, a strip of several, or a film of all."""
 
     file: Annotated[Path, tyro.conf.Positional]
     """Results file; it may still be growing."""
     frame: int = -1
     """Which frame; -1 is the last."""
-    colour: str = "angle"
-    """What colours the cells: angle, growth_rate, cell_type, length, or any other quantity per cell."""
+    strip: int | None = None
+    """Draw this many times side by side, evenly spaced from first to last."""
+    times: list[float] = field(default_factory=list)
+    """Draw these times side by side, h."""
+    movie: Path | None = None
+    """Film the run: a new file that ends in .mp4 or .gif."""
+    fps: float = 10.0
+    """Frames a second of a film."""
+    colour: str | None = None
+    """What colours the cells: angle (the default), growth_rate, cell_type, length, yfp, or any other quantity per cell."""
+    channels: list[str] = field(default_factory=list)
+    """Instead: several quantities, each with the colour of its light, as NAME=COLOUR, such as --channels cfp=cyan yfp=yellow."""
+    background: str | None = None
+    """A signal to draw behind the cells, white lowest and black highest."""
+    limits: list[str] = field(default_factory=list)
+    """Ranges of colours, as NAME=LOW:HIGH, such as --limits yfp=0:2."""
     view: str = "xy"
     """xy, xz or yz."""
+    section: str = "cells"
+    """Where a signal is seen along the line of sight: at the cells, its mean, or at a coordinate, µm."""
+    whole: bool = False
+    """Show the whole box of the medium."""
+    colonies: list[int] = field(default_factory=list)
+    """Which colonies, by their ids; by default all up to 36 (4 in a strip, 9 in a film)."""
     out: Path | None = None
     """The picture, a new file unless --overwrite is given; by default the run's own, the results file's name with .png, which is drawn anew."""
     overwrite: bool = False
-    """Replace the file given with --out if it exists."""
+    """Replace the file given with --out or --movie, or the strip beside the results, if it exists."""
 
     def __call__(self) -> None:
-        if self.out is not None:
-            check_new("--out", self.out, self.overwrite, "Choose another, or replace it with --overwrite.")
-        target = own_picture(self.file, self.out)
-        print(pictures.show(self.file, frame=self.frame, colour=self.colour, view=self.view, out=target))
+        many = self.strip is not None or bool(self.times)
+        chosen = {"--frame": self.frame != -1, "--strip or --times": many, "--movie": self.movie is not None}
+        if sum(chosen.values()) > 1 or (self.movie is not None and self.out is not None):
+            raise InputError(f"{', '.join(n for n, given in {**chosen, '--out': self.movie and self.out}.items() if given)}: give one of them.")
+        # what is not the run's own picture replaces nothing unasked
+        out = self.movie or self.out or (self.file.with_name(self.file.stem + "_strip.png") if many else None)
+        target = own_picture(self.file, out)
+        if out is not None:
+            check_new("--movie" if self.movie else "--out", out, self.overwrite, "Choose another, or replace it with --overwrite.")
+        print(self._draw(target, many))
+
+    def _draw(self, out: Path, many: bool) -> Path:
+        channels, limits, section = words.channels_of(self.channels), words.limits_of(self.limits), words.section_of(self.section)
+        colonies = self.colonies or None
+        if self.movie is not None:
+            return pictures.movie(
+                self.file, out, fps=self.fps, colour=self.colour, channels=channels, background=self.background, limits=limits, view=self.view,
+                section=section, whole=self.whole, colonies=colonies,
+            )  # fmt: skip
+        if many:
+            return pictures.strip(
+                self.file, frames=self.strip, times=self.times or None, colour=self.colour, channels=channels, background=self.background, limits=limits,
+                view=self.view, section=section, whole=self.whole, colonies=colonies, out=out,
+            )  # fmt: skip
+        return pictures.show(
+            self.file, frame=self.frame, colour=self.colour, channels=channels, background=self.background, limits=limits, view=self.view,
+            section=section, whole=self.whole, colonies=colonies, out=out,
+        )  # fmt: skip
 
 
 @dataclass

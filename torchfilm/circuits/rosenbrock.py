@@ -14,13 +14,10 @@ where a rate of 1e8/h balances another, 2/h would be lost in a float32 W and the
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 
 import torch
-import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from torchfilm.circuits import linear
@@ -73,43 +70,42 @@ def rosenbrock(
         none = torch.zeros(cells, dtype=torch.int64, device=u.device)
         return u.clone(), Report(none, none, none)
     scale = torch.as_tensor(atol, dtype=torch.float64, device=u.device).reshape(-1, 1)
-    method = _Method(rates, u.dtype, max(rtol, 4 * torch.finfo(u.dtype).eps), scale, nonnegative)
+    one = torch.zeros(1, dtype=torch.int64, device=u.device)
+    tracked = torch.is_grad_enabled() and (u.requires_grad or rates(u.index_select(0, one), one).requires_grad)
+    method = _Method(rates, u.dtype, max(rtol, 4 * torch.finfo(u.dtype).eps), scale, nonnegative, tracked)
     first = whole if first_step is None else whole.clamp(max=first_step)
     at, report = _advance(method, start, whole, first, max_steps)
     return at.t().to(u.dtype), report
 
 
-@cache
-def _prepare_forward_mode() -> None:
-    """Torch compiles its forward derivatives on their first use, by a function that it calls deprecated itself."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        with forward_ad.dual_level():
-            forward_ad.make_dual(torch.ones(1), torch.ones(1)).exp()
-
-
 class _Method:
-    """One step of the method for some cells; arrays are (S, M) in float64, species first."""
+    """One step of the method for some cells; arrays are (S, M) in float64, species first. tracked: whether a gradient is wanted."""
 
-    def __init__(self, rates: Rates, dtype: torch.dtype, rtol: float, atol: Tensor, nonnegative: bool):
-        self.rates, self.dtype, self.rtol, self.atol, self.nonnegative = rates, dtype, rtol, atol, nonnegative
+    def __init__(self, rates: Rates, dtype: torch.dtype, rtol: float, atol: Tensor, nonnegative: bool, tracked: bool):
+        self.rates, self.dtype, self.rtol, self.atol, self.nonnegative, self.tracked = rates, dtype, rtol, atol, nonnegative, tracked
 
     def evaluate(self, u: Tensor, rows: Tensor) -> Tensor:
         return self.rates(u.to(self.dtype).t(), rows).t().to(torch.float64)
 
     def linearise(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ: one forward-mode call on S copies of the cells, the k-th with species k as its direction."""
-        _prepare_forward_mode()
+        """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ: one backward pass over S copies of the cells, of the i-th of which only rate i is asked.
+
+        Forward derivatives would need no second pass, but where one factor of a product is constant torch works them out in Python, at five times the cost.
+        """
         size, count = u.shape
-        copies = u.to(self.dtype).repeat(1, size)
-        directions = torch.eye(size, dtype=self.dtype, device=u.device).unsqueeze(2).expand(size, size, count).reshape(size, size * count)
-        with forward_ad.dual_level():
-            out = self.rates(forward_ad.make_dual(copies.t(), directions.t()), rows.repeat(size))
-            value, slope = forward_ad.unpack_dual(out)
-        f = value[:count].t().to(torch.float64)
+        with torch.enable_grad():
+            copies = u.to(self.dtype).repeat(1, size)
+            copies = copies if self.tracked and copies.requires_grad else copies.detach().requires_grad_()
+            out = self.rates(copies.t(), rows.repeat(size))
+            f = out[:count].t().to(torch.float64)
+            f = f if self.tracked else f.detach()
+            if not out.requires_grad:
+                return f, u.new_zeros(size, size, count)
+            own = torch.diagonal(out.view(size, count, size), dim1=0, dim2=2)
+            (slope,) = torch.autograd.grad(own.sum(), copies, create_graph=self.tracked, allow_unused=True)
         if slope is None:
             return f, u.new_zeros(size, size, count)
-        jacobian = slope.t().to(torch.float64).reshape(size, size, count)
+        jacobian = slope.view(size, size, count).transpose(0, 1).to(torch.float64)
         if not bool(torch.isfinite(jacobian.sum())):
             # the slope of a root at 0 is infinite; any finite one will do, only the error grows, and that is watched
             jacobian = torch.nan_to_num(jacobian, 0.0, 0.0, 0.0)

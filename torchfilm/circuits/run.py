@@ -17,7 +17,7 @@ from torch import Tensor
 from torchfilm.circuits import integrators, rosenbrock, stochastic
 from torchfilm.circuits.columns import Columns, column
 from torchfilm.circuits.draws import Draw
-from torchfilm.circuits.names import Names, unknown
+from torchfilm.circuits.names import Names, UnknownName, unknown
 from torchfilm.circuits.network import Network
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
@@ -205,8 +205,8 @@ def _molecules(circuit: Circuit, concentrations: Tensor, dt: float, settings: Se
 MOLECULES = 100
 
 
-def words(circuit: Circuit, outcome: Outcome, concentrations: Tensor, k: int, method: str) -> str:
-    """What went wrong in the k-th of the M cells."""
+def words(circuit: Circuit, outcome: Outcome, concentrations: Tensor, k: int, method: str, dt: float) -> str:
+    """What went wrong in the k-th of the M cells, from concentrations (M, S) on."""
     code = int(outcome.code[k])
     if method in ("tau_leap", "direct"):
         assert isinstance(circuit.part, Network)
@@ -214,21 +214,33 @@ def words(circuit: Circuit, outcome: Outcome, concentrations: Tensor, k: int, me
             reaction = circuit.part.reactions[code - MOLECULES]
             return f"the reaction {reaction.name or str(reaction)!r} has a {stochastic.STATUS[stochastic.BAD_PROPENSITY].removeprefix('a ')}"
         return stochastic.STATUS[code]
-    said = rosenbrock.STATUS[code]
-    if code == rosenbrock.NOT_FINITE:
-        one = torch.tensor([k], device=concentrations.device)
-        start = circuit.start(concentrations).index_select(0, torch.arange(concentrations.shape[0], device=one.device)).index_select(0, one)
-        inside, outside = circuit.changes(start, circuit.rows.index_select(0, one))
-        bad = [f"the species {n!r}" for n, x in inside.items() if not bool(torch.isfinite(x).all())]
-        bad += [f"the signal {n!r}" for n, x in outside.items() if not bool(torch.isfinite(x).all())]
-        at = ", ".join(f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True))
-        said = f"the rate of {' and '.join(bad) or 'a species, on the way,'} is not a finite number, at {at}"
-    return said
+    bad = _not_finite(circuit, concentrations, k, dt)
+    if code != rosenbrock.NOT_FINITE and not bad:
+        return rosenbrock.STATUS[code]
+    at = ", ".join(f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True))
+    return f"the rate of {' and '.join(bad) or 'a species, on the way,'} is not a finite number, at {at}" + (" or soon after" if bad else "")
+
+
+@torch.no_grad()
+def _not_finite(circuit: Circuit, concentrations: Tensor, k: int, dt: float) -> list[str]:
+    """The species and signals whose rates in the k-th cell are not finite, at the start of the step or ahead of it: a careful method stops short of there."""
+    one = torch.tensor([k], device=concentrations.device)
+    start, rows = circuit.start(concentrations).index_select(0, one), circuit.rows.index_select(0, one)
+    slope = torch.nan_to_num(circuit.rates(start, one))
+    for share in (0.0, 0.01, 0.1, 0.5, 1.0):
+        inside, outside = circuit.changes((start + share * dt * slope).clamp(min=0.0), rows)
+        bad = [f"the {what} {n!r}" for what, found in (("species", inside), ("signal", outside)) for n, x in found.items() if not bool(torch.isfinite(x).all())]
+        if bad:
+            return bad
+    return []
 
 
 def trial(circuit: Circuit, concentrations: Tensor) -> tuple[str, ...]:
     """Try the circuit once at concentrations (M, S): raise InputError for what it returns wrongly; the signals that it exchanges."""
-    inside, outside = circuit.changes(concentrations, circuit.rows)
+    try:
+        inside, outside = circuit.changes(concentrations, circuit.rows)
+    except UnknownName as error:
+        raise UnknownName(f"{circuit.label}: {error}") from error
     for what, found in (("species", inside), ("signal", outside)):
         for name, value in found.items():
             if not bool(torch.isfinite(value.detach()).all()):

@@ -209,7 +209,7 @@ class _Leap:
         open_ = torch.arange(rows.numel(), device=rows.device)
         for trial in range(MOST_HALVINGS):
             pick = lambda v: v.index_select(-1, open_)  # noqa: B023, E731
-            far = torch.minimum(pick(longest) * 0.5**trial, pick(left))
+            far = torch.minimum(pick(longest), pick(left)) * 0.5**trial
             wait = pick(until_rare)
             fires = wait < far
             time = torch.minimum(far, wait)

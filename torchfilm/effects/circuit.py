@@ -45,6 +45,18 @@ class CircuitReport:
         return self.words[place]
 
 
+class Noted:
+    """What a circuit has found out about itself when it was tried: names that it reads, and by cell type the signals it gives and its network.
+
+    A plain class: whatever looks for the parameters of an effect shall not find any here.
+    """
+
+    def __init__(self) -> None:
+        self.reads: tuple[str, ...] = ()
+        self.given: dict[int, tuple[str, ...]] = {}
+        self.networks: dict[int, Any] = {}
+
+
 @dataclass(frozen=True, init=False, eq=False)
 class Circuit(Effect):
     """Species in every cell and how they change: `Circuit(lux, species=("luxi", "ahl"), k1=1.0, …)`.
@@ -71,7 +83,7 @@ class Circuit(Effect):
     atol: float = 1e-9
     copies: float | Tensor = 1.0
     parameters: Mapping[str, float | Tensor] = field(default_factory=dict)
-    noted: dict[str, Any] = field(default_factory=dict, repr=False)
+    noted: Noted = field(default_factory=Noted, repr=False)
 
     stage = CIRCUIT
     title = "circuit"
@@ -121,7 +133,7 @@ class Circuit(Effect):
             "rtol": checks.number("Circuit.rtol", rtol, above=0.0, most=0.1), "atol": checks.number("Circuit.atol", atol, above=0.0),
             "copies": checks.value("Circuit.copies", copies, above=0.0),
             "parameters": {n: checks.value(f"Circuit.{n}", v) for n, v in parameters.items()},
-            "noted": {"reads": (), "given": {}, "networks": {}},
+            "noted": Noted(),
         }  # fmt: skip
         for name, value in given.items():
             object.__setattr__(self, name, value)
@@ -141,7 +153,7 @@ class Circuit(Effect):
         if not state.births:
             return draw(f"Circuit.{name}", self.initial.get(name, 0.0), state, rows)
         births = state.births[-1]
-        amount = births.parents.fields[name] * births.parents.volume
+        amount = births.parents.fields[name] * births.parents.circuit_volume
         volumes = [state.volume.index_select(0, r) for r in (births.first, births.second)]
         share = volumes[0] / (volumes[0] + volumes[1])
         if not self.is_stochastic:
@@ -154,8 +166,8 @@ class Circuit(Effect):
     def prepare(self, state: State) -> State:
         """The networks put together, each rate function tried on a few cells, and what is read and given noted."""
         signals = tuple(state.signals)
-        self.noted["networks"] = {kind: network(part, self.species, signals) for kind, part in self.rates.items() if not callable(part)}
-        for made in self.noted["networks"].values():
+        self.noted.networks = {kind: network(part, self.species, signals) for kind, part in self.rates.items() if not callable(part)}
+        for made in self.noted.networks.values():
             for name in made.parameters:
                 if name not in self.parameters:
                     raise checks.InputError(unknown(f"a reaction needs the parameter {name!r}, which Circuit was not given", name, list(self.parameters)))
@@ -172,11 +184,11 @@ class Circuit(Effect):
             outside = {n: state.fields[OUTSIDE + n].new_zeros(state.cells) for n in signals}
             tried = self._circuit(state, rows, kind, (), outside, seen=seen)
             given[kind] = run.trial(tried, self._concentrations(state, rows))
-        self.noted["given"] = given
+        self.noted.given = given
         geometry = {g for n in seen["cell"] for g in GEOMETRY.get(n, (n,) if n in state.fields else ())}
         if seen["s"] or any(given.values()):
             geometry.add("position")
-        self.noted["reads"] = tuple(sorted({*geometry, *(OUTSIDE + n for n in seen["s"]), *(OUTSIDE + n for g in given.values() for n in g)}))
+        self.noted.reads = tuple(sorted({*geometry, *(OUTSIDE + n for n in seen["s"]), *(OUTSIDE + n for g in given.values() for n in g)}))
         return state
 
     def _whole(self, state: State) -> State:
@@ -187,10 +199,10 @@ class Circuit(Effect):
         return state.with_fields(**found)
 
     def reads(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys((*self.species, "length", "radius", *self.noted["reads"])))
+        return tuple(dict.fromkeys((*self.species, "length", "radius", *self.noted.reads)))
 
     def writes(self) -> tuple[str, ...]:
-        return (*self.species, *dict.fromkeys(OUTSIDE + n for g in self.noted["given"].values() for n in g))
+        return (*self.species, *dict.fromkeys(OUTSIDE + n for g in self.noted.given.values() for n in g))
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
@@ -208,11 +220,11 @@ class Circuit(Effect):
             rows = _cells_of(state, kind)
             if rows.numel() == 0:
                 continue
-            circuit = self._circuit(state, rows, kind, self.noted["given"][kind], outside, medium)
+            circuit = self._circuit(state, rows, kind, self.noted.given[kind], outside, medium)
             concentrations = self._concentrations(state, rows)
             draws = None if keys is None else lambda mine, event, what, count, rows=rows: keys(rows.index_select(0, mine), event, what, count)
             found = run.step(circuit, concentrations, dt, settings, draws)
-            report.note(circuit, found, concentrations, self.method)
+            report.note(circuit, found, concentrations, self.method, dt)
             for name, value in zip(self.species, found.concentrations.unbind(1), strict=True):
                 changed[name] = value if rows.numel() == state.cells else changed[name].index_copy(0, rows, value)
             if medium is not None:
@@ -231,7 +243,7 @@ class Circuit(Effect):
         seen: dict[str, set[str]] | None = None,
     ) -> run.Circuit:  # fmt: skip
         """The circuit of one type of cell as it stands in this state."""
-        part = self.noted["networks"].get(kind, self.rates[kind])
+        part = self.noted.networks.get(kind, self.rates[kind])
         label = getattr(part, "__name__", "the list of reactions") + ("" if kind == EVERY else f" (cell type {kind})")
         pool, beyond = (None, None) if medium is None else (medium.pool, medium.beyond)
         if isinstance(part, run.Network):
@@ -292,7 +304,7 @@ class _Notes:
         self.steps = torch.zeros(state.cells, dtype=torch.int64, device=state.device)
         self.words: dict[int, str] = {}
 
-    def note(self, circuit: run.Circuit, found: run.Outcome, concentrations: Tensor, method: str) -> None:
+    def note(self, circuit: run.Circuit, found: run.Outcome, concentrations: Tensor, method: str, dt: float) -> None:
         state = self.state
         self.steps = self.steps.index_copy(0, circuit.rows, found.steps)
         if not bool(found.failed.any()):
@@ -302,7 +314,7 @@ class _Notes:
         for place in sorted(set(owner)):
             mine = [k for k, o in zip(at.tolist(), owner, strict=True) if o == place]
             row = int(circuit.rows[mine[0]])
-            said = run.words(circuit, found, concentrations, mine[0], method)
+            said = run.words(circuit, found, concentrations, mine[0], method, dt)
             kind = f" (type {int(state.fields['cell_type'][row])})" if "cell_type" in state.fields else ""
             self.words[place] = f"circuit of cell {int(state.uid[row])}{kind}: {said}" + (f"; and {len(mine) - 1} more cell(s)" if len(mine) > 1 else "")
             self.status[place] = 1

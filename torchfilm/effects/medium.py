@@ -72,10 +72,10 @@ class Medium(Effect):
     a 2-D scene may lie in a box with three: in the plane z = `height`. spacing: of voxels, µm, one number or one an axis.
     faces: of the box; without, nothing passes them. flow: velocity of the medium, µm/h: two or three numbers (or one per colony each), or a function from
     places (M, 3) µm to velocities (M, 3). obstacles: a function from places (M, 3) to (M,) bool, true where there is none of the medium.
-    beyond: what cells beyond the box mean: "error"; "grow": the box grows with its colony, along the axes that `grows` names; "open": the box stands in a reservoir in which each
-    signal is at its `beyond`, and what cells give to it and take from it is kept count of in the fields NAME_beyond.
+    beyond: what cells beyond the box mean: "error"; "grow": the box grows with its colony, along the axes that `grows` names; "open": the box stands
+    in a reservoir in which each signal is at its `beyond`, and what cells give to it and take from it is kept count of in the fields NAME_beyond.
     method: "exponential" (exact, where the box is all medium and the flow uniform), "implicit" (positive at any step; elsewhere), "crank_nicolson" (the
-    paper's) or "euler"; by default the first of them that the scene allows.
+    paper's) or "euler"; by default the first of them that the scene allows. steps: of transport within one of the scene's, for accuracy.
     """
 
     signals: Mapping[str, Signal]
@@ -83,12 +83,13 @@ class Medium(Effect):
     spacing: tuple[float, ...]
     depth: float | None = None
     height: float = 0.0
-    faces: Faces = Faces()
+    faces: Faces = field(default_factory=Faces)
     flow: Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None = None
     obstacles: Callable[[Tensor], Tensor] | None = None
     beyond: str = "error"
     grows: str = "xyz"
     method: str | None = None
+    steps: int = 1
 
     stage = TRANSPORT
     title = "transport"
@@ -106,6 +107,7 @@ class Medium(Effect):
         beyond: str = "error",
         grows: str = "xyz",
         method: str | None = None,
+        steps: int = 1,
         **signals: Signal,
     ):
         if not signals:
@@ -119,10 +121,10 @@ class Medium(Effect):
             raise checks.refuse("Medium.box", box, "two corners, such as ((-64, -64), (64, 64))") from error
         if len(low) != len(high) or len(low) not in (2, 3) or not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True)):
             raise checks.refuse("Medium.box", (low, high), "two corners of 2 or 3 finite numbers, the first below the second along every axis")
-        steps = checks.vector("Medium.spacing", (spacing,) * len(low) if isinstance(spacing, (int, float)) else spacing, len(low))
-        if min(steps) <= 0:
+        voxel = checks.vector("Medium.spacing", (spacing,) * len(low) if isinstance(spacing, (int, float)) else spacing, len(low))
+        if min(voxel) <= 0:
             raise checks.refuse("Medium.spacing", spacing, "above 0")
-        for letter, a, b, h in zip("xyz", low, high, steps, strict=False):
+        for letter, a, b, h in zip("xyz", low, high, voxel, strict=False):
             count = (b - a) / h
             if abs(count - round(count)) > 1e-6:
                 whole = max(1, round(count)) * h
@@ -141,12 +143,15 @@ class Medium(Effect):
             raise checks.refuse("Medium.grows", grows, 'some of the letters x, y and z, such as "x"')
         if method is not None:
             checks.choice("Medium.method", method, tuple(METHODS))
+        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+            raise checks.refuse("Medium.steps", steps, "a whole number from 1")
         for name, value in (("obstacles", obstacles), ("flow", None if isinstance(flow, (tuple, list, Tensor)) else flow)):
             if value is not None and not callable(value):
                 raise checks.refuse(f"Medium.{name}", value, "a function of places" + (", or two or three numbers" if name == "flow" else ""))
         given = {
-            "signals": dict(signals), "box": (low, high), "spacing": steps, "depth": depth, "height": float(height),
-            "faces": faces if faces is not None else Faces(), "flow": _flow(flow), "obstacles": obstacles, "beyond": beyond, "grows": grows, "method": method,
+            "signals": dict(signals), "box": (low, high), "spacing": voxel, "depth": depth, "height": float(height),
+            "faces": faces if faces is not None else Faces(), "flow": _flow(flow), "obstacles": obstacles,
+            "beyond": beyond, "grows": grows, "method": method, "steps": steps,
         }  # fmt: skip
         for name, value in given.items():
             object.__setattr__(self, name, value)
@@ -227,18 +232,26 @@ class Medium(Effect):
         changed = {}
         for name in self.signals:
             values = state.fields[OUTSIDE + name]
-            parts = [self._stepper(name, state, batch, dt).step(batch.of(values)) for batch in grid.batches]
+            parts = [batch.of(values) for batch in grid.batches]
+            for k, batch in enumerate(grid.batches):
+                stepper = self._stepper(name, state, batch, dt / self.steps)
+                for _ in range(self.steps):
+                    parts[k] = stepper.step(parts[k])
             changed[OUTSIDE + name] = grid.join(parts)
         return state.with_fields(**changed)
 
     def _stepper(self, name: str, state: State, batch: Batch, dt: float) -> Stepper:
         """The step of a signal on the grids of one shape, made once for as long as they stay."""
         assert state.layout is not None
-        key = (self, name, batch.shape, dt, state.dtype)
+        numbers = [p for p in self._numbers(name) if isinstance(p, Tensor)]
+        if torch.is_grad_enabled() and any(p.requires_grad for p in numbers):
+            return self._prepare(name, state, batch, dt)[0]
+        # a number that was changed in place, as an optimiser does, asks for a new one
+        key = (self, name, batch.shape, dt, state.dtype, torch.is_grad_enabled(), *(0 if p.is_inference() else p._version for p in numbers))
         found = state.layout.work.get(key)
         if found is None:
-            found = self._prepare(name, state, batch, dt)
-            if not (torch.is_grad_enabled() and any(isinstance(p, Tensor) and p.requires_grad for p in self._numbers(name))):
+            found, tracked = self._prepare(name, state, batch, dt)
+            if not tracked:  # a function may hold what wants a gradient; its graph is good for one way back
                 state.layout.work[key] = found
         return found
 
@@ -249,7 +262,8 @@ class Medium(Effect):
         moving = [True] if callable(flow) else list(flow or ())
         return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
 
-    def _prepare(self, name: str, state: State, batch: Batch, dt: float) -> Stepper:
+    def _prepare(self, name: str, state: State, batch: Batch, dt: float) -> tuple[Stepper, bool]:
+        """The step, and whether a gradient passes through what it was made of."""
         signal, layout = self.signals[name], state.layout
         assert layout is not None
         ids = state.colony_id.index_select(0, batch.places)
@@ -261,7 +275,8 @@ class Medium(Effect):
             source=None if not callable(signal.source) and not isinstance(signal.source, Tensor) and signal.source == 0 else spread(signal.source),
             colonies=batch.places.numel(), dtype=state.dtype, device=state.device,
         )  # fmt: skip
-        return prepare(made, dt, self.method or choose(made))
+        held = (made.decay, made.source, *(x for axis in made.axes for x in (axis.up, axis.down, axis.low, axis.high)))
+        return prepare(made, dt, self.method or choose(made)), any(x is not None and x.requires_grad for x in held)
 
     def _velocity(self, layout: Layout, batch: Batch, own: Callable[[Any], Any]) -> Any:
         if self.flow is None:

@@ -73,12 +73,12 @@ def boundary_detector(
     The grid, 4 µm wide, starts as the paper's 64 × 8 × 12 voxels about the cells' plane and grows along the channel with the colony.
     """
     half = width / 2
-    constants = {
-        "D1": D1, "d1": d1, "d2": d2, "d3": d3, "dr": dr, "g1": g1, "g2": g2, "k1": k1, "k2": k2, "k3": k3, "k4": k4, "k5": k5, "k6": k6,
-    }  # fmt: skip
     return Scene(
         Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2, walls=[Channel(width)]),
-        Circuit({0: _sources, 1: _sinks}, species=("luxi", "ahl", "aiia", "cfp", "yfp"), **constants),
+        Circuit(
+            {0: _sources, 1: _sinks}, species=("luxi", "ahl", "aiia", "cfp", "yfp"),
+            D1=D1, d1=d1, d2=d2, d3=d3, dr=dr, g1=g1, g2=g2, k1=k1, k2=k2, k3=k3, k4=k4, k5=k5, k6=k6,
+        ),
         Medium(
             ahl=Signal(diffusion=diffusion), box=((-128.0, -half, -24.0), (128.0, half, 24.0)), spacing=4.0, beyond="grow", grows="x",
             flow=None if isinstance(flow, (int, float)) and flow == 0 else (flow, 0.0, 0.0),

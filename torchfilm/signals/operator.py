@@ -79,7 +79,7 @@ class Exchange:
 class Operator:
     """The operator of B colonies with grids of one shape; made by `operator`. Rates are held in float64, values advance in `dtype`.
 
-    axes: the exchange along x, y, z; decay: (B or 1, 1, 1, 1), 1/h; source: None or (B or 1, …), concentration/h; mask: None or
+    axes: the exchange along x, y, z; decay: (B or 1, 1, 1, 1) or (B or 1, nx, ny, nz), 1/h; source: None or (B or 1, …), concentration/h; mask: None or
     (B or 1, nx, ny, nz) bool, False in an obstacle. interior: (up, down) of each axis between two voxels of the medium, (B or 1,) each,
     where they are the same everywhere, else None. symmetric: nothing flows.
     """
@@ -97,7 +97,7 @@ class Operator:
     @property
     def separable(self) -> bool:
         """Whether the operator is a sum of one matrix for each axis."""
-        return self.mask is None and self.interior is not None
+        return self.mask is None and self.interior is not None and self.decay.shape[1:] == (1, 1, 1)
 
     @property
     def device(self) -> torch.device:
@@ -206,7 +206,7 @@ def operator(
 ) -> Operator:
     """The operator of one signal in `colonies` boxes of `shape` voxels and `spacing` µm.
 
-    diffusion: µm²/h, one number or one per colony; decay: 1/h, likewise. velocity: µm/h, None, uniform as (3,) or (B, 3), or on
+    diffusion: µm²/h, one number or one per colony; decay: 1/h, likewise, or ([B,] nx, ny, nz). velocity: µm/h, None, uniform as (3,) or (B, 3), or on
     faces as three tensors ([B,] nx + 1, ny, nz), ([B,] nx, ny + 1, nz), ([B,] nx, ny, nz + 1) of the velocity along x, y, z, from
     the low face to the high. faces: `Faces`, no flux without. mask: ([B,] nx, ny, nz) bool, False in an obstacle, through whose faces
     nothing passes. source: amount per volume and hour, a number, one per colony (B,), or ([B,] nx, ny, nz). B is `colonies`.
@@ -226,7 +226,7 @@ def operator(
     if made_source is not None and open_ is not None:
         made_source = made_source * open_
     return Operator(
-        given.shape, colonies, (axes[0], axes[1], axes[2]), given.number("decay", decay, least=0.0), made_source, open_,
+        given.shape, colonies, (axes[0], axes[1], axes[2]), given.rate("decay", decay), made_source, open_,
         tuple(inside) if uniform else None, velocity is None, dtype,
     )  # fmt: skip
 
@@ -310,6 +310,15 @@ class _Given:
         if not bool(torch.isfinite(given.detach()).all()):
             raise checks.refuse(name, "a value that is not finite", "finite everywhere")
         return given.to(device=self.device, dtype=dtype).reshape(-1, *shape)
+
+    def rate(self, name: str, given: float | Tensor) -> Tensor:
+        """A rate ≥ 0: a number, one per colony, or one per voxel."""
+        if not (isinstance(given, Tensor) and given.dim() >= 3):
+            return self.number(name, given, least=0.0)
+        found = self.grid(name, given)
+        if bool((found.detach() < 0).any()):
+            raise checks.refuse(name, float(found.detach().min()), "at least 0 everywhere")
+        return found
 
     def source(self, given: float | Tensor) -> Tensor:
         return self.grid("source", given) if isinstance(given, Tensor) and given.dim() >= 3 else self.number("source", given)
