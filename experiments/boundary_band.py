@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -85,9 +86,7 @@ def main() -> None:
         scene = tf.scenes.boundary_detector(**CONDITIONS[name])
         record = None if options.record is None else tf.Recorder(options.record / f"{name.replace(' ', '_')}.h5", scene, every=40, overwrite=True)
         begun = time.perf_counter()
-        state = scene.seed(options.seeds, seed=0)
-        for state in tf.simulate(scene, state, cells=options.cells, record=record):  # noqa: B007
-            pass
+        state = deque(tf.simulate(scene, scene.seed(options.seeds, seed=0), cells=options.cells, record=record), maxlen=1).pop()
         bands = [band(state, k) for k in range(options.seeds)]
         row = {key: [b[key] for b in bands] for key in bands[0]}
         found[name] = row | {"seconds": time.perf_counter() - begun, "time_h": state.time}

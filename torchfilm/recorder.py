@@ -134,7 +134,7 @@ class Recorder:
         for name, value in _colony_columns(state).items():
             _growing(file, f"frames/colony/{name}", value.dtype, value.shape, 64)
         if state.layout is not None:
-            file.attrs["spacing"] = state.layout.grid.spacing
+            file.attrs["spacing"], file.attrs["height"] = state.layout.grid.spacing, state.layout.height
             for name, value in _voxels(state).items():
                 _growing(file, f"signals/{name}", value.dtype, (), CHUNK_VOXELS)
             for name, value in _grid_columns(state).items():

@@ -229,7 +229,8 @@ def parameters(part: object, path: str = "") -> list[tuple[str, Tensor]]:
         return [found for name, item in part.items() for found in parameters(item, f"{path}[{name!r}]")]
     if dataclasses.is_dataclass(part) and not isinstance(part, type):
         path = path or type(part).__name__
-        return [found for f in dataclasses.fields(part) for found in parameters(getattr(part, f.name), f"{path}.{f.name}")]  # type: ignore[arg-type]
+        # what is not shown is not given by the user but worked out
+        return [found for f in dataclasses.fields(part) if f.repr for found in parameters(getattr(part, f.name), f"{path}.{f.name}")]  # type: ignore[arg-type]
     return []
 
 

@@ -14,10 +14,13 @@ where a rate of 1e8/h balances another, 2/h would be lost in a float32 W and the
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import torch
+import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from torchfilm.circuits import linear
@@ -78,6 +81,15 @@ def rosenbrock(
     return at.t().to(u.dtype), report
 
 
+@cache
+def _prepare_forward_mode() -> None:
+    """Torch compiles its forward derivatives on their first use, by a function that it calls deprecated itself."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        with forward_ad.dual_level():
+            forward_ad.make_dual(torch.ones(1), torch.ones(1)).exp()
+
+
 class _Method:
     """One step of the method for some cells; arrays are (S, M) in float64, species first. tracked: whether a gradient is wanted."""
 
@@ -88,28 +100,43 @@ class _Method:
         return self.rates(u.to(self.dtype).t(), rows).t().to(torch.float64)
 
     def linearise(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ: one backward pass over S copies of the cells, of the i-th of which only rate i is asked.
-
-        Forward derivatives would need no second pass, but where one factor of a product is constant torch works them out in Python, at five times the cost.
-        """
-        size, count = u.shape
-        with torch.enable_grad():
-            copies = u.to(self.dtype).repeat(1, size)
-            copies = copies if self.tracked and copies.requires_grad else copies.detach().requires_grad_()
-            out = self.rates(copies.t(), rows.repeat(size))
-            f = out[:count].t().to(torch.float64)
-            f = f if self.tracked else f.detach()
-            if not out.requires_grad:
-                return f, u.new_zeros(size, size, count)
-            own = torch.diagonal(out.view(size, count, size), dim1=0, dim2=2)
-            (slope,) = torch.autograd.grad(own.sum(), copies, create_graph=self.tracked, allow_unused=True)
-        if slope is None:
-            return f, u.new_zeros(size, size, count)
-        jacobian = slope.view(size, size, count).transpose(0, 1).to(torch.float64)
+        """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ, in one call on S copies of the cells."""
+        f, jacobian = self._forward(u, rows) if self.tracked else self._backward(u, rows)
         if not bool(torch.isfinite(jacobian.sum())):
             # the slope of a root at 0 is infinite; any finite one will do, only the error grows, and that is watched
             jacobian = torch.nan_to_num(jacobian, 0.0, 0.0, 0.0)
         return f, jacobian
+
+    def _backward(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """By a backward pass: of the i-th copy only the rate of species i is asked."""
+        size, count = u.shape
+        with torch.enable_grad():
+            copies = u.to(self.dtype).repeat(1, size).requires_grad_()
+            out = self.rates(copies.t(), rows.repeat(size))
+            f = out.detach()[:count].t().to(torch.float64)
+            slope = None
+            if out.requires_grad:
+                own = torch.diagonal(out.view(size, count, size), dim1=0, dim2=2)
+                (slope,) = torch.autograd.grad(own.sum(), copies, allow_unused=True)
+        if slope is None:
+            return f, u.new_zeros(size, size, count)
+        return f, slope.view(size, size, count).transpose(0, 1).to(torch.float64)
+
+    def _forward(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """By forward derivatives, of the k-th copy along species k. Where a gradient is wanted: a backward pass within one that is checkpointed would have
+        every step taken again from the start. Elsewhere it is the slower way: products with constants are worked out in Python.
+        """
+        _prepare_forward_mode()
+        size, count = u.shape
+        copies = u.to(self.dtype).repeat(1, size)
+        directions = torch.eye(size, dtype=self.dtype, device=u.device).unsqueeze(2).expand(size, size, count).reshape(size, size * count)
+        with forward_ad.dual_level():
+            out = self.rates(forward_ad.make_dual(copies.t(), directions.t()), rows.repeat(size))
+            value, slope = forward_ad.unpack_dual(out)
+        f = value[:count].t().to(torch.float64)
+        if slope is None:
+            return f, u.new_zeros(size, size, count)
+        return f, slope.t().to(torch.float64).reshape(size, size, count)
 
     def step(self, u: Tensor, rows: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The concentrations after h (M,), their error (M,) in units of what is allowed (NaN where there is no result), and whether (M,) a

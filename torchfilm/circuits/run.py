@@ -63,7 +63,7 @@ class Circuit:
         size = len(self.species)
         columns = u.unbind(1)
         outside: dict[str, Any] = dict(self.signals)
-        s = Columns(outside, rows, "s" if outside else "s (there is no Medium in this scene: it)", self.seen.get("s"))
+        s = Columns(outside, rows, "s" if outside else "without a Medium in the scene, s", self.seen.get("s"))
         for name, value in zip(self.given, columns[size:], strict=False):
             s.__dict__[name] = value
         return (
@@ -154,7 +154,11 @@ def step(circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings
             end = integrators.euler(circuit.rates, start, dt, settings.steps)
         else:
             end = integrators.runge_kutta(circuit.rates, start, dt, settings.steps, settings.method)
-        code = torch.where(torch.isfinite(end).all(1), rosenbrock.DONE, rosenbrock.NOT_FINITE)
+        # the exact circuit cannot get there: the step is too long for an explicit method
+        scale = start.abs() + end.abs()
+        below = (end < -(settings.atol + settings.rtol * scale.nan_to_num())) & (start >= 0)
+        code = torch.where(below.any(1), rosenbrock.BELOW_ZERO, rosenbrock.DONE)
+        code = torch.where(torch.isfinite(end).all(1), code, rosenbrock.NOT_FINITE)
     size, more = len(circuit.species), len(circuit.given)
     pools, beyond = {}, {}
     for k, name in enumerate(circuit.given):
@@ -214,6 +218,13 @@ def words(circuit: Circuit, outcome: Outcome, concentrations: Tensor, k: int, me
             reaction = circuit.part.reactions[code - MOLECULES]
             return f"the reaction {reaction.name or str(reaction)!r} has a {stochastic.STATUS[stochastic.BAD_PROPENSITY].removeprefix('a ')}"
         return stochastic.STATUS[code]
+    if code == rosenbrock.BELOW_ZERO:
+        start, one = circuit.start(concentrations), torch.tensor([k], device=concentrations.device)
+        slope = circuit.rates(start.index_select(0, one), one)[0]
+        names = (*circuit.species, *(f"out.{n}" for n in circuit.given))
+        first = int(torch.where(slope < 0, start[k] / -slope, torch.inf)[: len(names)].argmin())
+        hint = ". Take more steps, or method='rosenbrock'" if method != "rosenbrock" else ""
+        return f"{rosenbrock.STATUS[code]}, {names[first]!r} first, from {float(start[k, first]):g} at a rate of {float(slope[first]):g}/h{hint}"
     bad = _not_finite(circuit, concentrations, k, dt)
     if code != rosenbrock.NOT_FINITE and not bad:
         return rosenbrock.STATUS[code]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,7 +21,7 @@ from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.effect import CIRCUIT, Distribution, Effect, draw, parameter, per_cell
 from torchfilm.signals.exchange import Stencil, pool_volume, read, write
-from torchfilm.state import CELL, CELL_TYPE, OUTSIDE, Field, State
+from torchfilm.state import CELL, CELL_TYPE, OUTSIDE, RESERVED, Field, State
 from torchfilm.tools import checks
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
@@ -28,7 +30,7 @@ STIFF, LEAP, DIRECT = "rosenbrock", "tau_leap", "direct"
 EXPLICIT = ("euler", *integrators.METHODS)
 METHODS = (STIFF, *EXPLICIT, LEAP, DIRECT)
 GEOMETRY = {"volume": ("length", "radius"), "area": ("length", "radius"), "x": ("position",), "y": ("position",), "z": ("position",)}
-EVERY = -1  # the type of a circuit that runs in every cell
+EVERY = "every cell"  # where a circuit runs that is not given by type
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,8 @@ class Noted:
 
     def __init__(self) -> None:
         self.reads: tuple[str, ...] = ()
-        self.given: dict[int, tuple[str, ...]] = {}
-        self.networks: dict[int, Any] = {}
+        self.given: dict[int | str, tuple[str, ...]] = {}
+        self.networks: dict[int | str, Any] = {}
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -73,7 +75,7 @@ class Circuit(Effect):
     Growth dilutes: amounts stay, concentrations are multiplied by V_old/V_new. Further names are parameters: numbers, or one per colony.
     """
 
-    rates: Mapping[int, Part]
+    rates: Mapping[int | str, Part]
     species: tuple[str, ...]
     initial: Mapping[str, float | Tensor | Distribution] = field(default_factory=dict)
     daughters: str = "concentration"
@@ -102,18 +104,26 @@ class Circuit(Effect):
         copies: float | Tensor = 1.0,
         **parameters: float | Tensor,
     ):
-        by_type = dict(rates) if isinstance(rates, Mapping) else {EVERY: rates}
+        by_type: dict[int | str, Part] = {k: part for k, part in rates.items()} if isinstance(rates, Mapping) else {EVERY: rates}
         names = (species,) if isinstance(species, str) else tuple(species)
         if not names or len(set(names)) != len(names) or not all(isinstance(n, str) and n.isidentifier() for n in names):
             raise checks.refuse("Circuit.species", species, "different names, at least one")
+        taken = [n for n in names if n in RESERVED or n in GEOMETRY]
+        if taken:
+            raise checks.refuse("Circuit.species", taken[0], "a name that cells do not have already", "Call the species something else.")
         for kind, part in by_type.items():
-            if isinstance(kind, bool) or not isinstance(kind, int):
+            if isinstance(rates, Mapping) and (isinstance(kind, bool) or not isinstance(kind, int)):
                 raise checks.refuse("Circuit.rates", kind, "by cell types that are whole numbers")
             if not callable(part) and not (isinstance(part, (list, tuple)) and part):
                 raise checks.refuse("Circuit.rates", part, "a function (u, s, p, cell), a list of reactions, or a dict of either by cell type")
         for name in initial or {}:
             if name not in names:
                 raise checks.InputError(unknown(f"Circuit.initial names {name!r}, which is no species", name, names))
+        for name, odd in parameters.items():
+            if isinstance(odd, str) or callable(odd):
+                near = difflib.get_close_matches(name, [f.name for f in dataclasses.fields(self)], 1)
+                mend = f"Did you mean {near[0]}?" if near else "Further names are parameters of the rates."
+                raise checks.refuse(f"Circuit.{name}", odd, "a number, or one number per colony", mend)
         checks.choice("Circuit.daughters", daughters, ("concentration", "amount"))
         checks.choice("Circuit.method", method, METHODS)
         if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
@@ -239,7 +249,7 @@ class Circuit(Effect):
         return torch.stack([state.fields[n].index_select(0, rows) for n in self.species], 1)
 
     def _circuit(
-        self, state: State, rows: Tensor, kind: int, given: tuple[str, ...], outside: Mapping[str, Tensor], medium: _Medium | None = None,
+        self, state: State, rows: Tensor, kind: int | str, given: tuple[str, ...], outside: Mapping[str, Tensor], medium: _Medium | None = None,
         seen: dict[str, set[str]] | None = None,
     ) -> run.Circuit:  # fmt: skip
         """The circuit of one type of cell as it stands in this state."""
@@ -257,7 +267,7 @@ def _cell_columns(state: State, species: Sequence[str]) -> dict[str, Any]:
     columns: dict[str, Any] = {n: v for n, v in state.fields.items() if state.declared[n].scope == CELL and n not in species}
     columns |= {"length": state.length, "radius": state.radius, "volume": Lazy(lambda: state.volume), "area": Lazy(lambda: state.area)}
     columns |= {letter: Lazy(partial(_place, state, k)) for k, letter in zip(range(state.dim), "xyz", strict=False)}
-    return columns | {"colony": Lazy(lambda: state.own_colony_id), "time": state.time, "uid": state.uid}
+    return columns | {"colony": Lazy(lambda: state.own_colony_id), "time": state.length.new_tensor(state.time), "uid": state.uid}
 
 
 def _place(state: State, k: int) -> Tensor:
@@ -327,8 +337,8 @@ def _volume_of(state: State, rows: Tensor) -> Tensor:
     return state.volume.index_select(0, rows)
 
 
-def _cells_of(state: State, kind: int) -> Tensor:
+def _cells_of(state: State, kind: int | str) -> Tensor:
     """The cells in which a circuit runs, (M,)."""
-    if kind == EVERY:
+    if isinstance(kind, str):
         return torch.arange(state.cells, device=state.device)
-    return torch.nonzero(state.fields["cell_type"] == kind).squeeze(1)
+    return torch.nonzero(torch.eq(state.fields["cell_type"], kind)).squeeze(1)

@@ -12,6 +12,7 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 
 LAWS = ("volume", "length", "linear")
+UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Growth(Effect):
         return (
             Field(
                 "growth_rate", "relative growth rate" if self.law != "linear" else "growth of the centreline",
-                "1/h" if self.law != "linear" else "µm/h",
+                UNITS[self.law],
                 initial=lambda state, rows: draw("Growth.rate", rate, state, rows),
                 at_division="reset" if isinstance(rate, Distribution) else "copy",
             ),

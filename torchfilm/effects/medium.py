@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import COVER, TRANSPORT, Effect, per_colony
-from torchfilm.signals.faces import Faces
+from torchfilm.signals.faces import Faces, Open
 from torchfilm.signals.grid import Batch, Grid
 from torchfilm.signals.layout import Layout
 from torchfilm.signals.operator import operator
@@ -21,6 +21,8 @@ from torchfilm.tools import checks
 
 # A value on the grid: a number, one per colony, or a function from places (M, 3) µm to (M,).
 OnGrid = float | Tensor | Callable[[Tensor], Tensor]
+# A velocity: two or three numbers (or one per colony each), or a function from places (M, 3) µm to velocities (M, 3).
+Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 BEYOND = ("error", "grow", "open")
 # A grid that grows with its colony does so by this many voxels at a time, and keeps this many between the cells and its faces.
 BLOCK, MARGIN = 8, 2
@@ -32,7 +34,8 @@ class Signal:
 
     diffusion: K, µm²/h; decay: 1/h; each one number or one per colony; decay may also be a function from places (M, 3) µm to (M,), a sink. initial:
     concentration at the start, and source: concentration/h made everywhere, each a number, one per colony, or such a function.
-    faces: what happens at the faces of the box, if not as the medium says. beyond: the concentration that cells beyond an open box find there.
+    faces: what happens at the faces of the box, and flow: what carries it, µm/h, if not as the medium says. beyond: the concentration that cells
+    beyond an open box find there.
     """
 
     diffusion: float | Tensor
@@ -40,6 +43,7 @@ class Signal:
     initial: OnGrid = 0.0
     source: OnGrid = 0.0
     faces: Faces | None = None
+    flow: Flow = None
     beyond: float | Tensor = 0.0
 
     def __post_init__(self) -> None:
@@ -48,6 +52,7 @@ class Signal:
         for name in ("decay", "initial", "source"):
             if not callable(getattr(self, name)):
                 object.__setattr__(self, name, checks.value(f"Signal.{name}", getattr(self, name), least=0.0))
+        object.__setattr__(self, "flow", _flow("Signal.flow", self.flow))
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,7 @@ class MediumReport:
     status: Tensor
     left: Tensor
     first: Tensor
-    mend = "Make the box of the Medium larger, or let it grow with the colony: Medium(…, beyond='grow')"
+    mend = "Make the box of the Medium larger (one that is flat is a single layer), let it grow with the colony, Medium(…, beyond='grow'), or move the obstacle"
 
     def reason(self, place: int) -> str:
         where = ", ".join(f"{x:.4g}" for x in self.first[place].tolist())
@@ -70,8 +75,9 @@ class Medium(Effect):
 
     box: lower and upper corner, µm, in 2 or 3 dimensions; a flat box is one layer `depth` µm thick (by default as thick as a voxel is wide). Cells of
     a 2-D scene may lie in a box with three: in the plane z = `height`. spacing: of voxels, µm, one number or one an axis.
-    faces: of the box; without, nothing passes them. flow: velocity of the medium, µm/h: two or three numbers (or one per colony each), or a function from
-    places (M, 3) µm to velocities (M, 3). obstacles: a function from places (M, 3) to (M,) bool, true where there is none of the medium.
+    faces: of the box; without, nothing passes them, or where the medium flows, what it carries. flow: velocity of the medium, µm/h: two or three
+    numbers (or one per colony each), or a function from places (M, 3) µm to velocities (M, 3). obstacles: a function from places (M, 3) to
+    (M,) bool, true where there is none of the medium.
     beyond: what cells beyond the box mean: "error"; "grow": the box grows with its colony, along the axes that `grows` names; "open": the box stands
     in a reservoir in which each signal is at its `beyond`, and what cells give to it and take from it is kept count of in the fields NAME_beyond.
     method: "exponential" (exact, where the box is all medium and the flow uniform), "implicit" (positive at any step; elsewhere), "crank_nicolson" (the
@@ -83,8 +89,8 @@ class Medium(Effect):
     spacing: tuple[float, ...]
     depth: float | None = None
     height: float = 0.0
-    faces: Faces = field(default_factory=Faces)
-    flow: Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None = None
+    faces: Faces | None = None
+    flow: Flow = None
     obstacles: Callable[[Tensor], Tensor] | None = None
     beyond: str = "error"
     grows: str = "xyz"
@@ -102,7 +108,7 @@ class Medium(Effect):
         depth: float | None = None,
         height: float = 0.0,
         faces: Faces | None = None,
-        flow: Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None = None,
+        flow: Flow = None,
         obstacles: Callable[[Tensor], Tensor] | None = None,
         beyond: str = "error",
         grows: str = "xyz",
@@ -145,12 +151,11 @@ class Medium(Effect):
             checks.choice("Medium.method", method, tuple(METHODS))
         if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
             raise checks.refuse("Medium.steps", steps, "a whole number from 1")
-        for name, value in (("obstacles", obstacles), ("flow", None if isinstance(flow, (tuple, list, Tensor)) else flow)):
-            if value is not None and not callable(value):
-                raise checks.refuse(f"Medium.{name}", value, "a function of places" + (", or two or three numbers" if name == "flow" else ""))
+        if obstacles is not None and not callable(obstacles):
+            raise checks.refuse("Medium.obstacles", obstacles, "a function of places")
         given = {
             "signals": dict(signals), "box": (low, high), "spacing": voxel, "depth": depth, "height": float(height),
-            "faces": faces if faces is not None else Faces(), "flow": _flow(flow), "obstacles": obstacles,
+            "faces": faces, "flow": _flow("Medium.flow", flow), "obstacles": obstacles,
             "beyond": beyond, "grows": grows, "method": method, "steps": steps,
         }  # fmt: skip
         for name, value in given.items():
@@ -163,8 +168,15 @@ class Medium(Effect):
 
     def faces_of(self, name: str) -> Faces:
         """The faces that a signal meets."""
-        own = self.signals[name].faces
-        return self.faces if own is None else own
+        signal = self.signals[name]
+        if signal.faces is not None or self.faces is not None:
+            return signal.faces or self.faces or Faces()
+        return Faces() if self.flow_of(name) is None else Faces(Open(), Open(), Open())
+
+    def flow_of(self, name: str) -> Flow:
+        """What carries a signal."""
+        own = self.signals[name].flow
+        return self.flow if own is None else own
 
     @property
     def corners(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, float, float]]:
@@ -188,7 +200,7 @@ class Medium(Effect):
         return tuple(fields)
 
     def _first(self, name: str) -> Callable[[State, Tensor], Tensor]:
-        return lambda state, rows: self._values(self.signals[name].initial, state).index_select(0, rows)
+        return lambda state, rows: self._values(name, "initial", state).index_select(0, rows)
 
     def lay(self, state: State) -> State:
         """The state with its grids, all as the box says."""
@@ -202,15 +214,23 @@ class Medium(Effect):
         reservoir = {name: s.beyond for name, s in self.signals.items()} if self.beyond == "open" else None
         return state.replace(layout=Layout(grid, self.faces_of(next(iter(self.signals))).periodic, self.height, self.obstacles, reservoir))
 
-    def _values(self, given: OnGrid, state: State) -> Tensor:
-        """A value on every voxel, (nodes,); 0 in obstacles."""
+    def _values(self, name: str, what: str, state: State) -> Tensor:
+        """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
+        given: OnGrid = getattr(self.signals[name], what)
         layout = state.layout
         assert layout is not None
         if callable(given):
             found = given(layout.grid.centres())
-            shape = tuple(found.shape) if isinstance(found, Tensor) else found
-            if shape != (layout.grid.nodes,) or not bool(torch.isfinite(found).all()) or bool((found < 0).any()):
-                raise checks.refuse("a value on the grid", shape, f"a tensor of {layout.grid.nodes} finite numbers ≥ 0, one for each place")
+            label = f"{what}(places) of the signal {name!r}"
+            if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
+                shown = tuple(found.shape) if isinstance(found, Tensor) else found
+                raise checks.refuse(label, shown, f"a tensor of shape ({layout.grid.nodes},), one number for each place")
+            bad = torch.nonzero(~((found >= 0) & (found < torch.inf))).squeeze(1)
+            if bad.numel():
+                where = [round(x, 3) for x in layout.grid.centres()[bad[0]].tolist()]
+                raise checks.refuse(
+                    label, float(found[bad[0]]), "finite and at least 0 everywhere", f"It is not at {where} µm and {bad.numel() - 1} more places."
+                )
             value = found.to(dtype=state.dtype, device=state.device)
         else:
             value = per_colony(given, state).expand(state.colonies).index_select(0, layout.grid.owner)
@@ -257,7 +277,7 @@ class Medium(Effect):
 
     def _numbers(self, name: str) -> list[Any]:
         """What a signal's transport depends on, tensors among it."""
-        signal, flow = self.signals[name], self.flow
+        signal, flow = self.signals[name], self.flow_of(name)
         faces = [face.outside_value() for pair in self.faces_of(name).pairs for face in pair]
         moving = [True] if callable(flow) else list(flow or ())
         return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
@@ -268,42 +288,45 @@ class Medium(Effect):
         assert layout is not None
         ids = state.colony_id.index_select(0, batch.places)
         own = lambda x: x.to(state.device).index_select(0, ids) if isinstance(x, Tensor) and x.dim() == 1 else x  # noqa: E731
-        spread = lambda x: batch.of(self._values(x, state)) if callable(x) else own(x)  # noqa: E731
+        spread = lambda x: batch.of(self._values(name, x, state)) if callable(getattr(signal, x)) else own(getattr(signal, x))  # noqa: E731
         made = operator(
-            batch.shape, layout.grid.spacing, diffusion=own(signal.diffusion), decay=spread(signal.decay), velocity=self._velocity(layout, batch, own),
+            batch.shape, layout.grid.spacing, diffusion=own(signal.diffusion), decay=spread("decay"), 
+            velocity=_velocity(self.flow_of(name), layout, batch, own),
             faces=self.faces_of(name).take(ids), mask=None if layout.mask is None else batch.of(layout.mask),
-            source=None if not callable(signal.source) and not isinstance(signal.source, Tensor) and signal.source == 0 else spread(signal.source),
+            source=None if not callable(signal.source) and not isinstance(signal.source, Tensor) and signal.source == 0 else spread("source"),
             colonies=batch.places.numel(), dtype=state.dtype, device=state.device,
         )  # fmt: skip
         held = (made.decay, made.source, *(x for axis in made.axes for x in (axis.up, axis.down, axis.low, axis.high)))
         return prepare(made, dt, self.method or choose(made)), any(x is not None and x.requires_grad for x in held)
 
-    def _velocity(self, layout: Layout, batch: Batch, own: Callable[[Any], Any]) -> Any:
-        if self.flow is None:
-            return None
-        if not callable(self.flow):
-            parts = [torch.as_tensor(own(v), dtype=torch.float64).reshape(-1).expand(batch.places.numel()) for v in (*self.flow, 0.0)[:3]]
-            return torch.stack(parts, 1)
-        out = []
-        step, origin = layout.grid.step, layout.grid.origin.index_select(0, batch.places)
-        for axis in range(3):
-            counts = [n + (k == axis) for k, n in enumerate(batch.shape)]
-            lines = [(torch.arange(n, device=origin.device) + (0.0 if k == axis else 0.5)) * step[k] for k, n in enumerate(counts)]
-            faces = torch.stack(torch.meshgrid(*lines, indexing="ij"), -1) + origin.reshape(-1, 1, 1, 1, 3)
-            found = self.flow(faces.reshape(-1, 3))
-            if not isinstance(found, Tensor) or found.dim() != 2 or found.shape[0] != faces[..., 0].numel() or found.shape[1] not in (2, 3):
-                raise checks.refuse("flow(places)", tuple(getattr(found, "shape", ())), f"velocities of shape ({faces[..., 0].numel()}, 3)")
-            part = found[:, axis] if axis < found.shape[1] else torch.zeros_like(found[:, 0])
-            out.append(part.reshape(faces.shape[:-1]))
-        return tuple(out)
+
+def _velocity(flow: Flow, layout: Layout, batch: Batch, own: Callable[[Any], Any]) -> Any:
+    """The velocity as the operator wants it: none, uniform (b, 3), or on the faces of the voxels, three tensors."""
+    if flow is None:
+        return None
+    if not callable(flow):
+        parts = [torch.as_tensor(own(v), dtype=torch.float64).reshape(-1).expand(batch.places.numel()) for v in (*flow, 0.0)[:3]]
+        return torch.stack(parts, 1)
+    out = []
+    step, origin = layout.grid.step, layout.grid.origin.index_select(0, batch.places)
+    for axis in range(3):
+        counts = [n + (k == axis) for k, n in enumerate(batch.shape)]
+        lines = [(torch.arange(n, device=origin.device) + (0.0 if k == axis else 0.5)) * step[k] for k, n in enumerate(counts)]
+        faces = torch.stack(torch.meshgrid(*lines, indexing="ij"), -1) + origin.reshape(-1, 1, 1, 1, 3)
+        found = flow(faces.reshape(-1, 3))
+        if not isinstance(found, Tensor) or found.dim() != 2 or found.shape[0] != faces[..., 0].numel() or found.shape[1] not in (2, 3):
+            raise checks.refuse("flow(places)", tuple(getattr(found, "shape", ())), f"velocities of shape ({faces[..., 0].numel()}, 3)")
+        part = found[:, axis] if axis < found.shape[1] else torch.zeros_like(found[:, 0])
+        out.append(part.reshape(faces.shape[:-1]))
+    return tuple(out)
 
 
-def _flow(given: Any) -> Any:
+def _flow(name: str, given: Any) -> Any:
     if given is None or callable(given):
         return given
-    if len(given) not in (2, 3):
-        raise checks.refuse("Medium.flow", given, "two or three numbers, or a function of places")
-    return tuple(checks.value(f"Medium.flow[{k}]", v) for k, v in enumerate(given))
+    if not isinstance(given, (tuple, list, Tensor)) or len(given) not in (2, 3):
+        raise checks.refuse(name, given, "two or three numbers, or a function of places")
+    return tuple(checks.value(f"{name}[{k}]", v) for k, v in enumerate(given))
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +355,8 @@ class Cover(Effect):
         if report is not None and bool(report.status.any()):
             place = int(torch.nonzero(report.status)[0])
             colony = int(state.colony_id[place])
-            raise checks.InputError(f"Medium.box = {self.medium.box} is too small for colony {colony}: {report.reason(place)}. {report.mend}.")
+            low, high, _ = self.medium.corners
+            raise checks.InputError(f"Medium.box, from {low} to {high} µm, is too small for colony {colony}: {report.reason(place)}. {report.mend}.")
 
     def step(self, state: State, dt: float) -> State:
         if self.medium.beyond == "grow":
@@ -375,5 +399,5 @@ class Cover(Effect):
             return state
         state = state.replace(layout=layout.on(grid))
         old = values.pop() > 0
-        first = [self.medium._values(signal.initial, state) for signal in self.medium.signals.values()]
+        first = [self.medium._values(name, "initial", state) for name in self.medium.signals]
         return state.with_fields(**{n: torch.where(old, v, start) for n, v, start in zip(names, values, first, strict=True)})

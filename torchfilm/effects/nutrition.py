@@ -60,6 +60,11 @@ class Monod(Effect):
     def writes(self) -> tuple[str, ...]:
         return ("growth_rate", OUTSIDE + self.signal, f"{self.signal}_eaten")
 
+    def check(self, state: State) -> None:
+        unit = state.declared["growth_rate"].unit
+        if unit != "1/h":
+            raise checks.InputError(f"Monod sets growth of the volume, in 1/h, but Growth takes its rate in {unit!r}: use Growth() with law='volume'.")
+
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0 or state.layout is None:
             return state

@@ -29,7 +29,10 @@ def _share_out(parent: DivisionView, daughter1: DivisionView, daughter2: Divisio
 
 
 def random_partition(rate: float = 1.0, start: float = 1.0) -> Scene:
-    """A species that nothing makes or destroys, shared between daughters in random parts (the paper's `divide` example): its amount stays, cells differ ever more."""
+    """A species that nothing makes or destroys, shared between daughters in random parts (the paper's `divide` example).
+
+    Its amount stays, and cells differ ever more.
+    """
     return Scene(
         Rules(divide=_share_out), Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2),
         Circuit(_nothing, species=("plasmid",), initial={"plasmid": start}),
@@ -50,7 +53,8 @@ def repressilator(
     for name, by in zip(names, ("ci", "laci", "tetr"), strict=True):
         message = f"m_{name}"
         reactions += [
-            parts.repressed(message, by, rate="production", half=1.0, power=power), parts.constitutive(message, rate="leak"), parts.degradation(message, rate="speed"),
+            parts.repressed(message, by, rate="production", half=1.0, power=power), parts.constitutive(message, rate="leak"),
+            parts.degradation(message, rate="speed"),
             [Reaction({message: 1}, {message: 1, name: 1}, "turnover", f"{name} translated")], parts.degradation(name, rate="turnover"),
         ]  # fmt: skip
     return Scene(
@@ -68,8 +72,8 @@ def toggle_switch(
     """Two genes that repress each other (Gardner et al. 2000): cells near the tipping point fall to one side or the other, and their descendants stay there,
     so that the colony forms sectors.
 
-    x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y = `start`. noise: molecule by molecule, with `copies` of them in a unit of
-    concentration × µm³. Growth dilutes beside the decay.
+    x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y = `start`. noise: molecule by molecule, with `copies` of
+    them in a unit of concentration × µm³. Growth dilutes beside the decay.
     """
     reactions = []
     for name, by in (("red", "green"), ("green", "red")):

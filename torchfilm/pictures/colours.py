@@ -1,0 +1,230 @@
+"""Colours: what a picture shows of its cells and of the signal behind them, over which ranges, in which colours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from torchfilm.pictures.frames import Frame, unit_of
+from torchfilm.pictures.shapes import VIEWS
+from torchfilm.state import OUTSIDE
+from torchfilm.tools import checks
+
+ANGLE = "angle"
+CELLS, MEAN = "cells", "mean"
+# A dark cell is not quite black, so that it is seen on black; what has no number is grey.
+FLOOR, NOTHING = 0.14, (0.55, 0.55, 0.55, 1.0)
+# Whole numbers with at most this many values are kinds, each with a colour of its own (of Okabe and Ito, distinct to the colour-blind).
+KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C6BB1")
+
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+Beyond = Literal["neither", "both", "min", "max"]
+Limits = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a picture shows, checked. The options are those of `torchfilm.pictures.show`."""
+
+    colour: str | None = None
+    channels: Mapping[str, str] | None = None
+    background: str | None = None
+    limits: Limits | None = None
+    view: str = "xy"
+    section: float | str = CELLS
+    whole: bool = False
+
+    def __post_init__(self) -> None:
+        from matplotlib.colors import is_color_like
+
+        checks.choice("view", self.view, tuple(VIEWS))
+        if self.channels is not None:
+            if self.colour is not None:
+                raise checks.InputError("colour and channels both say what colours the cells: give one of them.")
+            if not isinstance(self.channels, Mapping) or not self.channels:
+                raise checks.refuse("channels", self.channels, 'colours by name of quantity, such as {"cfp": "cyan", "yfp": "yellow"}')
+            for name, colour in self.channels.items():
+                if not is_color_like(colour):
+                    raise checks.refuse(f"channels[{name!r}]", colour, 'a colour, such as "cyan" or "#00ffff"')
+        if self.section not in (CELLS, MEAN):
+            if isinstance(self.section, str):
+                raise checks.refuse("section", self.section, '"cells", "mean", or a coordinate in µm')
+            checks.number("section", self.section)
+        if self.section != CELLS and self.background is None:
+            raise checks.refuse("section", self.section, "left out without a background: it says where to cut the signal")
+        for name, pair in (self.limits or {}).items():
+            low, high = checks.vector(f"limits[{name!r}]", pair, 2)
+            if low >= high:
+                raise checks.refuse(f"limits[{name!r}]", (low, high), "two numbers, the first below the second")
+            if name not in (*self.quantities, self.background, self.signal):
+                drawn = ", ".join(repr(n) for n in (*self.quantities, self.background) if n not in (None, ANGLE)) or "nothing that has a range"
+                raise checks.refuse("limits", name, f"of what is drawn: {drawn}")
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What colours the cells."""
+        return tuple(self.channels) if self.channels is not None else (self.colour or ANGLE,)
+
+    @property
+    def signal(self) -> str | None:
+        """The background under the name by which it is told from a quantity of the cells."""
+        return None if self.background is None else OUTSIDE + self.background
+
+    def given(self, name: str) -> tuple[float, float] | None:
+        """The limits that were asked for. A bare name that is both a signal's and drawn in the cells means the cells'."""
+        limits = self.limits or {}
+        found = limits.get(name)
+        if found is None and name == self.signal and self.background not in self.quantities:
+            found = limits.get(str(self.background))
+        return None if found is None else (float(found[0]), float(found[1]))
+
+    def check(self, frame: Frame) -> None:
+        """Raise InputError for what this frame does not have."""
+        if max(VIEWS[self.view]) >= frame.dim:
+            raise checks.refuse("view", self.view, '"xy" for 2-D cells')
+        if self.whole and frame.origin is None:
+            raise checks.refuse("whole", True, "left out where the scene has no medium, and so no box")
+        if self.background is not None and self.background not in frame.signals:
+            raise checks.refuse("background", self.background, "a signal of the medium: " + (", ".join(frame.signals) or "there is none"))
+        known = [n for n, v in frame.cells.items() if v.ndim == 1]
+        for name in self.quantities:
+            if name not in known and not (name == ANGLE and self.channels is None):
+                what = "colour" if self.channels is None else "channels"
+                raise checks.refuse(what, name, ("'angle' or " if self.channels is None else "") + "one of " + ", ".join(known))
+
+
+def values_of(cells: Mapping[str, np.ndarray], name: str, view: str) -> np.ndarray:
+    """A quantity of each cell (N,); "angle" is that of its axis in the view, 0 … 180°."""
+    if name != ANGLE:
+        return cells[name].astype(float)
+    u, v = VIEWS[view]
+    return np.degrees(np.mod(np.arctan2(cells["axis"][:, v], cells["axis"][:, u]).astype(float), math.pi))
+
+
+@dataclass
+class Seen:
+    """The values of one quantity met so far: lowest, highest, and each of them while they are few whole numbers."""
+
+    low: float = math.inf
+    high: float = -math.inf
+    kinds: set[int] | None = field(default_factory=set)
+
+    def note(self, values: np.ndarray) -> None:
+        if self.kinds is not None:
+            whole = values.dtype == bool or np.issubdtype(values.dtype, np.integer)
+            self.kinds = self.kinds | {int(x) for x in np.unique(values)[: len(KINDS) + 1]} if whole else None
+            if self.kinds is not None and len(self.kinds) > len(KINDS):
+                self.kinds = None
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """A quantity's colours: its name, what a legend calls it and its unit, its colour map, the range that this spans, and whether some values lie
+    beyond ("min", "max", "both"; "neither").
+
+    kinds: instead of a range, the values of a quantity that tells kinds of cells apart.
+    """
+
+    name: str
+    label: str
+    unit: str
+    cmap: Any
+    limits: tuple[float, float]
+    beyond: Beyond = "neither"
+    kinds: tuple[int, ...] = ()
+
+    @property
+    def power(self) -> int:
+        """The power of ten that a legend takes out of very small and very large numbers."""
+        power = 0 if self.kinds else math.floor(math.log10(max(map(abs, self.limits))))
+        return power if power < -2 or power > 3 else 0
+
+    @property
+    def title(self) -> str:
+        """Name and unit, for a legend."""
+        ten = "10" + str(self.power).translate(RAISED) if self.power else ""
+        unit = f"{ten} {self.unit}".strip()
+        return f"{self.label} ({unit})" if unit else self.label
+
+    def level(self, values: np.ndarray) -> np.ndarray:
+        """Where values are in the range, 0 … 1; NaN stays."""
+        low, high = self.limits
+        return np.clip((np.asarray(values, dtype=float) - low) / (high - low), 0.0, 1.0)
+
+    def paint(self, values: np.ndarray) -> np.ndarray:
+        """Colours (…, 4) of values."""
+        if self.kinds:
+            return self.cmap(np.searchsorted(self.kinds, values))
+        return self.cmap(np.ma.masked_invalid(self.level(values)))
+
+
+def scale_of(name: str, seen: Seen, look: Look, units: Mapping[str, str], note: str = "") -> Scale:
+    """The scale of a quantity that has taken these values."""
+    from matplotlib.colors import ListedColormap
+
+    given, unit = look.given(name), unit_of(name, units)
+    label = name if name != look.signal else f"{look.background} outside{note}"
+    if name == ANGLE:
+        return Scale(name, "angle of the axis", "°", _wheel(), (0.0, 180.0))
+    if given is None and look.channels is None and seen.kinds and name != look.signal:
+        return Scale(name, label, unit, ListedColormap(KINDS[: len(seen.kinds)]), (0.0, 1.0), kinds=tuple(sorted(seen.kinds)))
+    low, high = (seen.low, seen.high) if seen.low <= seen.high else (0.0, 1.0)
+    if look.channels is not None and name != look.signal:
+        low = min(0.0, low)  # no light means none of it
+    limits = given or (low, high if high > low else low + (abs(low) or 1.0))
+    under, over = seen.low < limits[0], seen.high > limits[1]
+    beyond: Beyond = "both" if under and over else "min" if under else "max" if over else "neither"
+    return Scale(name, label, unit, _colours(name, look), limits, beyond)
+
+
+def _colours(name: str, look: Look) -> Any:
+    from matplotlib import colormaps
+    from matplotlib.colors import LinearSegmentedColormap
+
+    if name == look.signal:
+        made: Any = LinearSegmentedColormap.from_list("signal", ["white", "black"])
+    elif look.channels is not None:
+        made = LinearSegmentedColormap.from_list(name, [lit(np.zeros(3)), lit(light(look.channels[name]))])
+    else:
+        made = colormaps["viridis"]
+    return made.with_extremes(bad=NOTHING)
+
+
+def _wheel() -> Any:
+    """A cyclic colour map of even, muted colours: one that passes through white or black would hide cells of one direction."""
+    from matplotlib.colors import ListedColormap, hsv_to_rgb
+
+    hue = np.linspace(0, 1, 256, endpoint=False)
+    return ListedColormap(hsv_to_rgb(np.stack([hue, np.full(256, 0.55), np.full(256, 0.85)], 1)))
+
+
+def light(colour: str) -> np.ndarray:
+    """Red, green and blue of a named colour, (3,)."""
+    from matplotlib.colors import to_rgb
+
+    return np.array(to_rgb(colour))
+
+
+def lit(rgb: np.ndarray) -> np.ndarray:
+    """The colour of cells that give off this light, (…, 3)."""
+    return FLOOR + (1.0 - FLOOR) * np.clip(rgb, 0.0, 1.0)
+
+
+def paint_cells(cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: Look) -> np.ndarray:
+    """The colour of each cell, (N, 4): of its one quantity, or the lights of its channels added up as in a fluorescence picture."""
+    if look.channels is None:
+        (scale,) = scales
+        return scale.paint(values_of(cells, scale.name, look.view))
+    levels = np.stack([s.level(cells[s.name]) for s in scales], 1)
+    lights = np.stack([light(look.channels[s.name]) for s in scales])
+    colours = np.concatenate([lit(np.nan_to_num(levels) @ lights), np.ones((len(levels), 1))], 1)
+    colours[np.isnan(levels).any(1)] = NOTHING
+    return colours

@@ -1,0 +1,177 @@
+"""Drawing on matplotlib axes: cells as the capsules that they are, a signal behind them, a scale bar, legends. Lengths in µm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchfilm.pictures.colours import CELLS, MEAN, Look, Scale, Seen, paint_cells, scale_of, values_of
+from torchfilm.pictures.shapes import CAP_POINTS, VIEWS, Window, along, box, outlines, section, span
+from torchfilm.state import OUTSIDE
+from torchfilm.tools import checks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BEYOND = "#efe4d2"  # what is outside the box of a signal: no grey, so that it is not read as a concentration
+SMALL, TINY = 7.0, 6.0  # points
+ROUND = 0.1  # inches of a µm from which on an outline of few points has corners to be seen
+
+
+def draw_cells(
+    ax: Axes,
+    cells: Mapping[str, np.ndarray],
+    *,
+    colour: str | None = None,
+    channels: Mapping[str, str] | None = None,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    view: str = "xy",
+    window: Window | None = None,
+) -> list[Scale]:
+    """Draw cells, as `Results.frame` gives them, and return the scales of their colours, for `colour_bar`.
+
+    colour, channels, limits, view: as for `show`; ranges that are not given are those of these cells. window: what the axes show; by default all cells.
+    """
+    look = Look(colour=colour, channels=channels, limits=limits, view=view)
+    scales = []
+    for name in look.quantities:
+        if (name in cells and cells[name].ndim != 1) or name not in (*cells, "angle"):
+            raise checks.refuse("colour", name, "'angle' or one of " + ", ".join(n for n in cells if cells[n].ndim == 1))
+        seen = Seen()
+        seen.note(cells[name] if name in cells else values_of(cells, name, view))
+        scales.append(scale_of(name, seen, look, {}))
+    covered = span(cells, view)
+    if window is None and covered is not None:
+        pad = 0.04 * float((covered[1] - covered[0]).max())
+        window = (covered[0, 0] - pad, covered[1, 0] + pad, covered[0, 1] - pad, covered[1, 1] + pad)
+    if window is not None:
+        set_window(ax, window)
+    add_cells(ax, cells, scales, look)
+    return scales
+
+
+def draw_signal(
+    ax: Axes,
+    values: np.ndarray,
+    origin: Sequence[float] | np.ndarray,
+    spacing: Sequence[float] | np.ndarray,
+    *,
+    name: str = "signal",
+    view: str = "xy",
+    section: float | str = MEAN,
+    limits: tuple[float, float] | None = None,
+) -> Scale:
+    """Draw a signal (nx, ny, nz) of one colony, as `Results.signal` and `Results.grid` give it, and return its scale, for `colour_bar`.
+
+    White is lowest and black highest. section: where it is cut, the coordinate along the line of sight, µm, or "mean", its mean along it. limits: the range
+    from white to black; by default that of what is drawn.
+    """
+    look = Look(background=name, view=view, section=section, limits=None if limits is None else {name: limits})
+    if section == CELLS:
+        raise checks.refuse("section", section, 'a coordinate in µm, or "mean"')
+    flat = cut(values, np.asarray(origin), np.asarray(spacing), look, None)
+    seen = Seen()
+    seen.note(flat)
+    scale = scale_of(OUTSIDE + name, seen, look, {})
+    low, high = box(np.asarray(origin), np.asarray(spacing), values.shape, view)
+    set_window(ax, (low[0], high[0], low[1], high[1]))
+    add_signal(ax, flat, (low[0], high[0], low[1], high[1]), scale)
+    return scale
+
+
+def cut(values: np.ndarray, origin: np.ndarray, spacing: np.ndarray, look: Look, height: float | None) -> np.ndarray:
+    """What is seen of a signal, (nu, nv); `height` is where the cells are along the line of sight, for a section there."""
+    at = None if look.section == MEAN else height if look.section == CELLS else float(look.section)
+    if look.section == CELLS and at is not None:
+        # cells beyond the box read what is at its face
+        k = along(look.view)
+        at = min(max(at, float(origin[k])), float(origin[k] + spacing[k] * values.shape[k]))
+    return section(values, origin, spacing, view=look.view, at=at)
+
+
+def set_window(ax: Axes, window: Window) -> None:
+    left, right, bottom, top = window
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
+
+
+def add_signal(ax: Axes, flat: np.ndarray, extent: Window, scale: Scale) -> None:
+    """Put a signal as it is seen (nu, nv) behind the cells."""
+    window = (*ax.get_xlim(), *ax.get_ylim())
+    ax.set_facecolor(BEYOND)
+    ax.imshow(scale.paint(flat).transpose(1, 0, 2), origin="lower", extent=extent, interpolation="bilinear", zorder=0)
+    set_window(ax, window)
+
+
+def add_cells(ax: Axes, cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: Look) -> Any:
+    """Put cells into the window of the axes, the nearest to the eye last."""
+    from matplotlib.collections import PolyCollection
+
+    u, v = VIEWS[look.view]
+    if cells["position"].shape[1] == 3:
+        # seen against y in "xz", since x, z and what comes towards the eye turn like x, y and z
+        order = np.argsort(cells["position"][:, along(look.view)] * (-1 if look.view == "xz" else 1), kind="stable")
+        cells = {name: value[order] for name, value in cells.items()}
+    left, right = ax.get_xlim()
+    inch = ax.get_window_extent().width / ax.figure.dpi / abs(right - left)  # of a µm
+    points = CAP_POINTS if inch < ROUND else 4 * CAP_POINTS
+    shapes = outlines(cells["position"][:, [u, v]], cells["axis"][:, [u, v]], cells["length"], cells["radius"], points=points)
+    # an outline helps where a cell is large on paper and drowns the colour where it is small
+    width = min(0.4, 1.2 * inch)
+    edge = "black" if look.channels is None else "#d0d0d0"
+    made = PolyCollection(list(shapes), facecolors=paint_cells(cells, scales, look), edgecolors=edge, linewidths=width, zorder=1)
+    ax.add_collection(made, autolim=False)
+    return made
+
+
+def scale_bar(ax: Axes) -> float:
+    """A bar of a round length just below the axes, at the left, so that it hides nothing. Returns its length, µm."""
+    from matplotlib.transforms import ScaledTranslation
+
+    low, high = sorted(ax.get_xlim())
+    rough = 0.3 * (high - low)
+    size = max(s for e in range(-2, 6) for s in (10.0**e, 2 * 10.0**e, 5 * 10.0**e) if s <= rough)
+    # in parts of the axes, so that it stays where it is when they are moved to another place
+    below = ax.transAxes + ScaledTranslation(0, -5 / 72, ax.figure.dpi_scale_trans)
+    share = size / (high - low)
+    ax.add_line(_line([0, share], below))
+    ax.annotate(f"{size:g} µm", (0, 0), xycoords="axes fraction", xytext=(0, -8), textcoords="offset points", va="top", fontsize=SMALL, annotation_clip=False)
+    return size
+
+
+def _line(x: list[float], transform: Any) -> Any:
+    from matplotlib.lines import Line2D
+
+    return Line2D(x, [0, 0], transform=transform, color="black", linewidth=2.0, solid_capstyle="butt", clip_on=False)
+
+
+def colour_bar(ax: Axes, scale: Scale) -> None:
+    """Fill axes with the legend of a scale: its colours from left to right, its name above, its range below. Points show where values lie beyond."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.colors import BoundaryNorm, Normalize
+
+    if scale.kinds:
+        count = len(scale.kinds)
+        norm: Any = BoundaryNorm(np.arange(count + 1) - 0.5, count)
+        ticks, words = np.arange(count), [str(k) for k in scale.kinds]
+    else:
+        low, high = scale.limits
+        norm, ticks = Normalize(low, high), np.array([low, 0.5 * (low + high), high])
+        words = numbers(ticks / 10.0**scale.power)
+    bar = Colorbar(ax, ScalarMappable(norm, scale.cmap), orientation="horizontal", extend=scale.beyond, extendfrac=0.06)
+    bar.set_ticks(list(ticks), labels=words)
+    bar.minorticks_off()
+    bar.outline.set_linewidth(0.4)  # type: ignore[operator]
+    ax.tick_params(labelsize=TINY, length=2, width=0.4, pad=1.5)
+    ax.set_title(scale.title, fontsize=SMALL, pad=3)
+
+
+def numbers(values: np.ndarray) -> list[str]:
+    """Numbers with the decimals that matter in the range that they span, about three digits of it."""
+    decimals = min(17, max(0, 2 - math.floor(math.log10(values.max() - values.min()))))
+    words = (f"{x:.{decimals}f}" for x in values)
+    words = (w.rstrip("0").rstrip(".") if "." in w else w for w in words)
+    return ["0" if w == "-0" else w for w in words]

@@ -1,0 +1,119 @@
+"""What pictures are made from: cells and signals at one time as arrays, taken from a state or read from a results file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from torchfilm.results import Results
+from torchfilm.state import CELL, PER_CELL, State
+from torchfilm.tools import checks
+
+UNITS = {"length": "µm", "radius": "µm"}
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Cells and signals of B colonies at one time.
+
+    cells: arrays by name as `Results.frame` gives them, the cells of one colony side by side. time: h. colony_id: (B,). units: by name, signals under
+    "out.NAME". signals: by name, one array (nx, ny, nz) a colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm.
+    height: z of the plane of 2-D cells, µm, where it is known.
+    """
+
+    cells: Mapping[str, np.ndarray]
+    time: float
+    colony_id: np.ndarray
+    units: Mapping[str, str] = field(default_factory=dict)
+    signals: Mapping[str, list[np.ndarray]] = field(default_factory=dict)
+    origin: np.ndarray | None = None
+    shape: np.ndarray | None = None
+    spacing: np.ndarray | None = None
+    height: float | None = None
+
+    @property
+    def dim(self) -> int:
+        return self.cells["position"].shape[1]
+
+    @cached_property
+    def _ends(self) -> np.ndarray:
+        return np.searchsorted(self.cells["colony"], np.arange(len(self.colony_id) + 1))
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Cells in each colony, (B,)."""
+        return np.diff(self._ends)
+
+    def colony(self, place: int) -> dict[str, np.ndarray]:
+        """The cells of one colony, by its place in the batch."""
+        part = slice(self._ends[place], self._ends[place + 1])
+        return {name: value[part] for name, value in self.cells.items()}
+
+
+def frame_of(state: State) -> Frame:
+    """A state as a frame, its cells as `Results.frame` would give them."""
+    columns = {n: getattr(state, n) for n in PER_CELL} | {n: v for n, v in state.fields.items() if state.declared[n].scope == CELL}
+    cells = {n: v.detach().cpu().numpy() for n, v in columns.items()}
+    units = {f.name: f.unit for f in state.declared.values()}
+    ids = state.colony_id.cpu().numpy()
+    if state.layout is None:
+        return Frame(cells, state.time, ids, units)
+    grid = state.layout.grid
+    cuts = grid.offsets.cpu().numpy()[1:-1]
+    signals = {n: [x.reshape(s) for x, s in zip(np.split(v.detach().cpu().numpy(), cuts), grid.shapes, strict=True)] for n, v in state.signals.items()}
+    return Frame(
+        cells, state.time, ids, units, signals, grid.origin.cpu().numpy(), grid.shape.cpu().numpy(), np.asarray(grid.spacing), state.layout.height
+    )  # fmt: skip
+
+
+class Recorded(Sequence[Frame]):
+    """Some frames of a results file, each read when it is asked for, with one signal or none."""
+
+    def __init__(self, results: Results, places: Sequence[int], signal: str | None = None):
+        self.results, self.places, self.signal = results, [results._index(k) for k in places], signal
+        declared = json.loads(results.attributes["declared"])
+        self.units = {name: entry[1] for name, entry in declared.items()}
+        if signal is not None and signal not in results.signal_names:
+            raise checks.refuse("background", signal, "a signal of the medium: " + (", ".join(results.signal_names) or "this run has none"))
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __getitem__(self, k):
+        if isinstance(k, slice):
+            return Recorded(self.results, self.places[k], self.signal)
+        results, place = self.results, self.places[k]
+        cells, ids, time = results.frame(place), results.colony_id, float(results.times[place])
+        if not results.signal_names:
+            return Frame(cells, time, ids, self.units)
+        origin, shape, spacing = results.grid(place)
+        signals = {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
+        height = results.attributes.get("height")
+        return Frame(cells, time, ids, self.units, signals, origin, shape, spacing, None if height is None else float(height))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[k] for k in range(len(self)))
+
+    @property
+    def present(self) -> np.ndarray:
+        """(B,) whether a colony has a cell in any of the frames."""
+        return np.asarray(self.results.counts[self.places].sum(0) > 0)
+
+    @property
+    def times(self) -> np.ndarray:
+        """(F,) h."""
+        return self.results.times[self.places]
+
+    @property
+    def title(self) -> str:
+        """The name of the scene."""
+        return str(self.results.attributes["scene"]).splitlines()[0].split(":")[0]
+
+
+def unit_of(name: str, units: Mapping[str, str]) -> str:
+    """The unit of a quantity per cell, or of a signal under "out.NAME"; empty where it has none."""
+    return units.get(name, UNITS.get(name, ""))

@@ -1,0 +1,183 @@
+"""Films of a run: MP4 through imageio-ffmpeg, or animated GIF through pillow, which matplotlib brings along."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchfilm.pictures.colours import CELLS, Limits, Look, paint_cells
+from torchfilm.pictures.draw import BEYOND
+from torchfilm.pictures.frames import Recorded
+from torchfilm.pictures.page import Survey, entitle, figure_class, page, survey
+from torchfilm.pictures.sheets import beside, chosen, fill_sheet, seen_along, square
+from torchfilm.results import Results
+from torchfilm.tools import checks
+
+FASTEST_GIF = 50.0  # frames a second; viewers slow down what is faster
+GREYS = 104  # of the 256 colours of a GIF
+
+
+def movie(
+    path: str | Path,
+    out: str | Path,
+    *,
+    every: int = 1,
+    fps: float = 10.0,
+    colour: str | None = None,
+    channels: Mapping[str, str] | None = None,
+    background: str | None = None,
+    limits: Limits | None = None,
+    view: str = "xy",
+    section: float | str = CELLS,
+    whole: bool = False,
+    colonies: Sequence[int] | None = None,
+    dpi: float = 150,
+) -> Path:
+    """Film a results file, a panel a colony, with one window, one scale and one range of colours from beginning to end. Returns the film's path.
+
+    out: its name, which ends in .mp4 (needs imageio-ffmpeg) or .gif. every: draw every so many of the recorded frames, and the last. fps: drawn frames a
+    second; a GIF counts hundredths of a second. colonies: their ids; by default the first 9. The other options are those of `show`.
+    """
+    figure_class()
+    target = beside(path, out, "")
+    write = _writer(target, fps)
+    if isinstance(every, bool) or not isinstance(every, int) or every < 1:
+        raise checks.refuse("every", every, "a whole number from 1")
+    look = Look(colour, channels, background, limits, view, section, whole)
+    with Results(path) as results:
+        last = len(results) - 1
+        frames = Recorded(results, sorted({*range(0, last + 1, every), last}), background)
+        places, more = chosen(frames.present, results.colony_id, colonies, 9)
+        made = survey(frames, places, look)
+        part = target.with_name(f".{target.stem}.part{target.suffix}")
+        try:
+            write(part, Film(frames, made, f"{seen_along(look)}{more}", dpi), fps)
+            part.replace(target)
+        except OSError as error:
+            raise checks.InputError(f"{target} cannot be written as a film: {error}. Choose a folder that exists and has room.") from error
+        finally:
+            part.unlink(missing_ok=True)
+    return target
+
+
+class Film(Sequence[np.ndarray]):
+    """The frames of a film, each drawn when it is asked for: (height, width, 3) uint8."""
+
+    def __init__(self, frames: Recorded, made: Survey, more: str, dpi: float):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        self.frames, self.made = frames, made
+        clocks = clock(frames.times)
+        self.titles = [f"{frames.title}, t = {c} h{more}" for c in clocks]
+        self.figure, self.axes = page(*square(made), made, self.titles[-1], dpi=dpi)
+        self.canvas = FigureCanvasAgg(self.figure)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, k):
+        fill_sheet(self.axes, self.frames[k], self.made)
+        entitle(self.figure, self.titles[k])
+        self.canvas.draw()
+        return np.ascontiguousarray(np.asarray(self.canvas.buffer_rgba())[..., :3])
+
+
+def clock(times: np.ndarray) -> list[str]:
+    """Times with as many decimals, all the same, as they need, up to three."""
+    for decimals in range(4):
+        words = [f"{t:.{decimals}f}" for t in times]
+        if all(abs(float(w) - t) < 1e-6 for w, t in zip(words, times, strict=True)):
+            break
+    return words
+
+
+def _writer(target: Path, fps: float) -> Callable[[Path, Film, float], None]:
+    """What writes films of this kind, found before anything is drawn."""
+    kind = target.suffix.lower()
+    if kind not in (".mp4", ".gif"):
+        raise checks.refuse("out", str(target), "a name that ends in .mp4 or .gif")
+    if not target.parent.is_dir():
+        raise checks.refuse("out", str(target), "in a folder that exists")
+    if kind == ".gif":
+        checks.number("fps", fps, above=0.0, most=FASTEST_GIF, mend="Write an .mp4 for more, or draw fewer frames with every=.")
+        return _gif
+    checks.number("fps", fps, above=0.0)
+    try:
+        import imageio_ffmpeg  # noqa: F401
+    except ImportError as error:
+        raise checks.InputError('MP4 needs imageio-ffmpeg: pip install "torchfilm[movie]" or imageio-ffmpeg, or give a name that ends in .gif.') from error
+    return _mp4
+
+
+def _mp4(path: Path, film: Film, fps: float) -> None:
+    import imageio_ffmpeg
+
+    size = film.canvas.get_width_height()
+    stream = imageio_ffmpeg.write_frames(str(path), size, fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error")
+    stream.send(None)
+    try:
+        for k in range(len(film)):
+            stream.send(film[k])
+    finally:
+        stream.close()
+    written = imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+    if written != len(film):
+        raise OSError(f"ffmpeg wrote {written} of {len(film)} frames")
+
+
+def _gif(path: Path, film: Film, fps: float) -> None:
+    """All frames have one palette, so that a colour looks the same throughout."""
+    from PIL import Image
+
+    palette = _palette(film)
+
+    def image(k: int) -> Any:
+        made = Image.fromarray(_nearest(film[k], palette))
+        made.putpalette(palette.tobytes())
+        return made
+
+    frames = (image(k) for k in range(len(film)))
+    next(frames).save(path, format="GIF", save_all=True, append_images=frames, duration=round(100 / fps) * 10, loop=0)
+
+
+def _palette(film: Film) -> np.ndarray:
+    """The 256 colours (256, 3) uint8 of a GIF: greys for the signal, lines and letters; the others for those of the legends and of some frames' cells.
+
+    A palette from whole pictures would spend itself on the differences that cover most of the paper.
+    """
+    from matplotlib.colors import to_rgb
+
+    made = film.made
+    colours = [scale.cmap(np.linspace(0, 1, 256))[:, :3] for scale in made.scales]
+    for k in np.unique(np.linspace(0, len(film) - 1, 5).astype(int)):
+        frame = film.frames[int(k)]
+        colours += [paint_cells(frame.colony(place), made.scales, made.look)[:, :3] for place in made.places]
+    wanted = np.unique(np.round(255 * np.concatenate(colours)).astype(np.uint8), axis=0)
+    wanted = _spread(wanted, 256 - GREYS - 1)
+    greys = np.round(np.linspace(0, 255, GREYS)).astype(np.uint8)
+    made_up = np.concatenate([np.repeat(greys[:, None], 3, 1), np.round(255 * np.array([to_rgb(BEYOND)])).astype(np.uint8), wanted])
+    return np.concatenate([made_up, np.zeros((256 - len(made_up), 3), dtype=np.uint8)])
+
+
+def _spread(colours: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of some colours (n, 3), such that none is far from one of them: each next is the one farthest from those before."""
+    if len(colours) <= most:
+        return colours
+    points, chosen = colours.astype(np.float32), [0]
+    far = ((points - points[0]) ** 2).sum(1)
+    while len(chosen) < most:
+        chosen.append(int(far.argmax()))
+        far = np.minimum(far, ((points - points[chosen[-1]]) ** 2).sum(1))
+    return colours[chosen]
+
+
+def _nearest(picture: np.ndarray, palette: np.ndarray) -> np.ndarray:
+    """The place in the palette of the colour nearest to each pixel, (height, width) uint8; pillow's own search is coarser than the palette."""
+    shift = np.array([1 << 16, 1 << 8, 1])
+    found, where = np.unique(picture @ shift, return_inverse=True)
+    colours, there = np.stack([found >> 16, found >> 8 & 255, found & 255], 1).astype(np.float32), palette.astype(np.float32)
+    distance = (there * there).sum(1) - 2.0 * colours @ there.T
+    return distance.argmin(1).astype(np.uint8)[where].reshape(picture.shape[:2])

@@ -1,0 +1,234 @@
+"""The page: panels of one size and one scale, their titles, a scale bar and legends below, each with a place of its own in inches."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchfilm.pictures.colours import CELLS, MEAN, Look, Scale, Seen, scale_of
+from torchfilm.pictures.draw import add_cells, add_signal, colour_bar, cut, scale_bar, set_window
+from torchfilm.pictures.frames import Frame
+from torchfilm.pictures.shapes import Window, along, box, span, window
+from torchfilm.tools import checks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH, HEIGHT, NARROWEST = 7.2, 8.4, 3.2  # inches of the page, at most and at least
+EDGE, GAP, HEAD = 0.12, 0.07, 0.19  # margin, between panels, title of a panel
+BAR, BELOW, ROOM = 0.36, 0.24, 0.45  # height of a legend with its ticks; of the scale bar; between two legends, for numbers at their ends
+LETTER = 0.056  # width of a letter of 7 points, about
+
+
+def figure_class() -> Any:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise checks.InputError('Pictures need matplotlib: pip install "torchfilm[app]".') from error
+    return Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What all panels of a picture have in common: the colonies (places in the batch), the window of each, and the scales of cells and signal."""
+
+    look: Look
+    places: Sequence[int]
+    windows: Mapping[int, Window]
+    scales: tuple[Scale, ...]
+    behind: Scale | None
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of every panel, µm."""
+        left, right, bottom, top = next(iter(self.windows.values()))
+        return right - left, top - bottom
+
+
+def survey(frames: Sequence[Frame], places: Sequence[int], look: Look) -> Survey:
+    """Go through the frames once, for one window a colony and one range a quantity over all of them."""
+    seen = {name: Seen() for name in (*look.quantities, *([look.signal] if look.signal else []))}
+    covered: dict[int, np.ndarray] = {}
+    boxes: dict[int, np.ndarray] = {}
+    for frame in frames:
+        look.check(frame)
+        for place in places:
+            cells = frame.colony(place)
+            if (new := span(cells, look.view)) is not None:
+                covered[place] = _union(covered.get(place), new)
+            for name in look.quantities:
+                if name in cells:
+                    seen[name].note(cells[name])
+            if (look.background or look.whole) and frame.origin is not None and frame.spacing is not None and frame.shape is not None:
+                boxes[place] = _union(boxes.get(place), box(frame.origin[place], frame.spacing, tuple(frame.shape[place]), look.view))
+            if look.signal is not None:
+                seen[look.signal].note(signal_seen(frame, place, look, cells))
+    scales = tuple(scale_of(name, seen[name], look, frame.units) for name in look.quantities)
+    behind = None if look.signal is None else scale_of(look.signal, seen[look.signal], look, frame.units, _where(frame, look))
+    return Survey(look, places, _windows(places, covered, boxes, look), scales, behind)
+
+
+def _union(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:
+    return b if a is None else np.stack([np.minimum(a[0], b[0]), np.maximum(a[1], b[1])])
+
+
+def _windows(places: Sequence[int], covered: Mapping[int, np.ndarray], boxes: Mapping[int, np.ndarray], look: Look) -> dict[int, Window]:
+    """Windows of one size: about the cells with some room, within the box of the signal where the cells are; or the whole box."""
+    shown = {place: _union(covered.get(place), boxes[place]) for place in places} if look.whole else covered
+    sizes = []
+    for place in places:
+        extent = shown[place][1] - shown[place][0]
+        room = extent if look.whole else extent + 2.0 * (1.0 + 0.04 * extent.max())
+        if place in boxes:
+            whole = boxes[place][1] - boxes[place][0]
+            # cells that press against a wall which is a face of the box reach a little beyond it
+            room = np.where(extent < 1.02 * whole, np.minimum(room, whole), extent)
+        sizes.append(room)
+    size = np.max(sizes, 0)
+    size = np.maximum(size, 0.1 * size.max())  # a flat box seen from the side is a line
+    return {place: window(shown[place], size, boxes.get(place)) for place in places}
+
+
+def signal_seen(frame: Frame, place: int, look: Look, cells: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The background of one colony, (nu, nv)."""
+    assert look.background is not None and frame.origin is not None and frame.spacing is not None
+    height = _height(frame, place, look, cells) if look.section == CELLS else None
+    return cut(frame.signals[look.background][place], frame.origin[place], frame.spacing, look, height)
+
+
+def _height(frame: Frame, place: int, look: Look, cells: Mapping[str, np.ndarray]) -> float:
+    """Where cells are along the line of sight: their mean, or the plane of 2-D ones; the middle of the box where there are none."""
+    assert frame.origin is not None and frame.spacing is not None and frame.shape is not None
+    k = along(look.view)
+    low = float(frame.origin[place, k])
+    high = low + float(frame.spacing[k] * frame.shape[place, k])
+    if frame.dim == 3:
+        return float(cells["position"][:, k].mean()) if len(cells["length"]) else 0.5 * (low + high)
+    if frame.height is None and frame.shape[place, k] > 1 and not low <= 0.0 <= high:
+        told = f"the height of the cells, from {low:g} to {high:g} µm, which this file does not tell"
+        raise checks.refuse("section", look.section, told, 'Give it, or "mean".')
+    return frame.height or 0.0
+
+
+def _where(frame: Frame, look: Look) -> str:
+    """Where the signal is cut, for its legend."""
+    k = along(look.view)
+    if frame.shape is None or bool((frame.shape[:, k] == 1).all()):
+        return ""
+    letter = "xyz"[k]
+    if look.section == MEAN:
+        return f", mean over {letter}"
+    if look.section == CELLS and frame.dim == 3:
+        return f", {letter} of the cells"
+    return f", {letter} = {frame.height or 0.0 if look.section == CELLS else float(look.section):g} µm"
+
+
+def fill(ax: Axes, frame: Frame, place: int, made: Survey, titles: Sequence[str]) -> None:
+    """Draw one colony of one frame in a panel, in place of what was there. titles: from long to short; the longest that fits is written."""
+    for artist in (*ax.collections, *ax.images):
+        artist.remove()
+    set_window(ax, made.windows[place])
+    cells = frame.colony(place)
+    if made.behind is not None:
+        assert frame.origin is not None and frame.spacing is not None
+        low, high = box(frame.origin[place], frame.spacing, frame.signals[str(made.look.background)][place].shape, made.look.view)
+        add_signal(ax, signal_seen(frame, place, made.look, cells), (low[0], high[0], low[1], high[1]), made.behind)
+    elif made.look.channels is not None:
+        ax.set_facecolor("black")
+    add_cells(ax, cells, made.scales, made.look)
+    inches = ax.get_position().width * ax.figure.get_figwidth() + 0.5 * GAP  # type: ignore[union-attr]
+    ax.set_title(next((t for t in titles if LETTER * len(t) <= inches), ""), fontsize=7, pad=2.5)
+
+
+def page(rows: int, columns: int, made: Survey, title: str, *, dpi: float) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel for each place of a grid (row by row), its title, a scale bar and legends; panels are empty but have their windows."""
+    width, height = made.size
+    room = WIDTH - 2 * EDGE - (columns - 1) * GAP
+    panel = min(room / columns, ((HEIGHT - 1.2) / rows - HEAD) * width / height)
+    across = columns * panel + (columns - 1) * GAP
+    legends = [*made.scales, *([made.behind] if made.behind is not None else [])]
+    inches = max(NARROWEST, across + 2 * EDGE, *(_slot(s) + 2 * EDGE for s in legends))
+    left = 0.5 * (inches - across)
+    top = 0.1 + 0.15 * len(_lines(title, inches))
+    tall = panel * height / width
+    bars, depth = _legend(legends, inches, left + 0.3 * panel + 0.15)
+    total = top + rows * (HEAD + tall) + (rows - 1) * GAP + BELOW + depth + EDGE
+    # whole and even numbers of pixels, as films need them
+    figure = figure_class()(figsize=tuple(2 * math.ceil(x * dpi / 2) / dpi for x in (inches, total)), dpi=dpi)
+    wide, high = figure.get_size_inches()
+
+    def place(x: float, y: float, w: float, h: float) -> Axes:
+        """Axes whose upper left corner is x to the right and y down from that of the page, inches."""
+        return figure.add_axes((x / wide, 1 - (y + h) / high, w / wide, h / high))
+
+    axes = []
+    for k in range(rows * columns):
+        row, column = divmod(k, columns)
+        ax = place(left + column * (panel + GAP), top + row * (HEAD + tall + GAP) + HEAD, panel, tall)
+        set_window(ax, (0.0, width, 0.0, height))
+        for spine in ax.spines.values():
+            spine.set(linewidth=0.4, edgecolor="#808080")
+        axes.append(ax)
+    scale_bar(axes[(rows - 1) * columns])
+    under = top + rows * (HEAD + tall) + (rows - 1) * GAP
+    for scale, (x, y, w) in zip(legends, bars, strict=True):
+        colour_bar(place(x, under + y, w, 0.08), scale)
+    entitle(figure, title)
+    return figure, axes
+
+
+def entitle(figure: Figure, title: str) -> None:
+    """Write a page's title, in place of the one before."""
+    wide, high = figure.get_size_inches()
+    figure.suptitle("\n".join(_lines(title, wide)), fontsize=9, y=1 - 0.6 * EDGE / high, va="top", linespacing=1.1)
+
+
+def _lines(title: str, width: float) -> list[str]:
+    """A title in lines that fit on a page of this width, inches."""
+    return textwrap.wrap(title, max(10, int((width - 2 * EDGE) / (LETTER * 9 / 7))))
+
+
+def _slot(scale: Scale) -> float:
+    """Width that a legend takes, inches."""
+    return max(1.0, LETTER * len(scale.title) - 0.1, 0.2 * len(scale.kinds)) + ROOM
+
+
+def _legend(scales: Sequence[Scale], width: float, taken: float) -> tuple[list[tuple[float, float, float]], float]:
+    """Where each colour bar goes: (from the left, down from the panels, width), inches, and how far down they reach below the scale bar.
+
+    They stand at the right, beside the scale bar if all fit there, which has `taken` of the width; in rows of their own otherwise.
+    """
+    slots = [_slot(s) for s in scales]
+    beside = sum(slots) + EDGE <= width - max(taken, 0.9)
+    limit = width - EDGE
+    rows: list[list[int]] = [[]]
+    for k, slot in enumerate(slots):
+        if rows[-1] and sum(slots[j] for j in rows[-1]) + slot > limit - EDGE:
+            rows.append([])
+        rows[-1].append(k)
+    bars = []
+    for r, row in enumerate(rows):
+        x = limit - sum(slots[k] for k in row)
+        y = 0.2 + r * (BAR + 0.06) + (0.0 if beside else BELOW - 0.04)
+        for k in row:
+            bars.append((x + 0.5 * ROOM, y, slots[k] - ROOM))
+            x += slots[k]
+    deepest = max(y for _, y, _ in bars) + 0.22
+    return bars, max(0.0, deepest - BELOW)
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    try:
+        figure.savefig(path, dpi=figure.dpi)
+    except (OSError, ValueError) as error:  # no such folder; no such kind of picture
+        raise checks.InputError(
+            f"{path} cannot be written as a picture: {error}. Choose a folder that exists and a name that ends in .png, .pdf or .svg."
+        ) from error
+    return Path(path)
