@@ -33,6 +33,8 @@ ROOMS = {
     "state": Room(1, ("torchfilm.state",), besides=("torchfilm.physics.capsule", "torchfilm.signals.layout")),
     "effect": Room(2, ("torchfilm.effect",)),
     "kernels": Room(3, ("torchfilm.physics", "torchfilm.signals", "torchfilm.circuits")),
+    # what rules see: made of states and kernels, used by one effect and by whoever writes rules
+    "views": Room(3, ("torchfilm.views",)),
     "effects": Room(4, ("torchfilm.effects",), talk=False),
     "scene": Room(5, ("torchfilm.scene", "torchfilm.cells")),
     # simulate takes a path to record to, so results lie below it

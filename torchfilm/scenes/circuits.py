@@ -11,8 +11,9 @@ from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
-from torchfilm.effects.rules import DivisionView, Rules
+from torchfilm.effects.rules import Rules
 from torchfilm.scene import Scene
+from torchfilm.views import DivisionView
 
 Value = float | Tensor
 

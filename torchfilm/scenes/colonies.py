@@ -8,9 +8,10 @@ from torchfilm.effect import Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
-from torchfilm.effects.rules import CellsView, Rules
+from torchfilm.effects.rules import Rules
 from torchfilm.physics.walls import Plane
 from torchfilm.scene import Scene
+from torchfilm.views import CellsView
 
 
 def microcolony(

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.signals.exchange import Stencil, stencil
+from torchfilm.signals.exchange import Stencil, read, stencil
 from torchfilm.signals.grid import Grid
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import expand_ranges
@@ -51,6 +51,14 @@ class Layout:
     def stencil(self, position: Tensor, colony: Tensor, dtype: torch.dtype) -> Stencil:
         """Where cells at (N, d) µm of colonies (N,) meet the grid."""
         return stencil(self.grid, self.places(position), colony, periodic=self.periodic, mask=self.mask, dtype=dtype)
+
+    def readings(self, position: Tensor, colony: Tensor, signals: Mapping[str, Tensor]) -> list[Tensor]:
+        """What cells at (N, d) µm of colonies (N,) find of each signal (nodes,), (N,) each."""
+        values = list(signals.values())
+        if not values:
+            return []
+        where = self.stencil(position, colony, values[0].dtype)
+        return [read(value, where) for value in values]
 
     def on(self, grid: Grid) -> Layout:
         """The same medium on another grid."""
