@@ -41,7 +41,7 @@ def random_partition(rate: float = 1.0, start: float = 1.0) -> Scene:
 
 
 def repressilator(
-    alpha: Value = 216.0, basal: Value = 0.216, beta: Value = 5.0, power: float = 2.0, speed: Value = 3.0, copies: float = 5.0, noise: bool = True,
+    alpha: Value = 216.0, basal: Value = 0.216, beta: Value = 5.0, power: float = 2.0, speed: Value = 2.0, copies: float = 0.5, noise: bool = True,
     rate: float = 0.7,
 ) -> Scene:  # fmt: skip
     """Three genes that repress each other in a ring (Elowitz and Leibler 2000), in a growing colony: cells of one descent drift out of step.
@@ -68,13 +68,13 @@ def repressilator(
 
 
 def toggle_switch(
-    strength: Value = 10.0, power: float = 2.0, speed: Value = 4.0, start: float = 2.0, copies: float = 4.0, noise: bool = True, rate: float = 0.7,
+    strength: Value = 10.0, power: float = 2.0, speed: Value = 1.0, start: float = 1.65, copies: float = 50.0, noise: bool = True, rate: float = 0.7,
 ) -> Scene:  # fmt: skip
     """Two genes that repress each other (Gardner et al. 2000): cells near the tipping point fall to one side or the other, and their descendants stay there,
     so that the colony forms sectors.
 
-    x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y = `start`. noise: molecule by molecule, with `copies` of
-    them in a unit of concentration × µm³. Growth dilutes beside the decay.
+    x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y = `start`, by default where decay,
+    dilution and repression balance. noise: molecule by molecule, with `copies` of them in a unit of concentration × µm³. Growth dilutes beside the decay.
     """
     reactions = []
     for name, by in (("red", "green"), ("green", "red")):

@@ -15,7 +15,7 @@ from torchfilm.signals.faces import Faces, Fixed
 
 
 def nutrient_limited(
-    supply: float | Tensor = 1.0, half: float | Tensor = 0.1, diffusion: float | Tensor = 40.0, growth_yield: float | Tensor = 1.0, rate: float | Tensor = 1.0,
+    supply: float | Tensor = 1.0, half: float | Tensor = 0.1, diffusion: float | Tensor = 10.0, growth_yield: float | Tensor = 1.0, rate: float | Tensor = 1.0,
     size: float = 240.0, spacing: float = 4.0,
 ) -> Scene:  # fmt: skip
     """A colony that eats the nutrient about it, which comes by diffusion from the edge of a box `size` µm wide, where it is kept at `supply`: only a rim grows,
