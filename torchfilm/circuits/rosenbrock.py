@@ -9,7 +9,7 @@ W = 2/h − J a step from u is
     W k₄ = f(y₄) + (k₁ − k₂ − 8/3 k₃)/h    u' = y₄ + k₄,  error ≈ k₄
 
 Every k lies in the range of f, so what f conserves (w · f = 0) is conserved. All of this is done in float64, whatever the cells' own dtype:
-where a rate of 1e8/h balances another, 2/h would be lost in a float32 W and the conserved sum with it. The rates are asked in the cells' dtype.
+where a rate of 1e8/h balances another, 2/h would be lost in a float32 W and the conserved sum with it, or rounding of rates be magnified by it.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ STATUS = {
 }
 SAFETY, SHRINK, GROW = 0.9, 0.1, 5.0
 LEAST_STEP = 1e-20  # of the whole; a cell that asks for less has failed
+MOST_SICK = 60  # steps with a result that is no number, after which a cell that comes upon them again and again is given up
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,8 @@ def rosenbrock(
 ) -> tuple[Tensor, Report]:
     """Concentrations (N, S) after dt hours: each cell in steps whose error is at most atol + rtol |u| in every species.
 
-    rates: plain torch, du/dt (M, S) of the cells `rows` (M,), without a time of its own; differentiable in u. atol: in the unit of u, a number or (S,).
+    rates: plain torch, du/dt (M, S) of the cells `rows` (M,) at float64 concentrations, without a time of its own; differentiable in u.
+    atol: in the unit of u, a number or (S,).
     rtol below four units in the last place of u's dtype counts as that. first_step: h, default all of dt at once. nonnegative: what starts
     at or above 0 stays there: the rates are continued linearly below 0, and a step that ends there is drawn towards two steps of backward Euler.
     Gradients of u and of whatever `rates` holds pass through the accepted steps, with the steps' sizes held fixed. Raises nothing.
@@ -97,7 +99,7 @@ class _Method:
         self.rates, self.dtype, self.rtol, self.atol, self.nonnegative, self.tracked = rates, dtype, rtol, atol, nonnegative, tracked
 
     def evaluate(self, u: Tensor, rows: Tensor) -> Tensor:
-        return self.rates(u.to(self.dtype).t(), rows).t().to(torch.float64)
+        return self.rates(u.t(), rows).t().to(torch.float64)
 
     def linearise(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ, in one call on S copies of the cells."""
@@ -111,7 +113,7 @@ class _Method:
         """By a backward pass: of the i-th copy only the rate of species i is asked."""
         size, count = u.shape
         with torch.enable_grad():
-            copies = u.to(self.dtype).repeat(1, size).requires_grad_()
+            copies = u.repeat(1, size).requires_grad_()
             out = self.rates(copies.t(), rows.repeat(size))
             f = out.detach()[:count].t().to(torch.float64)
             slope = None
@@ -128,8 +130,8 @@ class _Method:
         """
         _prepare_forward_mode()
         size, count = u.shape
-        copies = u.to(self.dtype).repeat(1, size)
-        directions = torch.eye(size, dtype=self.dtype, device=u.device).unsqueeze(2).expand(size, size, count).reshape(size, size * count)
+        copies = u.repeat(1, size)
+        directions = torch.eye(size, dtype=u.dtype, device=u.device).unsqueeze(2).expand(size, size, count).reshape(size, size * count)
         with forward_ad.dual_level():
             out = self.rates(forward_ad.make_dual(copies.t(), directions.t()), rows.repeat(size))
             value, slope = forward_ad.unpack_dual(out)
@@ -210,7 +212,7 @@ def _advance(method: _Method, u: Tensor, left: Tensor, h: Tensor, max_steps: int
     accepted, rejected = torch.zeros_like(rows), torch.zeros_like(rows)
     status = torch.full_like(rows, TOO_MANY_STEPS)
     out: list[tuple[Tensor, Tensor]] = []
-    shortest = LEAST_STEP * left
+    shortest, sick = LEAST_STEP * left, torch.zeros_like(rows)
     for _ in range(max_steps):
         new, error, broken = method.step(u, rows, h)
         good = (error <= 1.0) & ~broken
@@ -231,6 +233,8 @@ def _advance(method: _Method, u: Tensor, left: Tensor, h: Tensor, max_steps: int
         h = torch.where((left - h) < 1e-10 * left, left, h)
         lost = ~good & (h < shortest)
         if bool(error.isnan().any()):
+            sick = sick + error.isnan()
+            lost |= sick > MOST_SICK
             lost |= ~torch.isfinite(method.evaluate(u.detach(), rows)).all(0)  # no step would help
         failed = torch.where(torch.isfinite(error), torch.where(broken, BELOW_ZERO, TOO_MANY_STEPS), NOT_FINITE)
         leave = ends | lost
@@ -239,7 +243,7 @@ def _advance(method: _Method, u: Tensor, left: Tensor, h: Tensor, max_steps: int
             gone, stay = torch.nonzero(leave).squeeze(1), torch.nonzero(~leave).squeeze(1)
             out.append((rows.index_select(0, gone), u.index_select(1, gone)))
             rows, u = rows.index_select(0, stay), u.index_select(1, stay)
-            left, h, shortest = left.index_select(0, stay), h.index_select(0, stay), shortest.index_select(0, stay)
+            left, h, shortest, sick = (x.index_select(0, stay) for x in (left, h, shortest, sick))
         if rows.numel() == 0:
             break
     out.append((rows, u))

@@ -57,7 +57,7 @@ class Mechanics(Effect):
     passes: at most this many times a step contacts are found and solved: again in colonies where the move made new contacts, or left an
     overlap deeper than `overlap` (µm). Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other; twice as many
     for unilateral contacts, since a push at one end may drive in the other; 6, down to 0.02 µm, for colonies that take sub-steps.
-    tolerance: of the solve, worst residual relative to the worst at rest; default 0.1 in the plane, where it changes no overlap, and 0.05 in space,
+    tolerance: of the solve, worst residual relative to the worst at rest; default 0.2 in the plane, where it changes no overlap, and 0.05 in space,
     where cells that buckle amplify what is left. max_iterations: CG iterations a solve.
     max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
     """
@@ -123,7 +123,7 @@ class Mechanics(Effect):
     @property
     def least_accuracy(self) -> float:
         """`tolerance`, or its default for the dimension."""
-        return self.tolerance if self.tolerance is not None else (0.1 if self.dim == 2 else 0.05)
+        return self.tolerance if self.tolerance is not None else (0.2 if self.dim == 2 else 0.05)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (

@@ -307,18 +307,7 @@ def _velocity(flow: Flow, layout: Layout, batch: Batch, own: Callable[[Any], Any
     if not callable(flow):
         parts = [torch.as_tensor(own(v), dtype=torch.float64).reshape(-1).expand(batch.places.numel()) for v in (*flow, 0.0)[:3]]
         return torch.stack(parts, 1)
-    out = []
-    step, origin = layout.grid.step, layout.grid.origin.index_select(0, batch.places)
-    for axis in range(3):
-        counts = [n + (k == axis) for k, n in enumerate(batch.shape)]
-        lines = [(torch.arange(n, device=origin.device) + (0.0 if k == axis else 0.5)) * step[k] for k, n in enumerate(counts)]
-        faces = torch.stack(torch.meshgrid(*lines, indexing="ij"), -1) + origin.reshape(-1, 1, 1, 1, 3)
-        found = flow(faces.reshape(-1, 3))
-        if not isinstance(found, Tensor) or found.dim() != 2 or found.shape[0] != faces[..., 0].numel() or found.shape[1] not in (2, 3):
-            raise checks.refuse("flow(places)", tuple(getattr(found, "shape", ())), f"velocities of shape ({faces[..., 0].numel()}, 3)")
-        part = found[:, axis] if axis < found.shape[1] else torch.zeros_like(found[:, 0])
-        out.append(part.reshape(faces.shape[:-1]))
-    return tuple(out)
+    return layout.on_faces(flow, batch)
 
 
 def _flow(name: str, given: Any) -> Any:

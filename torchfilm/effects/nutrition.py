@@ -64,6 +64,8 @@ class Monod(Effect):
         unit = state.declared["growth_rate"].unit
         if unit != "1/h":
             raise checks.InputError(f"Monod sets growth of the volume, in 1/h, but Growth takes its rate in {unit!r}: use Growth() with law='volume'.")
+        if bool((state.growth_rate != 0).any()):
+            raise checks.InputError("Monod sets the growth rate, but Growth has a rate of its own, which would be overwritten: write Growth().")
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0 or state.layout is None:

@@ -27,13 +27,14 @@ def _lux(u: Names, s: Names, p: Names, cell: Names):
 
 
 def quorum_sensing(
-    D1: Value = 1.0, d2: Value = 1e-3, k1: Value = 1.0, k2: Value = 1.0, k3: Value = 1.0, k4: Value = 1.0, g1: Value = 0.1, diffusion: Value = 100.0,
+    D1: Value = 100.0, d2: Value = 1e-3, k1: Value = 100.0, k2: Value = 1.0, k3: Value = 1.0, k4: Value = 1e-4, g1: Value = 0.1, diffusion: Value = 1000.0,
     rate: float = 1.0, size: float = 128.0, spacing: float = 4.0,
 ) -> Scene:  # fmt: skip
     """Lux quorum sensing (Table 2): cells make AHL, which crosses their membranes and spreads; together they make enough of it to switch LuxI on.
 
-    D1 µm/h, membrane; k1, k2 AHL from LuxI; d2, k3, k4 LuxI, basal and induced; g1 its decay, 1/h. The box, `size` µm wide, lets nothing out. The paper
-    names d2 without its value; 1e-3 is its d1.
+    D1 µm/h, membrane; k1, k2 AHL from LuxI; d2, k3, k4 LuxI, basal and induced; g1 its decay, 1/h. The box, `size` µm wide, lets nothing out. With the
+    constants that Table 2 prints (D1 = k1 = k4 = 1; d2 without a value, its d1 is 1e-3) LuxI is diluted faster than it can be induced and nothing switches;
+    with these it does, the sooner the smaller the box.
     """
     half = size / 2
     return Scene(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.signals.exchange import Stencil, read, stencil
-from torchfilm.signals.grid import Grid
+from torchfilm.signals.grid import Batch, Grid
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import expand_ranges
 
@@ -59,6 +59,23 @@ class Layout:
             return []
         where = self.stencil(position, colony, values[0].dtype)
         return [read(value, where) for value in values]
+
+    def on_faces(self, flow: Callable[[Tensor], Tensor], batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        """A velocity field, a function from places (M, 3) µm to velocities (M, 2 or 3), on the faces of the voxels of some colonies: (b, nx + 1, ny, nz)
+        along x, and so on."""
+        out = []
+        step, origin = self.grid.step, self.grid.origin.index_select(0, batch.places)
+        for axis in range(3):
+            counts = [n + (k == axis) for k, n in enumerate(batch.shape)]
+            lines = [(torch.arange(n, device=origin.device) + (0.0 if k == axis else 0.5)) * step[k] for k, n in enumerate(counts)]
+            faces = torch.stack(torch.meshgrid(*lines, indexing="ij"), -1) + origin.reshape(-1, 1, 1, 1, 3)
+            found = flow(faces.reshape(-1, 3))
+            size = faces[..., 0].numel()
+            if not isinstance(found, Tensor) or found.shape not in ((size, 2), (size, 3)):
+                raise checks.refuse("flow(places)", tuple(getattr(found, "shape", ())), f"velocities of shape ({size}, 3)")
+            part = found[:, axis] if axis < found.shape[1] else torch.zeros_like(found[:, 0])
+            out.append(part.reshape(faces.shape[:-1]))
+        return out[0], out[1], out[2]
 
     def on(self, grid: Grid) -> Layout:
         """The same medium on another grid."""

@@ -1,0 +1,188 @@
+"""A scene pays for what it lists and for nothing else, proved by counting: operators dispatched and bytes allocated, not seconds.
+
+Three claims. The steps of growth, division and mechanics cost exactly the same operators and bytes whatever else the scene lists. What a scene does
+not list is not called: with every public function of its rooms taken away the scene runs as before. And its fields are not there.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import sys
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.state import OUTSIDE
+from torchfilm.tools.counting import Operators
+
+BODY = ("division", "growth", "mechanics")
+BOX = {"box": ((-16.0, -16.0), (16.0, 16.0)), "spacing": 4.0}
+
+
+def made(u, s, p, cell):
+    return {"m": 1.0 - u.m}
+
+
+def watching(cells):
+    cells.mark = cells.length * 2.0
+
+
+def body(rate: float | None = 1.0) -> list[tf.Effect]:
+    return [tf.Growth(rate=rate), tf.Division(length=tf.Uniform(3.0, 3.6)), tf.Mechanics(dim=2)]
+
+
+def circuit(**options) -> tf.Circuit:
+    return tf.Circuit(made, species=("m",), **options)
+
+
+def reactions() -> tf.Circuit:
+    return tf.Circuit([tf.parts.constitutive("m", 1.0), tf.parts.degradation("m", 1.0)], species=("m",), method="tau_leap")
+
+
+def medium(**options) -> tf.Medium:
+    return tf.Medium(ahl=tf.Signal(diffusion=10.0), **{**BOX, **options})
+
+
+LISTED = {
+    "circuit": lambda: [circuit()], "molecules": lambda: [reactions()], "medium": lambda: [medium()], "both": lambda: [circuit(), medium(beyond="grow")],
+    "rules": lambda: [tf.Rules(watching)], "removal": lambda: [tf.Removal((-50, -50), (50, 50))],
+    "everything": lambda: [tf.Rules(watching), circuit(), medium(beyond="open"), tf.Removal((-50, -50), (50, 50))],
+}  # fmt: skip
+
+
+def costs(scene: tf.Scene, steps: int = 30) -> tuple[list[dict[str, tuple[dict[str, int], int]]], list[tf.State]]:
+    """What each effect of each step asked for, by its title: (operators by name, bytes), and the states."""
+    state, spent, states = scene.seed(seed=5, dtype=torch.float64), [], []
+    for _ in range(steps):
+        state, here = state.replace(births=(), ended=(), reports={}), {}
+        for effect in scene.effects:
+            with Operators() as seen:
+                state = effect.step(state, 0.05)
+            here[effect.title] = (dict(seen.calls), seen.bytes)
+        state = state.replace(step=state.step + 1, time=state.time + 0.05)
+        spent.append(here)
+        states.append(state)
+    return spent, states
+
+
+@pytest.fixture(scope="module")
+def bare():
+    spent, states = costs(tf.Scene(*body()))
+    assert states[-1].cells >= 4 and states[-1].births == states[-1].births
+    assert all(sum(step[title][0].values()) > 0 for step in spent for title in BODY)
+    return spent, states
+
+
+@pytest.mark.parametrize("listed", LISTED)
+def test_growth_division_and_mechanics_cost_the_same_whatever_else_is_listed(listed, bare):
+    """The same cells, the same operators by name and count. Only where cells divide, a scene with more fields per cell has more to hand on."""
+    scene = tf.Scene(*body(), *LISTED[listed]())
+    spent, states = costs(scene)
+    assert torch.equal(states[-1].position, bare[1][-1].position)
+    for here, there, state in zip(spent, bare[0], states, strict=True):
+        for title in BODY:
+            if title != "division" or not state.births or listed in ("medium", "removal"):
+                assert here[title] == there[title], (title, state.step)
+        extra = set(here) - set(there)
+        assert all(sum(here[title][0].values()) > 0 or title == "cover" for title in extra), "an effect that is listed and does nothing proves nothing"
+
+
+def test_the_counter_sees_what_it_should(bare):
+    """It would tell a scene whose growth did one operation more."""
+
+    class Wasteful(tf.Growth):
+        def step(self, state, dt):
+            return super().step(state.replace(length=state.length + 0.0), dt)
+
+    spent, _ = costs(tf.Scene(Wasteful(rate=1.0), *body()[1:]), steps=2)
+    calls, size = spent[0]["growth"]
+    wanted, allowed = bare[0][0]["growth"]
+    assert sum(calls.values()) == sum(wanted.values()) + 1 and size == allowed + 8  # one cell of float64
+
+
+def functions(*rooms: str) -> list[tuple[object, str]]:
+    """Every function and class of some packages, wherever a module has it under a name: (module, name)."""
+    own = set()
+    for room in rooms:
+        package = importlib.import_module(room)
+        modules = [importlib.import_module(f"{room}.{m.name}") for m in pkgutil.iter_modules(package.__path__)] if hasattr(package, "__path__") else [package]
+        for module in modules:
+            own |= {id(f) for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__}
+    assert own
+    return [(m, name) for key, m in list(sys.modules.items()) if key.startswith("torchfilm") for name, f in list(vars(m).items()) if id(f) in own]
+
+
+def forbid(monkeypatch, *rooms: str) -> None:
+    for module, name in functions(*rooms):
+        monkeypatch.setattr(module, name, _refusing(name))
+
+
+def _refusing(name: str):
+    def refuse(*_, **__):
+        raise AssertionError(f"{name} was called, in a scene that does not list it")
+
+    return refuse
+
+
+def run(scene: tf.Scene, steps: int = 30) -> tf.State:
+    state = scene.seed(2, seed=5, dtype=torch.float64)
+    for _ in range(steps):
+        state = scene.step(state, 0.05)
+    return state
+
+
+WITHOUT = {
+    "neither signals nor circuits": (lambda: [tf.Rules(watching), tf.Removal((-50, -50), (50, 50))], ("torchfilm.signals", "torchfilm.circuits")),
+    "no signals": (lambda: [circuit()], ("torchfilm.signals",)),
+    "no signals, molecules": (lambda: [reactions()], ("torchfilm.signals", "torchfilm.circuits.rosenbrock", "torchfilm.circuits.integrators")),
+    "no noise": (lambda: [circuit()], [f"torchfilm.circuits.{m}" for m in ("stochastic", "draws", "partition", "network")]),
+    "no circuits": (lambda: [medium()], ("torchfilm.circuits",)),
+    "nobody who exchanges": (lambda: [medium()], ("torchfilm.signals.implicit", "torchfilm.signals.iterative")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WITHOUT)
+def test_what_a_scene_does_not_list_is_never_called(case, monkeypatch):
+    more, rooms = WITHOUT[case]
+    before = run(tf.Scene(*body(), *more()))
+    forbid(monkeypatch, *rooms)
+    after = run(tf.Scene(*body(), *more()))
+    assert after.cells == before.cells > 4 and torch.equal(after.position, before.position)
+    for name, value in before.fields.items():
+        assert torch.equal(after.fields[name], value), name
+
+
+@pytest.mark.parametrize(
+    ("listed", "room"), [("circuit", "circuits.rosenbrock"), ("molecules", "circuits.stochastic"), ("medium", "signals.transport")]
+)  # fmt: skip
+def test_what_a_scene_lists_is_called(listed, room, monkeypatch):
+    """The other way round, so that the test above could fail."""
+    forbid(monkeypatch, f"torchfilm.{room}")
+    with pytest.raises(AssertionError, match="was called"):
+        run(tf.Scene(*body(), *LISTED[listed]()), 1)
+
+
+def test_fields_and_stages_are_those_of_the_effects_listed():
+    plain = tf.Scene(*body())
+    state = run(plain, 1)
+    assert state.layout is None and state.signals == {} and not any(n.startswith(OUTSIDE) for n in state.fields)
+    known = {"divide_flag", "division_threshold", "growth_rate", "elongation", "displacement"}
+    assert set(state.fields) == known and set(state.reports) == {"mechanics"}
+    for more, added in (
+        ([circuit()], {"m", "circuit_volume"}), ([medium()], {"out.ahl"}), ([medium(beyond="open")], {"out.ahl", "ahl_beyond"}),
+        ([tf.Circuit({0: made}, species=("m",))], {"m", "circuit_volume", "cell_type"}), ([tf.Rules(watching)], {"mark"}),
+    ):  # fmt: skip
+        found = run(tf.Scene(*body(), *more), 1)
+        assert set(found.fields) - known == added
+        assert (found.layout is None) == ("out.ahl" not in added)
+    eating = run(tf.Scene(*body(None), tf.Monod("ahl"), medium()), 1)
+    assert set(eating.fields) - known == {"out.ahl", "ahl_eaten"}
+
+
+def test_a_circuit_that_exchanges_nothing_costs_the_medium_nothing_but_reading():
+    """Beside a Medium, a circuit that neither reads nor gives writes nothing to it: the grid is that of the medium alone, bit for bit."""
+    alone, beside = (run(tf.Scene(*body(), *more, medium()), 5) for more in ([], [circuit()]))
+    assert torch.equal(alone.signals["ahl"], beside.signals["ahl"])
