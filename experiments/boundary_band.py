@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import time
 from collections import deque
 from pathlib import Path
@@ -84,7 +85,7 @@ def main() -> None:
     print(f"{'condition':<14} {'cells':>6} {'place µm':>14} {'width µm':>14} {'YFP peak':>20} {'contrast':>16} {'seconds':>8}")
     for name in options.only:
         scene = tf.scenes.boundary_detector(**CONDITIONS[name])
-        record = None if options.record is None else tf.Recorder(options.record / f"{name.replace(' ', '_')}.h5", scene, every=40, overwrite=True)
+        record = None if options.record is None else tf.Recorder(options.record / (re.sub(r"\W+", "_", name) + ".h5"), scene, every=40, overwrite=True)
         begun = time.perf_counter()
         state = deque(tf.simulate(scene, scene.seed(options.seeds, seed=0), cells=options.cells, record=record), maxlen=1).pop()
         bands = [band(state, k) for k in range(options.seeds)]
