@@ -5,7 +5,7 @@
 
 Each condition is one batch of colonies. For every colony the sink cells are put into strips along the channel by their distance from the border, which is
 the place with the fewest cells on the wrong side of it; the profile of mean YFP over these strips gives the band's peak, its place, its full
-width at half maximum, and its contrast: the peak over the mean of sinks far inside (farther than 40 µm from the border).
+width at half maximum and the middle of that, and its contrast: the peak over the mean of sinks far inside (farther than 40 µm from the border).
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def band(state: tf.State, place: int) -> dict[str, float]:
         right += 1
     inside, sources = at[sink] > FAR, at[~sink] < -FAR
     return {
-        "cells": float(mine.sum()), "place_um": float(centres[top]), "width_um": float(centres[right] - centres[left] + STRIP), "peak": float(profile[top]),
+        "cells": float(mine.sum()), "place_um": float(centres[top]), "middle_um": float(0.5 * (centres[left] + centres[right])), "width_um": float(centres[right] - centres[left] + STRIP), "peak": float(profile[top]),
         "contrast": float(profile[top] / yfp[sink][inside].mean()) if inside.any() else float("nan"),
         "cfp_inside": float(cfp[~sink][sources].mean()) if sources.any() else float("nan"),
     }  # fmt: skip
@@ -82,7 +82,7 @@ def main() -> None:
     options = parser.parse_args()
     tf.keep_memory()
     found = json.loads(options.out.read_text()) if options.out.exists() else {}
-    print(f"{'condition':<14} {'cells':>6} {'place µm':>14} {'width µm':>14} {'YFP peak':>20} {'contrast':>16} {'seconds':>8}")
+    print(f"{'condition':<14} {'cells':>6} {'place µm':>14} {'middle µm':>14} {'width µm':>14} {'YFP peak':>20} {'contrast':>16} {'seconds':>8}")
     for name in options.only:
         scene = tf.scenes.boundary_detector(**CONDITIONS[name])
         record = None if options.record is None else tf.Recorder(options.record / (re.sub(r"\W+", "_", name) + ".h5"), scene, every=40, overwrite=True)
@@ -94,7 +94,7 @@ def main() -> None:
         options.out.write_text(json.dumps(found, indent=1))
         shown = {k: f"{np.mean(v):.4g} ± {np.std(v):.2g}" for k, v in row.items()}
         print(
-            f"{name:<14} {np.mean(row['cells']):6.0f} {shown['place_um']:>14} {shown['width_um']:>14} {shown['peak']:>20} {shown['contrast']:>16} "
+            f"{name:<14} {np.mean(row['cells']):6.0f} {shown['place_um']:>14} {shown['middle_um']:>14} {shown['width_um']:>14} {shown['peak']:>20} {shown['contrast']:>16} "
             f"{found[name]['seconds']:8.1f}",
             flush=True,
         )

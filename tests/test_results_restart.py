@@ -80,7 +80,7 @@ def test_another_scene_is_refused(whole, tmp_path):
     with tf.Results(whole[0]) as results:
         with pytest.raises(tf.InputError, match="2-D"):
             results.state(tf.Scene(tf.Growth(rate=1.0), tf.Mechanics()))
-        with pytest.raises(tf.InputError, match=r"birth_length.*another scene"):
+        with pytest.raises(tf.InputError, match=r"it lacks .*birth_length"):
             results.state(tf.Scene(tf.Growth(rate=1.0), tf.Division(added=1.0), tf.Mechanics(dim=2)))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import inspect
-import json
 import os
 import signal
 import sys
@@ -109,6 +108,8 @@ class Resume:
     """Take up edits of the rules file while running."""
     picture: bool = True
     """Draw the last frame beside the results."""
+    changed: bool = False
+    """Go on although the scene is not as it was recorded."""
 
     def __call__(self) -> None:
         if self.cells is None and self.until is None:
@@ -120,8 +121,7 @@ class Resume:
                 scene = scenes.build(*results.recipe)
             else:
                 raise InputError(f"{self.file} was made by a scene of your own: give its file with --scene.")
-            check_fields(scene, results)
-            state = results.state(scene, device=self.device)
+            state = results.state(scene, device=self.device, changed=self.changed)
             dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
         if self.picture:
             own_picture(self.file)
@@ -236,23 +236,6 @@ def own_picture(results: Path, out: Path | None = None) -> Path:
         mend = "Give the results a name that does not end in .png, or draw with show --out."
         raise checks.refuse("picture", str(picture), "another file than the results", mend)
     return picture
-
-
-def check_fields(scene: Scene, results: Results) -> None:
-    """Raise InputError that names the fields of an edited scene which a results file does not hold, or holds in another shape."""
-    if scene.dim != int(results.attributes["dim"]):
-        return  # told better where the state is read
-    there = {name: (scope, tuple(shape)) for name, (_, _, scope, shape, _) in json.loads(results.attributes["declared"]).items()}
-    here = {f.name: (f.scope, tuple(f.shape)) for f in scene.unchecked(1).declared.values()}
-    kinds = {
-        "it lacks": [n for n in here if n not in there],
-        "of another shape there:": [n for n in here if n in there and here[n] != there[n]],
-    }
-    if not any(kinds.values()):
-        return
-    kinds["not in this scene:"] = [n for n in there if n not in here]
-    told = "; ".join(f"{kind} {', '.join(map(repr, names))}" for kind, names in kinds.items() if names)
-    raise InputError(f"{results.path} was recorded with other fields than this scene has ({told}). Take the edit back to go on with it, or start a new run.")
 
 
 def load_scene(what: str, parameters: dict[str, Any]) -> Scene:

@@ -100,6 +100,8 @@ class Recorder:
                 self.file.close()
                 self.file = None
                 raise checks.refuse("state", f"at step {state.step}", f"the last frame of {self.path}, at step {last}", "Start from its last frame.")
+            if "effects" in self.file.attrs:  # of a scene that was changed on purpose, or Results.state would have refused it
+                self.file.attrs["effects"], self.file.attrs["scene"] = json.dumps(self.scene.listing()), self.scene.explain()
             self.file.swmr_mode = True
             self.written, self.first_step = last, int(self.file["frames/step"][0])
             return
@@ -117,7 +119,7 @@ class Recorder:
         attributes = {
             "format": FORMAT, "version": VERSION, "seed": state.seed, "dim": state.dim, "dtype": str(state.dtype)[6:],
             "device": str(state.device), "dt": self.dt, "every": self.every,
-            "scene": scene.explain(), "recipe": json.dumps(scene.recipe), "settings": json.dumps(scene.settings),
+            "scene": scene.explain(), "effects": json.dumps(scene.listing()), "recipe": json.dumps(scene.recipe), "settings": json.dumps(scene.settings),
             "torchfilm": __version__, "torch": str(torch.__version__),
             "declared": json.dumps({f.name: [f.meaning, f.unit, f.scope, list(f.shape), f.at_division] for f in state.declared.values()}),
         }  # fmt: skip

@@ -178,6 +178,29 @@ class Results:
         flat = self.file[f"signals/{name}"]
         return [flat[a:b].reshape(tuple(shape)) for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)]
 
+    def _check_scene(self, scene: Scene, template: State, changed: bool) -> None:
+        """Raise InputError that names what a scene has otherwise than the one that was recorded."""
+        there = {name: (scope, tuple(shape)) for name, (_, _, scope, shape, _) in json.loads(self.file.attrs["declared"]).items()}
+        here = {f.name: (f.scope, tuple(f.shape)) for f in template.declared.values()}
+        kinds = {
+            "it lacks": [n for n in here if n not in there],
+            "of another shape there:": [n for n in here if n in there and here[n] != there[n]],
+        }
+        if any(kinds.values()):
+            kinds["not in this scene:"] = [n for n in there if n not in here]
+            raise InputError(
+                f"{self.path} was recorded with other fields than this scene has ({_told(kinds)}). Take the edit back to go on with it, or start a new run."
+            )
+        if self.signal_names and template.layout is None:
+            raise InputError(f"{self.path} was recorded with a Medium ({', '.join(self.signal_names)}), and this scene has none.")
+        was, now = json.loads(self.file.attrs.get("effects", "null")), scene.listing()
+        if was is not None and was != now and not changed:
+            kinds = {"recorded with": [e for e in was if e not in now], "this scene has": [e for e in now if e not in was]}
+            raise InputError(
+                f"{self.path} is of another scene: {_told(kinds) or 'the same effects in another order'}. If the change is meant, say so: "
+                "resume --changed, in Python results.state(scene, changed=True)."
+            )
+
     def table(self, frame: int | None = None) -> dict[str, np.ndarray]:
         """One column a quantity, one row a cell, for `pandas.DataFrame(results.table())`: of one frame, or of all with time and frame."""
         frames = range(len(self)) if frame is None else [self._index(frame)]
@@ -219,29 +242,24 @@ class Results:
         fate[at] = np.asarray(FATES)[ends["fate"]]
         return {"colony": colony, "uid": uid, "parent": parent, "born": born, "ended": ended, "fate": fate}
 
-    def state(self, scene: Scene, frame: int = -1, *, device: str | torch.device | None = None) -> State:
-        """The state at a frame, from which `simulate` goes on as if it had never stopped. The scene must be the one that was run."""
+    def state(self, scene: Scene, frame: int = -1, *, device: str | torch.device | None = None, changed: bool = False) -> State:
+        """The state at a frame, from which `simulate` goes on as if it had never stopped. The scene must be the one that was run, or, if
+        `changed`, one that has the same fields."""
         k = self._index(frame)
         dtype = getattr(torch, str(self.file.attrs["dtype"]))
         device = torch.device(device if device is not None else "cpu")
         template = scene.unchecked(int(self.colony_id.max()) + 1, seed=int(self.file.attrs["seed"]), dtype=dtype, device=device)
         if template.dim != int(self.file.attrs["dim"]):
             raise checks.refuse("scene", f"{template.dim}-D", f"{self.file.attrs['dim']}-D, as {self.path} is")
+        self._check_scene(scene, template, changed)
         recorded = self.frame(k)
         layout = template.layout
-        if (layout is None) != (not self.signal_names):
-            raise checks.refuse("scene", f"{'without' if layout is None else 'with'} a medium", f"as {self.path} is, which is not")
         if layout is not None:
             origin, shape, spacing = self.grid(k)
             corner, voxels = torch.from_numpy(origin).to(device), torch.from_numpy(shape).to(device)
             layout = layout.on(Grid(corner, voxels, (float(spacing[0]), float(spacing[1]), float(spacing[2]))))
             recorded |= {OUTSIDE + n: np.concatenate([x.reshape(-1) for x in self.signal(n, k)]) for n in self.signal_names}
         colony_fields = {n: d[k] for n, d in self.file["frames/colony"].items()} if "frames/colony" in self.file else {}
-        missing = [n for n in template.fields if n not in recorded and n not in colony_fields]
-        if missing:
-            raise InputError(
-                f"{self.path} lacks the field {missing[0]!r} that this scene has: it was made by another scene, {self.file.attrs['scene'].splitlines()[0]!r}."
-            )
         declared = dict(template.declared)
         for name, (meaning, unit, scope, shape, at_division) in json.loads(self.file.attrs["declared"]).items():
             if name not in declared:
@@ -263,6 +281,10 @@ class Results:
             **{n: tensor(recorded[n]) for n in PER_CELL}, colony_id=tensor(self.colony_id), next_uid=tensor(self.file["frames/next_uid"][k]),
             step=int(self.steps[k]), time=float(self.times[k]), fields=fields, declared=declared, layout=layout,
         )  # fmt: skip
+
+
+def _told(kinds: dict[str, list[str]]) -> str:
+    return "; ".join(f"{kind} {', '.join(map(repr, names))}" for kind, names in kinds.items() if names)
 
 
 def _pair(colony: np.ndarray, uid: np.ndarray) -> np.ndarray:

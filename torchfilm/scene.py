@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -160,6 +161,10 @@ class Scene:
         return [
             (w.title, name, r.title) for w in self.effects for r in self.effects if w is not r for name in w.writes() if name in r.reads() or name in r.needs()
         ]
+
+    def listing(self) -> list[str]:
+        """Each effect as it was listed, with the parameters that differ from their defaults; what a results file compares by."""
+        return [re.sub(r" at 0x[0-9a-f]+", "", summary(effect)) for effect in self.listed]
 
     def explain(self) -> str:
         """What this scene simulates, in the order in which it acts, and who drives whom."""

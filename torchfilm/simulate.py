@@ -54,6 +54,8 @@ def simulate(
         scene.check_moves(state)
     recorder = Recorder(record, scene) if isinstance(record, (str, Path)) else record
     if recorder is not None:
+        if recorder.scene is not scene:
+            raise checks.InputError("the Recorder was made for another scene than the one that runs: its file would tell of the wrong one.")
         recorder.dt = dt
     return _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings)
 
