@@ -66,7 +66,8 @@ def band(state: tf.State, place: int) -> dict[str, float]:
         right += 1
     inside, sources = at[sink] > FAR, at[~sink] < -FAR
     return {
-        "cells": float(mine.sum()), "place_um": float(centres[top]), "middle_um": float(0.5 * (centres[left] + centres[right])), "width_um": float(centres[right] - centres[left] + STRIP), "peak": float(profile[top]),
+        "cells": float(mine.sum()), "place_um": float(centres[top]),
+        "middle_um": float(0.5 * (centres[left] + centres[right])), "width_um": float(centres[right] - centres[left] + STRIP), "peak": float(profile[top]),
         "contrast": float(profile[top] / yfp[sink][inside].mean()) if inside.any() else float("nan"),
         "cfp_inside": float(cfp[~sink][sources].mean()) if sources.any() else float("nan"),
     }  # fmt: skip
@@ -93,11 +94,8 @@ def main() -> None:
         found[name] = row | {"seconds": time.perf_counter() - begun, "time_h": state.time}
         options.out.write_text(json.dumps(found, indent=1))
         shown = {k: f"{np.mean(v):.4g} ± {np.std(v):.2g}" for k, v in row.items()}
-        print(
-            f"{name:<14} {np.mean(row['cells']):6.0f} {shown['place_um']:>14} {shown['middle_um']:>14} {shown['width_um']:>14} {shown['peak']:>20} {shown['contrast']:>16} "
-            f"{found[name]['seconds']:8.1f}",
-            flush=True,
-        )
+        columns = [f"{shown[key]:>{size}}" for key, size in (("place_um", 14), ("middle_um", 14), ("width_um", 14), ("peak", 20), ("contrast", 16))]
+        print(f"{name:<14} {np.mean(row['cells']):6.0f} {' '.join(columns)} {found[name]['seconds']:8.1f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -176,7 +176,7 @@ def test_files_without_a_medium_say_so_and_hold_nothing_of_it(tmp_path):
             results.grid()
         with pytest.raises(InputError, match="none: the scene has no medium"):
             results.signal("ahl")
-        with pytest.raises(InputError, match="it lacks.*out.ahl"):
+        with pytest.raises(InputError, match=r"it lacks.*out\.ahl"):
             results.state(smooth())
 
 
@@ -186,7 +186,7 @@ def test_a_file_with_a_medium_is_not_of_a_scene_without(tmp_path):
     with tf.Results(tmp_path / "run.h5") as results:
         with pytest.raises(InputError, match=r"with a Medium \(ahl\)"):
             results.state(tf.Scene(tf.Growth(rate=[1.0] * 3), *body()))
-        with pytest.raises(InputError, match=r"lacks the field 'out.m'|lacks the field 'm'"):
+        with pytest.raises(InputError, match=r"it lacks 'm', 'out.m'"):
             results.state(leaping())
 
 

@@ -42,7 +42,7 @@ class Scene:
             raise checks.InputError("Scene() has no effect: nothing would happen. List at least one, such as tf.Growth(rate=1.0).")
         names = [e.title for e in effects]
         for title in names:
-            if names.count(title) > 1 and title in ("growth", "division", "mechanics", "circuit", "transport"):
+            if names.count(title) > 1 and title in ("growth", "division", "mechanics", "circuit", "transport", "nutrition"):
                 raise checks.InputError(f"Scene lists {title} {names.count(title)} times: one is allowed. Put all of it into one.")
         self.listed = effects
         self.effects: tuple[Effect, ...] = tuple(sorted((p for e in effects for p in e.parts()), key=lambda p: p.stage))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics import capsule
-from torchfilm.signals.layout import Layout
+from torchfilm.signals.layout import Contact, Layout
 from torchfilm.tools import checks, random
 from torchfilm.tools.ragged import Groups, offsets
 
@@ -164,6 +164,12 @@ class State:
     def signals(self) -> dict[str, Tensor]:
         """Values of each signal by name, (nodes,), laid out as `layout.grid` says."""
         return {name.removeprefix(OUTSIDE): value for name, value in self.fields.items() if name.startswith(OUTSIDE)}
+
+    def contact(self) -> Contact | None:
+        """Where cells meet the medium and what they find there; None in a scene without one."""
+        if self.layout is None:
+            return None
+        return self.layout.contact(self.position, self.colony, self.own_colony_id, self.signals, self.dtype)
 
     @property
     def own_colony_id(self) -> Tensor:

@@ -26,6 +26,8 @@ KNOWN_FIELDS = {"cell_type": CELL_TYPE, "drag": Field("drag", "factor on the vis
 
 def _quantity(state: State, name: str) -> Tensor:
     """A quantity by the name that rules use; a colony goes by its id, which does not depend on the batch."""
+    if name in state.declared and state.declared[name].scope == COLONY:
+        return state.fields[name].index_select(0, state.colony)
     return state.own_colony_id if name == "colony" else getattr(state, name)
 
 
@@ -94,6 +96,12 @@ class CellsView:
             return self._shown[name]
         if name == "remove_flag":
             self._work[name] = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
+        elif name in state.fields and state.declared[name].scope == COLONY:
+            self._read.add(name)
+            # of the colony's own, each cell gets its colony's; what is written into it is found out as for geometry
+            if name not in self._shown:
+                self._shown[name] = _quantity(state, name)
+            return self._shown[name]
         elif name in state.fields:
             self._read.add(name)
             # a copy, so that a rule may write into it: states are frozen
@@ -101,8 +109,11 @@ class CellsView:
         elif self._declaring and name in KNOWN_FIELDS:
             self._work[name] = KNOWN_FIELDS[name].start(state, torch.arange(state.cells, device=state.device))
         else:
+            if OUTSIDE + name in state.fields:
+                raise RuleError(f"cells have no {name!r}; it is a signal: read cells.signals.{name}.")
+            known = [*GEOMETRY, *IDENTITY, *(n for n in state.fields if n.isidentifier())]
             raise RuleError(
-                f"cells have no {name!r}; they have {', '.join([*GEOMETRY, *IDENTITY, *state.fields])}. A variable of your own needs a first value: "
+                f"cells have no {name!r}; they have {', '.join(known)}. A variable of your own needs a first value: "
                 f"give Rules(…, variables={{{name!r}: 0.0}})."
             )
         return self._work[name]
@@ -113,12 +124,15 @@ class CellsView:
         if state.layout is None:
             raise RuleError("cells have no signals: there is no Medium in this scene.")
         self._read.update(("position", *(n for n in state.fields if n.startswith(OUTSIDE))))
-        return Names(tuple(state.signals), state.layout.readings(state.position, state.colony, state.signals), "cells.signals")
+        contact = state.contact()
+        assert contact is not None
+        return Names(tuple(contact.found), list(contact.found.values()), "cells.signals")
 
     def __setattr__(self, name: str, value: Any) -> None:
         name = PAPER_NAMES.get(name, name)
         state = self._state
-        if name in (*GEOMETRY, *IDENTITY, "signals") or isinstance(getattr(type(self), name, None), property):
+        of_colony = name in state.declared and state.declared[name].scope == COLONY
+        if of_colony or name in (*GEOMETRY, *IDENTITY, "signals") or isinstance(getattr(type(self), name, None), property):
             raise RuleError(f"cells.{name} can only be read (Table 1 of the paper): rules change fields, flags and variables.")
         declared = KNOWN_FIELDS.get(name, state.declared.get(name)) if name != "remove_flag" else None
         dtype = torch.bool if name == "remove_flag" else (declared.dtype or state.dtype) if declared is not None else None
@@ -185,10 +199,13 @@ class CellView:
     def __init__(self, cells: CellsView, index: int):
         self.__dict__.update(_cells=cells, _index=index)
 
-    def __getattr__(self, name: str) -> Tensor:
+    def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(name)
-        return getattr(self._cells, name)[self._index]
+        found = getattr(self._cells, name)
+        if name == "signals":
+            return Names(tuple(found), [found[n][self._index] for n in found], "cell.signals")
+        return found[self._index]
 
     def __setattr__(self, name: str, value: Any) -> None:
         name = PAPER_NAMES.get(name, name)
@@ -231,9 +248,7 @@ class DivisionView:
 
     def _copy(self, name: str) -> Tensor:
         """The quantity as the state has it, a row for each division; of the colony's own, each division gets its colony's."""
-        state, value = self._state, _quantity(self._state, name)
-        if name in state.fields and state.declared[name].scope == COLONY:
-            value = value.index_select(0, state.colony)
+        value = _quantity(self._state, name)
         return value.clone() if self._rows is None else value.index_select(0, self._rows)
 
     def _writable(self, name: str) -> bool:

@@ -71,8 +71,10 @@ AT_SEED = {
     "unknown column": (lambda u, s, p, cell: {"m": cell.volum}, r"cell has no 'volum'.*Did you mean 'volume'\?"),
     "a signal without a medium": (lambda u, s, p, cell: {"m": s.ahl}, r"(?i)no Medium|without a Medium"),
     "a signal given without a medium": (lambda u, s, p, cell: ({"m": u.m}, {"ahl": u.m}), r"'ahl', which is no signal"),
-    "a wrong shape": (lambda u, s, p, cell: {"m": u.m.unsqueeze(1)}, r"a rate of shape \(2, 1\) for the species 'm': it must be one number a cell, \(2,\)"),
+    "a wrong shape": (lambda u, s, p, cell: {"m": u.m.unsqueeze(1)}, r"a rate of shape \(4, 1\) for the species 'm': it must be one number a cell, \(4,\)"),
     "too few": (lambda u, s, p, cell: {"m": u.m[:1].repeat(3)}, r"shape \(3,\) for the species 'm'"),
+    "for one cell only": (lambda u, s, p, cell: {"m": 1.0 if u.m < 1 else 0.0}, r"torch\.where rather than if"),
+    "a sum over cells": (lambda u, s, p, cell: {"m": -u.m.sum()}, r"depends on what other cells there are"),
     "no number": (lambda u, s, p, cell: {"m": "fast"}, r"shape str for the species 'm'"),
     "no dict": (lambda u, s, p, cell: u.m, r"returned Tensor: it must return a dict"),
     "NaN at the start": (lambda u, s, p, cell: {"m": u.m / u.m}, r"gives nan for the species 'm' at the start \(m = 0\)"),
@@ -107,7 +109,7 @@ def test_a_signal_is_named_when_its_amount_is_wrong():
 REACTIONS = {
     "missing parameter": ([tf.parts.constitutive("m", "kk")], r"needs the parameter 'kk', which Circuit was not given; known are k"),
     "unknown species": ([tf.parts.constitutive("w", "k")], r"'w made' has the unknown name 'w'"),
-    "signal without a medium": ([tf.parts.exchange("m", "k", "ahl")], r"unknown name 'out\.ahl'"),
+    "signal without a medium": ([tf.parts.exchange("m", "k", "ahl")], r"needs the signal 'ahl': list tf\.Medium"),
 }  # fmt: skip
 
 

@@ -25,7 +25,8 @@ def keyed_draws(seed: int, colony: Tensor, uid: Tensor, step: int) -> Draw:
         own, cell = colony.index_select(0, rows), uid.index_select(0, rows)
         pairs = (count + 1) // 2
         codes = torch.tensor([purpose_code(f"{what} {k}") for k in range(pairs)], device=rows.device).unsqueeze(1)
-        # events share the word of the uid's upper half: apart for 65,535 events of cells with uids below 2⁴⁸
+        # events share the word of the uid's upper half, apart for cells with uids below 2⁴⁸, and beyond 65,535 of them the codes
+        codes = (codes ^ (((event + 1) >> 16) * 0x9E3779B9)) & MASK
         upper = ((cell >> 32) ^ ((event + 1) << 16)) & MASK
         counter = (cell & MASK, upper, own & MASK, torch.full_like(cell, step & MASK))
         words = philox(counter, (torch.full_like(codes, seed & MASK), (((seed >> 32) & MASK) ^ codes) & MASK))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -90,11 +91,16 @@ class Network:
         return torch.stack(out, 1)
 
 
+def network_parts(entry: Sequence[Any]) -> list[Reaction]:
+    """Reactions in a part, or in parts within parts, in order."""
+    return [r for inner in entry for r in ([inner] if isinstance(inner, Reaction) else network_parts(inner))]
+
+
 def network(reactions: Sequence[Reaction | Sequence[Reaction]], species: Sequence[str], signals: Sequence[str] = ()) -> Network:
     """Reactions, or parts (lists of reactions), checked and put together over the given species and signals."""
     flat: list[Reaction] = []
     for entry in reactions:
-        flat += [entry] if isinstance(entry, Reaction) else list(entry)
+        flat += [entry] if isinstance(entry, Reaction) else network_parts(entry)
     if not flat:
         raise checks.refuse("reactions", list(reactions), "at least one reaction")
     names = [*species, *(OUTSIDE + s for s in signals)]
@@ -107,6 +113,11 @@ def network(reactions: Sequence[Reaction | Sequence[Reaction]], species: Sequenc
         seen.add(reaction.name)
         for name in (*reaction.consumes, *reaction.produces, *getattr(reaction.rate, "reads", ())):
             if name not in names:
+                if name.startswith(OUTSIDE) and not signals:
+                    signal = name.removeprefix(OUTSIDE)
+                    raise checks.InputError(
+                        f"the reaction {reaction.name or str(reaction)!r} needs the signal {signal!r}: list tf.Medium({signal}=tf.Signal(…))."
+                    )
                 raise checks.InputError(unknown(f"the reaction {reaction.name or str(reaction)!r} has the unknown name {name!r}", name, names))
         for name, count in reaction.change().items():
             stoichiometry[row, names.index(name)] = count

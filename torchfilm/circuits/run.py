@@ -107,6 +107,9 @@ class Circuit:
         if self.given:
             assert self.pool is not None
             pool = self.pool.index_select(0, rows)
+            new = [n for n in outside if n not in self.given]
+            if new:
+                raise InputError(f"{self.label} gave {new[0]!r} to the medium, and had not when it was tried: always return it, 0 where nothing passes.")
             flux = [outside.get(n, none) for n in self.given]
             if self.beyond is None:
                 columns += [x / pool for x in flux]
@@ -159,6 +162,7 @@ def step(circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings
         below = (end < -(settings.atol + settings.rtol * scale.nan_to_num())) & (start >= 0)
         code = torch.where(below.any(1), rosenbrock.BELOW_ZERO, rosenbrock.DONE)
         code = torch.where(torch.isfinite(end).all(1), code, rosenbrock.NOT_FINITE)
+        end = torch.where((end < 0) & (start >= 0), 0.0, end)  # by no more than the tolerance, or the cell has failed
     size, more = len(circuit.species), len(circuit.given)
     pools, beyond = {}, {}
     for k, name in enumerate(circuit.given):
@@ -250,8 +254,25 @@ def trial(circuit: Circuit, concentrations: Tensor) -> tuple[str, ...]:
     """Try the circuit once at concentrations (M, S): raise InputError for what it returns wrongly; the signals that it exchanges."""
     try:
         inside, outside = circuit.changes(concentrations, circuit.rows)
+        # a little of everything, another little in every cell: at 0 a sum over cells would not show
+        some = concentrations + 0.1 * torch.arange(1, len(concentrations) + 1, device=concentrations.device).unsqueeze(1)
+        crowd, alone = circuit.changes(some, circuit.rows), circuit.changes(some[:1], circuit.rows[:1])
     except UnknownName as error:
         raise UnknownName(f"{circuit.label}: {error}") from error
+    except InputError:
+        raise
+    except (TypeError, ValueError, RuntimeError, IndexError) as error:
+        raise InputError(
+            f"{circuit.label} failed on the columns of {len(concentrations)} cells: {error}. It is called with (u, s, p, cell), each name a column with "
+            "one value a cell: use torch.exp and the like rather than math or numpy, torch.where rather than if, and change nothing in place."
+        ) from error
+    for whole, one in zip(crowd, alone, strict=True):
+        for name, value in one.items():
+            if not torch.allclose(whole[name].detach()[:1], value.detach(), rtol=1e-4, atol=1e-30, equal_nan=True):
+                raise InputError(
+                    f"{circuit.label}: the rate of {name!r} in one cell depends on what other cells there are (a sum or a mean over them, or a draw?). "
+                    "A rate function may go by its own cell and what it finds outside only."
+                )
     for what, found in (("species", inside), ("signal", outside)):
         for name, value in found.items():
             if not bool(torch.isfinite(value.detach()).all()):

@@ -20,7 +20,7 @@ from torchfilm.circuits.network import network
 from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.effect import CIRCUIT, Distribution, Effect, draw, parameter, per_cell
-from torchfilm.signals.exchange import Stencil, pool_volume, read, write
+from torchfilm.signals.exchange import write
 from torchfilm.state import CELL, CELL_TYPE, OUTSIDE, RESERVED, Field, State
 from torchfilm.tools import checks
 
@@ -116,6 +116,8 @@ class Circuit(Effect):
                 raise checks.refuse("Circuit.rates", kind, "by cell types that are whole numbers")
             if not callable(part) and not (isinstance(part, (list, tuple)) and part):
                 raise checks.refuse("Circuit.rates", part, "a function (u, s, p, cell), a list of reactions, or a dict of either by cell type")
+        if initial is not None and not isinstance(initial, Mapping):
+            raise checks.refuse("Circuit.initial", initial, f"a dict by species, such as {{{names[0]!r}: 1.0}}")
         for name in initial or {}:
             if name not in names:
                 raise checks.InputError(unknown(f"Circuit.initial names {name!r}, which is no species", name, names))
@@ -174,24 +176,30 @@ class Circuit(Effect):
         return torch.cat([taken / (volumes[0] * copies), (count - taken) / (volumes[1] * copies)])
 
     def prepare(self, state: State) -> State:
-        """The networks put together, each rate function tried on a few cells, and what is read and given noted."""
+        """Molecules made whole, each rate function tried on a few cells."""
+        if state.cells == 0:
+            return state
+        if self.is_stochastic:
+            state = self._whole(state)
+        self._note(state)
+        return state
+
+    def _note(self, state: State) -> None:
+        """Put the networks together, try each rate function on a few cells, and note what is read and given."""
         signals = tuple(state.signals)
         self.noted.networks = {kind: network(part, self.species, signals) for kind, part in self.rates.items() if not callable(part)}
         for made in self.noted.networks.values():
             for name in made.parameters:
                 if name not in self.parameters:
                     raise checks.InputError(unknown(f"a reaction needs the parameter {name!r}, which Circuit was not given", name, list(self.parameters)))
-        if state.cells == 0:
-            return state
-        if self.is_stochastic:
-            state = self._whole(state)
         seen: dict[str, set[str]] = {"s": set(), "cell": set()}
         given = {}
+        contact = state.contact()
+        outside = {} if contact is None else contact.found
         for kind in self.rates:
             rows = _cells_of(state, kind)
-            rows = rows[:64] if rows.numel() else torch.zeros(1, dtype=torch.int64, device=state.device)
-            # tried with every signal there, whether or not it is going to be given any
-            outside = {n: state.fields[OUTSIDE + n].new_zeros(state.cells) for n in signals}
+            # at least two, so that a function that works for a single cell only is found out
+            rows = (rows if rows.numel() else torch.zeros(1, dtype=torch.int64, device=state.device)).repeat(2)[:64]
             tried = self._circuit(state, rows, kind, (), outside, seen=seen)
             given[kind] = run.trial(tried, self._concentrations(state, rows))
         self.noted.given = given
@@ -199,7 +207,6 @@ class Circuit(Effect):
         if seen["s"] or any(given.values()):
             geometry.add("position")
         self.noted.reads = tuple(sorted({*geometry, *(OUTSIDE + n for n in seen["s"]), *(OUTSIDE + n for g in given.values() for n in g)}))
-        return state
 
     def _whole(self, state: State) -> State:
         """First concentrations that are whole numbers of molecules: rounded up or down at random, so that the mean stays."""
@@ -217,6 +224,8 @@ class Circuit(Effect):
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
             return state
+        if not self.noted.given:  # a state that was seeded by another scene of the same fields
+            self._note(state)
         volume = state.volume
         thinner = state.circuit_volume / volume
         state = state.with_fields(circuit_volume=volume, **{n: state.fields[n] * thinner for n in self.species})
@@ -278,15 +287,9 @@ class _Medium:
     """What the cells of a state find outside, and what they have given to it by the end of the step."""
 
     def __init__(self, state: State):
-        assert state.layout is not None
-        self.state, layout = state, state.layout
-        self.stencil: Stencil = layout.stencil(state.position, state.colony, state.dtype)
-        self.found = {n: read(v, self.stencil) for n, v in state.signals.items()}
-        self.pool = pool_volume(self.stencil)
-        self.beyond: Tensor | None = None
-        if layout.reservoir is not None and bool(self.stencil.outside.any()):
-            self.beyond = self.stencil.outside
-            self.found = {n: torch.where(self.beyond, per_cell(layout.reservoir[n], state), v) for n, v in self.found.items()}
+        contact = state.contact()
+        assert contact is not None
+        self.state, self.stencil, self.found, self.pool, self.beyond = state, contact.stencil, contact.found, contact.pool, contact.beyond
         self.given: dict[str, Tensor] = {}
         self.gone: dict[str, Tensor] = {}
 

@@ -121,29 +121,9 @@ class Medium(Effect):
         for name, signal in signals.items():
             if not isinstance(signal, Signal):
                 raise checks.refuse(f"Medium.{name}", signal, "a Signal", f"Write {name}=tf.Signal(diffusion=…), or check the spelling of an option.")
-        try:
-            low, high = (tuple(float(x) for x in corner) for corner in box)
-        except (TypeError, ValueError) as error:
-            raise checks.refuse("Medium.box", box, "two corners, such as ((-64, -64), (64, 64))") from error
-        if len(low) != len(high) or len(low) not in (2, 3) or not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True)):
-            raise checks.refuse("Medium.box", (low, high), "two corners of 2 or 3 finite numbers, the first below the second along every axis")
-        voxel = checks.vector("Medium.spacing", (spacing,) * len(low) if isinstance(spacing, (int, float)) else spacing, len(low))
-        if min(voxel) <= 0:
-            raise checks.refuse("Medium.spacing", spacing, "above 0")
-        for letter, a, b, h in zip("xyz", low, high, voxel, strict=False):
-            count = (b - a) / h
-            if abs(count - round(count)) > 1e-6:
-                whole = max(1, round(count)) * h
-                raise checks.refuse(
-                    f"Medium.box along {letter}", (a, b), f"a whole number of voxels of {h:g} µm", f"It is {count:g}; make it {whole:g} µm long."
-                )
-        if depth is not None:
-            checks.number("Medium.depth", depth, above=0.0)
-            if len(low) == 3:
-                raise checks.refuse("Medium.depth", depth, "left out where the box has three dimensions")
-        checks.number("Medium.height", height)
-        if len(low) == 3 and not low[2] <= height <= high[2]:
-            raise checks.refuse("Medium.height", height, f"within the box, from {low[2]:g} to {high[2]:g} µm")
+        low, high, voxel = _box(box, spacing, depth, height)
+        if faces is not None and not isinstance(faces, Faces):
+            raise checks.refuse("Medium.faces", faces, "Faces", "Write faces=tf.Faces(x=tf.Open(), y=tf.NoFlux()).")
         checks.choice("Medium.beyond", beyond, BEYOND)
         if not isinstance(grows, str) or not grows or set(grows) - set("xyz"):
             raise checks.refuse("Medium.grows", grows, 'some of the letters x, y and z, such as "x"')
@@ -263,7 +243,7 @@ class Medium(Effect):
     def _stepper(self, name: str, state: State, batch: Batch, dt: float) -> Stepper:
         """The step of a signal on the grids of one shape, made once for as long as they stay."""
         assert state.layout is not None
-        numbers = [p for p in self._numbers(name) if isinstance(p, Tensor)]
+        numbers = [p for p in self._numbers(name) if isinstance(p, Tensor)] + _held(self.signals[name], self.flow_of(name))
         if torch.is_grad_enabled() and any(p.requires_grad for p in numbers):
             return self._prepare(name, state, batch, dt)[0]
         # a number that was changed in place, as an optimiser does, asks for a new one
@@ -279,7 +259,7 @@ class Medium(Effect):
         """What a signal's transport depends on, tensors among it."""
         signal, flow = self.signals[name], self.flow_of(name)
         faces = [face.outside_value() for pair in self.faces_of(name).pairs for face in pair]
-        moving = [True] if callable(flow) else list(flow or ())
+        moving = [] if callable(flow) else list(flow or ())
         return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
 
     def _prepare(self, name: str, state: State, batch: Batch, dt: float) -> tuple[Stepper, bool]:
@@ -290,7 +270,7 @@ class Medium(Effect):
         own = lambda x: x.to(state.device).index_select(0, ids) if isinstance(x, Tensor) and x.dim() == 1 else x  # noqa: E731
         spread = lambda x: batch.of(self._values(name, x, state)) if callable(getattr(signal, x)) else own(getattr(signal, x))  # noqa: E731
         made = operator(
-            batch.shape, layout.grid.spacing, diffusion=own(signal.diffusion), decay=spread("decay"), 
+            batch.shape, layout.grid.spacing, diffusion=own(signal.diffusion), decay=spread("decay"),
             velocity=_velocity(self.flow_of(name), layout, batch, own),
             faces=self.faces_of(name).take(ids), mask=None if layout.mask is None else batch.of(layout.mask),
             source=None if not callable(signal.source) and not isinstance(signal.source, Tensor) and signal.source == 0 else spread("source"),
@@ -305,9 +285,44 @@ def _velocity(flow: Flow, layout: Layout, batch: Batch, own: Callable[[Any], Any
     if flow is None:
         return None
     if not callable(flow):
-        parts = [torch.as_tensor(own(v), dtype=torch.float64).reshape(-1).expand(batch.places.numel()) for v in (*flow, 0.0)[:3]]
+        parts = [
+            torch.as_tensor(own(v), dtype=torch.float64, device=layout.grid.origin.device).reshape(-1).expand(batch.places.numel()) for v in (*flow, 0.0)[:3]
+        ]
         return torch.stack(parts, 1)
     return layout.on_faces(flow, batch)
+
+
+def _box(box: Any, spacing: Any, depth: float | None, height: float) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """Lower and upper corner and size of voxels, checked."""
+    try:
+        low, high = (tuple(float(x) for x in corner) for corner in box)
+    except (TypeError, ValueError) as error:
+        raise checks.refuse("Medium.box", box, "two corners, such as ((-64, -64), (64, 64))") from error
+    if len(low) != len(high) or len(low) not in (2, 3) or not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True)):
+        raise checks.refuse("Medium.box", (low, high), "two corners of 2 or 3 finite numbers, the first below the second along every axis")
+    voxel = checks.vector("Medium.spacing", (spacing,) * len(low) if isinstance(spacing, (int, float)) else spacing, len(low))
+    if min(voxel) <= 0:
+        raise checks.refuse("Medium.spacing", spacing, "above 0")
+    for letter, a, b, h in zip("xyz", low, high, voxel, strict=False):
+        count = (b - a) / h
+        if abs(count - round(count)) > 1e-6:
+            whole = max(1, round(count)) * h
+            raise checks.refuse(f"Medium.box along {letter}", (a, b), f"a whole number of voxels of {h:g} µm", f"It is {count:g}; make it {whole:g} µm long.")
+    if depth is not None:
+        checks.number("Medium.depth", depth, above=0.0)
+        if len(low) == 3:
+            raise checks.refuse("Medium.depth", depth, "left out where the box has three dimensions")
+    checks.number("Medium.height", height)
+    if len(low) == 3 and not low[2] <= height <= high[2]:
+        raise checks.refuse("Medium.height", height, f"within the box, from {low[2]:g} to {high[2]:g} µm")
+    return low, high, voxel
+
+
+def _held(signal: Signal, flow: Flow) -> list[Tensor]:
+    """Tensors that functions of places hold on to."""
+    functions = [f for f in (signal.decay, signal.source, flow) if callable(f)]
+    cells = [cell.cell_contents for f in functions for cell in (getattr(f, "__closure__", None) or ())]
+    return [x for x in cells if isinstance(x, Tensor)]
 
 
 def _flow(name: str, given: Any) -> Any:
@@ -315,6 +330,10 @@ def _flow(name: str, given: Any) -> Any:
         return given
     if not isinstance(given, (tuple, list, Tensor)) or len(given) not in (2, 3):
         raise checks.refuse(name, given, "two or three numbers, or a function of places")
+    if isinstance(given, Tensor) and given.dim() == 2:
+        raise checks.refuse(
+            name, tuple(given.shape), "two or three components", "For one velocity a colony give (vx, vy), each a tensor with one number per colony."
+        )
     return tuple(checks.value(f"{name}[{k}]", v) for k, v in enumerate(given))
 
 
@@ -357,9 +376,10 @@ class Cover(Effect):
     def _look(self, state: State) -> MediumReport | None:
         """Which cells are where no medium is; None where that is no failure."""
         layout = state.layout
-        if layout is None or layout.reservoir is not None:
+        if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
-        away = layout.stencil(state.position, state.colony, torch.float64).outside
+        where = layout.stencil(state.position, state.colony, torch.float64)
+        away = where.outside if layout.reservoir is None or where.blocked is None else where.blocked
         left = torch.bincount(state.colony[away], minlength=state.colonies)
         first = torch.zeros(state.colonies, 3, dtype=torch.float64, device=state.device)
         first[state.colony[away]] = layout.places(state.position)[away]
@@ -372,7 +392,9 @@ class Cover(Effect):
         places, groups, step = state.layout.places(state.position), state.groups, state.layout.grid.step
         high = torch.stack([groups.max(x, empty=-torch.inf) for x in places.unbind(1)], 1)
         low = -torch.stack([groups.max(-x, empty=-torch.inf) for x in places.unbind(1)], 1)
-        flat = torch.tensor([n == 1 for n in state.layout.grid.shapes[0]], device=state.device)  # a layer stays one
+        corner, end, size = self.medium.corners
+        # a layer, as the box was given, stays one
+        flat = torch.tensor([round((b - a) / h) == 1 for a, b, h in zip(corner, end, size, strict=True)], device=state.device)
         margin = torch.where(flat, 0.0, MARGIN * step)
         held = torch.tensor([letter not in self.medium.grows for letter in "xyz"], device=state.device)
         return torch.where(held, torch.inf, low - margin), torch.where(held, -torch.inf, high + margin)

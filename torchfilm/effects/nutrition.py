@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchfilm.circuits.rosenbrock import rosenbrock
 from torchfilm.effect import NUTRITION, Effect, per_cell
-from torchfilm.signals.exchange import pool_volume, read, write
+from torchfilm.signals.exchange import write
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
 
@@ -32,7 +32,8 @@ class Monod(Effect):
 
     signal: name of the nutrient in the Medium. rate: greatest growth, 1/h; half: concentration of half the growth; growth_yield: µm³ of cell made from
     one unit of concentration × µm³ of nutrient. Each one number or one per colony. Sets `growth_rate`, so the scene's Growth has no rate of its own.
-    What cells gain is exactly what the medium loses: growth over a step is computed from what was got, which cannot be more than there is.
+    What is eaten is exactly what the medium loses, and cannot be more than there is; growth over the step follows from it, exponential where the food stays
+    what it is. Where contacts hold that growth back, what was eaten for it is spent all the same, and so is the volume of the caps lost at division.
     """
 
     signal: str
@@ -71,28 +72,28 @@ class Monod(Effect):
         if state.cells == 0 or state.layout is None:
             return state
         name = OUTSIDE + self.signal
-        stencil = state.layout.stencil(state.position, state.colony, state.dtype)
-        there, pool, volume = read(state.fields[name], stencil), pool_volume(stencil), state.volume
-        beyond = None
-        if state.layout.reservoir is not None and bool(stencil.outside.any()):
-            beyond = stencil.outside
-            there = torch.where(beyond, per_cell(state.layout.reservoir[self.signal], state), there)
+        contact, volume = state.contact(), state.volume
+        assert contact is not None
+        there, beyond = contact.found[self.signal], contact.beyond
         greatest, half, gain = (per_cell(x, state).expand(state.cells) for x in (self.rate, self.half, self.growth_yield))
-        hunger = greatest * volume / (gain * pool)  # 1/h × conc
+        columns = (greatest, half, gain, volume, contact.pool)
 
-        def rates(s: Tensor, rows: Tensor) -> Tensor:
-            x = s[:, 0]
-            return (-hunger.index_select(0, rows) * x / (half.index_select(0, rows) + x)).unsqueeze(1)
+        def rates(x: Tensor, rows: Tensor) -> Tensor:
+            """Of what is left, and of what was eaten: kept apart, since where food abounds their sum would hide it from rounding."""
+            rate, k, y, start, pool = (c.index_select(0, rows) for c in columns)
+            eating = rate * (start / y + x[:, 1]) * x[:, 0] / (k + x[:, 0])
+            return torch.stack([-eating / pool, eating], 1)
 
-        left, report = rosenbrock(rates, there.unsqueeze(1), dt)
-        eaten = (there - left.squeeze(1)) * pool
+        end, report = rosenbrock(rates, torch.stack([there, torch.zeros_like(there)], 1), dt)
+        eaten = end[:, 1]
         if beyond is not None:  # a reservoir stays as it is
-            eaten = torch.where(beyond, hunger * pool * there / (half + there) * dt, eaten)
-        # V grows like exp(rate · dt) over the step; what was got makes it grow to V + gain · eaten
+            eaten = torch.where(beyond, volume / gain * torch.expm1(greatest * there / (half + there) * dt), eaten)
+        # dV/dt = growth · V over the step, from V to V + gain · eaten
         growth = torch.log1p(gain * eaten / volume) / dt
-        changed = {name: write(state.fields[name], -(eaten if beyond is None else torch.where(beyond, 0.0, eaten)), stencil)}
+        inside = eaten if beyond is None else torch.where(beyond, 0.0, eaten)
+        changed = {name: write(state.fields[name], -inside, contact.stencil)}
         if beyond is not None:
-            lost = state.groups.sum(torch.where(beyond, -eaten, 0.0).unsqueeze(1)).squeeze(1)
+            lost = state.groups.sum((inside - eaten).unsqueeze(1)).squeeze(1)
             changed[f"{self.signal}_beyond"] = state.fields[f"{self.signal}_beyond"] + lost
         changed |= {"growth_rate": growth, f"{self.signal}_eaten": state.fields[f"{self.signal}_eaten"] + eaten}
         uptake = state.groups.sum(eaten.unsqueeze(1)).squeeze(1)

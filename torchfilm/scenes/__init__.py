@@ -7,9 +7,16 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+import torch
+
 from torchfilm.scene import Scene
 from torchfilm.scenes import channels, circuits, colonies, nutrients, signalling
 from torchfilm.tools import checks
+
+
+def _numbers(given: Any) -> bool:
+    """Whether it is a list with one number per colony."""
+    return isinstance(given, (list, tuple)) and bool(given) and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in given)
 
 
 def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
@@ -19,7 +26,8 @@ def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
     def build(*args: Any, **parameters: Any) -> Scene:
         bound = inspect.signature(make).bind(*args, **parameters)
         bound.apply_defaults()
-        scene = make(*args, **parameters)
+        # a recipe holds lists, and a list times a number is no list of products
+        scene = make(**{n: torch.tensor(v, dtype=torch.float64) if _numbers(v) else v for n, v in bound.arguments.items()})
         plain = {n: v.tolist() if hasattr(v, "tolist") else v for n, v in bound.arguments.items()}
         scene.name, scene.recipe = make.__name__, (make.__name__, plain)
         return scene

@@ -36,7 +36,7 @@ class Stencil:
 
     node: (N, K) int64 voxels, the nearest first; weight: (N, K) ≥ 0, with sum 1 (0 for a cell wholly inside an obstacle);
     outside: (N,) bool, cells beyond the box, which read and write at its edge, or wholly inside an obstacle, which read 0 and
-    whose writing is lost: what to do with either is the caller's to say.
+    whose writing is lost: what to do with either is the caller's to say. blocked: (N,) bool, the latter alone, or None without obstacles.
     """
 
     node: Tensor
@@ -44,6 +44,7 @@ class Stencil:
     outside: Tensor
     voxel_volume: float
     nodes: int
+    blocked: Tensor | None = None
 
     @cached_property
     def groups(self) -> Groups:
@@ -99,15 +100,17 @@ def stencil(
             w = w * pair[side][1]
         node.append(n)
         weight.append(w)
+    blocked = None
     if mask is not None:
         weight = [w * mask.index_select(0, n).to(dtype) for n, w in zip(node, weight, strict=True)]
         total = _add(weight)
-        outside |= total <= 0
+        blocked = total <= 0
+        outside |= blocked
         weight = [w / torch.where(total > 0, total, 1.0) for w in weight]
         node, weight = _heaviest_first(node, weight)
     # the heaviest takes what is left of 1, so that the sum is 1 to its last bit
     weight[0] = torch.where(weight[0] > 0, 1 - _add(weight[1:]), 0.0) if len(weight) > 1 else weight[0]
-    return Stencil(torch.stack(node, 1), torch.stack(weight, 1), outside, grid.voxel_volume, grid.nodes)
+    return Stencil(torch.stack(node, 1), torch.stack(weight, 1), outside, grid.voxel_volume, grid.nodes, blocked)
 
 
 def _two_voxels(at: Tensor, size: Tensor, periodic: bool, dtype: torch.dtype) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:

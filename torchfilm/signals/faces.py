@@ -104,4 +104,4 @@ class Faces:
 
 
 def _take(given: float | Tensor, places: Tensor) -> float | Tensor:
-    return given.index_select(0, places) if isinstance(given, Tensor) and given.dim() == 1 else given
+    return given.to(places.device).index_select(0, places) if isinstance(given, Tensor) and given.dim() == 1 else given

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchfilm.signals.operator import Operator, apply
 from torchfilm.tools import checks
+from torchfilm.tools.ragged import Groups
 
 Map = Callable[[Tensor], Tensor]
 # Of the right-hand side's norm, what may be left. The solve is worked in float64, where this is far above rounding.
@@ -114,7 +115,10 @@ def prepare_crank_nicolson(operator: Operator, dt: float) -> CrankNicolson:
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """(B, …), (B, …) -> (B, 1, 1, 1)."""
-    return (a * b).reshape(a.shape[0], -1).sum(1).reshape(-1, 1, 1, 1)
+    product = (a * b).reshape(-1, 1)
+    # not .sum(1): with several threads the way it divides long rows depends on how many there are
+    owner = torch.arange(a.shape[0], device=a.device).repeat_interleave(product.shape[0] // max(1, a.shape[0]))
+    return Groups(owner, a.shape[0]).sum(product).reshape(-1, 1, 1, 1)
 
 
 def _ratio(a: Tensor, b: Tensor) -> Tensor:

@@ -10,10 +10,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.signals.exchange import Stencil, read, stencil
+from torchfilm.signals.exchange import Stencil, pool_volume, read, stencil
 from torchfilm.signals.grid import Batch, Grid
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import expand_ranges
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """Where cells meet the medium, the concentration of each signal that they find there, (N,) by name, and which of them stand in the reservoir
+    beyond the box, (N,) bool, or None where there is none or nobody in it."""
+
+    stencil: Stencil
+    found: dict[str, Tensor]
+    beyond: Tensor | None
+
+    @cached_property
+    def pool(self) -> Tensor:
+        """The volume of which each cell may take up all that is there, (N,) µm³."""
+        return pool_volume(self.stencil)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +67,19 @@ class Layout:
         """Where cells at (N, d) µm of colonies (N,) meet the grid."""
         return stencil(self.grid, self.places(position), colony, periodic=self.periodic, mask=self.mask, dtype=dtype)
 
-    def readings(self, position: Tensor, colony: Tensor, signals: Mapping[str, Tensor]) -> list[Tensor]:
-        """What cells at (N, d) µm of colonies (N,) find of each signal (nodes,), (N,) each."""
-        values = list(signals.values())
-        if not values:
-            return []
-        where = self.stencil(position, colony, values[0].dtype)
-        return [read(value, where) for value in values]
+    def contact(self, position: Tensor, colony: Tensor, ids: Tensor, signals: Mapping[str, Tensor], dtype: torch.dtype) -> Contact:
+        """What cells at (N, d) µm of colonies (N,), whose ids are `ids` (N,), find of each signal (nodes,)."""
+        where = self.stencil(position, colony, dtype)
+        found = {name: read(value, where) for name, value in signals.items()}
+        if self.reservoir is None:
+            return Contact(where, found, None)
+        beyond = where.outside if where.blocked is None else where.outside & ~where.blocked
+        if not bool(beyond.any()):
+            return Contact(where, found, None)
+        for name, value in found.items():
+            given = torch.as_tensor(self.reservoir[name], dtype=value.dtype, device=value.device)
+            found[name] = torch.where(beyond, given.index_select(0, ids) if given.dim() else given, value)
+        return Contact(where, found, beyond)
 
     def on_faces(self, flow: Callable[[Tensor], Tensor], batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """A velocity field, a function from places (M, 3) µm to velocities (M, 2 or 3), on the faces of the voxels of some colonies: (b, nx + 1, ny, nz)
