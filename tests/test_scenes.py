@@ -19,6 +19,13 @@ SMALL = {
     "programmed_growth": {"edge": 3.0},
     "channel": {"width": 5.0, "length": 20.0},
     "channel closed": {"width": 5.0, "length": 20.0, "open_ended": False},
+    "quorum_sensing": {"k3": [0.5, 2.0], "size": 64.0},
+    "boundary_detector": {"d3": [0.0, 1e-3]},
+    "boundary_detector under flow": {"flow": 5.0},
+    "random_partition": {},
+    "repressilator": {"alpha": [216.0, 100.0], "noise": False, "rate": 1.0},
+    "toggle_switch": {"strength": [10.0, 12.0], "speed": 2, "copies": 2.0, "rate": 1.0},
+    "nutrient_limited": {"supply": [1.0, 2.0], "size": 48.0},
 }
 
 

@@ -6,12 +6,10 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from torchfilm.physics.solve import CONVERGED, STATUS
 from torchfilm.recorder import Recorder
 from torchfilm.scene import Scene
 from torchfilm.state import State
@@ -111,17 +109,16 @@ def _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings
 def handle_failures(state: State, on_failure: str) -> State:
     """Raise for the colonies whose last step failed, all at once, or drop their cells.
 
-    Every report of the step has a `status` (B,), 0 where all is well. It may say itself what went wrong, `reason(place)`, and what helps, `mend`;
-    one that does not is a solve's.
+    Every report of the step has a `status` (B,), 0 where all is well, and says what went wrong, `reason(place)`, and what helps, `mend`.
     """
     failed = torch.zeros(state.colonies, dtype=torch.bool, device=state.device)
     reasons, mends = [], []
-    for name, report in state.reports.items():
-        bad = report.status != CONVERGED
+    for report in state.reports.values():
+        bad = report.status != 0
         failed = failed | bad
         for place in torch.nonzero(bad).squeeze(1).tolist():
-            reasons.append(f"colony {int(state.colony_id[place])} ({int(state.counts[place])} cells): {_reason(name, report, place)}")
-            mends.append(getattr(report, "mend", "A smaller dt, a larger alpha or more max_iterations may help"))
+            reasons.append(f"colony {int(state.colony_id[place])} ({int(state.counts[place])} cells): {report.reason(place)}")
+            mends.append(report.mend)
     if not reasons:
         return state
     if on_failure == "raise":
@@ -134,11 +131,3 @@ def handle_failures(state: State, on_failure: str) -> State:
             state.colony_id[failed].tolist(),
         )
     return state.remove(failed.index_select(0, state.colony), "failed")
-
-
-def _reason(name: str, report: Any, place: int) -> str:
-    if hasattr(report, "reason"):
-        return report.reason(place)
-    return (
-        f"the {name} solve {STATUS[int(report.status[place])]} after {int(report.iterations[place])} iterations, residual {float(report.residual[place]):.2g}"
-    )

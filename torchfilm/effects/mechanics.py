@@ -13,7 +13,7 @@ from torchfilm.physics import capsule
 from torchfilm.physics.contacts import Bodies, Contacts, find_contacts
 from torchfilm.physics.neighbours import find_pairs
 from torchfilm.physics.rows import ContactRows
-from torchfilm.physics.solve import CONVERGED, NOT_FINITE, TOO_FAST, ContactProblem, SolveReport, solve
+from torchfilm.physics.solve import CONVERGED, NOT_FINITE, STATUS, TOO_FAST, ContactProblem, SolveReport, solve
 from torchfilm.physics.walls import Surface, Wall, WallContacts, find_wall_contacts
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
@@ -41,6 +41,14 @@ class MechanicsReport:
     substeps: Tensor
     limited: Tensor
     share: Tensor
+    mend = "A smaller dt, a larger alpha or more max_iterations may help"
+
+    def reason(self, place: int) -> str:
+        """What went wrong in the colony at `place`."""
+        status = int(self.status[place])
+        if status == TOO_FAST:
+            return f"a cell would take more than {MOST_SUBSTEPS} sub-steps to grow as it wants to in one step (rates are per hour, and dt is in hours)"
+        return f"the mechanics solve {STATUS[status]} after {int(self.iterations[place])} iterations, residual {float(self.residual[place]):.2g}"
 
 
 @dataclass(frozen=True)

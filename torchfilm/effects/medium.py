@@ -378,8 +378,7 @@ class Cover(Effect):
         layout = state.layout
         if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
-        where = layout.stencil(state.position, state.colony, torch.float64)
-        away = where.outside if layout.reservoir is None or where.blocked is None else where.blocked
+        away = layout.astray(state.position, state.colony)
         left = torch.bincount(state.colony[away], minlength=state.colonies)
         first = torch.zeros(state.colonies, 3, dtype=torch.float64, device=state.device)
         first[state.colony[away]] = layout.places(state.position)[away]

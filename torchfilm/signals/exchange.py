@@ -60,6 +60,21 @@ class Stencil:
         return self.groups.sum(entry.reshape(-1, 1)).squeeze(1)
 
 
+def beyond_box(grid: Grid, position: Tensor, colony: Tensor, periodic: tuple[bool, bool, bool]) -> Tensor:
+    """Which cells at position (N, 3) are beyond the box of their colony's grid, (N,) bool; a place that is not finite is."""
+    return _beyond((position - grid.origin.index_select(0, colony)) / grid.step, grid.shape.index_select(0, colony), periodic)
+
+
+def _beyond(scaled: Tensor, shape: Tensor, periodic: tuple[bool, bool, bool]) -> Tensor:
+    """The same from places (N, 3) in voxels from the lower corner and numbers of voxels (N, 3)."""
+    outside = torch.zeros_like(scaled[:, 0], dtype=torch.bool)
+    for axis in range(3):
+        at, size = scaled[:, axis], shape[:, axis]
+        # written so that a NaN is outside
+        outside |= ~torch.isfinite(at) if periodic[axis] else ~((at >= -SLACK) & (at <= size + SLACK))
+    return outside
+
+
 def stencil(
     grid: Grid,
     position: Tensor,
@@ -82,14 +97,11 @@ def stencil(
     shape = grid.shape.index_select(0, colony)
     scaled = (position - grid.origin.index_select(0, colony)) / grid.step  # in voxels from the lower corner
     used = [axis for axis in range(3) if any(s[axis] > 1 for s in grid.shapes)]
-    outside = torch.zeros_like(colony, dtype=torch.bool)
+    outside = _beyond(scaled, shape, periodic)
     sides: list[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]] = []
     for axis in range(3):
-        at, size = scaled[:, axis], shape[:, axis]
-        # written so that a NaN is outside
-        outside |= ~torch.isfinite(at) if periodic[axis] else ~((at >= -SLACK) & (at <= size + SLACK))
         if axis in used:
-            sides.append(_two_voxels(at - 0.5, size, periodic[axis], dtype))
+            sides.append(_two_voxels(scaled[:, axis] - 0.5, shape[:, axis], periodic[axis], dtype))
     node, weight = [], []
     strides = {0: shape[:, 1] * shape[:, 2], 1: shape[:, 2], 2: torch.ones_like(colony)}
     first = grid.offsets.index_select(0, colony)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.signals.exchange import Stencil, pool_volume, read, stencil
+from torchfilm.signals.exchange import Stencil, beyond_box, pool_volume, read, stencil
 from torchfilm.signals.grid import Batch, Grid
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import expand_ranges
@@ -66,6 +66,14 @@ class Layout:
     def stencil(self, position: Tensor, colony: Tensor, dtype: torch.dtype) -> Stencil:
         """Where cells at (N, d) µm of colonies (N,) meet the grid."""
         return stencil(self.grid, self.places(position), colony, periodic=self.periodic, mask=self.mask, dtype=dtype)
+
+    def astray(self, position: Tensor, colony: Tensor) -> Tensor:
+        """Which cells at (N, d) µm of colonies (N,) are where no medium is, (N,) bool: beyond the box, if it stands in no reservoir, or in an obstacle."""
+        if self.obstacle is None:
+            return beyond_box(self.grid, self.places(position), colony, self.periodic)
+        where = self.stencil(position, colony, torch.float64)
+        assert where.blocked is not None
+        return where.outside if self.reservoir is None else where.blocked
 
     def contact(self, position: Tensor, colony: Tensor, ids: Tensor, signals: Mapping[str, Tensor], dtype: torch.dtype) -> Contact:
         """What cells at (N, d) µm of colonies (N,), whose ids are `ids` (N,), find of each signal (nodes,)."""
