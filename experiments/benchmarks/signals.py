@@ -17,6 +17,7 @@ import platform
 import statistics
 import subprocess
 import time
+from collections import deque
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -116,20 +117,36 @@ def transport(chosen: argparse.Namespace) -> list[dict]:
     return records
 
 
+def band(chosen: argparse.Namespace) -> list[dict]:
+    """The paper's Fig. 5 from two founders: circuits in every cell, AHL on a grid, contacts in a channel."""
+    scene, timings = tf.scenes.boundary_detector(), tf.Timings()
+    begun = time.perf_counter()
+    start = scene.seed(1, seed=0, dtype=DTYPES[chosen.dtype], device=chosen.device)
+    state = deque(tf.simulate(scene, start, cells=chosen.cells, timings=timings), maxlen=1).pop()
+    seconds = time.perf_counter() - begun
+    shares = {k: round(v, 2) for k, v in timings.seconds.items()}
+    print(f"Fig. 5 to {state.cells} cells: {seconds:.1f} s, {state.step} steps, {state.time:g} h; {shares}")
+    return [{"method": "fig5", "cells": state.cells, "steps": state.step, "simulated_h": state.time, "seconds": round(seconds, 2), "effects_s": shares}]
+
+
+PARTS = {"transport": transport, "band": band}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", action="append", type=int, help="voxels along an edge; may be given again")
     parser.add_argument("--method", action="append", choices=CASES, help="one method; may be given again")
     parser.add_argument("--dtype", default="float32", choices=sorted(DTYPES))
+    parser.add_argument("--part", action="append", choices=sorted(PARTS), help="one part; may be given again")
+    parser.add_argument("--cells", type=int, default=5000, help="of Fig. 5")
     parser.add_argument("--seconds", type=float, default=2.0, help="how long to repeat each")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("signals.json"))
     chosen = parser.parse_args()
     tf.keep_memory()
     records = json.loads(chosen.out.read_text()) if chosen.out.exists() else []
-    # a part of the benchmark is a function that returns records: further parts go here
-    for part in (transport,):
-        records += [machine() | record for record in part(chosen)]
+    for name in chosen.part or PARTS:
+        records += [machine() | record for record in PARTS[name](chosen)]
         chosen.out.write_text(json.dumps(records, indent=1) + "\n")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -117,8 +118,13 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     """(B, …), (B, …) -> (B, 1, 1, 1)."""
     product = (a * b).reshape(-1, 1)
     # not .sum(1): with several threads the way it divides long rows depends on how many there are
-    owner = torch.arange(a.shape[0], device=a.device).repeat_interleave(product.shape[0] // max(1, a.shape[0]))
-    return Groups(owner, a.shape[0]).sum(product).reshape(-1, 1, 1, 1)
+    return _rows(a.shape[0], a[0].numel(), str(a.device)).sum(product).reshape(-1, 1, 1, 1)
+
+
+@lru_cache(maxsize=8)
+def _rows(count: int, size: int, device: str) -> Groups:
+    """`count` groups of `size` rows each."""
+    return Groups(torch.arange(count, device=device).repeat_interleave(size), count)
 
 
 def _ratio(a: Tensor, b: Tensor) -> Tensor:
