@@ -161,6 +161,19 @@ def test_resume_of_a_run_that_is_at_its_end_is_no_error(command):
     assert_same(before, frames("a.h5"))
 
 
+def started(folder: Path, results: str, *arguments: str) -> subprocess.Popen:
+    """The command in a process of its own, from when its results file is there."""
+    child = subprocess.Popen(
+        [sys.executable, "-m", "torchfilm.cli", "run", *arguments],
+        cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    for _ in range(500):
+        time.sleep(0.02)
+        if (folder / results).exists():
+            break
+    return child
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("attempt", range(3))
 def test_interrupted_from_the_keyboard(tmp_path, attempt):
@@ -168,14 +181,7 @@ def test_interrupted_from_the_keyboard(tmp_path, attempt):
 
     Several times, because an interrupt that falls into a callback of the interpreter is easily swallowed there.
     """
-    child = subprocess.Popen(
-        [sys.executable, "-m", "torchfilm.cli", "run", "microcolony", "--colonies", "2", "--until", "8", "--every", "1"],
-        cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    for _ in range(500):
-        time.sleep(0.02)
-        if (tmp_path / "microcolony.h5").exists():
-            break
+    child = started(tmp_path, "microcolony.h5", "microcolony", "--colonies", "2", "--until", "8", "--every", "1")
     time.sleep(0.3 + 0.1 * attempt)
     child.send_signal(signal.SIGINT)
     _, errors = child.communicate(timeout=60)
@@ -197,14 +203,7 @@ def test_interrupted_from_the_keyboard(tmp_path, attempt):
 def test_watch_takes_up_an_edit_while_running(tmp_path):
     (tmp_path / "rules.py").write_text("import time\ndef update(cells):\n    time.sleep(0.02)\n    cells.growth_rate = 0.5\n")
     (tmp_path / "mine.py").write_text('import torchfilm as tf\nscene = tf.Scene(tf.Rules("rules.py"), tf.Growth(), dt=0.01)\n')
-    child = subprocess.Popen(
-        [sys.executable, "-m", "torchfilm.cli", "run", "mine.py", "--until", "1.5", "--watch", "--every", "1", "--no-picture"],
-        cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    for _ in range(500):
-        time.sleep(0.02)
-        if (tmp_path / "mine.h5").exists():
-            break
+    child = started(tmp_path, "mine.h5", "mine.py", "--until", "1.5", "--watch", "--every", "1", "--no-picture")
     time.sleep(0.4)
     (tmp_path / "rules.py").write_text("def update(cells)\n")
     time.sleep(0.4)

@@ -10,6 +10,7 @@ they stop at 1e-10 of displacements of about 0.1 µm, over 2h that is at most 1e
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
@@ -60,7 +61,7 @@ def run(scene: tf.Scene, state: tf.State, steps: int = 8, dt: float = 0.05) -> t
 Experiment = Callable[[Tensor], tf.State]
 
 
-def check(experiment: Experiment, at: list[float] | float, *, divides: bool = False) -> Tensor:
+def compare(outcome: Callable[[tf.State], Tensor], experiment: Experiment, at: list[float] | float, *, divides: bool = False) -> Tensor:
     """Compare d outcome / d parameters with central differences, one parameter at a time; returns the gradient."""
     value = torch.tensor(at, dtype=F64, requires_grad=True)
     last = experiment(value)
@@ -83,6 +84,9 @@ def check(experiment: Experiment, at: list[float] | float, *, divides: bool = Fa
     assert size > 1e-3, "nothing depends on it: the comparison would prove nothing"
     assert float((gradient - difference).abs().max()) <= RELATIVE * size, (gradient.tolist(), difference.tolist())
     return gradient
+
+
+check = partial(compare, outcome)
 
 
 def growing(dim: int, rate: Tensor, *more: tf.Effect, law: str = "volume", **options) -> tf.Scene:

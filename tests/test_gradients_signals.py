@@ -11,11 +11,11 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from test_gradients import F64, compare, weights
 from torch import Tensor
 
 import torchfilm as tf
 
-F64, H, RELATIVE = torch.float64, 1e-5, 1e-5
 DT = 0.05
 BOX = {"box": ((-8.0, -8.0), (8.0, 8.0)), "spacing": 2.0}
 
@@ -53,11 +53,6 @@ def talking(*, divides: bool = False, circuit: dict | None = None, medium: dict 
     )  # fmt: skip
 
 
-def weights(like: Tensor) -> Tensor:
-    """Fixed and generic, so that no symmetry hides an error."""
-    return torch.sin(1.0 + 1.7 * torch.arange(like.numel(), dtype=F64)).reshape(like.shape)
-
-
 def outcome(state: tf.State) -> Tensor:
     """One number that depends on every cell's contents and shape, and on every voxel."""
     # the last displacement is where the next solve starts from, without a gradient
@@ -76,27 +71,7 @@ def run(scene: tf.Scene, steps: int, colonies: int = 1) -> tf.State:
 
 
 def check(make: Callable[[Tensor], tf.Scene], at: float | list[float], steps: int = 6, colonies: int = 1, divides: bool = False) -> Tensor:
-    """d outcome / d value against central differences, one entry at a time; returns the gradient."""
-    value = torch.tensor(at, dtype=F64, requires_grad=True)
-    last = run(make(value), steps, colonies)
-    assert bool((last.parent >= 0).any()) == divides
-    (gradient,) = torch.autograd.grad(outcome(last), value)
-    found = []
-    with torch.no_grad():
-        for k in range(value.numel()):
-            ends = []
-            for h in (H, -H):
-                moved = value.detach().reshape(-1).clone()
-                moved[k] += h
-                state = run(make(moved.reshape(value.shape)), steps, colonies)
-                assert torch.equal(state.uid, last.uid), "the difference straddles a division"
-                ends.append(float(outcome(state)))
-            found.append((ends[0] - ends[1]) / (2 * H))
-    difference = torch.tensor(found, dtype=F64).reshape(value.shape)
-    size = float(difference.abs().max())
-    assert size > 1e-3, "nothing depends on it: the comparison would prove nothing"
-    assert float((gradient - difference).abs().max()) <= RELATIVE * size, (gradient.tolist(), difference.tolist())
-    return gradient
+    return compare(outcome, lambda x: run(make(x), steps, colonies), at, divides=divides)
 
 
 @pytest.mark.parametrize("name", [*CONSTANTS, *OPTIONS])

@@ -13,13 +13,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
-import subprocess
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
+from record import machine
 
 import torchfilm as tf
 from torchfilm.physics.rows import ContactRows
@@ -103,18 +101,6 @@ def run(name: str, device: str, seed: int) -> dict:
         "overlap_mean_um": round(mean, 5), "overlap_worst_um": round(float(found.worst.max()), 4),
         "depth_um": round(float(tf.measure.depth(state).max()), 2), "radius_um": round(float(tf.measure.colony_radius(state).mean()), 1),
         "products": counter.products, "floor_seconds": round(counter.bytes / copy_speed(device), 3), "marks": marks,
-    }  # fmt: skip
-
-
-def machine() -> dict:
-    try:
-        commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    return {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit, "torch": str(torch.__version__), "python": platform.python_version(),
-        "threads": torch.get_num_threads(), "processor": platform.processor() or platform.machine(), "gpu": gpu,
     }  # fmt: skip
 
 

@@ -13,16 +13,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import statistics
-import subprocess
 import time
 from collections import deque
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import torch
+from record import machine
 from scipy.special import ive
 
 import torchfilm as tf
@@ -86,18 +84,6 @@ def run(n: int, case: str, dtype: torch.dtype, device: str, seconds: float) -> d
         expected = exact(n)
         record["error"] = float(np.abs(found - expected).max() / expected.max())
     return record
-
-
-def machine() -> dict:
-    try:
-        commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    return {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit, "torch": str(torch.__version__), "python": platform.python_version(),
-        "threads": torch.get_num_threads(), "processor": platform.processor() or platform.machine(), "gpu": gpu,
-    }  # fmt: skip
 
 
 def row(record: dict) -> str:
