@@ -62,6 +62,17 @@ def test_fields_are_attributes_and_unknown_names_are_told():
     assert not hasattr(state, "displacement")
 
 
+def test_an_unknown_signal_is_named_beside_those_there_are():
+    medium = tf.Medium(ahl=tf.Signal(diffusion=1.0), food=tf.Signal(diffusion=1.0), box=((-4, -4), (4, 4)), spacing=4.0)
+    signals = tf.Scene(medium, founders=tf.Cells.single(2)).seed().signals
+    assert list(signals) == ["ahl", "food"] and signals["ahl"].numel() == 4 and signals.get("alh") is None
+    for error in (tf.InputError, KeyError):
+        with pytest.raises(error, match=r"^the state has no signal 'alh'; its signals are ahl, food$"):
+            signals["alh"]
+    with pytest.raises(tf.InputError, match=r"no signal 'ahl'.*none: list a Medium"):
+        batch().signals["ahl"]
+
+
 def test_replace_leaves_the_old_one():
     state = batch()
     new = state.replace(length=state.length * 2)

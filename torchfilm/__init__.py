@@ -16,18 +16,21 @@ from torchfilm.effects.rules import Rules
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
 from torchfilm.pictures import show
 from torchfilm.recorder import Recorder
+from torchfilm.replay import Course, Replay
 from torchfilm.results import Results
 from torchfilm.scene import Scene
 from torchfilm.signals.faces import Faces, Fixed, NoFlux, Open, Periodic
-from torchfilm.simulate import rollout, simulate
+from torchfilm.simulate import failures, rollout, simulate
 from torchfilm.state import Field, State
+from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.timing import Timings
 from torchfilm.version import __version__
 
 __all__ = [
-    "Box", "Cells", "Channel", "Circuit", "Division", "Effect", "Faces", "Field", "Fixed", "Growth", "InputError", "LogNormal", "Mechanics", "Medium", "Monod",
-    "NoFlux", "Normal", "Open", "Periodic", "Plane", "Reaction", "Recorder", "Removal", "Results", "Rules", "Scene", "Signal", "SimulationError", "Sphere",
-    "State", "Timings", "Uniform", "__version__", "effect", "keep_memory", "kinetics", "measure", "parts", "pictures", "rollout", "scenes", "show", "simulate",
+    "Box", "Cells", "Channel", "Circuit", "Course", "Division", "Effect", "Faces", "Field", "Fixed", "Growth", "InputError", "LogNormal", "Mechanics",
+    "Medium", "Monod", "NoFlux", "Normal", "Open", "Periodic", "Plane", "Reaction", "Recorder", "Removal", "Replay", "Results", "Rules", "Scene", "Signal",
+    "SimulationError", "Sphere", "State", "Timings", "Uniform", "__version__", "checks", "effect", "failures", "keep_memory", "kinetics", "measure",
+    "parts", "pictures", "rollout", "scenes", "show", "simulate",
 ]  # fmt: skip

@@ -121,7 +121,7 @@ class Cells:
             parent=torch.full((len(index),), -1, dtype=torch.int64, device=device),
             position=tensor(self.position, torch.float64), axis=tensor(self.axis, dtype),
             length=tensor(self.length, dtype), radius=tensor(self.radius, dtype),
-            colony_id=torch.arange(colonies, device=device),
+            colony_id=torch.arange(colonies, device=device), stream=torch.arange(colonies, device=device),
             next_uid=torch.as_tensor(counts, dtype=torch.int64, device=device), seed=seed,
         )  # fmt: skip
         axis = state.axis / (state.axis * state.axis).sum(1, keepdim=True).sqrt()

@@ -1,4 +1,4 @@
-"""What one measures on a state: overlaps, radius, depth, alignment, per colony."""
+"""What one measures on a state: overlaps, radius, depth, alignment, per colony, and who is whose neighbour."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from torch import Tensor
 from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.physics.walls import Wall
 from torchfilm.state import State
+from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
+from torchfilm.tools.vectors import safe_norm
 
 
 @dataclass(frozen=True)
@@ -83,3 +85,15 @@ def tilt(state: State) -> Tensor:
     if state.dim == 2:
         return torch.zeros_like(state.length)
     return torch.asin(state.axis[:, 2].abs().clamp(max=1))
+
+
+@torch.no_grad()
+def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Pairs of cells of one colony whose surfaces are less than `gap` µm apart, each once: first and second (P,) int64, and the distance of their centres,
+    (P,) float64 µm. A colony's pairs and their order do not depend on what else is in the batch."""
+    checks.number("neighbours(gap)", gap, least=0.0)
+    i, j, apart = gaps_nearby(state.position, state.axis, state.length, state.radius, state.colony, state.colonies, within=gap)
+    near = torch.nonzero(apart < gap).squeeze(1)
+    i, j = i.index_select(0, near), j.index_select(0, near)
+    between = state.position.index_select(0, j) - state.position.index_select(0, i)
+    return i, j, safe_norm(between.T)

@@ -88,13 +88,15 @@ class Recorder:
             rebuilt = self.path.with_name(self.path.name + ".resumed")
             _copy_committed(self.path, rebuilt)
             os.replace(rebuilt, self.path)
-            self.file = h5py.File(self.path, "r+", libver="latest")
-            mine = (state.seed, str(state.dtype)[6:], state.dim, state.colony_id.tolist())
-            there = (int(self.file.attrs["seed"]), str(self.file.attrs["dtype"]), int(self.file.attrs["dim"]), self.file["colony_id"][...].tolist())
+            mine = (state.seed, str(state.dtype)[6:], state.dim, state.colony_id.tolist(), state.stream.tolist())
+            with Results(self.path) as kept:
+                about = kept.attributes
+                there = (int(about["seed"]), str(about["dtype"]), int(about["dim"]), kept.colony_id.tolist(), kept.stream.tolist())
             if mine != there:
-                self.file.close()
-                self.file = None
-                raise checks.refuse("state", f"of (seed, dtype, dim, colonies) {mine}", f"of {there}, as {self.path} is", "Record to a file of its own.")
+                raise checks.refuse(
+                    "state", f"of (seed, dtype, dim, colonies, streams) {mine}", f"of {there}, as {self.path} is", "Record to a file of its own."
+                )
+            self.file = h5py.File(self.path, "r+", libver="latest")
             last = int(self.file["frames/step"][-1])
             if last != state.step:
                 self.file.close()
@@ -126,6 +128,7 @@ class Recorder:
         for name, value in attributes.items():
             file.attrs[name] = value
         file.create_dataset("colony_id", data=_numpy(state.colony_id))
+        file.create_dataset("stream", data=_numpy(state.stream))
         for name, value in _cell_columns(state).items():
             _growing(file, f"cells/{name}", value.dtype, value.shape[1:], CHUNK_ROWS)
         colonies = (state.colonies,)

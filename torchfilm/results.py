@@ -1,7 +1,7 @@
 """Results: one HDF5 file of ragged frames, readable while it is written, from which a run resumes bit for bit.
 
     /                 attributes: format, version, scene, recipe, seed, dim, dtype, versions
-    /colony_id        (B,)
+    /colony_id, /stream   (B,)
     /cells/NAME       rows of all frames one after the other: colony, uid, parent, position, axis, length, radius, fields per cell
     /frames/NAME      a row a frame: first_row, counts (B), next_uid (B), births, ends, time, step; /frames/colony/NAME fields per colony
     /signals/NAME     (in scenes with a medium) voxels of all colonies and frames one after the other; /frames/grid/origin, shape (B, 3), first_voxel
@@ -120,6 +120,11 @@ class Results:
     @property
     def colony_id(self) -> np.ndarray:
         return self.file["colony_id"][...]
+
+    @property
+    def stream(self) -> np.ndarray:
+        """(B,) which course of random numbers each colony follows."""
+        return self.file["stream" if "stream" in self.file else "colony_id"][...]
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -278,7 +283,8 @@ class Results:
 
         fields = {n: tensor(recorded[n] if n in recorded else colony_fields[n]) for n in declared}
         return template.replace(
-            **{n: tensor(recorded[n]) for n in PER_CELL}, colony_id=tensor(self.colony_id), next_uid=tensor(self.file["frames/next_uid"][k]),
+            **{n: tensor(recorded[n]) for n in PER_CELL}, colony_id=tensor(self.colony_id), stream=tensor(self.stream),
+            next_uid=tensor(self.file["frames/next_uid"][k]),
             step=int(self.steps[k]), time=float(self.times[k]), fields=fields, declared=declared, layout=layout,
         )  # fmt: skip
 

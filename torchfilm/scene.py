@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchfilm.cells import Cells
 from torchfilm.effect import BUILT_IN, STAGES, Effect
-from torchfilm.state import CELL, Field, State
+from torchfilm.state import CELL, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.timing import Timings
 
@@ -45,7 +45,9 @@ class Scene:
             if names.count(title) > 1 and title in ("growth", "division", "mechanics", "circuit", "transport", "nutrition"):
                 raise checks.InputError(f"Scene lists {title} {names.count(title)} times: one is allowed. Put all of it into one.")
         self.listed = effects
-        self.effects: tuple[Effect, ...] = tuple(sorted((p for e in effects for p in e.parts()), key=lambda p: p.stage))
+        parts = sorted(((part, k) for k, e in enumerate(effects) for part in e.parts()), key=lambda p: p[0].stage)
+        self.effects: tuple[Effect, ...] = tuple(part for part, _ in parts)
+        self.places: tuple[int, ...] = tuple(k for _, k in parts)  # which of the listed effects each is a part of
         self.name, self.recipe = name, recipe
         self.settings: dict[str, Any] = {}  # what a user's own scene function was given
         self.dt = checks.number("Scene.dt", dt, above=0.0)
@@ -69,6 +71,7 @@ class Scene:
                 if name not in declared and name not in BUILT_IN and name not in self.founders.extra:
                     raise checks.InputError(
                         f"{effect.title} needs the field {name!r}, which nothing in this scene provides. It has: {', '.join(declared) or 'no field'}."
+                        + (_signal_mend(name.removeprefix(OUTSIDE), declared) if name.startswith(OUTSIDE) else "")
                     )
 
     def seed(
@@ -76,12 +79,16 @@ class Scene:
         colonies: int = 1,
         *,
         seed: int = 0,
+        streams: Sequence[int] | Tensor | None = None,
         cells: Cells | None = None,
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> State:
         """The first state: `colonies` independent colonies, each from a copy of the founders (or of `cells`, which may carry a
         colony number for each cell instead). Checked here, before anything runs.
+
+        streams: whole numbers (B,), which course of random numbers each colony follows; by default colony k follows stream k. Colonies of one
+        stream differ only by their parameters: common random numbers, for comparing designs.
         """
         if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < 1:
             raise checks.refuse("colonies", colonies, "a whole number from 1", "A batch has at least one colony.")
@@ -98,15 +105,20 @@ class Scene:
                 raise checks.InputError(
                     f"{path} has {tensor.numel()} values, but the batch has {count} colonies: give one number, or one for each of scene.seed(colonies=…)."
                 )
-        state = self.unchecked(colonies, seed=seed, cells=cells, device=_known_device(device), dtype=dtype)
+        state = self.unchecked(colonies, seed=seed, streams=_streams(streams, count), cells=cells, device=_known_device(device), dtype=dtype)
         self.check(state)
         for effect in self.effects:
             effect.check(state)
         return state
 
-    def unchecked(self, colonies: int, *, seed: int = 0, cells: Cells | None = None, device: torch.device = CPU, dtype: torch.dtype = torch.float32) -> State:
+    def unchecked(
+        self, colonies: int, *, seed: int = 0, streams: Tensor | None = None, cells: Cells | None = None, device: torch.device = CPU,
+        dtype: torch.dtype = torch.float32,
+    ) -> State:  # fmt: skip
         """A first state whose cells are not asked whether they may stand where they do: to be filled from a file, or only looked at."""
         state = (cells if cells is not None else self.founders).state(colonies, seed, device, dtype)
+        if streams is not None:
+            state = state.replace(stream=streams.to(device))
         for effect in self.effects:
             state = effect.begin(state)
         for effect in self.effects:
@@ -186,6 +198,14 @@ class Scene:
         return f"Scene({', '.join(summary(e) for e in self.listed)}, name={self.name!r})"
 
 
+def _signal_mend(name: str, declared: Iterable[str]) -> str:
+    """What to do where a signal is asked for that no Medium has."""
+    has = ", ".join(n.removeprefix(OUTSIDE) for n in declared if n.startswith(OUTSIDE))
+    if not has:
+        return f" That is the signal {name!r}, and the scene has no Medium: list tf.Medium({name}=tf.Signal(…), …)."
+    return f" That is the signal {name!r}; the Medium has {has}: name one of these, or give the Medium {name}=tf.Signal(…)."
+
+
 def _with_given(state: State, wanted: Field) -> State:
     """A field that came with the first cells, under the effect's own declaration: its rule at division and its dtype are the effect's."""
     values = state.fields[wanted.name]
@@ -237,6 +257,15 @@ def parameters(part: object, path: str = "") -> list[tuple[str, Tensor]]:
         # what is not shown is not given by the user but worked out
         return [found for f in dataclasses.fields(part) if f.repr for found in parameters(getattr(part, f.name), f"{path}.{f.name}")]  # type: ignore[arg-type]
     return []
+
+
+def _streams(given: Sequence[int] | Tensor | None, colonies: int) -> Tensor | None:
+    if given is None:
+        return None
+    found = torch.as_tensor(given)
+    if found.shape != (colonies,) or found.is_floating_point() or found.dtype == torch.bool or bool(((found < 0) | (found >= 2**32)).any()):
+        raise checks.refuse("streams", given, f"{colonies} whole numbers from 0 to 2³² − 1, one for each colony")
+    return found.to(torch.int64)
 
 
 def _known_device(device: str | torch.device) -> torch.device:

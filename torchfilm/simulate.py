@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -106,28 +107,42 @@ def _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings
             recorder.close()
 
 
-def handle_failures(state: State, on_failure: str) -> State:
-    """Raise for the colonies whose last step failed, all at once, or drop their cells.
+@dataclass(frozen=True)
+class Failure:
+    """A colony that failed in the last step: its place in the batch, its id and cells, why, and what may help."""
+
+    place: int
+    colony_id: int
+    cells: int
+    reason: str
+    mend: str
+
+
+def failures(state: State) -> list[Failure]:
+    """The colonies whose last step failed, once for each reason: a solve that did not converge, a cell too short to divide, a circuit that left the numbers.
 
     Every report of the step has a `status` (B,), 0 where all is well, and says what went wrong, `reason(place)`, and what helps, `mend`.
     """
-    failed = torch.zeros(state.colonies, dtype=torch.bool, device=state.device)
-    reasons, mends = [], []
+    found = []
     for report in state.reports.values():
-        bad = report.status != 0
-        failed = failed | bad
-        for place in torch.nonzero(bad).squeeze(1).tolist():
-            reasons.append(f"colony {int(state.colony_id[place])} ({int(state.counts[place])} cells): {report.reason(place)}")
-            mends.append(report.mend)
-    if not reasons:
+        for place in torch.nonzero(report.status).squeeze(1).tolist():
+            found.append(Failure(place, int(state.colony_id[place]), int(state.counts[place]), report.reason(place), report.mend))
+    return found
+
+
+def handle_failures(state: State, on_failure: str) -> State:
+    """Raise for the colonies whose last step failed, all at once, or drop their cells."""
+    found = failures(state)
+    if not found:
         return state
+    places = sorted({f.place for f in found})
     if on_failure == "raise":
         raise SimulationError(
-            f"step {state.step} (t = {state.time:g} h) failed in {int(failed.sum())} of {state.colonies} colonies:\n  "
-            + "\n  ".join(reasons[:20])
+            f"step {state.step} (t = {state.time:g} h) failed in {len(places)} of {state.colonies} colonies:\n  "
+            + "\n  ".join(f"colony {f.colony_id} ({f.cells} cells): {f.reason}" for f in found[:20])
             + "\n"
-            + ". ".join(dict.fromkeys(mends))
+            + ". ".join(dict.fromkeys(f.mend for f in found))
             + '; on_failure="drop" goes on without them.',
-            state.colony_id[failed].tolist(),
+            [int(state.colony_id[p]) for p in places],
         )
-    return state.remove(failed.index_select(0, state.colony), "failed")
+    return state.remove(torch.isin(state.colony, torch.tensor(places, device=state.device)), "failed")

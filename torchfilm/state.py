@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -78,6 +78,19 @@ class Ended:
     fate: str
 
 
+class UnknownSignal(checks.InputError, KeyError):
+    """A state was asked for a signal that it does not have."""
+
+    __str__ = Exception.__str__  # a KeyError shows its message in quotes
+
+
+class Signals(dict[str, Tensor]):
+    """Values of signals by name."""
+
+    def __missing__(self, name: str) -> Tensor:
+        raise UnknownSignal(f"the state has no signal {name!r}; its signals are {', '.join(self) or 'none: list a Medium in the scene'}")
+
+
 @dataclass(frozen=True, eq=False)
 class State:
     """Cells of B colonies, N in all, those of one colony side by side. Frozen: a step returns a new one.
@@ -85,7 +98,8 @@ class State:
     colony (N,) int64, place of its colony in this batch · uid, parent (N,) int64, unique within a colony, founders have
     parent −1 · position (N, d) µm, always float64, so that a colony far from the origin keeps its resolution · axis (N, d)
     unit · length (N,) µm, of the centreline · radius (N,) µm · fields, by name.
-    colony_id (B,): which colony of the scene each is; parameters per colony and random numbers go by it. next_uid (B,).
+    colony_id (B,): which colony of the scene each is; parameters per colony go by it. stream (B,): which course of random numbers each follows, by default
+    its colony_id; colonies of one stream and alike in their parameters are alike in all. next_uid (B,).
     A field is also an attribute: `state.growth_rate`. layout: where the voxels of signals are, in a scene that has a medium; a signal's values are
     `state.signals["ahl"]`, (nodes,).
     """
@@ -98,6 +112,7 @@ class State:
     length: Tensor
     radius: Tensor
     colony_id: Tensor
+    stream: Tensor
     next_uid: Tensor
     seed: int
     step: int = 0
@@ -163,7 +178,7 @@ class State:
     @property
     def signals(self) -> dict[str, Tensor]:
         """Values of each signal by name, (nodes,), laid out as `layout.grid` says."""
-        return {name.removeprefix(OUTSIDE): value for name, value in self.fields.items() if name.startswith(OUTSIDE)}
+        return Signals({name.removeprefix(OUTSIDE): value for name, value in self.fields.items() if name.startswith(OUTSIDE)})
 
     def contact(self) -> Contact | None:
         """Where cells meet the medium and what they find there; None in a scene without one."""
@@ -175,6 +190,11 @@ class State:
     def own_colony_id(self) -> Tensor:
         """The id of each cell's colony, (N,)."""
         return self.colony_id.index_select(0, self.colony)
+
+    @property
+    def own_stream(self) -> Tensor:
+        """The stream of each cell's colony, (N,)."""
+        return self.stream.index_select(0, self.colony)
 
     def replace(self, **changes: Any) -> State:
         """A state with some of its parts replaced."""
@@ -204,6 +224,16 @@ class State:
         part = {name: getattr(self, name).index_select(0, index) for name in PER_CELL}
         return self.replace(**part, fields=fields)
 
+    def reset_at_division(self, daughters: Tensor, names: Iterable[str]) -> State:
+        """The state right after divisions (`births[-1]` tells of them) in which those of the named fields that a division resets start anew in the
+        cells `daughters` (M,), first daughters first; the others they have from their parents."""
+        changed = {}
+        for name in names:
+            declared = self.declared[name]
+            if declared.scope == CELL and declared.at_division == "reset":
+                changed[name] = self.fields[name].index_copy(0, daughters, declared.start(self, daughters))
+        return self.with_fields(**changed)
+
     def remove(self, gone: Tensor, fate: str) -> State:
         """The state without the cells where `gone` (N,) is true, whose end is noted."""
         if not bool(gone.any()):
@@ -229,25 +259,22 @@ class State:
         fields = {n: v if (index := kept[self.declared[n].scope]) is None else v.index_select(0, index) for n, v in taken.fields.items()}
         return taken.replace(
             colony=owner, fields=fields, layout=layout, births=(), ended=(), reports={},
-            colony_id=self.colony_id.index_select(0, places), next_uid=self.next_uid.index_select(0, places),
+            **{name: getattr(self, name).index_select(0, places) for name in PER_COLONY},
         )  # fmt: skip
 
     def to(self, device: str | torch.device) -> State:
         """The same state on another device."""
-        move = {name: getattr(self, name).to(device) for name in (*PER_CELL, "colony_id", "next_uid")}
+        move = {name: getattr(self, name).to(device) for name in (*PER_CELL, *PER_COLONY)}
         layout = None if self.layout is None else self.layout.to(device)
         return self.replace(**move, fields={n: v.to(device) for n, v in self.fields.items()}, layout=layout, births=(), ended=(), reports={})
 
     def uniform(self, rows: Tensor, purpose: str) -> Tensor:
-        """A draw from (0, 1) for each of the given cells (M,), the same whatever the batch: keyed by seed, colony, uid, step, purpose."""
-        return random.uniform(self.seed, self._ids(rows), self.uid.index_select(0, rows), self.step, purpose, self.dtype)
+        """A draw from (0, 1) for each of the given cells (M,), the same whatever the batch: keyed by seed, stream, uid, step, purpose."""
+        return random.uniform(self.seed, self.own_stream.index_select(0, rows), self.uid.index_select(0, rows), self.step, purpose, self.dtype)
 
     def normal(self, rows: Tensor, purpose: str) -> Tensor:
         """Four standard normal draws for each of the given cells, (M, 4), keyed as `uniform`."""
-        return random.normal(self.seed, self._ids(rows), self.uid.index_select(0, rows), self.step, purpose, self.dtype)
-
-    def _ids(self, rows: Tensor) -> Tensor:
-        return self.own_colony_id.index_select(0, rows)
+        return random.normal(self.seed, self.own_stream.index_select(0, rows), self.uid.index_select(0, rows), self.step, purpose, self.dtype)
 
     def __repr__(self) -> str:
         return (
@@ -257,6 +284,7 @@ class State:
 
 
 PER_CELL = ("colony", "uid", "parent", "position", "axis", "length", "radius")
+PER_COLONY = ("colony_id", "stream", "next_uid")
 RESERVED = frozenset(f.name for f in dataclasses.fields(State)) | {n for n in vars(State) if not n.startswith("__")}
 # A field that first cells may bring and rules may set.
 CELL_TYPE = Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64)

@@ -113,8 +113,7 @@ class CellsView:
                 raise RuleError(f"cells have no {name!r}; it is a signal: read cells.signals.{name}.")
             known = [*GEOMETRY, *IDENTITY, *(n for n in state.fields if n.isidentifier())]
             raise RuleError(
-                f"cells have no {name!r}; they have {', '.join(known)}. A variable of your own needs a first value: "
-                f"give Rules(…, variables={{{name!r}: 0.0}})."
+                f"cells have no {name!r}; they have {', '.join(known)}. A variable of your own needs a first value: give Rules(…, variables={{{name!r}: 0.0}})."
             )
         return self._work[name]
 

@@ -38,6 +38,7 @@ AT_ONCE = {
     "no species": (bad(idle, ()), r"Circuit\.species.*at least one"),
     "a species twice": (bad(idle, ("m", "m")), r"Circuit\.species.*different names"),
     "a species that is no name": (bad(idle, ("m w",)), r"Circuit\.species"),
+    "species in one string": (bad(idle, "a, b"), r"Circuit\.species = 'a, b'.*Pass a tuple of names: species=\('a', 'b'\)\."),
     "initial of no species": (bad(idle, ("luxi",), initial={"lux": 1.0}), r"initial names 'lux', which is no species; known are luxi\. Did you mean 'luxi'\?"),
     "negative initial": (bad(idle, initial={"m": -1.0}), r"Circuit\.initial\['m'\].*at least 0"),
     "initial that may be negative": (bad(idle, initial={"m": tf.Normal(1.0, 1.0)}), r"least value of Circuit\.initial\['m'\]"),

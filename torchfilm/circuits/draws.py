@@ -15,14 +15,14 @@ MOST_CORRECTIONS = 400  # steps of one from the first guess; one or two where th
 SMALL, LARGE = 4.0, 1e6  # means below which one counts up from 0, and above which the guess is the answer
 
 
-def keyed_draws(seed: int, colony: Tensor, uid: Tensor, step: int) -> Draw:
-    """Draws that are a function of (seed, colony, uid, step, event, what, k) only: colony, uid (N,) int64, step of the simulation.
+def keyed_draws(seed: int, stream: Tensor, uid: Tensor, step: int) -> Draw:
+    """Draws that are a function of (seed, stream, uid, step, event, what, k) only: stream, uid (N,) int64, step of the simulation.
 
-    `colony` is the colony's id, which does not depend on the batch. Each pair of uniforms takes one block of the generator, 53 bits each.
+    `stream` is the colony's, which does not depend on the batch. Each pair of uniforms takes one block of the generator, 53 bits each.
     """
 
     def draw(rows: Tensor, event: int, what: str, count: int) -> Tensor:
-        own, cell = colony.index_select(0, rows), uid.index_select(0, rows)
+        own, cell = stream.index_select(0, rows), uid.index_select(0, rows)
         pairs = (count + 1) // 2
         codes = torch.tensor([purpose_code(f"{what} {k}") for k in range(pairs)], device=rows.device).unsqueeze(1)
         # events share the word of the uid's upper half, apart for cells with uids below 2⁴⁸, and beyond 65,535 of them the codes

@@ -105,9 +105,7 @@ class Circuit(Effect):
         **parameters: float | Tensor,
     ):
         by_type: dict[int | str, Part] = {k: part for k, part in rates.items()} if isinstance(rates, Mapping) else {EVERY: rates}
-        names = (species,) if isinstance(species, str) else tuple(species)
-        if not names or len(set(names)) != len(names) or not all(isinstance(n, str) and n.isidentifier() for n in names):
-            raise checks.refuse("Circuit.species", species, "different names, at least one")
+        names = _names(species)
         taken = [n for n in names if n in RESERVED or n in GEOMETRY]
         if taken:
             raise checks.refuse("Circuit.species", taken[0], "a name that cells do not have already", "Call the species something else.")
@@ -232,7 +230,7 @@ class Circuit(Effect):
         medium = _Medium(state) if state.layout is not None else None
         outside = {} if medium is None else medium.found
         settings = run.Settings(self.method, self.steps, self.rtol, self.atol, per_cell(self.copies, state))
-        keys = keyed_draws(state.seed, state.own_colony_id, state.uid, state.step) if self.is_stochastic else None
+        keys = keyed_draws(state.seed, state.own_stream, state.uid, state.step) if self.is_stochastic else None
         report = _Notes(state)
         changed = {n: state.fields[n] for n in self.species}
         for kind in self.rates:
@@ -269,6 +267,16 @@ class Circuit(Effect):
             given = part.signals
         p = {n: per_cell(v, state) for n, v in self.parameters.items()}
         return run.Circuit(part, self.species, given, rows, _cell_columns(state, self.species), p, outside, pool, beyond, label, seen or {})
+
+
+def _names(species: Sequence[str]) -> tuple[str, ...]:
+    """The names of the species, checked."""
+    fit = lambda names: names and len(set(names)) == len(names) and all(isinstance(n, str) and n.isidentifier() for n in names)  # noqa: E731
+    names = (species,) if isinstance(species, str) else tuple(species)
+    if not fit(names):
+        apart = tuple(species.replace(",", " ").split()) if isinstance(species, str) else ()
+        raise checks.refuse("Circuit.species", species, "different names, at least one", f"Pass a tuple of names: species={apart}." if fit(apart) else "")
+    return names
 
 
 def _cell_columns(state: State, species: Sequence[str]) -> dict[str, Any]:

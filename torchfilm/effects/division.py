@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchfilm.effect import DIVISION, Distribution, Effect, draw, parameter
 from torchfilm.physics import capsule
-from torchfilm.state import CELL, Births, Ended, Field, State
+from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
 
@@ -189,7 +189,7 @@ def divide(state: State, due: Tensor, fraction: float | Tensor | Distribution, a
     new = new.replace(axis=_with_noise(new, daughters, axis_noise))
     note = Ended(parents.own_colony_id, parents.uid, "divided")
     new = new.replace(births=(*new.births, Births(first, second, new.uid.index_select(0, daughters), parents)), ended=(*new.ended, note))
-    return _reset_fields(new, daughters)
+    return new.reset_at_division(daughters, new.declared)
 
 
 def _new_ids(new: State, daughters: Tensor, parents: State) -> tuple[Tensor, Tensor, Tensor]:
@@ -214,15 +214,6 @@ def _with_noise(new: State, daughters: Tensor, axis_noise: float | Tensor) -> Te
     axis = new.axis.index_select(0, daughters) + noise
     axis = torch.where(sd > 0, axis / (axis * axis).sum(1, keepdim=True).sqrt(), axis)
     return new.axis.index_copy(0, daughters, axis)
-
-
-def _reset_fields(new: State, daughters: Tensor) -> State:
-    """Each field's own rule: "copy" has happened already; "reset" starts anew."""
-    changed = {}
-    for name, declared in new.declared.items():
-        if declared.scope == CELL and declared.at_division == "reset":
-            changed[name] = new.fields[name].index_copy(0, daughters, declared.start(new, daughters))
-    return new.with_fields(**changed)
 
 
 def _length_of_rows(state: State, rows: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Random numbers that belong to a cell, not to a moment of the program: Philox4x32-10 (Salmon et al. 2011), counter based.
 
-A draw is a pure function of (seed, colony, cell uid, step, purpose), so it is the same whatever the batch, the
+A draw is a pure function of (seed, stream of the colony, cell uid, step, purpose), so it is the same whatever the batch, the
 order of colonies or a restart in between. 32-bit arithmetic is carried out in int64, where products wrap harmlessly.
 """
 
@@ -33,24 +33,24 @@ def purpose_code(purpose: str) -> int:
     return zlib.crc32(purpose.encode())
 
 
-def words(seed: int, colony: Tensor, uid: Tensor, step: int, purpose: str) -> tuple[Tensor, ...]:
-    """Four independent 32-bit words for each cell: colony, uid (M,) int64 -> four (M,) int64."""
+def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> tuple[Tensor, ...]:
+    """Four independent 32-bit words for each cell: stream, uid (M,) int64 -> four (M,) int64."""
     fill = torch.zeros_like(uid)
-    counter = (uid & MASK, (uid >> 32) & MASK, colony & MASK, fill + (step & MASK))
+    counter = (uid & MASK, (uid >> 32) & MASK, stream & MASK, fill + (step & MASK))
     mixed = (seed ^ (purpose_code(purpose) << 32)) & (2**64 - 1)
     return philox(counter, (mixed & MASK, (mixed >> 32) & MASK))
 
 
-def uniform(seed: int, colony: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:
+def uniform(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:
     """One draw per cell from the open interval (0, 1)."""
-    w = words(seed, colony, uid, step, purpose)
+    w = words(seed, stream, uid, step, purpose)
     # 23 bits and half a unit: the most that a float32 holds without rounding a draw to 1
     return ((w[0] >> 9).to(torch.float64) + 0.5).mul(2.0**-23).to(dtype)
 
 
-def normal(seed: int, colony: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:
+def normal(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:
     """Four standard normal draws per cell, (M, 4), by Box and Muller from four words."""
-    w = [(x.to(torch.float64) + 0.5) * 2.0**-32 for x in words(seed, colony, uid, step, purpose)]
+    w = [(x.to(torch.float64) + 0.5) * 2.0**-32 for x in words(seed, stream, uid, step, purpose)]
     out = []
     for u, v in ((w[0], w[1]), (w[2], w[3])):
         size = torch.sqrt(-2.0 * torch.log(u))

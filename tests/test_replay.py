@@ -1,0 +1,150 @@
+"""Grow once, replay for all: a replay is the full run, bit for bit, and is refused where designs act on growth."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.replay import split
+from torchfilm.state import PER_CELL
+
+DT = 0.025
+
+
+def reporter(u, s, p, cell):
+    return {"gfp": p.make * cell.volume - u.gfp}
+
+
+def lit(make=1.0, rate=1.0, **options):
+    return tf.Scene(
+        tf.Growth(rate=rate), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2), tf.Circuit(reporter, species=("gfp",), make=make, **options)
+    )
+
+
+def stepped(scene, state, steps):
+    for _ in range(steps):
+        state = scene.step(state, DT) if isinstance(scene, tf.Scene) else scene.step(state)
+    return state
+
+
+def same(one, other):
+    assert one.step == other.step and one.time == other.time
+    for name in (*PER_CELL, "next_uid", "stream", *other.fields):
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
+
+
+DESIGNS = {
+    "boundary detector": lambda v: tf.scenes.boundary_detector(k3=v, diffusion=10 * v, width=16.0),
+    "quorum sensing": lambda v: tf.scenes.quorum_sensing(k3=v),
+    "switch, molecule by molecule": lambda v: tf.scenes.toggle_switch(strength=10 * v),
+    "amounts shared": lambda v: lit(v, daughters="amount"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", DESIGNS)
+def test_a_replay_is_the_full_run(name, dtype):
+    values, streams = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64).repeat_interleave(2), torch.tensor([7, 3] * 3)
+    scene = DESIGNS[name](values)
+    full = stepped(scene, scene.seed(6, seed=5, streams=streams, dtype=dtype), 130)
+    course = tf.Course(DESIGNS[name](1.0), streams=(3, 7), seed=5, dtype=dtype)
+    replay = tf.Replay(scene, course)
+    found = stepped(replay, replay.seed(6, streams=streams), 130)
+    assert found.cells > 6 * 6
+    same(found, full)
+
+
+def test_colonies_may_leave_a_replay_and_go_on_alike():
+    scene, streams = lit(torch.tensor([1.0, 2.0, 3.0])), [0, 1, 0]
+    replay = tf.Replay(scene, tf.Course(lit(), streams=(0, 1)))
+    whole = stepped(replay, replay.seed(3, streams=streams), 80)
+    part = stepped(replay, replay.seed(3, streams=streams), 50).select([2, 1])
+    same(stepped(replay, part, 30), whole.select([2, 1]))
+
+
+def test_colonies_of_one_stream_differ_by_their_parameters_only():
+    scene = lit(torch.tensor([1.0, 1.0, 2.0]))
+    state = stepped(scene, scene.seed(3, streams=[4, 4, 4]), 60)
+    first, second, third = (state.select([k]) for k in range(3))
+    for name in ("uid", "position", "length", "gfp"):
+        assert torch.equal(getattr(first, name), getattr(second, name))
+    assert torch.equal(first.position, third.position) and not torch.equal(first.gfp, third.gfp)
+    alone = lit(1.0)
+    apart = stepped(alone, alone.seed(5), 60).select([4])
+    assert torch.equal(apart.position, first.position)
+
+
+def test_a_course_grows_as_far_as_it_is_asked_and_no_further():
+    course = tf.Course(lit(), streams=(0,))
+    course.changes(9)
+    assert len(course.steps) == 10
+    course.changes(4)
+    assert len(course.steps) == 10 and course.nbytes > 0
+
+
+@pytest.mark.parametrize(
+    "scene, follows, why",
+    [
+        (tf.scenes.boundary_detector(), ("circuit", "transport"), ""),
+        (tf.scenes.toggle_switch(), ("circuit",), ""),
+        (tf.scenes.microcolony(), (), "every effect acts on growth or motion"),
+        (tf.scenes.nutrient_limited(), (), "transport acts on growth or motion by 'out.nutrient'"),
+        (tf.scenes.random_partition(), (), "rules may read and write anything"),
+    ],
+)
+def test_what_follows_is_found_from_what_is_declared(scene, follows, why):
+    found = split(scene)
+    assert tuple(scene.listed[k].title for k in found.follow) == follows or why
+    assert found.obstacle.startswith(why) and bool(found.obstacle) == bool(why)
+
+
+def test_a_design_that_acts_on_growth_is_refused():
+    with pytest.raises(tf.InputError, match=r"Growth\.rate differs between colonies and acts on their growth"):
+        tf.Course(lit(rate=torch.tensor([1.0, 2.0])), streams=(0, 1))
+    with pytest.raises(tf.InputError, match="rules may read and write anything"):
+        tf.Course(tf.scenes.random_partition(), streams=(0,))
+    course = tf.Course(lit(), streams=(0,))
+    with pytest.raises(tf.InputError, match="does not grow as the course did: Growth\\(rate=2"):
+        tf.Replay(lit(rate=2.0), course)
+    with pytest.raises(tf.InputError, match="streams = 1 is not allowed: it must be of the course: 0"):
+        tf.Replay(lit(), course).seed(2, streams=[0, 1])
+
+
+def test_other_founders_are_another_growth():
+    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.5)
+    other = tf.Scene(*lit().listed, founders=founders)
+    with pytest.raises(tf.InputError, match="does not grow as the course did"):
+        tf.Replay(other, tf.Course(lit(), streams=(0,)))
+
+
+def test_what_fails_in_the_course_fails_in_every_replay():
+    # a cell due to divide by volume while shorter than its two new caps
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(added=0.2), tf.Circuit(reporter, species=("gfp",), make=1.0), founders=tf.Cells.single(2, length=0.3))
+    replay = tf.Replay(scene, tf.Course(scene, streams=(0, 1)))
+    state = replay.seed(3, streams=[1, 0, 1])
+    while not tf.failures(state):
+        state = replay.step(state)
+    found = tf.failures(state)
+    assert sorted({f.place for f in found}) == [0, 1, 2]
+    assert "due to divide" in found[0].reason
+
+
+@pytest.mark.parametrize("streams", [[0], [0, -1], [0.5, 1.0], [0, 2**32], [True, False]])
+def test_streams_are_whole_numbers_one_a_colony(streams):
+    with pytest.raises(tf.InputError, match="streams"):
+        lit().seed(2, streams=streams)
+
+
+def test_streams_are_kept_in_results(tmp_path):
+    scene, path = lit(torch.tensor([1.0, 2.0])), tmp_path / "r.h5"
+    state = deque(tf.simulate(scene, scene.seed(2, streams=[9, 9]), until=1.0, record=path), maxlen=1).pop()
+    with tf.Results(path) as results:
+        again = results.state(scene)
+    assert again.stream.tolist() == [9, 9]
+    same(again, state)
+    with pytest.raises(tf.InputError, match="streams"):
+        list(tf.simulate(scene, state.replace(stream=torch.tensor([9, 8])), until=1.1, record=tf.Recorder(path, scene, append=True)))
