@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import inspect
 import os
 import signal
 import sys
@@ -11,7 +9,7 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 
@@ -22,6 +20,7 @@ from torchfilm.pictures import words
 from torchfilm.recorder import Recorder
 from torchfilm.results import Results
 from torchfilm.scene import Scene
+from torchfilm.scene_files import design, load_scene, parse_setting
 from torchfilm.simulate import simulate
 from torchfilm.state import State
 from torchfilm.tools import checks
@@ -38,22 +37,22 @@ except ImportError as missing:  # pragma: no cover - depends on what is installe
 
 @dataclass
 class Run:
-    """Run a scene: a ready-made one by name, or your own Python file that defines `scene` (a Scene, or a function that returns one)."""
+    """Run a scene: a ready-made one by name, your own Python file that defines `scene` (a Scene, or a function that returns one), or a saved design."""
 
     scene: Annotated[str, tyro.conf.Positional]
-    """microcolony, programmed_growth, channel, …, or the path of a Python file."""
+    """microcolony, programmed_growth, channel, …, or the path of a Python file or of a design saved as .json, with whose step, seed and end it runs."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE, such as --set dim=3 rate=0.8."""
     colonies: int = 1
     """Independent colonies in the batch."""
     cells: int | None = None
-    """Stop once every colony has this many cells (500 if no end is given)."""
+    """Stop once every colony has this many cells (500, or the design's number, if no end is given)."""
     until: float | None = None
     """Stop at this time, h."""
     dt: float | None = None
     """Step, h; by default the scene's."""
-    seed: int = 0
-    """Seed of all random numbers."""
+    seed: int | None = None
+    """Seed of all random numbers (0, or the design's)."""
     start: Path | None = None
     """CSV or HDF5 file of cells to start from."""
     device: str = "cpu"
@@ -73,9 +72,15 @@ class Run:
 
     def __call__(self) -> None:
         scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
-        cells = self.cells if self.cells is not None or self.until is not None else 500
+        plan = design(self.scene)
+        cells, until = self.cells, self.until
+        if cells is None and until is None:
+            cells, until = plan.get("cells"), plan.get("until")
+            if cells is None and until is None:
+                cells = 500
+        seed = plan.get("seed", 0) if self.seed is None else self.seed
         start = None if self.start is None else read_cells(self.start)
-        state = scene.seed(self.colonies, seed=self.seed, cells=start, device=self.device, dtype=torch.float64 if self.double else torch.float32)
+        state = scene.seed(self.colonies, seed=seed, cells=start, device=self.device, dtype=torch.float64 if self.double else torch.float32)
         if start is not None:
             report_empty(str(self.start), start, state)
             report_overlaps(start)
@@ -87,7 +92,7 @@ class Run:
         recorder = Recorder(out, scene, every=self.every, overwrite=self.overwrite)
         if self.picture:
             check_new("picture", own_picture(out), self.overwrite, "Choose another --out, replace it (--overwrite), or draw none (--no-picture).")
-        go(scene, state, recorder, cells=cells, until=self.until, dt=self.dt, watch=self.watch, picture=self.picture)
+        go(scene, state, recorder, cells=cells, until=until, dt=self.dt, watch=self.watch, picture=self.picture)
 
 
 @dataclass
@@ -236,49 +241,6 @@ def own_picture(results: Path, out: Path | None = None) -> Path:
         mend = "Give the results a name that does not end in .png, or draw with show --out."
         raise checks.refuse("picture", str(picture), "another file than the results", mend)
     return picture
-
-
-def load_scene(what: str, parameters: dict[str, Any]) -> Scene:
-    """A ready-made scene by name, or the `scene` of a Python file."""
-    path = Path(what)
-    if not path.suffix and path.name == what:
-        return scenes.build(what, parameters)
-    if not path.is_file() or path.suffix != ".py":
-        raise checks.refuse("scene", what, "the name of a ready scene or the path of a Python file", "" if path.exists() else "No such file.")
-    names: dict[str, Any] = {"__name__": path.stem, "__file__": str(path)}
-    sys.path.insert(0, str(path.parent.resolve()))
-    try:
-        exec(compile(path.read_text(), str(path), "exec"), names)
-    except (SyntaxError, ImportError) as error:
-        raise InputError(f"{what} cannot be run: {type(error).__name__}: {error}") from error
-    if "scene" not in names:
-        raise InputError(f"{what} does not define `scene`: write `scene = torchfilm.Scene(…)`, or a function `scene(…)` that returns one.")
-    made = names["scene"]
-    if callable(made) and not isinstance(made, Scene):
-        try:
-            inspect.signature(made).bind(**parameters)
-        except TypeError as error:
-            raise InputError(f"scene(…) in {what}: {error}. Its parameters are {inspect.signature(made)}; give them with --set.") from error
-        made = made(**parameters)
-    elif parameters:
-        raise checks.refuse("--set", list(parameters), f"left out: `scene` in {what} is a Scene, not a function with parameters")
-    if not isinstance(made, Scene):
-        raise checks.refuse(f"scene in {what}", made, "a Scene, or a function that returns one")
-    if made.name == "scene":
-        made.name = path.stem
-    made.settings = parameters
-    return made
-
-
-def parse_setting(text: str) -> tuple[str, Any]:
-    """NAME=VALUE; a value that is no Python literal is taken as text."""
-    name, equals, value = text.partition("=")
-    if not equals or not name.isidentifier():
-        raise checks.refuse("--set", text, "NAME=VALUE")
-    try:
-        return name, ast.literal_eval(value)
-    except (ValueError, SyntaxError):
-        return name, value
 
 
 def read_cells(path: Path):

@@ -66,14 +66,6 @@ def split(scene: Scene) -> Split:
     return Split(tuple(sorted(growth)), tuple(k for k in everything if k not in growth), obstacle)
 
 
-def growth_of(scene: Scene) -> Scene:
-    """The scene without what only follows. Raises InputError where nothing can be taken away."""
-    parts = split(scene)
-    if parts.obstacle:
-        raise checks.InputError(f"the growth of this scene cannot be kept for other designs: {parts.obstacle}. Run the scene itself.")
-    return Scene(*(scene.listed[k] for k in parts.growth), name=scene.name, dt=scene.dt, founders=scene.founders)
-
-
 @dataclass(frozen=True)
 class Change:
     """What an effect changed in one step of a course, for its R colonies side by side.
@@ -113,12 +105,7 @@ class Course:
         self, scene: Scene, *, streams: Iterable[int], seed: int = 0, dt: float | None = None, dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ):  # fmt: skip
-        self.scene = growth_of(scene)
-        held = [path for effect in self.scene.listed for path, tensor in parameters(effect) if tensor.dim() == 1]
-        if held:
-            raise checks.InputError(
-                f"{held[0]} differs between colonies and acts on their growth: a course is of colonies alike in growth. Run the scene itself."
-            )
+        self.scene = Course.scene_of(scene)
         self.dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
         self.streams = tuple(streams)
         if len(set(self.streams)) != len(self.streams):
@@ -126,6 +113,21 @@ class Course:
         self.state = self.scene.seed(len(self.streams), seed=seed, streams=self.streams, dtype=dtype, device=device)
         self.steps: list[list[Change]] = []
         self.failed: dict[int, tuple[int, str]] = {}
+
+    @staticmethod
+    def obstacle(scene: Scene) -> str:
+        """Why the growth of a scene cannot be kept for all its designs, or "" if it can."""
+        parts = split(scene)
+        held = [path for k in parts.growth for path, tensor in parameters(scene.listed[k]) if tensor.dim() == 1]
+        return parts.obstacle or (f"{held[0]} differs between colonies and acts on their growth" if held else "")
+
+    @staticmethod
+    def scene_of(scene: Scene) -> Scene:
+        """The scene without what only follows. Raises InputError where its growth cannot be kept."""
+        why = Course.obstacle(scene)
+        if why:
+            raise checks.InputError(f"the growth of this scene cannot be kept for other designs: {why}. Run the scene itself.")
+        return Scene(*(scene.listed[k] for k in split(scene).growth), name=scene.name, dt=scene.dt, founders=scene.founders)
 
     @property
     def nbytes(self) -> int:
@@ -207,7 +209,7 @@ class Replay:
 
     def __init__(self, scene: Scene, course: Course):
         self.scene, self.course, self.dt = scene, course, course.dt
-        grown = growth_of(scene)
+        grown = Course.scene_of(scene)
         if grown.listing() != course.scene.listing() or not _alike(scene, course.scene):
             raise checks.InputError(
                 f"this scene does not grow as the course did: {', '.join(grown.listing())} and its founders, instead of "

@@ -32,6 +32,7 @@ def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
         scene.name, scene.recipe = make.__name__, (make.__name__, plain)
         return scene
 
+    build.__module__ = __name__  # where it is found by its name, as pickling for another process does
     return build
 
 

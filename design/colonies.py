@@ -1,0 +1,81 @@
+"""Colonies of a batch on their way: each is measured when it is done, whoever else is in the batch, and leaves; one that fails leaves with its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+
+# h: a colony that has not reached its size by then never will
+LIMIT = 1000.0
+
+
+@dataclass(frozen=True)
+class Done:
+    """Colonies that have reached their end in one step, as a state of them alone, and their notes (T, B, k), or None."""
+
+    state: tf.State
+    history: Tensor | None
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A colony, by its id, that could not go on, and why."""
+
+    colony_id: int
+    reason: str
+
+
+def grow(
+    step: Callable[[tf.State], tf.State],
+    state: tf.State,
+    *,
+    cells: int | None,
+    until: float | None,
+    note: Callable[[tf.State], Tensor | None],
+) -> Iterator[Done | Failed]:
+    """Step a batch until each of its colonies is done: at `cells` cells or at `until` h, whichever it reaches first.
+
+    A colony's end depends on itself alone, so that its outcome does not depend on its batch. note: called after every step; see `Target.note`.
+    """
+    last = LIMIT if until is None else until
+    everyone = state.colonies
+    notes: list[Tensor] = []
+    while True:
+        state = step(state)
+        failures = {f.place: f for f in reversed(tf.failures(state))}
+        for place in sorted(failures):
+            yield Failed(failures[place].colony_id, f"at {state.time:g} h: {failures[place].reason}")
+        gone = torch.zeros(state.colonies, dtype=torch.bool, device=state.device)
+        gone[list(failures)] = True
+        empty = (state.counts == 0) & ~gone
+        for colony_id in state.colony_id[empty].tolist():
+            yield Failed(colony_id, f"no cell was left at {state.time:g} h")
+        gone = gone | empty
+        if bool(gone.all()):
+            return
+        state = _keep(state, ~gone)
+        found = note(state)
+        if found is not None:
+            row = found.new_full((everyone, *found.shape[1:]), torch.nan)
+            notes.append(row.index_copy(0, state.colony_id, found))
+        late = state.time >= last - 1e-9
+        done = torch.full_like(state.counts, late, dtype=torch.bool) if cells is None or (until is not None and late) else state.counts >= cells
+        if cells is not None and until is None and late:
+            for colony_id, count in zip(state.colony_id[~done].tolist(), state.counts[~done].tolist(), strict=True):
+                yield Failed(colony_id, f"it has only {count} of {cells} cells after {LIMIT:g} h")
+        if bool(done.any()):
+            finished = _keep(state, done)
+            yield Done(finished, torch.stack([n.index_select(0, finished.colony_id) for n in notes]) if notes else None)
+        if late or bool(done.all()):
+            return
+        state = _keep(state, ~done)
+
+
+def _keep(state: tf.State, which: Tensor) -> tf.State:
+    """Some colonies of the batch, (B,) bool, at least one."""
+    return state if bool(which.all()) else state.select(torch.nonzero(which).squeeze(1))

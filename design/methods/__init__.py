@@ -1,0 +1,32 @@
+"""Search methods: what to try next, asked and told in turns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from design.methods.base import Batch, Method
+from design.methods.bayesian import Bayesian
+from design.methods.cmaes import CMAES
+from design.methods.racing import Racing
+from design.methods.sobol import Sobol
+from torchfilm import checks
+
+METHODS: dict[str, type[Any]] = {"sobol": Sobol, "cmaes": CMAES, "bayesian": Bayesian, "racing": Racing}
+
+__all__ = ["CMAES", "METHODS", "Batch", "Bayesian", "Method", "Racing", "Sobol", "method_of"]
+
+
+def method_of(given: str | Method) -> Method:
+    """A method by its name, with its own settings, or any object with start, ask and tell."""
+    if isinstance(given, str):
+        checks.choice("method", given, tuple(METHODS))
+        made: Method = METHODS[given]()
+        return made
+    if isinstance(given, type) or not all(callable(getattr(given, name, None)) for name in ("start", "ask", "tell")):
+        raise checks.refuse(
+            "method",
+            given,
+            "one of " + ", ".join(map(repr, METHODS)) + ", or an object with start, ask and tell",
+            "A class is not yet an object: write CMAES().",
+        )
+    return given

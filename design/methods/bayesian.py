@@ -1,0 +1,105 @@
+"""Bayesian optimisation: a smooth model of the loss, with its own doubts, says where it pays to look."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+import torch
+
+from design.methods.base import Batch, Turns, alike, numpy_kept, snap, sobol, whole
+from torchfilm import checks
+
+# Where the search for the next points begins: the best few of many samples of the acquisition.
+RESTARTS, SAMPLES = 4, 128
+
+
+@dataclass(kw_only=True, eq=False)
+class Bayesian(Turns):
+    """A Gaussian process of the loss and the noisy expected improvement over all that was tried (Ament et al., NeurIPS 2023), by botorch.
+
+    For colonies so expensive that only some hundreds can be grown; a batch takes seconds to choose, and more with every point told.
+    batch: points in a batch. first: Sobol points before there is a model, one batch; None is 2 (D + 1), at least `batch`.
+
+    Loss is standardised, noise is inferred. A loss worse than the median by more than twice what the best is better counts as that, so that failed
+    designs do not flatten the model. Levels are rounded as the points are chosen; a point already tried is replaced by a Sobol point. While
+    all losses are equal, Sobol points are asked. The same bits need the same machine, versions and number of threads.
+    """
+
+    batch: int = 8
+    first: int | None = None
+
+    def __post_init__(self) -> None:
+        whole("Bayesian.batch", self.batch, least=1)
+        if self.first is not None:
+            whole("Bayesian.first", self.first, least=2)
+        if find_spec("botorch") is None:
+            raise checks.InputError('Bayesian needs the package botorch, which is not installed: pip install "torchfilm[bayes]".')
+
+    def _begin(self) -> None:
+        size = self._started().size
+        self._points = np.empty((0, size))
+        self._loss = np.empty(0)
+        self._open = self.first or max(self.batch, 2 * (size + 1))
+
+    def _meet(self, batch: Batch) -> None:
+        """Choosing costs seconds, so a history is told without choosing it again; only its shape is seen to."""
+        if self._batch is not None or not len(self._loss):
+            super()._meet(batch)
+        else:
+            alike((self.batch, self._started().size, 1.0, None), batch, "Bayesian")
+
+    def _next(self) -> Batch:
+        space, known = self._started(), len(self._loss)
+        if not known:
+            return Batch(sobol(space, self._seed, 0, self._open))
+        spare = sobol(space, self._seed, known, self.batch)
+        loss = tamed(self._loss)
+        if loss.std() == 0:
+            return Batch(spare)
+        with warnings.catch_warnings(), torch.random.fork_rng(devices=[]), numpy_kept([self._seed, known]):
+            warnings.simplefilter("ignore")
+            # of this generator alone: torch.manual_seed would change those of the devices too
+            torch.default_generator.manual_seed(int(np.random.SeedSequence([self._seed, known]).generate_state(1)[0]))
+            points = self._choose(loss)
+        tried = {row.tobytes() for row in self._points}
+        for place, row in enumerate(points):
+            if row.tobytes() in tried:
+                points[place] = spare[place]
+            tried.add(points[place].tobytes())
+        return Batch(points)
+
+    def _choose(self, loss: np.ndarray) -> np.ndarray:
+        """The points of most expected improvement, (batch, D), one after the other, each knowing those before it."""
+        from botorch.acquisition.logei import qLogNoisyExpectedImprovement
+        from botorch.fit import fit_gpytorch_mll
+        from botorch.models import SingleTaskGP
+        from botorch.optim import optimize_acqf
+        from botorch.sampling import SobolQMCNormalSampler
+        from gpytorch.mlls import ExactMarginalLogLikelihood
+
+        levels = self._started().levels
+        known = torch.from_numpy(self._points.copy())
+        model = SingleTaskGP(known, -torch.from_numpy((loss - loss.mean()) / loss.std()).unsqueeze(1), outcome_transform=None)
+        fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
+        sampler = SobolQMCNormalSampler(torch.Size([128]), seed=len(loss))
+        acquisition = qLogNoisyExpectedImprovement(model, known, sampler=sampler, prune_baseline=True)
+        found, _ = optimize_acqf(
+            acquisition, torch.tensor([[0.0], [1.0]], dtype=torch.float64).expand(2, known.shape[1]), q=self.batch,
+            num_restarts=RESTARTS, raw_samples=SAMPLES, sequential=True,
+            post_processing_func=lambda x: torch.from_numpy(snap(x.reshape(-1, x.shape[-1]).numpy(), levels)).reshape(x.shape),
+        )  # fmt: skip
+        return snap(found.numpy(), levels)
+
+    def _take(self, batch: Batch, loss: np.ndarray) -> None:
+        self._points = np.concatenate([self._points, batch.points])
+        self._loss = np.concatenate([self._loss, loss])
+
+
+def tamed(loss: np.ndarray) -> np.ndarray:
+    """Losses, with those far worse than the median brought to the median and twice what the best is better; as they are where the median is the best."""
+    middle = float(np.median(loss))
+    room = middle - float(loss.min())
+    return np.minimum(loss, middle + 2.0 * room) if room > 0 else loss

@@ -1,0 +1,134 @@
+"""CMA-ES: a cloud of points that moves, turns and shrinks towards what is good."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from design.methods.base import Batch, Turns, numpy_kept, snap, sobol, whole
+from torchfilm import checks
+
+# A restart doubles the population up to this many times the first: the batch must still fit the machine.
+MOST = 16
+# Learning rate of the mean and damping of the step size, for losses with noise; cma's own are 1 and 1 (docs/methods.md has what was measured).
+SLOW = {"CMA_cmean": 0.4, "CSA_dampfac": 3.0}
+
+
+@dataclass(kw_only=True, eq=False)
+class CMAES(Turns):
+    """Covariance matrix adaptation (Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772), by the package cma.
+
+    population: points in a batch; None is 4 + 3 ln D, rounded down, or, where there are levels, 6 + 3 ln(D · dimensions with levels). sigma: width of
+    the first cloud, as a share of each range. noisy: learn slowly, for losses with noise; False is faster where there is none.
+    restarts: when a cloud has converged, begin another with twice the population (IPOP: Auger and Hansen, CEC 2005), at most 16 times the first; False
+    stays with the first cloud for ever.
+
+    Every cloud begins at the best of a batch of Sobol points, and no cloud begins while these are all equally good, as where every design fails. A
+    cloud that ended where all is equally bad, worse than where it began, is followed by one no larger.
+    Levels are whole numbers for cma, in their order, with its lower bounds on their widths and its centring (Marty et al., PPSN 2024). Dimensions with
+    one level are left out; where fewer than the two dimensions that cma needs are left, it gets idle ones that change nothing.
+    """
+
+    population: int | None = None
+    sigma: float = 0.3
+    restarts: bool = True
+    noisy: bool = True
+
+    def __post_init__(self) -> None:
+        if self.population is not None:
+            whole("CMAES.population", self.population, least=4)
+        checks.number("CMAES.sigma", self.sigma, above=0.0, most=1.0)
+        for name in ("restarts", "noisy"):
+            checks.choice(f"CMAES.{name}", getattr(self, name), (True, False))
+        if find_spec("cma") is None:
+            raise checks.InputError('CMAES needs the package cma, which is not installed: pip install "torchfilm[design]".')
+
+    def _begin(self) -> None:
+        space = self._started()
+        self._free = [axis for axis, levels in enumerate(space.levels) if levels != 1]
+        counts = [space.levels[axis] for axis in self._free]
+        # a level is a whole number 0 … k - 1 for cma, k wide with the halves at its ends
+        self._scale = np.array([1.0 if k is None else float(k) for k in counts])
+        self._shift = np.array([0.0 if k is None else 0.5 for k in counts])
+        self._whole = [place for place, k in enumerate(counts) if k is not None]
+        self._idle = max(0, 2 - len(self._free))
+        self._first = self._size = self.population or self._usual(len(self._free) + self._idle)
+        self._cloud: Any = None
+        self._start = math.inf  # loss of the point where the cloud began
+        self._tried = self._draws = 0
+        self._random = np.random.default_rng(self._seed)
+
+    def _usual(self, size: int) -> int:
+        return int(6 + 3 * math.log(size * len(self._whole)) if self._whole else 4 + 3 * math.log(size))
+
+    @property
+    def wanted(self) -> int:
+        return self._size
+
+    @property
+    def fresh(self) -> bool:
+        return self._cloud is None
+
+    def draw(self, count: int) -> np.ndarray:
+        space = self._started()
+        if self._cloud is None:
+            self._points = sobol(space, self._seed, self._tried, count)
+            self._tried += count
+            return self._points
+        self._draws += 1
+        self._random = np.random.default_rng([self._seed, self._draws])
+        with self._quiet():
+            self._found = np.array(self._cloud.ask(number=count))
+        points = np.full((count, space.size), 0.5)
+        points[:, self._free] = (self._found[:, : len(self._free)] + self._shift) / self._scale
+        return snap(points, space.levels)
+
+    def take(self, rows: np.ndarray, loss: np.ndarray) -> None:
+        if self._cloud is None:
+            if loss.min() < loss.max():
+                self._cloud, self._start = self._new(self._points[rows[int(loss.argmin())]]), float(loss.min())
+            return
+        with self._quiet():
+            # cma must find its own points again, to the last bit
+            self._cloud.tell(list(self._found[rows]), loss.tolist())
+            stop = self._cloud.stop() if self.restarts else {}
+        if stop:
+            if loss.min() < loss.max() or loss.min() <= self._start:
+                self._size = min(2 * self._size, MOST * self._first)
+            self._cloud = None
+
+    def _next(self) -> Batch:
+        return Batch(self.draw(self._size))
+
+    def _take(self, batch: Batch, loss: np.ndarray) -> None:
+        self.take(np.arange(len(loss)), loss)
+
+    def _new(self, start: np.ndarray) -> Any:
+        """A cloud about a point."""
+        import cma
+
+        low, high = -self._shift, self._scale - self._shift
+        idle = [0.5] * self._idle
+        settings: dict[str, Any] = {
+            "bounds": [[*low, *(0.0 for _ in idle)], [*high, *(1.0 for _ in idle)]],
+            "CMA_stds": [*self._scale, *(1.0 for _ in idle)], "integer_variables": self._whole,
+            "popsize": self._size, "CMA_mirrors": 0, **(SLOW if self.noisy else {}),
+            "minstd": 1e-9, "tolx": 1e-7, "tolfun": 1e-9, "tolfunhist": 1e-10,
+            "randn": lambda *shape: self._random.standard_normal(shape), "seed": math.nan, "verbose": -9, "signals_filename": None,
+        }  # fmt: skip
+        with self._quiet():
+            return cma.CMAEvolutionStrategy([*(start[self._free] * self._scale - self._shift), *idle], self.sigma, settings)
+
+    @contextmanager
+    def _quiet(self) -> Iterator[None]:
+        """Round calls of cma: it warns about what is handled here, and draws from numpy's global generator in an assertion of its centring."""
+        with warnings.catch_warnings(), numpy_kept([self._seed, self._draws]):
+            warnings.simplefilter("ignore")
+            yield

@@ -1,0 +1,47 @@
+"""Search without learning: points that fill the space evenly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from design.methods.base import Batch, Turns, sobol, whole
+
+
+@dataclass(kw_only=True, eq=False)
+class Sobol(Turns):
+    """Points of a scrambled Sobol sequence (Owen 1998; scipy.stats.qmc): the measure of every other method, and a map of the whole space.
+
+    batch: points in a batch, any number; the sequence goes on from batch to batch.
+    """
+
+    batch: int = 64
+
+    def __post_init__(self) -> None:
+        whole("Sobol.batch", self.batch, least=1)
+
+    @property
+    def wanted(self) -> int:
+        return self.batch
+
+    @property
+    def fresh(self) -> bool:
+        return False
+
+    def draw(self, count: int) -> np.ndarray:
+        points = sobol(self._started(), self._seed, self._drawn, count)
+        self._drawn += count
+        return points
+
+    def take(self, rows: np.ndarray, loss: np.ndarray) -> None:
+        """Nothing is learnt."""
+
+    def _begin(self) -> None:
+        self._drawn = 0
+
+    def _next(self) -> Batch:
+        return Batch(self.draw(self.batch))
+
+    def _take(self, batch: Batch, loss: np.ndarray) -> None:
+        pass

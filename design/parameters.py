@@ -1,0 +1,162 @@
+"""What a search may change: named parameters of a scene, each with its bounds or its options, and the unit cube that they span."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from torchfilm import checks
+
+# What a parameter's value may be: a number, or one of the options of a choice.
+Value = Any
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number between two bounds: `Parameter("k3", 0.1, 10, log=True)`.
+
+    name: of the scene function's argument. log: spread evenly in its logarithm, for what may lie anywhere over decades; bounds above 0. whole: a whole
+    number, both bounds among them. A whole number makes a scene of its own for each value, so that it may say how a circuit is built, such as how many
+    genes; others are given to one scene as one value per colony.
+    """
+
+    name: str
+    low: float
+    high: float
+    log: bool = False
+    whole: bool = False
+
+    def __post_init__(self) -> None:
+        _check_name("Parameter", self.name)
+        for bound in ("low", "high"):
+            object.__setattr__(self, bound, checks.number(f"Parameter({self.name!r}).{bound}", getattr(self, bound)))
+        if not self.low < self.high:
+            raise checks.refuse(f"Parameter({self.name!r})", (self.low, self.high), "low < high", "Swap the two, or give a value that is fixed with fixed=….")
+        if self.log and self.low <= 0:
+            raise checks.refuse(
+                f"Parameter({self.name!r}).low", self.low, "above 0 with log=True", "A logarithm has no zero: raise the bound, or leave log out."
+            )
+        if self.log and self.whole:
+            raise checks.refuse(f"Parameter({self.name!r})", "log=True, whole=True", "one of the two", "Whole numbers have equal shares, whatever their size.")
+        if self.whole and not (self.low.is_integer() and self.high.is_integer()):
+            raise checks.refuse(f"Parameter({self.name!r})", (self.low, self.high), "whole numbers with whole=True")
+
+    @property
+    def levels(self) -> int | None:
+        """How many values it can have; None: any."""
+        return int(self.high - self.low) + 1 if self.whole else None
+
+    def value(self, unit: float) -> Value:
+        """The value at a coordinate in [0, 1]; whole numbers have equal shares."""
+        if self.levels is not None:
+            return int(self.low) + _level(unit, self.levels)
+        if self.log:
+            return math.exp(math.log(self.low) + unit * (math.log(self.high) - math.log(self.low)))
+        return self.low + unit * (self.high - self.low)
+
+    def coordinate(self, value: Value) -> float:
+        """The coordinate of a value within the bounds."""
+        number = checks.number(self.name, value, least=self.low, most=self.high)
+        if self.whole:
+            if not number.is_integer():
+                raise checks.refuse(self.name, value, "a whole number")
+            return (number - self.low + 0.5) / (self.high - self.low + 1)
+        if self.log:
+            return (math.log(number) - math.log(self.low)) / (math.log(self.high) - math.log(self.low))
+        return (number - self.low) / (self.high - self.low)
+
+    def describe(self) -> str:
+        kind = " whole" if self.whole else " log" if self.log else ""
+        return f"{self.name}: {self.low:g} to {self.high:g}{kind}"
+
+
+@dataclass(frozen=True, init=False)
+class Choice:
+    """One of several options, such as promoters: `Choice("promoter", ("weak", "strong"))`. Each option makes a scene of its own.
+
+    name: of the scene function's argument. options: at least two, all different, each a text, a number, True or False, so that a file can keep it.
+    """
+
+    name: str
+    options: tuple[Value, ...]
+
+    def __init__(self, name: str, options: Sequence[Value]):
+        _check_name("Choice", name)
+        if isinstance(options, str) or not isinstance(options, Sequence) or len(options) < 2 or len(set(map(repr, options))) != len(options):
+            raise checks.refuse(f"Choice({name!r}).options", options, "at least two different ones, such as ('weak', 'strong')")
+        odd = [o for o in options if not isinstance(o, (str, bool, int, float))]
+        if odd:
+            raise checks.refuse(f"Choice({name!r}).options", odd[0], "texts, numbers, True or False", "Name what stands for it, and let the scene look it up.")
+        object.__setattr__(self, "name", name)
+        object.__setattr__(self, "options", tuple(options))
+
+    @property
+    def levels(self) -> int:
+        return len(self.options)
+
+    def value(self, unit: float) -> Value:
+        """The option at a coordinate in [0, 1]; all have equal shares."""
+        return self.options[_level(unit, len(self.options))]
+
+    def coordinate(self, value: Value) -> float:
+        """The middle of an option's share."""
+        if value not in self.options:
+            raise checks.refuse(self.name, value, "one of " + ", ".join(map(repr, self.options)))
+        return (self.options.index(value) + 0.5) / len(self.options)
+
+    def describe(self) -> str:
+        return f"{self.name}: " + " or ".join(map(repr, self.options))
+
+
+class Space:
+    """The parameters of a search side by side: points are (n, D) coordinates in [0, 1], float64.
+
+    size: D; names; levels: how many values each dimension has, None for any.
+    """
+
+    def __init__(self, parameters: Sequence[Parameter | Choice]):
+        if not isinstance(parameters, Sequence) or not parameters or not all(isinstance(p, (Parameter, Choice)) for p in parameters):
+            raise checks.refuse("parameters", parameters, "a list of Parameter(…) and Choice(…), at least one")
+        self.parameters = tuple(parameters)
+        self.names = tuple(p.name for p in self.parameters)
+        twice = [n for n in self.names if self.names.count(n) > 1]
+        if twice:
+            raise checks.refuse("parameters", twice[0], "named once")
+        self.size = len(self.parameters)
+        self.levels = tuple(p.levels for p in self.parameters)
+
+    def values(self, point: np.ndarray) -> dict[str, Value]:
+        """The parameters of one design, from its coordinates (D,)."""
+        return {p.name: p.value(float(u)) for p, u in zip(self.parameters, point, strict=True)}
+
+    def point(self, values: Mapping[str, Value]) -> np.ndarray:
+        """The coordinates (D,) of one design."""
+        wrong = [n for n in (*values, *self.names) if n not in values or n not in self.names]
+        if wrong:
+            raise checks.refuse("values", list(values), "one for each of " + ", ".join(self.names), f"Look at {wrong[0]!r}.")
+        return np.array([p.coordinate(values[p.name]) for p in self.parameters])
+
+    def check(self, allowed: Sequence[str], scene: str) -> None:
+        """Raises InputError for a parameter that the scene has not."""
+        for name in self.names:
+            if name not in allowed:
+                near = difflib.get_close_matches(name, allowed, 1)
+                mend = f"Did you mean {near[0]!r}?" if near else ""
+                raise checks.refuse("Parameter", name, f"a parameter of {scene}: {', '.join(allowed)}", mend)
+
+    def describe(self) -> list[str]:
+        return [p.describe() for p in self.parameters]
+
+
+def _level(unit: float, count: int) -> int:
+    return min(int(unit * count), count - 1)
+
+
+def _check_name(kind: str, name: Any) -> None:
+    if not isinstance(name, str) or not name.isidentifier():
+        raise checks.refuse(f"{kind}.name", name, "the name of an argument of the scene")

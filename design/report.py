@@ -1,0 +1,142 @@
+"""What a search shows: a bar while it runs, a table, and a picture of first guess, best design and target."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import torchfilm as tf
+from design.colonies import Done
+from design.parameters import Parameter, Value
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from tqdm import tqdm
+
+    from design.search import Best
+
+SHOWN = 3  # replicates side by side
+
+
+def bar(total: float, progress: bool) -> tqdm:
+    """A bar of colonies simulated. Needs tqdm (the `app` extra) where it is to be seen."""
+    try:
+        from tqdm import tqdm
+    except ImportError as error:
+        raise tf.InputError('a progress bar needs tqdm: pip install "torchfilm[app]", or give progress=False.') from error
+    form = "{desc} |{bar}| {n:.0f}/{total:.0f} colonies {elapsed}<{remaining}{postfix}"
+    return tqdm(total=total, bar_format=form, desc="search", disable=not progress or None, mininterval=0.3)
+
+
+def table(best: Best) -> str:
+    """Parameters with bounds, first guess and best value, then losses and measures."""
+    search = best.search
+    first = search.first()
+    rows = [("parameter", "bounds", "first guess", "best")]
+    for p in search.objective.space.parameters:
+        bounds = f"{p.low:g} … {p.high:g}" if isinstance(p, Parameter) else " | ".join(map(str, p.options))
+        rows.append((p.name, bounds, _shown(first.values[p.name]), _shown(best.values[p.name])))
+    rows.append(("loss", "", f"{first.loss:.4f}", f"{best.loss:.4f}"))
+    measured = [_measures(b) for b in (first, best)]
+    for name in measured[1]:
+        rows.append((name, "", _shown(measured[0].get(name, float("nan"))), _shown(measured[1][name])))
+    wide = [max(len(r[k]) for r in rows) for k in range(4)]
+    lines = ["  ".join(x.ljust(w) if k < 2 else x.rjust(w) for k, (x, w) in enumerate(zip(r, wide, strict=True))) for r in rows]
+    study = search.study
+    failed = sum(len(e.reasons) for e in study.entries)
+    end = f"{study.colonies:.0f} colonies in {study.seconds:.0f} s" + (f", {failed} failed" if failed else "")
+    return "\n".join([*lines, end + (f"; grown anew for each design: {search.regrown}" if search.regrown else "; circuits ran on one recorded growth")])
+
+
+def _shown(value: Value) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _measures(best: Best) -> dict[str, float]:
+    """What the target measures on the replicates of a design, their mean."""
+    found: dict[str, list[float]] = {}
+    for done in best.colonies():
+        for name, value in best.search.objective.target.measures(done.state, done.history).items():
+            found.setdefault(name, []).extend(value.double().tolist())
+    return {name: float(np.mean(v)) if np.isfinite(v).all() else float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for name, v in found.items()}
+
+
+def draw(best: Best, path: Path) -> Path:
+    """First guess above, best design below, the target drawn over each colony, and beside them how the search got there."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise tf.InputError('pictures need matplotlib: pip install "torchfilm[app]".') from error
+    search = best.search
+    rows = [("first guess", search.first()), ("best", best)]
+    grown = {title: _places(one.colonies())[:SHOWN] for title, one in rows}
+    columns = max(1, *(len(g) for g in grown.values()))
+    figure = Figure(figsize=(2.6 * columns + 3.6, 5.6), layout="constrained")
+    grid = figure.add_gridspec(2, columns + 1, width_ratios=[1.0] * columns + [1.35])
+    names = [n for n in search.objective.target.names if not n.startswith("out.")]
+    for row, (title, one) in enumerate(rows):
+        axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
+        _draw_row(figure, axes, grown[title], names, search.objective.target, f"{title}, loss {one.loss:.3f}")
+    _draw_convergence(figure.add_subplot(grid[0, columns]), search)
+    _draw_parameters(figure.add_subplot(grid[1, columns]), best)
+    figure.savefig(path, dpi=160)
+    return path
+
+
+def _places(done: list[Done]) -> list[tuple[Done, int]]:
+    """The colonies one by one, by their ids."""
+    return sorted(((d, k) for d in done for k in range(d.state.colonies)), key=lambda x: int(x[0].state.colony_id[x[1]]))
+
+
+def _draw_row(figure: Figure, axes: list[Axes], grown: list[tuple[Done, int]], names: list[str], target: Any, title: str) -> None:
+    """Colonies of one design, coloured by what the target looks at, over one range."""
+    lights = ("yellow", "cyan", "magenta", "red", "lime", "white")
+    frames = [tf.pictures.frame_of(d.state).colony(k) for d, k in grown]
+    top = {n: max((float(f[n].max()) for f in frames), default=1.0) or 1.0 for n in names}
+    for ax in axes[len(grown) :]:
+        ax.set_visible(False)
+    for place, (ax, (done, k), cells) in enumerate(zip(axes, grown, frames, strict=False)):
+        limits = {n: (0.0, t) for n, t in top.items()}
+        if len(names) == 1:
+            scales = tf.pictures.draw_cells(ax, cells, colour=names[0], limits=limits)
+        else:
+            scales = tf.pictures.draw_cells(ax, cells, channels=dict(zip(names, lights, strict=False)) if names else None, limits=limits)
+        target.draw(ax, done.state, k, done.history)
+        tf.pictures.scale_bar(ax)
+        ax.set_title(title if place == 0 else f"replicate {int(done.state.colony_id[k])}", fontsize=9)
+        if place == len(grown) - 1 and names:
+            for scale in scales:
+                tf.pictures.colour_bar(ax, scale)
+
+
+def _draw_convergence(ax: Axes, search: Any) -> None:
+    colonies, _, best = search.study.convergence()
+    spent = np.concatenate([[0.0], colonies])
+    for entry, begin, end in zip(search.study.entries, spent[:-1], spent[1:], strict=True):
+        if any(entry is e for e in search.study.full()):
+            ax.plot(np.linspace(begin, end, len(entry.loss) + 1)[1:], entry.loss, ".", color="0.75", ms=2, zorder=0)
+    ax.step(colonies, best, where="post", color="C3")
+    ax.set(xlabel="colonies simulated", ylabel="loss", ylim=(0, None))
+    ax.set_title("every design (grey), the best yet (red)", fontsize=9)
+
+
+def _draw_parameters(ax: Axes, best: Best) -> None:
+    """Where the best design and the first guess lie between the bounds."""
+    space, first = best.search.objective.space, best.search.first()
+    rows = np.arange(space.size)[::-1]
+    ax.hlines(rows, 0, 1, color="0.85", lw=4, zorder=0)
+    ax.plot(first.point, rows, "o", color="0.55", label="first guess")
+    ax.plot(best.point, rows, "D", color="C3", label="best")
+    for y, p in zip(rows, space.parameters, strict=True):
+        low, high = (f"{p.low:g}", f"{p.high:g}") if isinstance(p, Parameter) else (str(p.options[0]), str(p.options[-1]))
+        for x, words, side in ((0, low, "right"), (1, high, "left")):
+            ax.annotate(words, (x, y), xytext=(-4 if side == "right" else 4, 0), textcoords="offset points", ha=side, va="center", fontsize=7, color="0.4")
+    ax.set(yticks=rows, yticklabels=[f"{p.name} = {_shown(best.values[p.name])}" for p in space.parameters], xticks=[], xlim=(-0.28, 1.28))
+    ax.set_ylim(-0.7, space.size - 0.3)
+    ax.tick_params(left=False)
+    for side in ("left", "right", "top", "bottom"):
+        ax.spines[side].set_visible(False)
+    ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False)

@@ -1,0 +1,186 @@
+"""A study: every evaluation of a search in one file, from which it goes on as if it had never stopped.
+
+    /             attributes: format, version, about (JSON: scene, parameters, target, method, …), torchfilm, torch
+    /streams      (R,) streams of random numbers, one a replicate
+    /batches/     rows, size, replicates, seconds: a row for each batch that was asked and told
+    /designs/     point (N, D), loss (N,), losses (N, R), cells (N, R), NaN and 0 where a replicate was not grown; reasons, JSON by replicate
+    /values/NAME  (N,) the parameters themselves
+
+The file is written anew after each batch beside the old one and then takes its place, so that a kill at any moment costs at most one batch.
+Files are data only; nothing in them is executed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+import torchfilm as tf
+from design.parameters import Value
+from torchfilm import checks
+
+FORMAT, VERSION = "torchfilm study", 1
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One batch: what was asked, and what was found. points (n, D), loss (n,), losses and cells (n, R); reasons by (row, replicate); size: share of the full
+    size; replicates: how many were grown; seconds."""
+
+    points: np.ndarray
+    loss: np.ndarray
+    losses: np.ndarray
+    cells: np.ndarray
+    reasons: dict[tuple[int, int], str]
+    size: float
+    replicates: int
+    seconds: float
+
+    @property
+    def colonies(self) -> float:
+        """Simulated, in colonies of full size: a smaller one counts by its share."""
+        return len(self.points) * self.replicates * self.size
+
+
+@dataclass(eq=False)
+class Study:
+    """The evaluations of a search, and the file that keeps them, if any.
+
+    about: what they depend on, plain data; names: of the parameters; streams: of the replicates.
+    """
+
+    about: dict[str, Any]
+    names: tuple[str, ...]
+    streams: tuple[int, ...]
+    path: Path | None = None
+    entries: list[Entry] = field(default_factory=list)
+
+    @property
+    def colonies(self) -> float:
+        """Simulated so far, in colonies of full size."""
+        return sum(e.colonies for e in self.entries)
+
+    @property
+    def seconds(self) -> float:
+        return sum(e.seconds for e in self.entries)
+
+    def full(self) -> list[Entry]:
+        """The batches at full size with all replicates, the only ones whose losses can be compared."""
+        return [e for e in self.entries if e.size == 1.0 and e.replicates == len(self.streams)]
+
+    def best(self) -> tuple[np.ndarray, float, np.ndarray] | None:
+        """Point (D,), loss and losses (R,) of the best design that was grown to full size; the first of equals. None before there is one."""
+        found = [(float(e.loss.min()), k, int(e.loss.argmin())) for k, e in enumerate(self.full())]
+        if not found:
+            return None
+        loss, k, row = min(found)
+        entry = self.full()[k]
+        return entry.points[row], loss, entry.losses[row]
+
+    def convergence(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """After each batch: colonies and seconds spent so far, and the best loss yet (NaN before there is one), (K,) each."""
+        colonies = np.cumsum([e.colonies for e in self.entries])
+        seconds = np.cumsum([e.seconds for e in self.entries])
+        full = {id(e) for e in self.full()}
+        lowest = [e.loss.min() if id(e) in full else np.inf for e in self.entries]
+        best = np.minimum.accumulate(lowest) if lowest else np.empty(0)
+        return colonies, seconds, np.where(np.isfinite(best), best, np.nan)
+
+    def add(self, entry: Entry, values: Sequence[dict[str, Value]]) -> None:
+        """Note a batch, and write the file."""
+        self.entries.append(entry)
+        if self.path is not None:
+            self._write(values)
+
+    def _write(self, last: Sequence[dict[str, Value]]) -> None:
+        assert self.path is not None
+        beside = self.path.with_name(self.path.name + ".new")
+        kept = {n: [] for n in self.names} if len(self.entries) == 1 else _values(self.path, self.names)
+        try:
+            with h5py.File(beside, "w") as file:
+                file.attrs.update(
+                    {"format": FORMAT, "version": VERSION, "about": json.dumps(self.about), "torchfilm": tf.__version__, "torch": str(torch.__version__)}
+                )
+                file["streams"] = np.asarray(self.streams, np.int64)
+                self._write_tables(file)
+                for name in self.names:
+                    column = [*kept[name], *(v[name] for v in last)]
+                    text = any(isinstance(v, (str, bytes)) for v in column)
+                    file.create_dataset(f"values/{name}", data=column, dtype=h5py.string_dtype() if text else None)
+            os.replace(beside, self.path)
+        except OSError as error:
+            raise tf.SimulationError(
+                f"could not write {self.path}: {error}. Is the disk full? What was written before is safe; run the search again to go on."
+            ) from error
+
+    def _write_tables(self, file: h5py.File) -> None:
+        replicates = len(self.streams)
+        file["batches/rows"] = [len(e.points) for e in self.entries]
+        for name in ("size", "replicates", "seconds"):
+            file[f"batches/{name}"] = [getattr(e, name) for e in self.entries]
+        wide = lambda x, fill: np.concatenate([x, np.full((len(x), replicates - x.shape[1]), fill, x.dtype)], 1)  # noqa: E731
+        file["designs/point"] = np.concatenate([e.points for e in self.entries])
+        file["designs/loss"] = np.concatenate([e.loss for e in self.entries])
+        file["designs/losses"] = np.concatenate([wide(e.losses, np.nan) for e in self.entries])
+        file["designs/cells"] = np.concatenate([wide(e.cells, 0) for e in self.entries])
+        words = [json.dumps({str(k): e.reasons[r, k] for k in range(e.replicates) if (r, k) in e.reasons}) for e in self.entries for r in range(len(e.points))]
+        file.create_dataset("designs/reasons", data=words, dtype=h5py.string_dtype())
+
+    @classmethod
+    def open(cls, path: str | Path, about: dict[str, Any], names: Sequence[str], streams: Sequence[int]) -> Study:
+        """The study at a path, to go on with, or a new one. Raises InputError where the file is of another search."""
+        path = Path(path)
+        if not path.exists():
+            if not path.parent.is_dir():
+                raise checks.refuse("study", str(path), "in a folder that exists", f"Make {path.parent} first.")
+            return cls(about, tuple(names), tuple(streams), path)
+        study = cls.read(path)
+        differ = [n for n in {**about, **study.about} if about.get(n) != study.about.get(n)]
+        if differ:
+            shown = "; ".join(f"{n}: {study.about.get(n)!r} there, {about.get(n)!r} here" for n in differ)
+            raise tf.InputError(f"{path} is the study of another search. {shown}. Give the study of this search, or another path for a new one.")
+        return study
+
+    @classmethod
+    def read(cls, path: str | Path) -> Study:
+        """A study from its file."""
+        path = Path(path)
+        if not path.is_file():
+            raise checks.refuse("study", str(path), "a study file", "No such file.")
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") != FORMAT:
+                    raise tf.InputError(f"{path} is not a torchfilm study (its format is {file.attrs.get('format')!r}).")
+                if int(file.attrs["version"]) > VERSION:
+                    raise tf.InputError(f"{path} has format version {file.attrs['version']}, newer than this torchfilm reads ({VERSION}). Update torchfilm.")
+                about = json.loads(file.attrs["about"])
+                study = cls(about, tuple(about["names"]), tuple(file["streams"][...].tolist()), path)
+                study.entries = _entries(file)
+        except (OSError, KeyError) as error:
+            raise tf.InputError(f"{path} cannot be read: it is truncated or not a study file ({error}).") from error
+        return study
+
+
+def _entries(file: h5py.File) -> list[Entry]:
+    batches, designs = ({n: d[...] for n, d in file[g].items()} for g in ("batches", "designs"))
+    out, at = [], 0
+    for rows, size, replicates, seconds in zip(*(batches[n].tolist() for n in ("rows", "size", "replicates", "seconds")), strict=True):
+        mine = slice(at, at + rows)
+        reasons = {(r, int(k)): words for r, text in enumerate(designs["reasons"][mine]) for k, words in json.loads(text).items()}
+        losses, cells = designs["losses"][mine, :replicates], designs["cells"][mine, :replicates]
+        out.append(Entry(designs["point"][mine], designs["loss"][mine], losses, cells, reasons, size, replicates, seconds))
+        at += rows
+    return out
+
+
+def _values(path: Path, names: Sequence[str]) -> dict[str, list[Value]]:
+    with h5py.File(path, "r") as file:
+        return {n: file[f"values/{n}"][...].tolist() for n in names}

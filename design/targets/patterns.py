@@ -1,0 +1,143 @@
+"""Targets of how cells of two states lie together, of how many are on, and of swings in time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.base import Target, ratio, require, seen, species_name, species_names, total, weights
+from torchfilm import checks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+GAP = 0.5  # µm: cells that are nearer to each other are neighbours
+FEWEST = 1e-12  # share of unlike neighbours that counts as none
+BRIGHTEST = 1e6  # levels, in thresholds, from which a cell is fully on in float64
+WANTED, FOUND = "#c2185b", "#757575"
+
+
+@dataclass(frozen=True)
+class DomainSize(Target):
+    """Domains of cells in one of two states, as wide as `size`, µm: the mean length that a straight line runs in one domain.
+
+    The state of a cell is z = (a − b)/(a + b), from −1 to 1, of the levels of two species (0 where it has neither). Of the n pairs of neighbours, cells with
+    a gap under 0.5 µm, the share p = Σ (1 − zᵢzⱼ)/2 / n is unlike, and with their mean centre distance d the domains are d/p wide. Loss: 1 − exp(−ln²(d/p /
+    size)); 1 where no pair is unlike, or no cell has a neighbour.
+
+    Why: let domains have borders of length A per area. A short segment of length d, thrown anyhow, crosses them 2dA/π times on average (Buffon); so does each
+    length d of a straight line, whose mean run in one domain is therefore ℓ = π/(2A) (Crofton), and p = d/ℓ; in space, with A per volume, dA/2 and ℓ = 2/A do
+    the same. A segment that crosses twice looks like one that does not: the estimate holds for ℓ well above d, and is 2d for cells whose states are drawn at
+    random.
+    """
+
+    species: tuple[str, str]
+    size: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "species", species_names("DomainSize.species", self.species, 2))
+        checks.number("DomainSize.size", self.size, above=0.0)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.species
+
+    def check(self, state: tf.State) -> None:
+        require(state, self.species)
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        _, sound = seen(state, self.species)
+        unlike, distance, _ = self._pairs(state)
+        # clamped, the logarithm stays finite and its loss is 1 to the last bit, with zero gradient
+        log = torch.log(torch.where(distance > 0, distance, 1.0) / (unlike.clamp(min=FEWEST) * self.size))
+        loss = torch.where(distance > 0, -torch.expm1(-log * log), 1.0)
+        return torch.where(sound, loss, self.failed)
+
+    def _pairs(self, state: tf.State) -> tuple[Tensor, Tensor, Tensor]:
+        """Share of unlike neighbours, mean centre distance (0 without neighbours, µm) and number of pairs, of each colony: (B,) float64 each."""
+        a, b = seen(state, self.species)[0].unbind(1)
+        z = ratio(a - b, a + b, 0.0)
+        i, j, apart = tf.measure.neighbours(state, GAP)
+        colony = state.colony.index_select(0, i)
+        add = lambda v: torch.zeros(state.colonies, dtype=torch.float64, device=v.device).index_add(0, colony, v)  # noqa: E731
+        count = add(torch.ones_like(apart))
+        unlike = add(0.5 * (1.0 - z.index_select(0, i) * z.index_select(0, j)))
+        return ratio(unlike, count, 0.0), ratio(add(apart), count, 0.0), count
+
+    @torch.no_grad()
+    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
+        """domain_size_um; unlike_share of the neighbours; pairs, how many neighbours there are."""
+        unlike, distance, count = self._pairs(state)
+        return {"domain_size_um": ratio(distance, unlike, math.nan), "unlike_share": torch.where(count > 0, unlike, math.nan), "pairs": count}
+
+    def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
+        """A bar as long as the domains should be wide."""
+        window = ax.get_xlim(), ax.get_ylim()
+        (left, right), (bottom, top) = window
+        x, y = left + 0.05 * (right - left), bottom + 0.05 * (top - bottom)
+        ax.plot([x, x + math.copysign(self.size, right - left)], [y, y], color=WANTED, linewidth=3.0, solid_capstyle="butt", zorder=3)
+        ax.annotate(f"wanted {self.size:g} µm", (x, y), xytext=(0, 3), textcoords="offset points", color=WANTED, fontsize=7.0, zorder=3)
+        ax.set(xlim=window[0], ylim=window[1])
+
+    def describe(self) -> str:
+        return f"domains of {self.species[0]} and {self.species[1]} {self.size:g} µm wide"
+
+
+@dataclass(frozen=True)
+class OnFraction(Target):
+    """A share of the cells on, the rest off, wherever they are.
+
+    fraction: wanted share of the volume, above 0 and below 1. A cell is on above `level`; smoothly, for the loss, s = y⁴/(y⁴ + level⁴). Loss:
+    (mean s − fraction)²/max(fraction, 1 − fraction)², which is 1 where all is as wrong as it can be.
+    """
+
+    species: str
+    fraction: float
+    level: float
+
+    def __post_init__(self) -> None:
+        species_name("OnFraction.species", self.species)
+        checks.number("OnFraction.fraction", self.fraction, above=0.0)
+        if self.fraction >= 1:
+            raise checks.refuse("OnFraction.fraction", self.fraction, "above 0 and below 1", "For all cells on, want one wide band of Bands.")
+        checks.number("OnFraction.level", self.level, above=0.0)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.species,)
+
+    def check(self, state: tf.State) -> None:
+        require(state, (self.species,))
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        y, sound = seen(state, (self.species,))
+        square = (y[:, 0] / self.level).clamp(max=BRIGHTEST) ** 2
+        on = square * square / (1.0 + square * square)
+        w = weights(state)
+        share = ratio(total(state, w * on), total(state, w), 0.0)
+        return torch.where(sound, ((share - self.fraction) / max(self.fraction, 1 - self.fraction)) ** 2, self.failed)
+
+    @torch.no_grad()
+    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
+        """on_share: share of the volume above the level; on_level and off_level: mean level of the cells above and of the others."""
+        y, w = seen(state, (self.species,))[0][:, 0], weights(state)
+        on = (y > self.level).double()
+        parts = total(state, torch.stack([w, w * on, w * on * y, w * (1 - on), w * (1 - on) * y], 1)).unbind(1)
+        shares = ((parts[1], parts[0]), (parts[2], parts[1]), (parts[4], parts[3]))
+        return {name: ratio(a, b, math.nan) for name, (a, b) in zip(("on_share", "on_level", "off_level"), shares, strict=True)}
+
+    def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
+        """Two bars in a corner: the share wanted and the share found."""
+        inset = ax.inset_axes((0.02, 0.02, 0.2, 0.2))
+        found = float(self.measures(state)["on_share"][place])
+        inset.bar([0, 1], [self.fraction, found], color=[WANTED, FOUND])
+        inset.set_xticks([0, 1], ["wanted", "found"], fontsize=5.0)
+        inset.set(ylim=(0, 1), yticks=[])
+
+    def describe(self) -> str:
+        return f"{self.species} above {self.level:g} in {self.fraction:.3g} of the cells"

@@ -1,0 +1,114 @@
+"""What targets draw over a colony: where the lines are, and that what the axes show stays as it was."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from patterned import placed
+
+from design.targets import Bands, DomainSize, Gradient, Image, OnFraction, Oscillation, Ring, Stripe, Target
+
+WINDOW = (-10.0, 10.0), (-8.0, 8.0)
+
+
+@pytest.fixture
+def ax():
+    from matplotlib.figure import Figure
+
+    ax = Figure(figsize=(5, 4)).add_subplot()
+    ax.set(xlim=WINDOW[0], ylim=WINDOW[1])
+    return ax
+
+
+def state():
+    """Two colonies; the second has its border at x = 5 and its middle at (5, 1)."""
+    return placed([(-1, 0), (1, 0), (4, 1), (6, 1)], cell_type=[0, 1, 0, 1], colony=[0, 0, 1, 1], colonies=2, yfp=[1, 0, 1, 0], cfp=1.0)
+
+
+def at(ax, axis: int) -> list[float]:
+    """Where the lines that cross an axis stand."""
+    return sorted(float(line.get_data()[axis][0]) for line in ax.lines)
+
+
+@pytest.mark.parametrize(
+    "target, axis, places",
+    [
+        (Stripe("yfp", width=4.0), 0, [3, 5, 7]),
+        (Stripe("yfp", width=4.0, cell_type=1), 0, [5, 5, 9]),
+        (Stripe("yfp", at=-1.0, width=4.0, along="y"), 1, [-3, 1]),
+        (Bands(("yfp", "cfp"), (-2, 0, 30)), 0, [-2, 0, 0, 30]),
+        (Bands(("yfp",), (-math.inf, 2.0), along="y", centre="colony"), 1, [3]),
+        (Gradient("yfp", "x", 3, -3), 0, [-3, 3]),
+    ],
+)
+def test_lines_stand_where_bands_are_wanted(ax, target, axis, places):
+    """Also beyond what is seen, which moves nothing."""
+    target.draw(ax, state(), 1)
+    assert at(ax, axis) == places
+    assert (ax.get_xlim(), ax.get_ylim()) == WINDOW
+
+
+@pytest.mark.parametrize(
+    "target, centre, radii",
+    [(Ring("yfp", 4.0, 2.0), (5, 1), [3, 5]), (Bands(("yfp", "cfp"), (0, 3, 20), along="radius"), (0, 0), [0, 3, 3, 20])],
+)
+def test_rings_are_circles(ax, target, centre, radii):
+    target.draw(ax, state(), 1)
+    assert sorted(p.radius for p in ax.patches) == radii and {tuple(p.center) for p in ax.patches} == {centre}
+    assert (ax.get_xlim(), ax.get_ylim()) == WINDOW
+
+
+@pytest.mark.parametrize("mask", [((1.0, 1.0), (1.0, 1.0)), ((0.5,),), ((0.0, 0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))])
+def test_an_image_is_outlined_about_its_lit_part(ax, mask):
+    """Within the image and half a pixel of its rim; a picture with one grey only too."""
+    Image("yfp", mask, (6.0, 4.0), centre="colony").draw(ax, state(), 1)
+    points = np.concatenate([p.vertices for c in ax.collections for p in c.get_paths()])
+    assert len(points) >= 4
+    rows, columns = np.shape(mask)
+    assert (np.abs(points - [5, 1]) <= np.array([3 + 3 / columns, 2 + 2 / rows]) + 1e-9).all()
+    assert (ax.get_xlim(), ax.get_ylim()) == WINDOW
+
+
+def test_domains_have_a_bar_of_their_size(ax):
+    DomainSize(("yfp", "cfp"), 3.5).draw(ax, state(), 1)
+    x, y = ax.lines[0].get_data()
+    assert x[1] - x[0] == pytest.approx(3.5) and y[0] == y[1] and "3.5 µm" in ax.texts[0].get_text()
+    assert (ax.get_xlim(), ax.get_ylim()) == WINDOW
+
+
+def test_a_share_has_two_bars(ax):
+    OnFraction("yfp", 0.25, 0.5).draw(ax, state(), 1)
+    assert [p.get_height() for p in ax.child_axes[0].patches] == pytest.approx([0.25, 0.5])
+
+
+def test_swings_have_a_curve_if_there_is_a_history(ax):
+    """Of this colony; the wanted wave has its maximum where the curve has it."""
+    target, time = Oscillation("yfp", 2.0), torch.arange(40, dtype=torch.float64) * 0.1
+    target.draw(ax, state(), 1)
+    assert not ax.child_axes
+    mean = torch.stack([torch.full_like(time, 7.0), 3 + torch.cos(math.pi * (time - 0.4))], 1)
+    history = torch.stack([time.unsqueeze(1).expand_as(mean), mean, mean**2], 2)
+    history[30:, 1] = math.nan
+    target.draw(ax, state(), 1, history)
+    wanted, curve = (line.get_ydata() for line in ax.child_axes[0].lines)
+    assert len(curve) == 30 and np.array_equal(curve, mean[:30, 1].numpy())
+    assert np.allclose(wanted, curve, atol=1e-9) and int(np.argmax(curve)) in (4, 24)
+    target.draw(ax, state(), 1, torch.full((3, 2, 3), math.nan))
+
+
+def test_a_target_of_ones_own_needs_a_loss_only(ax):
+    """What it does not say otherwise: nothing to check, to note, to measure or to draw."""
+
+    class Long(Target):
+        def loss(self, state, history=None):
+            return state.groups.sum(state.length.double().unsqueeze(1)).squeeze(1)
+
+    mine = Long()
+    mine.check(state())
+    mine.draw(ax, state(), 0)
+    assert mine.note(state()) is None and mine.measures(state()) == {} and mine.describe() == "Long" and mine.loss(state()).tolist() == [0, 0]
+    with pytest.raises(NotImplementedError, match=r"Target\.loss"):
+        Target().loss(state())
