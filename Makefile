@@ -4,9 +4,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help run test quick lint types docs bench clean
+.PHONY: help run colonies test quick lint types docs bench clean
 
-run: $(STAMP)  ## grow 16 colonies of 500 cells in one batch, write results and a picture (about a minute)
+run: $(STAMP)  ## search for a circuit that draws a stripe where two populations meet, show the best (a minute or two)
+	$(BIN)/python experiments/boundary_stripe.py --colonies 800 --out runs/stripe
+
+colonies: $(STAMP)  ## grow 16 colonies of 500 cells in one batch, write results and a picture (about a minute)
 	$(BIN)/torchfilm run microcolony --colonies 16 --cells 500 --out runs/colonies.h5 --overwrite
 
 test: $(STAMP)  ## all tests
@@ -26,8 +29,9 @@ docs: $(STAMP)  ## build the documentation into site/
 	$(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
 	$(BIN)/mkdocs build --strict -q
 
-bench: $(STAMP)  ## the growth benchmark, small sizes
+bench: $(STAMP)  ## the benchmarks of growth and of design, small sizes
 	$(BIN)/python experiments/benchmarks/growth.py --quick
+	$(BIN)/python experiments/benchmarks/search.py rate --cells 100 --designs 16 --out runs/rate.json
 
 clean:  ## remove what was built
 	rm -rf $(VENV) runs site
@@ -37,5 +41,5 @@ help:  ## this list
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e ".[app,dev]"
+	$(BIN)/python -m pip install -q -c constraints.txt -e ".[app,design,bayes,cluster,dev]"
 	touch $@

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -10,8 +11,8 @@ from torch import Tensor
 
 import torchfilm as tf
 
-# h: a colony that has not reached its size by then never will
-LIMIT = 1000.0
+# h: a colony that has not gained a cell in so long never will
+PATIENCE = 100.0
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ def grow(
 
     A colony's end depends on itself alone, so that its outcome does not depend on its batch. note: called after every step; see `Target.note`.
     """
-    last = LIMIT if until is None else until
-    everyone = state.colonies
+    everyone, last = state.colonies, math.inf if until is None else until
+    most, since = state.counts.new_zeros(everyone), state.counts.new_zeros(everyone, dtype=torch.float64)
     notes: list[Tensor] = []
     while True:
         state = step(state)
@@ -65,15 +66,24 @@ def grow(
             notes.append(row.index_copy(0, state.colony_id, found))
         late = state.time >= last - 1e-9
         done = torch.full_like(state.counts, late, dtype=torch.bool) if cells is None or (until is not None and late) else state.counts >= cells
-        if cells is not None and until is None and late:
-            for colony_id, count in zip(state.colony_id[~done].tolist(), state.counts[~done].tolist(), strict=True):
-                yield Failed(colony_id, f"it has only {count} of {cells} cells after {LIMIT:g} h")
         if bool(done.any()):
             finished = _keep(state, done)
             yield Done(finished, torch.stack([n.index_select(0, finished.colony_id) for n in notes]) if notes else None)
-        if late or bool(done.all()):
+        stuck = _stuck(state, most, since) & ~done
+        for colony_id, count in zip(state.colony_id[stuck].tolist(), state.counts[stuck].tolist(), strict=True):
+            yield Failed(colony_id, f"it has {count} of {cells} cells at {state.time:g} h, and has had no more for {PATIENCE:g} h")
+        gone = done | stuck
+        if bool(gone.all()):
             return
-        state = _keep(state, ~done)
+        state = _keep(state, ~gone)
+
+
+def _stuck(state: tf.State, most: Tensor, since: Tensor) -> Tensor:
+    """Which colonies have gained no cell in `PATIENCE`, (B,). most, since: by colony id, cells so far and h of the last gain; written anew here."""
+    known = most.index_select(0, state.colony_id)
+    since[state.colony_id[state.counts > known]] = state.time
+    most[state.colony_id] = torch.maximum(known, state.counts)
+    return state.time - since.index_select(0, state.colony_id) > PATIENCE + 1e-9
 
 
 def _keep(state: tf.State, which: Tensor) -> tf.State:

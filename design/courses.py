@@ -20,12 +20,14 @@ def of(objective: Objective, scene: tf.Scene, streams: tuple[int, ...]) -> tf.Co
     columns = (founders.position, founders.axis, founders.length, founders.radius, founders.cell_type, *founders.extra.values())
     who = (objective.make.__module__, getattr(objective.make, "__qualname__", repr(objective.make)), repr(sorted(objective.fixed.items())))
     start = tuple(None if c is None else c.tobytes() for c in columns)
-    key = (*who, tuple(grown.listing()), start, objective.seed, objective.dt, objective.dtype, objective.device)
+    key = (*who, tuple(grown.listing()), start, objective.seed, objective.dt, objective.dtype, objective.device, objective.cells)
     for known, course in _kept.items():
         if known[:-1] == key and set(streams) <= set(course.streams):
             _kept[known] = _kept.pop(known)  # the last used stands last
             return course
-    course = tf.Course(scene, streams=streams, seed=objective.seed, dt=objective.dt, dtype=objective.dtype, device=objective.device)
+    course = tf.Course(
+        scene, streams=streams, seed=objective.seed, dt=objective.dt, dtype=objective.dtype, device=objective.device, cells=objective.cells
+    )  # fmt: skip
     while _kept and sum(c.nbytes for c in _kept.values()) > MOST_BYTES:
         _kept.pop(next(iter(_kept)))
     _kept[(*key, streams)] = course

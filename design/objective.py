@@ -3,12 +3,16 @@ acts back on it."""
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import dataclasses
 import inspect
+import itertools
 import math
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,13 +20,14 @@ import numpy as np
 import torch
 
 import torchfilm as tf
-from design import courses, room
+from design import courses, machines, room
 from design.colonies import Done, grow
 from design.parameters import Choice, Parameter, Space, Value
 from design.targets.base import Target
 from torchfilm import checks
 
 REDUCE = ("mean", "worst")
+OFF = "replay=False"
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +106,18 @@ class Objective:
         self.replicates, self.most = _whole("replicates", replicates, 1), None if most is None else _whole("most", most, 1)
         if reduce not in REDUCE:
             checks.number("reduce", reduce, above=0.0, most=1.0, mend='"mean", "worst" or a quantile.')
+        _whole("seed", seed, 0)
         self.reduce, self.seed, self.dtype, self.device, self.replay = reduce, seed, dtype, device, replay
         self._check_names()
         probe = self._probe()
         self.dt = probe.dt if dt is None else checks.number("dt", dt, above=0.0)
-        self.recipe, self.listing = probe.recipe, probe.listing()
+        steps = 1.0 if self.until is None else self.until / self.dt
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
+            raise checks.refuse("until", until, f"a whole number of steps of dt = {self.dt:g} h")
+        # a ready scene is built again by its name; a function that calls one has parameters of its own
+        self.recipe = probe.recipe if probe.recipe and self.make is tf.scenes.READY.get(probe.recipe[0]) else None
+        self.listing = probe.listing()
+        self.regrown = tf.Course.obstacle(probe) if self.replay else OFF
 
     def _check_names(self) -> None:
         allowed = inspect.signature(self.make).parameters
@@ -129,13 +141,16 @@ class Objective:
             trials += [{**base, p.name: int(v) if isinstance(p, Parameter) and p.whole else v} for v in ends]
         for values in trials:
             try:
-                state = self.scene([values]).seed(1, seed=self.seed, dtype=self.dtype, device=self.device)
-            except (tf.InputError, TypeError) as error:
+                made = self.scene([values], repeat=2)  # two colonies: a tensor of one number passes for a plain number
+                state = made.seed(2, seed=self.seed, dtype=self.dtype, device=self.device)
+            except (ValueError, TypeError, RuntimeError) as error:
                 changed = {n: v for n, v in values.items() if v != base[n]} or values
                 raise tf.InputError(
                     f"the scene cannot be built with {changed}: {error} Narrow the bounds; a parameter that the scene takes as one plain number "
                     "only can be searched with whole=True or as a Choice of numbers."
                 ) from error
+        if self.until is None:
+            made.check_moves(state)
         self.target.check(state)
         return self.scene([base])
 
@@ -157,15 +172,15 @@ class Objective:
         """Grow designs, (n, D) coordinates in [0, 1], and score them.
 
         streams: of random numbers, one a replicate; by default 0 … replicates − 1. size: share of `cells` and `until`, for cheap first looks. executor: of the
-        `concurrent.futures` kind, for other processes or machines; pieces: how many parts it gets at least. The outcome is the same to the bit however it is
-        divided, on machines alike.
+        `concurrent.futures` kind, for other processes or machines; pieces: how many parts it gets at least. What it loses, as when a worker is killed, is
+        grown all the same, in the end here, with a warning. The outcome is the same to the bit however it is divided, on machines alike.
         """
         begun = time.perf_counter()
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != self.space.size or not len(points) or not bool(((points >= 0) & (points <= 1)).all()):
             raise checks.refuse("points", points.shape, f"(n, {self.space.size}) coordinates in [0, 1]")
         checks.number("size", size, above=0.0, most=1.0)
-        chosen = tuple(range(self.replicates)) if streams is None else tuple(int(s) for s in streams)
+        chosen = self._streams(streams)
         values = [self.space.values(p) for p in points]
         losses, cells = np.full((len(points), len(chosen)), np.nan), np.zeros((len(points), len(chosen)), np.int64)
         reasons: dict[tuple[int, int], str] = {}
@@ -176,6 +191,13 @@ class Objective:
             reasons |= {(rows[row], k): words for (row, k), words in found.reasons.items()}
             regrown = regrown or found.regrown
         return Evaluation(points, losses, self.reduced(losses), cells, reasons, size, regrown, time.perf_counter() - begun)
+
+    def _streams(self, given: Sequence[int] | None) -> tuple[int, ...]:
+        """The streams asked for, or those of the replicates."""
+        found = tuple(range(self.replicates)) if given is None else tuple(int(s) for s in given)
+        if not found or len(set(found)) != len(found) or not all(0 <= s < 2**32 for s in found):
+            raise checks.refuse("streams", given, "different whole numbers from 0 to 2³² − 1, at least one")
+        return found
 
     def reduced(self, losses: np.ndarray) -> np.ndarray:
         """One loss a design, (n,), from those of its replicates (n, R)."""
@@ -191,30 +213,33 @@ class Objective:
             groups.setdefault(tuple(repr(design[n]) for n in structural), []).append(row)
         out = []
         for rows in groups.values():
-            most = self.most or room.colonies(self.scene([values[rows[0]]]), self.end(size)[0], self.dtype, self.device)
-            share = min(max(1, most // replicates), math.ceil(len(values) / least))
-            out += [Piece(tuple(part), tuple(values[r] for r in part)) for k in range(0, len(rows), share) if (part := rows[k : k + share])]
+            most = self.most or self._room([values[r] for r in rows], size)
+            wanted = max(math.ceil(len(rows) / max(1, most // replicates)), math.ceil(least * len(rows) / len(values)))
+            count = min(len(rows), wanted)
+            cuts = [len(rows) * k // count for k in range(count + 1)]  # as even as can be
+            out += [Piece(tuple(rows[a:b]), tuple(values[r] for r in rows[a:b])) for a, b in itertools.pairwise(cuts)]
         return out
+
+    def _room(self, values: Sequence[dict[str, Value]], size: float) -> int:
+        """How many colonies of designs alike in what builds them memory takes at once; the first that the scene does not refuse tells."""
+        for design in values:
+            with contextlib.suppress(tf.InputError):
+                return room.colonies(self.scene([design]), self.end(size)[0], self.dtype, self.device)
+        return 1
 
     def _outcomes(
         self, pieces: list[Piece], streams: tuple[int, ...], size: float, executor: Executor | None
     ) -> Iterator[tuple[Piece, Outcome]]:  # fmt: skip
-        """Each piece with what became of it; those that an executor lost are done here."""
+        """Each piece with what became of it, once."""
         if executor is None:
-            for piece in pieces:
-                yield piece, self.run(piece, streams, size)
-            return
-        waiting: list[tuple[Piece, Future[Outcome] | None]] = []
-        for piece in pieces:
-            try:
-                waiting.append((piece, executor.submit(_run, self, piece, streams, size)))
-            except (BrokenExecutor, RuntimeError):  # it broke, or was shut down, before this piece
-                waiting.append((piece, None))
-        for piece, future in waiting:
-            try:
-                yield piece, self.run(piece, streams, size) if future is None else future.result()
-            except BrokenExecutor:  # a worker died and took the pool along
-                yield piece, self.run(piece, streams, size)
+            return ((piece, self.run(piece, streams, size)) for piece in pieces)
+        return machines.outcomes(self, pieces, streams, size, executor)
+
+    def resized(self, factor: float) -> Objective:
+        """The same with colonies `factor` times as large, or `factor` times as many hours: above 1 too."""
+        other = copy.copy(self)
+        other.cells, other.until = self.end(checks.number("factor", factor, above=0.0))
+        return other
 
     def end(self, size: float) -> tuple[int | None, float | None]:
         """Cells and hours at which colonies of a share of the full size end."""
@@ -265,7 +290,7 @@ class Objective:
         """The step of a batch, its first state, and why it does not follow a recorded growth, or ""."""
         scene = self.scene(values, repeat=len(streams))
         tiled = torch.tensor(streams).repeat(len(values))
-        why = "replay=False" if not self.replay else tf.Course.obstacle(scene)
+        why = tf.Course.obstacle(scene) if self.replay else OFF
         if not why:
             course = courses.of(self, scene, streams)
             replay = tf.Replay(scene, course)
@@ -276,15 +301,17 @@ class Objective:
     @torch.no_grad()
     def final(self, point: np.ndarray, *, streams: Sequence[int] | None = None, size: float = 1.0) -> list[Done]:
         """The colonies of one design at their ends, for pictures and measures; those that fail are left out."""
-        chosen = tuple(range(self.replicates)) if streams is None else tuple(streams)
-        step, state, _ = self._start([self.space.values(np.asarray(point))], chosen)
+        try:
+            step, state, _ = self._start([self.space.values(np.asarray(point))], self._streams(streams))
+        except tf.InputError:  # the scene refuses this design
+            return []
         cells, until = self.end(size)
         return [e for e in grow(step, state, cells=cells, until=until, note=self.target.note) if isinstance(e, Done)]
 
     def describe(self) -> dict[str, Any]:
         """What the losses depend on, as plain data: a study is gone on with only by an objective that says the same."""
         return {
-            "scene": self.recipe[0] if self.recipe else getattr(self.make, "__name__", "scene"), "fixed": {n: repr(v) for n, v in self.fixed.items()},
+            "scene": self.recipe[0] if self.recipe else getattr(self.make, "__name__", "scene"), "fixed": {n: _lasting(v) for n, v in self.fixed.items()},
             "effects": self.listing, "parameters": self.space.describe(), "target": _told(self.target), "cells": self.cells, "until": self.until,
             "replicates": self.replicates, "reduce": self.reduce, "seed": self.seed, "dt": self.dt, "dtype": str(self.dtype)[6:],
         }  # fmt: skip
@@ -292,12 +319,12 @@ class Objective:
 
 def _told(target: Target) -> str:
     """A target with all its settings, the same in every run."""
-    return repr(target) if dataclasses.is_dataclass(target) else target.describe()
+    return _lasting(target) if dataclasses.is_dataclass(target) else target.describe()
 
 
-def _run(objective: Objective, piece: Piece, streams: tuple[int, ...], size: float) -> Outcome:
-    """A piece in another process."""
-    return objective.run(piece, streams, size)
+def _lasting(value: Any) -> str:
+    """How a value is written, without where it lies in the memory of this process."""
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
 
 def _scene_function(scene: Callable[..., tf.Scene] | str) -> Callable[..., tf.Scene]:

@@ -55,9 +55,10 @@ class Parameter:
         """The value at a coordinate in [0, 1]; whole numbers have equal shares."""
         if self.levels is not None:
             return int(self.low) + _level(unit, self.levels)
-        if self.log:
-            return math.exp(math.log(self.low) + unit * (math.log(self.high) - math.log(self.low)))
-        return self.low + unit * (self.high - self.low)
+        low, high = (math.log(self.low), math.log(self.high)) if self.log else (self.low, self.high)
+        found = low + unit * (high - low)
+        # rounding must not lead over a bound
+        return min(max(math.exp(found) if self.log else found, self.low), self.high)
 
     def coordinate(self, value: Value) -> float:
         """The coordinate of a value within the bounds."""
@@ -87,11 +88,13 @@ class Choice:
 
     def __init__(self, name: str, options: Sequence[Value]):
         _check_name("Choice", name)
-        if isinstance(options, str) or not isinstance(options, Sequence) or len(options) < 2 or len(set(map(repr, options))) != len(options):
-            raise checks.refuse(f"Choice({name!r}).options", options, "at least two different ones, such as ('weak', 'strong')")
-        odd = [o for o in options if not isinstance(o, (str, bool, int, float))]
+        listed = isinstance(options, Sequence) and not isinstance(options, str)
+        odd = [o for o in options if not isinstance(o, (str, bool, int, float))] if listed else []
         if odd:
             raise checks.refuse(f"Choice({name!r}).options", odd[0], "texts, numbers, True or False", "Name what stands for it, and let the scene look it up.")
+        # 1 and True are equal, and could not be told apart by their value
+        if not listed or len(options) < 2 or len(set(options)) != len(options):
+            raise checks.refuse(f"Choice({name!r}).options", options, "at least two different ones, such as ('weak', 'strong')")
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "options", tuple(options))
 

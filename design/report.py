@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,22 +14,24 @@ from design.parameters import Parameter, Value
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from tqdm import tqdm
 
     from design.search import Best
+    from design.targets import Target
 
 SHOWN = 3  # replicates side by side
 
 
-def bar(total: float, progress: bool) -> tqdm:
-    """A bar of colonies simulated. Needs tqdm (the `app` extra) where it is to be seen."""
+def bar(total: float, progress: bool) -> AbstractContextManager[tqdm | None]:
+    """A bar of colonies simulated, or nothing. Needs tqdm (the `app` extra) where it is to be seen."""
+    if not progress:
+        return nullcontext()
     try:
         from tqdm import tqdm
     except ImportError as error:
         raise tf.InputError('a progress bar needs tqdm: pip install "torchfilm[app]", or give progress=False.') from error
     form = "{desc} |{bar}| {n:.0f}/{total:.0f} colonies {elapsed}<{remaining}{postfix}"
-    return tqdm(total=total, bar_format=form, desc="search", disable=not progress or None, mininterval=0.3)
+    return tqdm(total=total, bar_format=form, desc="search", disable=None, mininterval=0.3)
 
 
 def table(best: Best) -> str:
@@ -71,17 +74,18 @@ def draw(best: Best, path: Path) -> Path:
     except ImportError as error:
         raise tf.InputError('pictures need matplotlib: pip install "torchfilm[app]".') from error
     search = best.search
-    rows = [("first guess", search.first()), ("best", best)]
-    grown = {title: _places(one.colonies())[:SHOWN] for title, one in rows}
-    columns = max(1, *(len(g) for g in grown.values()))
-    figure = Figure(figsize=(2.6 * columns + 3.6, 5.6), layout="constrained")
-    grid = figure.add_gridspec(2, columns + 1, width_ratios=[1.0] * columns + [1.35])
-    names = [n for n in search.objective.target.names if not n.startswith("out.")]
-    for row, (title, one) in enumerate(rows):
-        axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
-        _draw_row(figure, axes, grown[title], names, search.objective.target, f"{title}, loss {one.loss:.3f}")
+    first = search.first()
+    grown = [_places(one.colonies())[:SHOWN] for one in (first, best)]
+    columns = max(1, *(len(g) for g in grown))
+    figure = Figure(figsize=(2.6 * columns + 4.2, 6.4), layout="constrained")
+    grid = figure.add_gridspec(4, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 0.05, 1.0, 0.05])
+    size = max((_extent(tf.pictures.frame_of(d.state).colony(k)) for g in grown for d, k in g), default=1.0)
+    for row, (title, one) in enumerate((("first guess", first), ("best", best))):
+        axes = [figure.add_subplot(grid[2 * row, k]) for k in range(columns)]
+        bars = [figure.add_subplot(grid[2 * row + 1, k]) for k in range(columns)]
+        _draw_row(axes, bars, grown[row], search.objective.target, size, f"{title}, loss {one.loss:.3f}")
     _draw_convergence(figure.add_subplot(grid[0, columns]), search)
-    _draw_parameters(figure.add_subplot(grid[1, columns]), best)
+    _draw_parameters(figure.add_subplot(grid[2:, columns]), best)
     figure.savefig(path, dpi=160)
     return path
 
@@ -91,25 +95,41 @@ def _places(done: list[Done]) -> list[tuple[Done, int]]:
     return sorted(((d, k) for d in done for k in range(d.state.colonies)), key=lambda x: int(x[0].state.colony_id[x[1]]))
 
 
-def _draw_row(figure: Figure, axes: list[Axes], grown: list[tuple[Done, int]], names: list[str], target: Any, title: str) -> None:
-    """Colonies of one design, coloured by what the target looks at, over one range."""
-    lights = ("yellow", "cyan", "magenta", "red", "lime", "white")
+def _extent(cells: dict[str, np.ndarray]) -> float:
+    """Half the side of a square that holds a colony, µm."""
+    place = cells["position"][:, :2]
+    return float((place.max(0) - place.min(0)).max()) / 2 + float((cells["length"] / 2 + cells["radius"]).max()) + 0.5
+
+
+def _light(name: str, place: int) -> str:
+    """The colour of a species: what its name says, or one of a few."""
+    known = {"cfp": "cyan", "gfp": "lime", "yfp": "yellow", "rfp": "red", "blue": "dodgerblue", "white": "white", "red": "red", "green": "lime"}
+    return known.get(name.lower(), ("yellow", "cyan", "magenta", "red", "lime", "white")[place % 6])
+
+
+def _draw_row(axes: list[Axes], bars: list[Axes], grown: list[tuple[Done, int]], target: Target, size: float, title: str) -> None:
+    """Colonies of one design to one scale, coloured over one range by what the target looks at."""
+    names = [n for n in target.names if not n.startswith("out.")]
     frames = [tf.pictures.frame_of(d.state).colony(k) for d, k in grown]
-    top = {n: max((float(f[n].max()) for f in frames), default=1.0) or 1.0 for n in names}
-    for ax in axes[len(grown) :]:
-        ax.set_visible(False)
-    for place, (ax, (done, k), cells) in enumerate(zip(axes, grown, frames, strict=False)):
-        limits = {n: (0.0, t) for n, t in top.items()}
-        if len(names) == 1:
-            scales = tf.pictures.draw_cells(ax, cells, colour=names[0], limits=limits)
-        else:
-            scales = tf.pictures.draw_cells(ax, cells, channels=dict(zip(names, lights, strict=False)) if names else None, limits=limits)
+    limits = {n: (0.0, max((float(f[n].max()) for f in frames), default=1.0) or 1.0) for n in names}
+    colour = names[0] if len(names) == 1 else None
+    channels = {n: _light(n, k) for k, n in enumerate(names)} if len(names) > 1 else None
+    scales: list[Any] = []
+    for ax, (done, k), cells in zip(axes, grown, frames, strict=False):
+        x, y = (cells["position"][:, :2].max(0) + cells["position"][:, :2].min(0)) / 2
+        window = (x - size, x + size, y - size, y + size)
+        if channels:
+            ax.set_facecolor("black")
+        scales = tf.pictures.draw_cells(ax, cells, colour=colour, channels=channels, limits=limits, window=window)
         target.draw(ax, done.state, k, done.history)
         tf.pictures.scale_bar(ax)
-        ax.set_title(title if place == 0 else f"replicate {int(done.state.colony_id[k])}", fontsize=9)
-        if place == len(grown) - 1 and names:
-            for scale in scales:
-                tf.pictures.colour_bar(ax, scale)
+        ax.set_title(title if ax is axes[0] else f"replicate {int(done.state.colony_id[k])}", fontsize=9)
+    for ax in axes[len(grown) :]:
+        ax.set_visible(False)
+    for ax, scale in zip(bars, scales if names else [], strict=False):
+        tf.pictures.colour_bar(ax, scale)
+    for ax in bars[len(scales) if names else 0 :]:
+        ax.set_visible(False)
 
 
 def _draw_convergence(ax: Axes, search: Any) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -13,11 +15,12 @@ import numpy as np
 import torch
 
 import torchfilm as tf
-from design import report
+from design import report, robust
 from design.colonies import Done
 from design.methods import Batch, Method, method_of
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Value
+from design.robust import Robustness
 from design.study import Entry, Study
 from design.targets.base import Target
 from torchfilm import checks
@@ -60,7 +63,7 @@ class Search:
             scene, parameters, target, cells=cells, until=until, replicates=replicates, reduce=reduce, fixed=fixed, seed=seed, dt=dt, dtype=dtype,
             device=device, replay=replay, most=most,
         )  # fmt: skip
-        self.method, self.seed, self.regrown = method_of(method), seed, ""
+        self.method, self.seed, self.regrown = method_of(method), seed, self.objective.regrown
         self.study = self._new_study(None)
 
     def run(
@@ -115,7 +118,7 @@ class Search:
             # another machine may round another way
             if batch.points.shape != entry.points.shape or not np.allclose(batch.points, entry.points, rtol=0, atol=1e-6):
                 raise tf.InputError(
-                    f"{self.study.path}: its batch {k} is not what the method asks for here, as if it had been made by another version of it. Start a new study."
+                    f"{self.study.path}: its batch {k} is not what the method asks for here, as if another version of it had made it. Start a new study."
                 )
             self.method.tell(Batch(entry.points, batch.size, batch.replicates), entry.loss)
 
@@ -133,7 +136,9 @@ class Search:
         found = self.study.best()
         return stop_at is not None and found is not None and found[1] <= stop_at
 
-    def _show(self, bar: tqdm) -> None:
+    def _show(self, bar: tqdm | None) -> None:
+        if bar is None:
+            return
         found = self.study.best()
         bar.update(min(self.study.colonies, bar.total) - bar.n)
         failed = sum(len(e.reasons) for e in self.study.entries)
@@ -158,16 +163,17 @@ class Best:
     def save(self, path: str | Path) -> Path:
         """Write the design as JSON, which `torchfilm run` takes. Replaces an older one."""
         objective, path = self.search.objective, Path(path)
-        home = (
-            {} if objective.recipe else {"file": getattr(getattr(objective.make, "__code__", None), "co_filename", None), "function": objective.make.__name__}
-        )
+        if not path.parent.is_dir():
+            raise checks.refuse("path", str(path), "in a folder that exists", f"Make {path.parent} first.")
+        home = {} if objective.recipe else _home(objective.make)
         end = {name: value for name, value in (("cells", objective.cells), ("until", objective.until)) if value is not None}
         told = {
-            "torchfilm": tf.__version__, "scene": objective.recipe[0] if objective.recipe else objective.make.__name__, **home,
-            "parameters": {**objective.fixed, **self.values}, **end, "seed": objective.seed, "dt": objective.dt, "target": objective.target.describe(),
-            "loss": self.loss, "losses": self.losses.tolist(), "colonies": self.search.study.colonies,
+            "torchfilm": tf.__version__, "scene": objective.recipe[0] if objective.recipe else home["function"], **home,
+            "parameters": {**objective.fixed, **self.values}, **end, "seed": objective.seed, "dt": objective.dt,
+            "dtype": str(objective.dtype)[6:], "target": objective.target.describe(), "loss": self.loss, "losses": self.losses.tolist(),
+            "colonies": self.search.study.colonies,
         }  # fmt: skip
-        path.write_text(json.dumps(told, indent=1, default=repr) + "\n")
+        path.write_text(json.dumps(told, indent=1, default=_plain) + "\n")
         return path
 
     def plot(self, path: str | Path) -> Path:
@@ -178,9 +184,30 @@ class Best:
         """The parameters, with their bounds and the first guess, and the losses."""
         return report.table(self)
 
+    def check(
+        self, *, seeds: int = 32, sizes: Sequence[float] = (0.5, 2.0), change: float = 0.2, samples: int = 0, threshold: float | None = None,
+        executor: Executor | None = None, pieces: int = 1, progress: bool = True,
+    ) -> Robustness:  # fmt: skip
+        """How it holds up on fresh seeds, at other sizes and with other parameters; see `robustness`."""
+        return robust.robustness(
+            self, seeds=seeds, sizes=sizes, change=change, samples=samples, threshold=threshold, executor=executor, pieces=pieces, progress=progress
+        )
+
     def colonies(self) -> list[Done]:
         """The replicates, grown again: the same colonies as were scored."""
         return self.search.objective.final(self.point)
+
+
+def _home(make: Callable[..., tf.Scene]) -> dict[str, Any]:
+    """Where a user's own scene function is found again: its file and its name there."""
+    made = inspect.unwrap(make)
+    code = getattr(made, "__code__", None)
+    return {"file": code and os.path.abspath(code.co_filename), "function": getattr(made, "__name__", "scene")}
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold of a value that it cannot."""
+    return value.tolist() if hasattr(value, "tolist") else repr(value)
 
 
 def _described(method: Method) -> str:

@@ -113,8 +113,11 @@ class Study:
                 self._write_tables(file)
                 for name in self.names:
                     column = [*kept[name], *(v[name] for v in last)]
-                    text = any(isinstance(v, (str, bytes)) for v in column)
-                    file.create_dataset(f"values/{name}", data=column, dtype=h5py.string_dtype() if text else None)
+                    if any(isinstance(v, (str, bytes)) for v in column):
+                        words = [v.decode() if isinstance(v, bytes) else str(v) for v in column]
+                        file.create_dataset(f"values/{name}", data=words, dtype=h5py.string_dtype())
+                    else:
+                        file[f"values/{name}"] = column
             os.replace(beside, self.path)
         except OSError as error:
             raise tf.SimulationError(
@@ -154,7 +157,7 @@ class Study:
         """A study from its file."""
         path = Path(path)
         if not path.is_file():
-            raise checks.refuse("study", str(path), "a study file", "No such file.")
+            raise checks.refuse("study", str(path), "a study file", "That is a folder." if path.is_dir() else "No such file.")
         try:
             with h5py.File(path, "r") as file:
                 if file.attrs.get("format") != FORMAT:
@@ -164,7 +167,9 @@ class Study:
                 about = json.loads(file.attrs["about"])
                 study = cls(about, tuple(about["names"]), tuple(file["streams"][...].tolist()), path)
                 study.entries = _entries(file)
-        except (OSError, KeyError) as error:
+        except tf.InputError:
+            raise
+        except (OSError, KeyError, ValueError, TypeError) as error:
             raise tf.InputError(f"{path} cannot be read: it is truncated or not a study file ({error}).") from error
         return study
 
@@ -178,6 +183,8 @@ def _entries(file: h5py.File) -> list[Entry]:
         losses, cells = designs["losses"][mine, :replicates], designs["cells"][mine, :replicates]
         out.append(Entry(designs["point"][mine], designs["loss"][mine], losses, cells, reasons, size, replicates, seconds))
         at += rows
+    if at != len(designs["point"]):
+        raise ValueError(f"its batches have {at} designs, and it lists {len(designs['point'])}")
     return out
 
 

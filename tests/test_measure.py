@@ -1,4 +1,4 @@
-"""What is measured on a state: overlaps with walls, wherever along a cell they are deepest."""
+"""What is measured on a state: overlaps with walls, wherever along a cell they are deepest, and neighbours."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import unit
+from helpers import crowd, near_pairs, unit
 
 import torchfilm as tf
 
@@ -69,3 +69,25 @@ def test_a_wall_for_each_colony_is_measured_in_its_own(device):
     ball = tf.Sphere([[0.5, -0.75], [0.5, -0.875], [0.5, -5.0]], 0.5, inside=False)
     assert tf.measure.overlaps(state, [ball]).walls.tolist() == [0.25, 0.125, 0.0]
     assert tf.measure.overlaps(state.select([2, 1]), [ball]).walls.tolist() == [0.0, 0.125]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("gap", [0.0, 0.5, 3.0])
+def test_neighbours_are_all_pairs_of_a_colony_within_the_gap(device, dtype, dim, gap):
+    """Against every pair whose centres are near enough, both from the state's own numbers; two colonies in one place see nothing of each other."""
+    scene = tf.Scene(tf.Growth(), founders=crowd(np.random.default_rng(7), 150, dim))
+    state = scene.seed(2, device=device, dtype=dtype)
+    i, j, distance = tf.measure.neighbours(state, gap)
+    found = {(min(p), max(p)) for p in zip(i.tolist(), j.tolist(), strict=True)}
+    assert len(found) == i.numel() and found == set(map(tuple, near_pairs(state, gap).tolist()))
+    place = state.position
+    assert distance.dtype == torch.float64 and torch.allclose(distance, (place[i] - place[j]).norm(dim=1), rtol=1e-14)
+    alone = tf.measure.neighbours(state.select([1]), gap)
+    second = state.colony[i] == 1
+    assert torch.equal(alone[0] + 150, i[second]) and torch.equal(alone[1] + 150, j[second]) and torch.equal(alone[2], distance[second])
+
+
+@pytest.mark.parametrize("gap", [-1.0, math.inf, "near"])
+def test_neighbours_within_no_such_gap_are_refused(gap):
+    with pytest.raises(tf.InputError, match="gap"):
+        tf.measure.neighbours(tf.Scene(tf.Growth()).seed(), gap)

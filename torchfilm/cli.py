@@ -58,7 +58,7 @@ class Run:
     device: str = "cpu"
     """cpu or cuda."""
     double: bool = False
-    """Compute in float64."""
+    """Compute in float64, as a design does that was searched so."""
     out: Path | None = None
     """Results file; by default SCENE.h5 here."""
     every: int = 10
@@ -80,7 +80,9 @@ class Run:
                 cells = 500
         seed = plan.get("seed", 0) if self.seed is None else self.seed
         start = None if self.start is None else read_cells(self.start)
-        state = scene.seed(self.colonies, seed=seed, cells=start, device=self.device, dtype=torch.float64 if self.double else torch.float32)
+        state = scene.seed(
+            self.colonies, seed=seed, cells=start, device=self.device, dtype=torch.float64 if self.double or plan.get("dtype") == "float64" else torch.float32
+        )
         if start is not None:
             report_empty(str(self.start), start, state)
             report_overlaps(start)
@@ -207,12 +209,12 @@ class Info:
     """Say what a scene simulates and who drives whom, or what a results file holds."""
 
     what: Annotated[str, tyro.conf.Positional]
-    """Scene name, Python file, or results file."""
+    """Scene name, Python file, saved design, or results file."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE."""
 
     def __call__(self) -> None:
-        if not self.what.endswith(".py") and Path(self.what).is_file():
+        if not self.what.endswith((".py", ".json")) and Path(self.what).is_file():
             return self._of_results()
         scene = load_scene(self.what, dict(map(parse_setting, self.set)))
         scene.unchecked(1)  # rules are tried on a first state, so that what they read and write is known

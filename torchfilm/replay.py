@@ -9,7 +9,6 @@ signals of any number of designs run on them.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -21,6 +20,8 @@ from torchfilm.scene import CPU, Scene, parameters
 from torchfilm.state import CELL, PER_CELL, Births, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import expand_ranges, offsets
+
+FIRST = -1  # the stage of what happens before all effects
 
 
 @dataclass(frozen=True)
@@ -98,16 +99,17 @@ class Course:
     """The growth and motion of some colonies of a scene, without what only follows: grown step by step as far as it is asked, and kept.
 
     scene: any design of it; streams: courses of random numbers, one colony each; seed, dt (h, by default the scene's), dtype and device as in
-    `scene.seed` and `simulate`. `Course.nbytes` tells what it holds. Raises InputError where growth depends on what would only follow.
+    `scene.seed` and `simulate`. cells: a colony that has as many is not grown on, and is empty from the next step; None: all go on.
+    `Course.nbytes` tells what it holds. Raises InputError where growth depends on what would only follow.
     """
 
     def __init__(
         self, scene: Scene, *, streams: Iterable[int], seed: int = 0, dt: float | None = None, dtype: torch.dtype = torch.float32,
-        device: str | torch.device = "cpu",
+        device: str | torch.device = "cpu", cells: int | None = None,
     ):  # fmt: skip
         self.scene = Course.scene_of(scene)
         self.dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
-        self.streams = tuple(streams)
+        self.streams, self.cells = tuple(streams), cells
         if len(set(self.streams)) != len(self.streams):
             raise checks.refuse("streams", self.streams, "different whole numbers")
         self.state = self.scene.seed(len(self.streams), seed=seed, streams=self.streams, dtype=dtype, device=device)
@@ -144,6 +146,11 @@ class Course:
     def _advance(self) -> None:
         state = self.state.replace(births=(), ended=(), reports={})
         noted: list[Change] = []
+        full = torch.zeros_like(state.counts, dtype=torch.bool) if self.cells is None else state.counts >= self.cells
+        if bool(full.any()):  # or the quick would fill the memory while the slow are waited for
+            kept = state.remove(full.index_select(0, state.colony), "left").replace(ended=())
+            noted.append(_change(FIRST, state, kept))
+            state = kept
         for effect in self.scene.effects:
             after = effect.step(state, self.dt)
             if after is not state:
@@ -152,7 +159,7 @@ class Course:
         for report in state.reports.values():
             for place in torch.nonzero(report.status).squeeze(1).tolist():
                 self.failed.setdefault(self.streams[place], (state.step, report.reason(place)))
-        self.steps.append(_merged(noted))
+        self.steps.append(noted)
         # counted as `Scene.step` counts
         self.state = state.replace(step=state.step + 1, time=(state.step + 1) * self.dt)
 
@@ -188,17 +195,6 @@ def _sources(before: State, after: State) -> Tensor:
     was_there = old.index_select(0, at) == mine
     place = torch.where(was_there, at, torch.searchsorted(old, parents).clamp(max=max(0, old.numel() - 1)))
     return order.index_select(0, place)
-
-
-def _merged(changes: list[Change]) -> list[Change]:
-    """Changes of values right after one another as one; one that follows a change of cells stays apart, since daughters start from the state between."""
-    out: list[Change] = []
-    for change in changes:
-        if out and change.source is None and out[-1].source is None:
-            out[-1] = dataclasses.replace(out[-1], values={**out[-1].values, **change.values})
-        else:
-            out.append(change)
-    return out
 
 
 class Replay:

@@ -233,7 +233,7 @@ def _same(a: object, b: object) -> bool:
 
 def _short(value: object) -> str:
     if isinstance(value, Tensor):
-        return f"{float(value):g}" if value.dim() == 0 else f"<{value.numel()} values, {float(value.min()):g} to {float(value.max()):g}>"
+        return f"{float(value):.9g}" if value.dim() == 0 else f"<{value.numel()} values, {float(value.min()):g} to {float(value.max()):g}>"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         inner = [f"{f.name}={_short(getattr(value, f.name))}" for f in dataclasses.fields(value) if not _same(getattr(value, f.name), f.default)]
         return f"{type(value).__name__}({', '.join(inner)})"

@@ -22,6 +22,8 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
     if path.suffix == ".json":
         plan = design(what)
         home = str(plan.get("file") or plan["scene"])
+        if Path(home).suffix == ".json":
+            raise checks.refuse(f"scene in {what}", home, "the name of a ready scene, or the path of a Python file")
         made = load_scene(home, {**plan["parameters"], **parameters}, str(plan.get("function") or "scene"))
         made.dt = checks.number(f"dt in {what}", plan.get("dt", made.dt), above=0.0)
         return made
@@ -68,6 +70,10 @@ def design(what: str) -> dict[str, Any]:
         raise InputError(f"{what} cannot be read as JSON: {error}.") from error
     if not isinstance(told, dict) or not isinstance(told.get("parameters"), dict) or not isinstance(told.get("scene"), str):
         raise InputError(f"{what} is no saved design: it must have a `scene` and its `parameters`, as Best.save writes them.")
+    for name, kind, allowed in (("cells", int, "a whole number"), ("seed", int, "a whole number"), ("until", (int, float), "a number")):
+        value = told.get(name)
+        if value is not None and (isinstance(value, bool) or not isinstance(value, kind)):
+            raise checks.refuse(f"{name} in {what}", value, allowed, "Leave it out for the usual one.")
     return told
 
 

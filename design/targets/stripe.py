@@ -27,10 +27,12 @@ FEWEST = 3  # cells, for a mean over a strip to count
 class Stripe(Mask):
     """A stripe across the colony: the species is wanted within `width` µm, and dark beyond.
 
-    at: "border", the border between the two populations (cell types) of the colony, the place along the axis with the fewest cells on the wrong side of it;
-    or a number, µm. along: "x" or "y", the axis that the stripe lies across. cell_type: only cells of this type count. place: of the stripe's middle from
-    `at`, µm along the axis. By default 0; with "border" and a cell_type, the stripe adjoins the border on the side of that type. floor: level from which a
-    cell counts as lit. soft: µm, how soft the edges are. A colony that has lost one of its two types has no border, and loss 1.
+    at: "border", the border between the two populations (cell types) of the colony, or a number, µm. straight: False, the stripe follows the border
+    wherever it winds: a cell's distance from it is that to the nearest cell of the other type, from centre to centre, less a cell's diameter; True, the
+    border is one straight line, at the place along the axis with the fewest cells on the wrong side. along: "x" or "y", the axis that the stripe lies across.
+    cell_type: only cells of this type count. place: of the stripe's middle from `at`, µm towards the type that lies higher on the axis. By default 0;
+    with "border" and a cell_type, the stripe adjoins the border on the side of that type. floor: level from which a cell counts as lit. soft: µm, how soft
+    the edges are. A colony that has lost one of its two types has no border, and loss 1.
     """
 
     species: str
@@ -42,6 +44,7 @@ class Stripe(Mask):
     cell_type: int | None = None
     floor: float = 0.0
     soft: float = 1.0
+    straight: bool = False
 
     def __post_init__(self) -> None:
         species_name("Stripe.species", self.species)
@@ -55,6 +58,7 @@ class Stripe(Mask):
         checks.choice("Stripe.along", self.along, ("x", "y"))
         if self.cell_type is not None and (isinstance(self.cell_type, bool) or not isinstance(self.cell_type, int) or self.cell_type < 0):
             raise checks.refuse("Stripe.cell_type", self.cell_type, "a whole number from 0, or None for all cells")
+        checks.choice("Stripe.straight", self.straight, (True, False))
         common("Stripe", self.floor, self.soft)
 
     @property
@@ -78,57 +82,77 @@ class Stripe(Mask):
     def counted(self, state: tf.State) -> Tensor:
         return super().counted(state) if self.cell_type is None else state.cell_type == self.cell_type
 
+    @property
+    def winds(self) -> bool:
+        """Whether the stripe follows the border."""
+        return self.at == "border" and not self.straight
+
     def reference(self, state: tf.State) -> tuple[Tensor, Tensor]:
-        """Where `at` is and where the middle of the stripe is, (B,) float64 µm each; NaN where a colony has no border."""
+        """The place of `at` along the axis, (B,) float64 µm, and of the stripe's middle from there; NaN where a colony has no border."""
         place = 0.0 if self.place is None else self.place
         if not isinstance(self.at, str):
             at = torch.full((state.colonies,), float(self.at), dtype=torch.float64, device=state.device)
-            return at, at + place
+            return at, torch.full_like(at, place)
         at, low_type = border(state, self.along)
         if self.place is None and self.cell_type is not None:
-            return at, at + torch.where(low_type == self.cell_type, -0.5 * self.width, 0.5 * self.width)
-        return at, at + place
+            return at, torch.where(low_type == self.cell_type, -0.5 * self.width, 0.5 * self.width)
+        return at, torch.full_like(at, place)
+
+    def distance(self, state: tf.State) -> Tensor:
+        """Of each cell from `at`, (N,) float64 µm, above 0 towards where the axis points; NaN where a colony has no border."""
+        at, _ = self.reference(state)
+        return _from_border(state, self.along) if self.winds else _axis(state, self.along) - at.index_select(0, state.colony)
 
     def wanted(self, state: tf.State) -> Tensor:
         _, middle = self.reference(state)
-        x = _axis(state, self.along) - middle.index_select(0, state.colony)
-        return torch.nan_to_num(between(x, -0.5 * self.width, 0.5 * self.width, self.soft)).unsqueeze(1)
+        x = self.distance(state) - middle.index_select(0, state.colony)
+        low, high = -0.5 * self.width, 0.5 * self.width
+        if self.winds and self.place is None and self.cell_type is not None:
+            # towards the border there is nothing but the border
+            low, x = -math.inf, torch.where(middle.index_select(0, state.colony) < 0, -x, x)
+        return torch.nan_to_num(between(x, low, high, self.soft)).unsqueeze(1)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """Of the cells that count, each (B,):
 
-        place_um: mean distance from `at`, along the axis, of what is brighter than the cells farther than 2·width from the wanted middle; width_um: full
+        place_um: mean distance from `at` of what is brighter than the cells farther than 2·width from the wanted middle; width_um: full
         width at half maximum of the profile in strips of 2 µm; peak: the greatest mean of a strip; contrast: mean level inside the wanted stripe over that of
         the cells farther than 2·width; straightness_um: how far, root mean square over strips of 4 µm across, the middle of the cells at least half as bright
         as the peak is from a straight line.
         """
-        y, (at, middle) = seen(state, self.names)[0][:, 0], self.reference(state)
-        x = _axis(state, self.along) - at.index_select(0, state.colony)
+        y, (_, middle) = seen(state, self.names)[0][:, 0], self.reference(state)
+        x = self.distance(state)
         # without a border there is no place: such colonies' cells are left out, and their measures are NaN
         w = torch.where(self.counted(state) & torch.isfinite(x), weights(state), 0.0)
         x = torch.nan_to_num(x)
-        away = (x - torch.nan_to_num(middle - at).index_select(0, state.colony)).abs()
+        away = (x - middle.index_select(0, state.colony)).abs()
         inside, far = w * (away <= 0.5 * self.width), w * (away > 2 * self.width)
         bright, dark = (ratio(total(state, part * y), total(state, part), math.nan) for part in (inside, far))
         light = w * (y - torch.nan_to_num(dark).index_select(0, state.colony)).clamp(min=0.0)
         found = {"place_um": ratio(total(state, light * x), total(state, light), math.nan)}
         kept = (w > 0).cpu().numpy()
-        owner, along, level, weight = (v.cpu().numpy()[kept] for v in (state.colony, x, y, w))
-        across = _axis(state, "y" if self.along == "x" else "x").cpu().numpy()[kept]
-        peak, width = profile(owner, along, level, weight, state.colonies)
+        columns = (state.colony, x, _axis(state, self.along), _axis(state, "y" if self.along == "x" else "x"), y, w)
+        owner, away_from, along, across, level, weight = (v.cpu().numpy()[kept] for v in columns)
+        peak, width = profile(owner, away_from, level, weight, state.colonies)
         straight = straightness(owner, along, across, level, weight, peak)
         found |= {name: torch.as_tensor(v, device=state.device) for name, v in (("width_um", width), ("peak", peak), ("straightness_um", straight))}
         return found | {"contrast": ratio(bright, dark, math.nan)}
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
+        """The edges of the stripe and the border as lines or, where it winds, a dot on each cell that is wanted lit."""
+        if self.winds:
+            mine = (state.colony == place) & self.counted(state) & (self.wanted(state)[:, 0] > 0.5)
+            x, y = state.position[mine, :2].cpu().numpy().T
+            ax.plot(x, y, ".", color=COLOURS[0], ms=3)
+            return
         at, middle = (float(v[place]) for v in self.reference(state))
-        lines(ax, self.along, (0.0, 0.0), (middle - 0.5 * self.width, middle + 0.5 * self.width), COLOURS[0])
+        lines(ax, self.along, (0.0, 0.0), (at + middle - 0.5 * self.width, at + middle + 0.5 * self.width), COLOURS[0])
         if self.at == "border":
             lines(ax, self.along, (0.0, 0.0), (at,), "black", ":")
 
     def describe(self) -> str:
-        at = "the border" if self.at == "border" else f"{self.along} = {self.at:g} µm"
+        at = f"the {'straight ' if self.straight else ''}border" if self.at == "border" else f"{self.along} = {self.at:g} µm"
         place = "" if self.place is None else f", {self.place:+g} µm from it"
         whose = "" if self.cell_type is None else f", cells of type {self.cell_type}"
         return f"{self.species} in a stripe {self.width:g} µm wide at {at}{place}{whose}"
@@ -137,6 +161,27 @@ class Stripe(Mask):
 def _axis(state: tf.State, along: str) -> Tensor:
     """The cells' places along x or y, (N,) float64 µm, without gradient."""
     return state.position.detach()[:, "xy".index(along)].double()
+
+
+@torch.no_grad()
+def _from_border(state: tf.State, along: str) -> Tensor:
+    """How far each cell is from the nearest cell of the other type, centre to centre less a diameter, (N,) float64 µm, below 0 for the type that lies lower
+    on the axis; NaN where there is no other type."""
+    _, low_type = border(state, along)
+    position, kind = state.position.detach(), state.cell_type
+    found = torch.full((state.cells,), math.nan, dtype=torch.float64, device=state.device)
+    start = 0
+    for count in state.counts.tolist():
+        mine = torch.arange(start, start + count, device=state.device)
+        start += count
+        of_one = kind[mine] == kind[mine].min() if count else mine.bool()
+        one, other = mine[of_one], mine[~of_one]
+        if not other.numel():
+            continue
+        apart = torch.cdist(position[one], position[other], compute_mode="donot_use_mm_for_euclid_dist")
+        found[one], found[other] = apart.amin(1), apart.amin(0)
+    found = found - 2.0 * state.radius.detach().double()
+    return torch.where(kind == low_type.index_select(0, state.colony), -found, found)
 
 
 @torch.no_grad()

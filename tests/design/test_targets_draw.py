@@ -36,8 +36,8 @@ def at(ax, axis: int) -> list[float]:
 @pytest.mark.parametrize(
     "target, axis, places",
     [
-        (Stripe("yfp", width=4.0), 0, [3, 5, 7]),
-        (Stripe("yfp", width=4.0, cell_type=1), 0, [5, 5, 9]),
+        (Stripe("yfp", straight=True, width=4.0), 0, [3, 5, 7]),
+        (Stripe("yfp", straight=True, width=4.0, cell_type=1), 0, [5, 5, 9]),
         (Stripe("yfp", at=-1.0, width=4.0, along="y"), 1, [-3, 1]),
         (Bands(("yfp", "cfp"), (-2, 0, 30)), 0, [-2, 0, 0, 30]),
         (Bands(("yfp",), (-math.inf, 2.0), along="y", centre="colony"), 1, [3]),

@@ -79,11 +79,11 @@ def test_a_stripe_of_one_type_adjoins_the_border_on_its_side(turned, low):
     state = field(shift=5.0, turned=turned, low=low)
     along = "y" if turned else "x"
     x = state.position[:, int(turned)] - 5.0
-    far = Stripe("yfp", width=6.0, along=along, cell_type=1 - low, soft=SHARP)
+    far = Stripe("yfp", straight=True, width=6.0, along=along, cell_type=1 - low, soft=SHARP)
     assert torch.equal(far.wanted(state)[:, 0], ((x > 0) & (x < 6)).double())
     # 6 columns at 8 and 14 at 1/8: 1 − (6·8)²/(6 · (6·64 + 14/64))
     assert float(far.loss(state)) == pytest.approx(1 - 48**2 / (6 * (6 * 64 + 14 / 64)), rel=1e-9)
-    near = Stripe("yfp", width=6.0, along=along, cell_type=low, soft=SHARP)
+    near = Stripe("yfp", straight=True, width=6.0, along=along, cell_type=low, soft=SHARP)
     assert torch.equal(near.wanted(state)[:, 0], ((x > -6) & (x < 0)).double())
     assert float(near.loss(state)) == pytest.approx(1 - 6 / 20, rel=1e-9)  # all 20 columns evenly lit
 
@@ -102,7 +102,7 @@ def test_a_stripe_of_one_type_adjoins_the_border_on_its_side(turned, low):
 def test_where_the_stripe_is(options, low, high):
     state = field(shift=5.0)
     x = state.position[:, 0] - 5.0
-    assert torch.equal(Stripe("yfp", width=6.0, soft=SHARP, **options).wanted(state)[:, 0], ((x > low) & (x < high)).double())
+    assert torch.equal(Stripe("yfp", straight=True, width=6.0, soft=SHARP, **options).wanted(state)[:, 0], ((x > low) & (x < high)).double())
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["x", "y"])
@@ -112,7 +112,7 @@ def test_measures_of_a_stripe_laid_out_by_hand(turned, mirror):
     state = field(shift=5.0, turned=turned)
     if mirror:
         state = state.replace(position=-state.position)
-    found = Stripe("yfp", width=6.0, cell_type=1, along="y" if turned else "x").measures(state)
+    found = Stripe("yfp", straight=True, width=6.0, cell_type=1, along="y" if turned else "x").measures(state)
     assert list(found) == ["place_um", "width_um", "peak", "straightness_um", "contrast"]
     assert float(found["place_um"]) == pytest.approx(-3 if mirror else 3, abs=1e-12)
     assert (float(found["width_um"]), float(found["peak"]), float(found["contrast"])) == (6.0, 8.0, 64.0)
@@ -125,7 +125,7 @@ def test_straightness_of_a_bent_stripe():
     strips 4 µm high, in which the cosine is averaged (by 0.90), leave 0.3 µm."""
     bend = 4.0
     state = field(bend=bend, edge=6.0)
-    found = Stripe("yfp", width=6.0, cell_type=1).measures(state)
+    found = Stripe("yfp", straight=True, width=6.0, cell_type=1).measures(state)
     assert float(found["straightness_um"]) == pytest.approx(0.9 * bend / math.sqrt(2), abs=0.3)
 
 
@@ -135,7 +135,7 @@ def test_a_slanted_stripe_is_straight(slope):
     x, y = state.position.unbind(1)
     state = state.with_fields(yfp=((x - 20 - slope * y).abs() < 2).double() + 0.01)
     # columns 1 µm apart: the middle of a slanted stripe is right to half of that
-    assert float(Stripe("yfp", width=4.0, cell_type=1).measures(state)["straightness_um"]) < 0.5
+    assert float(Stripe("yfp", straight=True, width=4.0, cell_type=1).measures(state)["straightness_um"]) < 0.5
 
 
 def test_width_is_that_of_the_run_about_the_peak():
@@ -150,7 +150,7 @@ def test_width_is_that_of_the_run_about_the_peak():
 
 def test_a_dark_colony_has_no_width():
     state = field().with_fields(yfp=torch.zeros(640, dtype=torch.float64))
-    found = Stripe("yfp", width=6.0, cell_type=1).measures(state)
+    found = Stripe("yfp", straight=True, width=6.0, cell_type=1).measures(state)
     assert all(math.isnan(found[name]) for name in ("place_um", "width_um", "peak", "straightness_um", "contrast"))
 
 
@@ -165,7 +165,7 @@ def test_measures_of_each_colony_are_its_own():
         yfp=torch.cat([p.yfp for p in parts]).numpy(),
         colonies=3,
     )
-    found = Stripe("yfp", width=4.0, cell_type=1).measures(state)
+    found = Stripe("yfp", straight=True, width=4.0, cell_type=1).measures(state)
     assert found["place_um"].tolist() == pytest.approx([3.0, 7.0, 11.0], abs=0.5)
     assert found["width_um"].tolist() == [6.0, 6.0, 6.0] and STRIP == 2.0
 
@@ -215,3 +215,35 @@ def test_what_is_not_allowed_is_refused_when_made(options, what):
 def test_describe_says_where():
     assert Stripe("yfp", width=8.0, cell_type=1).describe() == "yfp in a stripe 8 µm wide at the border, cells of type 1"
     assert Stripe("yfp", at=3.0, width=8.0, place=-2.0).describe() == "yfp in a stripe 8 µm wide at x = 3 µm, -2 µm from it"
+
+
+def winding():
+    """Two types along a staircase: cells 2 µm apart on a grid, the border at x = 0 below y = 0 and at x = 6 above."""
+    places = [(x, y) for y in (-6, -4, -2, 0, 2, 4) for x in range(-9, 16, 2)]
+    kinds = [int(x > (6 if y >= 0 else 0)) for x, y in places]
+    return placed(places, cell_type=kinds, yfp=1.0), torch.tensor(places), torch.tensor(kinds)
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_a_stripe_follows_a_border_that_winds(kind):
+    """Wanted are the cells whose nearest cell of the other type is nearer than the width and a diameter, centre to centre."""
+    state, places, kinds = winding()
+    apart = (places.unsqueeze(1) - places).double().square().sum(2).sqrt()
+    nearest = torch.where(kinds.unsqueeze(1) != kinds, apart, torch.inf).amin(1) - 1.0
+    target = Stripe("yfp", width=4.0, cell_type=kind, soft=SHARP)
+    mine = kinds == kind
+    assert torch.equal(target.wanted(state)[mine, 0], (nearest < 4.0).double()[mine])
+    assert float(target.loss(state)) == pytest.approx(1 - float((nearest < 4.0)[mine].double().mean()), rel=1e-9)
+    both = Stripe("yfp", width=4.0, soft=SHARP)
+    assert torch.equal(both.wanted(state)[:, 0], (nearest < 2.0).double())
+    straight = Stripe("yfp", width=4.0, cell_type=kind, soft=SHARP, straight=True)
+    assert not torch.equal(straight.wanted(state)[mine], target.wanted(state)[mine])
+
+
+def test_a_stripe_that_winds_is_the_same_in_any_batch():
+    state, _, _ = winding()
+    target = Stripe("yfp", width=4.0, cell_type=1)
+    places, kinds = [*state.position.tolist(), (0, 0), (2, 0)], [*state.cell_type.tolist(), 0, 1]
+    two = placed(places, cell_type=kinds, colony=[0] * state.cells + [1, 1], colonies=2, yfp=1.0)
+    assert torch.equal(target.loss(two)[:1], target.loss(state))
+    assert float(target.loss(two)[1]) == pytest.approx(0.0, abs=1e-3)

@@ -1,0 +1,220 @@
+"""Other processes and machines: the same bits wherever a piece is grown, and nothing is lost with a worker."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from searching import Level, lit, spots
+
+import torchfilm as tf
+from design import Objective, Parameter, Target
+
+MAKE = Parameter("make", 0.1, 10, log=True)
+SPAWN = multiprocessing.get_context("spawn")  # a fork of a process that has run torch may hang
+
+
+def objective(scene=lit, target: Target | None = None, **options) -> Objective:
+    return Objective(scene, [MAKE, Parameter("decay", 0.5, 2)], target or Level(wanted=1.0), cells=12, replicates=2, **options)
+
+
+POINTS = spots(6, 2)
+
+
+@pytest.fixture(scope="module")
+def here():
+    """The losses when nobody helps."""
+    return objective().evaluate(POINTS).losses
+
+
+@dataclass(frozen=True)
+class Deadly(Level):
+    """Kills the process that looks at it in mid-growth, unless that is the one at home or a flag says that it has been done."""
+
+    flag: str = ""
+    home: int = 0
+
+    def note(self, state):
+        if state.time > 0.45 and os.getpid() != self.home and not Path(self.flag).exists():
+            Path(self.flag).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def deadly(folder) -> Objective:
+    return objective(target=Deadly(wanted=1.0, flag=str(folder / "done"), home=os.getpid()))
+
+
+class OwnError(Exception):
+    """Takes two arguments, so that it cannot be unpickled by the one that it keeps."""
+
+    def __init__(self, what, where):
+        super().__init__(f"{what} at {where}")
+
+
+@dataclass(frozen=True)
+class Raising(Level):
+    """An error of the user's own code, in any process but that at home."""
+
+    kind: str = ""
+    home: int = 0
+
+    def loss(self, state, history=None):
+        if os.getpid() != self.home:
+            raise {"value": ValueError("no such level"), "os": FileNotFoundError("no such table"), "own": OwnError("lost", "sea")}[self.kind]
+        return super().loss(state, history)
+
+
+@pytest.fixture(scope="module")
+def processes():
+    with ProcessPoolExecutor(2, mp_context=SPAWN, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        yield pool
+
+
+@pytest.fixture(scope="module")
+def dask():
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster, cluster.get_client() as client:
+        yield client.get_executor()
+
+
+class Careless(Executor):
+    """Loses the first pieces that it is given, as if their workers had died, and does the others."""
+
+    def __init__(self, losses: int, error: Exception):
+        self.losses, self.error, self.given = losses, error, 0
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.given += 1
+        future: Future = Future()
+        if self.given <= self.losses:
+            future.set_exception(self.error)
+        else:
+            future.set_result(fn(*args, **kwargs))
+        return future
+
+
+GONE = [BrokenExecutor("a child ended"), CancelledError(), TimeoutError("no answer"), ConnectionResetError("no line"), RuntimeError("4 workers died")]
+
+
+@pytest.mark.parametrize("error", GONE, ids=lambda e: type(e).__name__)
+def test_a_piece_that_is_lost_once_is_given_again(here, error):
+    careless = Careless(4, error)
+    assert np.array_equal(objective().evaluate(POINTS, executor=careless, pieces=3 + 1).losses, here)
+    assert careless.given == 4 + 4
+
+
+@pytest.mark.parametrize("error", GONE, ids=lambda e: type(e).__name__)
+def test_a_piece_that_is_lost_again_is_grown_here_and_said_so(here, error):
+    careless = Careless(1000, error)
+    with pytest.warns(RuntimeWarning, match=f"lost 3 of 3 pieces, which were grown in this process .{type(error).__name__}"):
+        found = objective().evaluate(POINTS, executor=careless, pieces=3)
+    assert np.array_equal(found.losses, here)
+    assert careless.given == 3 * 2
+
+
+def test_an_executor_that_takes_nothing_any_more_loses_everything(here):
+    pool = ThreadPoolExecutor(1)
+    pool.shutdown()
+    with pytest.warns(RuntimeWarning, match="lost 2 of 2 pieces"):
+        assert np.array_equal(objective().evaluate(POINTS, executor=pool, pieces=2).losses, here)
+
+
+def test_every_row_is_answered_once(here):
+    """Pieces that are lost, and come back later than others, still have rows of their own."""
+    wanted = objective()
+    answered: list[int] = []
+    pieces = wanted._pieces([wanted.space.values(p) for p in POINTS], 2, 1.0, 4)
+    for piece, _ in wanted._outcomes(pieces, (0, 1), 1.0, Careless(2, CancelledError())):
+        answered += piece.rows
+    assert sorted(answered) == list(range(6))
+
+
+@pytest.mark.parametrize("pieces", [1, 3, 6, 20])
+def test_threads_find_the_same(here, pieces):
+    with ThreadPoolExecutor(3) as pool:
+        assert np.array_equal(objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here)
+
+
+def test_an_error_of_the_task_ends_the_rest():
+    """It is not taken for a loss, and pieces that have not begun are not grown for nothing."""
+    begun = threading.Event()
+
+    class Waiting(ThreadPoolExecutor):
+        def submit(self, fn, /, *args, **kwargs):
+            futures.append(super().submit(lambda: begun.wait(20) and fn(*args, **kwargs)))
+            if len(futures) == 6:
+                begun.set()
+            return futures[-1]
+
+    futures: list[Future] = []
+    with Waiting(1) as pool, pytest.raises(FileNotFoundError, match="no such table"):
+        objective(target=Raising(wanted=1.0, kind="os")).evaluate(POINTS, executor=pool, pieces=6)
+    assert len(futures) == 6
+    assert any(f.cancelled() for f in futures)
+
+
+@pytest.mark.parametrize("scene, fixed", [("boundary_detector", {"width": 16.0}), (tf.scenes.toggle_switch, {"power": 2.0}), (lit, {})])
+def test_an_objective_is_the_same_from_a_pickle(scene, fixed):
+    name = {"boundary_detector": "k3", lit: "make"}.get(scene, "strength")
+    target = Level({"boundary_detector": "yfp", lit: "gfp"}.get(scene, "red"), 1.0)
+    one = Objective(scene, [Parameter(name, 0.5, 5)], target, until=0.5, replicates=1, fixed=fixed)
+    two = pickle.loads(pickle.dumps(one))
+    assert one.describe() == two.describe()
+    assert np.array_equal(one.evaluate(POINTS[:2, :1]).losses, two.evaluate(POINTS[:2, :1]).losses)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["processes", "dask"])
+class TestElsewhere:
+    def test_the_bits_are_the_same(self, where, request, here):
+        pool = request.getfixturevalue(where)
+        for pieces in (2, 5):
+            assert np.array_equal(objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here)
+
+    @pytest.mark.parametrize("kind, error, words", [("os", FileNotFoundError, "no such table"), ("own", RuntimeError, "OwnError: lost at sea")])
+    def test_an_error_of_the_task_comes_through(self, where, request, kind, error, words):
+        pool = request.getfixturevalue(where)
+        with pytest.raises(error, match=words) as raised:
+            objective(target=Raising(wanted=1.0, kind=kind, home=os.getpid())).evaluate(POINTS, executor=pool, pieces=2)
+        # where it was raised, though that is on another machine
+        assert "in loss" in "".join([str(raised.value), *getattr(raised.value, "__notes__", ())])
+
+
+@pytest.mark.slow
+def test_a_scene_that_cannot_be_carried_is_refused(processes):
+    def mine(make=1.0, decay=1.0):
+        return lit(make, decay)
+
+    with pytest.raises(tf.InputError, match=r"mine.* top level of a module"):
+        objective(mine).evaluate(POINTS, executor=processes, pieces=2)
+
+
+@pytest.mark.slow
+def test_dask_carries_functions_by_themselves(dask, here):
+    assert np.array_equal(objective(lambda make=1.0, decay=1.0: lit(make, decay)).evaluate(POINTS, executor=dask, pieces=2).losses, here)
+
+
+@pytest.mark.slow
+def test_a_killed_process_takes_the_pool_along_and_nothing_is_lost(here, tmp_path):
+    """A broken pool of the standard library takes nothing any more: what is left is grown here."""
+    with ProcessPoolExecutor(1, mp_context=SPAWN) as pool, pytest.warns(RuntimeWarning, match="BrokenProcessPool"):
+        found = deadly(tmp_path).evaluate(POINTS, executor=pool, pieces=3)
+    assert (tmp_path / "done").exists()
+    assert np.array_equal(found.losses, here)
+
+
+@pytest.mark.slow
+def test_dask_grows_elsewhere_what_a_killed_worker_had(dask, here, tmp_path):
+    found = deadly(tmp_path).evaluate(POINTS, executor=dask, pieces=4)
+    assert (tmp_path / "done").exists()
+    assert np.array_equal(found.losses, here)

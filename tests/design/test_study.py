@@ -1,0 +1,291 @@
+"""A study keeps every evaluation, in a file of plain data, from which a search goes on as if it had never stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from searching import Level, Spread, fragile, grown, lit, paced
+
+import torchfilm as tf
+from design import CMAES, Batch, Choice, Parameter, Racing, Search, Sobol, Study
+from design.study import Entry
+
+LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
+
+
+def search(method=None, scene=lit, parameters=LIT, target=None, **options):
+    target = target or Level(wanted=1.0)
+    return Search(scene, parameters, target, method=method or Sobol(batch=3), **{"cells": 3, "replicates": 2, **options})
+
+
+METHODS = {
+    "sobol": lambda: Sobol(batch=3),
+    "cmaes": lambda: CMAES(population=4),
+    "racing": lambda: Racing(inner=CMAES(population=4), sizes=(0.5, 1.0), keep=0.5),
+    "a user's own": lambda: Halving(),
+}
+
+
+class Halving:
+    """A method of a user's own: three points about the best so far, ever nearer."""
+
+    def start(self, space, seed, replicates):
+        self.best, self.loss, self.width, self.size = np.full(space.size, 0.5), np.inf, 0.5, space.size
+
+    def ask(self):
+        step = self.width * np.ones(self.size)
+        return Batch(np.clip([self.best - step, self.best, self.best + step], 0, 1))
+
+    def tell(self, batch, loss):
+        if loss.min() < self.loss:
+            self.best, self.loss = batch.points[loss.argmin()], loss.min()
+        self.width *= 0.5
+
+
+def entries_alike(one, other):
+    assert len(one.entries) == len(other.entries)
+    for a, b in zip(one.entries, other.entries, strict=True):
+        for f in dataclasses.fields(Entry):
+            if f.name != "seconds":
+                assert np.array_equal(getattr(a, f.name), getattr(b, f.name)), f.name
+
+
+# --- the file -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["sobol", "racing"])
+def test_a_file_gives_back_what_was_written(tmp_path, method):
+    made = search(METHODS[method]())
+    made.run(12, study=tmp_path / "s.h5", progress=False)
+    again = Study.read(tmp_path / "s.h5")
+    assert (again.about, again.names, again.streams) == (made.study.about, made.study.names, made.study.streams)
+    entries_alike(again, made.study)
+    assert [e.seconds for e in again.entries] == [e.seconds for e in made.study.entries]
+    assert again.colonies == made.study.colonies
+    for a, b in zip(again.convergence(), made.study.convergence(), strict=True):
+        assert np.array_equal(a, b, equal_nan=True)
+    point, loss, losses = again.best()
+    assert np.array_equal(point, made.best().point) and loss == made.best().loss and np.array_equal(losses, made.best().losses)
+
+
+def test_reasons_are_kept(tmp_path):
+    made = search(Sobol(batch=4), fragile, [Parameter("make", 1, 10)])
+    made.run(8, study=tmp_path / "s.h5", progress=False)
+    reasons = made.study.entries[0].reasons
+    assert reasons and all("not finite" in w or "gfp" in w for w in reasons.values())
+    assert Study.read(tmp_path / "s.h5").entries[0].reasons == reasons
+
+
+def test_the_file_holds_numbers_and_text_only(tmp_path):
+    search(METHODS["racing"]()).run(12, study=tmp_path / "s.h5", progress=False)
+    kinds = {}
+    with h5py.File(tmp_path / "s.h5") as file:
+        file.visititems(lambda name, d: kinds.update({name: d.dtype}) if isinstance(d, h5py.Dataset) else None)
+        attributes = {n: file.attrs[n] for n in file.attrs}
+    assert {"designs/point", "designs/losses", "values/make", "batches/size", "streams"} <= set(kinds)
+    assert all(d.kind in "iuf" or h5py.check_string_dtype(d) is not None for d in kinds.values())
+    assert all(isinstance(v, (str, int, np.integer)) for v in attributes.values())
+    assert json.loads(attributes["about"])["names"] == ["make", "decay"]
+
+
+@pytest.mark.parametrize("options", [("weak", "strong"), (1, "x"), (1, 2.5), (True, False)])
+def test_values_of_all_kinds_are_written(tmp_path, options):
+    """A user who opens the file finds the parameters themselves, over several batches."""
+    chosen = Choice("kind", options)
+    made = search(Sobol(batch=2), of_a_kind, [chosen, Parameter("rate", 1, 2)], Spread(), replicates=1)
+    made.run(6, study=tmp_path / "s.h5", progress=False)
+    points = np.concatenate([e.points for e in made.study.entries])
+    with h5py.File(tmp_path / "s.h5") as file:
+        found, rates = file["values/kind"][...].tolist(), file["values/rate"][...].tolist()
+    wanted = [chosen.value(u) for u in points[:, 0]]
+    assert len(found) == 6 and set(wanted) == set(options)
+    text = any(isinstance(o, str) for o in options)
+    assert [v.decode() if text else v for v in found] == [str(v) if text else v for v in wanted]
+    assert rates == (1 + points[:, 1]).tolist()
+
+
+def of_a_kind(kind="weak", rate=1.0):
+    return tf.Scene(tf.Growth(rate=rate), tf.Division(length=4.0), dt=0.1)
+
+
+# --- going on -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """Searches that nothing interrupted, by method."""
+    found = {name: search(make()) for name, make in METHODS.items()}
+    for one in found.values():
+        one.run(30, progress=False)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stops", [(1,), (9,), (5, 13, 21)], ids=str)
+@pytest.mark.parametrize("method", METHODS)
+def test_stopped_and_gone_on_it_is_the_search_that_was_never_stopped(tmp_path, whole, method, stops):
+    path = tmp_path / "s.h5"
+    for colonies in stops:
+        try:
+            search(METHODS[method]()).run(colonies, study=path, progress=False)
+        except tf.InputError as error:  # a race has no full colony yet
+            assert method == "racing" and "full size" in str(error)
+    last = search(METHODS[method]())
+    best = last.run(30, study=path, progress=False)
+    entries_alike(last.study, whole[method].study)
+    assert best.values == whole[method].best().values and best.loss == whole[method].best().loss
+    assert np.array_equal(last.method.ask().points, whole[method].method.ask().points)
+
+
+@pytest.mark.parametrize("when", ["before the file takes its place", "between batches"])
+def test_a_kill_costs_at_most_one_batch(tmp_path, monkeypatch, whole, when):
+    """The file as a kill leaves it: the batch in work is lost, a half-written file may lie beside."""
+    path, made = tmp_path / "s.h5", search()
+    made.run(12, study=path, progress=False)
+    (tmp_path / "s.h5.new").write_bytes(path.read_bytes()[:500])
+    if when == "before the file takes its place":
+        before = path.read_bytes()
+        monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            search().run(30, study=path, progress=False)
+        monkeypatch.undo()
+        assert path.read_bytes() == before
+    last = search()
+    last.run(30, study=path, progress=False)
+    entries_alike(last.study, whole["sobol"].study)
+    assert not (tmp_path / "s.h5.new").exists()
+
+
+def test_what_a_study_holds_counts(tmp_path, monkeypatch):
+    path = tmp_path / "s.h5"
+    search().run(12, study=path, progress=False)
+    monkeypatch.setattr("design.objective.Objective.evaluate", lambda *_, **__: pytest.fail("nothing is left to do"))
+    made = search()
+    assert made.run(12, study=path, progress=False).loss == Study.read(path).best()[1]
+    assert made.run(10**6, study=path, stop_at=1e9, progress=False).loss <= 1e9
+    assert search("sobol", paced, [Parameter("rate", 1, 2)]).regrown.startswith("Growth.rate differs") and made.regrown == ""
+
+
+def test_a_full_disk_is_said_and_costs_nothing(tmp_path, monkeypatch):
+    path, made = tmp_path / "s.h5", search()
+    made.run(6, study=path, progress=False)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(tf.SimulationError, match=r"could not write .*s.h5: .*No space left.*go on"):
+        search().run(12, study=path, progress=False)
+    monkeypatch.undo()
+    assert len(Study.read(path).entries) == 1
+
+
+# --- what is refused ------------------------------------------------------------------------------------------------------
+
+
+def brighter(make=1.0, decay=1.0):
+    return grown(1.9, make, decay)
+
+
+OTHERS = {
+    "scene": ({"scene": brighter}, ["lit", "brighter", "rate=2.0", "rate=1.9"]),
+    "target": ({"target": Level(wanted=2.0)}, ["wanted=1.0", "wanted=2.0"]),
+    "bounds": ({"parameters": [LIT[0], Parameter("decay", 0.5, 3)]}, ["decay: 0.5 to 2", "decay: 0.5 to 3"]),
+    "method": ({"method": Sobol(batch=4)}, [r"sobol(batch=3)", r"sobol(batch=4)"]),
+    "another method": ({"method": CMAES(population=4)}, ["sobol(batch=3)", "cmaes(population=4"]),
+    "seed": ({"seed": 1}, ["seed: 0 there, 1 here"]),
+    "cells": ({"cells": 4}, ["cells: 3 there, 4 here"]),
+    "until": ({"until": 5.0}, ["until: None there, 5.0 here"]),
+    "replicates": ({"replicates": 3}, ["replicates: 2 there, 3 here"]),
+    "reduce": ({"reduce": "worst"}, ["'mean' there, 'worst' here"]),
+    "step": ({"dt": 0.05}, ["dt: 0.1 there, 0.05 here"]),
+    "names": ({"parameters": [LIT[0]], "fixed": {"decay": 1.0}}, ["'decay': '1.0'", "['make', 'decay'] there, ['make'] here"]),
+}
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    path = tmp_path_factory.mktemp("kept") / "s.h5"
+    search().run(6, study=path, progress=False)
+    return path
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_the_file_of_another_search_is_refused_with_both_values(kept, other):
+    given, words = OTHERS[other]
+    before = kept.read_bytes()
+    with pytest.raises(tf.InputError, match="is the study of another search") as error:
+        search(**given).run(12, study=kept, progress=False)
+    assert all(w in str(error.value) for w in words), str(error.value)
+    assert kept.read_bytes() == before
+
+
+def test_fixed_functions_are_the_same_in_another_process():
+    """What a value's text says of its place in memory is no part of what a study is of."""
+    one, other = (search(scene=chosen, parameters=[LIT[0]], fixed={"how": lambda x: x}).study.about for _ in range(2))
+    assert one == other
+
+
+def chosen(make=1.0, how=None):
+    return grown(2.0, how(make))
+
+
+def test_a_method_that_asks_otherwise_is_not_gone_on_with(kept, tmp_path):
+    path = tmp_path / "s.h5"
+    shutil.copy(kept, path)
+    with h5py.File(path, "r+") as file:
+        file["designs/point"][1, 0] += 0.01
+    with pytest.raises(tf.InputError, match="its batch 0 is not what the method asks for"):
+        search().run(12, study=path, progress=False)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_file_is_refused(kept, tmp_path, share):
+    whole = kept.read_bytes()
+    (tmp_path / "s.h5").write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(tf.InputError, match="cannot be read: it is truncated or not a study file"):
+        search().run(12, study=tmp_path / "s.h5", progress=False)
+
+
+def spoiled(path, what):
+    with h5py.File(path, "r+") as file:
+        if what == "about":
+            file.attrs["about"] = "{no json"
+        elif what == "about is a list":
+            file.attrs["about"] = "[]"
+        elif what == "rows":
+            file["batches/rows"][0] = 40
+        elif what == "reasons":
+            file["designs/reasons"][0] = "nonsense"
+        else:
+            del file[what]
+
+
+@pytest.mark.parametrize("what", ["about", "about is a list", "rows", "reasons", "batches", "designs/loss", "streams"])
+def test_a_spoiled_file_is_refused(kept, tmp_path, what):
+    shutil.copy(kept, tmp_path / "s.h5")
+    spoiled(tmp_path / "s.h5", what)
+    with pytest.raises(tf.InputError, match="cannot be read: it is truncated or not a study file"):
+        Study.read(tmp_path / "s.h5")
+
+
+def test_foreign_files_are_refused(tmp_path, kept):
+    (tmp_path / "a.h5").write_text("make,decay\n1,2\n")
+    scene = grown(2.0)
+    list(tf.simulate(scene, scene.seed(1), until=0.2, record=tmp_path / "b.h5"))
+    shutil.copy(kept, tmp_path / "c.h5")
+    with h5py.File(tmp_path / "c.h5", "r+") as file:
+        file.attrs["version"] = 99
+    for name, words in (
+        ("a.h5", "cannot be read"), ("b.h5", r"is not a torchfilm study \(its format is 'torchfilm results'"), ("c.h5", "format version 99, newer"),
+        ("", r"a study file\. That is a folder"), ("no/such.h5", "in a folder that exists"),
+    ):  # fmt: skip
+        with pytest.raises(tf.InputError, match=words):
+            search().run(12, study=tmp_path / name, progress=False)
+    with pytest.raises(tf.InputError, match=r"a study file\. No such file"):
+        Study.read(tmp_path / "none.h5")

@@ -1,0 +1,149 @@
+"""Scenes by what a user types: names, Python files and saved designs; what is none of them is refused in words."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+
+import torchfilm as tf
+from torchfilm.scene_files import design, load_scene, parse_setting
+
+OWN = """
+import torchfilm as tf
+
+def lamp(rate=1.0, longest=4.0):
+    return tf.Scene(tf.Growth(rate=rate), tf.Division(length=tf.Uniform(3.0, longest)), tf.Mechanics(dim=2), dt=0.05)
+
+def scene(rate=1.0):
+    return lamp(rate)
+
+ready = tf.scenes.microcolony(rate=0.5)
+number = 3
+"""
+
+READY = {"scene": "microcolony", "parameters": {"rate": 0.5, "dim": 2}, "seed": 3, "dt": 0.05, "cells": 4}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "mine.py").write_text(OWN)
+    return tmp_path
+
+
+def saved(folder, told) -> str:
+    path = folder / "best.json"
+    path.write_text(told if isinstance(told, str) else json.dumps(told))
+    return str(path)
+
+
+def test_a_design_of_a_ready_scene_is_that_scene(folder):
+    made = load_scene(saved(folder, READY), {})
+    assert made.listing() == tf.scenes.microcolony(rate=0.5, dim=2).listing()
+    assert made.recipe == tf.scenes.microcolony(rate=0.5, dim=2).recipe and made.dt == 0.05
+
+
+def test_a_design_of_a_file_is_its_function(folder):
+    made = load_scene(saved(folder, {"scene": "lamp", "file": str(folder / "mine.py"), "function": "lamp", "parameters": {"rate": 0.7, "longest": 3.5}}), {})
+    assert made.listing()[:2] == ["Growth(rate=0.7)", "Division(length=Uniform(low=3.0, high=3.5))"]
+    assert (made.name, made.dt, made.settings) == ("mine", 0.05, {"rate": 0.7, "longest": 3.5}) and made.recipe is None
+
+
+def test_settings_come_before_those_saved(folder):
+    made = load_scene(saved(folder, READY), {"rate": 2.0})
+    assert made.recipe[1]["rate"] == 2.0 and made.recipe[1]["dim"] == 2
+
+
+def test_only_a_json_file_is_a_design(folder):
+    assert design("microcolony") == {} and design("mine.py") == {}
+    assert design(saved(folder, READY)) == READY
+
+
+def test_a_design_of_one_colony_starts_as_the_ready_scene_does(folder):
+    one, other = load_scene(saved(folder, READY), {}).seed(2, seed=3), tf.scenes.microcolony(rate=0.5).seed(2, seed=3)
+    assert one.position.tolist() == other.position.tolist() and one.division_threshold.tolist() == other.division_threshold.tolist()
+
+
+@pytest.mark.parametrize(
+    "told, words",
+    [
+        ("", "cannot be read as JSON"),
+        ('{"scene": "microcolony", "param', "cannot be read as JSON"),
+        ("[1, 2]", "is no saved design: it must have a `scene` and its `parameters`"),
+        ({"a": 1}, "is no saved design"),
+        ({"scene": "microcolony"}, "is no saved design"),
+        ({"parameters": {}}, "is no saved design"),
+        ({"scene": "microcolony", "parameters": [1]}, "is no saved design"),
+        ({"scene": 5, "parameters": {}}, "is no saved design"),
+        ({**READY, "scene": "microcolonie"}, "scene = 'microcolonie'.*one of microcolony"),
+        ({**READY, "scene": "none.py"}, "scene = 'none.py'.*No such file"),
+        ({**READY, "scene": "best.json"}, "scene in .*best.json = 'best.json'.*a ready scene, or the path of a Python file"),
+        ({**READY, "file": "other.json"}, "'other.json'.*a ready scene, or the path of a Python file"),
+        ({**READY, "parameters": {"rates": 1.0}}, "parameter of microcolony = 'rates'.*one of dim"),
+        ({**READY, "parameters": {"rate": "fast"}}, "rate = 'fast'.*a number"),
+        ({**READY, "dt": 0}, "dt in .*best.json = 0.*above 0"),
+        ({**READY, "dt": "0.1"}, "dt in .*best.json = '0.1'.*a number"),
+        ({"scene": "<lambda>", "file": "mine.py", "function": "<lambda>", "parameters": {}}, "mine.py does not define `<lambda>`"),
+        ({"scene": "lamp", "file": "mine.py", "function": "lamp", "parameters": {"speed": 1}}, r"lamp\(…\) in mine.py: .*'speed'.*Its parameters are \(rate"),
+        ({"scene": "number", "file": "mine.py", "function": "number", "parameters": {}}, "number in mine.py = 3.*a Scene, or a function"),
+    ],
+)
+def test_a_bad_design_is_refused_in_words(folder, told, words):
+    path = saved(folder, told)
+    with pytest.raises(tf.InputError, match=words):
+        load_scene(path, {})
+
+
+@pytest.mark.parametrize(
+    "what, words",
+    [
+        ("none.json", "the path of a design that was saved. No such file"),
+        ("colony", "scene = 'colony'.*one of microcolony"),
+        ("none.py", "No such file"),
+        ("mine.txt", "No such file"),
+        (".", "scene = '.'"),
+    ],
+)
+def test_what_is_no_scene_is_refused_in_words(folder, what, words):
+    with pytest.raises(tf.InputError, match=words):
+        load_scene(what, {})
+
+
+def test_bytes_that_are_no_text_are_no_design(folder):
+    (folder / "best.json").write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(tf.InputError, match="cannot be read as JSON"):
+        load_scene(str(folder / "best.json"), {})
+
+
+@pytest.mark.parametrize(
+    "told, words",
+    [
+        ({"cells": "many"}, "cells in .*best.json = 'many'.*a whole number"),
+        ({"cells": 4.5}, "cells in .*best.json = 4.5.*a whole number"),
+        ({"cells": 0}, "cells = 0.*a whole number from 1"),
+        ({"seed": "x"}, "seed in .*best.json = 'x'.*a whole number"),
+        ({"seed": -1}, "seed = -1.*from 0"),
+        ({"until": [1]}, r"until in .*best.json = \[1\].*a number"),
+        ({"until": 0.33}, "until = 0.33.*a whole number of steps"),
+    ],
+)
+def test_what_a_design_says_of_its_run_is_checked(folder, command, told, words):
+    told = {**{n: v for n, v in READY.items() if n != "cells"}, **told}
+    with pytest.raises(SystemExit, match=words):
+        command("run", saved(folder, told), "--no-picture", "--out", "a.h5")
+
+
+@pytest.mark.parametrize(
+    "text, found", [("dim=3", ("dim", 3)), ("rate=[0.5, 1]", ("rate", [0.5, 1])), ("law=length", ("law", "length")), ("name=", ("name", ""))]
+)
+def test_settings_are_literals_or_text(text, found):
+    assert parse_setting(text) == found
+
+
+@pytest.mark.parametrize("text", ["rate", "3=rate", "=3", "a b=1"])
+def test_settings_without_a_name_are_refused(text):
+    with pytest.raises(tf.InputError, match=r"--set = .*NAME=VALUE"):
+        parse_setting(text)
