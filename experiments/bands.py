@@ -38,7 +38,7 @@ def flag(blue_above=0.5, green_above=0.2, green_below=0.5, red_below=0.2, n=4.0)
         tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2),
         tf.Circuit(
             genes, species=("blue", "green", "red"), blue_above=blue_above, green_above=green_above, green_below=green_below, red_below=red_below, n=n,
-            make=10.0, decay=4.0,
+            make=10.0, decay=4.0, rtol=1e-2,
         ),
         tf.Medium(
             morphogen=tf.Signal(diffusion=10 * REACH**2, decay=10.0, initial=steady), box=((-SIDE, -SIDE), (SIDE, SIDE)), spacing=4.0,

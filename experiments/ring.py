@@ -32,7 +32,7 @@ def band_detector(above=0.05, below=0.3, make=10.0, decay=2.0, promoter="steep")
     return tf.Scene(
         tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2),
         tf.Circuit(
-            detector, species=("repressor", "gfp"), above=above, below=below, make=make, decay=decay, n=POWERS[promoter],
+            detector, species=("repressor", "gfp"), above=above, below=below, make=make, decay=decay, n=POWERS[promoter], rtol=1e-2,
         ),
         tf.Medium(signal=tf.Signal(diffusion=250.0, decay=10.0, source=middle), box=((-34, -34), (34, 34)), spacing=4.0),
         name="band_detector",

@@ -3,7 +3,7 @@
     python experiments/benchmarks/search.py methods            # every method on every target at equal numbers of colonies: about an hour on two cores
     python experiments/benchmarks/search.py methods --targets stripe --methods sobol cmaes --seeds 3 --colonies 500
     python experiments/benchmarks/search.py rate               # one design at a time, in batches, and on recorded growth
-    python experiments/benchmarks/search.py unseen             # the winners of the last `methods` run on 32 seeds that no search has seen
+    python experiments/benchmarks/search.py unseen             # the winners that `methods` found, on 32 seeds that no search has seen
 
 The searches of one method differ by the method's own seed and share the colonies' four seeds; those of all seeds are evaluated side by side in one batch, so
 that seconds are a share of a common batch. A search succeeds when a design's mean loss over its four replicates is at most the target's threshold.
@@ -35,7 +35,7 @@ TARGETS = {
     "stripe": ("boundary_detector", boundary_stripe.PARAMETERS, boundary_stripe.TARGET, boundary_stripe.COLONY, 0.05, 10, 2000),
     "bands": (bands.flag, bands.PARAMETERS, bands.TARGET, bands.COLONY, 0.1, 5, 1000),
     "ring": (ring.band_detector, ring.PARAMETERS, ring.TARGET, ring.COLONY, 0.1, 5, 1000),
-    "domains": ("toggle_switch", domain_size.PARAMETERS, DomainSize(("red", "green"), 12.0), domain_size.COLONY, 0.05, 5, 400),
+    "domains": ("toggle_switch", domain_size.PARAMETERS, DomainSize(("red", "green"), 12.0), domain_size.COLONY, 0.02, 5, 200),
 }
 METHODS = {"sobol": Sobol, "cmaes": CMAES, "cmaes, 24 a batch": lambda: CMAES(population=24), "racing": Racing, "bayesian": Bayesian}
 REPLICATES = 4
@@ -109,10 +109,13 @@ def methods(options: argparse.Namespace) -> dict:
 
 
 def unseen(options: argparse.Namespace) -> dict:
-    """The best design of each search of the last record on 32 seeds that it was not searched on."""
-    last = next(r for r in reversed(json.loads(options.out.read_text())) if "methods" in r)["methods"]
+    """The best design of each search on record on 32 seeds that it was not searched on."""
+    known: dict = {}
+    for record in json.loads(options.out.read_text()):
+        for target, found in record.get("methods", {}).items():
+            known.setdefault(target, {}).update(found)
     out: dict = {}
-    for target, found in last.items():
+    for target, found in known.items():
         objective = objective_of(target)
         for name, record in found.items():
             points = np.array([objective.space.point(values) for values in record["best"]])

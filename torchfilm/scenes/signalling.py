@@ -65,20 +65,21 @@ def _sinks(u: Names, s: Names, p: Names, cell: Names):
 def boundary_detector(
     D1: Value = 0.1, d1: Value = 1e-3, d2: Value = 1e-5, d3: Value = 1e-3, dr: Value = 0.1, g1: Value = 0.1, g2: Value = 0.1, k1: Value = 1.0,
     k2: Value = 1.0, k3: Value = 1.0, k4: Value = 5e-5, k5: Value = 0.1, k6: Value = 1e-2, diffusion: Value = 10.0, flow: Value = 0.0,
-    rate: float = 1.0, width: float = 32.0,
+    rate: float = 1.0, width: float = 32.0, rtol: float = 1e-4,
 ) -> Scene:  # fmt: skip
     """Detection of the boundary between two populations (Fig. 5), in one plane of a channel `width` µm wide, from one founder of each.
 
     Sources (type 0, on the left) make AHL by LuxI and show it by CFP; sinks (type 1) take it apart by AiiA and show it by YFP: only at the
     boundary do they see any. Constants as published (hours, µm, arbitrary concentration); d3 = 0 is a strain without AiiA. flow: µm/h along the channel.
-    The grid, 4 µm wide, starts as the paper's 64 × 8 × 12 voxels about the cells' plane and grows along the channel with the colony.
+    rtol: relative tolerance of the circuits in a step. The grid, 4 µm wide, starts as the paper's 64 × 8 × 12 voxels about the cells' plane and grows along
+    the channel with the colony.
     """
     half = width / 2
     return Scene(
         Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2, walls=[Channel(width)]),
         Circuit(
             {0: _sources, 1: _sinks}, species=("luxi", "ahl", "aiia", "cfp", "yfp"),
-            D1=D1, d1=d1, d2=d2, d3=d3, dr=dr, g1=g1, g2=g2, k1=k1, k2=k2, k3=k3, k4=k4, k5=k5, k6=k6,
+            rtol=rtol, D1=D1, d1=d1, d2=d2, d3=d3, dr=dr, g1=g1, g2=g2, k1=k1, k2=k2, k3=k3, k4=k4, k5=k5, k6=k6,
         ),
         Medium(
             ahl=Signal(diffusion=diffusion), box=((-128.0, -half, -24.0), (128.0, half, 24.0)), spacing=4.0, beyond="grow", grows="x",
