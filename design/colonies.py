@@ -69,7 +69,8 @@ def grow(
         if bool(done.any()):
             finished = _keep(state, done)
             yield Done(finished, torch.stack([n.index_select(0, finished.colony_id) for n in notes]) if notes else None)
-        stuck = _stuck(state, most, since) & ~done
+        # where the end is a time, it comes by itself
+        stuck = _stuck(state, most, since) & ~done if until is None else torch.zeros_like(done)
         for colony_id, count in zip(state.colony_id[stuck].tolist(), state.counts[stuck].tolist(), strict=True):
             yield Failed(colony_id, f"it has {count} of {cells} cells at {state.time:g} h, and has had no more for {PATIENCE:g} h")
         gone = done | stuck

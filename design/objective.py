@@ -110,6 +110,9 @@ class Objective:
         self.reduce, self.seed, self.dtype, self.device, self.replay = reduce, seed, dtype, device, replay
         self._check_names()
         probe = self._probe()
+        self.founders = int(probe.founders.count)
+        if self.cells is not None and self.cells <= self.founders and probe.founders.colony is None:
+            raise checks.refuse("cells", self.cells, f"above the {self.founders} that a colony starts from")
         self.dt = probe.dt if dt is None else checks.number("dt", dt, above=0.0)
         steps = 1.0 if self.until is None else self.until / self.dt
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
@@ -135,7 +138,7 @@ class Objective:
         """The scene in the middle of the space, after one of each option was built and the target looked at its first state."""
         middle = [p.value(0.5) for p in self.space.parameters]
         base = dict(zip(self.space.names, middle, strict=True))
-        trials = [base]
+        trials, made_of = [base], []
         for p in self.space.parameters:
             ends = (p.low, p.high) if isinstance(p, Parameter) else p.options
             trials += [{**base, p.name: int(v) if isinstance(p, Parameter) and p.whole else v} for v in ends]
@@ -149,9 +152,12 @@ class Objective:
                     f"the scene cannot be built with {changed}: {error} Narrow the bounds; a parameter that the scene takes as one plain number "
                     "only can be searched with whole=True or as a Choice of numbers."
                 ) from error
-        if self.until is None:
-            made.check_moves(state)
-        self.target.check(state)
+            if self.until is None:
+                made.check_moves(state)
+            self.target.check(state)
+            made_of.append((made.listed, made.founders))
+        # what a listing does not show: founders, and what functions do
+        self.made_of = tf.digest(made_of)
         return self.scene([base])
 
     def scene(self, values: Sequence[Mapping[str, Value]], repeat: int = 1) -> tf.Scene:
@@ -160,7 +166,7 @@ class Objective:
         for p in self.space.parameters:
             column = [v[p.name] for v in values]
             structural = p.levels is not None
-            arguments[p.name] = column[0] if structural else torch.tensor(column, dtype=torch.float64).repeat_interleave(repeat)
+            arguments[p.name] = column[0] if structural else torch.tensor(column, dtype=torch.float64, device=self.device).repeat_interleave(repeat)
         made = self.make(**arguments)
         if not isinstance(made, tf.Scene):
             raise checks.refuse("scene", made, "a function that returns a tf.Scene")
@@ -243,7 +249,7 @@ class Objective:
 
     def end(self, size: float) -> tuple[int | None, float | None]:
         """Cells and hours at which colonies of a share of the full size end."""
-        cells = None if self.cells is None else max(2, round(self.cells * size))
+        cells = None if self.cells is None else max(self.founders + 1, round(self.cells * size))
         return cells, None if self.until is None else max(1, round(self.until * size / self.dt)) * self.dt
 
     def run(self, piece: Piece, streams: tuple[int, ...], size: float) -> Outcome:
@@ -292,7 +298,9 @@ class Objective:
         tiled = torch.tensor(streams).repeat(len(values))
         why = tf.Course.obstacle(scene) if self.replay else OFF
         if not why:
-            course = courses.of(self, scene, streams)
+            # one course for all replicates, also where a first look grows fewer
+            usual = tuple(range(self.replicates))
+            course = courses.of(self, scene, usual if set(streams) <= set(usual) else streams)
             replay = tf.Replay(scene, course)
             return replay.step, replay.seed(tiled.numel(), streams=tiled), ""
         state = scene.seed(tiled.numel(), seed=self.seed, streams=tiled, dtype=self.dtype, device=self.device)
@@ -312,7 +320,8 @@ class Objective:
         """What the losses depend on, as plain data: a study is gone on with only by an objective that says the same."""
         return {
             "scene": self.recipe[0] if self.recipe else getattr(self.make, "__name__", "scene"), "fixed": {n: _lasting(v) for n, v in self.fixed.items()},
-            "effects": self.listing, "parameters": self.space.describe(), "target": _told(self.target), "cells": self.cells, "until": self.until,
+            "effects": self.listing, "founders and functions": self.made_of, "parameters": self.space.describe(),
+            "target": _told(self.target), "cells": self.cells, "until": self.until,
             "replicates": self.replicates, "reduce": self.reduce, "seed": self.seed, "dt": self.dt, "dtype": str(self.dtype)[6:],
         }  # fmt: skip
 

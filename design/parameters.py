@@ -73,7 +73,7 @@ class Parameter:
 
     def describe(self) -> str:
         kind = " whole" if self.whole else " log" if self.log else ""
-        return f"{self.name}: {self.low:g} to {self.high:g}{kind}"
+        return f"{self.name}: {self.low!r} to {self.high!r}{kind}"
 
 
 @dataclass(frozen=True, init=False)

@@ -27,7 +27,8 @@ def colonies(scene: tf.Scene, cells: int | None, dtype: torch.dtype, device: str
 def left(device: str) -> int:
     """Bytes that can still be taken."""
     if torch.device(device).type == "cuda":
-        return torch.cuda.mem_get_info(torch.device(device))[0]
+        # what torch holds in reserve is free for its next batch
+        return torch.cuda.mem_get_info(torch.device(device))[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     for line in Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").exists() else ():
         if line.startswith("MemAvailable:"):
             return 1024 * int(line.split()[1])

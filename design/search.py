@@ -70,7 +70,7 @@ class Search:
         self, colonies: int, *, study: str | Path | None = None, stop_at: float | None = None, executor: Executor | None = None, pieces: int = 1,
         progress: bool = True,
     ) -> Best:  # fmt: skip
-        """Search until `colonies` have been simulated, or a design's loss is at most `stop_at`; returns the best design.
+        """Search anew, or on from what `study` holds, until `colonies` have been simulated, or a design's loss is at most `stop_at`; returns the best design.
 
         colonies: each replicate of each design counts as one, a smaller colony by its share of the full size; the last batch may go over. study: file in
         which every evaluation is kept; if there is one already of this search, it goes on from there, and what it holds counts. executor: of the
@@ -202,12 +202,16 @@ def _home(make: Callable[..., tf.Scene]) -> dict[str, Any]:
     """Where a user's own scene function is found again: its file and its name there."""
     made = inspect.unwrap(make)
     code = getattr(made, "__code__", None)
+    if code is None or "<" in made.__qualname__:
+        raise checks.refuse("scene", make, "a function at the top level of a file, for a design that is saved", "A file cannot find it again by its name.")
     return {"file": code and os.path.abspath(code.co_filename), "function": getattr(made, "__name__", "scene")}
 
 
 def _plain(value: Any) -> Any:
     """What JSON can hold of a value that it cannot."""
-    return value.tolist() if hasattr(value, "tolist") else repr(value)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise checks.refuse("fixed", value, "numbers, texts, or arrays of numbers in a design that is saved", "Let the scene function make it from such.")
 
 
 def _described(method: Method) -> str:

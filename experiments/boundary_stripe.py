@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import torchfilm as tf
-from design import CMAES, Objective, Parameter, Search, Stripe
+from design import CMAES, Objective, Parameter, Racing, Search, Stripe
 
 PARAMETERS = [
     Parameter("d1", 1e-3, 1.0, log=True),  # LuxI made by sources, 1/h
@@ -52,8 +52,9 @@ def main() -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
 
-    # a batch of 24 designs: larger than it need be, since large batches cost less a colony
-    search = Search("boundary_detector", PARAMETERS, TARGET, **COLONY, method=CMAES(population=24), replicates=4, seed=options.seed)
+    # many small colonies, and only the best third of them in full: there is more than one valley to look into
+    method = Racing(inner=CMAES(population=24, sigma=0.5))
+    search = Search("boundary_detector", PARAMETERS, TARGET, **COLONY, method=method, replicates=4, seed=options.seed)
     best = search.run(options.colonies, study=options.out.with_suffix(".h5"))
     print(best.table())
     print(f"\n{'on 8 fresh seeds':<18}{'published':>12}{'best':>12}")

@@ -1,7 +1,8 @@
 """A scene pays for what it lists and for nothing else, proved by counting: operators dispatched and bytes allocated, not seconds.
 
-Three claims. The steps of growth, division and mechanics cost exactly the same operators and bytes whatever else the scene lists. What a scene does
-not list is not called: with every public function of its rooms taken away the scene runs as before. And its fields are not there.
+Four claims. The steps of growth, division and mechanics cost exactly the same operators and bytes whatever else the scene lists. What a scene does
+not list is not called: with every public function of its rooms taken away the scene runs as before. Its fields are not there. And operators are for the whole
+batch: many colonies ask for no more of them than two.
 """
 
 from __future__ import annotations
@@ -53,16 +54,21 @@ LISTED = {
 }  # fmt: skip
 
 
+def spend(scene: tf.Scene, state: tf.State) -> tuple[dict[str, tuple[dict[str, int], int]], tf.State]:
+    """What each effect of a step asks for, by its title: (operators by name, bytes), and the state after it."""
+    state, here = state.replace(births=(), ended=(), reports={}), {}
+    for effect in scene.effects:
+        with Operators() as seen:
+            state = effect.step(state, 0.05)
+        here[effect.title] = (dict(seen.calls), seen.bytes)
+    return here, state.replace(step=state.step + 1, time=state.time + 0.05)
+
+
 def costs(scene: tf.Scene, steps: int = 30) -> tuple[list[dict[str, tuple[dict[str, int], int]]], list[tf.State]]:
     """What each effect of each step asked for, by its title: (operators by name, bytes), and the states."""
     state, spent, states = scene.seed(seed=5, dtype=torch.float64), [], []
     for _ in range(steps):
-        state, here = state.replace(births=(), ended=(), reports={}), {}
-        for effect in scene.effects:
-            with Operators() as seen:
-                state = effect.step(state, 0.05)
-            here[effect.title] = (dict(seen.calls), seen.bytes)
-        state = state.replace(step=state.step + 1, time=state.time + 0.05)
+        here, state = spend(scene, state)
         spent.append(here)
         states.append(state)
     return spent, states
@@ -101,6 +107,37 @@ def test_the_counter_sees_what_it_should(bare):
     calls, size = spent[0]["growth"]
     wanted, allowed = bare[0][0]["growth"]
     assert sum(calls.values()) == sum(wanted.values()) + 1 and size == allowed + 8  # one cell of float64
+
+
+def test_on_the_same_cells_nutrition_leaves_the_others_costs_alone():
+    """Nutrition changes how cells grow, so the runs differ; but on the cells of any moment growth and mechanics cost the same with and without it."""
+    fed, unfed = (tf.Scene(*body(None), *more) for more in ([tf.Monod("ahl"), tf.Medium(ahl=tf.Signal(diffusion=10.0, initial=9.0), **BOX)], []))
+    state, bare = fed.seed(seed=5, dtype=torch.float64), unfed.seed(seed=5, dtype=torch.float64)
+    compared = 0
+    for _ in range(30):
+        same = {n: getattr(state, n) for n in ("colony", "uid", "parent", "position", "axis", "length", "radius", "next_uid", "step", "time")}
+        twin = bare.replace(**same, fields={n: state.fields[n] for n in bare.fields})
+        with_food, state = spend(fed, state)
+        twin = twin.with_fields(growth_rate=state.growth_rate if state.cells == twin.cells else twin.growth_rate)
+        without, after = spend(unfed, twin)
+        if not state.births:
+            assert torch.equal(after.position, state.position)
+            compared += 1
+            for title in BODY:
+                assert with_food[title] == without[title], (title, state.step)
+    assert compared > 20 and state.cells > 1
+
+
+@pytest.mark.parametrize("listed", ["circuit", "medium", "both", "rules"])
+def test_many_colonies_ask_for_no_more_operators_than_two(listed):
+    """Colonies of one stream are alike in all, so whatever is asked for two is asked once for all nine: the same operators by name in every step. (Not than
+    one, which goes without what tells colonies apart.)"""
+    scene = tf.Scene(*body(), *LISTED[listed]())
+    two, nine = (scene.seed(n, seed=5, streams=[3] * n, dtype=torch.float64) for n in (2, 9))
+    for _ in range(30):
+        (here, two), (there, nine) = spend(scene, two), spend(scene, nine)
+        assert {title: calls for title, (calls, _) in here.items()} == {title: calls for title, (calls, _) in there.items()}, two.step
+    assert 2 * nine.cells == 9 * two.cells > 18
 
 
 def functions(*rooms: str) -> list[tuple[object, str]]:

@@ -13,6 +13,7 @@ from torchfilm.effects.medium import Medium, Signal
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
+from torchfilm.explain import explain
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
 from torchfilm.pictures import show
 from torchfilm.recorder import Recorder
@@ -26,11 +27,12 @@ from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.timing import Timings
+from torchfilm.tools.told import digest
 from torchfilm.version import __version__
 
 __all__ = [
     "Box", "Cells", "Channel", "Circuit", "Course", "Division", "Effect", "Faces", "Field", "Fixed", "Growth", "InputError", "LogNormal", "Mechanics",
     "Medium", "Monod", "NoFlux", "Normal", "Open", "Periodic", "Plane", "Reaction", "Recorder", "Removal", "Replay", "Results", "Rules", "Scene", "Signal",
-    "SimulationError", "Sphere", "State", "Timings", "Uniform", "__version__", "checks", "effect", "failures", "keep_memory", "kinetics", "measure",
-    "parts", "pictures", "rollout", "scenes", "show", "simulate",
+    "SimulationError", "Sphere", "State", "Timings", "Uniform", "__version__", "checks", "digest", "effect", "explain", "failures", "keep_memory",
+    "kinetics", "measure", "parts", "pictures", "rollout", "scenes", "show", "simulate",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The command line: `torchfilm run SCENE`, `resume FILE`, `show FILE`, `info SCENE-or-FILE`."""
+"""The command line: `torchfilm run SCENE`, `resume FILE`, `show FILE`, `info SCENE-or-FILE`, `explain SCENE`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import torch
 from torchfilm import measure, pictures, scenes
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.rules import Rules
+from torchfilm.explain import explain
 from torchfilm.pictures import words
 from torchfilm.recorder import Recorder
 from torchfilm.results import Results
@@ -104,7 +105,7 @@ class Resume:
     file: Annotated[Path, tyro.conf.Positional]
     """Results file."""
     scene: Path | None = None
-    """The Python file of the scene, unless it was a ready-made one (a results file holds data only, so it cannot bring its own)."""
+    """The Python file of the scene, or the saved design, unless it was a ready-made one (a results file holds data only, so it cannot bring its own)."""
     cells: int | None = None
     """Stop once every colony has this many cells."""
     until: float | None = None
@@ -127,7 +128,7 @@ class Resume:
             elif results.recipe is not None:
                 scene = scenes.build(*results.recipe)
             else:
-                raise InputError(f"{self.file} was made by a scene of your own: give its file with --scene.")
+                raise InputError(f"{self.file} was made by a scene of your own: give its file, or the saved design, with --scene.")
             state = results.state(scene, device=self.device, changed=self.changed)
             dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
         if self.picture:
@@ -206,7 +207,7 @@ class Show:
 
 @dataclass
 class Info:
-    """Say what a scene simulates and who drives whom, or what a results file holds."""
+    """Say what a scene simulates, field by field, and who drives whom, or what a results file holds."""
 
     what: Annotated[str, tyro.conf.Positional]
     """Scene name, Python file, saved design, or results file."""
@@ -228,6 +229,28 @@ class Info:
             print(f"seed {a['seed']}, {a['dtype']}, dt {a['dt']:g} h, torchfilm {a['torchfilm']}, torch {a['torch']}, {a['device']}")
             print("quantities per cell: " + ", ".join(results.file["cells"]))
             print(a["scene"])
+
+
+@dataclass
+class Explain:
+    """Say how a scene will be simulated: methods and tolerances, who drives whom, what is left out, and an estimate of what it costs."""
+
+    scene: Annotated[str, tyro.conf.Positional]
+    """Scene name, Python file or saved design."""
+    set: list[str] = field(default_factory=list)
+    """Parameters of the scene, as NAME=VALUE."""
+    cells: int = 1000
+    """Cells in each colony, for which to estimate."""
+    colonies: int | None = None
+    """Colonies for which to estimate; by default as many as the scene's parameters are for, else 1."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    seconds: float = 2.0
+    """About how long to measure, by running the scene's first steps; 0 leaves the estimate out."""
+
+    def __call__(self) -> None:
+        scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
+        print(explain(scene, cells=self.cells, colonies=self.colonies, device=self.device, seconds=self.seconds))
 
 
 def check_new(name: str, path: Path, overwrite: bool, mend: str) -> None:
@@ -361,7 +384,7 @@ def main() -> None:
 
 def _command() -> None:
     command = tyro.extras.subcommand_cli_from_dict(
-        {"run": Run, "resume": Resume, "show": Show, "info": Info},
+        {"run": Run, "resume": Resume, "show": Show, "info": Info, "explain": Explain},
         prog="torchfilm",
         description="Synthetic microbial biofilms, many colonies at once.",
     )

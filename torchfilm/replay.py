@@ -16,21 +16,21 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import BUILT_IN
-from torchfilm.scene import CPU, Scene, parameters
+from torchfilm.scene import Scene, parameters
 from torchfilm.state import CELL, PER_CELL, Births, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import expand_ranges, offsets
+from torchfilm.tools.told import digest
 
-FIRST = -1  # the stage of what happens before all effects
+FIRST = -1  # the part of what happens before all effects
 
 
 @dataclass(frozen=True)
 class Split:
-    """Which of a scene's effects, by their places in `scene.listed`, move, grow, divide or remove cells or drive what does (`growth`), and which only
-    follow; `obstacle`: why the followers cannot be run alone, or "" if they can."""
+    """Which of a scene's effects, by their places in `scene.listed`, move, grow, divide or remove cells or drive what does (`growth`); the others only
+    follow. `obstacle`: why the followers cannot be run alone, or "" if they can."""
 
     growth: tuple[int, ...]
-    follow: tuple[int, ...]
     obstacle: str = ""
 
 
@@ -42,14 +42,15 @@ def split(scene: Scene) -> Split:
     everything = tuple(range(len(scene.listed)))
     rules = [e.title for e in scene.listed if e.writes_anything]
     if rules:
-        return Split(everything, (), f"{rules[0]} may read and write anything")
+        return Split(everything, f"{rules[0]} may read and write anything")
     scene.unchecked(1)  # circuits are tried, so that what they read and write is known
     reads: list[set[str]] = [set() for _ in everything]
     writes: list[set[str]] = [set() for _ in everything]
     wide: dict[int, str] = {}
     for place, part in zip(scene.places, scene.effects, strict=True):
         reads[place] |= {*part.reads(), *part.needs()}
-        writes[place] |= set(part.writes())
+        # what is declared has a first value, and whoever reads that needs it
+        writes[place] |= {*part.writes(), *(f.name for f in part.declares(scene.dim))}
         for f in part.declares(scene.dim):
             if f.scope != CELL:
                 wide[place] = f.name
@@ -64,18 +65,21 @@ def split(scene: Scene) -> Split:
     for place, name in wide.items():
         if place in growth:
             obstacle = f"{scene.listed[place].title} acts on growth or motion by {name!r}, which is no quantity of cells"
-    return Split(tuple(sorted(growth)), tuple(k for k in everything if k not in growth), obstacle)
+    if scene.founders.colony is not None:
+        obstacle = "its first cells name their colonies, so that these do not start alike"
+    return Split(tuple(sorted(growth)), obstacle)
 
 
 @dataclass(frozen=True)
 class Change:
     """What an effect changed in one step of a course, for its R colonies side by side.
 
-    stage: the effect's. counts, next_uid (R,) after it. source: place of each cell among its colony's cells before it (N,), or None if these stay.
-    values: what changed, by name, (N, …). births: (R,) their number, and the places of first and second daughters within their colony, (M,) each; None without.
+    part: which of the course's effects, or FIRST. counts, next_uid (R,) after it. source: place of each cell among its colony's cells before it (N,), or
+    None if these stay. values: what changed, by name, (N, …). births: (R,) their number, and the places of first and second daughters within their colony,
+    (M,) each; None without.
     """
 
-    stage: int
+    part: int
     counts: Tensor
     next_uid: Tensor
     source: Tensor | None
@@ -120,8 +124,14 @@ class Course:
     def obstacle(scene: Scene) -> str:
         """Why the growth of a scene cannot be kept for all its designs, or "" if it can."""
         parts = split(scene)
-        held = [path for k in parts.growth for path, tensor in parameters(scene.listed[k]) if tensor.dim() == 1]
-        return parts.obstacle or (f"{held[0]} differs between colonies and acts on their growth" if held else "")
+        if parts.obstacle:
+            return parts.obstacle
+        for path, tensor in (found for k in parts.growth for found in parameters(scene.listed[k])):
+            if tensor.dim() == 1:
+                return f"{path} differs between colonies and acts on their growth"
+            if tensor.requires_grad:
+                return f"{path} wants a gradient, which recorded growth does not carry"
+        return ""
 
     @staticmethod
     def scene_of(scene: Scene) -> Scene:
@@ -130,6 +140,11 @@ class Course:
         if why:
             raise checks.InputError(f"the growth of this scene cannot be kept for other designs: {why}. Run the scene itself.")
         return Scene(*(scene.listed[k] for k in split(scene).growth), name=scene.name, dt=scene.dt, founders=scene.founders)
+
+    @staticmethod
+    def made_of(scene: Scene) -> str:
+        """A word that is the same for scenes that grow alike, and for no others. Raises InputError where the growth cannot be kept."""
+        return _made_of(Course.scene_of(scene))
 
     @property
     def nbytes(self) -> int:
@@ -146,15 +161,18 @@ class Course:
     def _advance(self) -> None:
         state = self.state.replace(births=(), ended=(), reports={})
         noted: list[Change] = []
-        full = torch.zeros_like(state.counts, dtype=torch.bool) if self.cells is None else state.counts >= self.cells
+        full = torch.tensor([s in self.failed for s in self.streams], device=state.device)
+        if self.cells is not None and self.steps:
+            full = full | (state.counts >= self.cells)
+        full = full & (state.counts > 0)
         if bool(full.any()):  # or the quick would fill the memory while the slow are waited for
             kept = state.remove(full.index_select(0, state.colony), "left").replace(ended=())
             noted.append(_change(FIRST, state, kept))
             state = kept
-        for effect in self.scene.effects:
+        for part, effect in enumerate(self.scene.effects):
             after = effect.step(state, self.dt)
             if after is not state:
-                noted.append(_change(effect.stage, state, after))
+                noted.append(_change(part, state, after))
             state = after
         for report in state.reports.values():
             for place in torch.nonzero(report.status).squeeze(1).tolist():
@@ -164,7 +182,7 @@ class Course:
         self.state = state.replace(step=state.step + 1, time=(state.step + 1) * self.dt)
 
 
-def _change(stage: int, before: State, after: State) -> Change:
+def _change(part: int, before: State, after: State) -> Change:
     """The difference between two states."""
     source = None
     if after.uid is not before.uid:
@@ -176,6 +194,8 @@ def _change(stage: int, before: State, after: State) -> Change:
             continue
         values[name] = new
     births = None
+    if len(after.births) > len(before.births) + 1:
+        raise checks.SimulationError("an effect divided cells more than once in one step: such growth cannot be kept for other designs. Give replay=False.")
     if len(after.births) > len(before.births):
         made = after.births[-1]
         start = offsets(after.counts)[:-1]
@@ -183,7 +203,7 @@ def _change(stage: int, before: State, after: State) -> Change:
         first, second = (rows - start.index_select(0, owner) for rows in (made.first, made.second))
         births = (torch.bincount(owner, minlength=after.colonies), first, second)
     within = None if source is None else source - offsets(before.counts)[:-1].index_select(0, after.colony)
-    return Change(stage, after.counts, after.next_uid, within, values, births)
+    return Change(part, after.counts, after.next_uid, within, values, births)
 
 
 def _sources(before: State, after: State) -> Tensor:
@@ -193,8 +213,12 @@ def _sources(before: State, after: State) -> Tensor:
     mine, parents = key(after.colony, after.uid), key(after.colony, after.parent.clamp(min=0))
     at = torch.searchsorted(old, mine).clamp(max=max(0, old.numel() - 1))
     was_there = old.index_select(0, at) == mine
-    place = torch.where(was_there, at, torch.searchsorted(old, parents).clamp(max=max(0, old.numel() - 1)))
-    return order.index_select(0, place)
+    above = torch.searchsorted(old, parents).clamp(max=max(0, old.numel() - 1))
+    if bool((~was_there & (old.index_select(0, above) != parents)).any()):
+        raise checks.SimulationError(
+            "cells came in that no cell of their colony gave birth to: such growth cannot be kept for other designs. Give replay=False."
+        )
+    return order.index_select(0, torch.where(was_there, at, above))
 
 
 class Replay:
@@ -206,52 +230,57 @@ class Replay:
     def __init__(self, scene: Scene, course: Course):
         self.scene, self.course, self.dt = scene, course, course.dt
         grown = Course.scene_of(scene)
-        if grown.listing() != course.scene.listing() or not _alike(scene, course.scene):
+        if _made_of(grown) != _made_of(course.scene):
             raise checks.InputError(
                 f"this scene does not grow as the course did: {', '.join(grown.listing())} and its founders, instead of "
                 f"{', '.join(course.scene.listing())}. Make a Course of this scene."
             )
-        self.order = {stream: k for k, stream in enumerate(course.streams)}
+        device = course.state.device
+        self.streams, self.order = torch.sort(torch.tensor(course.streams, device=device))
         kept = {id(effect) for effect in grown.listed}
-        self.following = [part for k, part in zip(scene.places, scene.effects, strict=True) if id(scene.listed[k]) not in kept]
-        self.own = [f.name for part in self.following for f in part.declares(scene.dim) if f.name not in course.state.declared]
+        # each effect with its number among those of the course, or None if it only follows
+        numbers = iter(range(len(grown.effects)))
+        self.parts = [(part, next(numbers) if id(scene.listed[k]) in kept else None) for k, part in zip(scene.places, scene.effects, strict=True)]
+        self.own = [f.name for part, number in self.parts if number is None for f in part.declares(scene.dim)]
 
     def seed(self, colonies: int, *, streams: Sequence[int] | Tensor) -> State:
         """The first state of `colonies` colonies that follow these streams of the course, (B,)."""
         first = self.course.state
         state = self.scene.seed(colonies, seed=first.seed, streams=streams, dtype=first.dtype, device=first.device)
-        strange = sorted(set(state.stream.tolist()) - set(self.order))
+        strange = sorted(set(state.stream.tolist()) - set(self.course.streams))
         if strange:
-            raise checks.refuse("streams", strange[0], f"of the course: {', '.join(map(str, self.order))}")
+            raise checks.refuse("streams", strange[0], f"of the course: {', '.join(map(str, self.course.streams))}")
         return state
 
     def step(self, state: State) -> State:
         """The state one step later."""
         number = state.step
-        place = torch.tensor([self.order[s] for s in state.stream.tolist()], device=state.device)
+        place = self.order.index_select(0, torch.searchsorted(self.streams, state.stream))
+        changes = {change.part: change for change in self.course.changes(number)}
         state = state.replace(births=(), ended=(), reports={})
-        following = list(self.following)
-        for change in self.course.changes(number):
-            while following and following[0].stage < change.stage:
-                state = following.pop(0).step(state, self.dt)
-            state = self._apply(state, change, place)
-        for effect in following:
-            state = effect.step(state, self.dt)
-        state = self._with_failures(state, number)
+        if FIRST in changes:
+            state = self._apply(state, changes[FIRST], place)
+        for effect, part in self.parts:
+            if part is None:
+                state = effect.step(state, self.dt)
+            elif part in changes:
+                state = self._apply(state, changes[part], place)
+        if any(step == number for step, _ in self.course.failed.values()):
+            state = self._with_failures(state, number)
         return state.replace(step=number + 1, time=(number + 1) * self.dt)
 
     def _apply(self, state: State, change: Change, place: Tensor) -> State:
         """The state after a change of the course, whose colonies at `place` (B,) ours follow."""
         counts = change.counts.index_select(0, place)
         owner, rows = expand_ranges(offsets(change.counts)[:-1].index_select(0, place), counts)
-        taken = {name: value.index_select(0, rows) for name, value in change.values.items()}
+        taken = {name: value.index_select(0, rows) for name, value in change.values.items() if name not in self.own}
         old = state
         if change.source is not None:
             source = change.source.index_select(0, rows) + offsets(state.counts)[:-1].index_select(0, owner)
             state = state.take(source).replace(next_uid=change.next_uid.index_select(0, place))
-        state = state.replace(**{n: taken.pop(n) for n in PER_CELL if n in taken}).with_fields(**taken)
+        state = state.replace(**{n: taken.pop(n) for n in PER_CELL if n in taken})
         if change.births is None:
-            return state
+            return state.with_fields(**taken)
         number, firsts, seconds = change.births
         mine, at = expand_ranges(offsets(number)[:-1].index_select(0, place), number.index_select(0, place))
         start = offsets(counts)[:-1].index_select(0, mine)
@@ -259,7 +288,8 @@ class Replay:
         daughters = torch.cat([first, second])
         parents = old.take(source.index_select(0, first))
         state = state.replace(births=(*state.births, Births(first, second, state.uid.index_select(0, daughters), parents)))
-        return state.reset_at_division(daughters, self.own)
+        # as where cells divide: what starts anew does so from the parents' values of all that does
+        return state.reset_at_division(daughters, self.own).with_fields(**taken)
 
     def _with_failures(self, state: State, number: int) -> State:
         """The state with a report of what failed in the course in this step."""
@@ -272,8 +302,6 @@ class Replay:
         return state.replace(reports={**state.reports, "course": CourseReport(status, words)})
 
 
-def _alike(one: Scene, other: Scene) -> bool:
-    """Whether colonies of both start alike."""
-    a, b = (s.founders.state(1, 0, CPU, torch.float64) for s in (one, other))
-    names = [*PER_CELL, *a.fields]
-    return a.fields.keys() == b.fields.keys() and all(torch.equal(getattr(a, n), getattr(b, n)) for n in names)
+def _made_of(scene: Scene) -> str:
+    """What the growth of a scene depends on."""
+    return digest(scene.listed, scene.founders, scene.dim)

@@ -178,20 +178,28 @@ class Scene:
         """Each effect as it was listed, with the parameters that differ from their defaults; what a results file compares by."""
         return [re.sub(r" at 0x[0-9a-f]+", "", summary(effect)) for effect in self.listed]
 
+    @property
+    def headline(self) -> str:
+        """Name, dimension, step and founders, in a line."""
+        return f"{self.name}: {self.dim}-D, step {self.dt:g} h, {self.founders.count} founder(s)"
+
+    def drives(self) -> list[str]:
+        """The couplings in words, a line for each pair: "growth -> mechanics: length, elongation"; "nobody" where there are none."""
+        drives: dict[tuple[str, str], list[str]] = {}
+        for writer, name, reader in self.couplings():
+            drives.setdefault((writer, reader), []).append(name)
+        return [f"{w} -> {r}: {', '.join(names)}" for (w, r), names in drives.items()] or ["nobody"]
+
     def explain(self) -> str:
-        """What this scene simulates, in the order in which it acts, and who drives whom."""
-        lines = [f"{self.name}: {self.dim}-D, step {self.dt:g} h, {self.founders.count} founder(s)"]
+        """What this scene simulates, in the order in which it acts, and who drives whom. `torchfilm.explain` tells the methods and what they cost."""
+        lines = [self.headline]
         for effect in self.effects:
             lines.append(f"  {STAGES.get(effect.stage, str(effect.stage)):<10} {summary(effect)}")
             lines.append(f"             reads  {', '.join(effect.reads()) or '-'}")
             lines.append(f"             writes {', '.join(effect.writes()) or '-'}")
             for f in effect.declares(self.dim):
                 lines.append(f"             field  {f.name} ({f.unit or '1'}, per {f.scope}; daughters: {f.at_division}): {f.meaning}")
-        lines.append("  who drives whom:")
-        drives: dict[tuple[str, str], list[str]] = {}
-        for writer, name, reader in self.couplings():
-            drives.setdefault((writer, reader), []).append(name)
-        lines += [f"    {w} -> {r}: {', '.join(names)}" for (w, r), names in drives.items()] or ["    nobody"]
+        lines += ["  who drives whom:", *(f"    {line}" for line in self.drives())]
         return "\n".join(lines)
 
     def __repr__(self) -> str:

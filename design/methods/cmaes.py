@@ -26,7 +26,8 @@ class CMAES(Turns):
     """Covariance matrix adaptation (Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772), by the package cma.
 
     population: points in a batch; None is 4 + 3 ln D, rounded down, or, where there are levels, 6 + 3 ln(D · dimensions with levels). sigma: width of
-    the first cloud, as a share of each range. noisy: learn slowly, for losses with noise; False is faster where there is none.
+    the first cloud, as a share of each range. noisy: learn slowly, for losses with noise. A search grows every design on the same seeds, so that its losses
+    have none; those of a user's own may.
     restarts: when a cloud has converged, begin another with twice the population (IPOP: Auger and Hansen, CEC 2005), at most 16 times the first; False
     stays with the first cloud for ever.
 
@@ -39,7 +40,7 @@ class CMAES(Turns):
     population: int | None = None
     sigma: float = 0.3
     restarts: bool = True
-    noisy: bool = True
+    noisy: bool = False
 
     def __post_init__(self) -> None:
         if self.population is not None:

@@ -25,6 +25,7 @@ Centre = Literal["colony"] | tuple[float, float]
 ALONG = ("x", "y", "radius")
 COLOURS = ("#c2185b", "#1976d2", "#388e3c", "#f57c00", "#7b1fa2", "#5d4037")  # of what is wanted, one a species
 LEAST = 1e-3  # a cell that is wanted less bright than this is wanted dark
+WITHIN = 0.5  # what is wanted of a cell that lies within an edge
 
 
 class Mask(Target):
@@ -36,7 +37,8 @@ class Mask(Target):
 
     and that of several their mean. By Cauchy–Schwarz 0 ≤ (Σ w m y)² ≤ Σ w m² · Σ w y², so L is in [0, 1]. Where y = c·m for all cells, L = floor²/(c² +
     floor²): 0 for floor = 0, at any brightness, and 1/2 where the brightest are just at the floor. Evenly lit cells have 1 − (Σ w m)²/(Σ w Σ w m²): what
-    share of the colony is wanted dark. A colony in which no cell is wanted lit, or none is lit, has 1, with a finite gradient. Seen from above in 3-D.
+    share of the colony is wanted dark. A colony in which no cell lies where it is wanted lit (m above `least`), or none is lit, has 1, with a finite
+    gradient. Seen from above in 3-D.
     """
 
     floor: float
@@ -45,6 +47,11 @@ class Mask(Target):
     def names(self) -> tuple[str, ...]:
         """The species that the target looks at."""
         raise NotImplementedError(f"{type(self).__name__}.names")
+
+    @property
+    def least(self) -> float:
+        """A colony without a cell whose m is above this has not the place where the pattern should be."""
+        return 0.0
 
     def wanted(self, state: tf.State) -> Tensor:
         """The wanted profile of each species, (N, k) float64."""
@@ -64,6 +71,8 @@ class Mask(Target):
         m = torch.where(m < LEAST, 0.0, m)
         both, lit, light = (total(state, part) for part in (w * m * y, w * m * m, w * y * y))
         each = 1.0 - ratio(both * both, lit * (light + self.floor**2 * lit), 0.0)
+        # the soft tail of an edge that the colony does not reach is no pattern
+        each = torch.where(total(state, w * (m > self.least)) > 0, each, 1.0)
         # rounding may take a perfect colony below 0; one after the other, for a sum along a tensor may depend on the batch
         mean = sum(each.clamp(min=0.0).unbind(1), torch.zeros_like(each[:, 0])) / each.shape[1]
         return torch.where(sound, mean, self.failed)
@@ -73,7 +82,7 @@ class Mask(Target):
         """Of each species: mean level `inside`, where more than half is wanted, and `outside`, and `contrast`, the one over the other."""
         y, _ = seen(state, self.names)
         w = torch.where(self.counted(state), weights(state), 0.0).unsqueeze(1)
-        within = (self.wanted(state) > 0.5).double()
+        within = (self.wanted(state) > WITHIN).double()
         inside = ratio(total(state, w * within * y), total(state, w * within), math.nan)
         outside = ratio(total(state, w * (1 - within) * y), total(state, w * (1 - within)), math.nan)
         found: dict[str, Tensor] = {}
@@ -119,6 +128,10 @@ class Bands(Mask):
     @property
     def names(self) -> tuple[str, ...]:
         return self.species
+
+    @property
+    def least(self) -> float:
+        return half(min(b - a for a, b in itertools.pairwise(self.edges)), self.soft)
 
     def wanted(self, state: tf.State) -> Tensor:
         x = coordinate(state, self.along, self.centre)
@@ -168,6 +181,10 @@ class Ring(Mask):
     def edges(self) -> tuple[float, float]:
         """Inner and outer radius, µm."""
         return self.radius - 0.5 * self.width, self.radius + 0.5 * self.width
+
+    @property
+    def least(self) -> float:
+        return half(self.width, self.soft)
 
     def wanted(self, state: tf.State) -> Tensor:
         low, high = self.edges
@@ -344,6 +361,11 @@ def between(x: Tensor, low: float, high: float, soft: float) -> Tensor:
     """1 between the edges and 0 beyond, each edge a logistic of `soft` µm: σ((x − low)/soft) − σ((x − high)/soft), so that neighbours add up to 1."""
     # by tanh, whose last bit does not depend on where in a tensor it is taken, as that of torch's sigmoid does
     return 0.5 * (torch.tanh((x - low) / (2 * soft)) - torch.tanh((x - high) / (2 * soft)))
+
+
+def half(width: float, soft: float) -> float:
+    """Half of the greatest value of `between` with edges this far apart."""
+    return 0.5 * math.tanh(width / (4 * soft))
 
 
 def offset(state: tf.State, centre: Centre) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import ratio, seen, species_name, total, weights
-from design.targets.masks import COLOURS, Mask, between, common, lines
+from design.targets.masks import COLOURS, Mask, between, common, half, lines
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 STRIP = 2.0  # µm, of the profile along the stripe's axis
 ACROSS = 4.0  # µm, of the places across at which the middle of the stripe is looked up
+BLOCK = 2048  # cells whose distances to all others are held at once
 FEWEST = 3  # cells, for a mean over a strip to count
 
 
@@ -83,29 +84,30 @@ class Stripe(Mask):
         return super().counted(state) if self.cell_type is None else state.cell_type == self.cell_type
 
     @property
+    def least(self) -> float:
+        return half(self.width, self.soft)
+
+    @property
     def winds(self) -> bool:
         """Whether the stripe follows the border."""
         return self.at == "border" and not self.straight
 
-    def reference(self, state: tf.State) -> tuple[Tensor, Tensor]:
-        """The place of `at` along the axis, (B,) float64 µm, and of the stripe's middle from there; NaN where a colony has no border."""
+    def reference(self, state: tf.State) -> tuple[Tensor, Tensor, Tensor]:
+        """The place of `at` along the axis and of the stripe's middle from there, (B,) float64 µm, and the distance of each cell from `at`, (N,) µm, above 0
+        towards where the axis points; NaN where a colony has no border."""
         place = 0.0 if self.place is None else self.place
         if not isinstance(self.at, str):
             at = torch.full((state.colonies,), float(self.at), dtype=torch.float64, device=state.device)
-            return at, torch.full_like(at, place)
+            return at, torch.full_like(at, place), _axis(state, self.along) - self.at
         at, low_type = border(state, self.along)
+        middle = torch.full_like(at, place)
         if self.place is None and self.cell_type is not None:
-            return at, torch.where(low_type == self.cell_type, -0.5 * self.width, 0.5 * self.width)
-        return at, torch.full_like(at, place)
-
-    def distance(self, state: tf.State) -> Tensor:
-        """Of each cell from `at`, (N,) float64 µm, above 0 towards where the axis points; NaN where a colony has no border."""
-        at, _ = self.reference(state)
-        return _from_border(state, self.along) if self.winds else _axis(state, self.along) - at.index_select(0, state.colony)
+            middle = torch.where(low_type == self.cell_type, -0.5 * self.width, 0.5 * self.width).double()
+        return at, middle, _from_border(state, low_type) if self.winds else _axis(state, self.along) - at.index_select(0, state.colony)
 
     def wanted(self, state: tf.State) -> Tensor:
-        _, middle = self.reference(state)
-        x = self.distance(state) - middle.index_select(0, state.colony)
+        _, middle, distance = self.reference(state)
+        x = distance - middle.index_select(0, state.colony)
         low, high = -0.5 * self.width, 0.5 * self.width
         if self.winds and self.place is None and self.cell_type is not None:
             # towards the border there is nothing but the border
@@ -121,8 +123,7 @@ class Stripe(Mask):
         the cells farther than 2·width; straightness_um: how far, root mean square over strips of 4 µm across, the middle of the cells at least half as bright
         as the peak is from a straight line.
         """
-        y, (_, middle) = seen(state, self.names)[0][:, 0], self.reference(state)
-        x = self.distance(state)
+        y, (_, middle, x) = seen(state, self.names)[0][:, 0], self.reference(state)
         # without a border there is no place: such colonies' cells are left out, and their measures are NaN
         w = torch.where(self.counted(state) & torch.isfinite(x), weights(state), 0.0)
         x = torch.nan_to_num(x)
@@ -146,7 +147,7 @@ class Stripe(Mask):
             x, y = state.position[mine, :2].cpu().numpy().T
             ax.plot(x, y, ".", color=COLOURS[0], ms=3)
             return
-        at, middle = (float(v[place]) for v in self.reference(state))
+        at, middle = (float(v[place]) for v in self.reference(state)[:2])
         lines(ax, self.along, (0.0, 0.0), (at + middle - 0.5 * self.width, at + middle + 0.5 * self.width), COLOURS[0])
         if self.at == "border":
             lines(ax, self.along, (0.0, 0.0), (at,), "black", ":")
@@ -164,11 +165,10 @@ def _axis(state: tf.State, along: str) -> Tensor:
 
 
 @torch.no_grad()
-def _from_border(state: tf.State, along: str) -> Tensor:
-    """How far each cell is from the nearest cell of the other type, centre to centre less a diameter, (N,) float64 µm, below 0 for the type that lies lower
-    on the axis; NaN where there is no other type."""
-    _, low_type = border(state, along)
-    position, kind = state.position.detach(), state.cell_type
+def _from_border(state: tf.State, low_type: Tensor) -> Tensor:
+    """How far each cell is from the nearest cell of the other type, seen from above, centre to centre less a diameter, (N,) float64 µm, below 0 for
+    `low_type` (B,), the type that lies lower on the axis; NaN where there is no other type."""
+    position, kind = state.position.detach()[:, :2], state.cell_type
     found = torch.full((state.cells,), math.nan, dtype=torch.float64, device=state.device)
     start = 0
     for count in state.counts.tolist():
@@ -178,8 +178,9 @@ def _from_border(state: tf.State, along: str) -> Tensor:
         one, other = mine[of_one], mine[~of_one]
         if not other.numel():
             continue
-        apart = torch.cdist(position[one], position[other], compute_mode="donot_use_mm_for_euclid_dist")
-        found[one], found[other] = apart.amin(1), apart.amin(0)
+        for these, those in ((one, other), (other, one)):
+            for some in these.split(BLOCK):
+                found[some] = torch.cdist(position[some], position[those], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
     found = found - 2.0 * state.radius.detach().double()
     return torch.where(kind == low_type.index_select(0, state.colony), -found, found)
 

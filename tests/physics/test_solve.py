@@ -79,7 +79,7 @@ class Problem:
         colonies = Groups(i(self.colony), self.colonies)
         return ContactProblem(rows, gap, held, t(self.alpha).unsqueeze(1), t(self.lower), t(self.scale), colonies, unilateral)
 
-    def solved(self, unilateral: bool, tolerance: float = 1e-12, **options):
+    def solved(self, unilateral: bool, tolerance: float | torch.Tensor = 1e-12, **options):
         """The solve's y = x / M^(−½), (N, D), and its report."""
         x, report = solve(self.problem(unilateral, **options), None, tolerance, 5000)
         return array(x) / self.scale, report
@@ -100,6 +100,18 @@ def test_bilateral_solve_against_dense(seed, degrees):
     assert (report.status == CONVERGED).all()
     assert np.abs(y - expected).max() <= 1e-9
     assert np.abs(expected).max() > 0.01
+
+
+@MODES
+def test_a_tolerance_for_each_colony(unilateral):
+    """Each colony is solved to its own tolerance, with the bits of a solve in which all have that tolerance."""
+    p, wanted = Problem.random(4, [12, 7, 20], 7), [0.2, 1e-10, 1e-3]
+    found, report = p.solved(unilateral, torch.tensor(wanted, dtype=torch.float64))
+    assert (report.residual <= torch.tensor(wanted, dtype=torch.float64)).all()
+    assert int(report.iterations[0]) < int(report.iterations[2]) < int(report.iterations[1])
+    for colony, tolerance in enumerate(wanted):
+        alike, _ = p.solved(unilateral, tolerance)
+        assert np.array_equal(found[p.colony == colony], alike[p.colony == colony])
 
 
 @pytest.mark.parametrize("seed", range(5))

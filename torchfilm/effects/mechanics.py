@@ -24,6 +24,11 @@ from torchfilm.tools.ragged import offsets
 # not hold the rest for long. What still turns too far is cut, and counted.
 MAX_TURN = 0.5
 LEAST_SHARE = 0.5
+# In a large colony in space some cell would always turn too far, and two shortened moves leave a quarter of every step's way
+# to go: as overlap that turns more cells. While more than MOST_LEFT of a move is left, up to twice as many passes are taken.
+MOST_LEFT = 0.2
+# Tolerances of the solve. In space cells that buckle amplify what is left by the last one; those that others follow may be loose.
+LOOSE, FINE = 0.2, 0.05
 MOST_SUBSTEPS = 1000
 COARSE_PASSES, COARSE_OVERLAP = 6, 0.02
 
@@ -63,10 +68,11 @@ class Mechanics(Effect):
     unilateral: contacts only push. False (default, the paper's least squares) also holds an overlapping pair that wants to part, until
     the next pass: measured, the overlap is the same or less, at half the CG iterations or fewer.
     passes: at most this many times a step contacts are found and solved: again in colonies where the move made new contacts, or left an
-    overlap deeper than `overlap` (µm). Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other; twice as many
-    for unilateral contacts, since a push at one end may drive in the other; 6, down to 0.02 µm, for colonies that take sub-steps.
-    tolerance: of the solve, worst residual relative to the worst at rest; default 0.2 in the plane, where it changes no overlap, and 0.05 in space,
-    where cells that buckle amplify what is left. max_iterations: CG iterations a solve.
+    overlap deeper than `overlap` (µm), or was cut short. Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other,
+    and up to 4 while the moves, cut short, leave more than a fifth of the way to go; twice as many for unilateral contacts, since a push at one
+    end may drive in the other; 6, down to 0.02 µm, for colonies that take sub-steps.
+    tolerance: of the solve, worst residual relative to the worst at rest; default 0.2, and in space, where cells that buckle amplify
+    what is left, 0.05 from the second pass on, unless that will not be the last. max_iterations: CG iterations a solve.
     max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
     """
 
@@ -130,8 +136,8 @@ class Mechanics(Effect):
 
     @property
     def least_accuracy(self) -> float:
-        """`tolerance`, or its default for the dimension."""
-        return self.tolerance if self.tolerance is not None else (0.2 if self.dim == 2 else 0.05)
+        """`tolerance`, or its default where other passes may follow."""
+        return self.tolerance if self.tolerance is not None else LOOSE
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (
@@ -199,7 +205,7 @@ class _Run:
         count = state.colonies
         zero = torch.zeros(count, dtype=torch.int64, device=state.device)
         self.limited = zero
-        self.share = torch.ones(count, dtype=state.dtype, device=state.device)
+        self.share = self.left = torch.ones(count, dtype=state.dtype, device=state.device)
         self.report = MechanicsReport(status, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero, self.share)
         start = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
         self.reference = state.position.detach().index_select(0, start).index_select(0, state.colony)
@@ -212,6 +218,7 @@ class _Run:
         # a step that needs sub-steps is a coarse one: unless told otherwise, it is looked at more closely
         coarse = substeps > 1
         self.passes = torch.where(coarse & (settings.passes is None), COARSE_PASSES, settings.most_passes)
+        self.most_passes = torch.where(~coarse & (settings.passes is None) & (state.dim == 3), 2 * self.passes, self.passes)
         limit = torch.full_like(self.report.residual, torch.inf if settings.overlap is None else settings.overlap)
         self.overlap = torch.where(coarse & (settings.overlap is None), COARSE_OVERLAP, limit).index_select(0, state.colony)
         if settings.stiffness is not None:
@@ -226,17 +233,21 @@ class _Run:
         moving = active.index_select(0, self.state.colony)
         self.length = torch.where(moving, base + growth, base)
         seen: Tensor | None = None
-        for number in range(int(self.passes.max())):
+        self.left = torch.ones_like(self.share)
+        for number in range(int(self.most_passes.max())):
+            active = active & ((number < self.passes) | (number < self.most_passes) & (self.left > MOST_LEFT))
+            if not bool(active.any()):
+                return
             contacts, walls = self._detect(active)
             if seen is not None:
-                active = active & (number < self.passes) & self._again(contacts, walls, seen)
+                active = active & self._again(contacts, walls, seen)
                 if not bool(active.any()):
                     return
             moving = active.index_select(0, self.state.colony)
             contacts, walls = _only(contacts, walls, moving)
-            move, report = self._solve(contacts, walls, base, moving, first=number == 0)
+            move, report = self._solve(contacts, walls, base, moving, number)
             self._move(move, base, moving, report, active)
-            seen = self._keys(contacts) if number + 1 < int(self.passes.max()) else None
+            seen = self._keys(contacts) if number + 1 < int(self.most_passes.max()) else None
             self.report = self._noted(report, active)
             if number == 0:
                 self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
@@ -273,7 +284,7 @@ class _Run:
         again[walls.cell[walls.gap < -self.overlap.index_select(0, walls.cell)]] = True
         return groups.any(again) | (self.share < 1)
 
-    def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, first: bool):
+    def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, number: int):
         state, settings = self.state, self.settings
         across, turning, _ = capsule.drag(self.length, state.radius, self.viscosity)
         d, turns = state.dim, settings.degrees - state.dim - 1
@@ -290,11 +301,19 @@ class _Run:
         gap = torch.cat([contacts.gap * root.squeeze(1), walls.gap * wall_root])
         # a soft row's force acts once a step: later passes only correct it (hard rows are numerics, each pass a closer limit)
         soft = torch.cat([torch.full_like(contacts.first, settings.stiffness is not None, dtype=torch.bool), wall_soft])
-        held = torch.zeros_like(gap) if first else torch.where(soft, gap.clamp(max=0), 0.0)
+        held = torch.zeros_like(gap) if number == 0 else torch.where(soft, gap.clamp(max=0), 0.0)
         lower = (base - self.length) / scale[:, -1]
         problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1), lower, scale, state.groups, settings.unilateral)
-        start = state.displacement if first else None
-        return solve(problem, start, settings.least_accuracy, settings.max_iterations)
+        start = state.displacement if number == 0 else None
+        return solve(problem, start, self._accuracy(number), settings.max_iterations)
+
+    def _accuracy(self, number: int) -> Tensor:
+        """Tolerance of the solve in each colony's pass `number`, (B,)."""
+        # no more than loose where even this move, if cut short too, must be followed by another, and in those that follow
+        more = (self.most_passes > self.passes) & (self.left * (1 - LEAST_SHARE) > MOST_LEFT)
+        late = (number + 1 >= self.passes.clamp(max=2)) & (number < self.passes)
+        fine = late & ~more & (self.settings.tolerance is None) & (self.state.dim == 3)
+        return torch.full_like(self.share, self.settings.least_accuracy).masked_fill(fine, FINE)
 
     def _turn(self, move: Tensor) -> Tensor:
         """How far each cell turns, (N,) rad."""
@@ -327,6 +346,7 @@ class _Run:
         too_far = turn > MAX_TURN * (1 + 1e-5)
         cut = torch.where(too_far, MAX_TURN / turn, 1.0)
         self.share = torch.where(active, share, self.share)
+        self.left = torch.where(active, self.left * (1 - share), self.left)
         self.limited = torch.where(active, state.groups.sum(too_far.to(state.dtype)).squeeze(1).long(), self.limited)
         self.position = self.position + move[:, :d].to(self.position.dtype)
         self.axis = torch.where(sound, capsule.rotate(self.axis, move[:, d:-1] * cut), self.axis)

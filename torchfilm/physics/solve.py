@@ -106,11 +106,12 @@ class ContactProblem:
         return (self.of_rows.sum(spring.unsqueeze(1)) + self.colonies.sum(drag)).squeeze(1)
 
 
-def solve(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int) -> tuple[Tensor, SolveReport]:
+def solve(problem: ContactProblem, start: Tensor | None, tolerance: float | Tensor, max_iterations: int) -> tuple[Tensor, SolveReport]:
     """Solve for x (N, D) from `start` (an earlier x, or None for 0). Differentiable by the adjoint: one more solve with the same operator.
 
-    A colony has converged when its worst preconditioned residual is at most `tolerance` times the worst at x = 0.
+    A colony has converged when its worst preconditioned residual is at most `tolerance`, one or one per colony (B,), times the worst at x = 0.
     """
+    tolerance = torch.as_tensor(tolerance, dtype=problem.scale.dtype, device=problem.scale.device).expand(problem.colonies.size)
     with torch.no_grad():
         y, free, active, report, inverse = _minimise(_detached(problem), start, tolerance, max_iterations)
     tracked = (problem.gap, problem.rows.row_first, problem.rows.row_wall, problem.alpha, problem.lower, problem.scale)
@@ -127,7 +128,7 @@ def _detached(p: ContactProblem) -> ContactProblem:
     return ContactProblem(rows, p.gap.detach(), p.held.detach(), p.alpha.detach(), p.lower.detach(), p.scale.detach(), p.colonies, p.unilateral)
 
 
-def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: float, max_iterations: int):
+def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: Tensor, max_iterations: int):
     colonies = problem.colonies
     zero = torch.zeros_like(problem.scale)
     active = problem.acting(problem.gap)
@@ -166,9 +167,7 @@ class _Iterate:
         return _Iterate(*(getattr(self, f.name).index_select(0, index) for f, index in zip(fields(self), which.by_field(), strict=True)))
 
     def with_part(self, part: _Iterate, which: Selection) -> _Iterate:
-        return _Iterate(
-            *(getattr(self, f.name).index_copy(0, index, getattr(part, f.name)) for f, index in zip(fields(self), which.by_field(), strict=True))
-        )
+        return _Iterate(*(getattr(self, f.name).index_copy(0, index, getattr(part, f.name)) for f, index in zip(fields(self), which.by_field(), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -184,7 +183,7 @@ class Selection:
         return (self.cells, self.rows, self.rows, self.cells, self.colonies, self.colonies, self.colonies)
 
 
-def _newton(problem: ContactProblem, inverse: Tensor, at: _Iterate, tolerance: float, max_iterations: int, number: int) -> _Iterate:
+def _newton(problem: ContactProblem, inverse: Tensor, at: _Iterate, tolerance: Tensor, max_iterations: int, number: int) -> _Iterate:
     """Rounds of Newton's method from the iterate `at`, the round `number` first, until every colony has converged."""
     colonies = problem.colonies
     y, after, active, scale, previous, iterations = at.y, at.after, at.active, at.scale, at.worst, at.iterations
@@ -208,7 +207,7 @@ def _newton(problem: ContactProblem, inverse: Tensor, at: _Iterate, tolerance: f
         which = _minority(problem, going)
         if which is not None:  # the few that go on need not carry the others along
             part = replace(here.part(which), worst=previous.index_select(0, which.colonies))
-            end = _newton(problem.part(which), inverse.index_select(0, which.cells), part, tolerance, max_iterations, number)
+            end = _newton(problem.part(which), inverse.index_select(0, which.cells), part, tolerance.index_select(0, which.colonies), max_iterations, number)
             return here.with_part(end, which)
         previous = worst
         least = torch.maximum(0.5 * target, FORCING * worst) if problem.unilateral else 0.5 * target
@@ -325,7 +324,7 @@ class _AdjointSolve:
         colonies, b = self.problem.colonies, grad * self.free
         precondition = _within(self.free, self.inverse)
         # the forward solve's tolerance is a matter of overlaps; a gradient wants more
-        tolerance = min(self.tolerance, 1e-4 if grad.dtype == torch.float32 else 1e-8)
+        tolerance = self.tolerance.clamp(max=1e-4 if grad.dtype == torch.float32 else 1e-8)
         target = tolerance * worst_of(precondition(b), colonies)
         return conjugate_gradients(_operator(self.problem, self.active), b, precondition, colonies, target, self.max_iterations).x
 

@@ -18,6 +18,11 @@ class Operators(TorchDispatchMode):
         self.calls: Counter[str] = Counter()
         self.bytes = 0
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        # or torch would load its compiler, a second or two, only to be told to leave this class alone
+        return False
+
     @property
     def total(self) -> int:
         """Operators in all."""

@@ -1,0 +1,175 @@
+"""What each effect costs, in every ready-made scene: time, operators and bytes of a step; and that an effect which is not listed costs nothing.
+
+    OMP_NUM_THREADS=1 python experiments/effect_costs.py                     # five to ten minutes; writes docs/costs.md and a JSON record
+    OMP_NUM_THREADS=1 python experiments/effect_costs.py --cells 50 --out costs.json --page ''
+
+Each scene is grown from its founders to 200 cells in each of 4 colonies, or as many as it has after 12 h. From there 20 steps are taken twice: once
+timed, once with every operator counted that they dispatch, and the bytes allocated for its results. Operators and bytes are the same whatever else the
+machine does; times are told as shares of one run. Then growth, division and mechanics are taken alone and beside other effects that do not act on them:
+the same cells, the same operators, the same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+
+import torchfilm as tf
+from torchfilm.explain import Spending
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from record import machine
+
+HERE = Path(__file__).parent
+STEPS, HOURS = 20, 12.0
+# What a ready scene is given where by default it holds fewer cells than are wanted.
+SETTINGS = {"channel": {"width": 16.0, "length": 80.0}, "programmed_growth": {"edge": 20.0}}
+BEGIN, END = "<!-- tables: experiments/effect_costs.py -->", "<!-- end of tables -->"
+BODY = ("growth", "mechanics", "division")
+
+
+def grown(scene: tf.Scene, cells: int, colonies: int) -> tf.State:
+    """The scene's colonies at so many cells each, or after HOURS."""
+    run = tf.simulate(scene, scene.seed(colonies, seed=0), cells=cells, until=round(HOURS / scene.dt) * scene.dt)
+    return deque(run, maxlen=1).pop()
+
+
+def counted(scene: tf.Scene, state: tf.State, steps: int) -> list[Spending]:
+    """What each of the next steps asks of torch."""
+    found = []
+    for _ in range(steps):
+        found.append(Spending())
+        state = scene.step(state, scene.dt, found[-1])
+    return found
+
+
+def timed(scene: tf.Scene, state: tf.State, steps: int) -> dict[str, float]:
+    """Median ms of a step, by effect."""
+    taken: dict[str, list[float]] = {}
+    for _ in range(steps):
+        timings = tf.Timings()
+        state = scene.step(state, scene.dt, timings)
+        for title, seconds in timings.seconds.items():
+            taken.setdefault(title, []).append(1e3 * seconds)
+    return {title: statistics.median(ms) for title, ms in taken.items()}
+
+
+def of_scene(name: str, cells: int, colonies: int) -> dict:
+    """What a ready scene's effects cost in a step."""
+    scene = tf.scenes.build(name, SETTINGS.get(name))
+    state = grown(scene, cells, colonies)
+    timed(scene, state, 3)  # what is made once is made now
+    ms, spent = timed(scene, state, STEPS), counted(scene, state, STEPS)
+    effects = {
+        title: {
+            "ms": round(ms[title], 4), "share": round(ms[title] / sum(ms.values()), 4),
+            "operators": sum(sum(s.calls[title].values()) for s in spent) / STEPS, "bytes": sum(s.bytes[title] for s in spent) / STEPS,
+        } for title in ms
+    }  # fmt: skip
+    return {"case": "scene", "scene": name, "settings": SETTINGS.get(name, {}), "cells": state.cells, "colonies": colonies, "steps": STEPS, "effects": effects}
+
+
+def _watching(cells: tf.State) -> None:
+    cells.mark = cells.length * 2.0
+
+
+def _made(u, s, p, cell):
+    return {"m": 1.0 - u.m}
+
+
+def additions() -> dict[str, Sequence[tf.Effect]]:
+    """Effects that leave growth, division and mechanics what they are."""
+    medium = tf.Medium(ahl=tf.Signal(diffusion=10.0), box=((-64.0, -64.0), (64.0, 64.0)), spacing=4.0, beyond="grow")
+    smooth = tf.Circuit(_made, species=("m",))
+    molecules = tf.Circuit([tf.parts.constitutive("m", 1.0), tf.parts.degradation("m", 1.0)], species=("m",), method="tau_leap")
+    return {
+        "nothing": (), "a circuit": (smooth,), "a circuit, molecule by molecule": (molecules,), "a medium": (medium,),
+        "a circuit and a medium": (smooth, medium), "rules": (tf.Rules(_watching),), "removal": (tf.Removal((-500.0, -500.0), (500.0, 500.0)),),
+    }  # fmt: skip
+
+
+def beside(cells: int, colonies: int) -> list[dict]:
+    """Operators and bytes of STEPS steps of growth, division and mechanics, alone and beside other effects."""
+    records = []
+    for name, more in additions().items():
+        scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2), *more)
+        state = grown(scene, cells, colonies)
+        spent = counted(scene, state, STEPS)
+        record: dict = {"case": "beside", "beside": name, "cells": state.cells, "colonies": colonies, "steps": STEPS}
+        for title in BODY:
+            calls = sum((s.calls[title] for s in spent), Counter())
+            record[title] = {"operators": sum(calls.values()), "bytes": sum(s.bytes[title] for s in spent), "by_name": dict(sorted(calls.items()))}
+        others = [title for title in spent[0].calls if title not in BODY]
+        record["others"] = {"operators": sum(sum(s.calls[t].values()) for s in spent for t in others), "bytes": sum(s.bytes[t] for s in spent for t in others)}
+        records.append(record)
+        alone = records[0]
+        for title in ("growth", "mechanics"):
+            if record[title] != alone[title] or state.cells != alone["cells"]:
+                raise SystemExit(f"{title} beside {name} does not cost what it costs alone: {record[title]} instead of {alone[title]}")
+        print(f"beside {name}: growth and mechanics the same", flush=True)
+    return records
+
+
+def scene_rows(record: dict) -> list[str]:
+    """A scene's rows of the table."""
+    effects = record["effects"]
+    total = {key: sum(e[key] for e in effects.values()) for key in ("ms", "operators", "bytes")}
+    rows = [f"| **{record['scene']}**, {record['cells']} cells | {total['ms']:.1f} ms | {total['operators']:.0f} | {total['bytes'] / 1e6:.2f} |"]
+    for title, e in sorted(effects.items(), key=lambda item: -item[1]["ms"]):
+        rows.append(f"| {title} | {100 * e['share']:.1f} % | {e['operators']:.0f} | {e['bytes'] / 1e6:.2f} |")
+    return rows
+
+
+def tables(noted: dict, records: list[dict]) -> str:
+    """The page's tables in Markdown."""
+    scenes, body = ([r for r in records if r["case"] == case] for case in ("scene", "beside"))
+    lines = [
+        f"Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']}, Python {noted['python']}, {noted['threads']} thread(s), "
+        f"{noted['processor']}, float32. Means over {STEPS} steps of {scenes[0]['colonies']} colonies; times are medians, as shares of the step.",
+        "", "| scene, effect | time of a step | operators a step | MB allocated a step |", "|---|---|---|---|", *(row for r in scenes for row in scene_rows(r)),
+        "", "## What is not listed costs nothing", "",
+        f"{body[0]['cells']} cells in {body[0]['colonies']} colonies, {STEPS} steps: operators dispatched and bytes allocated, in all.", "",
+        "| growth, division and mechanics beside | growth | mechanics | division | the other effects |", "|---|---|---|---|---|",
+    ]  # fmt: skip
+    show: Callable[[dict], str] = lambda cost: f"{cost['operators']}, {cost['bytes']:,} B"  # noqa: E731
+    lines += [f"| {r['beside']} | " + " | ".join(show(r[key]) for key in (*BODY, "others")) + " |" for r in body]
+    return "\n".join(lines)
+
+
+def write_page(path: Path, text: str) -> None:
+    """Put the tables between the page's two marks."""
+    page = path.read_text()
+    if BEGIN not in page or END not in page:
+        raise SystemExit(f"{path} has no place for tables, from {BEGIN} to {END}")
+    path.write_text(page[: page.index(BEGIN) + len(BEGIN)] + "\n\n" + text + "\n\n" + page[page.index(END) :])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", action="append", choices=tuple(tf.scenes.READY), help="one scene; may be given again")
+    parser.add_argument("--cells", type=int, default=200, help="in each colony")
+    parser.add_argument("--colonies", type=int, default=4)
+    parser.add_argument("--out", type=Path, default=HERE / "benchmarks" / "effect_costs.json", help="JSON record, written anew")
+    parser.add_argument("--page", default=str(HERE.parent / "docs" / "costs.md"), help="page whose tables are written anew; '' for none")
+    chosen = parser.parse_args()
+    tf.keep_memory()
+    torch.set_grad_enabled(False)
+    noted, records = machine(), []
+    for name in chosen.scene or tf.scenes.READY:
+        records.append(of_scene(name, chosen.cells, chosen.colonies))
+        print("\n".join(scene_rows(records[-1])), flush=True)
+    records += beside(chosen.cells, chosen.colonies)
+    chosen.out.write_text(json.dumps([noted | record for record in records], indent=1) + "\n")
+    if chosen.page:
+        write_page(Path(chosen.page), tables(noted, records))
+
+
+if __name__ == "__main__":
+    main()
