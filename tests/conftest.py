@@ -24,6 +24,18 @@ def dtype(request) -> torch.dtype:
 
 
 @pytest.fixture
+def measured(record_property):
+    """`measured("overlap, µm", value, "≤ 0.05")` beside a hard case's assertion notes the value for docs/stability.md, and gives it back. Of several of one
+    case the page shows the worst: the least where the criterion is "≥ …", else the greatest."""
+
+    def note(what: str, value, criterion: str):
+        record_property("measured", (what, float(value), criterion))
+        return value
+
+    return note
+
+
+@pytest.fixture
 def deterministic():
     """Torch's deterministic algorithms, switched back afterwards."""
     before = torch.are_deterministic_algorithms_enabled()

@@ -27,7 +27,7 @@ def solved(rates, u, t, **options):
     return out
 
 
-def test_case_24_a_fast_variable_in_a_bistable_loop(device, dtype):
+def test_case_24_a_fast_variable_in_a_bistable_loop(device, dtype, measured):
     """x' = 0.1 + 2z − x, z' = 1e8 (h(x) − z), h = x⁸/(1+x⁸): from (1, 0), x(10) = 2.0945004; from (0.9, 0), 0.100049.
 
     The answers have 8 and 6 digits. The first approaches a fixed point, the second passes near the threshold, which magnifies errors: with rtol
@@ -41,10 +41,11 @@ def test_case_24_a_fast_variable_in_a_bistable_loop(device, dtype):
     u = solved(rates, torch.tensor([[1.0, 0.0], [0.9, 0.0]], dtype=dtype, device=device), 10.0, rtol=rtol_of(dtype))
     bound = 3e-5 if dtype == torch.float32 else 1e-6
     assert array(u)[:, 0] == pytest.approx([2.0945004, 0.100049], abs=bound)
+    measured("error of x(10)", abs(array(u)[:, 0] - [2.0945004, 0.100049]).max(), "≤ 3e-5 (float64: 1e-6)")
     assert float(u.min()) >= 0
 
 
-def test_case_26_fast_exchange(device, dtype):
+def test_case_26_fast_exchange(device, dtype, measured):
     """A ⇌ B with rates 1e8 and 1, Δt = 1: equilibrium to 1e-6 (given): A/(A + B) = 1/(1 + 1e8). The sum is kept to rounding, in float32 too,
     because the linear algebra is done in float64: cond(W) · 1e-16 = 1e-8 there, one unit of 6e-8 here. One step does it.
     """
@@ -58,12 +59,13 @@ def test_case_26_fast_exchange(device, dtype):
     u, report = rosenbrock(rates, start, 1.0)
     assert (report.status == DONE).all() and (report.accepted <= 2).all()
     assert array(u)[:, 0] == pytest.approx(1e-8, abs=1e-6) and array(u)[:, 1] == pytest.approx(1.0, abs=1e-6)
-    assert float((u.double().sum(1) - 1).abs().max()) <= 1.2e-7
+    measured("error of the equilibrium", abs(array(u)[:, 0] - 1e-8).max(), "≤ 1e-6")
+    assert measured("change of the sum", float((u.double().sum(1) - 1).abs().max()), "≤ 1.2e-7") <= 1.2e-7
     assert float(u.min()) >= 0
 
 
 @pytest.mark.parametrize("power", [1.5, 8])
-def test_case_27_hill_at_zero(device, dtype, power):
+def test_case_27_hill_at_zero(device, dtype, measured, power):
     """All zeros with Hill n = 1.5 and 8: Jacobian finite, x ≥ 0; also by autograd a second time, as gradients through a step need it."""
 
     def rates(u, rows):
@@ -78,10 +80,10 @@ def test_case_27_hill_at_zero(device, dtype, power):
     assert torch.isfinite(torch.autograd.grad(u.sum(), zero)[0]).all()
     # from within reach of zero, each to its own side: 0.5 is a fixed point only of one of the two
     small = torch.tensor([[1e-20, 0.0], [0.0, 1e-3], [0.4, 1e-6]], dtype=dtype, device=device)
-    assert float(solved(rates, small, 3.0).min()) >= 0
+    assert measured("lowest concentration", float(solved(rates, small, 3.0).min()), "≥ 0") >= 0
 
 
-def test_case_28_hopf(device, dtype):
+def test_case_28_hopf(device, dtype, measured):
     """Hopf normal form, μ = 0.01, ω = 1: amplitude 0.1, period 2π, within 1 % (given), from inside and outside.
 
     From 0.09 and 0.11 the distance falls as e^−2μt: 5 % of 10 % is left at t = 150. The steps' own damping, about rtol an hour, shifts the amplitude by
@@ -97,14 +99,16 @@ def test_case_28_hopf(device, dtype):
     start = torch.tensor([[0.09, 0.0], [0.11, 0.0]], dtype=dtype, device=device)
     there = solved(rates, start, 150.0, **options)
     assert array(there.norm(dim=1)) == pytest.approx(0.1, rel=0.01)
+    measured("error of the amplitude, relative", abs(array(there.norm(dim=1)) / 0.1 - 1).max(), "≤ 0.01")
     later = solved(rates, there, 2 * math.pi, **options)
     # a turn later it is back: 1 % of the period is an angle of 0.06
     turned = torch.atan2(there[:, 0] * later[:, 1] - there[:, 1] * later[:, 0], (there * later).sum(1))
     assert float(turned.abs().max()) <= 0.01 * 2 * math.pi
+    measured("error of the period, relative", float(turned.abs().max()) / (2 * math.pi), "≤ 0.01")
 
 
 @pytest.mark.slow
-def test_case_29_repressilator(device, dtype):
+def test_case_29_repressilator(device, dtype, measured):
     """α = 216, α₀ = 0.216, n = 2: period 43.447 (β = 0.2), 8.6893 (β = 5).
 
     The answers are given to 5 digits, 1.2e-5. Seven periods leave 4e-6 of the way to the cycle (three leave 1e-4, six 1e-5), and rtol from 1e-4 to 3e-6
@@ -130,9 +134,10 @@ def test_case_29_repressilator(device, dtype):
     assert (half_way.abs().amax(1) > 10).all()
     assert ((away - late.unsqueeze(1) * speed).norm(dim=1) <= 1e-3 * half_way.double().norm(dim=1)).all()
     assert array(late) == pytest.approx([0.0, 0.0], abs=3e-5)
+    measured("error of the period, relative", abs(array(late)).max(), "≤ 3e-5")
 
 
-def test_case_30_toggle_switch(device, dtype):
+def test_case_30_toggle_switch(device, dtype, measured):
     """a = 10, n = 2: stable at 5 ± √24, saddle at (2, 2); from (2, 2) ± 1e-3 each goes to its own side; on the diagonal it stays at the saddle."""
 
     def rates(u, rows):
@@ -143,5 +148,6 @@ def test_case_30_toggle_switch(device, dtype):
     high, low = 5 + math.sqrt(24), 5 - math.sqrt(24)
     assert u[0] == pytest.approx([high, low], rel=1e-5)
     assert u[1] == pytest.approx([low, high], rel=1e-5)
+    measured("error of the stable states, relative", abs(u[:2] / [[high, low], [low, high]] - 1).max(), "≤ 1e-5")
     # both species of the third are computed alike, so nothing parts them
     assert u[2] == pytest.approx([2.0, 2.0], rel=1e-5)

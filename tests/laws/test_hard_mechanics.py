@@ -22,41 +22,42 @@ DT = 0.01
 X, Y, Z = np.eye(3)
 
 
-def parted(scene: tf.Scene, cells: tf.Cells, device, dtype) -> None:
+def parted(scene: tf.Scene, cells: tf.Cells, device, dtype, measured) -> None:
     """Two cells on top of each other are parted in one step of at most six passes, and their forces balance."""
     start = seeded(scene, cells, device, dtype)
     state = scene.step(start, DT)
     check_always(state, scene)
     # criterion of the cases: no gap below −1e-3 µm
-    assert worst_overlap(state) <= 1e-3
+    assert measured("overlap, µm", worst_overlap(state), "≤ 1e-3") <= 1e-3
     # action = reaction row by row, so Σ μL Δc = 0; the two cells are alike, so their L is one number and 1e-6 leaves only rounding
     drag = array(state.length + 2 * state.radius)[:, None]
-    assert np.abs((drag * array(state.position - start.position)).sum(0)).max() <= 1e-6
+    moved = np.abs((drag * array(state.position - start.position)).sum(0)).max()
+    assert measured("Σ drag·displacement", moved, "≤ 1e-6") <= 1e-6
 
 
 @MODES
 @pytest.mark.parametrize("rate", [0.0, 1.0])
 @pytest.mark.parametrize("sign", [1, -1], ids=["parallel", "antiparallel"])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_case_01_same_centre_parallel(device, dtype, unilateral, rate, sign, dim):
+def test_case_01_same_centre_parallel(device, dtype, measured, unilateral, rate, sign, dim):
     """Two cells, same centre, parallel, l = 2: after 6 passes no gap below −1e-3; Σ drag·displacement = 0 ± 1e-6."""
     scene = tf.Scene(growth(rate), mechanics(passes=6, overlap=1e-3, unilateral=unilateral, dim=dim))
     axis = rotation(np.random.default_rng(1), dim)[0]
-    parted(scene, tf.Cells(np.zeros((2, dim)), [axis, sign * axis], 2.0), device, dtype)
+    parted(scene, tf.Cells(np.zeros((2, dim)), [axis, sign * axis], 2.0), device, dtype, measured)
 
 
 @MODES
 @pytest.mark.parametrize("rate", [0.0, 1.0])
-def test_case_02_same_centre_crossing(device, dtype, unilateral, rate):
+def test_case_02_same_centre_crossing(device, dtype, measured, unilateral, rate):
     """Same centre, crossing at 90°: the normal is the cross product of the axes; same bounds as case 1."""
     a, b, c = rotation(np.random.default_rng(2), 3)
     cells = tf.Cells(np.zeros((2, 3)), [a, b], 2.0)
     pair = bodies(np.zeros((2, 3)), [a, b], [2.0, 2.0], dtype=dtype, device=device)
     found = find_contacts(pair, torch.tensor([0], device=device), torch.tensor([1], device=device))
     # unit vectors that are the same but for rounding and sign: their product is ±1 to a few units of float32's 1.2e-7
-    assert abs(abs(float(array(found.normal)[:, 0] @ c)) - 1) <= 1e-6
+    assert measured("normal against the cross product", abs(abs(float(array(found.normal)[:, 0] @ c)) - 1), "≤ 1e-6") <= 1e-6
     scene = tf.Scene(growth(rate), mechanics(passes=6, overlap=1e-3, unilateral=unilateral))
-    parted(scene, cells, device, dtype)
+    parted(scene, cells, device, dtype, measured)
 
 
 SWITCH = math.asin(LINE_CONTACT_SINE)
@@ -80,15 +81,15 @@ def forces(pair: Bodies, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-4, SWITCH - 1e-6, SWITCH + 1e-6])
 @pytest.mark.parametrize("sign", [1, -1], ids=["parallel", "antiparallel"])
 @pytest.mark.parametrize("about", [Y, Z], ids=["scissors", "wedge"])
-def test_case_03_near_parallel(device, dtype, angle, sign, about):
+def test_case_03_near_parallel(device, dtype, measured, angle, sign, about):
     """Parallel and antiparallel, offset 0.9: distance error ≤ 1e-6, swapping the pair changes ≤ 1e-6 (both given)."""
     pair = tilted(angle, sign, about, dtype, device)
     zero, one = torch.tensor([0], device=device), torch.tensor([1], device=device)
     c, a, h = array(pair.centre.T), array(pair.axis.T), array(pair.half)
     expected = segment_distance(c[:1], a[:1], h[:1], c[1:], a[1:], h[1:])[0] - 1.0
     gap, swapped = float(contact_gaps(pair, zero, one)), float(contact_gaps(pair, one, zero))
-    assert abs(gap - expected) <= 1e-6
-    assert abs(gap - swapped) <= 1e-6
+    assert measured("error of the distance, µm", abs(gap - expected), "≤ 1e-6") <= 1e-6
+    assert measured("change by swapping, µm", abs(gap - swapped), "≤ 1e-6") <= 1e-6
     for given, exchanged in zip(forces(pair, 0), forces(pair, 1), strict=True):
         assert np.abs(given - exchanged).max() <= 1e-6
 
@@ -96,7 +97,7 @@ def test_case_03_near_parallel(device, dtype, angle, sign, about):
 @pytest.mark.parametrize("shift", [0.0, 0.3, 1.0, 1.9])
 @pytest.mark.parametrize("sign", [1, -1], ids=["parallel", "antiparallel"])
 @pytest.mark.parametrize("about", [Y, Z, (Y + Z) / math.sqrt(2)], ids=["scissors", "wedge", "both"])
-def test_case_03_no_jump_at_the_switch(device, dtype, sign, about, shift):
+def test_case_03_no_jump_at_the_switch(device, dtype, measured, sign, about, shift):
     """The total force jumps ≤ 1e-3 from two rows to one. Force, torque and elongation are all held to it, on both cells.
 
     The two sides are 2e-6 rad apart, over which a force that does not jump moves by less than 1e-5.
@@ -109,7 +110,7 @@ def test_case_03_no_jump_at_the_switch(device, dtype, sign, about, shift):
         return forces(Bodies(moved, pair.axis, pair.half, pair.radius))
 
     for below, above in zip(at(SWITCH - 1e-6), at(SWITCH + 1e-6), strict=True):
-        assert np.abs(below - above).max() <= 1e-3
+        assert measured("jump of the force", np.abs(below - above).max(), "≤ 1e-3") <= 1e-3
 
 
 def judged(cells: Bodies) -> tuple[np.ndarray, np.ndarray]:
@@ -127,16 +128,16 @@ def judged(cells: Bodies) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_case_04_random_pairs(device, dtype, dim):
+def test_case_04_random_pairs(device, dtype, measured, dim):
     """1e5 random pairs, l from {0} ∪ U(0, 4): distance against a float64 reference ≤ 1e-5 (given)."""
     rng, count = np.random.default_rng(4), 200_000
     length = rng.uniform(0, 4, count) * (rng.uniform(size=count) > 0.2)
     cells = bodies(rng.uniform(-2, 2, (count, dim)), unit(rng, count, dim), length, dtype=dtype, device=device)
-    assert judged(cells)[0].max() <= 1e-5
+    assert measured("error of the distance, µm", judged(cells)[0].max(), "≤ 1e-5") <= 1e-5
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_case_04_random_pairs_near_parallel(device, dtype, dim):
+def test_case_04_random_pairs_near_parallel(device, dtype, measured, dim):
     """The same for pairs 1e-8 to 0.1 rad out of parallel or antiparallel, bound as given.
 
     Left out are centrelines that cross: where two lines meet at a sine s is known to ε/s², the distance there to ε/s, and nobody
@@ -148,7 +149,7 @@ def test_case_04_random_pairs_near_parallel(device, dtype, dim):
     axis = np.concatenate([axis, other / np.linalg.norm(other, axis=1, keepdims=True)])
     cells = bodies(rng.uniform(-2, 2, (2 * count, dim)), axis, rng.uniform(0, 4, 2 * count), dtype=dtype, device=device)
     error, distance = judged(cells)
-    assert error[distance > 1e-3].max() <= 1e-5
+    assert measured("error of the distance near parallel, µm", error[distance > 1e-3].max(), "≤ 1e-5") <= 1e-5
     assert (distance > 1e-3).mean() > 0.8
 
 
@@ -158,7 +159,7 @@ def along_length(f, h: float):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_case_05_spheres(device, dtype, dim):
+def test_case_05_spheres(device, dtype, measured, dim):
     """Spheres (l = 0), on each other and on a plane: the Jacobian row against finite differences of the gap ≤ 1e-4 (given).
 
     Central differences with h = 5e-3 in float32: rounding 1e-7/h = 2e-5, truncation h²/6 · |f‴| < 2e-5; with 1e-4 in float64: 1e-8.
@@ -180,12 +181,12 @@ def test_case_05_spheres(device, dtype, dim):
 
             slope = [(gap(h * e) - gap(-h * e)) / (2 * h) for e in np.eye(dim)]
             # the row is minus the slope: the gap after a move x is gap − row · x
-            assert np.abs(found[:dim] + slope).max() <= 1e-4
+            assert measured("row against finite differences", np.abs(found[:dim] + slope).max(), "≤ 1e-4") <= 1e-4
             assert np.abs(found[dim:-1]).max() <= 1e-4  # no lever arm
             assert abs(found[-1] + along_length(lambda x, gap=gap: gap(length=x), h)) <= 1e-4
 
 
-def test_case_05_sphere_on_a_plane(device, dtype):
+def test_case_05_sphere_on_a_plane(device, dtype, measured):
     """As above for a sphere and a tilted plane: each of its two (coinciding) ends has a row of its own."""
     h = 5e-3 if dtype == torch.float32 else 1e-4
     rng = np.random.default_rng(6)
@@ -203,7 +204,7 @@ def test_case_05_sphere_on_a_plane(device, dtype):
         rows, gap = array(found().row), lambda found=found, **at: array(found(**at).gap)
         assert rows.shape == (2, 7)
         slope = np.stack([(gap(shift=h * e) - gap(shift=-h * e)) / (2 * h) for e in np.eye(3)], 1)
-        assert np.abs(rows[:, :3] + slope).max() <= 1e-4
+        assert measured("row at a plane against finite differences", np.abs(rows[:, :3] + slope).max(), "≤ 1e-4") <= 1e-4
         assert np.abs(rows[:, 3:6]).max() <= 1e-4
         assert np.abs(rows[:, 6] + along_length(lambda x, gap=gap: gap(length=x), h)).max() <= 1e-4
 
@@ -217,7 +218,7 @@ def trap(weight=None) -> list[tf.Plane]:
 
 @MODES
 @pytest.mark.parametrize("law", ["linear", "length"])
-def test_case_06_trapped_cell(device, dtype, unilateral, law):
+def test_case_06_trapped_cell(device, dtype, measured, unilateral, law):
     """One cell, l = 2, between walls at ±1.5, 200 steps: the wall overlap settles (0.0200), growth goes to 0.
 
     At rest growth e a step is just held back: αγ e = D² o with αγ = 1 and D = 1, so the overlap o is e. Where e is the same in every
@@ -229,12 +230,12 @@ def test_case_06_trapped_cell(device, dtype, unilateral, law):
     state = run(scene, seeded(scene, tf.Cells(np.zeros((1, 3)), [X], 2.0), device, dtype), 200, DT)
     gain = math.expm1(0.01)
     expected = 0.02 if law == "linear" else 2 * gain / (1 - 2 * gain)
-    assert np.abs(wall_overlap(state, TRAP) - expected).max() <= 1e-5
-    assert abs(float(state.elongation)) <= 1e-6
+    assert measured("overlap against theory, µm", np.abs(wall_overlap(state, TRAP) - expected).max(), "≤ 1e-5") <= 1e-5
+    assert measured("growth left, µm a step", abs(float(state.elongation)), "≤ 1e-6") <= 1e-6
 
 
 @MODES
-def test_case_07_row_between_walls(device, dtype, unilateral):
+def test_case_07_row_between_walls(device, dtype, measured, unilateral):
     """100 cells tip to tip between two hard walls, 60 steps: all 101 overlaps equal g·l·Δt within 1 % (given).
 
     Of that 1 %, 0.5 % is e^0.01 − 1 against 0.01.
@@ -246,13 +247,13 @@ def test_case_07_row_between_walls(device, dtype, unilateral):
     walls = wall_overlap(state, [((1, 0, 0), 0.0), ((-1, 0, 0), -300.0)])
     overlap = np.concatenate([walls[0, :1], between, walls[1, -1:]])
     expected = DT * array(state.length)
-    assert np.abs(overlap[:-1] / expected - 1).max() <= 0.01
-    assert np.abs(overlap[1:] / expected - 1).max() <= 0.01
+    assert measured("overlap against g·l·Δt, relative", np.abs(overlap[:-1] / expected - 1).max(), "≤ 0.01") <= 0.01
+    assert measured("overlap against g·l·Δt, relative", np.abs(overlap[1:] / expected - 1).max(), "≤ 0.01") <= 0.01
 
 
 @pytest.mark.slow
 @MODES
-def test_case_09_soft_wall(device, dtype, unilateral):
+def test_case_09_soft_wall(device, dtype, measured, unilateral):
     """The trapped cell of 6 with wall weight D = 1 and D = 0.1: overlap ratio 100 ± 1 % (given).
 
     The balance αγ e = D² o gives o = e/D² with the same wanted e in both: growth is linear, since by the length law the
@@ -266,13 +267,13 @@ def test_case_09_soft_wall(device, dtype, unilateral):
         state = run(scene, state, 9, DT, check=False)
         state = run(scene, state, 1, DT)
     overlap = wall_overlap(state, TRAP)
-    assert np.abs(overlap[:, 1] / overlap[:, 0] - 100).max() <= 1.0
+    assert measured("ratio less 100", np.abs(overlap[:, 1] / overlap[:, 0] - 100).max(), "≤ 1") <= 1.0
 
 
 @MODES
 @pytest.mark.parametrize("height", [0.0, 0.05])
 @pytest.mark.parametrize("tilt", [0.0, 0.03])
-def test_case_10_planes_too_near(device, dtype, unilateral, height, tilt):
+def test_case_10_planes_too_near(device, dtype, measured, unilateral, height, tilt):
     """Two planes 0.8 µm apart, a cell of diameter 1 between them: 0.1 ± 1e-3 overlap each (given), no oscillation.
 
     No oscillation: started off the middle, the cell comes nearer to it in every step and never goes over to the other side, to
@@ -285,14 +286,14 @@ def test_case_10_planes_too_near(device, dtype, unilateral, height, tilt):
         state = run(scene, state, 1, DT)
         z.append(float(state.position[0, 2]))
     overlap = wall_overlap(state, [((0, 0, 1), -0.4), ((0, 0, -1), -0.4)])
-    assert np.abs(overlap - 0.1).max() <= 1e-3
-    assert min(z) >= -1e-6
-    assert max(np.diff(z)) <= 1e-6
+    assert measured("overlap less 0.1, µm", np.abs(overlap - 0.1).max(), "≤ 1e-3") <= 1e-3
+    assert measured("height over the middle, µm", min(z), "≥ −1e-6") >= -1e-6
+    assert measured("step away from the middle, µm", max(np.diff(z)), "≤ 1e-6") <= 1e-6
 
 
 @MODES
 @pytest.mark.parametrize("other", [([0, 0.9, 0], X), ([0.3, 0.8, 0.1], X + 0.4 * Y)], ids=["side by side", "at an angle"])
-def test_case_14_heavy_and_light(device, dtype, unilateral, other):
+def test_case_14_heavy_and_light(device, dtype, measured, unilateral, other):
     """Drag ratio 1e4 between two overlapping cells: heavy/light displacement ≤ 1.01e-4 (given).
 
     Forces balance, so the ratio is 1e-4 exactly, and below 0.99e-4 would be as wrong. The solve must see the heavy cell: in scaled
@@ -305,11 +306,11 @@ def test_case_14_heavy_and_light(device, dtype, unilateral, other):
     check_always(state, scene)
     heavy, light = array((state.position - start.position).norm(dim=1))
     assert light > 0.05
-    assert 0.99e-4 <= heavy / light <= 1.01e-4
+    assert 0.99e-4 <= measured("heavy over light", heavy / light, "≤ 1.01e-4") <= 1.01e-4
 
 
 @MODES
-def test_case_18_near_but_not_touching(device, dtype, unilateral):
+def test_case_18_near_but_not_touching(device, dtype, measured, unilateral):
     """Gap +0.005, no growth: displacement exactly 0, in every unknown. Beside it a pair that does overlap, and so must move."""
     scene = tf.Scene(mechanics(unilateral=unilateral))
     cells = tf.Cells([[0, 0, 0], [0.3, 1.005, 0], [0, 0, 0], [0.3, 0.995, 0]], [X] * 4, 2.0, colony=[0, 0, 1, 1])
@@ -318,5 +319,5 @@ def test_case_18_near_but_not_touching(device, dtype, unilateral):
     check_always(state, scene)
     for name in ("position", "axis", "length"):
         assert torch.equal(getattr(state, name)[:2], getattr(start, name)[:2])
-    assert not state.displacement[:2].any()
+    assert not measured("displacement, µm", state.displacement[:2].abs().max(), "= 0").any()
     assert (state.position - start.position)[2:].norm(dim=1).min() > 1e-3

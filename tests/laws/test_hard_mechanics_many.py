@@ -43,7 +43,7 @@ ACCURACY = {
     "dim, unilateral, accuracy",
     [(2, False, "default"), (2, True, "default"), (2, False, "alpha = 1/gamma, six passes"), (3, False, "default"), (3, True, "default")],
 )
-def test_case_08_closed_channel(device, dtype, unilateral, dim, accuracy):
+def test_case_08_closed_channel(device, dtype, measured, unilateral, dim, accuracy):
     """Closed channel 3 µm wide, 200 cells: nothing escapes, overlap ≤ 3·g·l_max·Δt (given), with l_max the longest cell of the moment.
 
     70 steps, in 3-D 100: the channel is then full, and most of growth held back. Nothing escapes: every centreline stays inside.
@@ -57,8 +57,10 @@ def test_case_08_closed_channel(device, dtype, unilateral, dim, accuracy):
     for _ in range(7 if dim == 2 else 10):
         state = run(scene, state, 10, DT)
         assert np.abs(ends(state)[..., 0]).max() < half
-        assert np.abs(ends(state)[..., 1:]).max() < 1.5
-        assert worst_overlap(state, flat) <= 3 * DT * float(state.length.max())
+        assert measured("ends from the middle, µm", np.abs(ends(state)[..., 1:]).max(), "< 1.5") < 1.5
+        deepest = worst_overlap(state, flat)
+        assert deepest <= 3 * DT * float(state.length.max())
+        measured("overlap / (g·l_max·Δt)", deepest / (DT * float(state.length.max())), "≤ 3")
     assert float(state.elongation.mean()) < 0.5 * DT * float(state.length.mean()), "the channel should be full"
     assert wall_overlap(state, flat).max() > 0
 
@@ -66,7 +68,7 @@ def test_case_08_closed_channel(device, dtype, unilateral, dim, accuracy):
 @pytest.mark.slow
 @MODES
 @DIMS
-def test_case_12_one_giant_step(device, dtype, unilateral, dim):
+def test_case_12_one_giant_step(device, dtype, measured, unilateral, dim):
     """g·Δt = 0.7, 64 cells: it sub-steps by itself, and goes on with overlap ≤ 0.05 µm (given). Four colonies, default accuracy."""
     scene = tf.Scene(growth(), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=dim, unilateral=unilateral))
     state = scene.seed(4, seed=12, device=device, dtype=dtype)
@@ -78,11 +80,11 @@ def test_case_12_one_giant_step(device, dtype, unilateral, dim):
     assert (grown.reports["mechanics"].substeps > 1).all()
     # not by holding growth back: outside walls cells gain most of e^0.7 − 1 = 101 %
     assert float(grown.length.mean() / state.length.mean()) > 1.5
-    assert worst_overlap(grown) <= 0.05
+    assert measured("overlap, µm", worst_overlap(grown), "≤ 0.05") <= 0.05
 
 
 @DIMS
-def test_case_13_one_long_cell(device, dtype, dim):
+def test_case_13_one_long_cell(device, dtype, measured, dim):
     """One l = 40 among 200 of l = 2: the contact set equals brute force.
 
     A gap within 1e-5 µm of zero may be judged either way: float32 places 20 µm out are 2e-6 apart.
@@ -99,12 +101,13 @@ def test_case_13_one_long_cell(device, dtype, dim):
     touching = as_set(found.first, found.second)
     sure, perhaps = near_pairs(state, -1e-5), near_pairs(state, 1e-5)
     assert as_set(*sure.T) <= touching <= as_set(*perhaps.T)
+    measured("pairs missed or too many", len(as_set(*sure.T) - touching) + len(touching - as_set(*perhaps.T)), "= 0")
     assert sum(0 in pair for pair in touching) > 3 and len(touching) > 20
 
 
 @MODES
 @DIMS
-def test_case_16_far_from_the_origin(device, dtype, unilateral, dim):
+def test_case_16_far_from_the_origin(device, dtype, measured, unilateral, dim):
     """500 cells shifted by (1e4, −1e4, 1e3) µm in float32: relative drift against the unshifted run ≤ 1e-4 (given).
 
     Relative to how far the cells travel, over 10 steps. Places are kept in float64, where 1e4 µm is known to 2e-12.
@@ -118,13 +121,15 @@ def test_case_16_far_from_the_origin(device, dtype, unilateral, dim):
     far = run(scene, seeded(scene, there, device, dtype), 10, DT)
     travel = np.linalg.norm(array(near.position - start.position), axis=1).max()
     assert travel > 0.1
-    assert np.abs(array(far.position) - shift - array(near.position)).max() <= 1e-4 * travel
+    drift = np.abs(array(far.position) - shift - array(near.position)).max()
+    assert drift <= 1e-4 * travel
+    measured("drift, relative", drift / travel, "≤ 1e-4")
     assert np.abs(array(far.length - near.length)).max() <= 1e-4 * travel
 
 
 @MODES
 @DIMS
-def test_case_17_rotated(device, dtype, unilateral, dim):
+def test_case_17_rotated(device, dtype, measured, unilateral, dim):
     """The whole scene rotated at random: the result rotates with it ≤ 1e-5 (given). Eight crowds of 40 cells, one step.
 
     The solve is taken to 1e-6 of the greatest move, under 0.5 µm; the crowds are 12 µm across, where float32 is 1e-6 apart.
@@ -136,13 +141,13 @@ def test_case_17_rotated(device, dtype, unilateral, dim):
         turned = tf.Cells(cells.position @ turn.T, cells.axis @ turn.T, cells.length, cells.radius)
         plain = run(scene, seeded(scene, cells, device, dtype), 1, DT)
         other = run(scene, seeded(scene, turned, device, dtype), 1, DT)
-        assert np.abs(array(plain.position) @ turn.T - array(other.position)).max() <= 1e-5
+        assert measured("difference when rotated, µm", np.abs(array(plain.position) @ turn.T - array(other.position)).max(), "≤ 1e-5") <= 1e-5
         assert np.abs(array(plain.axis) @ turn.T - array(other.axis)).max() <= 1e-5
         assert np.abs(array(plain.length - other.length)).max() <= 1e-5
 
 
 @MODES
-def test_case_17_rotated_where_turns_are_cut_short(device, dtype, unilateral):
+def test_case_17_rotated_where_turns_are_cut_short(device, dtype, measured, unilateral):
     """As above where a turn has to be cut short, of a light cell that crosses a heavy one near its end: how much must not depend on the frame.
 
     α = 0.01: float32 knows forces of 1 to 1e-7, and what they move across the contact, 1e-7/(α μL), to 4e-6.
@@ -158,13 +163,13 @@ def test_case_17_rotated_where_turns_are_cut_short(device, dtype, unilateral):
         turn = rotation(rng, 3)
         turned = tf.Cells(position @ turn.T, axis @ turn.T, 1.4, extra=heavy)
         other = scene.step(seeded(scene, turned, device, dtype), DT)
-        assert np.abs(array(plain.position) @ turn.T - array(other.position)).max() <= 1e-5
+        assert measured("difference when rotated, µm", np.abs(array(plain.position) @ turn.T - array(other.position)).max(), "≤ 1e-5") <= 1e-5
         assert np.abs(array(plain.axis) @ turn.T - array(other.axis)).max() <= 1e-5
 
 
 @MODES
 @DIMS
-def test_case_17_permuted(device, dtype, unilateral, dim):
+def test_case_17_permuted(device, dtype, measured, unilateral, dim):
     """Cells permuted: the result permutes ≤ 1e-6 (given). The crowd is 6 µm across, where float32 is 5e-7 apart."""
     rng = np.random.default_rng(171)
     scene = tf.Scene(growth(), mechanics(dim=dim, unilateral=unilateral, tolerance=1e-6))
@@ -174,13 +179,13 @@ def test_case_17_permuted(device, dtype, unilateral, dim):
         plain = run(scene, seeded(scene, cells, device, dtype), 1, DT)
         other = run(scene, seeded(scene, mixed, device, dtype), 1, DT)
         for name in ("position", "axis", "length"):
-            assert np.abs(array(getattr(plain, name))[order] - array(getattr(other, name))).max() <= 1e-6
+            assert measured("difference when permuted", np.abs(array(getattr(plain, name))[order] - array(getattr(other, name))).max(), "≤ 1e-6") <= 1e-6
 
 
 @pytest.mark.slow
 @MODES
 @DIMS
-def test_case_20_colonies_of_any_size(device, dtype, unilateral, dim):
+def test_case_20_colonies_of_any_size(device, dtype, measured, unilateral, dim):
     """A batch of colonies with 0, 1, 7 and 5,000 cells: no NaN anywhere. The small ones go on as if they were alone, bitwise."""
     rng = np.random.default_rng(20)
     parts = [crowd(rng, count, dim) for count in (1, 7, 5000)]
@@ -193,6 +198,7 @@ def test_case_20_colonies_of_any_size(device, dtype, unilateral, dim):
     assert int(state.counts[0]) == 0 and bool((state.counts[1:] > start.counts[1:]).any())
     for value in (state.volume, state.area, *(v for v in vars(state.reports["mechanics"]).values() if v.is_floating_point())):
         assert torch.isfinite(value).all()
+        measured("numbers that are none", (~torch.isfinite(value)).sum(), "= 0")
     small = run(scene, start.select([0, 1, 2]), 3, 0.2)
     assert torch.equal(state.select([0, 1, 2]).position, small.position)
 
@@ -216,7 +222,7 @@ def same_colony(a: tf.State, b: tf.State) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dim, unilateral", [(3, False), (2, True)])
-def test_case_21_batch_is_no_matter(device, dtype, unilateral, dim, deterministic):
+def test_case_21_batch_is_no_matter(device, dtype, measured, unilateral, dim, deterministic):
     """A colony alone equals the same colony in any batch, any order, 200 steps with division: bitwise in deterministic mode on one device,
     the same iteration counts, its own random stream. Growth rates differ from colony to colony.
     """
@@ -235,8 +241,11 @@ def test_case_21_batch_is_no_matter(device, dtype, unilateral, dim, deterministi
     for batch in ([2], [3, 1, 0, 2], [0, 3]):
         part, iterations = grown_apart(scene, start.select(batch), 200)
         assert torch.equal(iterations, counted[:, batch])
+        measured("difference of iteration counts", (iterations - counted[:, batch]).abs().max(), "= 0")
         for place, colony in enumerate(batch):
-            same_colony(part.select([place]), whole.select([colony]))
+            one, same = part.select([place]), whole.select([colony])
+            same_colony(one, same)
+            measured("difference of places, µm", (one.position - same.position).abs().max(), "= 0")
 
 
 @dataclass(frozen=True)
@@ -255,7 +264,7 @@ class Partition(tf.Effect):
 
 
 @DIMS
-def test_case_23_thousands_of_divisions(device, dtype, dim):
+def test_case_23_thousands_of_divisions(device, dtype, measured, dim):
     """4,096 divisions in one step: amounts conserved to 1e-6 (given), ids unique, parents right. Beside them 904 cells too short to divide.
 
     Outer ends stay where they were to 1e-5 µm: a float32 half length of 2 µm times an axis of unit length within 1e-7, four times.
@@ -284,7 +293,7 @@ def test_case_23_thousands_of_divisions(device, dtype, dim):
     at = order[np.searchsorted(before, array(state.colony) * 10**6 + array(state.parent), sorter=order)[young]]
     assert (np.bincount(at, minlength=count) == 2 * divides).all()
     total = np.bincount(at, array(state.amount)[young], minlength=count)[divides]
-    assert np.abs(total / array(start.amount)[divides] - 1).max() <= 1e-6
+    assert measured("change of an amount, relative", np.abs(total / array(start.amount)[divides] - 1).max(), "≤ 1e-6") <= 1e-6
     assert (array(state.level)[young] == array(start.level)[at]).all()
     assert not state.divide_flag.any()
     # in the parent's place: outer ends where they were, and two new caps between

@@ -36,13 +36,14 @@ def mass(u: torch.Tensor) -> float:
 
 
 @CHOSEN
-def test_case_31_delta_and_a_long_step(device, dtype, method):
+def test_case_31_delta_and_a_long_step(device, dtype, measured, method):
     """Delta, r = 1e3, 32³: u ≥ −1e-9, mass to 1e-6. Here u ≥ 0 exactly; in each of ten steps, as the field flattens."""
     stepper, u = prepare(cube(32, 1e3, dtype, device), 1.0, method), delta(32, dtype, device)
     for _ in range(10):
         before, u = mass(u), stepper.step(u)
-        assert float(u.min()) >= 0.0
+        assert measured("lowest concentration", float(u.min()), "≥ −1e-9") >= 0.0
         assert mass(u) == pytest.approx(before, abs=1e-6)
+        measured("change of mass", abs(mass(u) - before), "≤ 1e-6")
 
 
 def test_case_31_crank_nicolson_rings(device, dtype):
@@ -56,10 +57,10 @@ def test_case_31_crank_nicolson_rings(device, dtype):
 
 
 @CHOSEN
-def test_case_32_delta_and_a_short_step(device, dtype, method):
+def test_case_32_delta_and_a_short_step(device, dtype, measured, method):
     """Delta, r = 0.5: u ≥ −1e-7. Here u ≥ 0 exactly."""
     u = prepare(cube(32, 0.5, dtype, device), 1.0, method).step(delta(32, dtype, device))
-    assert float(u.min()) >= 0.0 and mass(u) == pytest.approx(1.0, abs=1e-6)
+    assert measured("lowest concentration", float(u.min()), "≥ −1e-7") >= 0.0 and mass(u) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_case_32_crank_nicolson_goes_below_zero(device, dtype):
@@ -70,19 +71,20 @@ def test_case_32_crank_nicolson_goes_below_zero(device, dtype):
 
 @CHOSEN
 @pytest.mark.parametrize("faces", [Faces(), Faces(Periodic(), Periodic(), Periodic())], ids=["closed", "periodic"])
-def test_case_33_strong_flow(device, dtype, method, faces):
+def test_case_33_strong_flow(device, dtype, measured, method, faces):
     """Cell Péclet 100, Courant 10, 48³: u ≥ 0, mass to 1e-6; in each of five steps."""
     op = cube(48, 1.0, dtype, device, velocity=(100.0, 0.0, 0.0), faces=faces)
     stepper, u = prepare(op, 0.1, method), delta(48, dtype, device)
     for _ in range(5):
         before, u = mass(u), stepper.step(u)
-        assert float(u.min()) >= 0.0
+        assert measured("lowest concentration", float(u.min()), "≥ 0") >= 0.0
         assert mass(u) == pytest.approx(before, abs=1e-6)
+        measured("change of mass", abs(mass(u) - before), "≤ 1e-6")
 
 
 @CHOSEN
 @pytest.mark.parametrize("r", [1e-3, 0.5, 10.0, 1e3, 1e6])
-def test_case_35_step_wall(device, dtype, method, r):
+def test_case_35_step_wall(device, dtype, measured, method, r):
     """Step wall 1 | 0: 0 ≤ u ≤ 1 always. Above 1 only what rounding of a few hundred products can add (1e-5 in float32, 1e-13)."""
     most = 1.0 + (1e-5 if dtype == torch.float32 else 1e-13)
     wall = torch.zeros(1, 32, 16, 8, dtype=dtype, device=device)
@@ -92,11 +94,13 @@ def test_case_35_step_wall(device, dtype, method, r):
         stepper, u = prepare(op, 1.0, method), wall
         for _ in range(20):
             u = stepper.step(u)
-            assert float(u.min()) >= 0.0 and float(u.max()) <= most
+            assert measured("lowest concentration", float(u.min()), "≥ 0") >= 0.0
+            assert float(u.max()) <= most
+            measured("highest less 1", float(u.max()) - 1, "≤ 0, but for rounding")
 
 
 @CHOSEN
-def test_case_36_spacing_of_its_own_along_each_axis(device, dtype, method):
+def test_case_36_spacing_of_its_own_along_each_axis(device, dtype, measured, method):
     """Spacing (1, 2, 5): variance grows 2 K t along each axis, 1e-3. Both kernels have that variance exactly; the box is 12 widths wide."""
     shape, spacing, k, t, steps = (65, 33, 15), (1.0, 2.0, 5.0), 1.0, 8.0, 8
     op = operator(shape, spacing, diffusion=k, dtype=dtype, device=device)
@@ -108,7 +112,9 @@ def test_case_36_spacing_of_its_own_along_each_axis(device, dtype, method):
     for axis in range(3):
         x = (torch.arange(shape[axis], dtype=torch.float64, device=device) - shape[axis] // 2) * spacing[axis]
         along = u[0].double().sum(tuple(a for a in range(3) if a != axis))
-        assert float((along * x**2).sum()) == pytest.approx(2 * k * t, rel=1e-3)
+        variance = float((along * x**2).sum())
+        assert variance == pytest.approx(2 * k * t, rel=1e-3)
+        measured("variance over 2 K t, less 1", abs(variance / (2 * k * t) - 1), "≤ 1e-3")
 
 
 def cells_on_nodes(grid: Grid):
@@ -121,7 +127,7 @@ def cells_on_nodes(grid: Grid):
 
 @pytest.mark.parametrize("shape", [(6, 5, 4), (6, 5, 1)], ids=["3-D", "2-D"])
 @pytest.mark.parametrize("periodic", [False, True])
-def test_case_37_cells_on_nodes_faces_and_corners(device, dtype, shape, periodic):
+def test_case_37_cells_on_nodes_faces_and_corners(device, dtype, measured, shape, periodic):
     """Amount deposited to 1e-6; a constant field is sampled exactly. No cell on a face counts as outside."""
     grid = Grid(torch.tensor([[0.1, -7.3, 2.9]], dtype=torch.float64, device=device), torch.tensor([shape], device=device), (1.1, 0.7, 0.3))
     position, colony = cells_on_nodes(grid)
@@ -129,16 +135,18 @@ def test_case_37_cells_on_nodes_faces_and_corners(device, dtype, shape, periodic
     assert not bool(found.outside.any())
     constant = torch.full((grid.nodes,), 0.7, dtype=dtype, device=device)
     assert bool((read(constant, found) == constant[0]).all())
+    measured("error of a constant field", (read(constant, found) - constant[0]).abs().max(), "= 0")
     amount = torch.linspace(0.1, 1.0, len(position), dtype=dtype, device=device)
     after = write(torch.zeros_like(constant), amount, found)
     assert mass(after) * grid.voxel_volume == pytest.approx(mass(amount), rel=1e-6)
+    measured("amount lost, relative", abs(mass(after) * grid.voxel_volume / mass(amount) - 1), "≤ 1e-6")
     assert float(after.min()) >= 0.0
 
 
 @pytest.mark.parametrize("by", [1e-3, 10.0])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_case_38_a_cell_outside_the_grid(device, dtype, by, axis, side):
+def test_case_38_a_cell_outside_the_grid(device, dtype, measured, by, axis, side):
     """Outside by 1e-3 h and by 10 h: it is said which cell is, and nothing is lost: it writes to and reads from the nearest voxels.
 
     A periodic axis has no outside.
@@ -157,6 +165,7 @@ def test_case_38_a_cell_outside_the_grid(device, dtype, by, axis, side):
     assert seen[1] == seen[2]
     after = write(values, torch.ones(3, dtype=dtype, device=device), found)
     assert (mass(after) - mass(values)) * grid.voxel_volume == pytest.approx(3.0, rel=2e-6)
+    measured("amount lost, relative", abs((mass(after) - mass(values)) * grid.voxel_volume / 3 - 1), "≤ 2e-6")
     wrapped = stencil(grid, position, colony, periodic=(axis == 0, axis == 1, axis == 2), dtype=dtype)
     assert not bool(wrapped.outside.any())
 
@@ -172,7 +181,7 @@ def test_case_38_a_place_that_is_no_number(device, dtype):
 
 
 @pytest.mark.parametrize("cells", [1, 40, 2000])
-def test_case_39_taking_up_everything(device, dtype, cells):
+def test_case_39_taking_up_everything(device, dtype, measured, cells):
     """Uptake k·Δt = 1e3, so that each cell takes all it may: u ≥ 0, what cells gain is what the grid loses, 1e-6. Ten times over, from a field with holes."""
     grid = Grid(torch.zeros(1, 3, dtype=torch.float64, device=device), torch.tensor([[5, 4, 3]], device=device), (1.0, 1.0, 1.0))
     rng = np.random.default_rng(39)
@@ -186,14 +195,15 @@ def test_case_39_taking_up_everything(device, dtype, cells):
         uptake = part * read(values, found) * pool_volume(found)
         values = write(values, -uptake, found)
         gained += mass(uptake)
-        assert float(values.min()) >= 0.0
+        assert measured("lowest concentration", float(values.min()), "≥ 0") >= 0.0
     assert gained == pytest.approx(start - mass(values), abs=1e-6 * start)
+    measured("gain less loss, relative", abs(gained - start + mass(values)) / start, "≤ 1e-6")
     assert gained > 0
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("shape", [(64, 1, 1), (64, 64, 1), (1, 64, 1), (1, 1, 64)], ids=str)
-def test_case_40_flat_grids(device, dtype, method, shape):
+def test_case_40_flat_grids(device, dtype, measured, method, shape):
     """64×1×1 and 64×64×1: a cosine along the long axis decays as on a long axis alone; an all-zero field stays zero."""
     op = operator(shape, (1.0, 1.0, 0.5), diffusion=2.0, velocity=(0.0, 0.0, 0.0), dtype=dtype, device=device)
     axis = shape.index(64)
@@ -201,6 +211,7 @@ def test_case_40_flat_grids(device, dtype, method, shape):
     stepper = prepare(op, 1.0, method)
     zero = torch.zeros(1, *shape, dtype=dtype, device=device)
     assert torch.equal(stepper.step(zero), zero)
+    measured("of an all-zero field", stepper.step(zero).abs().max(), "= 0")
     wave = torch.cos(math.pi * 3 * (torch.arange(64, dtype=torch.float64, device=device) + 0.5) / 64)
     line = [1, 1, 1, 1]
     line[axis + 1] = 64
@@ -210,4 +221,5 @@ def test_case_40_flat_grids(device, dtype, method, shape):
     steps = int(stepper.substeps) if method == "euler" else 1
     left = {"exponential": math.exp(x), "implicit": 1 / (1 - x), "crank_nicolson": (1 + x / 2) / (1 - x / 2), "euler": (1 + x / steps) ** steps}[method]
     expected = (1 + left * wave).reshape(line)
-    assert float((stepper.step(u).double() - expected).abs().max()) <= (1e-9 if dtype == torch.float64 else 2e-6)
+    error = float((stepper.step(u).double() - expected).abs().max())
+    assert measured("error of a wave", error, "≤ 2e-6 (float64: 1e-9)") <= (1e-9 if dtype == torch.float64 else 2e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,21 @@ from torchfilm.tools import checks
 
 LAWS = ("volume", "length", "linear")
 UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}
+
+
+@dataclass(frozen=True)
+class GrowthReport:
+    """Made only where a cell of some colony would grow past all numbers: `status` (B,), 1 for its colony, of which no cell grew, and the `rate` (B,) and
+    `uid` (B,) of the first such cell."""
+
+    status: Tensor
+    uid: Tensor
+    rate: Tensor
+    mend = "A smaller dt or growth rate may help (rates are per hour, and dt is in hours)"
+
+    def reason(self, place: int) -> str:
+        """What went wrong in the colony at this place of the batch."""
+        return f"cell {int(self.uid[place])} at a growth rate of {float(self.rate[place]):g} would be of no finite length"
 
 
 @dataclass(frozen=True)
@@ -66,4 +82,18 @@ class Growth(Effect):
             elongation = torch.expm1(wanted) * state.length
         else:
             elongation = wanted
-        return state.replace(length=state.length + elongation).with_fields(elongation=elongation)
+        length = state.length + elongation
+        # one look at the longest: NaN is the greatest of all
+        if state.cells and not length.max().item() < math.inf:
+            report = _too_long(state, torch.isfinite(length))
+            elongation = torch.where((report.status == 0).index_select(0, state.colony), elongation, 0.0)
+            state, length = state.replace(reports={**state.reports, "growth": report}), state.length + elongation
+        return state.replace(length=length).with_fields(elongation=elongation)
+
+
+def _too_long(state: State, good: Tensor) -> GrowthReport:
+    """The report of the cells that cannot be as long as they want, ~good (N,)."""
+    number = torch.arange(state.cells, device=state.device)
+    first = state.cells - state.groups.max(torch.where(good, 0, state.cells - number))
+    row = first.clamp(max=state.cells - 1)
+    return GrowthReport((first < state.cells).long(), state.uid.index_select(0, row), state.growth_rate.detach().index_select(0, row))

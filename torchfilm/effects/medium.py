@@ -26,6 +26,8 @@ Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 BEYOND = ("error", "grow", "open")
 # A grid that grows with its colony does so by this many voxels at a time, and keeps this many between the cells and its faces.
 BLOCK, MARGIN = 8, 2
+# A colony's grid grows to this many voxels, 0.27 GB a signal in float32: one cell that is flung far away must not take all memory there is.
+MOST_VOXELS = 2**26
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,10 @@ class MediumReport:
     status: Tensor
     left: Tensor
     first: Tensor
-    mend = "Make the box of the Medium larger (one that is flat is a single layer), let it grow with the colony, Medium(…, beyond='grow'), or move the obstacle"
+    mend = (
+        "Make the box of the Medium larger (one that is flat is a single layer), let it grow with the colony, Medium(…, beyond='grow'), with a spacing that "
+        f"needs at most {MOST_VOXELS:,} voxels a colony, or move the obstacle"
+    )
 
     def reason(self, place: int) -> str:
         where = ", ".join(f"{x:.4g}" for x in self.first[place].tolist())
@@ -174,9 +179,12 @@ class Medium(Effect):
     def declares(self, dim: int) -> tuple[Field, ...]:
         fields = [Field(OUTSIDE + name, "signal in the medium", "conc", scope=GRID, initial=self._first(name)) for name in self.signals]
         if self.beyond == "open":
+            # counted in float64: over thousands of steps a float32 sum would no longer notice what a step adds
             fields += [
-                Field(f"{name}_beyond", "amount given to the reservoir beyond the box, less what was taken", "conc·µm³", scope=COLONY) for name in self.signals
-            ]
+                Field(
+                    f"{name}_beyond", "amount given to the reservoir beyond the box, less what was taken", "conc·µm³", scope=COLONY, dtype=torch.float64
+                ) for name in self.signals
+            ]  # fmt: skip
         return tuple(fields)
 
     def _first(self, name: str) -> Callable[[State, Tensor], Tensor]:
@@ -402,6 +410,10 @@ class Cover(Effect):
         layout = state.layout
         assert layout is not None
         low, high = self._span(state)
+        # a colony that would need more, or whose cells are nowhere, keeps its grid; its cells are then beyond it, which is reported
+        size = ((torch.maximum(high, layout.grid.high) - torch.minimum(low, layout.grid.origin)) / layout.grid.step).prod(1, keepdim=True)
+        fits = size <= MOST_VOXELS
+        low, high = torch.where(fits, low, torch.inf), torch.where(fits, high, -torch.inf)
         names = [OUTSIDE + name for name in self.medium.signals]
         here = [state.fields[n] for n in names]
         grid, values = layout.grid.extended([*here, torch.ones_like(here[0])], low, high, block=BLOCK)

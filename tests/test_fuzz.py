@@ -1,0 +1,101 @@
+"""A few dozen random scenes, the same each time, under the laws of experiments/fuzz.py; what longer runs of it found; and that it would notice."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+
+import torchfilm as tf
+
+sys.path.append(str(Path(__file__).parent.parent / "experiments"))
+import fuzz
+
+ENDINGS: list[str] = []
+
+
+@pytest.mark.slow
+@settings(max_examples=40, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+@given(fuzz.DRAWS)
+def test_random_scenes_obey_the_laws(draw):
+    """Finite, nonnegative, unique uids, no escape, amounts conserved, the same alone as in the batch; failures are reported."""
+    ENDINGS.append(fuzz.run(draw))
+
+
+def test_most_random_scenes_run():
+    """A fuzzer whose scenes are mostly refused tests nothing: at least half of those above ran to their end."""
+    if not ENDINGS:  # this test alone
+        test_random_scenes_obey_the_laws()
+    assert ENDINGS.count("ran") >= len(ENDINGS) / 2
+
+
+def far_apart(distance: float) -> tuple[tf.Scene, tf.Cells]:
+    """A medium that grows with its colony, voxels of 0.3 µm, and two cells `distance` µm apart along each axis; a colony of one beside it."""
+    medium = tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=1.0), box=((-1.2,) * 3, (1.2,) * 3), spacing=0.3, beyond="grow")
+    cells = tf.Cells([[0.0] * 3, [distance] * 3, [0.0] * 3], [1.0, 0.0, 0.0], colony=[0, 0, 1])
+    return tf.Scene(medium, founders=tf.Cells.single(3)), cells
+
+
+def test_a_medium_does_not_grow_without_end():
+    """Found by the fuzzer: cells 1 mm apart on a grid of 0.3 µm asked for 3.7e10 voxels, which no machine has. Refused at the start."""
+    scene, cells = far_apart(1e3)
+    with pytest.raises(tf.InputError, match=r"too small for colony 0.*at most 67,108,864 voxels"):
+        scene.seed(2, cells=cells)
+
+
+@pytest.mark.parametrize("distance", [1e3, float("inf"), float("nan")])
+def test_a_cell_that_flies_away_fails_its_own_colony(device, dtype, distance):
+    """The same in the middle of a run: that colony is reported and the other goes on as it would have alone."""
+    scene, cells = far_apart(1.0)
+    state = scene.seed(2, cells=cells, device=device, dtype=dtype)
+    position = state.position.clone()
+    position[1] = distance
+    after = scene.step(state.replace(position=position), 0.01)
+    (failure,) = tf.failures(after)
+    assert failure.colony_id == 0 and "1 cell(s) are beyond the box" in failure.reason
+    assert all(bool(torch.isfinite(v).all()) for v in after.signals.values())
+    assert torch.equal(after.select([1]).signals["ahl"], scene.step(state.select([1]), 0.01).signals["ahl"])
+
+
+@pytest.mark.parametrize("law", ["volume", "length", "linear"])
+@pytest.mark.parametrize("more", [(), (tf.Division(length=4.0),), (tf.Mechanics(dim=3),)], ids=["alone", "division", "mechanics"])
+def test_growth_past_all_numbers_is_reported(device, dtype, law, more):
+    """Found beside the fuzzer: e^10000 µm is no length, and without mechanics nobody said so; a step later cells were nowhere.
+
+    The other colony goes on, and what is left of the failed one is finite.
+    """
+    huge = 1e38 if dtype == torch.float32 else 1e308
+    scene = tf.Scene(tf.Growth(rate=torch.tensor([huge, 0.01], dtype=torch.float64), law=law), *more)
+    start = scene.seed(2, device=device, dtype=dtype)
+    state = scene.step(start, 100.0)
+    assert "growth rate" in next(f for f in tf.failures(state) if f.colony_id == 0).reason
+    assert all(f.colony_id == 0 for f in tf.failures(state))
+    assert float(state.length[0]) == 2.0 and bool(torch.isfinite(state.position).all())
+    assert torch.equal(state.select([1]).length, scene.step(start.select([1]), 100.0).length)
+    with pytest.raises(tf.SimulationError, match="of no finite length"):
+        list(tf.simulate(scene, start, until=100.0, dt=100.0))
+
+
+@pytest.mark.parametrize("name", ["length", "axis", "a"])
+def test_the_fuzzer_notices_a_number_that_is_none(name):
+    """Each of its laws is broken on purpose: this one by a NaN in one cell of one colony, and only if that colony did not fail."""
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Circuit(lambda u, s, p, cell: {"a": -u.a}, species=("a",)))
+    state = scene.seed(2)
+    value = (state.fields[name] if name in state.fields else getattr(state, name)).clone()
+    value[1] = torch.nan
+    broken = state.with_fields(a=value) if name == "a" else state.replace(**{name: value})
+    fuzz.finite(broken, [0])
+    with pytest.raises(AssertionError, match=name):
+        fuzz.finite(broken, [0, 1])
+
+
+def test_the_fuzzer_notices_cells_that_do_not_add_up():
+    state = tf.Scene(tf.Growth(rate=1.0), founders=tf.Cells([[0.0, 0.0], [9.0, 0.0]], [1.0, 0.0])).seed(1)
+    fuzz.counted(state, state)
+    with pytest.raises(AssertionError, match="unique"):
+        fuzz.counted(state, state.replace(uid=torch.zeros_like(state.uid)))
+    with pytest.raises(AssertionError, match="add up"):
+        fuzz.counted(state, state.take(torch.tensor([0])))
