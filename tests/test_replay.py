@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import pytest
@@ -176,3 +177,89 @@ def test_an_effect_between_growth_and_mechanics_sees_the_state_between():
     full, found = stepped(scene, scene.seed(1), 120), stepped(replay, replay.seed(1, streams=[0]), 120)
     assert not torch.equal(full.longest, full.length)  # contacts held some back
     same(found, full)
+
+
+def test_what_founders_bring_keeps_the_rule_of_its_circuit_at_division():
+    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], extra={"gfp": [3.0]})
+    scene = tf.Scene(*lit(torch.tensor([1.0, 2.0]), daughters="amount").listed, founders=founders)
+    replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
+    same(stepped(replay, replay.seed(2, streams=[0, 0]), 90), stepped(scene, scene.seed(2, streams=[0, 0]), 90))
+
+
+@dataclass(frozen=True)
+class Started(tf.Effect):
+    """A field with a first value of its own, at birth or at the start; listed, it does nothing else."""
+
+    name: str
+    initial: Callable
+    at_division: str = "copy"
+
+    stage, title = 30, "started"
+
+    def declares(self, dim):
+        return (tf.Field(self.name, "set once", initial=self.initial, at_division=self.at_division),)
+
+    def step(self, state, dt):
+        return state
+
+
+def twice(state, rows):
+    return torch.full((rows.numel(),), 2.0, dtype=state.dtype)
+
+
+def four_times(state, rows):
+    return torch.full((rows.numel(),), 4.0, dtype=state.dtype)
+
+
+def rate_at_birth(state, rows):
+    return state.growth_rate.index_select(0, rows)
+
+
+def test_what_growth_reads_belongs_to_it_also_where_nothing_writes_it():
+    scene = tf.Scene(*lit(torch.tensor([1.0, 2.0])).listed, Started("drag", twice))
+    replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
+    full = stepped(scene, scene.seed(2, streams=[0, 0]), 110)
+    same(stepped(replay, replay.seed(2, streams=[0, 0]), 110), full)
+    assert not torch.equal(full.position, stepped(lit(torch.tensor([1.0, 2.0])), lit(torch.tensor([1.0, 2.0])).seed(2, streams=[0, 0]), 110).position)
+
+
+def test_growth_is_told_by_what_its_functions_do():
+    course = tf.Course(tf.Scene(*lit().listed, Started("drag", twice)), streams=(0,))
+    tf.Replay(tf.Scene(*lit().listed, Started("drag", twice)), course)
+    with pytest.raises(tf.InputError, match="does not grow as the course did"):
+        tf.Replay(tf.Scene(*lit().listed, Started("drag", four_times)), course)
+
+
+def test_daughters_fields_start_from_what_they_see_where_cells_divide():
+    """A field that starts anew from another that does, growth_rate drawn at birth: it sees the parent's, as in the full run."""
+    circuit = tf.Circuit(reporter, species=("gfp",), make=torch.tensor([1.0, 2.0]))
+    scene = tf.Scene(tf.Growth(rate=tf.Uniform(0.5, 1.5)), tf.Division(length=3.5), circuit, Started("born_rate", rate_at_birth, "reset"))
+    replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
+    full = stepped(scene, scene.seed(2, streams=[0, 0]), 110)
+    assert full.cells > 8 and not torch.equal(full.born_rate, full.growth_rate)
+    same(stepped(replay, replay.seed(2, streams=[0, 0]), 110), full)
+
+
+def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
+    class Early(Measured):
+        stage = 30
+
+    early = dataclass(frozen=True)(Early)()
+    scene = tf.Scene(early, tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Circuit(reporter, species=("gfp",), make=1.0))
+    replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
+    full = stepped(scene, scene.seed(1), 20)
+    assert float(full.longest.max()) < float(full.length.max())
+    same(stepped(replay, replay.seed(1, streams=[0]), 20), full)
+
+
+@pytest.mark.parametrize(
+    "scene, why",
+    [
+        (lambda: lit(rate=torch.tensor(1.0, requires_grad=True)), "wants a gradient"),
+        (lambda: tf.Scene(*lit().listed, founders=tf.Cells([[0.0, 0.0], [1.0, 0.0]], [[1.0, 0.0]] * 2, colony=[0, 1])), "its first cells name their colonies"),
+    ],
+)
+def test_more_that_cannot_be_kept(scene, why):
+    assert why in tf.Course.obstacle(scene())
+    with pytest.raises(tf.InputError, match=why):
+        tf.Course(scene(), streams=(0,))

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from searching import DT, Count, Level, Spread, alone, banned, built, fragile, lit, paced, short, spots, uneven
+from searching import DT, Count, Level, Spread, alone, banned, built, fragile, grown, lit, paced, short, spots, uneven
 
 import torchfilm as tf
 from design import Choice, Objective, Parameter, Stripe, Target, colonies, courses
@@ -395,3 +395,21 @@ def test_colonies_at_their_ends_are_those_that_were_scored():
     assert all(isinstance(d, Done) for d in done)
     found = {int(s): float(x) for d in done for s, x in zip(d.state.stream, made.target.loss(d.state), strict=True)}
     assert [found[k] for k in range(3)] == made.evaluate(spots(1, 2)).losses[0].tolist()
+
+
+def resting(make=1.0):
+    """Cells that do not grow."""
+    return grown(0.0, make)
+
+
+def test_where_the_end_is_a_time_it_comes_also_to_cells_that_rest(monkeypatch):
+    monkeypatch.setattr("design.colonies.PATIENCE", 1.0)
+    found = Objective(resting, [Parameter("make", 0.5, 2.0)], Level(), until=5.0, replicates=1).evaluate(np.array([[0.5]]))
+    assert not found.reasons and found.loss[0] < 1.5
+
+
+def test_a_colony_must_have_somewhere_to_grow():
+    with pytest.raises(tf.InputError, match="cells = 2 is not allowed: it must be above the 2 that a colony starts from"):
+        Objective("boundary_detector", [Parameter("k3", 0.1, 10)], Level("yfp"), cells=2)
+    small = Objective("boundary_detector", [Parameter("k3", 0.1, 10)], Level("yfp"), cells=20, dt=0.05, replicates=1)
+    assert small.end(0.01)[0] == 3 and not small.evaluate(np.array([[0.5]]), size=0.01).reasons

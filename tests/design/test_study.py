@@ -192,7 +192,28 @@ def brighter(make=1.0, decay=1.0):
     return grown(1.9, make, decay)
 
 
+def moved(make=1.0, decay=1.0):
+    scene = lit(make, decay)
+    return tf.Scene(*scene.listed, dt=scene.dt, founders=tf.Cells([[0.0, 3.0]], [[1.0, 0.0]]))
+
+
+def faster(u, s, p, cell):
+    return {"gfp": 2.0 * p.make * (1.0 + 0.02 * cell.x * cell.x) - p.decay * u.gfp}
+
+
+def quicker(make=1.0, decay=1.0):
+    """Its listing is that of `lit`: what a function does is not listed."""
+    faster.__name__ = "filling"
+    scene = lit(make, decay)
+    circuit = tf.Circuit(faster, species=("gfp",), make=make, decay=decay)
+    return tf.Scene(*(circuit if isinstance(e, tf.Circuit) else e for e in scene.listed), dt=scene.dt)
+
+
+moved.__name__ = quicker.__name__ = "lit"
+
 OTHERS = {
+    "founders": ({"scene": moved}, ["founders and functions: "]),
+    "what a function does": ({"scene": quicker}, ["founders and functions: "]),
     "scene": ({"scene": brighter}, ["lit", "brighter", "rate=2.0", "rate=1.9"]),
     "target": ({"target": Level(wanted=2.0)}, ["wanted=1.0", "wanted=2.0"]),
     "bounds": ({"parameters": [LIT[0], Parameter("decay", 0.5, 3)]}, ["decay: 0.5 to 2", "decay: 0.5 to 3"]),

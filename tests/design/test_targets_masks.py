@@ -289,3 +289,12 @@ def test_targets_are_values():
     assert all("yfp" in t.describe() and "\n" not in t.describe() for t in MASKS.values())
     with pytest.raises(AttributeError):
         LEFT.floor = 1.0
+
+
+@pytest.mark.parametrize("target, places", [(Ring("yfp", radius=3.0, width=2.0), [(0.0, 0.0)]), (Bands(("yfp",), (20.0, 26.0)), [(0.0, 0.0), (16.0, 0.0)])])
+def test_the_soft_tail_of_an_edge_that_is_not_reached_is_no_pattern(target, places):
+    """Lit in proportion to the tail, the colony has nothing of what is wanted."""
+    state = placed(places, yfp=1.0)
+    wanted = target.wanted(state)[:, 0]
+    assert 0 < float(wanted.max()) < 0.25
+    assert target.loss(state.with_fields(yfp=wanted)).tolist() == [1.0]
