@@ -104,8 +104,8 @@ class Objective:
         self.cells = None if cells is None else _whole("cells", cells, 2)
         self.until = None if until is None else checks.number("until", until, above=0.0)
         self.replicates, self.most = _whole("replicates", replicates, 1), None if most is None else _whole("most", most, 1)
-        if reduce not in REDUCE:
-            checks.number("reduce", reduce, above=0.0, most=1.0, mend='"mean", "worst" or a quantile.')
+        if reduce not in REDUCE and (isinstance(reduce, bool) or not isinstance(reduce, (int, float)) or not 0 < reduce <= 1):
+            raise checks.refuse("reduce", reduce, '"mean", "worst" or a quantile above 0 and at most 1')
         _whole("seed", seed, 0)
         self.reduce, self.seed, self.dtype, self.device, self.replay = reduce, seed, dtype, device, replay
         self._check_names()
@@ -146,11 +146,12 @@ class Objective:
             try:
                 made = self.scene([values], repeat=2)  # two colonies: a tensor of one number passes for a plain number
                 state = made.seed(2, seed=self.seed, dtype=self.dtype, device=self.device)
-            except (ValueError, TypeError, RuntimeError) as error:
+            except Exception as error:
                 changed = {n: v for n, v in values.items() if v != base[n]} or values
                 raise tf.InputError(
-                    f"the scene cannot be built with {changed}: {error} Narrow the bounds; a parameter that the scene takes as one plain number "
-                    "only can be searched with whole=True or as a Choice of numbers."
+                    f"the scene cannot be built with {changed}: {type(error).__name__}: {str(error).rstrip('.')}. A plain Parameter reaches the scene as a "
+                    "tensor with one value per colony; what the scene takes as one plain number or as a name can be searched with whole=True or as a Choice. "
+                    "Else narrow the bounds."
                 ) from error
             if self.until is None:
                 made.check_moves(state)
@@ -320,7 +321,8 @@ class Objective:
         """What the losses depend on, as plain data: a study is gone on with only by an objective that says the same."""
         return {
             "scene": self.recipe[0] if self.recipe else getattr(self.make, "__name__", "scene"), "fixed": {n: _lasting(v) for n, v in self.fixed.items()},
-            "effects": self.listing, "founders and functions": self.made_of, "parameters": self.space.describe(),
+            "effects": self.listing, "founders and functions": self.made_of,
+            "parameters": self.space.describe(), "code of the target": tf.digest(self.target),
             "target": _told(self.target), "cells": self.cells, "until": self.until,
             "replicates": self.replicates, "reduce": self.reduce, "seed": self.seed, "dt": self.dt, "dtype": str(self.dtype)[6:],
         }  # fmt: skip

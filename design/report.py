@@ -51,6 +51,7 @@ def table(best: Best) -> str:
     study = search.study
     failed = sum(len(e.reasons) for e in study.entries)
     end = f"{study.colonies:.0f} colonies in {study.seconds:.0f} s" + (f", {failed} failed" if failed else "")
+    lines += [f"most failures: {words} ({times} colonies)" for words, times in study.failures()[:1]]
     return "\n".join([*lines, end + (f"; grown anew for each design: {search.regrown}" if search.regrown else "; circuits ran on one recorded growth")])
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -64,6 +65,7 @@ class Search:
             device=device, replay=replay, most=most,
         )  # fmt: skip
         self.method, self.seed, self.regrown = method_of(method), seed, self.objective.regrown
+        self.grown: dict[bytes, list[Done]] = {}  # colonies of designs that were looked at
         self.study = self._new_study(None)
 
     def run(
@@ -83,11 +85,18 @@ class Search:
         self.study = self._new_study(study)
         self.method.start(self.objective.space, self.seed, self.objective.replicates)
         self._catch_up()
-        with report.bar(colonies, progress) as bar:
-            self._show(bar)
-            while self.study.colonies < colonies and not self._reached(stop_at):
-                self._batch(executor, pieces)
+        try:
+            with report.bar(colonies, progress) as bar:
                 self._show(bar)
+                while self.study.colonies < colonies and not self._reached(stop_at):
+                    self._batch(executor, pieces)
+                    self._show(bar)
+        except KeyboardInterrupt:
+            kept = f"they are in {self.study.path}: run the search again to go on" if self.study.path else "best() gives the best of them"
+            print(f"stopped at {self.study.colonies:.0f} of {colonies} colonies; {kept}.", file=sys.stderr)
+            raise
+        if self.study.entries and all(len(e.reasons) == e.losses.size for e in self.study.entries):
+            print(f"every colony failed; most often: {self.study.failures()[0][0]}", file=sys.stderr)
         return self.best()
 
     def best(self) -> Best:
@@ -124,6 +133,10 @@ class Search:
 
     def _batch(self, executor: Executor | None, pieces: int) -> Evaluation:
         batch = self.method.ask()
+        if not isinstance(batch, Batch):
+            raise tf.InputError(
+                f"{type(self.method).__name__}.ask must return a design.Batch of points (n, {self.objective.space.size}), not {type(batch).__name__}."
+            )
         replicates = self.objective.replicates if batch.replicates is None else min(batch.replicates, self.objective.replicates)
         found = self.objective.evaluate(batch.points, streams=range(replicates), size=batch.size, executor=executor, pieces=pieces)
         entry = Entry(found.points, found.loss, found.losses, found.cells, found.reasons, batch.size, replicates, found.seconds)
@@ -170,7 +183,8 @@ class Best:
         told = {
             "torchfilm": tf.__version__, "scene": objective.recipe[0] if objective.recipe else home["function"], **home,
             "parameters": {**objective.fixed, **self.values}, **end, "seed": objective.seed, "dt": objective.dt,
-            "dtype": str(objective.dtype)[6:], "target": objective.target.describe(), "loss": self.loss, "losses": self.losses.tolist(),
+            "dtype": str(objective.dtype)[6:], "target": objective.target.describe(),
+            "species": list(objective.target.names), "loss": self.loss, "losses": self.losses.tolist(),
             "colonies": self.search.study.colonies,
         }  # fmt: skip
         path.write_text(json.dumps(told, indent=1, default=_plain) + "\n")
@@ -194,8 +208,11 @@ class Best:
         )
 
     def colonies(self) -> list[Done]:
-        """The replicates, grown again: the same colonies as were scored."""
-        return self.search.objective.final(self.point)
+        """The replicates, grown again, once: the same colonies as were scored."""
+        key = self.point.tobytes()
+        if key not in self.search.grown:
+            self.search.grown[key] = self.search.objective.final(self.point)
+        return self.search.grown[key]
 
 
 def _home(make: Callable[..., tf.Scene]) -> dict[str, Any]:

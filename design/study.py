@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,6 +85,14 @@ class Study:
         loss, k, row = min(found)
         entry = self.full()[k]
         return entry.points[row], loss, entry.losses[row]
+
+    def failures(self) -> list[tuple[str, int]]:
+        """Why colonies failed and how many, the commonest reason first; told without its numbers, which differ from colony to colony."""
+        words: dict[str, list[str]] = {}
+        for entry in self.entries:
+            for reason in entry.reasons.values():
+                words.setdefault(re.sub(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", "#", reason), []).append(reason)
+        return [(alike[0], len(alike)) for alike in sorted(words.values(), key=len, reverse=True)]
 
     def convergence(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """After each batch: colonies and seconds spent so far, and the best loss yet (NaN before there is one), (K,) each."""

@@ -61,7 +61,7 @@ class Run:
     double: bool = False
     """Compute in float64, as a design does that was searched so."""
     out: Path | None = None
-    """Results file; by default SCENE.h5 here."""
+    """Results file; by default SCENE.h5 here, of a saved design NAME_run.h5."""
     every: int = 10
     """Steps from one recorded frame to the next."""
     overwrite: bool = False
@@ -87,7 +87,9 @@ class Run:
         if start is not None:
             report_empty(str(self.start), start, state)
             report_overlaps(start)
-        out = self.out if self.out is not None else Path(f"{scene.name}.h5")
+        # a design's study is likely to be called as its scene or itself is
+        own = Path(f"{Path(self.scene).stem}_run.h5") if plan else Path(f"{scene.name}.h5")
+        out = self.out if self.out is not None else own
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -95,7 +97,8 @@ class Run:
         recorder = Recorder(out, scene, every=self.every, overwrite=self.overwrite)
         if self.picture:
             check_new("picture", own_picture(out), self.overwrite, "Choose another --out, replace it (--overwrite), or draw none (--no-picture).")
-        go(scene, state, recorder, cells=cells, until=until, dt=self.dt, watch=self.watch, picture=self.picture)
+        colour = next((n for n in plan.get("species", ()) if n in state.fields), None)
+        go(scene, state, recorder, cells=cells, until=until, dt=self.dt, watch=self.watch, picture=self.picture, colour=colour)
 
 
 @dataclass
@@ -294,7 +297,10 @@ def _colonies(numbers: list[int], most: int = 12) -> str:
     return f"{'colony' if len(numbers) == 1 else 'colonies'} {listed}"
 
 
-def go(scene: Scene, start: State, recorder: Recorder, *, cells: int | None, until: float | None, dt: float | None, watch: bool, picture: bool) -> None:
+def go(
+    scene: Scene, start: State, recorder: Recorder, *, cells: int | None, until: float | None, dt: float | None, watch: bool, picture: bool,
+    colour: str | None = None,
+) -> None:  # fmt: skip
     """Run with a progress bar, then say where things are and how they went."""
     rules = [e for e in scene.effects if isinstance(e, Rules)]
     for rule in rules:
@@ -318,7 +324,7 @@ def go(scene: Scene, start: State, recorder: Recorder, *, cells: int | None, unt
     seconds = time.perf_counter() - begun
     print(f"results  {recorder.path}")
     if picture and state.cells:
-        print(f"picture  {pictures.show(recorder.path)}")
+        print(f"picture  {pictures.show(recorder.path, colour=colour)}")
     print(table(scene, state, timings, seconds))
 
 

@@ -51,6 +51,10 @@ class Recorder:
                 "a path where there is no file yet",
                 "Choose another (--out), replace it (--overwrite; in Python tf.Recorder(path, scene, overwrite=True)), or resume from it.",
             )
+        if self.path.exists() and not append and not _may_go(self.path):
+            raise checks.refuse(
+                "record", str(path), "a results file, where it replaces one", "This is another kind of file, such as a study. Choose another (--out)."
+            )
         if not self.path.parent.is_dir():
             raise checks.refuse("record", str(path), "in a folder that exists", f"Make {self.path.parent} first.")
         self.overwrite = overwrite
@@ -231,6 +235,15 @@ class Recorder:
             self._append(f"frames/{name}", np.asarray(row[name])[None], frame)
         file.flush()
         self.births, self.ends = [], []
+
+
+def _may_go(path: Path) -> bool:
+    """Whether a file may be replaced by results: not if it is HDF5 of another kind."""
+    try:
+        with h5py.File(path, "r") as file:
+            return file.attrs.get("format", FORMAT) == FORMAT
+    except OSError:
+        return True
 
 
 def _numpy(x: Tensor) -> np.ndarray:

@@ -22,11 +22,12 @@ def method_of(given: str | Method) -> Method:
         checks.choice("method", given, tuple(METHODS))
         made: Method = METHODS[given]()
         return made
-    if isinstance(given, type) or not all(callable(getattr(given, name, None)) for name in ("start", "ask", "tell")):
+    missing = [name for name in ("start", "ask", "tell") if not callable(getattr(given, name, None))]
+    if isinstance(given, type) or missing:
         raise checks.refuse(
             "method",
             given,
             "one of " + ", ".join(map(repr, METHODS)) + ", or an object with start, ask and tell",
-            "A class is not yet an object: write CMAES().",
+            "A class is not yet an object: write CMAES()." if isinstance(given, type) else f"It has no {' and no '.join(missing)}.",
         )
     return given

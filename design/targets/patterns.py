@@ -93,7 +93,8 @@ class OnFraction(Target):
     """A share of the cells on, the rest off, wherever they are.
 
     fraction: wanted share of the volume, above 0 and below 1. A cell is on above `level`; smoothly, for the loss, s = y⁴/(y⁴ + level⁴). Loss:
-    (mean s − fraction)²/max(fraction, 1 − fraction)², which is 1 where all is as wrong as it can be.
+    1 − (1 − d²)(1 − g), with d = (mean s − fraction)/max(fraction, 1 − fraction), which is 1 where the share is as wrong as it can be, and g the mean of
+    4 s (1 − s): 1 where all cells are at the level itself, neither on nor off, 0 where all have decided.
     """
 
     species: str
@@ -119,8 +120,9 @@ class OnFraction(Target):
         square = (y[:, 0] / self.level).clamp(max=BRIGHTEST) ** 2
         on = square * square / (1.0 + square * square)
         w = weights(state)
-        share = ratio(total(state, w * on), total(state, w), 0.0)
-        return torch.where(sound, ((share - self.fraction) / max(self.fraction, 1 - self.fraction)) ** 2, self.failed)
+        share, grey = (ratio(total(state, w * part), total(state, w), 0.0) for part in (on, 4.0 * on * (1.0 - on)))
+        wrong = ((share - self.fraction) / max(self.fraction, 1 - self.fraction)) ** 2
+        return torch.where(sound, 1.0 - (1.0 - wrong) * (1.0 - grey), self.failed)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:

@@ -136,11 +136,13 @@ def test_colonies_that_failed_score_so_and_harm_no_other(name):
     ],
 )
 def test_share_of_cells_that_are_on(levels, share):
-    """s = y⁴/(y⁴ + level⁴); 1 − s = 1e-20 at 1e5."""
+    """s = y⁴/(y⁴ + level⁴); 1 − s = 1e-20 at 1e5. Cells between on and off cost as much as they are: 4 s (1 − s)."""
+    fourth = np.minimum(np.array(levels, dtype=float), 1e9) ** 4
+    s = fourth / (1 + fourth)
     state = placed([(0, 0), (2, 0), (4, 0), (6, 0)], yfp=3.0 * np.array(levels, dtype=float))
     given = state.yfp.clone().requires_grad_()
     loss = OnFraction("yfp", 0.2, 3.0).loss(state.with_fields(yfp=given))
-    assert float(loss.detach()) == pytest.approx(((share - 0.2) / 0.8) ** 2, abs=1e-15)
+    assert float(loss.detach()) == pytest.approx(1 - (1 - ((share - 0.2) / 0.8) ** 2) * (1 - np.mean(4 * s * (1 - s))), abs=1e-15)
     assert bool(torch.isfinite(torch.autograd.grad(loss.sum(), given)[0]).all())
 
 

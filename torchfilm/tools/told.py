@@ -16,8 +16,9 @@ import torch
 def digest(*things: Any) -> str:
     """A short hexadecimal word that differs where numbers, arrays, options or the code of functions differ.
 
-    Functions go by what they do, their code, defaults and what they hold on to, not by their names or line numbers; other objects by their public
-    representation. Python's own versions may compile one function in two ways.
+    Functions go by what they do: their code, defaults, what they hold on to and what they use of their own module, not their names or line numbers; objects
+    of a user's class by their attributes and functions. What is imported from elsewhere is not looked into, and versions of Python may compile one function
+    in two ways.
     """
     made = hashlib.sha256()
     _add(made, things, set())
@@ -43,10 +44,13 @@ def _add(made: Any, thing: Any, within: set[int]) -> None:
     made.update(b")")
 
 
+OURS = ("torchfilm", "design", "torch", "numpy", "builtins")
+
+
 def _parts(thing: Any) -> list[Any]:
     if isinstance(thing, FunctionType):
         held = [c.cell_contents for c in thing.__closure__ or () if not _is_empty(c)]
-        return [thing.__code__, thing.__defaults__, thing.__kwdefaults__, *held]
+        return [thing.__code__, thing.__defaults__, thing.__kwdefaults__, *held, *_globals(thing)]
     if isinstance(thing, CodeType):
         return [thing.co_code, thing.co_names, thing.co_consts]
     if isinstance(thing, Mapping):
@@ -55,10 +59,32 @@ def _parts(thing: Any) -> list[Any]:
         return list(thing)
     if isinstance(thing, (set, frozenset)):
         return sorted(map(repr, thing))
-    if dataclasses.is_dataclass(thing) and not isinstance(thing, type):
+    if isinstance(thing, type) or not hasattr(thing, "__dict__") or type(thing).__module__ == "builtins":
+        return [re.sub(r" at 0x[0-9a-f]+", "", repr(thing))]
+    kind = type(thing)
+    if dataclasses.is_dataclass(thing):
         # what is not shown is not given by the user but worked out
-        return [type(thing).__qualname__, *(getattr(thing, f.name) for f in dataclasses.fields(thing) if f.repr)]
-    return [re.sub(r" at 0x[0-9a-f]+", "", repr(thing))]
+        given = [getattr(thing, f.name) for f in dataclasses.fields(thing) if f.repr]
+    elif kind.__module__.split(".")[0] in OURS:
+        return [kind.__qualname__, re.sub(r" at 0x[0-9a-f]+", "", repr(thing))]
+    else:
+        given = [x for name, value in vars(thing).items() for x in (name, value)]
+    # a class of the user's own is also what its functions do
+    own = [c for c in kind.__mro__ if c.__module__.split(".")[0] not in OURS]
+    return [kind.__qualname__, *given, *(f for c in own for f in vars(c).values() if isinstance(f, FunctionType))]
+
+
+def _globals(function: FunctionType) -> list[Any]:
+    """What a function uses of its own module: numbers, texts, arrays and other functions of it."""
+    names: list[str] = []
+    codes = [function.__code__]
+    while codes:
+        code = codes.pop()
+        names += code.co_names
+        codes += [c for c in code.co_consts if isinstance(c, CodeType)]
+    used = [function.__globals__.get(name) for name in dict.fromkeys(names)]
+    plain = (str, int, float, bool, tuple, list, dict, np.ndarray, torch.Tensor)
+    return [x for x in used if isinstance(x, plain) or (isinstance(x, FunctionType) and x.__module__ == function.__module__)]
 
 
 def _is_empty(cell: Any) -> bool:
