@@ -154,7 +154,7 @@ def test_a_method_by_its_name(name):
     ("given", "said"),
     [
         (Sobol(batch=9), "sobol(batch=9)"),
-        (CMAES(), "cmaes(population=None, sigma=0.3, restarts=True, noisy=True)"),
+        (CMAES(), "cmaes(population=None, sigma=0.3, restarts=True, noisy=False)"),
         (Racing(inner=Sobol(batch=9)), "racing(inner=sobol(batch=9), sizes=(0.25, 1.0), keep=0.33, small=1, agree=0.1)"),
     ],
 )

@@ -61,7 +61,7 @@ def test_cmaes_finds_the_best_of_levels_among_hills(seed):
 def test_noise_does_not_make_the_cloud_collapse(seed):
     """Noise of 0.1 on losses of up to 1: were the width to shrink as without noise, it were 1e-3 after 100 batches."""
     noise = np.random.default_rng(seed)
-    given = begun(CMAES(restarts=False), Room((None,) * 5), seed)
+    given = begun(CMAES(restarts=False, noisy=True), Room((None,) * 5), seed)
     history = follow(given, lambda points: ellipsoid(points) + 0.1 * noise.standard_normal(len(points)), 100)
     late = np.concatenate([batch.points for batch, _ in history[-10:]])
     assert late.std(0).mean() > 0.02
@@ -141,8 +141,8 @@ def race(given, seed: int, *, shift: float, target: float, budget: float) -> flo
 
 
 def test_racing_spends_half_where_small_colonies_tell_something():
-    plain = [race(CMAES(), seed, shift=0.05, target=0.04, budget=400) for seed in range(6)]
-    raced = [race(Racing(), seed, shift=0.05, target=0.04, budget=400) for seed in range(6)]
+    plain = [race(CMAES(noisy=True), seed, shift=0.05, target=0.04, budget=400) for seed in range(6)]
+    raced = [race(Racing(inner=CMAES(noisy=True)), seed, shift=0.05, target=0.04, budget=400) for seed in range(6)]
     assert sum(raced) < 0.5 * sum(plain)
 
 

@@ -76,7 +76,7 @@ def test_a_space_has_its_parameters_side_by_side():
     assert values == {"k3": pytest.approx(1.0), "genes": 3, "promoter": "weak"}
     again = space.values(space.point(values))
     assert again == {**values, "k3": pytest.approx(values["k3"], rel=ROUNDING)}
-    assert space.describe() == ["k3: 0.1 to 10 log", "genes: 1 to 3 whole", "promoter: 'weak' or 'strong'"]
+    assert space.describe() == ["k3: 0.1 to 10.0 log", "genes: 1.0 to 3.0 whole", "promoter: 'weak' or 'strong'"]
 
 
 @pytest.mark.parametrize(
