@@ -326,7 +326,7 @@ def ungrown(make=1.0):
         ({"scene": lambda make: 3}, "scene = 3.*a function that returns a tf.Scene"),
         ({"scene": lambda make, other: lit()}, "cannot be built.*'other'"),
         ({"scene": paced, "parameters": [Parameter("rate", -1, 1)]}, r"cannot be built with \{'rate': -1.0\}.*at least 0.*narrow the bounds"),
-        ({"scene": plain, "parameters": [Parameter("rate", 0.5, 1)], "target": Spread()}, "one plain number or as a name can be searched with whole=True or as a Choice"),
+        ({"scene": plain, "parameters": [Parameter("rate", 0.5, 1)], "target": Spread()}, "one plain number or as a name can be searched with whole=True or"),
         ({"scene": plain, "parameters": [Parameter("longest", 2.0, 4.0)], "target": Spread()}, r"cannot be built with \{'longest': 2.0\}"),
         ({"scene": ungrown, "parameters": [Parameter("make", 1, 2)], "target": Spread()}, "growth waits for 'growth_rate'.*until="),
     ],
