@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,11 +42,11 @@ def table(best: Best) -> str:
     rows = [("parameter", "bounds", "first guess", "best")]
     for p in search.objective.space.parameters:
         bounds = f"{p.low:g} … {p.high:g}" if isinstance(p, Parameter) else " | ".join(map(str, p.options))
-        rows.append((p.name, bounds, _shown(first.values[p.name]), _shown(best.values[p.name])))
+        rows.append((p.name, bounds, shown(first.values[p.name]), shown(best.values[p.name])))
     rows.append(("loss", "", f"{first.loss:.4f}", f"{best.loss:.4f}"))
-    measured = [_measures(b) for b in (first, best)]
-    for name in measured[1]:
-        rows.append((name, "", _shown(measured[0].get(name, float("nan"))), _shown(measured[1][name])))
+    before, after = (measured(search.objective.target, b.colonies()) for b in (first, best))
+    for name in after:
+        rows.append((name, "", shown(before.get(name, float("nan"))), shown(after[name])))
     wide = [max(len(r[k]) for r in rows) for k in range(4)]
     lines = ["  ".join(x.ljust(w) if k < 2 else x.rjust(w) for k, (x, w) in enumerate(zip(r, wide, strict=True))) for r in rows]
     study = search.study
@@ -55,17 +56,18 @@ def table(best: Best) -> str:
     return "\n".join([*lines, end + (f"; grown anew for each design: {search.regrown}" if search.regrown else "; circuits ran on one recorded growth")])
 
 
-def _shown(value: Value) -> str:
+def shown(value: Value) -> str:
+    """A parameter's value in a table."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _measures(best: Best) -> dict[str, float]:
-    """What the target measures on the replicates of a design, their mean."""
+def measured(target: Target, done: Iterable[Done]) -> dict[str, float]:
+    """What a target measures, its mean over all these colonies that have the number; NaN where none has."""
     found: dict[str, list[float]] = {}
-    for done in best.colonies():
-        for name, value in best.search.objective.target.measures(done.state, done.history).items():
+    for part in done:
+        for name, value in target.measures(part.state, part.history).items():
             found.setdefault(name, []).extend(value.double().tolist())
-    return {name: float(np.mean(v)) if np.isfinite(v).all() else float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for name, v in found.items()}
+    return {name: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for name, v in found.items()}
 
 
 def draw(best: Best, path: Path) -> Path:
@@ -137,7 +139,7 @@ def _draw_convergence(ax: Axes, search: Any) -> None:
     colonies, _, best = search.study.convergence()
     spent = np.concatenate([[0.0], colonies])
     for entry, begin, end in zip(search.study.entries, spent[:-1], spent[1:], strict=True):
-        if any(entry is e for e in search.study.full()):
+        if search.study.is_full(entry):
             ax.plot(np.linspace(begin, end, len(entry.loss) + 1)[1:], entry.loss, ".", color="0.75", ms=2, zorder=0)
     ax.step(colonies, best, where="post", color="C3")
     ax.set(xlabel="colonies simulated", ylabel="loss", ylim=(0, None))
@@ -155,7 +157,7 @@ def _draw_parameters(ax: Axes, best: Best) -> None:
         low, high = (f"{p.low:g}", f"{p.high:g}") if isinstance(p, Parameter) else (str(p.options[0]), str(p.options[-1]))
         for x, words, side in ((0, low, "right"), (1, high, "left")):
             ax.annotate(words, (x, y), xytext=(-4 if side == "right" else 4, 0), textcoords="offset points", ha=side, va="center", fontsize=7, color="0.4")
-    ax.set(yticks=rows, yticklabels=[f"{p.name} = {_shown(best.values[p.name])}" for p in space.parameters], xticks=[], xlim=(-0.28, 1.28))
+    ax.set(yticks=rows, yticklabels=[f"{p.name} = {shown(best.values[p.name])}" for p in space.parameters], xticks=[], xlim=(-0.28, 1.28))
     ax.set_ylim(-0.7, space.size - 0.3)
     ax.tick_params(left=False)
     for side in ("left", "right", "top", "bottom"):

@@ -121,9 +121,9 @@ class Robustness:
         lines += _aligned(rows)
         rows = [("parameter", "value", "changed to", "asked for", "loss change", "± error")]
         for c in self.changes:
-            asked = _shown(c.wanted) if c.clipped else ""
+            asked = report.shown(c.wanted) if c.clipped else ""
             told = ("", "") if math.isnan(c.difference) else (f"{c.difference:+.4f}", "" if math.isnan(c.error) else f"{c.error:.4f}")
-            rows.append((c.name, _shown(self.values[c.name]), _shown(c.value), asked, *told))
+            rows.append((c.name, report.shown(self.values[c.name]), report.shown(c.value), asked, *told))
         lines += ["", *_aligned(rows)]
         if self.indices is not None:
             rows = [("parameter", "first", "±", "total", "±")]
@@ -279,10 +279,6 @@ def _summary(losses: np.ndarray) -> tuple[str, ...]:
     return tuple(f"{x:.4f}" for x in (losses.mean(), np.median(losses), np.quantile(losses, 0.9)))
 
 
-def _shown(value: Value) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
 def _or_blank(number: float | None) -> str:
     return "" if number is None else f"{number:g}"
 
@@ -324,7 +320,7 @@ def _draw_changes(ax: Axes, found: Robustness) -> None:
     places = np.arange(len(rows))[::-1]
     ax.barh(places, [c.difference for c in rows], xerr=np.nan_to_num([c.error for c in rows]), color="C0", ecolor="0.3")
     ax.axvline(0, color="black", lw=0.8)
-    ax.set(yticks=places, yticklabels=[f"{c.name} = {_shown(c.value)}" for c in rows], xlabel="change of the loss")
+    ax.set(yticks=places, yticklabels=[f"{c.name} = {report.shown(c.value)}" for c in rows], xlabel="change of the loss")
     ax.set_title("one parameter changed", fontsize=9)
 
 

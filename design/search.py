@@ -103,7 +103,7 @@ class Search:
         """The best design so far."""
         found = self.study.best()
         if found is None:
-            raise tf.InputError("no design has been grown to full size yet: run the search for more colonies.")
+            raise _none_yet()
         point, loss, losses = found
         return Best(self, self.objective.space.values(point), point, loss, losses)
 
@@ -111,7 +111,7 @@ class Search:
         """The first design that was grown to full size: where the search began."""
         full = self.study.full()
         if not full:
-            raise tf.InputError("no design has been grown to full size yet: run the search for more colonies.")
+            raise _none_yet()
         entry = full[0]
         return Best(self, self.objective.space.values(entry.points[0]), entry.points[0], float(entry.loss[0]), entry.losses[0])
 
@@ -139,8 +139,9 @@ class Search:
             )
         replicates = self.objective.replicates if batch.replicates is None else min(batch.replicates, self.objective.replicates)
         found = self.objective.evaluate(batch.points, streams=range(replicates), size=batch.size, executor=executor, pieces=pieces)
-        entry = Entry(found.points, found.loss, found.losses, found.cells, found.reasons, batch.size, replicates, found.seconds)
-        self.study.add(entry, [self.objective.space.values(p) for p in found.points])
+        values = [self.objective.space.values(p) for p in found.points]
+        entry = Entry(found.points, found.loss, found.losses, found.cells, found.reasons, batch.size, replicates, found.seconds, values)
+        self.study.add(entry)
         self.method.tell(batch, found.loss)
         self.regrown = found.regrown
         return found
@@ -215,13 +216,17 @@ class Best:
         return self.search.grown[key]
 
 
+def _none_yet() -> tf.InputError:
+    return tf.InputError("no design has been grown to full size yet: run the search for more colonies.")
+
+
 def _home(make: Callable[..., tf.Scene]) -> dict[str, Any]:
     """Where a user's own scene function is found again: its file and its name there."""
     made = inspect.unwrap(make)
     code = getattr(made, "__code__", None)
     if code is None or "<" in made.__qualname__:
         raise checks.refuse("scene", make, "a function at the top level of a file, for a design that is saved", "A file cannot find it again by its name.")
-    return {"file": code and os.path.abspath(code.co_filename), "function": getattr(made, "__name__", "scene")}
+    return {"file": os.path.abspath(code.co_filename), "function": made.__name__}
 
 
 def _plain(value: Any) -> Any:

@@ -34,7 +34,7 @@ FORMAT, VERSION = "torchfilm study", 1
 @dataclass(frozen=True, eq=False)
 class Entry:
     """One batch: what was asked, and what was found. points (n, D), loss (n,), losses and cells (n, R); reasons by (row, replicate); size: share of the full
-    size; replicates: how many were grown; seconds."""
+    size; replicates: how many were grown; seconds; values: the parameters of each point."""
 
     points: np.ndarray
     loss: np.ndarray
@@ -44,6 +44,7 @@ class Entry:
     size: float
     replicates: int
     seconds: float
+    values: Sequence[dict[str, Value]]
 
     @property
     def colonies(self) -> float:
@@ -75,16 +76,20 @@ class Study:
 
     def full(self) -> list[Entry]:
         """The batches at full size with all replicates, the only ones whose losses can be compared."""
-        return [e for e in self.entries if e.size == 1.0 and e.replicates == len(self.streams)]
+        return [e for e in self.entries if self.is_full(e)]
+
+    def is_full(self, entry: Entry) -> bool:
+        """Whether a batch was grown to full size with all replicates."""
+        return entry.size == 1.0 and entry.replicates == len(self.streams)
 
     def best(self) -> tuple[np.ndarray, float, np.ndarray] | None:
         """Point (D,), loss and losses (R,) of the best design that was grown to full size; the first of equals. None before there is one."""
-        found = [(float(e.loss.min()), k, int(e.loss.argmin())) for k, e in enumerate(self.full())]
-        if not found:
+        full = self.full()
+        if not full:
             return None
-        loss, k, row = min(found)
-        entry = self.full()[k]
-        return entry.points[row], loss, entry.losses[row]
+        entry = min(full, key=lambda e: float(e.loss.min()))
+        row = int(entry.loss.argmin())
+        return entry.points[row], float(entry.loss[row]), entry.losses[row]
 
     def failures(self) -> list[tuple[str, int]]:
         """Why colonies failed and how many, the commonest reason first; told without its numbers, which differ from colony to colony."""
@@ -98,21 +103,18 @@ class Study:
         """After each batch: colonies and seconds spent so far, and the best loss yet (NaN before there is one), (K,) each."""
         colonies = np.cumsum([e.colonies for e in self.entries])
         seconds = np.cumsum([e.seconds for e in self.entries])
-        full = {id(e) for e in self.full()}
-        lowest = [e.loss.min() if id(e) in full else np.inf for e in self.entries]
+        lowest = [e.loss.min() if self.is_full(e) else np.inf for e in self.entries]
         best = np.minimum.accumulate(lowest) if lowest else np.empty(0)
         return colonies, seconds, np.where(np.isfinite(best), best, np.nan)
 
-    def add(self, entry: Entry, values: Sequence[dict[str, Value]]) -> None:
+    def add(self, entry: Entry) -> None:
         """Note a batch, and write the file."""
         self.entries.append(entry)
         if self.path is not None:
-            self._write(values)
+            self._write(self.path)
 
-    def _write(self, last: Sequence[dict[str, Value]]) -> None:
-        assert self.path is not None
-        beside = self.path.with_name(self.path.name + ".new")
-        kept = {n: [] for n in self.names} if len(self.entries) == 1 else _values(self.path, self.names)
+    def _write(self, path: Path) -> None:
+        beside = path.with_name(path.name + ".new")
         try:
             with h5py.File(beside, "w") as file:
                 file.attrs.update(
@@ -121,16 +123,15 @@ class Study:
                 file["streams"] = np.asarray(self.streams, np.int64)
                 self._write_tables(file)
                 for name in self.names:
-                    column = [*kept[name], *(v[name] for v in last)]
-                    if any(isinstance(v, (str, bytes)) for v in column):
-                        words = [v.decode() if isinstance(v, bytes) else str(v) for v in column]
-                        file.create_dataset(f"values/{name}", data=words, dtype=h5py.string_dtype())
+                    column = [v[name] for e in self.entries for v in e.values]
+                    if any(isinstance(v, str) for v in column):
+                        file.create_dataset(f"values/{name}", data=[str(v) for v in column], dtype=h5py.string_dtype())
                     else:
                         file[f"values/{name}"] = column
-            os.replace(beside, self.path)
+            os.replace(beside, path)
         except OSError as error:
             raise tf.SimulationError(
-                f"could not write {self.path}: {error}. Is the disk full? What was written before is safe; run the search again to go on."
+                f"could not write {path}: {error}. Is the disk full? What was written before is safe; run the search again to go on."
             ) from error
 
     def _write_tables(self, file: h5py.File) -> None:
@@ -185,18 +186,15 @@ class Study:
 
 def _entries(file: h5py.File) -> list[Entry]:
     batches, designs = ({n: d[...] for n, d in file[g].items()} for g in ("batches", "designs"))
+    columns = {name: (d.asstr() if h5py.check_string_dtype(d.dtype) else d)[...].tolist() for name, d in file["values"].items()}
+    values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     out, at = [], 0
     for rows, size, replicates, seconds in zip(*(batches[n].tolist() for n in ("rows", "size", "replicates", "seconds")), strict=True):
         mine = slice(at, at + rows)
         reasons = {(r, int(k)): words for r, text in enumerate(designs["reasons"][mine]) for k, words in json.loads(text).items()}
         losses, cells = designs["losses"][mine, :replicates], designs["cells"][mine, :replicates]
-        out.append(Entry(designs["point"][mine], designs["loss"][mine], losses, cells, reasons, size, replicates, seconds))
+        out.append(Entry(designs["point"][mine], designs["loss"][mine], losses, cells, reasons, size, replicates, seconds, values[mine]))
         at += rows
     if at != len(designs["point"]):
         raise ValueError(f"its batches have {at} designs, and it lists {len(designs['point'])}")
     return out
-
-
-def _values(path: Path, names: Sequence[str]) -> dict[str, list[Value]]:
-    with h5py.File(path, "r") as file:
-        return {n: file[f"values/{n}"][...].tolist() for n in names}

@@ -16,6 +16,7 @@ import numpy as np
 
 import torchfilm as tf
 from design import CMAES, Objective, Parameter, Racing, Search, Stripe
+from design.report import measured
 
 PARAMETERS = [
     Parameter("d1", 1e-3, 1.0, log=True),  # LuxI made by sources, 1/h
@@ -33,14 +34,11 @@ COLONY = {"cells": 100, "dt": 0.05, "fixed": {"width": 16.0, "rtol": 1e-2}}
 PUBLISHED = {"d1": 1e-3, "k1": 1.0, "D1": 0.1, "d3": 1e-3, "k5": 0.1, "k3": 1.0, "k4": 5e-5, "dr": 0.1}
 
 
-def measured(objective: Objective, values: dict[str, float], seeds: int = 8) -> dict[str, float]:
+def fresh(objective: Objective, values: dict[str, float], seeds: int = 8) -> dict[str, float]:
     """What the stripe of a design is like, the mean over seeds it was not searched on."""
-    found: dict[str, list[float]] = {}
-    for done in objective.final(objective.space.point(values), streams=range(100, 100 + seeds)):
-        measures = objective.target.measures(done.state, done.history) | {"loss": objective.target.loss(done.state)}
-        for name, value in measures.items():
-            found.setdefault(name, []).extend(value.tolist())
-    return {name: float(np.nanmean(value)) for name, value in found.items()}
+    done = objective.final(objective.space.point(values), streams=range(100, 100 + seeds))
+    losses = [loss for d in done for loss in objective.target.loss(d.state).tolist()]
+    return measured(objective.target, done) | {"loss": float(np.mean(losses))}
 
 
 def main() -> None:
@@ -58,7 +56,7 @@ def main() -> None:
     best = search.run(options.colonies, study=options.out.with_suffix(".h5"))
     print(best.table())
     print(f"\n{'on 8 fresh seeds':<18}{'published':>12}{'best':>12}")
-    published, ours = (measured(search.objective, values) for values in (PUBLISHED, best.values))
+    published, ours = (fresh(search.objective, values) for values in (PUBLISHED, best.values))
     for name in ours:
         print(f"{name:<18}{published[name]:>12.4g}{ours[name]:>12.4g}")
     for path in (best.save(options.out.with_suffix(".json")), best.plot(options.out.with_suffix(".png"))):

@@ -67,7 +67,17 @@ def split(scene: Scene) -> Split:
             obstacle = f"{scene.listed[place].title} acts on growth or motion by {name!r}, which is no quantity of cells"
     if scene.founders.colony is not None:
         obstacle = "its first cells name their colonies, so that these do not start alike"
-    return Split(tuple(sorted(growth)), obstacle)
+    return Split(tuple(sorted(growth)), obstacle or _held(scene, sorted(growth)))
+
+
+def _held(scene: Scene, growth: Iterable[int]) -> str:
+    """What among the parameters of growth a recorded course cannot carry, or ""."""
+    for path, tensor in (found for k in growth for found in parameters(scene.listed[k])):
+        if tensor.dim() == 1:
+            return f"{path} differs between colonies and acts on their growth"
+        if tensor.requires_grad:
+            return f"{path} wants a gradient, which recorded growth does not carry"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -123,23 +133,15 @@ class Course:
     @staticmethod
     def obstacle(scene: Scene) -> str:
         """Why the growth of a scene cannot be kept for all its designs, or "" if it can."""
-        parts = split(scene)
-        if parts.obstacle:
-            return parts.obstacle
-        for path, tensor in (found for k in parts.growth for found in parameters(scene.listed[k])):
-            if tensor.dim() == 1:
-                return f"{path} differs between colonies and acts on their growth"
-            if tensor.requires_grad:
-                return f"{path} wants a gradient, which recorded growth does not carry"
-        return ""
+        return split(scene).obstacle
 
     @staticmethod
     def scene_of(scene: Scene) -> Scene:
         """The scene without what only follows. Raises InputError where its growth cannot be kept."""
-        why = Course.obstacle(scene)
-        if why:
-            raise checks.InputError(f"the growth of this scene cannot be kept for other designs: {why}. Run the scene itself.")
-        return Scene(*(scene.listed[k] for k in split(scene).growth), name=scene.name, dt=scene.dt, founders=scene.founders)
+        parts = split(scene)
+        if parts.obstacle:
+            raise checks.InputError(f"the growth of this scene cannot be kept for other designs: {parts.obstacle}. Run the scene itself.")
+        return Scene(*(scene.listed[k] for k in parts.growth), name=scene.name, dt=scene.dt, founders=scene.founders)
 
     @staticmethod
     def made_of(scene: Scene) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -15,6 +14,7 @@ from torchfilm.effect import BUILT_IN, STAGES, Effect
 from torchfilm.state import CELL, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.timing import Timings
+from torchfilm.tools.told import lasting
 
 CPU = torch.device("cpu")
 
@@ -176,7 +176,7 @@ class Scene:
 
     def listing(self) -> list[str]:
         """Each effect as it was listed, with the parameters that differ from their defaults; what a results file compares by."""
-        return [re.sub(r" at 0x[0-9a-f]+", "", summary(effect)) for effect in self.listed]
+        return [lasting(summary(effect)) for effect in self.listed]
 
     @property
     def headline(self) -> str:

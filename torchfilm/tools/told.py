@@ -13,6 +13,11 @@ import numpy as np
 import torch
 
 
+def lasting(words: str) -> str:
+    """How a thing is written, without where it lies in the memory of this process."""
+    return re.sub(r" at 0x[0-9a-f]+", "", words)
+
+
 def digest(*things: Any) -> str:
     """A short hexadecimal word that differs where numbers, arrays, options or the code of functions differ.
 
@@ -60,13 +65,13 @@ def _parts(thing: Any) -> list[Any]:
     if isinstance(thing, (set, frozenset)):
         return sorted(map(repr, thing))
     if isinstance(thing, type) or not hasattr(thing, "__dict__") or type(thing).__module__ == "builtins":
-        return [re.sub(r" at 0x[0-9a-f]+", "", repr(thing))]
+        return [lasting(repr(thing))]
     kind = type(thing)
     if dataclasses.is_dataclass(thing):
         # what is not shown is not given by the user but worked out
         given = [getattr(thing, f.name) for f in dataclasses.fields(thing) if f.repr]
     elif kind.__module__.split(".")[0] in OURS:
-        return [kind.__qualname__, re.sub(r" at 0x[0-9a-f]+", "", repr(thing))]
+        return [kind.__qualname__, lasting(repr(thing))]
     else:
         given = [x for name, value in vars(thing).items() for x in (name, value)]
     # a class of the user's own is also what its functions do
