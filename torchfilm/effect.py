@@ -18,10 +18,10 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 
 # The paper's stages, in its order; an effect says where it belongs.
-RULES, DIVISION, NUTRITION, GROWTH, MECHANICS, COVER, CIRCUIT, TRANSPORT, REMOVAL = 10, 20, 25, 30, 40, 45, 50, 60, 90
+RULES, DIVISION, BEFORE_CELLS, NUTRITION, GROWTH, MECHANICS, COVER, CIRCUIT, TRANSPORT, REMOVAL = 10, 20, 22, 25, 30, 40, 45, 50, 60, 90
 STAGES = {
-    RULES: "rules", DIVISION: "division", NUTRITION: "nutrition", GROWTH: "growth", MECHANICS: "mechanics", COVER: "cover", CIRCUIT: "circuit",
-    TRANSPORT: "transport", REMOVAL: "removal",
+    RULES: "rules", DIVISION: "division", BEFORE_CELLS: "transport", NUTRITION: "nutrition", GROWTH: "growth", MECHANICS: "mechanics", COVER: "cover",
+    CIRCUIT: "circuit", TRANSPORT: "transport", REMOVAL: "removal",
 }  # fmt: skip
 
 GEOMETRY = ("position", "axis", "length", "radius")

@@ -82,7 +82,7 @@ def replayed(scene: Scene) -> str:
     if why:
         return f"no, {why}"
     kept = {effect.title for effect in Course.scene_of(scene).effects}
-    follow = [effect.title for effect in scene.effects if effect.title not in kept and not isinstance(effect, Cover)]
+    follow = [effect.title for effect in sorted(scene.listed, key=lambda e: e.stage) if effect.title not in kept]
     return f"yes, {' and '.join(follow)} only follow{'s' if len(follow) == 1 else ''} (Course, Replay)"
 
 
@@ -167,7 +167,7 @@ def _(effect: Circuit, state: State, dt: float) -> list[str]:
     lines = [said.get(effect.method, f"{effect.method}, {effect.steps} equal step(s) of {dt / effect.steps:g} h; nothing watches its error")]
     exchanged = list(dict.fromkeys(name for names in effect.noted.given.values() for name in names))
     if exchanged:
-        lines.append(f"exchanges {', '.join(exchanged)} with each cell's own pool: amounts kept to rounding; in turn with transport, first order in dt")
+        lines.append(f"exchanges {', '.join(exchanged)} with each cell's own pool: amounts kept to rounding; first order in dt")
     return lines
 
 
@@ -177,9 +177,11 @@ def _(effect: Medium, state: State, dt: float) -> list[str]:
     shape, spacing = state.layout.grid.shape[0].tolist(), state.layout.grid.spacing
     lines = [f"grid: {' × '.join(map(str, shape))} voxels of {' × '.join(f'{h:g}' for h in spacing)} µm a colony"]
     finest = min((h for n, h in zip(shape, spacing, strict=True) if n > 1), default=spacing[0])
+    lines.append("half of transport before the cells, half after (Strang)" if effect.splitting == "strang" else "cells, then transport (Lie)")
+    part = dt / effect.steps / (2 if effect.splitting == "strang" else 1)
     for name, signal in effect.signals.items():
         method, why = transport(effect, name)
-        order = "exact over a step" if method == "exponential" else f"order {2 if method == 'crank_nicolson' else 1} in Δt = {dt / effect.steps:g} h"
+        order = "exact over a step" if method == "exponential" else f"order {2 if method == 'crank_nicolson' else 1} in steps of {part:g} h"
         lines.append(f"{name}: {method}, {order} ({why}); dt·K/h² = {_number(torch.as_tensor(signal.diffusion) * (dt / finest**2))}")
     return lines
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import difflib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -148,6 +150,20 @@ class Circuit(Effect):
         for name, value in given.items():
             object.__setattr__(self, name, value)
 
+    def solved_to(self, rtol: float) -> Circuit:
+        """The same circuit to another relative tolerance."""
+        return self._with("rtol", checks.number("Circuit.rtol", rtol, above=0.0, most=0.1))
+
+    def smooth(self) -> Circuit:
+        """The same circuit by the stiff solver: of reactions that run molecule by molecule, the mean that many molecules come to."""
+        return self._with("method", STIFF)
+
+    def _with(self, name: str, value: object) -> Circuit:
+        changed = copy.copy(self)
+        object.__setattr__(changed, name, value)
+        object.__setattr__(changed, "noted", Noted())
+        return changed
+
     @property
     def is_stochastic(self) -> bool:
         return self.method in (LEAP, DIRECT)
@@ -224,9 +240,9 @@ class Circuit(Effect):
             return state
         if not self.noted.given:  # a state that was seeded by another scene of the same fields
             self._note(state)
-        volume = state.volume
-        thinner = state.circuit_volume / volume
-        state = state.with_fields(circuit_volume=volume, **{n: state.fields[n] * thinner for n in self.species})
+        # dilution, rates in the cell as it is half way, dilution: of second order in dt, and keeps amounts
+        middle, end = _half_way(state), state.volume
+        state = state.with_fields(circuit_volume=end, **{n: state.fields[n] * (state.circuit_volume / middle.volume) for n in self.species})
         medium = _Medium(state) if state.layout is not None else None
         outside = {} if medium is None else medium.found
         settings = run.Settings(self.method, self.steps, self.rtol, self.atol, per_cell(self.copies, state))
@@ -237,7 +253,7 @@ class Circuit(Effect):
             rows = _cells_of(state, kind)
             if rows.numel() == 0:
                 continue
-            circuit = self._circuit(state, rows, kind, self.noted.given[kind], outside, medium)
+            circuit = self._circuit(middle, rows, kind, self.noted.given[kind], outside, medium)
             concentrations = self._concentrations(state, rows)
             draws = None if keys is None else lambda mine, event, what, count, rows=rows: keys(rows.index_select(0, mine), event, what, count)
             found = run.step(circuit, concentrations, dt, settings, draws)
@@ -248,7 +264,8 @@ class Circuit(Effect):
                 medium.note(rows, found)
         if medium is not None:
             state = medium.settle()
-        state = state.with_fields(**changed)
+        thinner = middle.volume / end
+        state = state.with_fields(**{n: value * thinner for n, value in changed.items()})
         return state.replace(reports={**state.reports, "circuit": report.report()})
 
     def _concentrations(self, state: State, rows: Tensor) -> Tensor:
@@ -267,6 +284,13 @@ class Circuit(Effect):
             given = part.signals
         p = {n: per_cell(v, state) for n, v in self.parameters.items()}
         return run.Circuit(part, self.species, given, rows, _cell_columns(state, self.species), p, outside, pool, beyond, label, seen or {})
+
+
+def _half_way(state: State) -> State:
+    """The cells as long as they were half way, in time, between the volume that their concentrations refer to and their own."""
+    volume = (state.circuit_volume * state.volume).sqrt()
+    longer = volume / (math.pi * state.radius * state.radius) - state.radius * (4.0 / 3.0)
+    return state.replace(length=torch.where(state.circuit_volume == state.volume, state.length, longer.clamp(min=0.0)))
 
 
 def _names(species: Sequence[str]) -> tuple[str, ...]:
