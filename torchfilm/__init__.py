@@ -1,6 +1,7 @@
 """torchfilm: synthetic microbial biofilms, many colonies at once, in PyTorch."""
 
 from torchfilm import effect, measure, pictures, scenes
+from torchfilm.accuracy import Settings, preset
 from torchfilm.cells import Cells
 from torchfilm.circuits import kinetics, parts
 from torchfilm.circuits.reactions import Reaction
@@ -28,11 +29,12 @@ from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.told import digest
+from torchfilm.tune import Tuned, tune
 from torchfilm.version import __version__
 
 __all__ = [
     "Box", "Cells", "Channel", "Circuit", "Course", "Division", "Effect", "Faces", "Field", "Fixed", "Growth", "InputError", "LogNormal", "Mechanics",
-    "Medium", "Monod", "NoFlux", "Normal", "Open", "Periodic", "Plane", "Reaction", "Recorder", "Removal", "Replay", "Results", "Rules", "Scene", "Signal",
-    "SimulationError", "Sphere", "State", "Timings", "Uniform", "__version__", "checks", "digest", "effect", "explain", "failures", "keep_memory",
-    "kinetics", "measure", "parts", "pictures", "rollout", "scenes", "show", "simulate",
+    "Medium", "Monod", "NoFlux", "Normal", "Open", "Periodic", "Plane", "Reaction", "Recorder", "Removal", "Replay", "Results", "Rules", "Scene",
+    "Settings", "Signal", "SimulationError", "Sphere", "State", "Timings", "Tuned", "Uniform", "__version__", "checks", "digest", "effect", "explain",
+    "failures", "keep_memory", "kinetics", "measure", "parts", "pictures", "preset", "rollout", "scenes", "show", "simulate", "tune",
 ]  # fmt: skip

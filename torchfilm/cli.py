@@ -1,4 +1,4 @@
-"""The command line: `torchfilm run SCENE`, `resume FILE`, `show FILE`, `info SCENE-or-FILE`, `explain SCENE`."""
+"""The command line: `torchfilm run SCENE`, `resume FILE`, `show FILE`, `info SCENE-or-FILE`, `explain SCENE`, `tune SCENE`."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 
 from torchfilm import measure, pictures, scenes
+from torchfilm.accuracy import Settings, preset
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.rules import Rules
-from torchfilm.explain import explain
 from torchfilm.pictures import words
 from torchfilm.recorder import Recorder
 from torchfilm.results import Results
@@ -32,6 +32,8 @@ from torchfilm.tools.timing import Timings
 try:
     import tyro
     from tqdm import tqdm
+
+    from torchfilm.cli_ask import Explain, Info, Tune
 except ImportError as missing:  # pragma: no cover - depends on what is installed
     raise SystemExit(f'The command line needs {missing.name}: pip install "torchfilm[app]".') from missing
 
@@ -52,6 +54,10 @@ class Run:
     """Stop at this time, h."""
     dt: float | None = None
     """Step, h; by default the scene's."""
+    preset: Literal["draft", "standard", "reference"] | None = None
+    """How accurately: draft to look at it, standard (the defaults), reference to measure others against."""
+    settings: Path | None = None
+    """How accurately: a file of settings, as `torchfilm tune SCENE --out` writes it."""
     seed: int | None = None
     """Seed of all random numbers (0, or the design's)."""
     start: Path | None = None
@@ -72,7 +78,7 @@ class Run:
     """Draw the last frame beside the results."""
 
     def __call__(self) -> None:
-        scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
+        scene = accurate(load_scene(self.scene, dict(map(parse_setting, self.set))), self.preset, self.settings)
         plan = design(self.scene)
         cells, until = self.cells, self.until
         if cells is None and until is None:
@@ -132,6 +138,7 @@ class Resume:
                 scene = scenes.build(*results.recipe)
             else:
                 raise InputError(f"{self.file} was made by a scene of your own: give its file, or the saved design, with --scene.")
+            scene = Settings.named(results.accuracy, str(self.file)).apply(scene)
             state = results.state(scene, device=self.device, changed=self.changed)
             dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
         if self.picture:
@@ -208,52 +215,13 @@ class Show:
         )  # fmt: skip
 
 
-@dataclass
-class Info:
-    """Say what a scene simulates, field by field, and who drives whom, or what a results file holds."""
-
-    what: Annotated[str, tyro.conf.Positional]
-    """Scene name, Python file, saved design, or results file."""
-    set: list[str] = field(default_factory=list)
-    """Parameters of the scene, as NAME=VALUE."""
-
-    def __call__(self) -> None:
-        if not self.what.endswith((".py", ".json")) and Path(self.what).is_file():
-            return self._of_results()
-        scene = load_scene(self.what, dict(map(parse_setting, self.set)))
-        scene.unchecked(1)  # rules are tried on a first state, so that what they read and write is known
-        print(scene.explain())
-
-    def _of_results(self) -> None:
-        with Results(self.what) as results:
-            a, counts = results.attributes, results.counts
-            print(f"{self.what}: {len(results)} frames, t = {results.times[0]:g} to {results.times[-1]:g} h, {counts.shape[1]} colonies")
-            print(f"cells in the last frame: {counts[-1].sum()} ({counts[-1].min()} to {counts[-1].max()} a colony)")
-            print(f"seed {a['seed']}, {a['dtype']}, dt {a['dt']:g} h, torchfilm {a['torchfilm']}, torch {a['torch']}, {a['device']}")
-            print("quantities per cell: " + ", ".join(results.file["cells"]))
-            print(a["scene"])
-
-
-@dataclass
-class Explain:
-    """Say how a scene will be simulated: methods and tolerances, who drives whom, what is left out, and an estimate of what it costs."""
-
-    scene: Annotated[str, tyro.conf.Positional]
-    """Scene name, Python file or saved design."""
-    set: list[str] = field(default_factory=list)
-    """Parameters of the scene, as NAME=VALUE."""
-    cells: int = 1000
-    """Cells in each colony, for which to estimate."""
-    colonies: int | None = None
-    """Colonies for which to estimate; by default as many as the scene's parameters are for, else 1."""
-    device: str = "cpu"
-    """cpu or cuda."""
-    seconds: float = 2.0
-    """About how long to measure, by running the scene's first steps; 0 leaves the estimate out."""
-
-    def __call__(self) -> None:
-        scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
-        print(explain(scene, cells=self.cells, colonies=self.colonies, device=self.device, seconds=self.seconds))
+def accurate(scene: Scene, named: str | None, file: Path | None) -> Scene:
+    """The scene as accurately as a preset or a file of settings says."""
+    if named is not None and file is not None:
+        raise InputError("--preset and --settings: give one of the two.")
+    if file is not None:
+        return Settings.load(file).apply(scene)
+    return scene if named is None else preset(named, scene).apply(scene)
 
 
 def check_new(name: str, path: Path, overwrite: bool, mend: str) -> None:
@@ -390,7 +358,7 @@ def main() -> None:
 
 def _command() -> None:
     command = tyro.extras.subcommand_cli_from_dict(
-        {"run": Run, "resume": Resume, "show": Show, "info": Info, "explain": Explain},
+        {"run": Run, "resume": Resume, "show": Show, "info": Info, "explain": Explain, "tune": Tune},
         prog="torchfilm",
         description="Synthetic microbial biofilms, many colonies at once.",
     )

@@ -29,7 +29,7 @@ from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
 from torchfilm.replay import Course
-from torchfilm.scene import Scene, parameters, summary
+from torchfilm.scene import Scene, summary
 from torchfilm.simulate import failures
 from torchfilm.state import CELL, GRID, PER_CELL, State
 from torchfilm.tools import checks
@@ -55,7 +55,7 @@ def explain(scene: Scene, *, cells: int = 1000, colonies: int | None = None, dev
         if given is not None and (isinstance(given, bool) or not isinstance(given, int) or given < 1):
             raise checks.refuse(name, given, "a whole number from 1")
     checks.number("seconds", seconds, least=0.0)
-    fixed = _fixed_colonies(scene)
+    fixed = scene.fixed_colonies
     if fixed > 1 and colonies not in (None, fixed):
         raise checks.refuse("colonies", colonies, f"{fixed}, as the scene's parameters or founders have", "Leave it out.")
     state = scene.seed(fixed if fixed > 1 else PROBE_COLONIES, device=device)
@@ -84,12 +84,6 @@ def replayed(scene: Scene) -> str:
     kept = {effect.title for effect in Course.scene_of(scene).effects}
     follow = [effect.title for effect in sorted(scene.listed, key=lambda e: e.stage) if effect.title not in kept]
     return f"yes, {' and '.join(follow)} only follow{'s' if len(follow) == 1 else ''} (Course, Replay)"
-
-
-def _fixed_colonies(scene: Scene) -> int:
-    """How many colonies the scene's parameters or founders are for; 1 where it may be any number."""
-    each = [tensor.numel() for effect in scene.effects for _, tensor in parameters(effect) if tensor.dim() == 1]
-    return max([scene.founders.colonies, *each])
 
 
 # --- how each effect acts -------------------------------------------------------------------------------------------------------

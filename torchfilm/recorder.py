@@ -126,6 +126,7 @@ class Recorder:
             "format": FORMAT, "version": VERSION, "seed": state.seed, "dim": state.dim, "dtype": str(state.dtype)[6:],
             "device": str(state.device), "dt": self.dt, "every": self.every,
             "scene": scene.explain(), "effects": json.dumps(scene.listing()), "recipe": json.dumps(scene.recipe), "settings": json.dumps(scene.settings),
+            "accuracy": json.dumps(scene.accuracy),
             "torchfilm": __version__, "torch": str(torch.__version__),
             "declared": json.dumps({f.name: [f.meaning, f.unit, f.scope, list(f.shape), f.at_division] for f in state.declared.values()}),
         }  # fmt: skip

@@ -142,6 +142,11 @@ class Results:
         """The parameters that a scene of the user's own was made with."""
         return json.loads(self.file.attrs["settings"])
 
+    @property
+    def accuracy(self) -> dict[str, float]:
+        """The knobs of accuracy that the scene was given beside its own (`torchfilm.Settings`)."""
+        return json.loads(self.file.attrs.get("accuracy", "{}"))
+
     def refresh(self) -> None:
         """See what a run has written since."""
         self.file["frames/step"].id.refresh()  # first: what it counts has been written before it

@@ -50,12 +50,19 @@ class Scene:
         self.places: tuple[int, ...] = tuple(k for _, k in parts)  # which of the listed effects each is a part of
         self.name, self.recipe = name, recipe
         self.settings: dict[str, Any] = {}  # what a user's own scene function was given
+        self.accuracy: dict[str, float] = {}  # knobs of accuracy that it was given since
         self.dt = checks.number("Scene.dt", dt, above=0.0)
         self.dim = next((e.dim for e in effects if hasattr(e, "dim")), founders.dim if founders is not None else 3)
         self.founders = founders if founders is not None else Cells.single(self.dim)
         if self.founders.dim != self.dim:
             raise checks.refuse("Scene.founders", f"{self.founders.dim}-D cells", f"{self.dim}-D, as the mechanics are")
         self._check_fields()
+
+    def retuned(self, effects: Sequence[Effect], dt: float, accuracy: dict[str, float]) -> Scene:
+        """The same scene with its effects, in the order in which they are listed, and its step simulated by other knobs (`torchfilm.accuracy`)."""
+        scene = Scene(*effects, name=self.name, dt=dt, founders=self.founders, recipe=self.recipe)
+        scene.settings, scene.accuracy = self.settings, accuracy
+        return scene
 
     def _check_fields(self) -> None:
         """Every field that is read or written exists, and is declared once or alike."""
@@ -127,6 +134,11 @@ class Scene:
         for effect in self.effects:
             state = effect.prepare(state)
         return state
+
+    @property
+    def fixed_colonies(self) -> int:
+        """How many colonies the parameters or founders are for; 1 where it may be any number."""
+        return max([self.founders.colonies, *(tensor.numel() for _, tensor in self._per_colony())])
 
     def _per_colony(self) -> list[tuple[str, Tensor]]:
         return [(path, tensor) for effect in self.effects for path, tensor in parameters(effect) if tensor.dim() == 1]

@@ -1,0 +1,110 @@
+"""Settings of accuracy: what they change in a scene and what not, as data in files and results, and as presets."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.accuracy import PRESETS
+from torchfilm.tools.checks import InputError
+
+
+def made(u, s, p, cell):
+    return {"m": 1.0 - u.m}
+
+
+def scene(**mechanics) -> tf.Scene:
+    return tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2, **mechanics), tf.Circuit(made, species=("m",)), name="mine", dt=0.02
+    )
+
+
+def of(made: tf.Scene, kind: type):
+    return next(e for e in made.listed if isinstance(e, kind))
+
+
+def test_knobs_reach_their_effects_and_nothing_else():
+    first = scene(length_drag=20.0, walls=[tf.Channel(8.0)])
+    second = tf.Settings(dt=0.01, penalty=0.2, passes=3, tolerance=0.01, rtol=1e-3).apply(first)
+    mechanics, circuit = of(second, tf.Mechanics), of(second, tf.Circuit)
+    assert (second.dt, mechanics.alpha, mechanics.passes, mechanics.tolerance, circuit.rtol) == (0.01, 0.01, 3, 0.01, 1e-3)
+    assert mechanics.walls == of(first, tf.Mechanics).walls and mechanics.length_drag == 20.0
+    assert circuit.rates == of(first, tf.Circuit).rates and circuit.noted is not of(first, tf.Circuit).noted
+    assert second.listed[:2] == first.listed[:2] and second.name == "mine" and second.founders is first.founders
+    assert first.dt == 0.02 and of(first, tf.Mechanics).passes is None  # the first is as it was
+
+
+def test_without_knobs_the_scene_stays_as_it_is():
+    first = scene()
+    assert tf.Settings().apply(first).listing() == first.listing() and tf.Settings().given == {}
+    assert tf.preset("standard", first).apply(first).listing() == first.listing()
+
+
+def test_physical_softness_and_molecules_are_no_knobs():
+    soft = tf.Settings(penalty=0.2, passes=2).apply(scene(stiffness=100.0))
+    assert of(soft, tf.Mechanics).stiffness == 100.0 and of(soft, tf.Mechanics).alpha is None and of(soft, tf.Mechanics).passes == 2
+    molecules = tf.Circuit([tf.parts.constitutive("m", 1.0)], species="m", method="tau_leap")
+    grown = tf.Settings(rtol=1e-2).apply(tf.Scene(tf.Growth(rate=1.0), molecules))
+    assert of(grown, tf.Circuit) is molecules
+    assert molecules.smooth().method == "rosenbrock" and molecules.method == "tau_leap"
+
+
+def test_one_penalty_for_drags_that_differ_between_colonies():
+    first = scene(length_drag=[10.0, 20.0])
+    alpha = of(tf.Settings(penalty=0.1).apply(first), tf.Mechanics).alpha
+    assert alpha.tolist() == pytest.approx([0.01, 0.005])
+
+
+@pytest.mark.parametrize("wrong", [{"dt": 0.0}, {"penalty": -1.0}, {"passes": 0}, {"passes": 1.5}, {"tolerance": 0.7}, {"rtol": 0.5}, {"rtol": "small"}])
+def test_knobs_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(InputError, match=f"Settings.{next(iter(wrong))}"):
+        tf.Settings(**wrong)
+
+
+def test_files_hold_what_was_saved_and_nothing_else_is_taken(tmp_path):
+    settings = tf.Settings(dt=0.01, passes=2)
+    path = settings.save(tmp_path / "a.json")
+    assert tf.Settings.load(path) == settings
+    with pytest.raises(InputError, match="no file yet"):
+        settings.save(path)
+    for text, words in (
+        ("{", "cannot be read"),
+        ('{"dt": 0.01}', "no settings of accuracy"),
+        ('{"format": "torchfilm settings", "pass": 2}', "one of dt, penalty"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=words):
+            tf.Settings.load(path)
+    path.write_text(json.dumps({"format": "torchfilm settings", "dt": -1.0}))
+    with pytest.raises(InputError, match=r"Settings\.dt"):
+        tf.Settings.load(path)
+
+
+def test_presets_are_ordered_by_what_they_cost_and_by_overlap():
+    """Draft to reference: smaller steps and, measured, less overlap. One colony of 40 cells each."""
+    first = tf.scenes.microcolony()
+    steps, overlaps = [], []
+    for name in PRESETS:
+        chosen = tf.preset(name, first).apply(first)
+        *_, last = tf.simulate(chosen, chosen.seed(3, seed=2), cells=40)
+        steps.append(last.step)
+        overlaps.append(float(tf.measure.overlaps(last).mean.mean()))
+    assert steps == sorted(steps) and steps[0] < steps[-1] / 10
+    assert overlaps == sorted(overlaps, reverse=True), overlaps
+    with pytest.raises(InputError, match="draft"):
+        tf.preset("rough", first)
+
+
+def test_results_say_how_accurately_and_go_on_so(tmp_path):
+    first = tf.scenes.microcolony()
+    drafted = tf.preset("draft", first).apply(first)
+    *_, last = tf.simulate(drafted, drafted.seed(2, seed=1), until=1.0, record=tmp_path / "a.h5")
+    with tf.Results(tmp_path / "a.h5") as results:
+        assert results.accuracy == {"dt": 0.05, "penalty": 0.1, "passes": 1, "tolerance": 0.2, "rtol": 0.01}
+        built = tf.Settings.named(results.accuracy, "a.h5").apply(tf.scenes.build(*results.recipe))
+        assert torch.equal(results.state(built).position, last.position)
+        with pytest.raises(InputError, match="another scene"):
+            results.state(first)

@@ -1,0 +1,69 @@
+"""`torchfilm tune`, `run --settings` and `run --preset`: what is printed, written, recorded and gone on with."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from commands import shell
+
+import torchfilm as tf
+
+SCENE = """
+import torchfilm as tf
+
+def made(u, s, p, cell):
+    return {"m": 1.0 - u.m}
+
+scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Circuit(made, species=("m",)), dt=0.05)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "mine.py").write_text(SCENE)
+    return tmp_path
+
+
+def done(folder, *arguments) -> str:
+    """What a command that must work prints."""
+    ran = shell(*arguments, folder=folder)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def test_tune_prints_what_it_chose_and_writes_it_for_a_run(folder):
+    out = done(folder, "tune", "mine.py", "--error", "5%", "--cells", "4", "--colonies", "2", "--out", "s.json")
+    assert "mine: 5 % in cells, volume" in out and "settings  s.json" in out
+    saved = tf.Settings.load(folder / "s.json")
+    assert f"dt {saved.dt:g} h" in out and f"rtol {saved.rtol:g}" in out
+    done(folder, "run", "mine.py", "--settings", "s.json", "--cells", "4", "--out", "a.h5", "--no-picture")
+    with tf.Results(folder / "a.h5") as results:
+        assert results.accuracy == saved.given and results.attributes["dt"] == saved.dt
+    done(folder, "resume", "a.h5", "--scene", "mine.py", "--cells", "8", "--no-picture")
+    with tf.Results(folder / "a.h5") as results:
+        assert results.counts[-1].min() >= 8
+
+
+def test_a_run_by_a_preset_says_so_in_its_results(folder):
+    done(folder, "run", "mine.py", "--preset", "draft", "--cells", "2", "--out", "a.h5", "--no-picture")
+    with tf.Results(folder / "a.h5") as results:
+        assert results.attributes["dt"] == 0.1 and results.accuracy["rtol"] == 0.01
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (("tune", "mine.py", "--error", "much"), "--error = 'much'"),
+        (("tune", "mine.py", "--error", "60%"), "error = 0.6"),
+        (("tune", "mine.py", "--out", "mine.py"), "no file yet"),
+        (("run", "mine.py", "--preset", "draft", "--settings", "s.json", "--cells", "2"), "give one of the two"),
+        (("run", "mine.py", "--settings", "none.json", "--cells", "2"), "cannot be read"),
+        (("run", "mine.py", "--settings", "empty.json", "--cells", "2"), "no settings of accuracy"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_anything_runs(folder, arguments, words):
+    (folder / "empty.json").write_text(json.dumps({}))
+    ran = shell(*arguments, folder=folder)
+    assert ran.returncode == 1 and words in ran.stderr and "Traceback" not in ran.stderr
+    assert not list(folder.glob("*.h5"))

@@ -1,0 +1,111 @@
+"""tune: settings that hold an error, shown by a run of their own; what cannot be held or told is said."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.tools.checks import InputError
+from torchfilm.tune import observables
+
+F64 = torch.float64
+
+
+def made(u, s, p, cell):
+    return {"m": p.k - 2.0 * u.m}
+
+
+def dividing(**circuit) -> tf.Scene:
+    """Cells that do not touch anything: growth, division and a circuit are all there is."""
+    return tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Circuit(made, species=("m",), k=10.0, **circuit), dt=0.05)
+
+
+@pytest.fixture(scope="module")
+def colony() -> tf.Tuned:
+    return tf.tune(tf.scenes.microcolony(), 0.02, cells=25, colonies=4)
+
+
+@pytest.mark.slow
+def test_what_was_chosen_holds_the_error_in_a_run_of_its_own(colony):
+    """Other seeds, another size, and a reference of another kind: contacts that only push, an eighth of the step, float64."""
+    base = tf.scenes.microcolony()
+    *_, start = tf.simulate(base, base.seed(4, seed=9, dtype=F64), cells=40)
+    tight = tf.Scene(*base.listed[:2], tf.Mechanics(dim=2, unilateral=True, alpha=0.003, passes=4, tolerance=0.005), dt=base.dt / 8)
+    ends = []
+    for scene in (colony.scene, tight):
+        state, steps = start, round(0.4 / scene.dt)
+        assert steps * scene.dt == pytest.approx(0.4)
+        for _ in range(steps):
+            state = scene.step(state, scene.dt)
+        ends.append({n: float(v[0]) for n, v in observables(state).items()})
+    first = {n: float(v[0]) for n, v in observables(start).items()}
+    mine, right = ends
+    assert mine["overlap"] < 0.02
+    assert abs(mine["volume"] - right["volume"]) < 0.02 * (right["volume"] - first["volume"])
+    assert abs(mine["radius"] - right["radius"]) < 0.02 * right["radius"]
+
+
+@pytest.mark.slow
+def test_it_says_what_it_chose_and_why(colony):
+    assert colony.chosen.worst <= 0.02 and set(colony.chosen.errors) <= {"cells", "volume", "radius", "overlap"}
+    assert set(colony.parts) == {"step", "contacts"} and colony.settings.rtol is None
+    assert all(t.seconds >= colony.chosen.seconds for t in colony.tries if t.worst <= 0.02 and t is not colony.own)
+    told = str(colony)
+    for words in (f"dt {colony.settings.dt:g} h", f"passes {colony.settings.passes}", "2 % in", "the reference's own", "settings were run"):
+        assert words in told
+    assert colony.scene.accuracy == colony.settings.given and colony.scene.dt == colony.settings.dt
+
+
+def test_a_coarser_step_where_the_scene_is_finer_than_it_need_be():
+    """m' = k − 2 m, thinned at 1/h: k/3 in the end. Thinning and making take turns at second order and all else is exact, so that 5 % allows a coarse step."""
+    tuned = tf.tune(dividing(), 0.05, cells=8, colonies=4)
+    assert tuned.settings.dt >= 0.1 and tuned.settings.rtol >= 1e-2
+    assert tuned.chosen.errors["m"] < 0.05
+
+
+def test_a_smaller_error_asks_for_smaller_steps():
+    steps = [tf.tune(dividing(), error, cells=8, colonies=4, of=["m"]).settings.dt for error in (0.05, 2e-4)]
+    assert steps[1] < steps[0]
+
+
+def test_only_what_is_named_counts():
+    tuned = tf.tune(dividing(), 0.05, cells=8, colonies=4, of=["volume"])
+    assert set(tuned.chosen.errors) == {"volume"} == set(tuned.own.errors)
+
+
+def test_molecules_are_probed_by_their_mean():
+    reactions = [tf.parts.constitutive("m", 5.0), tf.parts.degradation("m", 2.0)]
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Circuit(reactions, species="m", method="tau_leap"), dt=0.05)
+    tuned = tf.tune(scene, 0.05, cells=8, colonies=2)
+    assert tuned.chosen.errors["m"] < 0.05
+
+
+def test_what_cannot_be_held_or_told_is_said():
+    with pytest.raises(InputError, match=r"the probe can tell\. Here m two references differ by"):
+        tf.tune(dividing(), 1e-9, cells=8, colonies=2, of=["m"])
+
+
+@pytest.mark.parametrize(
+    "wrong, words",
+    [({"error": 0.0}, "error"), ({"error": 1.0}, "error"), ({"error": 0.1, "cells": 0}, "cells"), ({"error": 0.1, "colonies": True}, "colonies"),
+     ({"error": 0.1, "of": ["luxi"], "cells": 2}, "among cells, volume")],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused(wrong, words):
+    with pytest.raises(InputError, match=words):
+        tf.tune(dividing(), **wrong)
+
+
+def test_observables_of_a_known_state():
+    cells = tf.Cells([[0.0, 0.0], [0.0, 0.9]], [[1.0, 0.0], [1.0, 0.0]], [2.0, 2.0], [0.5, 0.5])
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Circuit(made, species=("m",), k=1.0, initial={"m": 3.0}),
+        tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=2.0), box=((-8.0, -8.0), (8.0, 8.0)), spacing=4.0), founders=cells,
+    )  # fmt: skip
+    found = observables(scene.seed(2, dtype=F64))
+    assert float(found["cells"]) == 4 and float(found["overlap"]) == pytest.approx(0.1)
+    assert float(found["volume"]) == pytest.approx(4 * math.pi * 0.25 * (2 + 2 / 3))
+    assert float(found["radius"]) == pytest.approx(math.sqrt(2) * 0.45)
+    assert found["m"].tolist() == [3.0, 0.0] and found["signal ahl"].tolist() == [2.0 * 16 * 2, 2.0]

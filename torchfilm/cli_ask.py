@@ -1,0 +1,105 @@
+"""The commands that only look: `torchfilm info SCENE-or-FILE`, `explain SCENE`, `tune SCENE`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from torchfilm.accuracy import Settings
+from torchfilm.explain import explain
+from torchfilm.results import Results
+from torchfilm.scene_files import load_scene, parse_setting
+from torchfilm.tools import checks
+from torchfilm.tune import tune
+
+
+@dataclass
+class Info:
+    """Say what a scene simulates, field by field, and who drives whom, or what a results file holds."""
+
+    what: Annotated[str, tyro.conf.Positional]
+    """Scene name, Python file, saved design, or results file."""
+    set: list[str] = field(default_factory=list)
+    """Parameters of the scene, as NAME=VALUE."""
+
+    def __call__(self) -> None:
+        if not self.what.endswith((".py", ".json")) and Path(self.what).is_file():
+            return self._of_results()
+        scene = load_scene(self.what, dict(map(parse_setting, self.set)))
+        scene.unchecked(1)  # rules are tried on a first state, so that what they read and write is known
+        print(scene.explain())
+
+    def _of_results(self) -> None:
+        with Results(self.what) as results:
+            a, counts = results.attributes, results.counts
+            print(f"{self.what}: {len(results)} frames, t = {results.times[0]:g} to {results.times[-1]:g} h, {counts.shape[1]} colonies")
+            print(f"cells in the last frame: {counts[-1].sum()} ({counts[-1].min()} to {counts[-1].max()} a colony)")
+            print(f"seed {a['seed']}, {a['dtype']}, dt {a['dt']:g} h, torchfilm {a['torchfilm']}, torch {a['torch']}, {a['device']}")
+            print("quantities per cell: " + ", ".join(results.file["cells"]))
+            print(a["scene"])
+
+
+@dataclass
+class Explain:
+    """Say how a scene will be simulated: methods and tolerances, who drives whom, what is left out, and an estimate of what it costs."""
+
+    scene: Annotated[str, tyro.conf.Positional]
+    """Scene name, Python file or saved design."""
+    set: list[str] = field(default_factory=list)
+    """Parameters of the scene, as NAME=VALUE."""
+    cells: int = 1000
+    """Cells in each colony, for which to estimate."""
+    colonies: int | None = None
+    """Colonies for which to estimate; by default as many as the scene's parameters are for, else 1."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    seconds: float = 2.0
+    """About how long to measure, by running the scene's first steps; 0 leaves the estimate out."""
+
+    def __call__(self) -> None:
+        scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
+        print(explain(scene, cells=self.cells, colonies=self.colonies, device=self.device, seconds=self.seconds))
+
+
+@dataclass
+class Tune:
+    """Find the cheapest settings that hold an error: the scene is run for a moment, by many settings, and compared with a far tighter run."""
+
+    scene: Annotated[str, tyro.conf.Positional]
+    """Scene name, Python file or saved design."""
+    error: str = "1%"
+    """Greatest relative error of what is read off, such as 1% or 0.01."""
+    set: list[str] = field(default_factory=list)
+    """Parameters of the scene, as NAME=VALUE."""
+    of: list[str] = field(default_factory=list)
+    """What must be right: cells, volume, radius, overlap, species by name, "signal NAME"; by default all of them."""
+    cells: int = 60
+    """Cells in each colony where the probe begins."""
+    colonies: int = 8
+    """Colonies of the probe, if the scene's parameters leave it open."""
+    seed: int = 0
+    """Seed of the probe."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    out: Path | None = None
+    """Write the settings to this new file, for `torchfilm run SCENE --settings FILE`."""
+
+    def __call__(self) -> None:
+        if self.out is not None:
+            Settings.check_new(self.out)
+        scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
+        tuned = tune(scene, parse_error(self.error), cells=self.cells, colonies=self.colonies, of=self.of or None, seed=self.seed, device=self.device)
+        print(tuned)
+        if self.out is not None:
+            print(f"settings  {tuned.settings.save(self.out)}")
+
+
+def parse_error(text: str) -> float:
+    """A share: 1% or 0.01."""
+    try:
+        return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+    except ValueError as error:
+        raise checks.refuse("--error", text, "a share, such as 1% or 0.01") from error

@@ -1,0 +1,356 @@
+"""The cheapest settings that hold an error: `tune(scene, error=0.01)`.
+
+A few colonies of the scene are grown by its own settings; from that same state a window of some steps is run again and again: once by far tighter settings,
+the reference, and then by settings that are tried from coarse to fine. What a user would read off at the end is compared. Each observable's error must be
+within what was asked; of the settings that are, the one that took the least time is chosen, and measured once more with each of its knobs tightened, which
+tells the knobs' parts in the error.
+
+| observable | error                                                                                                                   |
+|------------|-------------------------------------------------------------------------------------------------------------------------|
+| cells      | difference of their number, relative; those that are due to divide at the next step count as two                          |
+| volume     | difference, relative to what the window added (or to a tenth of the whole, if that is more): what a longer run comes to   |
+| radius     | difference, relative                                                                                                    |
+| overlap    | mean overlap of touching cells over their diameter, 0 being right; of soft cells its difference                         |
+| a species  | difference of its mean and standard deviation over cells, relative                                                      |
+| signal …   | difference of its amount, and of its mean seen by its own molecules, relative; the greater                              |
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from torchfilm import measure
+from torchfilm.accuracy import Settings
+from torchfilm.effect import DIVISION
+from torchfilm.effects.circuit import STIFF, Circuit
+from torchfilm.effects.mechanics import Mechanics
+from torchfilm.scene import Scene
+from torchfilm.simulate import simulate
+from torchfilm.state import State
+from torchfilm.tools import checks
+from torchfilm.tools.timing import Timings
+
+# The window, in steps of the scene, and into how many steps it is divided instead: all even, so that its middle is a step too.
+WINDOW = 16
+STEPS = (4, 8, 10, 16, 20, 32, 40, 50, 64, 80, 100)
+FINEST = 160  # the reference
+# Knobs from loose to tight: (penalty, passes beyond the least, tolerance) of contacts, and rtol of circuits.
+# A larger penalty saves no time, and its overlap grows with the colony beyond what a probe of a small one shows.
+CONTACTS = ((0.1, 0, 0.2), (0.1, 0, 0.05), (0.1, 0, 0.02), (0.1, 1, 0.05), (0.1, 1, 0.02), (0.03, 1, 0.02), (0.03, 3, 0.01))
+CIRCUITS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
+TIGHT_CONTACTS, TIGHT_CIRCUITS = (0.03, 3, 1e-3), 1e-8
+# A scene that never has as many cells as asked for is taken as it is after this many steps.
+MOST_STEPS = 2000
+SIGNAL = "signal "
+
+
+@dataclass(frozen=True)
+class Try:
+    """One setting that was run: its errors by observable, and what its window took, s, in all and by effect."""
+
+    settings: Settings
+    errors: dict[str, float]
+    seconds: float
+    spent: dict[str, float]
+
+    @property
+    def worst(self) -> float:
+        """The greatest error."""
+        return max(self.errors.values())
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Settings that hold an error, and how that is known.
+
+    scene: with the settings. error: what was asked. chosen: the try that was taken; own: the scene's own settings, for comparison. parts: by knob, how much of
+    each observable's error comes from it. unsure: by observable, how far two references differ; left_out: observables that cannot be told so finely, with
+    why. tries: all that were run, in order. window: hours, cells: at its start.
+    """
+
+    scene: Scene
+    settings: Settings
+    error: float
+    chosen: Try
+    own: Try
+    parts: dict[str, dict[str, float]]
+    unsure: dict[str, float]
+    left_out: dict[str, str]
+    tries: list[Try]
+    window: float
+    cells: int
+
+    def __str__(self) -> str:
+        return "\n".join(_told(self))
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """Where all windows begin, and what they are compared with."""
+
+    scene: Scene
+    start: State
+    dt: float
+    of: tuple[str, ...] | None
+    reference: dict[str, list[Tensor]] = field(default_factory=dict)
+
+    def window(self, settings: Settings, steps: int) -> tuple[list[State], float, dict[str, float]]:
+        """The states in the middle and at the end of the window in so many steps, the seconds it took, and those of each effect."""
+        made = settings.apply(self.scene)
+        dt, state, seen, timings = self.dt * WINDOW / steps, self.start, [], Timings()
+        begun = time.perf_counter()
+        for k in range(steps):
+            state = made.step(state, dt, timings)
+            if 2 * (k + 1) % steps == 0:
+                seen.append(state)
+        return seen, time.perf_counter() - begun, timings.seconds
+
+    def observed(self, settings: Settings, steps: int) -> tuple[dict[str, list[Tensor]], float, dict[str, float]]:
+        """What is read off in the middle and at the end, by observable; a colony that failed makes them NaN."""
+        states, seconds, spent = self.window(settings, steps)
+        found: dict[str, list[Tensor]] = {}
+        for state in states:
+            broken = any(bool((r.status != 0).any()) for r in state.reports.values())
+            for name, value in (observables(state) | self._due(state)).items():
+                if self.of is None or name in self.of:
+                    found.setdefault(name, []).append(value * math.nan if broken else value)
+        return found, seconds, spent
+
+    def _due(self, state: State) -> dict[str, Tensor]:
+        """The number of cells after the divisions with which the next step would begin: until then a count is late, by a step that is known."""
+        for effect in self.scene.effects:
+            if effect.stage <= DIVISION:
+                state = effect.step(state, self.dt)
+        return {"cells": torch.tensor([float(max(1, state.cells))], dtype=torch.float64)}
+
+    def errors(self, found: dict[str, list[Tensor]], against: dict[str, list[Tensor]]) -> dict[str, float]:
+        """By observable, the greater of the errors in the middle and at the end."""
+        soft = any(isinstance(e, Mechanics) and e.stiffness is not None for e in self.scene.listed)
+        first = observables(self.start)
+        out = {}
+        for name, values in found.items():
+            worst = 0.0
+            for value, right in zip(values, against[name], strict=True):
+                if name == "overlap" and not soft:
+                    error = float(value.max())
+                elif name.startswith(SIGNAL):
+                    error = float(((value - right) / right).abs().max())
+                elif name == "volume":
+                    error = float(((value - right).abs() / torch.maximum((right - first[name]).abs(), 0.1 * right)).max())
+                else:
+                    error = float((value - right).norm() / right.norm().clamp(min=1e-30))
+                worst = max(worst, math.inf if math.isnan(error) else error)
+            out[name] = worst
+        return out
+
+
+def observables(state: State) -> dict[str, Tensor]:
+    """What is read off a state of a batch: numbers by name, (k,) float64 each. Species and signals that are 0 everywhere are left out."""
+    cells = max(1, state.cells)
+    diameter = 2 * float(state.radius.double().mean())
+    found = measure.overlaps(state)
+    overlap = (found.mean.double() * found.count).sum() / found.count.sum().clamp(min=1) / diameter
+    one = lambda *x: torch.stack([torch.as_tensor(v, dtype=torch.float64).cpu() for v in x])  # noqa: E731
+    out = {"cells": one(cells), "volume": one(state.volume.double().sum()), "overlap": one(overlap)}
+    if int(state.counts.min()) >= 2:
+        out["radius"] = one(measure.colony_radius(state).double().mean())
+    for name in _species(state):
+        value = state.fields[name].double()
+        if bool((value != 0).any()):
+            out[name] = one(value.mean(), value.std(correction=0))
+    for name, grid in state.signals.items():
+        value = grid.double()
+        if bool((value != 0).any()):
+            # the amount, and the mean concentration that a molecule of it finds itself in
+            out[SIGNAL + name] = one(value.sum(), value.sum() * (value * value).sum() / value.sum() ** 2)
+    return out
+
+
+def _species(state: State) -> list[str]:
+    """Names of fields that are concentrations in cells."""
+    return [name for name, f in state.declared.items() if f.scope == "cell" and f.unit == "conc"]
+
+
+def tune(
+    scene: Scene, error: float = 0.01, *, cells: int = 60, colonies: int = 8, of: Sequence[str] | None = None, seed: int = 0,
+    device: str | torch.device = "cpu",
+) -> Tuned:  # fmt: skip
+    """The cheapest settings with which a scene's observables are within `error` (relative, 0.01 for 1 %) of what far tighter settings give; about a minute.
+
+    cells: in each of `colonies` colonies (or as many as the scene's parameters are for) where the probe begins; a scene that stays smaller is taken as it
+    is after 2,000 steps. of: names of the observables that matter, by default all: "cells", "volume", "radius", "overlap", species, "signal NAME". Circuits
+    that run molecule by molecule are probed by their smooth mean, since noise is no error. Raises InputError where nothing holds the error, or
+    where the probe cannot tell it.
+    """
+    checks.number("error", error, above=0.0, most=0.5)
+    for name, given in (("cells", cells), ("colonies", colonies)):
+        if isinstance(given, bool) or not isinstance(given, int) or given < 1:
+            raise checks.refuse(name, given, "a whole number from 1")
+    probe = _begin(scene, cells, colonies, of, seed, device)
+    if of is not None:
+        for name in of:
+            if name not in observables(probe.start):
+                raise checks.refuse("of", name, "among " + ", ".join(observables(probe.start)))
+    return _Search(probe, error).run()
+
+
+@torch.no_grad()
+def _begin(scene: Scene, cells: int, colonies: int, of: Sequence[str] | None, seed: int, device: str | torch.device) -> _Probe:
+    """The scene as it is probed, grown to where the windows begin."""
+    smooth = [e.smooth() if isinstance(e, Circuit) and e.is_stochastic else e for e in scene.listed]
+    made = scene.retuned(smooth, scene.dt, scene.accuracy)
+    fixed = scene.fixed_colonies
+    state = made.seed(fixed if fixed > 1 else colonies, seed=seed, device=device)
+    run = simulate(made, state, cells=cells, until=MOST_STEPS * scene.dt) if cells > 1 else iter(())
+    return _Probe(made, deque(run, maxlen=1).pop() if cells > 1 else state, scene.dt, None if of is None else tuple(of))
+
+
+class _Search:
+    """Settings tried from coarse to fine."""
+
+    def __init__(self, probe: _Probe, error: float):
+        self.probe, self.error = probe, error
+        self.mechanics = next((e for e in probe.scene.listed if isinstance(e, Mechanics)), None)
+        self.circuit = next((e for e in probe.scene.listed if isinstance(e, Circuit) and e.method == STIFF), None)
+        self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
+        self.rtols = CIRCUITS if self.circuit is not None else (TIGHT_CIRCUITS,)
+        self.tries: dict[Settings, Try] = {}
+        self.seen: dict[Settings, dict[str, list[Tensor]]] = {}
+
+    def settings(self, steps: int, contacts: tuple[float, int, float], rtol: float) -> Settings:
+        """As knobs of the scene; those of effects that it does not list stay unset."""
+        penalty, more, tolerance = contacts
+        mechanics = self.mechanics
+        least = 0 if mechanics is None else (mechanics.dim - 1) * (2 if mechanics.unilateral else 1)
+        return Settings(
+            dt=self.probe.dt * WINDOW / steps, rtol=None if self.circuit is None else rtol, tolerance=None if mechanics is None else tolerance,
+            passes=None if mechanics is None else least + more, penalty=None if mechanics is None or mechanics.stiffness is not None else penalty,
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def run(self) -> Tuned:
+        probe = self.probe
+        tight = [probe.observed(self.settings(n, TIGHT_CONTACTS, TIGHT_CIRCUITS), n)[0] for n in (FINEST, FINEST // 2)]
+        self.unsure = probe.errors(tight[1], tight[0])
+        # the coarser reference is off by twice as much as the finer is: their difference is the finer's own error
+        left_out = {n: f"two references differ by {_percent(e)}" for n, e in self.unsure.items() if e > self.error / 2}
+        self.reference = {n: v for n, v in tight[0].items() if n not in left_out}
+        if not self.reference:
+            worst = ", ".join(f"{n} {why}" for n, why in left_out.items())
+            raise checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}: ask for more, or probe more colonies or cells.")
+        best = self._cheapest()
+        own = self._try(Settings(), WINDOW)
+        return Tuned(
+            best.settings.apply(self.probe.scene), best.settings, self.error, best, own, self._parts(best), self.unsure, left_out,
+            list(self.tries.values()), probe.dt * WINDOW, probe.start.cells,
+        )  # fmt: skip
+
+    def _try(self, settings: Settings, steps: int) -> Try:
+        if settings not in self.tries:
+            found, seconds, spent = self.probe.observed(settings, steps)
+            self.seen[settings] = found = {n: v for n, v in found.items() if n in self.reference}
+            self.tries[settings] = Try(settings, self.probe.errors(found, self.reference), seconds, spent)
+        return self.tries[settings]
+
+    def _cheapest(self) -> Try:
+        """Of every step that is fine enough, the loosest knobs that hold the error; of these, the one that took the least time."""
+        best: Try | None = None
+        closest: Try | None = None
+        for steps in STEPS:
+            fastest = min((t.seconds * t.settings.dt for t in self.tries.values() if t.settings.dt), default=0.0) / (self.probe.dt * WINDOW)
+            if best is not None and steps * fastest > best.seconds:
+                break
+            found = self._at(steps)
+            if found is None:
+                continue
+            closest = found if closest is None or found.worst < closest.worst else closest
+            if found.worst <= self.error and (best is None or found.seconds < best.seconds):
+                best = found
+        if best is None:
+            closest = min(self.tries.values(), key=lambda t: t.worst)
+            name = max(closest.errors, key=lambda n: closest.errors[n])
+            raise checks.refuse(
+                "error", self.error, f"reached by some settings: the closest came to {_percent(closest.worst)}, in {name!r}, with {_words(closest.settings)}",
+                "Ask for more, or name what matters (of=…).",
+            )  # fmt: skip
+        return best
+
+    def _at(self, steps: int) -> Try | None:
+        """The loosest knobs in a window of so many steps that hold the error; None where the tightest do not."""
+        if self._try(self.settings(steps, TIGHT_CONTACTS, TIGHT_CIRCUITS), steps).worst > self.error:
+            return None
+        contacts, rtols = [*self.contacts, TIGHT_CONTACTS], [*self.rtols, TIGHT_CIRCUITS]
+        holds = lambda c, r: self._try(self.settings(steps, c, r), steps).worst <= self.error  # noqa: E731
+        m = next(k for k, c in enumerate(contacts) if holds(c, TIGHT_CIRCUITS))
+        r = next(k for k, rtol in enumerate(rtols) if holds(TIGHT_CONTACTS, rtol))
+        while not holds(contacts[m], rtols[r]):  # each is within the error alone; together they may not be
+            m, r = (min(m + 1, len(contacts) - 1), r) if m < len(contacts) - 1 else (m, r + 1)
+        return self._try(self.settings(steps, contacts[m], rtols[r]), steps)
+
+    def _parts(self, best: Try) -> dict[str, dict[str, float]]:
+        """By knob, what of each observable's error is gone when it alone is tight; for the step, what is left when all others are."""
+        steps = round(self.probe.dt * WINDOW / (best.settings.dt or self.probe.dt))
+        s = best.settings
+        tight = self.settings(steps, TIGHT_CONTACTS, TIGHT_CIRCUITS)
+        parts = {"step": self._try(tight, steps).errors}
+        if self.mechanics is not None:
+            parts["contacts"] = self._difference(best, dataclasses.replace(tight, rtol=s.rtol), steps)
+        if self.circuit is not None:
+            parts["circuits"] = self._difference(best, dataclasses.replace(s, rtol=tight.rtol), steps)
+        return parts
+
+    def _difference(self, best: Try, other: Settings, steps: int) -> dict[str, float]:
+        self._try(other, steps)
+        found = self.probe.errors(self.seen[best.settings], self.seen[other])
+        if "overlap" in found:
+            found["overlap"] = max(0.0, best.errors["overlap"] - self.tries[other].errors["overlap"])
+        return found
+
+
+def _told(tuned: Tuned) -> list[str]:
+    """The tables."""
+    best, own = tuned.chosen, tuned.own
+    head = f"{tuned.scene.name}: {_percent(tuned.error)} in {', '.join(best.errors)}, over {tuned.window:g} h from {tuned.cells} cells on"
+    rows = [("", "chosen", "part of the error", "of the time")]
+    total = sum(best.spent.values()) or 1.0
+    for knob, errors in tuned.parts.items():
+        name = max(errors, key=lambda n: errors[n])
+        share = {"contacts": best.spent.get("mechanics"), "circuits": best.spent.get("circuit")}.get(knob)
+        rows.append((knob, _knob(knob, tuned.settings), f"{_percent(errors[name])} ({name})", "" if share is None else f"{100 * share / total:.0f} %"))
+    lines = [head, "", *_aligned(rows), ""]
+    rows = [("", "error", "with the scene's own settings", "the reference's own")]
+    rows += [(n, _percent(e), _percent(own.errors[n]), _percent(tuned.unsure[n])) for n, e in best.errors.items()]
+    lines += _aligned(rows)
+    lines += [f"{name}: not told so finely, since {why}" for name, why in tuned.left_out.items()]
+    ratio = best.seconds / own.seconds
+    return [*lines, "", f"{best.seconds:.2g} s for the window, {ratio:.2g} times what the scene's own settings take; {len(tuned.tries)} settings were run"]
+
+
+def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    wide = [max(len(r[k]) for r in rows) for k in range(len(rows[0]))]
+    return ["  " + "  ".join(x.ljust(w) for x, w in zip(r, wide, strict=True)).rstrip() for r in rows]
+
+
+def _knob(knob: str, s: Settings) -> str:
+    if knob == "step":
+        return f"dt {s.dt:g} h"
+    if knob == "circuits":
+        return f"rtol {s.rtol:g}"
+    penalty = "" if s.penalty is None else f"penalty α·γ {s.penalty:g}, "
+    return f"{penalty}passes {s.passes}, tolerance {s.tolerance:g}"
+
+
+def _words(settings: Settings) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in settings.given.items())
+
+
+def _percent(error: float) -> str:
+    return "failed" if math.isinf(error) else f"{100 * error:.2g} %"
