@@ -132,9 +132,7 @@ def _(effect: Mechanics, state: State, dt: float) -> list[str]:
         + f"; a colony with a cell that grows more than {effect.max_elongation:g} µm takes sub-steps"
         + (f" of up to {COARSE_PASSES} passes" if effect.passes is None else "")
         + (", one whose moves are cut short up to twice as many" if effect.passes is None and effect.dim == 3 else ""),
-        f"solver: conjugate gradients, each colony to a worst residual of {effect.least_accuracy:g}{'' if effect.tolerance is not None else ' (default)'}"
-        + (", finer in the last pass" if effect.tolerance is None and effect.dim == 3 else "")
-        + f", at most {effect.max_iterations} iterations",
+        f"solver: conjugate gradients, each colony to a worst residual of {effect.tolerance:g}, at most {effect.max_iterations} iterations",
     ]
     soft = [wall for wall in effect.walls if wall.stiffness is not None or wall.weight is not None]
     if effect.walls:

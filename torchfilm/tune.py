@@ -22,7 +22,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -40,7 +40,7 @@ from torchfilm.tools.timing import Timings
 
 # The window, in steps of the scene, and into how many steps it is divided instead: all even, so that its middle is a step too.
 WINDOW = 16
-STEPS = (4, 8, 10, 16, 20, 32, 40, 50, 64, 80, 100)
+STEPS = (4, 6, 8, 10, 12, 16, 20, 26, 32, 40, 50, 64, 80, 100)
 FINEST = 160  # the reference
 # Knobs from loose to tight: (penalty, passes beyond the least, tolerance) of contacts, and rtol of circuits.
 # A larger penalty saves no time, and its overlap grows with the colony beyond what a probe of a small one shows.
@@ -93,14 +93,13 @@ class Tuned:
 
 
 @dataclass(frozen=True)
-class _Probe:
+class Probe:
     """Where all windows begin, and what they are compared with."""
 
     scene: Scene
     start: State
     dt: float
     of: tuple[str, ...] | None
-    reference: dict[str, list[Tensor]] = field(default_factory=dict)
 
     def window(self, settings: Settings, steps: int) -> tuple[list[State], float, dict[str, float]]:
         """The states in the middle and at the end of the window in so many steps, the seconds it took, and those of each effect."""
@@ -119,12 +118,12 @@ class _Probe:
         found: dict[str, list[Tensor]] = {}
         for state in states:
             broken = any(bool((r.status != 0).any()) for r in state.reports.values())
-            for name, value in (observables(state) | self._due(state)).items():
+            for name, value in (observables(state) | self.due(state)).items():
                 if self.of is None or name in self.of:
                     found.setdefault(name, []).append(value * math.nan if broken else value)
         return found, seconds, spent
 
-    def _due(self, state: State) -> dict[str, Tensor]:
+    def due(self, state: State) -> dict[str, Tensor]:
         """The number of cells after the divisions with which the next step would begin: until then a count is late, by a step that is known."""
         for effect in self.scene.effects:
             if effect.stage <= DIVISION:
@@ -194,29 +193,29 @@ def tune(
     for name, given in (("cells", cells), ("colonies", colonies)):
         if isinstance(given, bool) or not isinstance(given, int) or given < 1:
             raise checks.refuse(name, given, "a whole number from 1")
-    probe = _begin(scene, cells, colonies, of, seed, device)
+    probe = begin(scene, cells, colonies, of, seed, device)
     if of is not None:
         for name in of:
             if name not in observables(probe.start):
                 raise checks.refuse("of", name, "among " + ", ".join(observables(probe.start)))
-    return _Search(probe, error).run()
+    return Search(probe, error).run()
 
 
 @torch.no_grad()
-def _begin(scene: Scene, cells: int, colonies: int, of: Sequence[str] | None, seed: int, device: str | torch.device) -> _Probe:
+def begin(scene: Scene, cells: int, colonies: int, of: Sequence[str] | None = None, seed: int = 0, device: str | torch.device = "cpu") -> Probe:
     """The scene as it is probed, grown to where the windows begin."""
     smooth = [e.smooth() if isinstance(e, Circuit) and e.is_stochastic else e for e in scene.listed]
     made = scene.retuned(smooth, scene.dt, scene.accuracy)
     fixed = scene.fixed_colonies
     state = made.seed(fixed if fixed > 1 else colonies, seed=seed, device=device)
     run = simulate(made, state, cells=cells, until=MOST_STEPS * scene.dt) if cells > 1 else iter(())
-    return _Probe(made, deque(run, maxlen=1).pop() if cells > 1 else state, scene.dt, None if of is None else tuple(of))
+    return Probe(made, deque(run, maxlen=1).pop() if cells > 1 else state, scene.dt, None if of is None else tuple(of))
 
 
-class _Search:
+class Search:
     """Settings tried from coarse to fine."""
 
-    def __init__(self, probe: _Probe, error: float):
+    def __init__(self, probe: Probe, error: float):
         self.probe, self.error = probe, error
         self.mechanics = next((e for e in probe.scene.listed if isinstance(e, Mechanics)), None)
         self.circuit = next((e for e in probe.scene.listed if isinstance(e, Circuit) and e.method == STIFF), None)

@@ -46,12 +46,10 @@ def test_no_more_passes_than_asked(device, dtype, passes):
     assert float(report.share[0]) < 1 or passes == 3  # there was more to do
 
 
-def test_the_only_pass_is_a_fine_one(device, dtype):
-    """Where no other follows, the worst residual is at most 0.05 of that at rest, in the plane 0.2, and what is asked where it is asked."""
-    assert float(first_step(device, dtype, passes=1).reports["mechanics"].residual.max()) <= 0.05
+def test_a_pass_is_as_fine_as_asked(device, dtype):
+    """The worst residual is at most the tolerance of that at rest, 0.05 unless another is given, whichever pass it is."""
+    assert 1e-3 < float(first_step(device, dtype, passes=1).reports["mechanics"].residual.max()) <= 0.05
     assert float(first_step(device, dtype, passes=2, tolerance=1e-3).reports["mechanics"].residual.max()) <= 1e-3
-    # in space the first of two is loose, or the measure above would say nothing
-    assert float(first_step(device, dtype, passes=2).reports["mechanics"].residual.max()) > 0.05
 
 
 def test_passes_do_not_depend_on_the_batch(device, dtype):

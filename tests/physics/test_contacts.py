@@ -139,6 +139,54 @@ def test_rows_of_a_line_of_contact(dim, tilt):
                 assert float((row[:, dof] + (up - down) / (2 * h)).abs().max()) <= 1e-6
 
 
+@DIMS
+@pytest.mark.parametrize("whole_lines", [False, True])
+def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, whole_lines):
+    """All rows that `contact_points` has for every pair, wherever it overlaps or is held, and no other: gaps and weights to rounding, order exactly."""
+    rng, count = np.random.default_rng(4), 8000
+    axis = unit(rng, 2 * count, dim)
+    tilt = rng.choice([1e-8, 1e-3, 0.08, 0.12], (count // 2, 1))
+    axis[count : count + count // 2] = axis[: count // 2] + tilt * unit(rng, count // 2, dim)
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    cells = bodies(rng.uniform(-0.9, 0.9, (2 * count, dim)), axis, rng.choice([0.0, 0.5, 2.0, 3.0], 2 * count), dtype=dtype)
+    first, second = halves(cells)
+    s, t, end_a, end_b, line = contact_points(cells.take(first), cells.take(second))
+    gap = torch.stack([gap_at(cells, first, second, s[k], t[k], end_a[k], end_b[k], cells.half) for k in range(2)])
+    clear = (gap.abs() > 1e-5).all(0) & (gap.sum(0).abs() > 1e-5)  # of the others rounding may say whether they overlap, or are held
+    first, second, gap, line = first[clear], second[clear], gap[:, clear], line[clear]
+    deep = (gap < 0) & torch.stack([torch.ones_like(line), line])
+    assert deep[1].sum() > 500 and (~deep[0]).sum() > 500 and (line & (deep[0] != deep[1])).sum() > 3
+    weight = torch.where(line, 0.5, 1.0).expand(2, -1).clone()
+    if whole_lines:
+        deep = deep | (line & deep.any(0))
+    else:  # the end that does not overlap is held, the less the farther it is
+        held = line & (deep[0] != deep[1]) & (gap.sum(0) < 0)
+        weight = torch.where(held & (gap > 0), (0.5 * gap.sum(0) / gap.amin(0)).float(), weight)
+        deep = deep | held
+        assert held.sum() > 3
+        gap = gap.clamp(max=0.0)
+    found = find_contacts(cells, first, second, whole_lines)
+    assert torch.equal(found.first, torch.cat([first[d] for d in deep])) and torch.equal(found.second, torch.cat([second[d] for d in deep]))
+    assert float((found.weight - torch.cat([w[d] for w, d in zip(weight, deep, strict=True)])).abs().max()) <= 1e-3
+    assert float((found.gap - torch.cat([g[d] for g, d in zip(gap, deep, strict=True)])).abs().max()) <= 1e-5
+
+
+@pytest.mark.parametrize("apart, tilt", [(1.9, 0.02), (1.9, 0.05), (1.9, 0.2), (1.7, 0.02), (1.7, 0.2), (1.5, 0.02), (1.5, 0.05)])
+def test_a_cell_squeezed_between_two_comes_to_rest(apart, tilt):
+    """Between two cells as good as fixed, too near for it at any angle, it overlaps them at opposite ends: a solve that saw these ends alone would
+    turn it as far the other way, step after step. It lies down between them instead, to what is left of a tilt by a tolerance of 0.01 a step."""
+    cells = tf.Cells(
+        [[0.0, -apart / 2], [0.1, 0.0], [0.0, apart / 2]], [[1.0, 0.0], [math.cos(tilt), math.sin(tilt)], [1.0, 0.0]], [4.0, 1.4, 4.0], [0.5] * 3,
+        extra={"drag": [1e3, 1.0, 1e3]},
+    )  # fmt: skip
+    scene = tf.Scene(tf.Mechanics(dim=2, tolerance=0.01), founders=cells)
+    state, angles = scene.seed(dtype=torch.float64), []
+    for _ in range(30):
+        state = scene.step(state, 0.025)
+        angles.append(float(torch.atan2(state.axis[1, 1], state.axis[1, 0])))
+    assert max(map(abs, angles)) < max(tilt, 0.1) + 0.02 and max(map(abs, angles[-5:])) < 1e-3, angles
+
+
 def forces(cells: Bodies) -> np.ndarray:
     """Force, torque and elongation JᵀD²g on the first cell of each pair, (P, 4 or 7)."""
     first, second = halves(cells)

@@ -94,13 +94,16 @@ def test_writing_is_the_adjoint_of_reading(device, shape):
 
 
 def test_a_cell_alone_may_empty_its_voxel_and_a_crowd_shares(device, dtype):
-    """W cells at one centre each have 1/W of the voxel; a cell alone between centres has all that it reads from."""
+    """W cells at one centre each have 1/W of the voxel; a cell alone all of its voxel, and between centres, where it reads
+    and shares more than one, as much as leaves the nearest voxel what it has."""
     g = grid([(5, 4, 6)], device)
     centre = g.centres()[37].expand(7, 3)
     found = stencil(g, centre, torch.zeros(7, dtype=torch.int64, device=device), dtype=dtype)
     assert torch.allclose(pool_volume(found), torch.full((7,), g.voxel_volume / 7, dtype=dtype, device=device), rtol=1e-6)
     alone = stencil(g, centre[:1] + 0.1, torch.zeros(1, dtype=torch.int64, device=device), dtype=dtype)
-    assert float(pool_volume(alone)) == g.voxel_volume
+    assert float(pool_volume(alone)) == pytest.approx(g.voxel_volume / float(alone.weight.max()), rel=1e-6)
+    emptied = write(torch.ones(g.nodes, dtype=dtype, device=device), -pool_volume(alone), alone)
+    assert float(emptied.min()) == pytest.approx(0.0, abs=1e-6) and float(emptied.min()) >= 0.0
 
 
 @settings(max_examples=60, deadline=None)

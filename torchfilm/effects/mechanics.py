@@ -27,8 +27,8 @@ LEAST_SHARE = 0.5
 # In a large colony in space some cell would always turn too far, and two shortened moves leave a quarter of every step's way
 # to go: as overlap that turns more cells. While more than MOST_LEFT of a move is left, up to twice as many passes are taken.
 MOST_LEFT = 0.2
-# Tolerances of the solve. In space cells that buckle amplify what is left by the last one; those that others follow may be loose.
-LOOSE, FINE = 0.2, 0.05
+# Tolerance of the solve. Overlaps hardly feel it, growth under pressure does: at 0.2 a tenth of what a colony grows is wrong, at 0.05 a hundredth.
+TOLERANCE = 0.05
 MOST_SUBSTEPS = 1000
 COARSE_PASSES, COARSE_OVERLAP = 6, 0.02
 
@@ -71,8 +71,7 @@ class Mechanics(Effect):
     overlap deeper than `overlap` (µm), or was cut short. Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other,
     and up to 4 while the moves, cut short, leave more than a fifth of the way to go; twice as many for unilateral contacts, since a push at one
     end may drive in the other; 6, down to 0.02 µm, for colonies that take sub-steps.
-    tolerance: of the solve, worst residual relative to the worst at rest; default 0.2, and in space, where cells that buckle amplify
-    what is left, 0.05 from the second pass on, unless that will not be the last. max_iterations: CG iterations a solve.
+    tolerance: of the solve, worst residual relative to the worst at rest. max_iterations: CG iterations a solve.
     max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
     """
 
@@ -85,7 +84,7 @@ class Mechanics(Effect):
     unilateral: bool = False
     passes: int | None = None
     overlap: float | None = None
-    tolerance: float | None = None
+    tolerance: float = TOLERANCE
     max_iterations: int = 2000
     max_elongation: float = 0.25
 
@@ -112,8 +111,7 @@ class Mechanics(Effect):
                 continue
             if not isinstance(given, int) or given < 1:
                 raise checks.refuse(f"Mechanics.{name}", given, "a whole number from 1")
-        if self.tolerance is not None:
-            checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
+        checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
         checks.number("Mechanics.max_elongation", self.max_elongation, above=0.0)
         if self.overlap is not None:
             checks.number("Mechanics.overlap", self.overlap, above=0.0)
@@ -133,11 +131,6 @@ class Mechanics(Effect):
     def most_passes(self) -> int:
         """`passes`, or its default for the dimension and the kind of contact."""
         return self.passes if self.passes is not None else (self.dim - 1) * (2 if self.unilateral else 1)
-
-    @property
-    def least_accuracy(self) -> float:
-        """`tolerance`, or its default where other passes may follow."""
-        return self.tolerance if self.tolerance is not None else LOOSE
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (
@@ -277,6 +270,8 @@ class _Run:
     def _again(self, contacts: Contacts, walls: WallContacts, seen: Tensor) -> Tensor:
         """Which colonies need another pass, (B,): a new contact that overlaps, an overlap over the limit, or a move cut short."""
         groups, colony = self.state.groups, self.state.colony
+        if bool((self.share < 1).all()):
+            return self.share < 1
         new = ~torch.isin(self._keys(contacts), seen) & (contacts.gap < 0)
         again = torch.zeros_like(colony, dtype=torch.bool)
         again[contacts.first[new]] = True
@@ -305,15 +300,7 @@ class _Run:
         lower = (base - self.length) / scale[:, -1]
         problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1), lower, scale, state.groups, settings.unilateral)
         start = state.displacement if number == 0 else None
-        return solve(problem, start, self._accuracy(number), settings.max_iterations)
-
-    def _accuracy(self, number: int) -> Tensor:
-        """Tolerance of the solve in each colony's pass `number`, (B,)."""
-        # no more than loose where even this move, if cut short too, must be followed by another, and in those that follow
-        more = (self.most_passes > self.passes) & (self.left * (1 - LEAST_SHARE) > MOST_LEFT)
-        late = (number + 1 >= self.passes.clamp(max=2)) & (number < self.passes)
-        fine = late & ~more & (self.settings.tolerance is None) & (self.state.dim == 3)
-        return torch.full_like(self.share, self.settings.least_accuracy).masked_fill(fine, FINE)
+        return solve(problem, start, torch.full_like(self.share, settings.tolerance), settings.max_iterations)
 
     def _turn(self, move: Tensor) -> Tensor:
         """How far each cell turns, (N,) rad."""

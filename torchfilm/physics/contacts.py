@@ -14,7 +14,7 @@ from torchfilm.physics.neighbours import find_pairs
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
 
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see `contact_points`).
-LINE_CONTACT_SINE = 0.1
+LINE_CONTACT_SINE = 0.4
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,19 @@ def contact_points(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor, Tensor, Tensor
     up; each carries half the weight (D = 1/√2), so neither force nor torque jumps. An `end` is −1, 0 or +1, or between
     while it slides: how much of ½ l the point moves with when the cell grows.
     """
-    s0, t0 = closest_points(a, b)
-    end_a0, end_b0 = _end(s0, a.half), _end(t0, b.half)
+    return _line_points(a, b, *closest_points(a, b))
+
+
+def _slide(turn: Tensor) -> Tensor:
+    """How far the ends of a line of contact are from having met, by the cross product of the axes alone, (P,): 1 where parallel, 0 or less where
+    there is no line."""
+    return 1.0 - dot(turn, turn) / LINE_CONTACT_SINE**2
+
+
+def _line_points(a: Bodies, b: Bodies, s0: Tensor, t0: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """What `contact_points` gives, from the closest points (s0, t0)."""
     turn = cross(a.axis, b.axis)
-    sine2 = dot(turn, turn)
-    slide = 1.0 - sine2 / LINE_CONTACT_SINE**2
+    slide = _slide(turn)
     # the common part of the two segments, measured along the mean axis so that neither cell is preferred
     sign = torch.where(dot(a.axis, b.axis) < 0, -1.0, 1.0).to(a.half.dtype)
     mean = a.axis + sign * b.axis
@@ -127,16 +135,34 @@ def contact_points(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor, Tensor, Tensor
     line = (slide > 0) & (high > low)
     # a line shorter than the cells are thick counts as less of one, so that it ends as smoothly as it turns away
     share = ((high - low) / (0.5 * (a.radius + b.radius))).clamp(max=1.0)
+    # nor do two that cross, so that the line's ends lie on opposite sides: all of it is near the crossing
+    swing = 0.5 * (high - low) * safe_sqrt(dot(turn, turn))
+    crossed = swing > 1e-6 * a.radius
+    apart = safe_sqrt(_distance2(b.centre - a.centre, a.axis, b.axis, s0, t0))
+    share = share * torch.where(crossed, apart / torch.where(crossed, swing, 1.0), 1.0).clamp(max=1.0)
     slide = torch.where(line, slide * slide * share, 0.0)
+    cosine, between = dot(a.axis, b.axis), b.centre - a.centre
+    end_a0 = _leaving(s0, cosine * t0 + dot(between, a.axis), a, slide)
+    end_b0 = _leaving(t0, cosine * s0 - dot(between, b.axis), b, slide)
     s_all, t_all, end_a, end_b = [], [], [], []
-    for at in (low, high):
+    for at, side in ((low, -1.0), (high, 1.0)):
         s1 = _clamp(at / project, a.half)
         t1 = _clamp(sign * (at - offset) / project, b.half)
         s_all.append(s0 + slide * (s1 - s0))
         t_all.append(t0 + slide * (t1 - t0))
-        end_a.append(end_a0 + slide * (_end(s1, a.half) - end_a0))
-        end_b.append(end_b0 + slide * (_end(t1, b.half) - end_b0))
+        # the line ends where the first of the two cells does; the farther the other goes on, the less does its end matter
+        beyond = (side * (at - a.half * project * side), side * (at - offset - b.half * project * side))
+        mark_a, mark_b = ((1.0 + x / (0.5 * (a.radius + b.radius))).clamp(min=0.0) for x in beyond)
+        end_a.append(end_a0 + slide * (side * mark_a - end_a0))
+        end_b.append(end_b0 + slide * (sign * side * mark_b - end_b0))
     return torch.stack(s_all), torch.stack(t_all), torch.stack(end_a), torch.stack(end_b), line
+
+
+def _leaving(s: Tensor, free: Tensor, cell: Bodies, slide: Tensor) -> Tensor:
+    """`_end` of a closest point s that would be at `free` on a line without ends. Where a line's point has slid away from it, the normal there is not
+    across the cell as the end is left: then the less of an end, the less is missing to `free`."""
+    missing = (free.abs() - cell.half) / (slide * cell.radius + 1e-9)
+    return torch.where(slide > 0, torch.sign(free) * missing.clamp(min=0.0, max=1.0), _end(s, cell.half))
 
 
 def _end(s: Tensor, half: Tensor) -> Tensor:
@@ -146,24 +172,51 @@ def _end(s: Tensor, half: Tensor) -> Tensor:
 
 
 def find_contacts(bodies: Bodies, first: Tensor, second: Tensor, whole_lines: bool = False) -> Contacts:
-    """All rows that overlap (gap < 0) among the given pairs (P,), (P,). whole_lines: both ends of a line of contact if one of them overlaps,
-    so that a solve in which contacts only push sees what it would push the other end into."""
-    a, b = bodies.take(first), bodies.take(second)
-    s, t, end_a, end_b, line = contact_points(a, b)
-    # cull before the expensive part, without a gradient: a point row for every pair, a second one where there is a line
+    """All rows that overlap (gap < 0) among the given pairs (P,), (P,), and of a line of contact that overlaps at one end what keeps the other from
+    swinging in: a row of gap 0, whose weight falls from that of the line to nothing as its end parts as far as the first overlaps. Without it a cell that is
+    squeezed between two rocks from step to step, and they close in on it. whole_lines: both ends as they are if one of them overlaps, for a
+    solve in which contacts only push, which sees by itself what it would push the other end into."""
+    first, second, a, b, s, t = _touching(bodies, first, second)
+    # only the nearly parallel may have a line; all others touch at the closest point
+    near = torch.nonzero(_slide(cross(a.axis, b.axis)).detach() > 0).squeeze(1)
+    near_a, near_b = a.take(near), b.take(near)
+    *of_lines, line = _line_points(near_a, near_b, s.index_select(0, near), t.index_select(0, near))
+    points = [x.index_copy(0, near, ends[0]) for x, ends in zip((s, t, _end(s, a.half), _end(t, b.half)), of_lines, strict=True)]
+    ends = [_gap(near_a, near_b, of_lines[0][k], of_lines[1][k]) for k in (0, 1)]
+    # cull again without a gradient: a first row for every pair, a second one where there is a line
     with torch.no_grad():
-        gap0 = _gap(a, b, s[0], t[0])
-        gap1 = _gap(a, b, s[1], t[1])
-        deep0, deep1 = gap0 < 0, line & (gap1 < 0)
-        either = line & (deep0 | deep1) & whole_lines
-        keep0, keep1 = torch.nonzero(deep0 | either).squeeze(1), torch.nonzero(deep1 | either).squeeze(1)
-    keep = torch.cat([keep0, keep1])
-    which = lambda x: torch.cat([x[0].index_select(0, keep0), x[1].index_select(0, keep1)])  # noqa: E731
-    a, b, s, t = a.take(keep), b.take(keep), which(s), which(t)
-    gap, row_first, row_second, normal = _rows(a, b, s, t, which(end_a), which(end_b))
+        deep0, deep1 = _gap(a, b, points[0], points[1]) < 0, line & (ends[1] < 0)
+        either = line & (deep0.index_select(0, near) | deep1) & (whole_lines | (ends[0] + ends[1] < 0))
+        deep0[near] |= either
+        keep0, keep1 = torch.nonzero(deep0).squeeze(1), torch.nonzero(deep1 | either).squeeze(1)
+    share = torch.full_like(ends[0], 0.5) if whole_lines else 0.5 * _held_share(*ends)
+    of_ends = [torch.ones_like(s).index_copy(0, near, torch.where(line, torch.where(end < 0, 0.5, share), 1.0)) for end in ends]
+    weight = torch.cat([of_ends[0].index_select(0, keep0), of_ends[1].index_select(0, near).index_select(0, keep1)])
+    keep = torch.cat([keep0, near.index_select(0, keep1)])
+    s, t, end_a, end_b = (torch.cat([x.index_select(0, keep0), two[1].index_select(0, keep1)]) for x, two in zip(points, of_lines, strict=True))
+    a, b = a.take(keep), b.take(keep)
+    gap, row_first, row_second, normal = _rows(a, b, s, t, end_a, end_b)
+    gap = gap if whole_lines else gap.clamp(max=0.0)
     where = 3 * _third(s, a.half) + _third(t, b.half)
-    weight = torch.where(line.index_select(0, keep), 0.5, 1.0).to(gap.dtype)
-    return Contacts(first.index_select(0, keep), second.index_select(0, keep), gap, weight, row_first, row_second, normal, where)
+    pick = lambda x: x.index_select(0, keep)  # noqa: E731
+    return Contacts(pick(first), pick(second), gap, weight, row_first, row_second, normal, where)
+
+
+def _held_share(one: Tensor, other: Tensor) -> Tensor:
+    """Of two ends of a line with gaps of which one is negative: 1 while neither parts, 0 once one parts as far as the other overlaps."""
+    deepest = torch.minimum(one, other)
+    return ((one + other) / torch.where(deepest < 0, deepest, -1.0)).clamp(min=0.0, max=1.0)
+
+
+def _touching(bodies: Bodies, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Bodies, Bodies, Tensor, Tensor]:
+    """Those of the pairs (P,), (P,) that overlap at their closest points: first, second, both bodies, and the points s and t."""
+    a, b = bodies.take(first), bodies.take(second)
+    s, t = closest_points(a, b)
+    with torch.no_grad():
+        # no point of a line is nearer than the closest one, but for rounding, of which this is many times more
+        keep = torch.nonzero(_gap(a, b, s, t) < 1e-3 * (a.radius + b.radius)).squeeze(1)
+    pick = lambda x: x.index_select(0, keep)  # noqa: E731
+    return pick(first), pick(second), a.take(keep), b.take(keep), pick(s), pick(t)
 
 
 def _third(s: Tensor, half: Tensor) -> Tensor:
@@ -201,7 +254,9 @@ def _rows(a: Bodies, b: Bodies, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tens
     between = b.centre - a.centre + lever_b - lever_a
     distance = safe_norm(between)
     touching = distance <= 1e-5 * (a.radius + b.radius)
-    normal = torch.where(touching, _fallback_normal(a, b), between / torch.where(touching, 1.0, distance))
+    normal = between / torch.where(touching, 1.0, distance)
+    if bool(touching.any()):  # rare, and dear to ask of every pair
+        normal = torch.where(touching, _fallback_normal(a, b), normal)
     gap = distance - a.radius - b.radius
     along_a, along_b = dot(normal, a.axis), dot(normal, b.axis)
     # a sphere grows from both ends at once: the one nearer the contact counts

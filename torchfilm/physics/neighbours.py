@@ -42,17 +42,17 @@ def find_pairs(position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, c
     smallest = -groups.max(-reach)
     ratio = reach / smallest.index_select(0, colony)
     level = torch.floor(torch.log(ratio) / math.log(CLASS_RATIO) + 1e-3).long()
-    found = []
+    place, found = position.T.contiguous(), []
     for k in range(int(level.max()) + 1):
         members = torch.nonzero(level == k).squeeze(1)
         if members.numel():
             grid = _Grid.build(position, reach, colony, colonies, members)
-            found.append(grid.pairs_within())
+            found.append(grid.pairs_within(place, reach))
             larger = torch.nonzero(level > k).squeeze(1)
             if larger.numel():
-                found.append(grid.pairs_with(larger))
+                found.append(_meeting(place, reach, *grid.pairs_with(larger)))
     first, second = torch.cat([f[0] for f in found]), torch.cat([f[1] for f in found])
-    return _near(position, axis, length, radius, reach, margin, first, second)
+    return _near(place, axis, length, radius, margin, first, second)
 
 
 @dataclass(frozen=True)
@@ -126,10 +126,12 @@ class _Grid:
         """How many members stand before each key."""
         return torch.searchsorted(self.keys, key) if self.table is None else self.table.index_select(0, key)
 
-    def pairs_within(self) -> tuple[Tensor, Tensor]:
-        """Every pair of members that may touch, once: the rest of a member's own row, and the rows after it."""
+    def pairs_within(self, place: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+        """Every pair of members whose bounding spheres meet, once: in the rest of a member's own row, and in the rows after it. place (d, N), reach (N,)."""
         members = self.members  # asked in their own order, so that neighbours in space are neighbours in memory
         own = torch.floor(self.at[1:].index_select(1, members)).long()
+        # strangers are told apart row by row, from copies in the members' own order: what is read stands side by side, and fits a cache
+        place, reach = place.index_select(1, members), reach.index_select(0, members)
         reaches = 2 if own.shape[0] == 1 else 1
         first, second = [], []
         for step in itertools.product(range(-reaches, reaches + 1), repeat=own.shape[0]):
@@ -140,9 +142,9 @@ class _Grid:
                 stop = start + count
                 start = torch.arange(1, members.numel() + 1, device=members.device)
                 count = (stop - start).clamp(min=0)
-            owner, run = expand_ranges(start, count)
+            owner, run = _meeting(place, reach, *expand_ranges(start, count))
             first.append(members.index_select(0, owner))
-            second.append(self.members.index_select(0, run))
+            second.append(members.index_select(0, run))
         return torch.cat(first), torch.cat(second)
 
     def pairs_with(self, larger: Tensor) -> tuple[Tensor, Tensor]:
@@ -161,18 +163,23 @@ class _Grid:
         return cells.index_select(0, owner), self.members.index_select(0, run)
 
 
-def _near(position, axis, length, radius, reach, margin, i, j):
-    """Keep the pairs whose bounding spheres and boxes, each grown by half the margin, meet."""
-    place = position.T.contiguous()
-    between = place.index_select(1, j) - place.index_select(1, i)
-    sum_reach = reach.index_select(0, i) + reach.index_select(0, j)
+def _meeting(place: Tensor, reach: Tensor, i: Tensor, j: Tensor) -> tuple[Tensor, Tensor]:
+    """Those of the pairs (i, j) whose bounding spheres meet. place (d, N), reach (N,)."""
+    between = [x.index_select(0, j) - x.index_select(0, i) for x in place]
     squared = between[0] * between[0]
-    for k in range(1, between.shape[0]):
-        squared = squared + between[k] * between[k]
+    for x in between[1:]:
+        squared = squared + x * x
+    sum_reach = reach.index_select(0, i) + reach.index_select(0, j)
     # a hair more than the reach: rounding must not lose a pair that touches exactly
     keep = torch.nonzero(squared <= sum_reach * sum_reach * (1 + 1e-5)).squeeze(1)
-    i, j, between = i.index_select(0, keep), j.index_select(0, keep), between.index_select(1, keep)
-    box = (0.5 * length * axis.abs().T + radius + 0.5 * margin) * (1 + 1e-5)
-    apart = (between.abs() > box.index_select(1, i) + box.index_select(1, j)).any(0)
-    keep = torch.nonzero(~apart).squeeze(1)
     return i.index_select(0, keep), j.index_select(0, keep)
+
+
+def _near(place, axis, length, radius, margin, i, j):
+    """Keep the pairs whose bounding boxes, each grown by half the margin, meet."""
+    box = (0.5 * length * axis.abs().T + radius + 0.5 * margin) * (1 + 1e-5)
+    for x, size in zip(place, box, strict=True):
+        apart = (x.index_select(0, j) - x.index_select(0, i)).abs() > size.index_select(0, i) + size.index_select(0, j)
+        keep = torch.nonzero(~apart).squeeze(1)
+        i, j = i.index_select(0, keep), j.index_select(0, keep)
+    return i, j

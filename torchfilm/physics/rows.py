@@ -81,9 +81,9 @@ class ContactRows:
         if active is not None:
             pair, wall = active[: self.pairs], active[self.pairs :]
             scaled = rows * torch.cat([pair, pair, wall]).unsqueeze(1)
-        # the upper half of each square, row by row of it: slices are cheap, picking columns is not
-        upper = torch.cat([rows[:, k : k + 1] * scaled[:, k:] for k in range(width)], 1)
-        summed = self.half_rows.sum_into(upper, rows.new_empty(self.cells, upper.shape[1]))
+        # the upper half of each square, row by row of it: slices are cheap, picking columns is not, and the whole half would not fit a cache
+        parts = (rows[:, k : k + 1] * scaled[:, k:] for k in range(width))
+        summed = torch.cat([self.half_rows.sum_into(part, rows.new_empty(self.cells, part.shape[1])) for part in parts], 1)
         i, j = torch.triu_indices(width, width, device=rows.device)
         whole = torch.empty(width, width, dtype=torch.int64, device=rows.device)
         whole[i, j] = whole[j, i] = torch.arange(i.numel(), device=rows.device)

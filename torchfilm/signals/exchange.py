@@ -171,13 +171,14 @@ def read(values: Tensor, stencil: Stencil) -> Tensor:
 
 
 def pool_volume(stencil: Stencil) -> Tensor:
-    """The volume, µm³, of which each cell may take up all that is there, (N,): voxel volume / max(1, W), W the greatest sum of weights at its voxels.
+    """The volume, µm³, of which each cell may take up all that is there, (N,): voxel volume / W, W the greatest sum of weights at its voxels.
 
-    However many cells share a voxel, uptake of at most `read` × this leaves nothing negative.
+    However many cells share a voxel, uptake of at most `read` × this leaves nothing negative: of a voxel each takes at most weight / W of what is there.
+    A cell off the middle of its voxel reads, and shares, more than one: then W is below 1 and its pool is larger than a voxel.
     """
     crowd = stencil.gather(stencil.sum(stencil.weight))
     worst = torch.where(stencil.weight > 0, crowd, 0.0).amax(1)
-    return stencil.voxel_volume / worst.clamp(min=1.0)
+    return stencil.voxel_volume / torch.where(worst > 0, worst, 1.0)
 
 
 def write(values: Tensor, amount: Tensor, stencil: Stencil) -> Tensor:

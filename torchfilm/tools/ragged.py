@@ -85,6 +85,8 @@ class Groups:
 
     def max(self, value: Tensor, empty: float = 0.0) -> Tensor:
         """Greatest of each group, (K,) -> (size,); `empty` where a group has no row. Exact, so in any order. No gradient."""
+        if self.size == 1 and value.numel():
+            return value.detach().amax(0, keepdim=True)
         out = torch.full((self.size,), empty, dtype=value.dtype, device=value.device)
         return out.scatter_reduce(0, self.owner, value.detach(), "amax", include_self=False)
 
