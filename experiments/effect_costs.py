@@ -1,6 +1,6 @@
 """What each effect costs, in every ready-made scene: time, operators and bytes of a step; and that an effect which is not listed costs nothing.
 
-    OMP_NUM_THREADS=1 python experiments/effect_costs.py                     # five to ten minutes; writes docs/costs.md and a JSON record
+    OMP_NUM_THREADS=1 python experiments/effect_costs.py                     # five to ten minutes; writes its part of docs/effects.md and a JSON record
     OMP_NUM_THREADS=1 python experiments/effect_costs.py --cells 50 --out costs.json --page ''
 
 Each scene is grown from its founders to 200 cells in each of 4 colonies, or as many as it has after 12 h. From there 20 steps are taken twice: once
@@ -25,13 +25,13 @@ import torchfilm as tf
 from torchfilm.explain import Spending
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
-from record import machine
+from record import machine, write_page
 
 HERE = Path(__file__).parent
 STEPS, HOURS = 20, 12.0
 # What a ready scene is given where by default it holds fewer cells than are wanted.
 SETTINGS = {"channel": {"width": 16.0, "length": 80.0}, "programmed_growth": {"edge": 20.0}}
-BEGIN, END = "<!-- tables: experiments/effect_costs.py -->", "<!-- end of tables -->"
+MARK = "tables: experiments/effect_costs.py"
 BODY = ("growth", "mechanics", "division")
 
 
@@ -134,7 +134,7 @@ def tables(noted: dict, records: list[dict]) -> str:
         f"Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']}, Python {noted['python']}, {noted['threads']} thread(s), "
         f"{noted['processor']}, float32. Means over {STEPS} steps of {scenes[0]['colonies']} colonies; times are medians, as shares of the step.",
         "", "| scene, effect | time of a step | operators a step | MB allocated a step |", "|---|---|---|---|", *(row for r in scenes for row in scene_rows(r)),
-        "", "## What is not listed costs nothing", "",
+        "", "### What is not listed costs nothing", "",
         f"{body[0]['cells']} cells in {body[0]['colonies']} colonies, {STEPS} steps: operators dispatched and bytes allocated, in all.", "",
         "| growth, division and mechanics beside | growth | mechanics | division | the other effects |", "|---|---|---|---|---|",
     ]  # fmt: skip
@@ -143,21 +143,13 @@ def tables(noted: dict, records: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def write_page(path: Path, text: str) -> None:
-    """Put the tables between the page's two marks."""
-    page = path.read_text()
-    if BEGIN not in page or END not in page:
-        raise SystemExit(f"{path} has no place for tables, from {BEGIN} to {END}")
-    path.write_text(page[: page.index(BEGIN) + len(BEGIN)] + "\n\n" + text + "\n\n" + page[page.index(END) :])
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", action="append", choices=tuple(tf.scenes.READY), help="one scene; may be given again")
     parser.add_argument("--cells", type=int, default=200, help="in each colony")
     parser.add_argument("--colonies", type=int, default=4)
     parser.add_argument("--out", type=Path, default=HERE / "benchmarks" / "effect_costs.json", help="JSON record, written anew")
-    parser.add_argument("--page", default=str(HERE.parent / "docs" / "costs.md"), help="page whose tables are written anew; '' for none")
+    parser.add_argument("--page", default=str(HERE.parent / "docs" / "effects.md"), help="page whose tables are written anew; '' for none")
     chosen = parser.parse_args()
     tf.keep_memory()
     torch.set_grad_enabled(False)
@@ -168,7 +160,7 @@ def main() -> None:
     records += beside(chosen.cells, chosen.colonies)
     chosen.out.write_text(json.dumps([noted | record for record in records], indent=1) + "\n")
     if chosen.page:
-        write_page(Path(chosen.page), tables(noted, records))
+        write_page(Path(chosen.page), tables(noted, records), MARK)
 
 
 if __name__ == "__main__":

@@ -80,6 +80,17 @@ class Outside:
     beyond: str
     method: str | None
     obstacle: bool
+    splitting: str
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What else. eating: cells grow by the signal that they eat (where there is one to eat, and growth is by volume); rule: what a rule of the user's
+    does; leaving: cells beyond 0.7 of where they start are removed."""
+
+    eating: bool
+    rule: str | None
+    leaving: bool
 
 
 @dataclass(frozen=True)
@@ -104,6 +115,7 @@ class Draw:
     growing: Growing | None
     outside: Outside | None
     inside: Inside | None
+    beside: Beside
     dt: float
     steps: int
     dtype: str
@@ -135,15 +147,18 @@ OUTSIDE = st.integers(2, 3).flatmap(
         Outside, shape=st.tuples(*[st.sampled_from([4, 1, 2, 3, 7, 13])] * dim), spacing=st.tuples(*[st.sampled_from([2.0, 0.3, 9.0])] * dim),
         diffusion=st.sampled_from([0.0, 1.0, 1e-3, 1e3, 1e6]), decay=st.sampled_from([0.0, 1.0, 1e8]), start=st.sampled_from([0.0, 1.0, 1e-12, 1e6]),
         faces=st.tuples(*[st.sampled_from(list(FACES))] * 3), flow=st.sampled_from([0.0, 10.0, -1e4]), beyond=st.sampled_from(["open", "grow", "error"]),
-        method=st.sampled_from([None, "implicit"]), obstacle=st.booleans(),
+        method=st.sampled_from([None, "implicit"]), obstacle=st.booleans(), splitting=st.sampled_from(["strang", "lie"]),
     )
 )  # fmt: skip
 INSIDE = st.builds(
     Inside, kind=st.sampled_from(["exchange", "hill", "reactions"]), fast=powers(-3, 8), power=st.sampled_from([1.0, 1.5, 8.0]), half=powers(-6, 3),
     daughters=st.sampled_from(["amount", "concentration"]), method=st.sampled_from(["rosenbrock", "tau_leap", "direct"]),
 )  # fmt: skip
+BESIDE = st.builds(
+    Beside, eating=st.booleans(), rule=st.sampled_from([None, "grow", "divide", "remove", "read"]), leaving=st.sampled_from([False, False, True])
+)
 DRAWS = st.builds(
-    Draw, bodies=BODIES, contacts=st.none() | CONTACTS, growing=st.none() | GROWING, outside=st.none() | OUTSIDE, inside=st.none() | INSIDE,
+    Draw, bodies=BODIES, contacts=st.none() | CONTACTS, growing=st.none() | GROWING, outside=st.none() | OUTSIDE, inside=st.none() | INSIDE, beside=BESIDE,
     dt=st.sampled_from([0.01, 1e-4, 0.1, 1.0, 10.0]), steps=st.integers(1, 4), dtype=st.sampled_from(list(FLOATS)), seed=st.integers(0, 2**40),
 ).filter(lambda d: any(x is not None for x in (d.contacts, d.growing, d.outside, d.inside)))  # fmt: skip
 
@@ -177,12 +192,37 @@ def growing(draw: Draw) -> list[tf.Effect]:
     g, r = draw.growing, draw.bodies.radius
     # what rates are allowed to be is no question here, only how many cells come of them
     rate = min(g.rate, GROWN / (draw.dt * draw.steps))
-    out: list[tf.Effect] = [tf.Growth(rate=tf.Uniform(rate / 3, rate) if g.varied and rate else rate, law=g.law)]
+    if eats(draw):
+        out: list[tf.Effect] = [tf.Growth(), tf.Monod("ahl", rate=rate, half=0.1, growth_yield=0.5)]
+    else:
+        out = [tf.Growth(rate=tf.Uniform(rate / 3, rate) if g.varied and rate else rate, law=g.law)]
     if g.criterion is None:
         return out
     longest = max(2 * r, draw.bodies.lengths[1])
     least = {"length": longest, "volume": math.pi * r * r * (longest + 4 / 3 * r), "added": 3 * r}[g.criterion]
     return [*out, tf.Division(**{g.criterion: tf.Uniform(least * g.multiple, 1.3 * least * g.multiple)}, fraction=g.fraction)]
+
+
+def eats(draw: Draw) -> bool:
+    return draw.beside.eating and draw.outside is not None and draw.growing is not None and draw.growing.law == "volume"
+
+
+def rules(draw: Draw) -> list[tf.Effect]:
+    """A rule that does one of the things that rules do, to some of the cells."""
+    kind = draw.beside.rule
+
+    def update(cells):
+        some = cells.uid % 3 == 1
+        if kind == "grow" and draw.growing is not None and not eats(draw):
+            cells.growth_rate = torch.where(some, 0.5 * cells.growth_rate, cells.growth_rate)
+        elif kind == "divide" and draw.growing is not None:
+            cells.divide_flag = some & (cells.length > 4 * cells.radius)
+        elif kind == "remove":
+            cells.remove_flag = some & (cells.length > 2.5)
+        elif kind == "read":
+            cells.mark = cells.colony_sum(cells.volume) + cells.contact_count() + cells.random()
+
+    return [] if kind is None else [tf.Rules(update, variables={"mark": 0.0} if kind == "read" else {})]
 
 
 def medium(draw: Outside, dim: int) -> tf.Medium:
@@ -194,7 +234,7 @@ def medium(draw: Outside, dim: int) -> tf.Medium:
     return tf.Medium(
         ahl=tf.Signal(diffusion=draw.diffusion, decay=draw.decay, initial=draw.start, beyond=0.3), box=(low, high), spacing=draw.spacing,
         faces=tf.Faces(*(FACES[f] for f in draw.faces)), flow=(draw.flow, 0.0) if draw.flow else None, beyond=draw.beyond, method=draw.method,
-        obstacles=(lambda x: (x > 0.5 * corner).all(1)) if draw.obstacle else None,
+        splitting=draw.splitting, obstacles=(lambda x: (x > 0.5 * corner).all(1)) if draw.obstacle else None,
     )  # fmt: skip
 
 
@@ -227,6 +267,10 @@ def scene_of(draw: Draw) -> tuple[tf.Scene, tf.State]:
     effects += [] if draw.contacts is None else [mechanics(draw.contacts, draw.bodies)]
     effects += [] if draw.outside is None else [medium(draw.outside, draw.bodies.dim)]
     effects += [] if draw.inside is None else [circuit(draw.inside, draw.outside is not None)]
+    effects += rules(draw)
+    if draw.beside.leaving:
+        side = 0.7 * draw.bodies.within
+        effects.append(tf.Removal((-side,) * draw.bodies.dim, (side,) * draw.bodies.dim))
     scene = tf.Scene(*effects, founders=tf.Cells.single(draw.bodies.dim))
     # grids that follow scattered cells are a matter of memory, which tests/test_fuzz.py looks at
     within = min(draw.bodies.within, 20.0) if draw.outside is not None and draw.outside.beyond == "grow" else draw.bodies.within
@@ -317,7 +361,7 @@ def kept(before: tf.State, after: tf.State, draw: Draw) -> None:
     """Amounts are what they were where nothing makes or takes them, to some roundings of the parts that they are the sum of, and to what the stiff solver's
     float64 can know: its matrix 2/h − J has a condition number of about 1 + h|J|."""
     i, o = draw.inside, draw.outside
-    if i is None or i.kind != "exchange" or i.daughters != "amount":
+    if i is None or i.kind != "exchange" or i.daughters != "amount" or eats(draw) or draw.beside.leaving or draw.beside.rule == "remove":
         return
     if o is not None and (o.decay or o.flow or {"open", "fixed"} & set(o.faces) or (o.beyond == "grow" and o.start)):
         return

@@ -20,8 +20,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from record import write_page  # noqa: E402
+
 PAGE = ROOT / "docs" / "stability.md"
-BEGIN, END = "<!-- written by experiments/stability.py -->", "<!-- to here -->"
+MARK = "written by experiments/stability.py"
 CASE = re.compile(r"test_case_(\d+)_")
 COLUMNS = ("cpu float32", "cpu float64", "cuda float32", "cuda float64")
 HEADS = {"cpu float32": "float32", "cpu float64": "float64", "cuda float32": "float32, CUDA", "cuda float64": "float64, CUDA"}
@@ -103,9 +106,7 @@ def main() -> None:
     if chosen.values:
         chosen.values.write_text(json.dumps(noting.values, ensure_ascii=False, indent=1))
     extra: Values = json.loads(chosen.extra.read_text()) if chosen.extra else {}
-    page = PAGE.read_text()
-    before, after = page.split(BEGIN)[0], page.split(END)[1]
-    PAGE.write_text(f"{before}{BEGIN}\n\n{table(noting, extra)}\n\n{noting.passed} tests passed, {len(noting.failed)} failed.\n\n{END}{after}")
+    write_page(PAGE, f"{table(noting, extra)}\n\n{noting.passed} tests passed, {len(noting.failed)} failed.", MARK)
     if noting.failed:
         sys.exit("failed, and the page says so: " + ", ".join(noting.failed))
 

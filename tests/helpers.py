@@ -55,7 +55,7 @@ def check_always(state: tf.State, scene: tf.Scene | None = None) -> None:
         return
     assert (report.status == CONVERGED).all(), report
     if scene is not None:
-        tolerance = next(e.tolerance for e in scene.effects if isinstance(e, tf.Mechanics))
+        tolerance = next(e.tolerance or 0.05 for e in scene.effects if isinstance(e, tf.Mechanics))
         assert (report.residual <= tolerance).all(), report
 
 

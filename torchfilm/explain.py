@@ -23,7 +23,7 @@ from torchfilm.cells import Cells
 from torchfilm.effects.circuit import DIRECT, LEAP, STIFF, Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
-from torchfilm.effects.mechanics import COARSE_PASSES, Mechanics
+from torchfilm.effects.mechanics import COARSE_PASSES, PENALTY, TOLERANCE, Mechanics
 from torchfilm.effects.medium import BLOCK, Cover, Medium
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
@@ -132,7 +132,7 @@ def _(effect: Mechanics, state: State, dt: float) -> list[str]:
         + f"; a colony with a cell that grows more than {effect.max_elongation:g} µm takes sub-steps"
         + (f" of up to {COARSE_PASSES} passes" if effect.passes is None else "")
         + (", one whose moves are cut short up to twice as many" if effect.passes is None and effect.dim == 3 else ""),
-        f"solver: conjugate gradients, each colony to a worst residual of {effect.tolerance:g}, at most {effect.max_iterations} iterations",
+        f"solver: conjugate gradients, each colony to a worst residual of {_accuracy(effect)}, at most {effect.max_iterations} iterations",
     ]
     soft = [wall for wall in effect.walls if wall.stiffness is not None or wall.weight is not None]
     if effect.walls:
@@ -181,6 +181,13 @@ def _(effect: Medium, state: State, dt: float) -> list[str]:
 @how.register
 def _(effect: Removal, state: State, dt: float) -> list[str]:
     return ["once a step, by the cell's centre"]
+
+
+def _accuracy(effect: Mechanics) -> str:
+    """The tolerance of the solve in words."""
+    if effect.tolerance is not None:
+        return f"{effect.tolerance:g}"
+    return f"{TOLERANCE:g} (default" + ("" if effect.alpha is None else f"; less where α·γ is below {PENALTY:g}") + ")"
 
 
 def transport(medium: Medium, name: str) -> tuple[str, str]:

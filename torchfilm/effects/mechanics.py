@@ -27,8 +27,10 @@ LEAST_SHARE = 0.5
 # In a large colony in space some cell would always turn too far, and two shortened moves leave a quarter of every step's way
 # to go: as overlap that turns more cells. While more than MOST_LEFT of a move is left, up to twice as many passes are taken.
 MOST_LEFT = 0.2
-# Tolerance of the solve. Overlaps hardly feel it, growth under pressure does: at 0.2 a tenth of what a colony grows is wrong, at 0.05 a hundredth.
-TOLERANCE = 0.05
+# Tolerance of the solve at the default penalty α γ. Overlaps hardly feel it, growth under pressure does: at 0.2 a tenth of what a colony grows is wrong, at
+# 0.05 a hundredth. The harder contacts are, the farther from rest is what moves with none of them at the same residual: a tolerance that falls as (α γ)^¼ is
+# enough from 0.1 down to 1e-6 (0.02 is needed at 0.01), and one that falls faster is out of reach of float32.
+PENALTY, TOLERANCE = 0.1, 0.05
 MOST_SUBSTEPS = 1000
 COARSE_PASSES, COARSE_OVERLAP = 6, 0.02
 
@@ -71,7 +73,8 @@ class Mechanics(Effect):
     overlap deeper than `overlap` (µm), or was cut short. Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other,
     and up to 4 while the moves, cut short, leave more than a fifth of the way to go; twice as many for unilateral contacts, since a push at one
     end may drive in the other; 6, down to 0.02 µm, for colonies that take sub-steps.
-    tolerance: of the solve, worst residual relative to the worst at rest. max_iterations: CG iterations a solve.
+    tolerance: of the solve, worst residual relative to the worst at rest; default 0.05, and where α γ is below 0.1, 0.05 · (α γ/0.1)^¼.
+    max_iterations: CG iterations a solve.
     max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
     """
 
@@ -84,7 +87,7 @@ class Mechanics(Effect):
     unilateral: bool = False
     passes: int | None = None
     overlap: float | None = None
-    tolerance: float = TOLERANCE
+    tolerance: float | None = None
     max_iterations: int = 2000
     max_elongation: float = 0.25
 
@@ -111,7 +114,8 @@ class Mechanics(Effect):
                 continue
             if not isinstance(given, int) or given < 1:
                 raise checks.refuse(f"Mechanics.{name}", given, "a whole number from 1")
-        checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
+        if self.tolerance is not None:
+            checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
         checks.number("Mechanics.max_elongation", self.max_elongation, above=0.0)
         if self.overlap is not None:
             checks.number("Mechanics.overlap", self.overlap, above=0.0)
@@ -219,7 +223,7 @@ class _Run:
         elif settings.alpha is not None:
             self.alpha = per_cell(settings.alpha, state).expand(state.cells)
         else:
-            self.alpha = (0.1 / self.length_drag).expand(state.cells)
+            self.alpha = (PENALTY / self.length_drag).expand(state.cells)
 
     def substep(self, base: Tensor, growth: Tensor, active: Tensor) -> None:
         """Grow by `growth` (N,) from `base` (N,), and pass over contacts, in the colonies that are active (B,) bool."""
@@ -300,7 +304,15 @@ class _Run:
         lower = (base - self.length) / scale[:, -1]
         problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1), lower, scale, state.groups, settings.unilateral)
         start = state.displacement if number == 0 else None
-        return solve(problem, start, torch.full_like(self.share, settings.tolerance), settings.max_iterations)
+        return solve(problem, start, self._tolerance(), settings.max_iterations)
+
+    def _tolerance(self) -> Tensor:
+        """Of the solve in each colony, (B,)."""
+        if self.settings.tolerance is not None:
+            return torch.full_like(self.share, self.settings.tolerance)
+        with torch.no_grad():
+            hardest = -self.state.groups.max(-self.alpha * self.length_drag, empty=-PENALTY)
+            return TOLERANCE * (hardest / PENALTY).clamp(max=1.0).sqrt().sqrt()
 
     def _turn(self, move: Tensor) -> Tensor:
         """How far each cell turns, (N,) rad."""
