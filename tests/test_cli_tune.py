@@ -48,7 +48,7 @@ def test_tune_prints_what_it_chose_and_writes_it_for_a_run(folder):
 def test_a_run_by_a_preset_says_so_in_its_results(folder):
     done(folder, "run", "mine.py", "--preset", "draft", "--cells", "2", "--out", "a.h5", "--no-picture")
     with tf.Results(folder / "a.h5") as results:
-        assert results.attributes["dt"] == 0.08 and results.accuracy["rtol"] == 0.01
+        assert results.attributes["dt"] == pytest.approx(0.08) and results.accuracy["rtol"] == 0.01
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ class Tune:
     """Parameters of the scene, as NAME=VALUE."""
     of: list[str] = field(default_factory=list)
     """What must be right: cells, volume, radius, overlap, species by name, "signal NAME"; by default all of them."""
-    cells: int = 60
+    cells: int = 100
     """Cells in each colony where the probe begins."""
     colonies: int = 8
     """Colonies of the probe, if the scene's parameters leave it open."""

@@ -50,6 +50,8 @@ TIGHT_CONTACTS, TIGHT_CIRCUITS = (0.03, 3, 1e-3), 1e-8
 # A scene that never has as many cells as asked for is taken as it is after this many steps.
 MOST_STEPS = 2000
 SIGNAL = "signal "
+# Of the error that is asked for, so much is aimed at: other seeds, and colonies somewhat larger, have somewhat other errors than the probe's.
+AIM = 0.6
 
 
 @dataclass(frozen=True)
@@ -105,12 +107,12 @@ class Probe:
         """The states in the middle and at the end of the window in so many steps, the seconds it took, and those of each effect."""
         made = settings.apply(self.scene)
         dt, state, seen, timings = self.dt * WINDOW / steps, self.start, [], Timings()
-        begun = time.perf_counter()
+        begun = time.thread_time()  # what other work on the machine takes does not count
         for k in range(steps):
             state = made.step(state, dt, timings)
             if 2 * (k + 1) % steps == 0:
                 seen.append(state)
-        return seen, time.perf_counter() - begun, timings.seconds
+        return seen, time.thread_time() - begun, timings.seconds
 
     def observed(self, settings: Settings, steps: int) -> tuple[dict[str, list[Tensor]], float, dict[str, float]]:
         """What is read off in the middle and at the end, by observable; a colony that failed makes them NaN."""
@@ -179,7 +181,7 @@ def _species(state: State) -> list[str]:
 
 
 def tune(
-    scene: Scene, error: float = 0.01, *, cells: int = 60, colonies: int = 8, of: Sequence[str] | None = None, seed: int = 0,
+    scene: Scene, error: float = 0.01, *, cells: int = 100, colonies: int = 8, of: Sequence[str] | None = None, seed: int = 0,
     device: str | torch.device = "cpu",
 ) -> Tuned:  # fmt: skip
     """The cheapest settings with which a scene's observables are within `error` (relative, 0.01 for 1 %) of what far tighter settings give; about a minute.
@@ -216,7 +218,7 @@ class Search:
     """Settings tried from coarse to fine."""
 
     def __init__(self, probe: Probe, error: float):
-        self.probe, self.error = probe, error
+        self.probe, self.error, self.aim = probe, error, AIM * error
         self.mechanics = next((e for e in probe.scene.listed if isinstance(e, Mechanics)), None)
         self.circuit = next((e for e in probe.scene.listed if isinstance(e, Circuit) and e.method == STIFF), None)
         self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
@@ -271,7 +273,7 @@ class Search:
             if found is None:
                 continue
             closest = found if closest is None or found.worst < closest.worst else closest
-            if found.worst <= self.error and (best is None or found.seconds < best.seconds):
+            if found.worst <= self.aim and (best is None or found.seconds < best.seconds):
                 best = found
         if best is None:
             closest = min(self.tries.values(), key=lambda t: t.worst)
@@ -284,10 +286,10 @@ class Search:
 
     def _at(self, steps: int) -> Try | None:
         """The loosest knobs in a window of so many steps that hold the error; None where the tightest do not."""
-        if self._try(self.settings(steps, TIGHT_CONTACTS, TIGHT_CIRCUITS), steps).worst > self.error:
+        if self._try(self.settings(steps, TIGHT_CONTACTS, TIGHT_CIRCUITS), steps).worst > self.aim:
             return None
         contacts, rtols = [*self.contacts, TIGHT_CONTACTS], [*self.rtols, TIGHT_CIRCUITS]
-        holds = lambda c, r: self._try(self.settings(steps, c, r), steps).worst <= self.error  # noqa: E731
+        holds = lambda c, r: self._try(self.settings(steps, c, r), steps).worst <= self.aim  # noqa: E731
         m = next(k for k, c in enumerate(contacts) if holds(c, TIGHT_CIRCUITS))
         r = next(k for k, rtol in enumerate(rtols) if holds(TIGHT_CONTACTS, rtol))
         while not holds(contacts[m], rtols[r]):  # each is within the error alone; together they may not be

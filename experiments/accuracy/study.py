@@ -13,8 +13,11 @@ from typing import Any
 
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 REPEATS = 3
+SHORT_AXIS = 2.0  # decades
 
 
 @dataclass(frozen=True)
@@ -145,4 +148,18 @@ def _draw(ax: Axes, study: Study, error: str, cost: Callable[[Point], float]) ->
     usual = [p for p in study.points if p.default and p.errors.get(error, 0.0) > 0.0]
     ax.plot([cost(p) for p in usual], [p.errors[error] for p in usual], "*", color="black", ms=14, zorder=5, label="default")
     ax.set(xscale="log", yscale="log")
+    for axis, (low, high) in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
+        _mark(axis, math.log10(high / low))
     ax.grid(True, which="both", lw=0.2)
+
+
+def _mark(axis: Axis, decades: float) -> None:
+    """Numbers at whole decades; where there may be one of them or none, also between: few enough that they do not overlap."""
+    axis.set_minor_formatter(NullFormatter())
+    if decades < SHORT_AXIS:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades > 0.5 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)))
+        axis.set_major_formatter(FuncFormatter(lambda x, _: _number(x)))
+
+
+def _number(x: float) -> str:
+    return f"{x:g}" if 1e-3 <= x < 1e5 else f"{x:.1e}".replace(".0e", "e").replace("e+0", "e").replace("e-0", "e-")
