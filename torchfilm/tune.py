@@ -266,8 +266,7 @@ class Search:
         best: Try | None = None
         closest: Try | None = None
         for steps in STEPS:
-            fastest = min((t.seconds * t.settings.dt for t in self.tries.values() if t.settings.dt), default=0.0) / (self.probe.dt * WINDOW)
-            if best is not None and steps * fastest > best.seconds:
+            if best is not None and steps * self._least() > best.seconds:
                 break
             found = self._at(steps)
             if found is None:
@@ -283,6 +282,16 @@ class Search:
                 "Ask for more, or name what matters (of=…).",
             )  # fmt: skip
         return best
+
+    def _least(self) -> float:
+        """What a step would take, s, if every effect took as little as it ever did."""
+        each: dict[str, float] = {}
+        for t in self.tries.values():
+            steps = round(WINDOW * self.probe.dt / (t.settings.dt or self.probe.dt))
+            share = t.seconds / max(1e-9, sum(t.spent.values())) / steps
+            for name, spent in t.spent.items():
+                each[name] = min(each.get(name, math.inf), share * spent)
+        return sum(each.values())
 
     def _at(self, steps: int) -> Try | None:
         """The loosest knobs in a window of so many steps that hold the error; None where the tightest do not."""
