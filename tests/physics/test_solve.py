@@ -161,6 +161,27 @@ def test_unilateral_solve_against_a_general_minimiser(seed, lower):
     assert pushing_energy(p)(y.ravel())[0] <= found.fun + 1e-12
 
 
+@pytest.mark.parametrize("lower", [WIDE, -0.05])
+@pytest.mark.parametrize("degrees", [4, 7])
+@pytest.mark.parametrize("seed", range(4))
+def test_contacts_that_just_touch_do_not_take_turns(seed, degrees, lower, dtype, device):
+    """Nearly hard contacts of which many just touch: the overlapping ones, once solved for, drive the others in, and those, once solved for, drive
+    the first ones back. The solve to 1 % gets there all the same, within the iterations that any solve has.
+
+    What is minimised is then within 1e-3 of what it was at rest from its least: (1 %)², ten times over since residuals are judged cell by cell.
+    """
+    p = Problem.random(seed, [30, 12], degrees, lower=lower)
+    touching = np.random.default_rng(seed).uniform(size=len(p.gap)) < 0.6
+    p = Problem(**{**vars(p), "gap": np.where(touching, 0.0, p.gap), "alpha": np.full(42, 1e-3)})
+    y, report = p.solved(True, tolerance=0.01, dtype=dtype, device=device)
+    assert (report.status == CONVERGED).all(), (report.iterations, report.residual)
+    exact, best = p.solved(True, tolerance=1e-6)
+    assert (best.status == CONVERGED).all()
+    at_rest, left, least = (pushing_energy(p)(at.ravel())[0] for at in (0 * y, y, exact))
+    assert left - least <= 1e-3 * at_rest
+    assert least < 0.01 * at_rest, "contacts must be hard enough to be cleared"
+
+
 @MODES
 def test_force_already_spent_is_not_spent_again(unilateral):
     """Rows whose force `held` has acted in an earlier pass: the minimum is that of the function with their work added."""
@@ -178,8 +199,8 @@ def test_force_already_spent_is_not_spent_again(unilateral):
 
 @MODES
 def test_reported_residual_is_the_true_one(unilateral, dtype, device):
-    """Recomputed here: the worst preconditioned residual of each colony relative to the worst at rest, over the free degrees of freedom.
-    float32 sums of twenty terms: 1e-5 of the start.
+    """Recomputed here: the worst residual of each colony, preconditioned by the rows that act, relative to the worst at rest, over the free
+    degrees of freedom. float32 sums of twenty terms: 1e-5 of the start.
     """
     p = Problem.random(6, [15, 10], 7)
     y, report = p.solved(unilateral, tolerance=1e-3, dtype=dtype, device=device)
@@ -188,12 +209,12 @@ def test_reported_residual_is_the_true_one(unilateral, dtype, device):
     active = left < 0 if unilateral else np.ones(len(left), dtype=bool)
     start = p.gap < 0 if unilateral else np.ones(len(left), dtype=bool)
 
-    def preconditioned(slope):
-        blocks = (j * start[:, None]).reshape(len(j), len(p.scale), 7)
+    def preconditioned(slope, acting):
+        blocks = (j * acting[:, None]).reshape(len(j), len(p.scale), 7)
         return np.stack([np.linalg.solve(b.T @ b + a * np.eye(7), s) for b, a, s in zip(blocks.transpose(1, 0, 2), p.alpha, slope, strict=True)])
 
-    worst = np.abs(preconditioned((p.weight * y.ravel() - j.T @ (left * active)).reshape(y.shape))).max(1)
-    rest = np.abs(preconditioned((-j.T @ np.minimum(p.gap, 0)).reshape(y.shape))).max(1)
+    worst = np.abs(preconditioned((p.weight * y.ravel() - j.T @ (left * active)).reshape(y.shape), active)).max(1)
+    rest = np.abs(preconditioned((-j.T @ np.minimum(p.gap, 0)).reshape(y.shape), start)).max(1)
     for colony in range(2):
         expected = worst[p.colony == colony].max() / rest[p.colony == colony].max()
         assert float(report.residual[colony]) == pytest.approx(expected, rel=1e-3, abs={torch.float32: 1e-5, torch.float64: 1e-12}[dtype])
