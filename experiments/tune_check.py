@@ -1,10 +1,10 @@
 """Does `tune` hold what it promises? On every ready-made scene: the error of the chosen settings in a run that it has not seen, and what a wider sweep finds.
 
     OMP_NUM_THREADS=1 python experiments/tune_check.py                         # some twenty minutes; writes its part of docs/accuracy.md, and a CSV
-    OMP_NUM_THREADS=1 python experiments/tune_check.py --scene channel --error 3% --page ''
+    OMP_NUM_THREADS=1 python experiments/tune_check.py --scene channel --error 3%
 
 The runs that it has not seen have other seeds and begin with half as many cells again. Of a sweep of six steps with six settings of contacts and two
-tolerances of circuits, the cheapest that holds the error in both runs is timed in turn with the chosen one: what that one takes over what the sweep's takes
+tolerances of circuits, the cheapest that holds the error in both runs is timed beside the chosen one: what that one takes over what the sweep's takes
 is the last column.
 """
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -54,7 +55,7 @@ class Run:
     def errors(self, settings: tf.Settings, names: Sequence[str]) -> dict[str, float]:
         """By observable."""
         seen, _, _ = self.probe.observed(settings, self.steps(settings))
-        return self.probe.errors({n: seen[n] for n in names if n in seen}, self.reference)
+        return self.probe.errors(seen, {n: self.reference[n] for n in names})
 
     def steps(self, settings: tf.Settings) -> int:
         """Of the window."""
@@ -62,7 +63,7 @@ class Run:
 
     def seconds(self, settings: tf.Settings) -> float:
         """The least of three."""
-        return min(self.probe.window(settings, self.steps(settings))[1] for _ in range(3))
+        return min(self.probe.window(settings, self.steps(settings))[2] for _ in range(3))
 
 
 def sweep(run: Run) -> list[tf.Settings]:
@@ -85,12 +86,15 @@ def check(name: str, error: float) -> dict[str, str]:
     holding = [s for s in tried if max(runs[0].errors(s, names).values()) <= error]
     # of so many settings some hold it by luck in one run
     both = [s for s in holding if max(runs[1].errors(s, names).values()) <= error]
-    best = min(both, key=runs[0].seconds, default=tuned.settings)
+    best = min(both, key=runs[0].seconds, default=None)
     words = lambda s: ", ".join(f"{n} {v:g}" for n, v in s.given.items())  # noqa: E731
-    told = (
-        name, words(tuned.settings), f"{100 * max(e[worst] for e in errors):.2f} %", worst, words(best),
-        f"{100 * max(max(run.errors(best, names).values()) for run in runs):.2f} %", str(len(tried)), str(len(both)),
+    of_best = ("none", "", "") if best is None else (
+        words(best), f"{100 * max(max(run.errors(best, names).values()) for run in runs):.2f} %",
         f"{runs[0].seconds(tuned.settings) / runs[0].seconds(best):.2f}",
+    )  # fmt: skip
+    told = (
+        name, words(tuned.settings), f"{100 * max(e.get(worst, math.inf) for e in errors):.2f} %", worst, *of_best[:2],
+        str(len(tried)), str(len(both)), of_best[2],
     )  # fmt: skip
     return dict(zip(COLUMNS, told, strict=True))
 
@@ -99,8 +103,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", action="append", choices=tuple(tf.scenes.READY), help="one scene; may be given again")
     parser.add_argument("--error", default="1%")
-    parser.add_argument("--out", type=Path, default=HERE / "benchmarks" / "accuracy" / "tune.csv")
-    parser.add_argument("--page", default=str(HERE.parent / "docs" / "accuracy.md"), help="page whose table is written anew; '' for none")
+    parser.add_argument("--out", type=Path, help="CSV; by default the one beside the benchmarks, and with --scene none")
+    parser.add_argument("--page", type=Path, help="page whose table is written anew; by default docs/accuracy.md, and with --scene none")
     chosen = parser.parse_args()
     tf.keep_memory()
     torch.set_grad_enabled(False)
@@ -108,16 +112,20 @@ def main() -> None:
     for name in chosen.scene or tf.scenes.READY:
         rows.append(check(name, error))
         print(rows[-1], flush=True)
-    chosen.out.parent.mkdir(parents=True, exist_ok=True)
-    with chosen.out.open("w", newline="") as file:
-        table = csv.DictWriter(file, COLUMNS)
-        table.writeheader()
-        table.writerows(rows)
-    if chosen.page:
+    out, page = chosen.out, chosen.page
+    if not chosen.scene:
+        out, page = out or HERE / "benchmarks" / "accuracy" / "tune.csv", page or HERE.parent / "docs" / "accuracy.md"
+    if out:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with out.open("w", newline="") as file:
+            table = csv.DictWriter(file, COLUMNS)
+            table.writeheader()
+            table.writerows(rows)
+    if page:
         noted = machine()
         lines = ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|", *("| " + " | ".join(r.values()) + " |" for r in rows)]
         how = f"Asked for {chosen.error}. Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']}, {noted['threads']} thread(s)."
-        write_page(Path(chosen.page), "\n".join([how, "", *lines]), "tune: experiments/tune_check.py")
+        write_page(page, "\n".join([how, "", *lines]), "tune: experiments/tune_check.py")
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def test_it_says_what_it_chose_and_why(colony):
     assert set(colony.parts) == {"step", "contacts"} and colony.settings.rtol is None
     assert all(t.seconds >= colony.chosen.seconds for t in colony.tries if t.worst <= AIM * 0.02 and t is not colony.own)
     told = str(colony)
-    for words in (f"dt {colony.settings.dt:g} h", f"passes {colony.settings.passes}", "2 % in", "the reference's own", "settings were run"):
+    for words in (f"dt {colony.settings.dt:g} h", f"tolerance {colony.settings.tolerance:g}", "2 % in", "the reference's own", "settings were run"):
         assert words in told
     assert colony.scene.accuracy == colony.settings.given and colony.scene.dt == colony.settings.dt
 
@@ -80,7 +80,22 @@ def test_molecules_are_probed_by_their_mean():
     reactions = [tf.parts.constitutive("m", 5.0), tf.parts.degradation("m", 2.0)]
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Circuit(reactions, species="m", method="tau_leap"), dt=0.05)
     tuned = tf.tune(scene, 0.05, cells=8, colonies=2)
-    assert tuned.chosen.errors["m"] < 0.05
+    assert tuned.chosen.errors["m"] < 0.05 and tuned.settings.rtol is None and "circuits" not in tuned.parts
+    assert [e.method for e in tuned.scene.listed if isinstance(e, tf.Circuit)] == ["tau_leap"]
+
+
+def test_founders_that_are_as_many_as_asked_for_are_the_start():
+    cells = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0], [1.0, 0.0]])
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), founders=cells, dt=0.05)
+    assert tf.tune(scene, 0.05, cells=2, colonies=2).cells == 4
+
+
+def test_settings_with_which_a_colony_fails_are_not_chosen():
+    """Euler's method is unstable in steps over 2/200 h, and below zero soon: the step is finer, though all that is asked for is the volume."""
+    stiff = tf.Circuit(lambda u, s, p, cell: {"m": 400.0 - 200.0 * u.m}, species=("m",), method="euler")
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), stiff, dt=0.005)
+    tuned = tf.tune(scene, 0.05, cells=2, colonies=2, of=["volume"])
+    assert tuned.settings.dt < 0.02 and any(math.isinf(t.worst) for t in tuned.tries)
 
 
 def test_what_cannot_be_held_or_told_is_said():
@@ -101,7 +116,7 @@ def test_what_makes_no_sense_is_refused(wrong, words):
 def test_observables_of_a_known_state():
     cells = tf.Cells([[0.0, 0.0], [0.0, 0.9]], [[1.0, 0.0], [1.0, 0.0]], [2.0, 2.0], [0.5, 0.5])
     scene = tf.Scene(
-        tf.Growth(rate=1.0), tf.Circuit(made, species=("m",), k=1.0, initial={"m": 3.0}),
+        tf.Growth(rate=1.0), tf.Mechanics(dim=2), tf.Circuit(made, species=("m",), k=1.0, initial={"m": 3.0}),
         tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=2.0), box=((-8.0, -8.0), (8.0, 8.0)), spacing=4.0), founders=cells,
     )  # fmt: skip
     found = observables(scene.seed(2, dtype=F64))

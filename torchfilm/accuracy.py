@@ -100,7 +100,7 @@ class Settings:
 # By name: the step as a part of the scene's own, and the other knobs. Their places on the fronts are in docs/accuracy.md: a step much longer than a
 # draft's makes cells of usual growth take sub-steps, which cost more than they save.
 PRESETS: dict[str, tuple[float, Settings]] = {
-    "draft": (1.6, Settings(penalty=0.1, passes=1, tolerance=0.2, rtol=1e-2)),
+    "draft": (1.6, Settings(penalty=0.1, tolerance=0.2, rtol=1e-2)),
     "standard": (1.0, Settings()),
     "reference": (0.125, Settings(penalty=0.03, passes=4, tolerance=1e-3, rtol=1e-6)),
 }

@@ -24,7 +24,7 @@ from torchfilm.effects.circuit import DIRECT, LEAP, STIFF, Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import COARSE_PASSES, PENALTY, TOLERANCE, Mechanics
-from torchfilm.effects.medium import BLOCK, Cover, Medium
+from torchfilm.effects.medium import BLOCK, Cover, FirstHalf, Medium
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
@@ -150,6 +150,11 @@ def _(effect: Cover, state: State, dt: float) -> list[str]:
 
 
 @how.register
+def _(effect: FirstHalf, state: State, dt: float) -> list[str]:
+    return ["of signals through the first half of the step, before the cells"]
+
+
+@how.register
 def _(effect: Circuit, state: State, dt: float) -> list[str]:
     said = {
         STIFF: f"stiff solver (Rodas3), each cell in steps of its own: error at most {effect.atol:g} + {effect.rtol:g}·|u| in each; nothing below 0",
@@ -187,7 +192,7 @@ def _accuracy(effect: Mechanics) -> str:
     """The tolerance of the solve in words."""
     if effect.tolerance is not None:
         return f"{effect.tolerance:g}"
-    return f"{TOLERANCE:g} (default" + ("" if effect.alpha is None else f"; less where α·γ is below {PENALTY:g}") + ")"
+    return f"{TOLERANCE:g} (default" + ("" if effect.alpha is None and effect.stiffness is None else f"; less where α·γ is below {PENALTY:g}") + ")"
 
 
 def transport(medium: Medium, name: str) -> tuple[str, str]:

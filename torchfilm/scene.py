@@ -183,7 +183,12 @@ class Scene:
     def couplings(self) -> list[tuple[str, str, str]]:
         """Who drives whom: (writer, name, reader) for every name that one effect writes and another reads."""
         return [
-            (w.title, name, r.title) for w in self.effects for r in self.effects if w is not r for name in w.writes() if name in r.reads() or name in r.needs()
+            (w.title, name, r.title)
+            for w in self.effects
+            for r in self.effects
+            if w.title != r.title
+            for name in w.writes()
+            if name in r.reads() or name in r.needs()
         ]
 
     def listing(self) -> list[str]:

@@ -56,7 +56,7 @@ AIM = 0.6
 
 @dataclass(frozen=True)
 class Try:
-    """One setting that was run: its errors by observable, and what its window took, s, in all and by effect."""
+    """One setting that was run: its errors by observable, and what its window took, s, in all (on the CPU of the thread that ran it) and by effect."""
 
     settings: Settings
     errors: dict[str, float]
@@ -98,28 +98,31 @@ class Tuned:
 class Probe:
     """Where all windows begin, and what they are compared with."""
 
-    scene: Scene
+    given: Scene
+    scene: Scene  # as it is probed: molecules by their mean
     start: State
     dt: float
     of: tuple[str, ...] | None
 
-    def window(self, settings: Settings, steps: int) -> tuple[list[State], float, dict[str, float]]:
-        """The states in the middle and at the end of the window in so many steps, the seconds it took, and those of each effect."""
+    def window(self, settings: Settings, steps: int) -> tuple[list[State], bool, float, dict[str, float]]:
+        """The states in the middle and at the end of the window in so many steps, whether a colony failed, the seconds it took, and those of each effect."""
         made = settings.apply(self.scene)
-        dt, state, seen, timings = self.dt * WINDOW / steps, self.start, [], Timings()
-        begun = time.thread_time()  # what other work on the machine takes does not count
+        dt, state, seen, timings, broken = self.dt * WINDOW / steps, self.start, [], Timings(), False
+        # what other work on the machine takes does not count, where the work is this thread's own
+        clock = time.thread_time if state.device.type == "cpu" else time.perf_counter
+        begun = clock()
         for k in range(steps):
             state = made.step(state, dt, timings)
+            broken = broken or any(bool((r.status != 0).any()) for r in state.reports.values())
             if 2 * (k + 1) % steps == 0:
                 seen.append(state)
-        return seen, time.thread_time() - begun, timings.seconds
+        return seen, broken, clock() - begun, timings.seconds
 
     def observed(self, settings: Settings, steps: int) -> tuple[dict[str, list[Tensor]], float, dict[str, float]]:
-        """What is read off in the middle and at the end, by observable; a colony that failed makes them NaN."""
-        states, seconds, spent = self.window(settings, steps)
+        """What is read off in the middle and at the end, by observable; NaN if a colony failed."""
+        states, broken, seconds, spent = self.window(settings, steps)
         found: dict[str, list[Tensor]] = {}
         for state in states:
-            broken = any(bool((r.status != 0).any()) for r in state.reports.values())
             for name, value in (observables(state) | self.due(state)).items():
                 if self.of is None or name in self.of:
                     found.setdefault(name, []).append(value * math.nan if broken else value)
@@ -132,16 +135,18 @@ class Probe:
                 state = effect.step(state, self.dt)
         return {"cells": torch.tensor([float(max(1, state.cells))], dtype=torch.float64)}
 
-    def errors(self, found: dict[str, list[Tensor]], against: dict[str, list[Tensor]]) -> dict[str, float]:
-        """By observable, the greater of the errors in the middle and at the end."""
+    def errors(self, found: dict[str, list[Tensor]], against: dict[str, list[Tensor]], apart: bool = False) -> dict[str, float]:
+        """By observable of `against`, the greater of the errors in the middle and at the end; infinite where it is not found.
+
+        apart: of two runs of which neither is right, so that overlaps, too, are compared and not told."""
         soft = any(isinstance(e, Mechanics) and e.stiffness is not None for e in self.scene.listed)
         first = observables(self.start)
         out = {}
-        for name, values in found.items():
-            worst = 0.0
-            for value, right in zip(values, against[name], strict=True):
+        for name, rights in against.items():
+            values, worst = found.get(name, []), 0.0
+            for value, right in zip(values, rights, strict=False):
                 if name == "overlap" and not soft:
-                    error = float(value.max())
+                    error = float((value - right).abs().max() if apart else value.max())
                 elif name.startswith(SIGNAL):
                     error = float(((value - right) / right).abs().max())
                 elif name == "volume":
@@ -149,18 +154,18 @@ class Probe:
                 else:
                     error = float((value - right).norm() / right.norm().clamp(min=1e-30))
                 worst = max(worst, math.inf if math.isnan(error) else error)
-            out[name] = worst
+            out[name] = worst if len(values) == len(rights) else math.inf
         return out
 
 
 def observables(state: State) -> dict[str, Tensor]:
     """What is read off a state of a batch: numbers by name, (k,) float64 each. Species and signals that are 0 everywhere are left out."""
     cells = max(1, state.cells)
-    diameter = 2 * float(state.radius.double().mean())
-    found = measure.overlaps(state)
-    overlap = (found.mean.double() * found.count).sum() / found.count.sum().clamp(min=1) / diameter
     one = lambda *x: torch.stack([torch.as_tensor(v, dtype=torch.float64).cpu() for v in x])  # noqa: E731
-    out = {"cells": one(cells), "volume": one(state.volume.double().sum()), "overlap": one(overlap)}
+    out = {"cells": one(cells), "volume": one(state.volume.double().sum())}
+    if "displacement" in state.fields:  # cells that do not push each other have no overlap to speak of
+        found, diameter = measure.overlaps(state), 2 * float(state.radius.double().mean())
+        out["overlap"] = one((found.mean.double() * found.count).sum() / found.count.sum().clamp(min=1) / diameter)
     if int(state.counts.min()) >= 2:
         out["radius"] = one(measure.colony_radius(state).double().mean())
     for name in _species(state):
@@ -189,7 +194,7 @@ def tune(
     cells: in each of `colonies` colonies (or as many as the scene's parameters are for) where the probe begins; a scene that stays smaller is taken as it
     is after 2,000 steps. of: names of the observables that matter, by default all: "cells", "volume", "radius", "overlap", species, "signal NAME". Circuits
     that run molecule by molecule are probed by their smooth mean, since noise is no error. Raises InputError where nothing holds the error, or
-    where the probe cannot tell it.
+    where the probe cannot tell it; SimulationError where the scene fails on the way to where the probe begins.
     """
     checks.number("error", error, above=0.0, most=0.5)
     for name, given in (("cells", cells), ("colonies", colonies)):
@@ -197,9 +202,10 @@ def tune(
             raise checks.refuse(name, given, "a whole number from 1")
     probe = begin(scene, cells, colonies, of, seed, device)
     if of is not None:
+        known = list(dict.fromkeys([*observables(probe.start), *_species(probe.start), *(SIGNAL + n for n in probe.start.signals)]))
         for name in of:
-            if name not in observables(probe.start):
-                raise checks.refuse("of", name, "among " + ", ".join(observables(probe.start)))
+            if name not in known:
+                raise checks.refuse("of", name, "among " + ", ".join(known))
     return Search(probe, error).run()
 
 
@@ -210,8 +216,8 @@ def begin(scene: Scene, cells: int, colonies: int, of: Sequence[str] | None = No
     made = scene.retuned(smooth, scene.dt, scene.accuracy)
     fixed = scene.fixed_colonies
     state = made.seed(fixed if fixed > 1 else colonies, seed=seed, device=device)
-    run = simulate(made, state, cells=cells, until=MOST_STEPS * scene.dt) if cells > 1 else iter(())
-    return Probe(made, deque(run, maxlen=1).pop() if cells > 1 else state, scene.dt, None if of is None else tuple(of))
+    ends = deque(simulate(made, state, cells=cells, until=MOST_STEPS * scene.dt), maxlen=1)
+    return Probe(scene, made, ends[0] if ends else state, scene.dt, None if of is None else tuple(of))
 
 
 class Search:
@@ -220,7 +226,7 @@ class Search:
     def __init__(self, probe: Probe, error: float):
         self.probe, self.error, self.aim = probe, error, AIM * error
         self.mechanics = next((e for e in probe.scene.listed if isinstance(e, Mechanics)), None)
-        self.circuit = next((e for e in probe.scene.listed if isinstance(e, Circuit) and e.method == STIFF), None)
+        self.circuit = next((e for e in probe.given.listed if isinstance(e, Circuit) and e.method == STIFF), None)
         self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
         self.rtols = CIRCUITS if self.circuit is not None else (TIGHT_CIRCUITS,)
         self.tries: dict[Settings, Try] = {}
@@ -233,16 +239,17 @@ class Search:
         least = 0 if mechanics is None else (mechanics.dim - 1) * (2 if mechanics.unilateral else 1)
         return Settings(
             dt=self.probe.dt * WINDOW / steps, rtol=None if self.circuit is None else rtol, tolerance=None if mechanics is None else tolerance,
-            passes=None if mechanics is None else least + more, penalty=None if mechanics is None or mechanics.stiffness is not None else penalty,
+            passes=None if mechanics is None or more == 0 else least + more, penalty=None if mechanics is None or mechanics.stiffness is not None else penalty,
         )  # fmt: skip
 
     @torch.no_grad()
     def run(self) -> Tuned:
         probe = self.probe
         tight = [probe.observed(self.settings(n, TIGHT_CONTACTS, TIGHT_CIRCUITS), n)[0] for n in (FINEST, FINEST // 2)]
-        self.unsure = probe.errors(tight[1], tight[0])
+        self.unsure = probe.errors(tight[1], tight[0], apart=True)
         # the coarser reference is off by twice as much as the finer is: their difference is the finer's own error
-        left_out = {n: f"two references differ by {_percent(e)}" for n, e in self.unsure.items() if e > self.error / 2}
+        said = lambda e: "a reference failed" if math.isinf(e) else f"two references differ by {_percent(e)}"  # noqa: E731
+        left_out = {n: said(e) for n, e in self.unsure.items() if e > self.error / 2}
         self.reference = {n: v for n, v in tight[0].items() if n not in left_out}
         if not self.reference:
             worst = ", ".join(f"{n} {why}" for n, why in left_out.items())
@@ -250,29 +257,27 @@ class Search:
         best = self._cheapest()
         own = self._try(Settings(), WINDOW)
         return Tuned(
-            best.settings.apply(self.probe.scene), best.settings, self.error, best, own, self._parts(best), self.unsure, left_out,
+            best.settings.apply(self.probe.given), best.settings, self.error, best, own, self._parts(best), self.unsure, left_out,
             list(self.tries.values()), probe.dt * WINDOW, probe.start.cells,
         )  # fmt: skip
 
     def _try(self, settings: Settings, steps: int) -> Try:
         if settings not in self.tries:
             found, seconds, spent = self.probe.observed(settings, steps)
-            self.seen[settings] = found = {n: v for n, v in found.items() if n in self.reference}
+            self.seen[settings] = found
             self.tries[settings] = Try(settings, self.probe.errors(found, self.reference), seconds, spent)
         return self.tries[settings]
 
     def _cheapest(self) -> Try:
         """Of every step that is fine enough, the loosest knobs that hold the error; of these, the one that took the least time."""
         best: Try | None = None
-        closest: Try | None = None
         for steps in STEPS:
             if best is not None and steps * self._least() > best.seconds:
                 break
             found = self._at(steps)
             if found is None:
                 continue
-            closest = found if closest is None or found.worst < closest.worst else closest
-            if found.worst <= self.aim and (best is None or found.seconds < best.seconds):
+            if best is None or found.seconds < best.seconds:
                 best = found
         if best is None:
             closest = min(self.tries.values(), key=lambda t: t.worst)
@@ -319,7 +324,7 @@ class Search:
 
     def _difference(self, best: Try, other: Settings, steps: int) -> dict[str, float]:
         self._try(other, steps)
-        found = self.probe.errors(self.seen[best.settings], self.seen[other])
+        found = self.probe.errors(self.seen[best.settings], {n: v for n, v in self.seen[other].items() if n in self.reference})
         if "overlap" in found:
             found["overlap"] = max(0.0, best.errors["overlap"] - self.tries[other].errors["overlap"])
         return found
@@ -355,7 +360,8 @@ def _knob(knob: str, s: Settings) -> str:
     if knob == "circuits":
         return f"rtol {s.rtol:g}"
     penalty = "" if s.penalty is None else f"penalty α·γ {s.penalty:g}, "
-    return f"{penalty}passes {s.passes}, tolerance {s.tolerance:g}"
+    passes = "" if s.passes is None else f"passes {s.passes}, "
+    return f"{penalty}{passes}tolerance {s.tolerance:g}"
 
 
 def _words(settings: Settings) -> str:

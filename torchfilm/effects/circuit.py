@@ -152,15 +152,16 @@ class Circuit(Effect):
 
     def solved_to(self, rtol: float) -> Circuit:
         """The same circuit to another relative tolerance."""
-        return self._with("rtol", checks.number("Circuit.rtol", rtol, above=0.0, most=0.1))
+        return self._with(rtol=checks.number("Circuit.rtol", rtol, above=0.0, most=0.1))
 
     def smooth(self) -> Circuit:
         """The same circuit by the stiff solver: of reactions that run molecule by molecule, the mean that many molecules come to."""
-        return self._with("method", STIFF)
+        return self._with(method=STIFF, daughters="amount")
 
-    def _with(self, name: str, value: object) -> Circuit:
+    def _with(self, **changes: object) -> Circuit:
         changed = copy.copy(self)
-        object.__setattr__(changed, name, value)
+        for name, value in changes.items():
+            object.__setattr__(changed, name, value)
         object.__setattr__(changed, "noted", Noted())
         return changed
 
