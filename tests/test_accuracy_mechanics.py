@@ -117,7 +117,7 @@ def test_a_choice_says_what_a_user_would_type():
     assert turned.words == "dt=0.05, alpha=0.003, tolerance=0.02, unilateral=True, float64"
     scene = tf.scenes.microcolony(dim=2)
     draft, settings = mechanics.Choice.of_preset("draft", scene), tf.preset("draft", scene)
-    assert draft.words == f"preset draft: dt={settings.dt:g}, alpha=0.01, passes={settings.passes}, tolerance={settings.tolerance:g}"
+    assert draft.words == f"preset draft: dt={settings.dt:g}, alpha=0.01, tolerance={settings.tolerance:g}"
     assert draft.scene(scene).dt == settings.dt and mechanics.mechanics_of(settings.apply(scene)) == draft.mechanics
     made = turned.scene(scene)
     assert made.dt == 0.05 and mechanics.mechanics_of(made) == turned.mechanics and len(made.listed) == len(scene.listed)

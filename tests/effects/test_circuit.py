@@ -281,9 +281,8 @@ def lux(u, s, p, cell):
 
 
 def test_halving_the_step():
-    """Cells and transport take turns. What cells hold is of first order, since through a step each has a pool of its own, and so is the signal where
-    all of transport comes last ("lie"). With half of it before the cells the signal is left with what the cells' error does to it. Fixed cells, against a
-    step 16 times the smallest."""
+    """Cells and transport take turns. What cells that meet no others hold is of second order, and so is the signal with half of transport before them; where
+    all of it comes last ("lie") the signal is of first. Fixed cells, against a step of a sixteenth of the smallest."""
     cells, signal = {}, {}
     for splitting in ("lie", "strang"):
         ends = {}
@@ -294,10 +293,10 @@ def test_halving_the_step():
             state = advance(scene, scene.seed(dtype=F64), steps, 1.0 / steps)
             ends[steps] = torch.cat([state.luxi, state.ahl]), state.signals["ahl"]
         cells[splitting], signal[splitting] = ([float((ends[n][k] - ends[512][k]).abs().max()) for n in (8, 16, 32)] for k in (0, 1))
-    # the reference is off by a part 1/16 of the smallest error: ratios of 2 come out as up to 2.15, and as less where the next order still shows
-    for errors in (*cells.values(), signal["lie"]):
-        assert all(1.7 <= a / b <= 2.3 for a, b in itertools.pairwise(errors)), errors
-    # what cells give is late by half a step, which "strang" takes away
+    # the reference is off by 1/16 of the smallest error or less: ratios of 2 come out as up to 2.15, and all as less where the next order still shows
+    assert all(1.7 <= a / b <= 2.3 for a, b in itertools.pairwise(signal["lie"])), signal
+    for errors in (*cells.values(), signal["strang"]):
+        assert all(3.0 <= a / b <= 4.6 for a, b in itertools.pairwise(errors)), errors
     assert all(5 * s < e for s, e in zip(signal["strang"], signal["lie"], strict=True)), signal
 
 
