@@ -24,7 +24,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from torchfilm.cli_ask import parse_error
-from torchfilm.tune import FINEST, TIGHT_CIRCUITS, TIGHT_CONTACTS, WINDOW, Probe, Search, begin
+from torchfilm.tune import FINEST, TIGHT_CIRCUITS, TIGHT_CONTACTS, Probe, Search, begin
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "benchmarks"))
@@ -50,20 +50,16 @@ class Run:
     def of(scene: tf.Scene, seed: int) -> Run:
         probe = begin(scene, cells=150, colonies=6, seed=seed)
         search = Search(probe, 0.01)
-        return Run(probe, search, probe.observed(search.settings(FINEST, TIGHT_CONTACTS, TIGHT_CIRCUITS), FINEST)[0])
+        return Run(probe, search, probe.observed(search.settings(FINEST, TIGHT_CONTACTS, TIGHT_CIRCUITS))[0])
 
     def errors(self, settings: tf.Settings, names: Sequence[str]) -> dict[str, float]:
         """By observable."""
-        seen, _, _ = self.probe.observed(settings, self.steps(settings))
+        seen, _, _ = self.probe.observed(settings)
         return self.probe.errors(seen, {n: self.reference[n] for n in names})
-
-    def steps(self, settings: tf.Settings) -> int:
-        """Of the window."""
-        return round(self.probe.dt * WINDOW / (settings.dt or self.probe.dt))
 
     def seconds(self, settings: tf.Settings) -> float:
         """The least of three."""
-        return min(self.probe.window(settings, self.steps(settings))[2] for _ in range(3))
+        return min(self.probe.window(settings)[2] for _ in range(3))
 
 
 def sweep(run: Run) -> list[tf.Settings]:

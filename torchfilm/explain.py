@@ -122,7 +122,7 @@ def _(effect: Mechanics, state: State, dt: float) -> list[str]:
     elif effect.alpha is not None:
         kind = f"hard by a penalty, α = {_number(effect.alpha)}"
     else:
-        kind = f"hard by a penalty, α = 0.1/γ = {_number(0.1 / torch.as_tensor(effect.length_drag))} (default)"
+        kind = f"hard by a penalty, α = {PENALTY:g}/γ = {_number(PENALTY / torch.as_tensor(effect.length_drag))} (default)"
     mode = "unilateral, they only push" if effect.unilateral else "bilateral, an overlapping pair is held until the next pass"
     times = effect.most_passes
     lines = [

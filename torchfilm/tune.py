@@ -104,9 +104,13 @@ class Probe:
     dt: float
     of: tuple[str, ...] | None
 
-    def window(self, settings: Settings, steps: int) -> tuple[list[State], bool, float, dict[str, float]]:
-        """The states in the middle and at the end of the window in so many steps, whether a colony failed, the seconds it took, and those of each effect."""
-        made = settings.apply(self.scene)
+    def steps(self, settings: Settings) -> int:
+        """Into how many steps the window is divided."""
+        return round(WINDOW * self.dt / (settings.dt or self.dt))
+
+    def window(self, settings: Settings) -> tuple[list[State], bool, float, dict[str, float]]:
+        """The states in the middle and at the end of the window, whether a colony failed, the seconds it took, and those of each effect."""
+        made, steps = settings.apply(self.scene), self.steps(settings)
         dt, state, seen, timings, broken = self.dt * WINDOW / steps, self.start, [], Timings(), False
         # what other work on the machine takes does not count, where the work is this thread's own
         clock = time.thread_time if state.device.type == "cpu" else time.perf_counter
@@ -118,9 +122,9 @@ class Probe:
                 seen.append(state)
         return seen, broken, clock() - begun, timings.seconds
 
-    def observed(self, settings: Settings, steps: int) -> tuple[dict[str, list[Tensor]], float, dict[str, float]]:
+    def observed(self, settings: Settings) -> tuple[dict[str, list[Tensor]], float, dict[str, float]]:
         """What is read off in the middle and at the end, by observable; NaN if a colony failed."""
-        states, broken, seconds, spent = self.window(settings, steps)
+        states, broken, seconds, spent = self.window(settings)
         found: dict[str, list[Tensor]] = {}
         for state in states:
             for name, value in (observables(state) | self.due(state)).items():
@@ -236,16 +240,16 @@ class Search:
         """As knobs of the scene; those of effects that it does not list stay unset."""
         penalty, more, tolerance = contacts
         mechanics = self.mechanics
-        least = 0 if mechanics is None else (mechanics.dim - 1) * (2 if mechanics.unilateral else 1)
         return Settings(
             dt=self.probe.dt * WINDOW / steps, rtol=None if self.circuit is None else rtol, tolerance=None if mechanics is None else tolerance,
-            passes=None if mechanics is None or more == 0 else least + more, penalty=None if mechanics is None or mechanics.stiffness is not None else penalty,
+            passes=None if mechanics is None or more == 0 else mechanics.usual_passes + more,
+            penalty=None if mechanics is None or mechanics.stiffness is not None else penalty,
         )  # fmt: skip
 
     @torch.no_grad()
     def run(self) -> Tuned:
         probe = self.probe
-        tight = [probe.observed(self.settings(n, TIGHT_CONTACTS, TIGHT_CIRCUITS), n)[0] for n in (FINEST, FINEST // 2)]
+        tight = [probe.observed(self.settings(n, TIGHT_CONTACTS, TIGHT_CIRCUITS))[0] for n in (FINEST, FINEST // 2)]
         self.unsure = probe.errors(tight[1], tight[0], apart=True)
         # the coarser reference is off by twice as much as the finer is: their difference is the finer's own error
         said = lambda e: "a reference failed" if math.isinf(e) else f"two references differ by {_percent(e)}"  # noqa: E731
@@ -255,15 +259,15 @@ class Search:
             worst = ", ".join(f"{n} {why}" for n, why in left_out.items())
             raise checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}: ask for more, or probe more colonies or cells.")
         best = self._cheapest()
-        own = self._try(Settings(), WINDOW)
+        own = self._try(Settings())
         return Tuned(
             best.settings.apply(self.probe.given), best.settings, self.error, best, own, self._parts(best), self.unsure, left_out,
             list(self.tries.values()), probe.dt * WINDOW, probe.start.cells,
         )  # fmt: skip
 
-    def _try(self, settings: Settings, steps: int) -> Try:
+    def _try(self, settings: Settings) -> Try:
         if settings not in self.tries:
-            found, seconds, spent = self.probe.observed(settings, steps)
+            found, seconds, spent = self.probe.observed(settings)
             self.seen[settings] = found
             self.tries[settings] = Try(settings, self.probe.errors(found, self.reference), seconds, spent)
         return self.tries[settings]
@@ -292,38 +296,36 @@ class Search:
         """What a step would take, s, if every effect took as little as it ever did."""
         each: dict[str, float] = {}
         for t in self.tries.values():
-            steps = round(WINDOW * self.probe.dt / (t.settings.dt or self.probe.dt))
-            share = t.seconds / max(1e-9, sum(t.spent.values())) / steps
+            share = t.seconds / max(1e-9, sum(t.spent.values())) / self.probe.steps(t.settings)
             for name, spent in t.spent.items():
                 each[name] = min(each.get(name, math.inf), share * spent)
         return sum(each.values())
 
     def _at(self, steps: int) -> Try | None:
         """The loosest knobs in a window of so many steps that hold the error; None where the tightest do not."""
-        if self._try(self.settings(steps, TIGHT_CONTACTS, TIGHT_CIRCUITS), steps).worst > self.aim:
+        if self._try(self.settings(steps, TIGHT_CONTACTS, TIGHT_CIRCUITS)).worst > self.aim:
             return None
         contacts, rtols = [*self.contacts, TIGHT_CONTACTS], [*self.rtols, TIGHT_CIRCUITS]
-        holds = lambda c, r: self._try(self.settings(steps, c, r), steps).worst <= self.aim  # noqa: E731
+        holds = lambda c, r: self._try(self.settings(steps, c, r)).worst <= self.aim  # noqa: E731
         m = next(k for k, c in enumerate(contacts) if holds(c, TIGHT_CIRCUITS))
         r = next(k for k, rtol in enumerate(rtols) if holds(TIGHT_CONTACTS, rtol))
         while not holds(contacts[m], rtols[r]):  # each is within the error alone; together they may not be
             m, r = (min(m + 1, len(contacts) - 1), r) if m < len(contacts) - 1 else (m, r + 1)
-        return self._try(self.settings(steps, contacts[m], rtols[r]), steps)
+        return self._try(self.settings(steps, contacts[m], rtols[r]))
 
     def _parts(self, best: Try) -> dict[str, dict[str, float]]:
         """By knob, what of each observable's error is gone when it alone is tight; for the step, what is left when all others are."""
-        steps = round(self.probe.dt * WINDOW / (best.settings.dt or self.probe.dt))
         s = best.settings
-        tight = self.settings(steps, TIGHT_CONTACTS, TIGHT_CIRCUITS)
-        parts = {"step": self._try(tight, steps).errors}
+        tight = self.settings(self.probe.steps(s), TIGHT_CONTACTS, TIGHT_CIRCUITS)
+        parts = {"step": self._try(tight).errors}
         if self.mechanics is not None:
-            parts["contacts"] = self._difference(best, dataclasses.replace(tight, rtol=s.rtol), steps)
+            parts["contacts"] = self._difference(best, dataclasses.replace(tight, rtol=s.rtol))
         if self.circuit is not None:
-            parts["circuits"] = self._difference(best, dataclasses.replace(s, rtol=tight.rtol), steps)
+            parts["circuits"] = self._difference(best, dataclasses.replace(s, rtol=tight.rtol))
         return parts
 
-    def _difference(self, best: Try, other: Settings, steps: int) -> dict[str, float]:
-        self._try(other, steps)
+    def _difference(self, best: Try, other: Settings) -> dict[str, float]:
+        self._try(other)
         found = self.probe.errors(self.seen[best.settings], {n: v for n, v in self.seen[other].items() if n in self.reference})
         if "overlap" in found:
             found["overlap"] = max(0.0, best.errors["overlap"] - self.tries[other].errors["overlap"])

@@ -134,7 +134,12 @@ class Mechanics(Effect):
     @property
     def most_passes(self) -> int:
         """`passes`, or its default for the dimension and the kind of contact."""
-        return self.passes if self.passes is not None else (self.dim - 1) * (2 if self.unilateral else 1)
+        return self.passes if self.passes is not None else self.usual_passes
+
+    @property
+    def usual_passes(self) -> int:
+        """The default of `passes`."""
+        return (self.dim - 1) * (2 if self.unilateral else 1)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (
