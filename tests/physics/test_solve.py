@@ -166,14 +166,15 @@ def test_unilateral_solve_against_a_general_minimiser(seed, lower):
 @pytest.mark.parametrize("seed", range(4))
 def test_contacts_that_just_touch_do_not_take_turns(seed, degrees, lower, dtype, device):
     """Nearly hard contacts of which many just touch: the overlapping ones, once solved for, drive the others in, and those, once solved for, drive
-    the first ones back. The solve to 1 % gets there all the same, within the iterations that any solve has.
+    the first ones back. The solve to 0.3 % gets there all the same, within the iterations that any solve has.
 
-    What is minimised is then within 1e-3 of what it was at rest from its least: (1 %)², ten times over since residuals are judged cell by cell.
+    What is minimised is then within 1e-3 of what it was at rest from its least: (0.3 %)², a hundred times over, since residuals are what cells would
+    move by alone, and contacts a thousand times as stiff as drag make them lean on one another.
     """
     p = Problem.random(seed, [30, 12], degrees, lower=lower)
     touching = np.random.default_rng(seed).uniform(size=len(p.gap)) < 0.6
     p = Problem(**{**vars(p), "gap": np.where(touching, 0.0, p.gap), "alpha": np.full(42, 1e-3)})
-    y, report = p.solved(True, tolerance=0.01, dtype=dtype, device=device)
+    y, report = p.solved(True, tolerance=0.003, dtype=dtype, device=device)
     assert (report.status == CONVERGED).all(), (report.iterations, report.residual)
     exact, best = p.solved(True, tolerance=1e-6)
     assert (best.status == CONVERGED).all()

@@ -10,23 +10,21 @@ from torch import Tensor
 
 from torchfilm.effect import MECHANICS, Effect, per_cell
 from torchfilm.physics import capsule
-from torchfilm.physics.contacts import Bodies, Contacts, find_contacts
+from torchfilm.physics.contacts import Bodies, Contacts, Touching, contacts_of
 from torchfilm.physics.neighbours import find_pairs
 from torchfilm.physics.rows import ContactRows
 from torchfilm.physics.solve import CONVERGED, NOT_FINITE, STATUS, TOO_FAST, ContactProblem, SolveReport, solve
-from torchfilm.physics.walls import Surface, Wall, WallContacts, find_wall_contacts
+from torchfilm.physics.walls import Surface, Wall, WallContacts, find_wall_contacts, share_to_walls
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
 
-# No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing. Where one would, the
-# whole colony's move is shortened, since other cells counted on that turn, but not below LEAST_SHARE of it: one bad cell must
-# not hold the rest for long. What still turns too far is cut, and counted.
+# No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing. One that would is moved by a part of its move, and
+# takes part in the next pass.
 MAX_TURN = 0.5
-LEAST_SHARE = 0.5
-# In a large colony in space some cell would always turn too far, and two shortened moves leave a quarter of every step's way
-# to go: as overlap that turns more cells. While more than MOST_LEFT of a move is left, up to twice as many passes are taken.
-MOST_LEFT = 0.2
+# What a pass leaves overlapping by more than DEEP radii is solved again in the next one, among all the others at rest. It is a few cells in a hundred, which
+# slip or turn; the others are as well off after one solve as contacts that give way let them be, and to solve for them again takes twice the time.
+DEEP = 0.2
 # Tolerance of the solve at the default penalty α γ. Overlaps hardly feel it, growth under pressure does: at 0.2 a tenth of what a colony grows is wrong, at
 # 0.05 a hundredth. The harder contacts are, the farther from rest is what moves with none of them at the same residual: a tolerance that falls as (α γ)^¼ is
 # enough from 0.1 down to 1e-6 (0.02 is needed at 0.01), and one that falls faster is out of reach of float32.
@@ -38,8 +36,8 @@ COARSE_PASSES, COARSE_OVERLAP = 6, 0.02
 @dataclass(frozen=True)
 class MechanicsReport:
     """What the last step's contact solves did, per colony (B,). `status` of the worst solve, `iterations` of CG in all, `residual` the
-    worst true one; `passes` and `substeps` taken; `limited`: cells that the last pass kept from turning further, `share`: how much of the
-    last pass's move was carried out (see MAX_TURN)."""
+    worst true one; `passes` and `substeps` taken; `limited`: cells whose last move was cut, since it turned them further than MAX_TURN or took them
+    through a wall."""
 
     status: Tensor
     iterations: Tensor
@@ -47,7 +45,6 @@ class MechanicsReport:
     passes: Tensor
     substeps: Tensor
     limited: Tensor
-    share: Tensor
     mend = "A smaller dt, a larger alpha or more max_iterations may help"
 
     def reason(self, place: int) -> str:
@@ -69,10 +66,11 @@ class Mechanics(Effect):
     converges to the motion of soft cells, where with α fixed it stiffens the contact. Each may be one number or one per colony.
     unilateral: contacts only push. False (default, the paper's least squares) also holds an overlapping pair that wants to part, until
     the next pass: measured, the overlap is the same or less, at half the CG iterations or fewer.
-    passes: at most this many times a step contacts are found and solved: again in colonies where the move made new contacts, or left an
-    overlap deeper than `overlap` (µm), or was cut short. Default 1 in the plane; 2 in space, where cells that are squeezed can slip past each other,
-    and up to 4 while the moves, cut short, leave more than a fifth of the way to go; twice as many for unilateral contacts, since a push at one
-    end may drive in the other; 6, down to 0.02 µm, for colonies that take sub-steps.
+    passes: at most this many times a step contacts are found and solved. The first solves for every cell, each later one for the cells that the move
+    left deeper than `overlap` or would have turned too far, among the others at rest. Default 1 in the plane; 2 in space, where cells that are squeezed
+    can slip past each other; twice as many for unilateral contacts, since a push at one end may drive in the other; 6, down to 0.02 µm, for colonies that
+    take sub-steps.
+    overlap: µm; default a fifth of a cell's radius, and where α γ is below 0.1 as much less.
     tolerance: of the solve, worst residual relative to the worst at rest; default 0.05, and where α γ is below 0.1, 0.05 · (α γ/0.1)^¼.
     max_iterations: CG iterations a solve.
     max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
@@ -206,9 +204,8 @@ class _Run:
         self.first_move = state.displacement
         count = state.colonies
         zero = torch.zeros(count, dtype=torch.int64, device=state.device)
-        self.limited = zero
-        self.share = self.left = torch.ones(count, dtype=state.dtype, device=state.device)
-        self.report = MechanicsReport(status, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero, self.share)
+        self.limited, self.cut = zero, torch.zeros_like(state.colony, dtype=torch.bool)
+        self.report = MechanicsReport(status, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero)
         start = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
         self.reference = state.position.detach().index_select(0, start).index_select(0, state.colony)
         drag_factor = state.fields.get("drag")
@@ -220,42 +217,44 @@ class _Run:
         # a step that needs sub-steps is a coarse one: unless told otherwise, it is looked at more closely
         coarse = substeps > 1
         self.passes = torch.where(coarse & (settings.passes is None), COARSE_PASSES, settings.most_passes)
-        self.most_passes = torch.where(~coarse & (settings.passes is None) & (state.dim == 3), 2 * self.passes, self.passes)
-        limit = torch.full_like(self.report.residual, torch.inf if settings.overlap is None else settings.overlap)
-        self.overlap = torch.where(coarse & (settings.overlap is None), COARSE_OVERLAP, limit).index_select(0, state.colony)
         if settings.stiffness is not None:
             self.alpha = 1.0 / (per_cell(settings.stiffness, state) * self.dt)
         elif settings.alpha is not None:
             self.alpha = per_cell(settings.alpha, state).expand(state.cells)
         else:
             self.alpha = (PENALTY / self.length_drag).expand(state.cells)
+        self.overlap = self._overlap(coarse.index_select(0, state.colony))
+
+    @torch.no_grad()
+    def _overlap(self, coarse: Tensor) -> Tensor:
+        """How deep a contact of each cell may be left, (N,) µm; coarse: (N,) bool, of a colony that takes sub-steps."""
+        if self.settings.overlap is not None:
+            return torch.full_like(self.state.radius, self.settings.overlap)
+        usual = DEEP * self.state.radius * (self.alpha * self.length_drag / PENALTY).clamp(max=1.0)
+        return torch.where(coarse, COARSE_OVERLAP, usual)
 
     def substep(self, base: Tensor, growth: Tensor, active: Tensor) -> None:
         """Grow by `growth` (N,) from `base` (N,), and pass over contacts, in the colonies that are active (B,) bool."""
         moving = active.index_select(0, self.state.colony)
         self.length = torch.where(moving, base + growth, base)
-        seen: Tensor | None = None
-        self.left = torch.ones_like(self.share)
-        for number in range(int(self.most_passes.max())):
-            active = active & ((number < self.passes) | (number < self.most_passes) & (self.left > MOST_LEFT))
+        for number in range(int(self.passes.max())):
+            active = active & (number < self.passes)
+            pairs, walls = self._detect(active)
+            moving = active.index_select(0, self.state.colony)
+            if number > 0:
+                moving = moving & self._unsettled(pairs, walls)
+                active = self.state.groups.any(moving)
             if not bool(active.any()):
                 return
-            contacts, walls = self._detect(active)
-            if seen is not None:
-                active = active & self._again(contacts, walls, seen)
-                if not bool(active.any()):
-                    return
-            moving = active.index_select(0, self.state.colony)
-            contacts, walls = _only(contacts, walls, moving)
-            move, report = self._solve(contacts, walls, base, moving, number)
+            pairs, walls = _of_cells(pairs, walls, moving)
+            move, report = self._solve(contacts_of(pairs, whole_lines=self.settings.unilateral), walls, base, moving, number)
             self._move(move, base, moving, report, active)
-            seen = self._keys(contacts) if number + 1 < int(self.most_passes.max()) else None
             self.report = self._noted(report, active)
             if number == 0:
                 self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
 
-    def _detect(self, active: Tensor) -> tuple[Contacts, WallContacts]:
-        """All contacts of the present geometry; those of colonies that cannot be stepped are of no use to anyone and are left out."""
+    def _detect(self, active: Tensor) -> tuple[Touching, WallContacts]:
+        """All that touches in the present geometry; colonies that cannot be stepped are of no use to anyone and are left out."""
         state = self.state
         local = (self.position - self.reference).to(state.dtype)
         with torch.no_grad():
@@ -268,27 +267,23 @@ class _Run:
                 found = find_pairs(pick(local), pick(axis), pick(length), pick(radius), pick(colony), state.colonies)
                 first, second = rows.index_select(0, found[0]), rows.index_select(0, found[1])
         bodies = Bodies(local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius)
-        contacts = find_contacts(bodies, first, second, whole_lines=self.settings.unilateral)
         walls = find_wall_contacts(self.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids)
-        return contacts, walls
+        return Touching.among(bodies, first, second), walls
 
-    def _keys(self, contacts: Contacts) -> Tensor:
-        low, high = torch.minimum(contacts.first, contacts.second), torch.maximum(contacts.first, contacts.second)
-        return (low * self.state.cells + high) * 9 + contacts.where
-
-    def _again(self, contacts: Contacts, walls: WallContacts, seen: Tensor) -> Tensor:
-        """Which colonies need another pass, (B,): a new contact that overlaps, an overlap over the limit, or a move cut short."""
-        groups, colony = self.state.groups, self.state.colony
-        if bool((self.share < 1).all()):
-            return self.share < 1
-        new = ~torch.isin(self._keys(contacts), seen) & (contacts.gap < 0)
-        again = torch.zeros_like(colony, dtype=torch.bool)
-        again[contacts.first[new]] = True
-        again[contacts.first[contacts.gap < -self.overlap.index_select(0, contacts.first)]] = True
-        again[walls.cell[walls.gap < -self.overlap.index_select(0, walls.cell)]] = True
-        return groups.any(again) | (self.share < 1)
+    @torch.no_grad()
+    def _unsettled(self, pairs: Touching, walls: WallContacts) -> Tensor:
+        """Which cells take part in another pass, (N,) bool: those whose move was cut short, or left them too deep."""
+        found = self.cut.clone()
+        deep = torch.nonzero(pairs.gap < -self.overlap.index_select(0, pairs.first)).squeeze(1)
+        found[torch.cat([pairs.first.index_select(0, deep), pairs.second.index_select(0, deep)])] = True
+        # into a soft wall cells are pressed as deep as it lets them, and so they are into one of little weight
+        root, soft = self._wall_weights(walls)
+        deep = ~soft & (root * root * walls.gap < -self.overlap.index_select(0, walls.cell))
+        found[walls.cell[deep]] = True
+        return found
 
     def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, number: int):
+        """The move of the cells that are moving, (N, D), while the others stay where they are."""
         state, settings = self.state, self.settings
         across, turning, _ = capsule.drag(self.length, state.radius, self.viscosity)
         d, turns = state.dim, settings.degrees - state.dim - 1
@@ -308,13 +303,15 @@ class _Run:
         held = torch.zeros_like(gap) if number == 0 else torch.where(soft, gap.clamp(max=0), 0.0)
         lower = (base - self.length) / scale[:, -1]
         problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1), lower, scale, state.groups, settings.unilateral)
-        start = state.displacement if number == 0 else None
-        return solve(problem, start, self._tolerance(), settings.max_iterations)
+        if bool(moving.all()):
+            return solve(problem, state.displacement if number == 0 else None, self._tolerance(), settings.max_iterations)
+        move, report = solve(problem.among(moving), state.displacement[moving] if number == 0 else None, self._tolerance(), settings.max_iterations)
+        return torch.zeros_like(scale).index_copy(0, torch.nonzero(moving).squeeze(1), move), report
 
     def _tolerance(self) -> Tensor:
         """Of the solve in each colony, (B,)."""
         if self.settings.tolerance is not None:
-            return torch.full_like(self.share, self.settings.tolerance)
+            return torch.full_like(self.report.residual, self.settings.tolerance)
         with torch.no_grad():
             hardest = -self.state.groups.max(-self.alpha * self.length_drag, empty=-PENALTY)
             return TOLERANCE * (hardest / PENALTY).clamp(max=1.0).sqrt().sqrt()
@@ -340,22 +337,34 @@ class _Run:
         return root, soft
 
     def _move(self, move: Tensor, base: Tensor, moving: Tensor, report: SolveReport, active: Tensor) -> None:
-        """Carry the solve's move out in the colonies that are moving, shortened where a cell would turn too far."""
+        """Carry the solve's move out for the cells that are moving, in part where a cell would turn too far, or go through a wall."""
         state, d = self.state, self.state.dim
         sound = (moving & (report.status != NOT_FINITE).index_select(0, state.colony)).unsqueeze(1)
         move = torch.where(sound, move, 0.0)
-        share = (MAX_TURN / state.groups.max(self._turn(move))).clamp(min=LEAST_SHARE, max=1.0)
-        move = move * share.index_select(0, state.colony).unsqueeze(1)
-        turn = self._turn(move).unsqueeze(1)
-        too_far = turn > MAX_TURN * (1 + 1e-5)
-        cut = torch.where(too_far, MAX_TURN / turn, 1.0)
-        self.share = torch.where(active, share, self.share)
-        self.left = torch.where(active, self.left * (1 - share), self.left)
-        self.limited = torch.where(active, state.groups.sum(too_far.to(state.dtype)).squeeze(1).long(), self.limited)
+        share = self._share(move.detach())
+        self.cut = share < 1
+        move = move * share.unsqueeze(1)
+        limited = state.groups.sum(self.cut.to(state.dtype).unsqueeze(1)).squeeze(1).long()
+        self.limited = torch.where(active, limited, self.limited)
         self.position = self.position + move[:, :d].to(self.position.dtype)
-        self.axis = torch.where(sound, capsule.rotate(self.axis, move[:, d:-1] * cut), self.axis)
+        self.axis = torch.where(sound, capsule.rotate(self.axis, move[:, d:-1]), self.axis)
         length = self.length + move[:, -1]
         self.length = torch.where(length >= base, length, base)  # unlike a maximum, whole gradient at a tie
+
+    @torch.no_grad()
+    def _share(self, move: Tensor) -> Tensor:
+        """How much of its move each cell makes, (N,): see MAX_TURN, and no farther than its radius behind a wall that it may not have touched before."""
+        d, radius = self.state.dim, self.state.radius
+        turn, way = (x.square().sum(1).sqrt() for x in (move[:, d:-1], move[:, :d]))
+        share = (MAX_TURN / turn).clamp(max=1.0)
+        far = torch.nonzero(share * way > radius).squeeze(1)
+        if far.numel() and self.surfaces:
+            pick = lambda x: x.index_select(0, far)  # noqa: E731
+            position, axis, length, part = pick(self.position), pick(self.axis), pick(self.length), pick(move) * pick(share).unsqueeze(1)
+            after = position + part[:, :d].to(position.dtype), capsule.rotate(axis, part[:, d:-1]), 0.5 * (length + part[:, -1])
+            to_walls = share_to_walls(self.surfaces, (position, axis, 0.5 * length), after, pick(radius), pick(self.colony_ids))
+            share[far] *= to_walls
+        return share
 
     def _noted(self, new: SolveReport, active: Tensor) -> MechanicsReport:
         old = self.report
@@ -363,14 +372,13 @@ class _Run:
             torch.where(active, torch.maximum(old.status, new.status), old.status),
             old.iterations + torch.where(active, new.iterations, 0),
             torch.where(active, torch.maximum(old.residual, new.residual), old.residual),
-            old.passes + active, old.substeps, self.limited, self.share,
+            old.passes + active, old.substeps, self.limited,
         )  # fmt: skip
 
 
-def _only(contacts: Contacts, walls: WallContacts, cells: Tensor) -> tuple[Contacts, WallContacts]:
-    """The rows whose cells are marked, (N,) bool."""
+def _of_cells(pairs: Touching, walls: WallContacts, cells: Tensor) -> tuple[Touching, WallContacts]:
+    """Those in which a cell that is marked, (N,) bool, takes part."""
     if bool(cells.all()):
-        return contacts, walls
-    keep = torch.nonzero(cells.index_select(0, contacts.first)).squeeze(1)
-    keep_wall = torch.nonzero(cells.index_select(0, walls.cell)).squeeze(1)
-    return contacts.take(keep), walls.take(keep_wall)
+        return pairs, walls
+    either = cells.index_select(0, pairs.first) | cells.index_select(0, pairs.second)
+    return pairs.take(torch.nonzero(either).squeeze(1)), walls.take(torch.nonzero(cells.index_select(0, walls.cell)).squeeze(1))

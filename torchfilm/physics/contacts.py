@@ -38,8 +38,7 @@ class Contacts:
     """Rows of the contact problem, K pairs' rows; first and second cell (K,), gap (K,) µm, weight D² (K,).
 
     `row_first`, `row_second`: (K, 4) in 2-D [n, q×n, ∂] and (K, 7) in 3-D: the gap after moves x is gap − row_first·x_first −
-    row_second·x_second. `normal` (d, K) from first to second. `where` (K,) int64: at which end or middle the two
-    cells touch, 0 … 8, so that a contact at another place of the same pair is told apart.
+    row_second·x_second. `normal` (d, K) from first to second.
     """
 
     first: Tensor
@@ -49,15 +48,6 @@ class Contacts:
     row_first: Tensor
     row_second: Tensor
     normal: Tensor
-    where: Tensor
-
-    def take(self, index: Tensor) -> Contacts:
-        """The rows at `index`."""
-        pick = lambda x: x.index_select(0, index)  # noqa: E731
-        return Contacts(
-            pick(self.first), pick(self.second), pick(self.gap), pick(self.weight),
-            pick(self.row_first), pick(self.row_second), self.normal.index_select(1, index), pick(self.where),
-        )  # fmt: skip
 
 
 def closest_points(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor]:
@@ -171,12 +161,49 @@ def _end(s: Tensor, half: Tensor) -> Tensor:
     return (s >= half - slack).to(s.dtype) - (s <= slack - half).to(s.dtype)
 
 
+@dataclass(frozen=True)
+class Touching:
+    """K pairs of cells that overlap at their closest points: first and second cell (K,), their bodies a and b, the points s and t of `closest_points`."""
+
+    first: Tensor
+    second: Tensor
+    a: Bodies
+    b: Bodies
+    s: Tensor
+    t: Tensor
+
+    @staticmethod
+    def among(bodies: Bodies, first: Tensor, second: Tensor) -> Touching:
+        """Those of the pairs (P,), (P,)."""
+        a, b = bodies.take(first), bodies.take(second)
+        found = Touching(first, second, a, b, *closest_points(a, b))
+        with torch.no_grad():
+            # no point of a line is nearer than the closest one, but for rounding, of which this is many times more
+            keep = torch.nonzero(found.gap < 1e-3 * (a.radius + b.radius)).squeeze(1)
+        return found.take(keep)
+
+    @property
+    def gap(self) -> Tensor:
+        """(K,) µm, at the closest points."""
+        return _gap(self.a, self.b, self.s, self.t)
+
+    def take(self, index: Tensor) -> Touching:
+        """The pairs at `index`."""
+        pick = lambda x: x.index_select(0, index)  # noqa: E731
+        return Touching(pick(self.first), pick(self.second), self.a.take(index), self.b.take(index), pick(self.s), pick(self.t))
+
+
 def find_contacts(bodies: Bodies, first: Tensor, second: Tensor, whole_lines: bool = False) -> Contacts:
-    """All rows that overlap (gap < 0) among the given pairs (P,), (P,), and of a line of contact that overlaps at one end what keeps the other from
+    """All rows that overlap among the given pairs (P,), (P,): see `contacts_of`."""
+    return contacts_of(Touching.among(bodies, first, second), whole_lines)
+
+
+def contacts_of(pairs: Touching, whole_lines: bool = False) -> Contacts:
+    """All rows of pairs that overlap (gap < 0), and of a line of contact that overlaps at one end what keeps the other from
     swinging in: a row of gap 0, whose weight falls from that of the line to nothing as its end parts as far as the first overlaps. Without it a cell that is
     squeezed between two rocks from step to step, and they close in on it. whole_lines: both ends as they are if one of them overlaps, for a
     solve in which contacts only push, which sees by itself what it would push the other end into."""
-    first, second, a, b, s, t = _touching(bodies, first, second)
+    first, second, a, b, s, t = pairs.first, pairs.second, pairs.a, pairs.b, pairs.s, pairs.t
     # only the nearly parallel may have a line; all others touch at the closest point
     near = torch.nonzero(_slide(cross(a.axis, b.axis)).detach() > 0).squeeze(1)
     near_a, near_b = a.take(near), b.take(near)
@@ -197,31 +224,14 @@ def find_contacts(bodies: Bodies, first: Tensor, second: Tensor, whole_lines: bo
     a, b = a.take(keep), b.take(keep)
     gap, row_first, row_second, normal = _rows(a, b, s, t, end_a, end_b)
     gap = gap if whole_lines else gap.clamp(max=0.0)
-    where = 3 * _third(s, a.half) + _third(t, b.half)
     pick = lambda x: x.index_select(0, keep)  # noqa: E731
-    return Contacts(pick(first), pick(second), gap, weight, row_first, row_second, normal, where)
+    return Contacts(pick(first), pick(second), gap, weight, row_first, row_second, normal)
 
 
 def _held_share(one: Tensor, other: Tensor) -> Tensor:
     """Of two ends of a line with gaps of which one is negative: 1 while neither parts, 0 once one parts as far as the other overlaps."""
     deepest = torch.minimum(one, other)
     return ((one + other) / torch.where(deepest < 0, deepest, -1.0)).clamp(min=0.0, max=1.0)
-
-
-def _touching(bodies: Bodies, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Bodies, Bodies, Tensor, Tensor]:
-    """Those of the pairs (P,), (P,) that overlap at their closest points: first, second, both bodies, and the points s and t."""
-    a, b = bodies.take(first), bodies.take(second)
-    s, t = closest_points(a, b)
-    with torch.no_grad():
-        # no point of a line is nearer than the closest one, but for rounding, of which this is many times more
-        keep = torch.nonzero(_gap(a, b, s, t) < 1e-3 * (a.radius + b.radius)).squeeze(1)
-    pick = lambda x: x.index_select(0, keep)  # noqa: E731
-    return pick(first), pick(second), a.take(keep), b.take(keep), pick(s), pick(t)
-
-
-def _third(s: Tensor, half: Tensor) -> Tensor:
-    """0, 1 or 2 for a point near the −axis end, in the middle, near the +axis end."""
-    return torch.round(s.detach() / half.detach().clamp(min=1e-9)).clamp(-1, 1).long() + 1
 
 
 def _gap(a: Bodies, b: Bodies, s: Tensor, t: Tensor) -> Tensor:

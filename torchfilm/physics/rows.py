@@ -38,6 +38,22 @@ class ContactRows:
             number.index_select(0, at_wall), row_wall, cells,
         )  # fmt: skip
 
+    def among(self, moving: Tensor) -> tuple[ContactRows, Tensor]:
+        """The rows of the cells that move, (N,) bool, numbered anew: to them a cell that stays is like a wall. And where each row stands here, (R',)."""
+        number = torch.cumsum(moving, 0) - 1
+        one, other = moving.index_select(0, self.first), moving.index_select(0, self.second)
+        both, only_one, only_other, wall = (
+            torch.nonzero(which).squeeze(1) for which in (one & other, one & ~other, other & ~one, moving.index_select(0, self.at_wall))
+        )
+        of = lambda cell, rows: number.index_select(0, cell.index_select(0, rows))  # noqa: E731
+        at_wall = torch.cat([of(self.first, only_one), of(self.second, only_other), of(self.at_wall, wall)])
+        parts = ((self.row_first, only_one), (self.row_second, only_other), (self.row_wall, wall))
+        rows = ContactRows(
+            of(self.first, both), of(self.second, both), self.row_first.index_select(0, both), self.row_second.index_select(0, both),
+            at_wall, torch.cat([row.index_select(0, which) for row, which in parts]), int(moving.sum()),
+        )  # fmt: skip
+        return rows, torch.cat([both, only_one, only_other, self.pairs + wall])
+
     def apply(self, x: Tensor) -> Tensor:
         """J x: (N, D) -> (R,)."""
         if x.device.type != "cpu" or self._needs_grad(x) or not self.rows:

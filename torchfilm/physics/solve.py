@@ -88,6 +88,16 @@ class ContactProblem:
         """Of the function that is minimised, (N, D); violation (R,): the gap after the move of the rows that act, else 0."""
         return self.alpha * y - self.rows.apply_transpose(violation - self.held)
 
+    def among(self, moving: Tensor) -> ContactProblem:
+        """The problem of the cells that move, (N,) bool, while the others stay where they are; colonies keep their numbers."""
+        cells = torch.nonzero(moving).squeeze(1)
+        rows, places = self.rows.among(moving)
+        of_rows, of_cells = (lambda x, index=index: x.index_select(0, index) for index in (places, cells))
+        return ContactProblem(
+            rows, of_rows(self.gap), of_rows(self.held), of_cells(self.alpha), of_cells(self.lower), of_cells(self.scale),
+            Groups(of_cells(self.colonies.owner), self.colonies.size), self.unilateral,
+        )  # fmt: skip
+
     def part(self, which: Selection) -> ContactProblem:
         """The problem of some of its colonies."""
         cells, rows = which.cells, which.rows
@@ -246,8 +256,11 @@ def _rounding(problem: ContactProblem, inverse: Tensor, y: Tensor) -> Tensor:
 
 def _within(free: Tensor, inverse: Tensor) -> Map:
     """The preconditioner among the degrees of freedom that are free: what it is given elsewhere it does not look at, and leaves at 0."""
-    among = inverse.clone()
     length = free[:, -1:]  # the only one that may be held
+    # The inverse of the block without it, and not a part of the whole block's inverse, in which the length would still give way: with that, the cells
+    # whose length is held, where pressure is, took three times as many iterations.
+    along = inverse[:, :, -1] * (1 - length) / inverse[:, -1:, -1].sqrt()
+    among = torch.baddbmm(inverse, along.unsqueeze(2), along.unsqueeze(1), alpha=-1.0)
     among[:, -1] *= length
     among[:, :, -1] *= length
     return lambda r: _times(among, r)
@@ -301,8 +314,19 @@ def _line_search(problem: ContactProblem, y, after, gradient, direction, going):
         going = going & (share < 1)
         if not bool(going.any()):
             break
-        length = torch.where(going, share * length, length)
+        # the way to a step that is stopped is not the one that leads there: on that, the first of the lengths comes to its bound at the least
+        free_run = _to_bound(problem, y, direction)
+        length = torch.where(going, torch.maximum(share * length, torch.where(free_run < length, free_run, 0.0)), length)
     return new, then
+
+
+def _to_bound(problem: ContactProblem, y: Tensor, direction: Tensor) -> Tensor:
+    """The share of a direction at which the first length that was above its bound is just at it, (B,); infinite where none comes to be."""
+    room, way = y[:, -1] - problem.lower, direction[:, -1]
+    shrinks = (room > 0) & (way < 0)
+    # a hair more, so that it is stopped there, and not short of there
+    share = torch.where(shrinks, room / torch.where(shrinks, -way, 1.0), torch.inf) * (1 + 1e-5)
+    return -problem.colonies.max(-share, empty=-torch.inf)
 
 
 def _least(problem: ContactProblem, after: Tensor, change: Tensor, slope: Tensor, drag: Tensor, going: Tensor) -> Tensor:

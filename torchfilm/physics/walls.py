@@ -280,6 +280,9 @@ def _vectors(entries: Vector, colony: Tensor, like: Tensor) -> Tensor:
     return torch.stack(torch.broadcast_tensors(*(f if isinstance(f, Tensor) else like.new_tensor(f) for f in found)), -1)
 
 
+Capsules = tuple[Tensor, Tensor, Tensor]
+
+
 @dataclass(frozen=True)
 class WallContacts:
     """W rows of one cell and a wall: cell (W,), gap (W,) µm, row (W, D), surface (W,) number of the surface touched.
@@ -341,3 +344,20 @@ def _reaches(surface: Surface, position: Tensor, axis: Tensor, half: Tensor, col
         (half, one, safe_sqrt(0.5 * (1 - at))),
         (-half, -one, safe_sqrt(0.5 * (1 + at))),
     ]
+
+
+@torch.no_grad()
+def share_to_walls(surfaces: Sequence[Surface], before: Capsules, after: Capsules, radius: Tensor, colony_id: Tensor) -> Tensor:
+    """How much of its move takes each cell no farther than its radius behind any wall, or behind where it was, (P,): contacts with a wall that a cell did not
+    touch have no part in the solve. before, after: position (P, d) float64, axis (P, d), half length (P,)."""
+    share = torch.ones_like(radius)
+    for surface in surfaces:
+        start, end = (
+            surface.gap_of_points(p + (surface.deepest(p, a.to(p.dtype), h.to(p.dtype), colony_id).unsqueeze(1) * a).to(p.dtype), colony_id)[0]
+            for p, a, h in (before, after)
+        )
+        start, end = (gap.to(radius.dtype) - radius for gap in (start, end))
+        deepest = start.clamp(max=0.0) - radius
+        through = end < deepest
+        share = torch.where(through, torch.minimum(share, (start - deepest) / torch.where(through, start - end, 1.0)), share)
+    return share
