@@ -49,7 +49,7 @@ class Run:
     @staticmethod
     def of(scene: tf.Scene, seed: int) -> Run:
         probe = begin(scene, cells=150, colonies=6, seed=seed)
-        search = Search(probe, 0.01)
+        search = Search(probe, probe, 0.01)
         return Run(probe, search, probe.observed(search.settings(FINEST, TIGHT_CONTACTS, TIGHT_CIRCUITS))[0])
 
     def errors(self, settings: tf.Settings, names: Sequence[str]) -> dict[str, float]:

@@ -9,7 +9,7 @@ import torch
 
 import torchfilm as tf
 from torchfilm.tools.checks import InputError
-from torchfilm.tune import AIM, observables
+from torchfilm.tune import AIM, Probe, Search, begin, observables
 
 F64 = torch.float64
 
@@ -51,10 +51,18 @@ def test_what_was_chosen_holds_the_error_in_a_run_of_its_own(colony):
 @pytest.mark.slow
 def test_it_says_what_it_chose_and_why(colony):
     assert colony.chosen.worst <= AIM * 0.02 and set(colony.chosen.errors) <= {"cells", "volume", "radius", "overlap"}
+    assert max(colony.confirmed.values()) <= 0.02 and set(colony.confirmed) == set(colony.chosen.errors)
     assert set(colony.parts) == {"step", "contacts"} and colony.settings.rtol is None
-    assert all(t.seconds >= colony.chosen.seconds for t in colony.tries if t.worst <= AIM * 0.02 and t is not colony.own)
+    assert all(t.seconds >= colony.chosen.seconds for t in colony.tries if t.worst <= colony.chosen.worst and t is not colony.own)
     told = str(colony)
-    for words in (f"dt {colony.settings.dt:g} h", f"tolerance {colony.settings.tolerance:g}", "2 % in", "the reference's own", "settings were run"):
+    for words in (
+        f"dt {colony.settings.dt:g} h",
+        f"tolerance {colony.settings.tolerance:g}",
+        "2 % in",
+        "in other colonies",
+        "the reference's own",
+        "settings were run",
+    ):
         assert words in told
     assert colony.scene.accuracy == colony.settings.given and colony.scene.dt == colony.settings.dt
 
@@ -62,13 +70,27 @@ def test_it_says_what_it_chose_and_why(colony):
 def test_a_coarser_step_where_the_scene_is_finer_than_it_need_be():
     """m' = k − 2 m, thinned at 1/h: k/3 in the end. Thinning and making take turns at second order and all else is exact, so that 5 % allows a coarse step."""
     tuned = tf.tune(dividing(), 0.05, cells=8, colonies=4)
-    assert tuned.settings.dt >= 0.1 and tuned.settings.rtol >= 1e-2
+    assert tuned.settings.dt > 0.05 and tuned.settings.rtol >= 1e-2
     assert tuned.chosen.errors["m"] < 0.05
 
 
 def test_a_smaller_error_asks_for_smaller_steps():
     steps = [tf.tune(dividing(), error, cells=8, colonies=4, of=["m"]).settings.dt for error in (0.05, 2e-4)]
     assert steps[1] < steps[0]
+
+
+def test_what_does_not_hold_in_other_colonies_is_tightened():
+    """A probe by which all errors are a hundredth of what they are: the other's are not, and the settings are those of an honest search, or finer."""
+    probe, other = begin(dividing(), 8, 4, ["m"]), begin(dividing(), 12, 4, ["m"], seed=1)
+
+    class Flatterer(Probe):
+        def errors(self, found, against, apart=False):
+            return {n: e if apart else 0.01 * e for n, e in super().errors(found, against, apart).items()}
+
+    search = Search(Flatterer(**vars(probe)), other, 1e-3)
+    flattered = search.run()
+    assert search.aim < AIM * 1e-3 and flattered.confirmed["m"] <= 1e-3
+    assert flattered.settings.dt <= 1.5 * tf.tune(dividing(), 1e-3, cells=8, colonies=4, of=["m"]).settings.dt
 
 
 def test_only_what_is_named_counts():

@@ -39,7 +39,7 @@ STATUS = {
 FORCING = 0.02
 # The share of its target that CG is asked for where they may not: less than the whole, since the true residual differs by rounding from the
 # recurred one, but not much, since lengths that meet their bound would undo what more iterations gained.
-FINISH = 0.8
+FINISH = 0.5
 # What bounds a solve is its CG iterations, of which a round takes at least one; this many rounds is the last resort.
 NEWTON_LIMIT = 200
 # A line search leaves at most LEVEL of the slope that it began with; a full step that leaves no more than STEEP of it, upwards, is not looked at closer.
