@@ -236,6 +236,7 @@ class Search:
         self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
         self.rtols = CIRCUITS if self.circuit is not None else (TIGHT_CIRCUITS,)
         self.tries: dict[Settings, Try] = {}
+        self.refuted: set[Settings] = set()
         self.seen: dict[Settings, dict[str, list[Tensor]]] = {}
 
     def settings(self, steps: int, contacts: tuple[float, int, float], rtol: float) -> Settings:
@@ -268,13 +269,15 @@ class Search:
         )  # fmt: skip
 
     def _confirmed(self) -> tuple[Try, dict[str, float]]:
-        """The cheapest that holds the error in the other colonies too, and its errors there."""
-        right = {n: v for n, v in self.other.observed(self.settings(FINEST, TIGHT_CONTACTS, TIGHT_CIRCUITS))[0].items() if n in self.reference}
+        """The cheapest that holds the error in the other colonies too, and its errors there, in what can be seen there."""
+        seen = self.other.observed(self.settings(FINEST, TIGHT_CONTACTS, TIGHT_CIRCUITS))[0]
+        right = {n: seen[n] for n in self.reference if n in seen and not any(bool(v.isnan().any()) for v in seen[n])}
         while True:
             best = self._cheapest()
             errors = self.other.errors(self.other.observed(best.settings)[0], right)
-            if max(errors.values()) <= self.error:
+            if max(errors.values(), default=0.0) <= self.error:
                 return best, errors
+            self.refuted.add(best.settings)
             self.aim *= STRICTER
 
     def _try(self, settings: Settings) -> Try:
@@ -291,7 +294,7 @@ class Search:
             if best is not None and steps * self._least() > best.seconds:
                 break
             self._look_at(steps)
-            holding = [t for t in self.tries.values() if t.worst <= self.aim and t.settings != Settings()]
+            holding = [t for t in self.tries.values() if t.worst <= self.aim and t.settings not in {Settings(), *self.refuted}]
             best = min(holding, key=lambda t: t.seconds, default=None)
         if best is None:
             closest = min(self.tries.values(), key=lambda t: t.worst)
@@ -353,7 +356,10 @@ def _told(tuned: Tuned) -> list[str]:
         rows.append((knob, _knob(knob, tuned.settings), f"{_percent(errors[name])} ({name})", "" if share is None else f"{100 * share / total:.0f} %"))
     lines = [head, "", *_aligned(rows), ""]
     rows = [("", "error", "in other colonies", "with the scene's own settings", "the reference's own")]
-    rows += [(n, _percent(e), _percent(tuned.confirmed[n]), _percent(own.errors[n]), _percent(tuned.unsure[n])) for n, e in best.errors.items()]
+    rows += [
+        (n, _percent(e), _percent(tuned.confirmed[n]) if n in tuned.confirmed else "not seen there", _percent(own.errors[n]), _percent(tuned.unsure[n]))
+        for n, e in best.errors.items()
+    ]
     lines += _aligned(rows)
     lines += [f"{name}: not told so finely, since {why}" for name, why in tuned.left_out.items()]
     ratio = best.seconds / own.seconds

@@ -274,9 +274,10 @@ class _Run:
     def _unsettled(self, pairs: Touching, walls: WallContacts) -> Tensor:
         """Which cells take part in another pass, (N,) bool: those whose move was cut short, or left them too deep."""
         found = self.cut.clone()
-        deep = torch.nonzero(pairs.gap < -self.overlap.index_select(0, pairs.first)).squeeze(1)
-        found[torch.cat([pairs.first.index_select(0, deep), pairs.second.index_select(0, deep)])] = True
-        # into a soft wall cells are pressed as deep as it lets them, and so they are into one of little weight
+        # soft cells, and cells at a soft wall or one of little weight, are pressed as deep as these let them
+        if self.settings.stiffness is None:
+            deep = torch.nonzero(pairs.gap < -self.overlap.index_select(0, pairs.first)).squeeze(1)
+            found[torch.cat([pairs.first.index_select(0, deep), pairs.second.index_select(0, deep)])] = True
         root, soft = self._wall_weights(walls)
         deep = ~soft & (root * root * walls.gap < -self.overlap.index_select(0, walls.cell))
         found[walls.cell[deep]] = True
@@ -357,13 +358,15 @@ class _Run:
         d, radius = self.state.dim, self.state.radius
         turn, way = (x.square().sum(1).sqrt() for x in (move[:, d:-1], move[:, :d]))
         share = (MAX_TURN / turn).clamp(max=1.0)
-        far = torch.nonzero(share * way > radius).squeeze(1)
+        reach = share * (way + 0.5 * turn * self.length + 0.5 * move[:, -1].clamp(min=0.0))
+        far = torch.nonzero(reach > radius).squeeze(1)
         if far.numel() and self.surfaces:
             pick = lambda x: x.index_select(0, far)  # noqa: E731
             position, axis, length, part = pick(self.position), pick(self.axis), pick(self.length), pick(move) * pick(share).unsqueeze(1)
-            after = position + part[:, :d].to(position.dtype), capsule.rotate(axis, part[:, d:-1]), 0.5 * (length + part[:, -1])
-            to_walls = share_to_walls(self.surfaces, (position, axis, 0.5 * length), after, pick(radius), pick(self.colony_ids))
-            share[far] *= to_walls
+            at = lambda s: (  # noqa: E731
+                position + s * part[:, :d].to(position.dtype), capsule.rotate(axis, s * part[:, d:-1]), 0.5 * (length + s * part[:, -1]),
+            )  # fmt: skip
+            share[far] *= share_to_walls(self.surfaces, at, pick(radius), pick(self.colony_ids))
         return share
 
     def _noted(self, new: SolveReport, active: Tensor) -> MechanicsReport:

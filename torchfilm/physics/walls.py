@@ -8,7 +8,7 @@ D² = stiffness · α · Δt. `weight` gives D itself instead, the paper's way, 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -346,18 +346,30 @@ def _reaches(surface: Surface, position: Tensor, axis: Tensor, half: Tensor, col
     ]
 
 
+# A ball in the way is looked for at so many places of a move; another wall, which has all cells on one side, at its end.
+PLACES = 8
+
+
 @torch.no_grad()
-def share_to_walls(surfaces: Sequence[Surface], before: Capsules, after: Capsules, radius: Tensor, colony_id: Tensor) -> Tensor:
+def share_to_walls(surfaces: Sequence[Surface], at: Callable[[float], Capsules], radius: Tensor, colony_id: Tensor) -> Tensor:
     """How much of its move takes each cell no farther than its radius behind any wall, or behind where it was, (P,): contacts with a wall that a cell did not
-    touch have no part in the solve. before, after: position (P, d) float64, axis (P, d), half length (P,)."""
-    share = torch.ones_like(radius)
+    touch have no part in the solve. at: for a share of the move, position (P, d) float64, axis (P, d), half length (P,)."""
+
+    def gap(surface: Surface, share: float) -> Tensor:
+        position, axis, half = at(share)
+        deepest = surface.deepest(position, axis.to(position.dtype), half.to(position.dtype), colony_id)
+        distance, _ = surface.gap_of_points(position + deepest.unsqueeze(1) * axis.to(position.dtype), colony_id)
+        return distance.to(radius.dtype) - radius
+
+    out = torch.ones_like(radius)
     for surface in surfaces:
-        start, end = (
-            surface.gap_of_points(p + (surface.deepest(p, a.to(p.dtype), h.to(p.dtype), colony_id).unsqueeze(1) * a).to(p.dtype), colony_id)[0]
-            for p, a, h in (before, after)
-        )
-        start, end = (gap.to(radius.dtype) - radius for gap in (start, end))
-        deepest = start.clamp(max=0.0) - radius
-        through = end < deepest
-        share = torch.where(through, torch.minimum(share, (start - deepest) / torch.where(through, start - end, 1.0)), share)
-    return share
+        places = 1 if isinstance(surface, _Flat) or surface.inside else PLACES
+        before = gap(surface, 0.0)
+        limit = before.clamp(max=0.0) - radius
+        for k in range(places):
+            after = gap(surface, (k + 1) / places)
+            through = (after < limit) & (out > k / places)
+            part = (before - limit) / torch.where(through, before - after, 1.0)
+            out = torch.where(through, torch.minimum(out, (k + part) / places), out)
+            before = after
+    return out

@@ -1,0 +1,73 @@
+"""What is carried out of a solve's moves: no cell turns too far or goes through a wall in one of them; and lengths that are held spoil no solve."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers import run, seeded
+
+import torchfilm as tf
+from torchfilm.physics.capsule import rotate
+from torchfilm.physics.solve import NOT_FINITE
+from torchfilm.physics.walls import share_to_walls
+
+X, Y = [1.0, 0.0], [0.0, 1.0]
+
+
+def share(wall: tf.Wall, position, axis, length: float, way, turn: float = 0.0, radius: float = 0.5) -> float:
+    """How much of a move of one cell in the plane it makes."""
+    t = lambda x: torch.tensor([x], dtype=torch.float64)  # noqa: E731
+    at = lambda s: (t(position) + s * t(way), rotate(t(axis), s * t([turn])), torch.tensor([0.5 * length], dtype=torch.float64))  # noqa: E731
+    return float(share_to_walls(wall.surfaces(2), at, torch.tensor([radius], dtype=torch.float64), torch.zeros(1, dtype=torch.int64)))
+
+
+def test_a_move_ends_a_radius_behind_a_wall():
+    """From 2 µm above a floor, 5 µm down: the cell's underside goes 1.5 µm to the floor and 0.5 µm on. One that began 0.2 µm deep goes 0.5 µm on from there."""
+    floor = tf.Plane(y=0.0, facing="+y")
+    assert share(floor, [0.0, 2.0], X, 2.0, [0.0, -5.0]) == pytest.approx(2.0 / 5.0)
+    assert share(floor, [0.0, 0.3], X, 2.0, [0.0, -5.0]) == pytest.approx(0.5 / 5.0)
+    assert share(floor, [0.0, 2.0], X, 2.0, [7.0, -1.9]) == 1.0
+    assert share(floor, [0.0, 2.0], X, 2.0, [0.0, 5.0]) == 1.0
+
+
+def test_a_move_that_turns_an_end_through_a_wall():
+    """A rod of 6 µm just above a floor turns by 0.49 rad about its centre: its end would be 3 sin 0.49 lower, 0.91 µm deeper than a radius behind the floor."""
+    floor = tf.Plane(y=0.0, facing="+y")
+    part = share(floor, [0.0, 0.55], X, 6.0, [0.0, 0.0], turn=0.49)
+    assert part == pytest.approx(0.55 / (3 * math.sin(0.49)))
+    assert 0.55 - 3 * math.sin(part * 0.49) > -0.05
+
+
+def test_a_move_does_not_jump_over_a_ball():
+    """A post of 1 µm in the way of a cell that would go from one side to the other: it stops behind the surface by a radius or less."""
+    post = tf.Sphere((0.0, 0.0), 1.0, inside=False)
+    part = share(post, [-1.6, 0.0], Y, 0.0, [3.4, 0.0])
+    assert -1.6 + 3.4 * part == pytest.approx(-1.0, abs=3.4 / 8)
+    assert share(post, [-1.6, 3.0], Y, 0.0, [3.4, 0.0]) == 1.0
+
+
+def test_a_cell_that_is_thrown_at_a_wall_stays(device, dtype):
+    """Two rods on top of each other, one drag ten thousand times the other's: the light one takes the whole way, and there is a wall in it."""
+    cells = tf.Cells([[0.0, 0.0], [0.0, 0.02]], [X, X], [4.0, 4.0], extra={"drag": [1e4, 1.0]})
+    scene = tf.Scene(tf.Mechanics(dim=2, walls=[tf.Plane(y=0.55, facing="-y")], alpha=1e-4))
+    state = run(scene, seeded(scene, cells, device, dtype), 1, dt=0.01)
+    assert float(state.displacement[1, 1]) > 0.9 and float(state.position[1, 1]) <= 0.55 + 1e-5
+    assert state.reports["mechanics"].limited.tolist() == [1]
+
+
+@pytest.mark.parametrize("alpha, viscosity, length_drag", [(1e-7, 0.1, 10.0), (1e-6, 0.01, 1.0), (1e-8, 1.0, 100.0)])
+def test_rods_end_to_end_in_a_full_channel(device, alpha, viscosity, length_drag):
+    """Contacts so hard that in float32 rounding leaves nothing of some cells' inverse blocks: the colony moves on, and all is finite."""
+    rng = np.random.default_rng(0)
+    centre = np.stack([1.45 + 2.9 * np.arange(12), 0.02 * rng.normal(size=12)], 1)
+    axis = np.stack([np.ones(12), 0.02 * rng.normal(size=12)], 1)
+    cells = tf.Cells(centre, axis / np.linalg.norm(axis, axis=1, keepdims=True), 1.95)
+    walls = [tf.Channel(width=1.1, low_end=0.0, high_end=34.8)]
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, walls=walls, alpha=alpha, viscosity=viscosity, length_drag=length_drag, max_iterations=500))
+    state = seeded(scene, cells, device, torch.float32)
+    for _ in range(4):
+        state = run(scene, state, 1, dt=0.025, check=False)
+        assert int(state.reports["mechanics"].status.max()) < NOT_FINITE and bool(torch.isfinite(state.position).all())
