@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 from matplotlib import pyplot as plt
@@ -78,12 +78,12 @@ class Study:
 
 
 def timed(run: Callable[[], Any], repeats: int = REPEATS) -> tuple[Any, float]:
-    """What it returns, and the median seconds of some runs."""
+    """What it returns, and the median seconds of some runs: of the processor, which other work on the machine does not lengthen, on one thread."""
     seconds = []
     for _ in range(repeats):
-        begun = perf_counter()
+        begun = process_time()
         found = run()
-        seconds.append(perf_counter() - begun)
+        seconds.append(process_time() - begun)
     return found, statistics.median(seconds)
 
 
