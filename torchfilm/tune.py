@@ -43,8 +43,11 @@ WINDOW = 16
 STEPS = (4, 6, 8, 10, 12, 16, 20, 26, 32, 40, 50, 64, 80, 100)
 FINEST = 160  # the reference
 # Knobs from loose to tight: (penalty, passes beyond the least, tolerance) of contacts, and rtol of circuits.
-# A larger penalty saves no time, and its overlap grows with the colony beyond what a probe of a small one shows.
-CONTACTS = ((0.1, 0, 0.2), (0.1, 0, 0.1), (0.1, 0, 0.05), (0.1, 0, 0.02), (0.1, 0, 0.01), (0.1, 1, 0.05), (0.1, 1, 0.02), (0.03, 1, 0.02), (0.03, 3, 0.01))
+# A larger penalty saves no time, and its overlap grows with the colony beyond what a probe of a small one shows. In the order of what they cost.
+CONTACTS = (
+    (0.1, 0, 0.2), (0.1, 0, 0.1), (0.03, 0, 0.2), (0.1, 0, 0.05), (0.03, 0, 0.1), (0.1, 0, 0.02), (0.03, 0, 0.05), (0.03, 0, 0.02),
+    (0.01, 0, 0.05), (0.1, 0, 0.01), (0.03, 0, 0.01), (0.01, 0, 0.02), (0.01, 0, 0.01), (0.03, 1, 0.005),
+)  # fmt: skip
 CIRCUITS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
 TIGHT_CONTACTS, TIGHT_CIRCUITS = (0.03, 3, 1e-3), 1e-8
 # A scene that never has as many cells as asked for is taken as it is after this many steps.

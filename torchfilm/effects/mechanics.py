@@ -25,12 +25,14 @@ MAX_TURN = 0.5
 # What a pass leaves overlapping by more than DEEP radii is solved again in the next one, among all the others at rest. It is a few cells in a hundred, which
 # slip or turn; the others are as well off after one solve as contacts that give way let them be, and to solve for them again takes twice the time.
 DEEP = 0.2
+# Where a step is coarse, or passes are asked for by their number, it is looked at more closely: µm.
+CLOSE = 0.02
 # Tolerance of the solve at the default penalty α γ. Overlaps hardly feel it, growth under pressure does: at 0.2 a tenth of what a colony grows is wrong, at
 # 0.05 a hundredth. The harder contacts are, the farther from rest is what moves with none of them at the same residual: a tolerance that falls as (α γ)^¼ is
 # enough from 0.1 down to 1e-6 (0.02 is needed at 0.01), and one that falls faster is out of reach of float32.
 PENALTY, TOLERANCE = 0.1, 0.05
 MOST_SUBSTEPS = 1000
-COARSE_PASSES, COARSE_OVERLAP = 6, 0.02
+COARSE_PASSES = 6
 
 
 @dataclass(frozen=True)
@@ -68,9 +70,8 @@ class Mechanics(Effect):
     the next pass: measured, the overlap is the same or less, at half the CG iterations or fewer.
     passes: at most this many times a step contacts are found and solved. The first solves for every cell, each later one for the cells that the move
     left deeper than `overlap` or would have turned too far, among the others at rest. Default 1 in the plane; 2 in space, where cells that are squeezed
-    can slip past each other; twice as many for unilateral contacts, since a push at one end may drive in the other; 6, down to 0.02 µm, for colonies that
-    take sub-steps.
-    overlap: µm; default a fifth of a cell's radius, and where α γ is below 0.1 as much less.
+    can slip past each other; twice as many for unilateral contacts, since a push at one end may drive in the other; 6 for colonies that take sub-steps.
+    overlap: µm; default a fifth of a cell's radius, or 0.02 where `passes` is given and for colonies that take sub-steps; where α γ is below 0.1 as much less.
     tolerance: of the solve, worst residual relative to the worst at rest; default 0.05, and where α γ is below 0.1, 0.05 · (α γ/0.1)^¼.
     max_iterations: CG iterations a solve.
     max_elongation: µm; a colony whose cells want to grow more in a step takes sub-steps.
@@ -230,8 +231,8 @@ class _Run:
         """How deep a contact of each cell may be left, (N,) µm; coarse: (N,) bool, of a colony that takes sub-steps."""
         if self.settings.overlap is not None:
             return torch.full_like(self.state.radius, self.settings.overlap)
-        usual = DEEP * self.state.radius * (self.alpha * self.length_drag / PENALTY).clamp(max=1.0)
-        return torch.where(coarse, COARSE_OVERLAP, usual)
+        usual = torch.where(coarse | (self.settings.passes is not None), CLOSE, DEEP * self.state.radius)
+        return usual * (self.alpha * self.length_drag / PENALTY).clamp(max=1.0)
 
     def substep(self, base: Tensor, growth: Tensor, active: Tensor) -> None:
         """Grow by `growth` (N,) from `base` (N,), and pass over contacts, in the colonies that are active (B,) bool."""
