@@ -56,6 +56,9 @@ SIGNAL = "signal "
 # Other seeds, and colonies somewhat larger, have somewhat other errors than the probe's. So of the error that is asked for AIM is aimed at, what is chosen is
 # confirmed in a second probe of other colonies, LARGER times as large, and where it does not hold there, a part STRICTER as large is aimed at.
 AIM, LARGER, STRICTER = 0.85, 1.5, 0.8
+# A long step lets a colony grow too much and a loose solve too little. So a step is not given up where it alone is over what is aimed at, but where it is OFF
+# times over. Circuits may take a SMALL part of it.
+OFF, SMALL = 2.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -264,8 +267,8 @@ class Search:
         if not self.reference:
             worst = ", ".join(f"{n} {why}" for n, why in left_out.items())
             raise checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}: ask for more, or probe more colonies or cells.")
+        own = self._try(Settings())  # first, since a coarse step that takes sub-steps does not tell what a step costs
         best, confirmed = self._confirmed()
-        own = self._try(Settings())
         return Tuned(
             best.settings.apply(self.probe.given), best.settings, self.error, best, own, confirmed, self._parts(best), self.unsure, left_out,
             list(self.tries.values()), probe.dt * WINDOW, probe.start.cells,
@@ -318,15 +321,21 @@ class Search:
         return sum(each.values())
 
     def _look_at(self, steps: int) -> None:
-        """Try a window of so many steps with looser and looser knobs, down to the loosest that hold the error; with the tightest only, where those do not."""
-        if self._try(self.settings(steps, TIGHT_CONTACTS, TIGHT_CIRCUITS)).worst > self.aim:
+        """Try a window of so many steps with tighter and tighter knobs until the error is held; with the tightest only, where that is far off."""
+        if self._try(self.settings(steps, TIGHT_CONTACTS, TIGHT_CIRCUITS)).worst > OFF * self.aim:
             return
-        contacts, rtols = [*self.contacts, TIGHT_CONTACTS], [*self.rtols, TIGHT_CIRCUITS]
-        holds = lambda c, r: self._try(self.settings(steps, c, r)).worst <= self.aim  # noqa: E731
-        m = next(k for k, c in enumerate(contacts) if holds(c, TIGHT_CIRCUITS))
-        r = next(k for k, rtol in enumerate(rtols) if holds(TIGHT_CONTACTS, rtol))
-        while not holds(contacts[m], rtols[r]):  # each is within the error alone; together they may not be
-            m, r = (min(m + 1, len(contacts) - 1), r) if m < len(contacts) - 1 else (m, r + 1)
+        rtol = next(r for r in (*self.rtols, TIGHT_CIRCUITS) if self._circuits_add(steps, r) <= SMALL * self.aim)
+        for contacts in (*self.contacts, TIGHT_CONTACTS):
+            if self._try(self.settings(steps, contacts, rtol)).worst <= self.aim:
+                return
+
+    def _circuits_add(self, steps: int, rtol: float) -> float:
+        """What circuits at `rtol` change in the worst observable, contacts as they usually are."""
+        usual = CONTACTS[3] if self.mechanics is not None else TIGHT_CONTACTS
+        loose, tight = (self.settings(steps, usual, r) for r in (rtol, TIGHT_CIRCUITS))
+        for s in (loose, tight):
+            self._try(s)
+        return max(self.probe.errors(self.seen[loose], {n: v for n, v in self.seen[tight].items() if n in self.reference}, apart=True).values())
 
     def _parts(self, best: Try) -> dict[str, dict[str, float]]:
         """By knob, what of each observable's error is gone when it alone is tight; for the step, what is left when all others are."""
