@@ -51,11 +51,19 @@ def test_a_run_by_a_preset_says_so_in_its_results(folder):
         assert results.attributes["dt"] == pytest.approx(0.08) and results.accuracy["rtol"] == 0.01
 
 
+def test_explain_says_what_a_preset_would_do(folder):
+    words = [done(folder, "explain", "mine.py", "--seconds", "0", *more) for more in ((), ("--preset", "draft"))]
+    assert "0.05 h" in words[0] and "0.08 h" in words[1]
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
         (("tune", "mine.py", "--error", "much"), "--error = 'much'"),
         (("tune", "mine.py", "--error", "60%"), "error = 0.6"),
+        (("tune", "mine.py", "--error", "3"), "did you mean 3%?"),
+        (("run", "mine.py", "--preset", "drafty", "--cells", "2"), "'drafty' is not allowed: it must be one of 'draft', 'standard', 'reference'"),
+        (("explain", "mine.py", "--preset", "draft", "--settings", "s.json"), "give one of the two"),
         (("tune", "mine.py", "--out", "mine.py"), "no file yet"),
         (("run", "mine.py", "--preset", "draft", "--settings", "s.json", "--cells", "2"), "give one of the two"),
         (("run", "mine.py", "--settings", "none.json", "--cells", "2"), "cannot be read"),

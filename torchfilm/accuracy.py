@@ -81,8 +81,10 @@ class Settings:
         """Read what `save` wrote. Raises InputError for anything else."""
         try:
             found = json.loads(Path(path).read_text())
-        except (OSError, ValueError) as error:
-            raise checks.InputError(f"{path} cannot be read as settings: {error}.") from error
+        except OSError as error:
+            raise checks.InputError(f"{path} cannot be read: {error.strerror}. `torchfilm tune SCENE --out FILE` writes settings.") from error
+        except ValueError:
+            found = None
         if not isinstance(found, dict) or found.pop("format", None) != FORMAT:
             raise checks.InputError(f"{path} holds no settings of accuracy: `torchfilm tune SCENE --out FILE` writes such a file.")
         return Settings.named(found, str(path))
@@ -111,3 +113,12 @@ def preset(name: str, scene: Scene) -> Settings:
     checks.choice("preset", name, tuple(PRESETS))
     pace, settings = PRESETS[name]
     return dataclasses.replace(settings, dt=None if pace == 1.0 else scene.dt * pace)
+
+
+def accurate(scene: Scene, named: str | None, file: Path | None) -> Scene:
+    """The scene as accurately as a preset by name or a file of settings says, if either is given. Raises InputError for both."""
+    if named is not None and file is not None:
+        raise checks.InputError("--preset and --settings: give one of the two.")
+    if file is not None:
+        return Settings.load(file).apply(scene)
+    return scene if named is None else preset(named, scene).apply(scene)

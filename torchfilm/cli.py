@@ -9,12 +9,12 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 
 from torchfilm import measure, pictures, scenes
-from torchfilm.accuracy import Settings, preset
+from torchfilm.accuracy import Settings, accurate
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.rules import Rules
 from torchfilm.pictures import words
@@ -54,7 +54,7 @@ class Run:
     """Stop at this time, h."""
     dt: float | None = None
     """Step, h; by default the scene's."""
-    preset: Literal["draft", "standard", "reference"] | None = None
+    preset: str | None = None
     """How accurately: draft to look at it, standard (the defaults), reference to measure others against."""
     settings: Path | None = None
     """How accurately: a file of settings, as `torchfilm tune SCENE --out` writes it."""
@@ -213,15 +213,6 @@ class Show:
             self.file, frame=self.frame, colour=self.colour, channels=channels, background=self.background, limits=limits, view=self.view,
             section=section, whole=self.whole, colonies=colonies, out=out,
         )  # fmt: skip
-
-
-def accurate(scene: Scene, named: str | None, file: Path | None) -> Scene:
-    """The scene as accurately as a preset or a file of settings says."""
-    if named is not None and file is not None:
-        raise InputError("--preset and --settings: give one of the two.")
-    if file is not None:
-        return Settings.load(file).apply(scene)
-    return scene if named is None else preset(named, scene).apply(scene)
 
 
 def check_new(name: str, path: Path, overwrite: bool, mend: str) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from torchfilm.accuracy import Settings
+from torchfilm.accuracy import Settings, accurate
 from torchfilm.explain import explain
 from torchfilm.results import Results
 from torchfilm.scene_files import load_scene, parse_setting
@@ -56,11 +56,15 @@ class Explain:
     """Colonies for which to estimate; by default as many as the scene's parameters are for, else 1."""
     device: str = "cpu"
     """cpu or cuda."""
+    preset: str | None = None
+    """How accurately, as of `run`: draft, standard or reference."""
+    settings: Path | None = None
+    """How accurately: a file of settings, as `torchfilm tune SCENE --out` writes it."""
     seconds: float = 2.0
     """About how long to measure, by running the scene's first steps; 0 leaves the estimate out."""
 
     def __call__(self) -> None:
-        scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
+        scene = accurate(load_scene(self.scene, dict(map(parse_setting, self.set))), self.preset, self.settings)
         print(explain(scene, cells=self.cells, colonies=self.colonies, device=self.device, seconds=self.seconds))
 
 
@@ -100,6 +104,9 @@ class Tune:
 def parse_error(text: str) -> float:
     """A share: 1% or 0.01."""
     try:
-        return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+        share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
     except ValueError as error:
         raise checks.refuse("--error", text, "a share, such as 1% or 0.01") from error
+    if share >= 1:
+        raise checks.refuse("--error", text, "a share, such as 1% or 0.01", f"{share:g} is {100 * share:g} %; did you mean {text.removesuffix('%')}%?")
+    return share

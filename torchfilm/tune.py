@@ -359,7 +359,7 @@ class Search:
 def _told(tuned: Tuned) -> list[str]:
     """The tables."""
     best, own = tuned.chosen, tuned.own
-    head = f"{tuned.scene.name}: {_percent(tuned.error)} in {', '.join(best.errors)}, over {tuned.window:g} h from {tuned.cells} cells on"
+    head = f"{tuned.scene.name}: {_percent(tuned.error)} in {', '.join(best.errors)}, over {tuned.window:g} h from {tuned.cells} cells in all"
     rows: list[tuple[str, ...]] = [("", "chosen", "part of the error", "of the time")]
     total = sum(best.spent.values()) or 1.0
     for knob, errors in tuned.parts.items():
