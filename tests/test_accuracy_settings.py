@@ -71,7 +71,7 @@ def test_files_hold_what_was_saved_and_nothing_else_is_taken(tmp_path):
     with pytest.raises(InputError, match="no file yet"):
         settings.save(path)
     for text, words in (
-        ("{", "cannot be read"),
+        ("{", "holds no settings"),
         ('{"dt": 0.01}', "no settings of accuracy"),
         ('{"format": "torchfilm settings", "pass": 2}', "one of dt, penalty"),
     ):
