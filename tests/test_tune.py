@@ -9,7 +9,7 @@ import torch
 
 import torchfilm as tf
 from torchfilm.tools.checks import InputError
-from torchfilm.tune import AIM, Probe, Search, begin, observables
+from torchfilm.tune import AIM, CONFIRM, Probe, Search, begin, observables
 
 F64 = torch.float64
 
@@ -58,7 +58,7 @@ def test_what_was_chosen_holds_the_error_in_a_run_of_its_own(colony):
 @pytest.mark.slow
 def test_it_says_what_it_chose_and_why(colony, search):
     assert colony.chosen.worst <= AIM * 0.02 and set(colony.chosen.errors) <= {"cells", "volume", "radius", "overlap"}
-    assert max(colony.confirmed.values()) <= 0.02 and set(colony.confirmed) == set(colony.chosen.errors)
+    assert max(colony.confirmed.values()) <= CONFIRM * 0.02 and set(colony.confirmed) == set(colony.chosen.errors)
     assert set(colony.parts) == {"step", "contacts"} and colony.settings.rtol is None
     others = [t for t in colony.tries if t.worst <= search.aim and t.settings not in search.refuted and t is not colony.own]
     assert all(t.seconds >= colony.chosen.seconds for t in others)

@@ -53,9 +53,9 @@ TIGHT_CONTACTS, TIGHT_CIRCUITS = (0.03, 3, 1e-3), 1e-8
 # A scene that never has as many cells as asked for is taken as it is after this many steps.
 MOST_STEPS = 2000
 SIGNAL = "signal "
-# Other seeds, and colonies somewhat larger, have somewhat other errors than the probe's. So of the error that is asked for AIM is aimed at, what is chosen is
-# confirmed in a second probe of other colonies, LARGER times as large, and where it does not hold there, a part STRICTER as large is aimed at.
-AIM, LARGER, STRICTER = 0.85, 1.5, 0.8
+# Other seeds, and colonies somewhat larger, have somewhat other errors than the probe's. So of the error that is asked for AIM is aimed at, and what is chosen
+# must hold CONFIRM of it in a second probe of other colonies, LARGER times as large; where it does not, a part STRICTER as large is aimed at.
+AIM, CONFIRM, LARGER, STRICTER = 0.65, 0.8, 1.5, 0.8
 # A long step lets a colony grow too much and a loose solve too little. So a step is not given up where it alone is over what is aimed at, but where it is OFF
 # times over. Circuits may take a SMALL part of it.
 OFF, SMALL = 2.0, 0.3
@@ -281,7 +281,7 @@ class Search:
         while True:
             best = self._cheapest()
             errors = self.other.errors(self.other.observed(best.settings)[0], right)
-            if max(errors.values(), default=0.0) <= self.error:
+            if max(errors.values(), default=0.0) <= CONFIRM * self.error:
                 return best, errors
             self.refuted.add(best.settings)
             self.aim *= STRICTER
