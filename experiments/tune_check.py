@@ -48,7 +48,7 @@ class Run:
 
     @staticmethod
     def of(scene: tf.Scene, seed: int) -> Run:
-        probe = begin(scene, cells=150, colonies=6, seed=seed)
+        probe = begin(scene, cells=150, colonies=24, seed=seed)
         search = Search(probe, probe, 0.01)
         return Run(probe, search, probe.observed(search.settings(FINEST, TIGHT_CONTACTS, TIGHT_CIRCUITS))[0])
 

@@ -82,7 +82,7 @@ class Tune:
     """What must be right: cells, volume, radius, overlap, species by name, "signal NAME"; by default all of them."""
     cells: int = 100
     """Cells in each colony where the probe begins."""
-    colonies: int = 8
+    colonies: int = 24
     """Colonies of the probe, if the scene's parameters leave it open."""
     seed: int = 0
     """Seed of the probe."""
