@@ -27,9 +27,9 @@ MAX_TURN = 0.5
 DEEP = 0.2
 # Where a step is coarse, or passes are asked for by their number, it is looked at more closely: µm.
 CLOSE = 0.02
-# Tolerance of the solve at the default penalty α γ. Overlaps hardly feel it, growth under pressure does: at 0.2 a tenth of what a colony grows is wrong, at
-# 0.05 a hundredth. The harder contacts are, the farther from rest is what moves with none of them at the same residual: a tolerance that falls as (α γ)^¼ is
-# enough from 0.1 down to 1e-6 (0.02 is needed at 0.01), and one that falls faster is out of reach of float32.
+# Tolerance of the solve at the default penalty α γ. Overlaps hardly feel it, growth under pressure does: at 0.2 a twentieth of what a colony grows is wrong,
+# at 0.05 less than a hundredth. The harder contacts are, the farther from rest is what moves with none of them at the same residual: a tolerance that falls
+# as (α γ)^¼ is enough from 0.1 down to 1e-6 (0.02 is needed at 0.01), and one that falls faster is out of reach of float32.
 PENALTY, TOLERANCE = 0.1, 0.05
 MOST_SUBSTEPS = 1000
 COARSE_PASSES = 6
@@ -305,9 +305,10 @@ class _Run:
         held = torch.zeros_like(gap) if number == 0 else torch.where(soft, gap.clamp(max=0), 0.0)
         lower = (base - self.length) / scale[:, -1]
         problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1), lower, scale, state.groups, settings.unilateral)
+        start = state.displacement if number == 0 else None
         if bool(moving.all()):
-            return solve(problem, state.displacement if number == 0 else None, self._tolerance(), settings.max_iterations)
-        move, report = solve(problem.among(moving), state.displacement[moving] if number == 0 else None, self._tolerance(), settings.max_iterations)
+            return solve(problem, start, self._tolerance(), settings.max_iterations)
+        move, report = solve(problem.among(moving), None if start is None else start[moving], self._tolerance(), settings.max_iterations)
         return torch.zeros_like(scale).index_copy(0, torch.nonzero(moving).squeeze(1), move), report
 
     def _tolerance(self) -> Tensor:

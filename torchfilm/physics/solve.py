@@ -264,8 +264,8 @@ def _within(free: Tensor, inverse: Tensor) -> Map:
     own = inverse[:, -1:, -1]
     held = (length == 0) & (own > 0)
     along = torch.where(held, inverse[:, :, -1] / torch.where(held, own, 1.0).sqrt(), 0.0)
-    left = inverse.diagonal(dim1=1, dim2=2)[:, :-1] - along[:, :-1].square()
-    along = along * (left > LEAST_LEFT * inverse.diagonal(dim1=1, dim2=2)[:, :-1]).all(1, keepdim=True)
+    whole = inverse.diagonal(dim1=1, dim2=2)[:, :-1]
+    along = along * (whole - along[:, :-1].square() > LEAST_LEFT * whole).all(1, keepdim=True)
     among = torch.baddbmm(inverse, along.unsqueeze(2), along.unsqueeze(1), alpha=-1.0)
     among[:, -1] *= length
     among[:, :, -1] *= length
