@@ -8,7 +8,8 @@ import torch
 from helpers import run, seeded
 
 import torchfilm as tf
-from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.effects.mechanics import _Run
+from torchfilm.physics.contacts import contacts_of, gaps_nearby
 
 # Sixty short rods thrown into a box of 5 µm: the first moves would turn some of them by far more than MAX_TURN, as in the middle of a large colony.
 RODS, SIDE = 60, 5.0
@@ -71,6 +72,32 @@ def test_a_later_pass_moves_only_what_is_too_deep(device, dtype):
     assert bool(moved[deep].all()) and not bool(moved[-2:].any())
     assert 0 < int((moved & ~deep).sum()) <= int(one.reports["mechanics"].limited[0]) < RODS
     assert not bool(moved[:RODS].all())
+
+
+@pytest.mark.parametrize("overlap", [None, 0.02, 0.3])
+def test_what_is_left_deep_is_found_wherever_it_is(dtype, overlap):
+    """By the search near what has moved, the same cells and the same contacts as by looking at every pair: for cells of many sizes, thrown together."""
+    cells = thrown(1.0, 1.6)
+    rng = np.random.default_rng(3)
+    cells = tf.Cells(
+        cells.position, cells.axis, length=rng.choice([0.0, 0.5, 2.0, 12.0], 2 * RODS), radius=rng.uniform(0.2, 0.6, 2 * RODS), colony=cells.colony
+    )
+    scene = tf.Scene(tf.Mechanics(dim=3, passes=2, overlap=overlap))
+    state = seeded(scene, cells, "cpu", dtype)
+    both = torch.ones(2, dtype=torch.bool)
+    run_of = _Run(scene.effects[0], state, 0.025, torch.ones(2, dtype=torch.int64), torch.zeros(2, dtype=torch.int64))
+    before, walls = run_of._all_that_touches(both)
+    every = torch.ones(2 * RODS, dtype=torch.bool)
+    move, report = run_of._solve(contacts_of(before), walls, state.length, every, 0)
+    run_of._move(move, state.length, every, report, both)
+    pairs, _, left = run_of._left_deep(both, before)
+    after, _ = run_of._all_that_touches(both)
+    limit = 0.5 * (run_of.overlap[after.first] + run_of.overlap[after.second])
+    wanted = run_of.cut.clone()
+    wanted[torch.cat([after.first[after.gap < -limit], after.second[after.gap < -limit]])] = True
+    assert torch.equal(left, wanted) and 0 < int(left.sum()) < 2 * RODS
+    as_set = lambda t: {(min(p), max(p)) for p in zip(t.first.tolist(), t.second.tolist(), strict=True)}  # noqa: E731
+    assert as_set(pairs) == {p for p in as_set(after) if left[list(p)].any()}
 
 
 @pytest.mark.parametrize("passes", [1, 2, 3])

@@ -9,7 +9,7 @@ from helpers import segment_distance, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchfilm.physics.neighbours import find_pairs
+from torchfilm.physics.neighbours import Neighbourhood
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
 
@@ -26,10 +26,13 @@ class Scatter:
         self.radius = rng.uniform(0.3, 0.6, count)
 
     def pairs(self, dtype, margin: float = 0.0, device="cpu") -> tuple[np.ndarray, np.ndarray]:
+        i, j = self.asked(dtype, margin, device).pairs()
+        return i.cpu().numpy(), j.cpu().numpy()
+
+    def asked(self, dtype, margin: float = 0.0, device="cpu") -> Neighbourhood:
         t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)  # noqa: E731
         colony = torch.as_tensor(self.colony, device=device)
-        i, j = find_pairs(t(self.position), t(self.axis), t(self.length), t(self.radius), colony, self.colonies, margin)
-        return i.cpu().numpy(), j.cpu().numpy()
+        return Neighbourhood(t(self.position), t(self.axis), t(self.length), t(self.radius), colony, self.colonies, margin)
 
     def near(self, margin: float) -> set[tuple[int, int]]:
         """Brute force: every pair of one colony whose surfaces are within `margin`."""
@@ -77,6 +80,29 @@ def test_pairs_against_brute_force(device, dtype, dim, margin):
 def test_pairs_of_any_scatter(seed, counts, dim, side, lengths, dtype, margin):
     """The same for whatever sizes and densities: all cells in one place, or none near another."""
     check(Scatter(np.random.default_rng(seed), counts, dim, side, lengths), dtype, margin)
+
+
+@settings(deadline=None, derandomize=True, max_examples=60)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    counts=st.lists(st.integers(0, 25), min_size=1, max_size=4),
+    dim=st.sampled_from([2, 3]),
+    side=st.sampled_from([0.0, 0.5, 3.0, 20.0]),
+    lengths=st.lists(st.sampled_from([0.0, 0.1, 2.0, 9.0, 60.0]), min_size=1, max_size=3),
+    share=st.sampled_from([0.0, 0.1, 0.5, 1.0]),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+def test_pairs_of_some_cells_are_those_of_all_that_hold_one(seed, counts, dim, side, lengths, share, dtype):
+    """Each once, the cell that was asked for first, whatever its class and its partner's; nothing where nobody is asked for."""
+    rng = np.random.default_rng(seed)
+    cells = Scatter(rng, counts, dim, side, lengths)
+    asked = np.flatnonzero(rng.random(len(cells.colony)) < share)
+    near = cells.asked(dtype, 0.1)
+    i, j = (x.numpy() for x in near.pairs_of(torch.as_tensor(asked)))
+    every = {(min(p), max(p)) for p in zip(*(x.tolist() for x in near.pairs()), strict=True)}
+    found = [(min(p), max(p)) for p in zip(i.tolist(), j.tolist(), strict=True)]
+    assert len(set(found)) == len(found) and np.isin(i, asked).all()
+    assert set(found) == {p for p in every if np.isin(p, asked).any()}
 
 
 @DIMS

@@ -9,7 +9,7 @@ from helpers import array
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchfilm.tools.ragged import Groups, expand_ranges, offsets
+from torchfilm.tools.ragged import Groups, WeightedRows, expand_ranges, offsets
 
 
 def loop(owner: np.ndarray, size: int, value: np.ndarray, what, empty: float = 0.0) -> np.ndarray:
@@ -61,6 +61,49 @@ def test_maxima_of_negative_numbers_and_infinities(device, dtype):
     found = groups.max(torch.tensor([-3.0, -1.0, -torch.inf, 1.0, torch.nan], dtype=dtype, device=device))
     assert found[:2].tolist() == [-1.0, -torch.inf]
     assert bool(found[2].isnan()) and float(found[3]) == 0.0
+
+
+@settings(deadline=None, derandomize=True, max_examples=60)
+@given(
+    owner=st.lists(st.integers(0, 6), max_size=40),
+    width=st.sampled_from([1, 4, 7]),
+    in_order=st.booleans(),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+def test_weighted_sums_against_loops(owner, width, in_order, dtype):
+    """Of the same rows with one set of weights and then another."""
+    owner = np.array(sorted(owner) if in_order else owner, dtype=np.int64)
+    rng = np.random.default_rng(len(owner))
+    value = rng.normal(size=(len(owner), width))
+    rows = WeightedRows(torch.as_tensor(value, dtype=dtype), Groups(torch.as_tensor(owner), 8))
+    for weight in rng.normal(size=(2, len(owner))):
+        found = rows.sum(rows.sorted(torch.as_tensor(weight, dtype=dtype)))
+        assert found.shape == (8, width) and found.dtype == dtype
+        wanted = loop(owner, 8, weight[:, None] * value, np.sum)
+        assert np.abs(array(found) - wanted).max() <= {torch.float32: 1e-5, torch.float64: 1e-13}[dtype]
+
+
+@pytest.mark.parametrize("width", [1, 4, 7])
+def test_a_group_has_the_same_weighted_sum_in_any_company(device, dtype, width, deterministic):
+    """To the last bit: alone, and first, last or in the midst of many."""
+    rng = np.random.default_rng(1)
+    t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)  # noqa: E731
+    value, weight = rng.normal(size=(90, width)), rng.normal(size=90)
+    alone = WeightedRows(t(value), Groups(torch.zeros(90, dtype=torch.int64, device=device), 1))
+    wanted = alone.sum(alone.sorted(t(weight)))[0]
+    for others in (3, 2000, 70_000):
+        for own in (0, others // 2, others - 1):
+            owner = np.concatenate([rng.integers(0, others, 2 * others), np.full(90, own)])
+            owner[:-90][owner[:-90] == own] = (own + 1) % others
+            order = np.sort(rng.permutation(len(owner))[:90])  # where the group's rows stand among the rest
+            place = np.concatenate([np.setdiff1d(np.arange(len(owner)), order), order])
+            every = {k: np.empty((len(owner), *v.shape[1:])) for k, v in (("value", value), ("weight", weight))}
+            every["value"][place] = np.concatenate([rng.normal(size=(2 * others, width)), value])
+            every["weight"][place] = np.concatenate([rng.normal(size=2 * others), weight])
+            owners = np.empty(len(owner), dtype=np.int64)
+            owners[place] = owner
+            among = WeightedRows(t(every["value"]), Groups(torch.as_tensor(owners, device=device), others))
+            assert torch.equal(among.sum(among.sorted(t(every["weight"])))[own], wanted), (others, own)
 
 
 @pytest.mark.parametrize("width", [(), (1,), (3,)])

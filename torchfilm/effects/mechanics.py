@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchfilm.effect import MECHANICS, Effect, per_cell
 from torchfilm.physics import capsule
-from torchfilm.physics.contacts import Bodies, Contacts, Touching, contacts_of
-from torchfilm.physics.neighbours import find_pairs
+from torchfilm.physics.contacts import Bodies, Contacts, Touching, contact_gaps, contacts_of
+from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.rows import ContactRows
 from torchfilm.physics.solve import CONVERGED, NOT_FINITE, STATUS, TOO_FAST, ContactProblem, SolveReport, solve
 from torchfilm.physics.walls import Surface, Wall, WallContacts, find_wall_contacts, share_to_walls
@@ -205,7 +205,9 @@ class _Run:
         self.first_move = state.displacement
         count = state.colonies
         zero = torch.zeros(count, dtype=torch.int64, device=state.device)
-        self.limited, self.cut = zero, torch.zeros_like(state.colony, dtype=torch.bool)
+        self.limited = zero
+        # of the last move: which cells it was cut short for, (N,), and how far the surface of each has come at the most, (N,) µm
+        self.cut, self.moved = torch.zeros_like(state.colony, dtype=torch.bool), torch.zeros_like(state.radius)
         self.report = MechanicsReport(status, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero)
         start = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
         self.reference = state.position.detach().index_select(0, start).index_select(0, state.colony)
@@ -240,49 +242,80 @@ class _Run:
         self.length = torch.where(moving, base + growth, base)
         for number in range(int(self.passes.max())):
             active = active & (number < self.passes)
-            pairs, walls = self._detect(active)
-            moving = active.index_select(0, self.state.colony)
-            if number > 0:
-                moving = moving & self._unsettled(pairs, walls)
-                active = self.state.groups.any(moving)
             if not bool(active.any()):
                 return
-            pairs, walls = _of_cells(pairs, walls, moving)
+            if number == 0:
+                pairs, walls = self._all_that_touches(active)
+            else:
+                pairs, walls, moving = self._left_deep(active, pairs)
+                active = self.state.groups.any(moving)
+                if not bool(active.any()):
+                    return
             move, report = self._solve(contacts_of(pairs, whole_lines=self.settings.unilateral), walls, base, moving, number)
             self._move(move, base, moving, report, active)
             self.report = self._noted(report, active)
             if number == 0:
                 self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
 
-    def _detect(self, active: Tensor) -> tuple[Touching, WallContacts]:
-        """All that touches in the present geometry; colonies that cannot be stepped are of no use to anyone and are left out."""
-        state = self.state
-        local = (self.position - self.reference).to(state.dtype)
-        with torch.no_grad():
-            axis, length, radius, colony = self.axis, self.length, state.radius, state.colony
-            if bool(active.all()):
-                first, second = find_pairs(local, axis, length, radius, colony, state.colonies)
-            else:
-                rows = torch.nonzero(active.index_select(0, colony)).squeeze(1)
-                pick = lambda x: x.index_select(0, rows)  # noqa: E731
-                found = find_pairs(pick(local), pick(axis), pick(length), pick(radius), pick(colony), state.colonies)
-                first, second = rows.index_select(0, found[0]), rows.index_select(0, found[1])
-        bodies = Bodies(local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius)
-        walls = find_wall_contacts(self.surfaces, self.position, self.axis, self.length, state.radius, self.colony_ids)
+    def _all_that_touches(self, active: Tensor) -> tuple[Touching, WallContacts]:
+        """In the colonies that are active, (B,) bool."""
+        near, rows, bodies = self._neighbourhood(active)
+        first, second = (rows.index_select(0, side) for side in near.pairs())
+        walls = self._at_walls(active.index_select(0, self.state.colony))
         return Touching.among(bodies, first, second), walls
 
-    @torch.no_grad()
-    def _unsettled(self, pairs: Touching, walls: WallContacts) -> Tensor:
-        """Which cells take part in another pass, (N,) bool: those whose move was cut short, or left them too deep."""
-        found = self.cut.clone()
-        # soft cells, and cells at a soft wall or one of little weight, are pressed as deep as these let them
-        if self.settings.stiffness is None:
-            deep = torch.nonzero(pairs.gap < -self.overlap.index_select(0, pairs.first)).squeeze(1)
-            found[torch.cat([pairs.first.index_select(0, deep), pairs.second.index_select(0, deep)])] = True
-        root, soft = self._wall_weights(walls)
-        deep = ~soft & (root * root * walls.gap < -self.overlap.index_select(0, walls.cell))
-        found[walls.cell[deep]] = True
-        return found
+    def _left_deep(self, active: Tensor, pairs: Touching) -> tuple[Touching, WallContacts, Tensor]:
+        """After a move, in the colonies that are active: the cells that take part in another pass, (N,) bool, those whose move was cut short, or left
+        them too deep; and all that touches them. pairs: what touched before the move.
+
+        Only there is it looked for: of two cells that did not touch, one must have moved by half of what may be left, and two that did must have come
+        nearer by what was missing to it.
+        """
+        state = self.state
+        near, rows, bodies = self._neighbourhood(active)
+        with torch.no_grad():
+            of_active = active.index_select(0, state.colony)
+            walls = self._at_walls(of_active)
+            number = torch.full_like(state.colony, -1).index_copy(0, rows, torch.arange(rows.numel(), device=rows.device))
+            pairs_of = lambda cells: [rows.index_select(0, side) for side in near.pairs_of(number[cells])]  # noqa: E731
+            sum_of = lambda x, one, other: x.index_select(0, one) + x.index_select(0, other)  # noqa: E731
+            far = (2 * self.moved > self.overlap) & of_active
+            come = sum_of(self.moved, pairs.first, pairs.second) - pairs.gap > 0.5 * sum_of(self.overlap, pairs.first, pairs.second)
+            come = torch.nonzero(come & of_active.index_select(0, pairs.first)).squeeze(1)
+            first, second = pairs_of(far)
+            left = self.cut & of_active
+            # soft cells, and cells at a soft wall or one of little weight, are pressed as deep as these let them
+            if self.settings.stiffness is None:
+                for one, other in ((pairs.first.index_select(0, come), pairs.second.index_select(0, come)), (first, second)):
+                    deep = torch.nonzero(contact_gaps(bodies, one, other) < -0.5 * sum_of(self.overlap, one, other)).squeeze(1)
+                    left[torch.cat([one.index_select(0, deep), other.index_select(0, deep)])] = True
+            root, soft = self._wall_weights(walls)
+            left[walls.cell[~soft & (root * root * walls.gap < -self.overlap.index_select(0, walls.cell))]] = True
+            more = pairs_of(left & ~far)
+            new = torch.nonzero(~far.index_select(0, more[1])).squeeze(1)  # the others are known by now
+            first, second = (torch.cat([a, b.index_select(0, new)]) for a, b in zip((first, second), more, strict=True))
+            theirs = torch.nonzero(left.index_select(0, first) | left.index_select(0, second)).squeeze(1)
+        pairs = Touching.among(bodies, first.index_select(0, theirs), second.index_select(0, theirs))
+        return pairs, self._at_walls(left), left
+
+    def _neighbourhood(self, active: Tensor) -> tuple[Neighbourhood, Tensor, Bodies]:
+        """The cells of the colonies that are active (others cannot be stepped perhaps), which those are (M,), and every cell's body."""
+        state = self.state
+        local = (self.position - self.reference).to(state.dtype)
+        bodies = Bodies(local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius)
+        rows = torch.nonzero(active.index_select(0, state.colony)).squeeze(1)
+        pick = lambda x: x.detach() if rows.numel() == state.cells else x.detach().index_select(0, rows)  # noqa: E731
+        near = Neighbourhood(pick(local), pick(self.axis), pick(self.length), pick(state.radius), pick(state.colony), state.colonies)
+        return near, rows, bodies
+
+    def _at_walls(self, which: Tensor) -> WallContacts:
+        """What touches walls among the cells that are marked, (N,) bool."""
+        given = (self.position, self.axis, self.length, self.state.radius, self.colony_ids)
+        if bool(which.all()):
+            return find_wall_contacts(self.surfaces, *given)
+        rows = torch.nonzero(which).squeeze(1)
+        found = find_wall_contacts(self.surfaces, *(x.index_select(0, rows) for x in given))
+        return replace(found, cell=rows.index_select(0, found.cell))
 
     def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, number: int):
         """The move of the cells that are moving, (N, D), while the others stay where they are."""
@@ -319,11 +352,6 @@ class _Run:
             hardest = -self.state.groups.max(-self.alpha * self.length_drag, empty=-PENALTY)
             return TOLERANCE * (hardest / PENALTY).clamp(max=1.0).sqrt().sqrt()
 
-    def _turn(self, move: Tensor) -> Tensor:
-        """How far each cell turns, (N,) rad."""
-        turns = move[:, self.state.dim : -1].detach()
-        return (turns * turns).sum(1).sqrt()
-
     def _wall_weights(self, walls: WallContacts) -> tuple[Tensor, Tensor]:
         """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
         root = torch.ones_like(walls.gap)
@@ -344,8 +372,8 @@ class _Run:
         state, d = self.state, self.state.dim
         sound = (moving & (report.status != NOT_FINITE).index_select(0, state.colony)).unsqueeze(1)
         move = torch.where(sound, move, 0.0)
-        share = self._share(move.detach())
-        self.cut = share < 1
+        reach, share = self._share(move.detach())
+        self.cut, self.moved = share < 1, share * reach
         move = move * share.unsqueeze(1)
         limited = state.groups.sum(self.cut.to(state.dtype).unsqueeze(1)).squeeze(1).long()
         self.limited = torch.where(active, limited, self.limited)
@@ -355,13 +383,14 @@ class _Run:
         self.length = torch.where(length >= base, length, base)  # unlike a maximum, whole gradient at a tie
 
     @torch.no_grad()
-    def _share(self, move: Tensor) -> Tensor:
-        """How much of its move each cell makes, (N,): see MAX_TURN, and no farther than its radius behind a wall that it may not have touched before."""
+    def _share(self, move: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the surface of each cell would come with the whole of its move, (N,) µm, and how much of it the cell makes, (N,): see MAX_TURN, and
+        no farther than its radius behind a wall that it may not have touched before."""
         d, radius = self.state.dim, self.state.radius
         turn, way = (x.square().sum(1).sqrt() for x in (move[:, d:-1], move[:, :d]))
         share = (MAX_TURN / turn).clamp(max=1.0)
-        reach = share * (way + 0.5 * turn * self.length + 0.5 * move[:, -1].clamp(min=0.0))
-        far = torch.nonzero(reach > radius).squeeze(1)
+        reach = way + 0.5 * turn * self.length + 0.5 * move[:, -1].clamp(min=0.0)
+        far = torch.nonzero(share * reach > radius).squeeze(1)
         if far.numel() and self.surfaces:
             pick = lambda x: x.index_select(0, far)  # noqa: E731
             position, axis, length, part = pick(self.position), pick(self.axis), pick(self.length), pick(move) * pick(share).unsqueeze(1)
@@ -369,7 +398,7 @@ class _Run:
                 position + s * part[:, :d].to(position.dtype), capsule.rotate(axis, s * part[:, d:-1]), 0.5 * (length + s * part[:, -1]),
             )  # fmt: skip
             share[far] *= share_to_walls(self.surfaces, at, pick(radius), pick(self.colony_ids))
-        return share
+        return reach, share
 
     def _noted(self, new: SolveReport, active: Tensor) -> MechanicsReport:
         old = self.report
@@ -379,11 +408,3 @@ class _Run:
             torch.where(active, torch.maximum(old.residual, new.residual), old.residual),
             old.passes + active, old.substeps, self.limited,
         )  # fmt: skip
-
-
-def _of_cells(pairs: Touching, walls: WallContacts, cells: Tensor) -> tuple[Touching, WallContacts]:
-    """Those in which a cell that is marked, (N,) bool, takes part."""
-    if bool(cells.all()):
-        return pairs, walls
-    either = cells.index_select(0, pairs.first) | cells.index_select(0, pairs.second)
-    return pairs.take(torch.nonzero(either).squeeze(1)), walls.take(torch.nonzero(cells.index_select(0, walls.cell)).squeeze(1))

@@ -30,29 +30,64 @@ CLASS_RATIO = 4.0
 
 @torch.no_grad()
 def find_pairs(position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Pairs (i, j), i ≠ j, of one colony, whose bounding spheres and bounding boxes come within `margin` µm of each other.
+    """Every pair of a `Neighbourhood`, which takes the same."""
+    return Neighbourhood(position, axis, length, radius, colony, colonies, margin).pairs()
 
-    position, axis (N, d) µm and unit; length, radius (N,) µm; colony (N,) int64. Every pair stands once; no pair whose
-    surfaces are within `margin` is missing. Returns two (P,) int64 tensors.
+
+class Neighbourhood:
+    """Cells of many colonies where they stand, to be asked who is near whom as often as need be.
+
+    position, axis (N, d) µm and unit; length, radius (N,) µm; colony (N,) int64. A pair (i, j), i ≠ j, is of one colony, and its bounding spheres and
+    bounding boxes come within `margin` µm of each other. No pair whose surfaces are within `margin` is missing. Pairs are two (P,) int64 tensors.
     """
-    if colony.numel() < 2:
-        return colony.new_empty(0), colony.new_empty(0)
-    groups = Groups(colony, colonies)
-    reach = 0.5 * length + radius + 0.5 * margin
-    smallest = -groups.max(-reach)
-    ratio = reach / smallest.index_select(0, colony)
-    level = torch.floor(torch.log(ratio) / math.log(CLASS_RATIO) + 1e-3).long()
-    place, found = position.T.contiguous(), []
-    for k in range(int(level.max()) + 1):
-        members = torch.nonzero(level == k).squeeze(1)
-        if members.numel():
-            grid = _Grid.build(position, reach, colony, colonies, members)
-            found.append(grid.pairs_within(place, reach))
-            larger = torch.nonzero(level > k).squeeze(1)
+
+    @torch.no_grad()
+    def __init__(self, position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float = 0.0):
+        self.place, self.reach = position.T.contiguous(), 0.5 * length + radius + 0.5 * margin
+        # a hair more, so that rounding loses no pair that touches exactly
+        self.box = (0.5 * length * axis.abs().T + radius + 0.5 * margin) * (1 + 1e-5)
+        self.grids: list[tuple[_Grid, Tensor]] = []  # of each class, with the cells of larger classes
+        if colony.numel() < 2:
+            return
+        smallest = -Groups(colony, colonies).max(-self.reach)
+        level = torch.floor(torch.log(self.reach / smallest.index_select(0, colony)) / math.log(CLASS_RATIO) + 1e-3).long()
+        for k in range(int(level.max()) + 1):
+            members = torch.nonzero(level == k).squeeze(1)
+            if members.numel():
+                grid = _Grid.build(position, self.reach, colony, colonies, members)
+                self.grids.append((grid, torch.nonzero(level > k).squeeze(1)))
+
+    @torch.no_grad()
+    def pairs(self) -> tuple[Tensor, Tensor]:
+        """Every pair, once."""
+        found = []
+        for grid, larger in self.grids:
+            found.append(grid.pairs_within(self.place, self.reach))
             if larger.numel():
-                found.append(_meeting(place, reach, *grid.pairs_with(larger)))
-    first, second = torch.cat([f[0] for f in found]), torch.cat([f[1] for f in found])
-    return _near(place, axis, length, radius, margin, first, second)
+                found.append(_meeting(self.place, self.reach, *grid.pairs_with(larger)))
+        return self._near(found)
+
+    @torch.no_grad()
+    def pairs_of(self, cells: Tensor) -> tuple[Tensor, Tensor]:
+        """Every pair of which at least one is among `cells` (M,), once; that one stands first."""
+        asked = torch.zeros(self.reach.numel(), dtype=torch.bool, device=self.reach.device).index_fill(0, cells, True)
+        found = []
+        for grid, _ in self.grids if cells.numel() else ():
+            i, j = _meeting(self.place, self.reach, *grid.pairs_with(cells))
+            # two that were both asked have found each other, and each has found itself
+            once = torch.nonzero((i < j) | ~asked.index_select(0, j)).squeeze(1)
+            found.append((i.index_select(0, once), j.index_select(0, once)))
+        return self._near(found)
+
+    def _near(self, found: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+        """Those of the pairs whose bounding boxes, each grown by half the margin, meet."""
+        none = self.reach.new_empty(0, dtype=torch.int64)
+        i, j = (torch.cat([none, *side]) for side in (zip(*found, strict=True) if found else ((), ())))
+        for x, size in zip(self.place, self.box, strict=True):
+            apart = (x.index_select(0, j) - x.index_select(0, i)).abs() > size.index_select(0, i) + size.index_select(0, j)
+            keep = torch.nonzero(~apart).squeeze(1)
+            i, j = i.index_select(0, keep), j.index_select(0, keep)
+        return i, j
 
 
 @dataclass(frozen=True)
@@ -133,9 +168,10 @@ class _Grid:
         # strangers are told apart row by row, from copies in the members' own order: what is read stands side by side, and fits a cache
         place, reach = place.index_select(1, members), reach.index_select(0, members)
         reaches = 2 if own.shape[0] == 1 else 1
+        most = self.shape[1:].amax(1).tolist()  # a film a row thick has no rows above or below
         first, second = [], []
         for step in itertools.product(range(-reaches, reaches + 1), repeat=own.shape[0]):
-            if step[::-1] < (0,) * len(step):
+            if step[::-1] < (0,) * len(step) or any(abs(k) >= rows for k, rows in zip(step, most, strict=True)):
                 continue
             start, count = self._run(members, own + torch.tensor(step, device=own.device).unsqueeze(1))
             if not any(step):
@@ -148,7 +184,7 @@ class _Grid:
         return torch.cat(first), torch.cat(second)
 
     def pairs_with(self, larger: Tensor) -> tuple[Tensor, Tensor]:
-        """Every pair of a larger cell (of another class) and a member."""
+        """Every pair of one of the cells `larger` (M,), of this class or another, and a member: those of this class meet themselves too."""
         rows_each_way = torch.ceil(self.window.index_select(0, larger)).long()
         found: list[Tensor] = []
         query = torch.arange(larger.numel(), device=larger.device)
@@ -173,13 +209,3 @@ def _meeting(place: Tensor, reach: Tensor, i: Tensor, j: Tensor) -> tuple[Tensor
     # a hair more than the reach: rounding must not lose a pair that touches exactly
     keep = torch.nonzero(squared <= sum_reach * sum_reach * (1 + 1e-5)).squeeze(1)
     return i.index_select(0, keep), j.index_select(0, keep)
-
-
-def _near(place, axis, length, radius, margin, i, j):
-    """Keep the pairs whose bounding boxes, each grown by half the margin, meet."""
-    box = (0.5 * length * axis.abs().T + radius + 0.5 * margin) * (1 + 1e-5)
-    for x, size in zip(place, box, strict=True):
-        apart = (x.index_select(0, j) - x.index_select(0, i)).abs() > size.index_select(0, i) + size.index_select(0, j)
-        keep = torch.nonzero(~apart).squeeze(1)
-        i, j = i.index_select(0, keep), j.index_select(0, keep)
-    return i, j

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from torch import Tensor
 
-from torchfilm.tools.ragged import Groups, csr
+from torchfilm.tools.ragged import Groups, WeightedRows, csr
 
 
 class ContactRows:
@@ -22,7 +24,6 @@ class ContactRows:
         self.half_rows = Groups(torch.cat([first, second, at_wall]), cells)
         self.row_owner = torch.cat([first, at_wall])
         self._matrix: Tensor | None = None
-        self._work: Tensor | None = None
 
     @property
     def rows(self) -> int:
@@ -65,18 +66,19 @@ class ContactRows:
 
     def apply_transpose(self, e: Tensor) -> Tensor:
         """Jᵀ e: (R,) -> (N, D)."""
-        e = e.unsqueeze(1)
-        pair, wall = e[: self.pairs], e[self.pairs :]
         if self._needs_grad(e):
+            pair, wall = e.unsqueeze(1)[: self.pairs], e.unsqueeze(1)[self.pairs :]
             return self.half_rows.sum(torch.cat([self.row_first * pair, self.row_second * pair, self.row_wall * wall]))
-        width = self.row_first.shape[1]
-        if self._work is None:
-            self._work = e.new_empty(2 * self.pairs + self.walls, width)
-        # one buffer for the life of the rows: fresh memory for every product would cost more than the product
-        torch.mul(self.row_first, pair, out=self._work[: self.pairs])
-        torch.mul(self.row_second, pair, out=self._work[self.pairs : 2 * self.pairs])
-        torch.mul(self.row_wall, wall, out=self._work[2 * self.pairs :])
-        return self.half_rows.sum_into(self._work, e.new_empty(self.cells, width))
+        halves, row = self._halves
+        return halves.sum(e.index_select(0, row))
+
+    @cached_property
+    def _halves(self) -> tuple[WeightedRows, Tensor]:
+        """What each row does to each of its cells, cell by cell, and which row it is of."""
+        halves = WeightedRows(torch.cat([self.row_first, self.row_second, self.row_wall]).detach(), self.half_rows)
+        pair = torch.arange(self.pairs, device=self.first.device)
+        wall = torch.arange(self.pairs, self.rows, device=self.first.device)
+        return halves, halves.sorted(torch.cat([pair, pair, wall]))
 
     def sizes_of(self, x: Tensor) -> Tensor:
         """|J| |x|: (N, D) -> (R,)."""
@@ -91,33 +93,25 @@ class ContactRows:
 
     def blocks(self, active: Tensor | None = None) -> Tensor:
         """The diagonal blocks of Jᵀ diag(active) J, or of JᵀJ: (R,) -> (N, D, D)."""
-        width = self.row_first.shape[1]
-        rows = torch.cat([self.row_first, self.row_second, self.row_wall])
-        scaled = rows
+        halves, row = self._halves
+        weight = halves.value.T.contiguous()
         if active is not None:
-            pair, wall = active[: self.pairs], active[self.pairs :]
-            scaled = rows * torch.cat([pair, pair, wall]).unsqueeze(1)
-        # the upper half of each square, row by row of it: slices are cheap, picking columns is not, and the whole half would not fit a cache
-        parts = (rows[:, k : k + 1] * scaled[:, k:] for k in range(width))
-        summed = torch.cat([self.half_rows.sum_into(part, rows.new_empty(self.cells, part.shape[1])) for part in parts], 1)
-        i, j = torch.triu_indices(width, width, device=rows.device)
-        whole = torch.empty(width, width, dtype=torch.int64, device=rows.device)
-        whole[i, j] = whole[j, i] = torch.arange(i.numel(), device=rows.device)
-        return summed.index_select(1, whole.reshape(-1)).reshape(-1, width, width)
+            weight = weight * active.index_select(0, row)
+        return torch.stack([halves.sum(of_column) for of_column in weight], 1)
 
     def _needs_grad(self, x: Tensor) -> bool:
         return torch.is_grad_enabled() and (x.requires_grad or self.row_first.requires_grad or self.row_wall.requires_grad)
 
     def _assemble(self, width: int) -> Tensor:
-        dof = torch.arange(width, device=self.first.device)
-        column = lambda cell: cell.unsqueeze(1) * width + dof  # noqa: E731
-        columns = torch.cat([torch.cat([column(self.first), column(self.second)], 1).reshape(-1), column(self.at_wall).reshape(-1)])
-        values = torch.cat([torch.cat([self.row_first, self.row_second], 1).reshape(-1), self.row_wall.reshape(-1)])
-        pair_end = 2 * width * self.pairs
-        start = torch.cat(
-            [
-                torch.arange(self.pairs, device=dof.device) * (2 * width),
-                pair_end + torch.arange(self.walls + 1, device=dof.device) * width,
-            ]
-        )
-        return csr(start, columns, values.detach(), (self.rows, self.cells * width))
+        # 32-bit from the start: what is made and read here is as long as all that a product reads
+        dof = torch.arange(width, dtype=torch.int32, device=self.first.device)
+        columns = torch.empty(2 * self.pairs + self.walls, width, dtype=torch.int32, device=dof.device)
+        values = self.row_first.new_empty(columns.shape)
+        of_pairs, of_walls = 2 * self.pairs, columns[2 * self.pairs :]
+        for side, (cell, row) in enumerate(((self.first, self.row_first), (self.second, self.row_second))):
+            torch.add((cell * width).int().unsqueeze(1), dof, out=columns[side:of_pairs:2])
+            values[side:of_pairs:2] = row.detach()
+        torch.add((self.at_wall * width).int().unsqueeze(1), dof, out=of_walls)
+        values[of_pairs:] = self.row_wall.detach()
+        start = torch.cat([torch.arange(self.pairs, device=dof.device) * 2, of_pairs + torch.arange(self.walls + 1, device=dof.device)])
+        return csr(start * width, columns.reshape(-1), values.reshape(-1), (self.rows, self.cells * width))

@@ -204,10 +204,10 @@ def _newton(problem: ContactProblem, at: _Iterate, tolerance: Tensor, max_iterat
     """Rounds of Newton's method from the iterate `at`, the round `number` first, until every colony has converged."""
     colonies = problem.colonies
     y, after, active, inverse, scale, previous, iterations = at.y, at.after, at.active, at.inverse, at.scale, at.worst, at.iterations
+    within, gradient = _Within(inverse), problem.gradient(y, after * active)
     while True:
-        gradient = problem.gradient(y, after * active)
         free = _free(y, gradient, problem.lower)
-        precondition = _within(free, inverse)
+        precondition = within.at(free)
         worst = worst_of(precondition(gradient), colonies)
         target = tolerance * scale
         going = (worst > target) & (worst < torch.inf) & (iterations < max_iterations)
@@ -231,11 +231,11 @@ def _newton(problem: ContactProblem, at: _Iterate, tolerance: Tensor, max_iterat
         inner = torch.where(going, least, torch.inf)
         result = conjugate_gradients(_operator(problem, active), -gradient, precondition, colonies, inner, max_iterations)
         iterations = iterations + result.iterations
-        y, after = _line_search(problem, y, after, gradient, result.x, going)
-        active = problem.acting(after)
+        y, after, active, gradient = _line_search(problem, y, after, gradient, result.x, going)
         if problem.unilateral:
             # a cell that nothing touched before has blocks of α alone: kept, they would weigh its new contact 1/α times too much and hide all else
             inverse = _block_inverse(problem, active)
+            within = _Within(inverse)
         number += 1
 
 
@@ -256,20 +256,29 @@ def _rounding(problem: ContactProblem, precondition: Map, y: Tensor) -> Tensor:
     return 2 * torch.finfo(y.dtype).eps * worst_of(precondition(forces), problem.colonies)
 
 
-def _within(free: Tensor, inverse: Tensor) -> Map:
+class _Within:
     """The preconditioner among the degrees of freedom that are free: what it is given elsewhere it does not look at, and leaves at 0."""
-    length = free[:, -1:]  # the only one that may be held
-    # The inverse of the block without it, and not a part of the whole block's inverse, in which the length would still give way: with that, the cells
-    # whose length is held, where pressure is, took three times as many iterations. Where rounding would leave nothing of it, the part must do.
-    own = inverse[:, -1:, -1]
-    held = (length == 0) & (own > 0)
-    along = torch.where(held, inverse[:, :, -1] / torch.where(held, own, 1.0).sqrt(), 0.0)
-    whole = inverse.diagonal(dim1=1, dim2=2)[:, :-1]
-    along = along * (whole - along[:, :-1].square() > LEAST_LEFT * whole).all(1, keepdim=True)
-    among = torch.baddbmm(inverse, along.unsqueeze(2), along.unsqueeze(1), alpha=-1.0)
-    among[:, -1] *= length
-    among[:, :, -1] *= length
-    return lambda r: _times(among, r)
+
+    def __init__(self, inverse: Tensor):
+        self._inverse, self._blocks = inverse, inverse.clone()
+        self._free = torch.ones_like(inverse[:, -1, -1])  # of the length, the only one that may be held
+
+    def at(self, free: Tensor) -> Map:
+        """With these free, (N, D). It holds until the next are asked for: from one round to the next few are others."""
+        cells = torch.nonzero(free[:, -1] != self._free).squeeze(1)
+        self._free = free[:, -1]
+        whole, held = self._inverse.index_select(0, cells), self._free.index_select(0, cells) == 0
+        # The inverse of the block without it, and not a part of the whole block's inverse, in which the length would still give way: with that, the cells
+        # whose length is held, where pressure is, took three times as many iterations. Where rounding would leave nothing of it, the part must do.
+        own = whole[:, -1:, -1]
+        along = torch.where(own > 0, whole[:, :, -1] / torch.where(own > 0, own, 1.0).sqrt(), 0.0)
+        diagonal = whole.diagonal(dim1=1, dim2=2)[:, :-1]
+        along = along * (diagonal - along[:, :-1].square() > LEAST_LEFT * diagonal).all(1, keepdim=True)
+        without = whole - along.unsqueeze(2) * along.unsqueeze(1)
+        without[:, -1] = 0.0
+        without[:, :, -1] = 0.0
+        blocks = self._blocks.index_copy_(0, cells, torch.where(held.reshape(-1, 1, 1), without, whole))
+        return lambda r: _times(blocks, r)
 
 
 def _times(blocks: Tensor, r: Tensor) -> Tensor:
@@ -300,6 +309,7 @@ def _line_search(problem: ContactProblem, y, after, gradient, direction, going):
     Anything less exact lets two sets of contacts take turns: each step ends where the other's begins, and the energy falls by next to nothing.
     A step is made shorter before its lengths are stopped, not after: else those next to their bound would come nearer each time and never be there.
     Where every row holds and no length is stopped, the full step is the minimum and needs no looking at.
+    Returns where it ends, the rows' gaps there, which of them act, and the gradient.
     """
     colonies, owner = problem.colonies, problem.colonies.owner
     length = going.to(y.dtype)
@@ -308,22 +318,25 @@ def _line_search(problem: ContactProblem, y, after, gradient, direction, going):
         stopped = colonies.any(new[:, -1] < problem.lower)
         new[:, -1] = torch.maximum(new[:, -1], problem.lower)
         then = problem.after(new)
+        active = problem.acting(then)
+        ahead = problem.gradient(new, then * active)
         # asked of each colony by itself: one that needs no looking at must not change because another does
         going = going & (stopped | problem.unilateral)
         if not bool(going.any()):
             break
         step = new - y
-        terms = [gradient * step, gradient * direction, problem.alpha * step * step]
-        slope, whole, drag = colonies.sum(torch.stack([x.sum(1) for x in terms], 1)).unbind(1)
-        share = _least(problem, after, after - then, slope, drag, going)
-        share = torch.where(going & stopped & (slope > DOWNHILL * length * whole), 0.5, share)
-        going = going & (share < 1)
+        terms = [gradient * step, gradient * direction, ahead * step]
+        slope, whole, end = colonies.sum(torch.stack([x.sum(1) for x in terms], 1)).unbind(1)
+        steep, uphill = going & stopped & (slope > DOWNHILL * length * whole), going & (end > STEEP * slope.abs())
+        going = steep | uphill
         if not bool(going.any()):
             break
+        share = _least(problem, after, then, step, slope, uphill)
+        share = torch.where(steep, 0.5, share)
         # the way to a step that is stopped is not the one that leads there: on that, the first of the lengths comes to its bound at the least
         free_run = _to_bound(problem, y, direction)
         length = torch.where(going, torch.maximum(share * length, torch.where(free_run < length, free_run, 0.0)), length)
-    return new, then
+    return new, then, active, ahead
 
 
 def _to_bound(problem: ContactProblem, y: Tensor, direction: Tensor) -> Tensor:
@@ -335,14 +348,14 @@ def _to_bound(problem: ContactProblem, y: Tensor, direction: Tensor) -> Tensor:
     return -problem.colonies.max(-share, empty=-torch.inf)
 
 
-def _least(problem: ContactProblem, after: Tensor, change: Tensor, slope: Tensor, drag: Tensor, going: Tensor) -> Tensor:
-    """The share of a step at which the energy is least, (B,), to LEVEL of its slope; 1 where the whole may be taken.
+def _least(problem: ContactProblem, after: Tensor, then: Tensor, step: Tensor, slope: Tensor, going: Tensor) -> Tensor:
+    """The share of a step at which the energy is least, (B,), to LEVEL of its slope, in the colonies where it rises at the end; 1 in others.
 
-    after, change: (R,) the gaps before the step, and by how much they become less on it. slope: (B,) of the energy where the step begins;
-    drag: (B,) the curvature that the rows do not give. The energy is convex, so its slope only grows, and by terms that are none of
-    them negative: no digits are lost, as they would be in a difference of energies.
+    after, then: (R,) the gaps before the step and after it. slope: (B,) of the energy where the step begins. The energy is convex, so its slope only
+    grows, and by terms that are none of them negative: no digits are lost, as they would be in a difference of energies.
     """
-    rows, before = problem.of_rows, after.clamp(max=0) if problem.unilateral else after
+    rows, before, change = problem.of_rows, after.clamp(max=0) if problem.unilateral else after, after - then
+    drag = problem.colonies.sum((problem.alpha * step * step).sum(1, keepdim=True)).squeeze(1)  # the curvature that the rows do not give
 
     def look(share: Tensor):
         left = after - share.index_select(0, rows.owner) * change
@@ -353,7 +366,6 @@ def _least(problem: ContactProblem, after: Tensor, change: Tensor, slope: Tensor
 
     share = torch.ones_like(slope)
     here, curvature = look(share)
-    going = going & (here > STEEP * slope.abs())
     low, high = torch.zeros_like(share), torch.ones_like(share)
     for _ in range(LOOKS):
         if not bool(going.any()):
@@ -392,7 +404,7 @@ class _AdjointSolve:
 
     def __call__(self, grad: Tensor) -> Tensor:
         colonies, b = self.problem.colonies, grad * self.free
-        precondition = _within(self.free, self.inverse)
+        precondition = _Within(self.inverse).at(self.free)
         # the forward solve's tolerance is a matter of overlaps; a gradient wants more
         tolerance = self.tolerance.clamp(max=1e-4 if grad.dtype == torch.float32 else 1e-8)
         target = tolerance * worst_of(precondition(b), colonies)

@@ -4,18 +4,23 @@ This is the one place that knows how to scatter. On the CPU a sum over groups is
 matrix: six times faster than ``index_add_`` and, because every row of the product is accumulated by itself in the order
 of its entries, the same bits come out whatever else stands in the batch. (The matrix-vector product of the same library
 does *not* have that property: it picks a kernel by the shape of the whole matrix. Hence the matrix-matrix product even
-for one column.) On CUDA ``index_add_`` is fast, and ordered when torch's deterministic algorithms are on.
+for one column.) Rows that are weighted anew for each sum, in 32 bits, are bags of embeddings: half the time of weighting and summing, and ordered just
+so. On CUDA ``index_add_`` is fast, and ordered when torch's deterministic algorithms are on.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
 import torch
 from torch import Tensor
+
+# Elsewhere bags are summed by a plain loop, many times slower.
+FAST_BAGS = "fbgemm" in torch.backends.quantized.supported_engines
 
 warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta", category=UserWarning)
 
@@ -58,18 +63,22 @@ class Groups:
         """(size,) int64, rows in each group."""
         return torch.bincount(self.owner, minlength=self.size)
 
+    @cached_property
+    def order(self) -> tuple[Tensor, Tensor]:
+        """The rows group by group, each group's in their own order: where each group starts and the last ends, (size + 1,), and which row, (K,) int32."""
+        count = self.owner.numel()
+        if bool((self.owner[1:] >= self.owner[:-1]).all()):
+            return offsets(self.counts).int(), torch.arange(count, dtype=torch.int32)
+        # linear time and stable, where a sort would cost more than all the sums of a solve
+        entries = (np.ones(count, np.int8), self.owner.int().numpy(), np.arange(count + 1, dtype=np.int32))
+        found = scipy.sparse.csc_array(entries, shape=(self.size, count)).tocsr()
+        return torch.from_numpy(found.indptr), torch.from_numpy(found.indices)
+
     def _incidence(self, dtype: torch.dtype) -> Tensor:
         """The (size, K) matrix of ones that sums rows into groups, on the CPU."""
         if dtype not in self._matrix:
             count = self.owner.numel()
-            if bool((self.owner[1:] >= self.owner[:-1]).all()):
-                start, order = offsets(self.counts), torch.arange(count)
-            else:
-                # linear time and stable, where a sort would cost more than all the sums of a solve
-                entries = (np.ones(count, np.int8), self.owner.int().numpy(), np.arange(count + 1, dtype=np.int32))
-                found = scipy.sparse.csc_array(entries, shape=(self.size, count)).tocsr()
-                start, order = torch.from_numpy(found.indptr), torch.from_numpy(found.indices)
-            self._matrix[dtype] = csr(start, order, torch.ones(count, dtype=dtype), (self.size, count))
+            self._matrix[dtype] = csr(*self.order, torch.ones(count, dtype=dtype), (self.size, count))
         return self._matrix[dtype]
 
     def sum(self, value: Tensor) -> Tensor:
@@ -93,6 +102,29 @@ class Groups:
     def any(self, flag: Tensor) -> Tensor:
         """(K,) bool -> (size,) bool."""
         return self.max(flag.to(torch.uint8)) > 0
+
+
+class WeightedRows:
+    """Rows `value` (K, D) of groups, to be summed with other weights each time. No gradient."""
+
+    def __init__(self, value: Tensor, groups: Groups):
+        self.groups, self.value = groups, value
+        self.fast = FAST_BAGS and value.device.type == "cpu" and value.dtype == torch.float32
+        if self.fast:
+            start, self.order = groups.order
+            # side by side as they are read
+            self.value = value.index_select(0, self.order)
+            self._bags = torch.arange(value.shape[0], dtype=torch.int32), start
+
+    def sum(self, weight: Tensor) -> Tensor:
+        """Σ weight · row over each group, (size, D), the weights (K,) in the order of `value` as it stands here."""
+        if self.fast:
+            return torch.embedding_bag(self.value, *self._bags, mode=0, per_sample_weights=weight, include_last_offset=True)[0]
+        return self.groups.sum_into(self.value * weight.unsqueeze(1), weight.new_empty(self.groups.size, self.value.shape[1]))
+
+    def sorted(self, given: Tensor) -> Tensor:
+        """What is given in the order of the rows (K,), in the order of `value` as it stands here."""
+        return given.index_select(0, self.order) if self.fast else given
 
 
 class _GroupSum(torch.autograd.Function):
