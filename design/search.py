@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -164,9 +164,9 @@ class Search:
 class Best:
     """The best design of a search: its parameters by name, their point (D,), its loss, and the losses of its replicates (R,)."""
 
-    search: Search
+    search: Search = field(repr=False)
     values: dict[str, Value]
-    point: np.ndarray
+    point: np.ndarray = field(repr=False)
     loss: float
     losses: np.ndarray
 

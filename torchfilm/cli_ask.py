@@ -26,7 +26,8 @@ class Info:
     """Parameters of the scene, as NAME=VALUE."""
 
     def __call__(self) -> None:
-        if not self.what.endswith((".py", ".json")) and Path(self.what).is_file():
+        path = Path(self.what)
+        if path.suffix in (".h5", ".hdf5") or (path.suffix not in (".py", ".json") and path.is_file()):
             return self._of_results()
         scene = load_scene(self.what, dict(map(parse_setting, self.set)))
         scene.unchecked(1)  # rules are tried on a first state, so that what they read and write is known

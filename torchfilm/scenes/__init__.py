@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from typing import Any
 
 import torch
 
+from torchfilm.accuracy import Settings
 from torchfilm.scene import Scene
 from torchfilm.scenes import channels, circuits, colonies, nutrients, signalling
 from torchfilm.tools import checks
@@ -61,5 +63,6 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
     allowed = inspect.signature(READY[name]).parameters
     for given in parameters or {}:
         if given not in allowed:
-            raise checks.refuse(f"parameter of {name}", given, "one of " + ", ".join(allowed))
+            knob = "It is a knob of accuracy: --settings FILE, or tf.Settings(…)." if given in {f.name for f in dataclasses.fields(Settings)} else ""
+            raise checks.refuse(f"parameter of {name}", given, "one of " + ", ".join(allowed), knob)
     return READY[name](**(parameters or {}))
