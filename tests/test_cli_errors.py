@@ -105,7 +105,6 @@ ERRORS = {
     "show good.h5 --out nowhere/a.png": ("nowhere", ""),
     "show good.h5 --out a.nonsense": ("nonsense", ""),
     "info unknown": ("unknown", "microcolony"),
-    "info missing.h5": (r"missing\.h5", "No such file"),
     "info text.h5": (r"text\.h5", "not a results file"),
     "info no_such_file.py": (r"no_such_file\.py", "No such file"),
 }

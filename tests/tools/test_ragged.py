@@ -9,7 +9,7 @@ from helpers import array
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchfilm.tools.ragged import Groups, WeightedRows, expand_ranges, offsets
+from torchfilm.tools.ragged import Blocks, Groups, WeightedRows, expand_ranges, offsets
 
 
 def loop(owner: np.ndarray, size: int, value: np.ndarray, what, empty: float = 0.0) -> np.ndarray:
@@ -138,6 +138,22 @@ def test_a_group_has_the_same_sum_in_any_company(device, dtype, width, count, de
         owner[place] = 0
         mixed[torch.as_tensor(owner == 0, device=device)], mixed[torch.as_tensor(owner == 1, device=device)] = mine, strange
         assert torch.equal(summed(owner, mixed, 2, 0), alone)
+
+
+@pytest.mark.parametrize("width", [1, 4, 7])
+@pytest.mark.parametrize("count", [1, 5, 1000])
+def test_blocks_against_products_and_in_any_company(device, dtype, width, count):
+    """Each block times its row, and bitwise the same whatever stands before it; what is not a number stays in its own."""
+    rng = np.random.default_rng(count + width)
+    value = rng.normal(size=(count, width, width))
+    value, r = value + value.swapaxes(1, 2), rng.normal(size=(count, width))
+    t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)  # noqa: E731
+    found = Blocks(t(value)).times(t(r))
+    close = {torch.float32: 1e-5, torch.float64: 1e-13}[dtype]
+    assert np.abs(array(found) - np.einsum("nij,nj->ni", value, r)).max() <= close
+    strange = np.full((37, width, width), np.nan)
+    among = Blocks(t(np.concatenate([strange, value]))).times(t(np.concatenate([rng.normal(size=(37, width)), r])))
+    assert torch.equal(among[37:], found) and bool(among[:37].isnan().all())
 
 
 def test_not_a_number_stays_in_its_group(device, dtype):

@@ -337,7 +337,7 @@ class _Run:
         soft = torch.cat([torch.full_like(contacts.first, settings.stiffness is not None, dtype=torch.bool), wall_soft])
         held = torch.zeros_like(gap) if number == 0 else torch.where(soft, gap.clamp(max=0), 0.0)
         lower = (base - self.length) / scale[:, -1]
-        problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1), lower, scale, state.groups, settings.unilateral)
+        problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1).expand_as(scale).contiguous(), lower, scale, state.groups, settings.unilateral)
         start = state.displacement if number == 0 else None
         if bool(moving.all()):
             return solve(problem, start, self._tolerance(), settings.max_iterations)

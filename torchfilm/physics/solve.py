@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchfilm.physics.rows import ContactRows
 from torchfilm.tools.cg import conjugate_gradients, worst_of
-from torchfilm.tools.ragged import Groups
+from torchfilm.tools.ragged import Blocks, Groups
 
 Map = Callable[[Tensor], Tensor]
 
@@ -66,7 +66,7 @@ class ContactProblem:
     """One linearised contact problem, R rows over N cells in B colonies.
 
     rows: J scaled by weights and drag. gap: (R,) D g. held: (R,) force of each row already spent in this step (soft rows in
-    later passes), D min(0, g) or 0. alpha: (N, 1) or (N, D). lower: (N,) least scaled Δl. scale: (N, D) M^(−½).
+    later passes), D min(0, g) or 0. alpha: (N, D). lower: (N,) least scaled Δl. scale: (N, D) M^(−½).
     """
 
     rows: ContactRows
@@ -148,7 +148,7 @@ def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: Tensor, 
     zero = torch.zeros_like(problem.scale)
     active = problem.acting(problem.gap)
     inverse = _block_inverse(problem, active)
-    scale = worst_of(_times(inverse, problem.gradient(zero, problem.gap * active)), colonies)
+    scale = worst_of(Blocks(inverse).times(problem.gradient(zero, problem.gap * active)), colonies)
     still = scale == 0  # nothing pushes: such a colony does not move at all
     y, after = zero, problem.gap
     if start is not None:
@@ -260,7 +260,7 @@ class _Within:
     """The preconditioner among the degrees of freedom that are free: what it is given elsewhere it does not look at, and leaves at 0."""
 
     def __init__(self, inverse: Tensor):
-        self._inverse, self._blocks = inverse, inverse.clone()
+        self._inverse, self._blocks = inverse, Blocks(inverse.clone())
         self._free = torch.ones_like(inverse[:, -1, -1])  # of the length, the only one that may be held
 
     def at(self, free: Tensor) -> Map:
@@ -277,12 +277,8 @@ class _Within:
         without = whole - along.unsqueeze(2) * along.unsqueeze(1)
         without[:, -1] = 0.0
         without[:, :, -1] = 0.0
-        blocks = self._blocks.index_copy_(0, cells, torch.where(held.reshape(-1, 1, 1), without, whole))
-        return lambda r: _times(blocks, r)
-
-
-def _times(blocks: Tensor, r: Tensor) -> Tensor:
-    return torch.bmm(blocks, r.unsqueeze(2)).squeeze(2)
+        self._blocks.value.index_copy_(0, cells, torch.where(held.reshape(-1, 1, 1), without, whole))
+        return self._blocks.times
 
 
 def _operator(problem: ContactProblem, active: Tensor) -> Map:
@@ -384,7 +380,8 @@ def _block_inverse(problem: ContactProblem, active: Tensor) -> Tensor:
     blocks = problem.rows.blocks(active if problem.unilateral else None)
     blocks.diagonal(dim1=1, dim2=2).add_(problem.alpha)
     # no check here: where a colony is not finite so is its inverse, and its residual says so without stopping the others
-    return torch.linalg.inv_ex(blocks).inverse
+    # it comes column by column, which for symmetric blocks is row by row
+    return torch.linalg.inv_ex(blocks).inverse.mT.contiguous()
 
 
 def _attach_gradient(problem: ContactProblem, end: _Iterate, tolerance: Tensor, max_iterations: int) -> Tensor:

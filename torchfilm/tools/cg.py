@@ -26,7 +26,21 @@ class CGResult:
 
 def worst_of(value: Tensor, groups: Groups) -> Tensor:
     """Greatest |entry| of (N, D) in each group, (B,); NaN where one is."""
+    if groups.size == 1 and value.numel():
+        return value.detach().abs().amax().reshape(1)
     return groups.max(value.abs().amax(1))
+
+
+def _dot(a: Tensor, b: Tensor, groups: Groups) -> Tensor:
+    """a · b of (N, D) in each group, (B, 1)."""
+    # the rows of a group first: to sum each short row by itself takes twice as long
+    return groups.sum(a * b).sum(1, keepdim=True)
+
+
+def _for_rows(value: Tensor, groups: Groups, width: int) -> Tensor:
+    """A number of each group (B, 1) for each entry of (N, D), or (1, 1) for all; as a column, which is spread as it is read, it would take six times as
+    long."""
+    return value if groups.size == 1 else value.expand(-1, width).contiguous().index_select(0, groups.owner)
 
 
 @torch.no_grad()
@@ -43,12 +57,11 @@ def conjugate_gradients(
     b: (N, D). `apply` and `precondition` map (N, D) to (N, D) and keep groups apart. A system stops when its greatest
     preconditioned residual is at most target (B,), or is not finite, or after `max_iterations`; the others go on.
     """
-    owner = groups.owner
     x = torch.zeros_like(b)
     r = b.clone()
     z = precondition(r)
     p = z.clone()
-    rz = groups.sum((r * z).sum(1, keepdim=True))
+    rz = _dot(r, z, groups)
     worst = worst_of(z, groups)
     going = (worst > target) & (worst < torch.inf)  # neither holds for a NaN
     iterations = torch.zeros(groups.size, dtype=torch.int64, device=b.device)
@@ -57,16 +70,16 @@ def conjugate_gradients(
         if k % every == 0 and not bool(going.any()):
             break
         q = apply(p)
-        curvature = groups.sum((p * q).sum(1, keepdim=True))
+        curvature = _dot(p, q, groups)
         moves = going.unsqueeze(1) & (curvature > 0)
-        step = torch.where(moves, rz / torch.where(moves, curvature, 1.0), 0.0).index_select(0, owner)
+        step = _for_rows(torch.where(moves, rz / torch.where(moves, curvature, 1.0), 0.0), groups, b.shape[1])
         x.addcmul_(step, p)
         r.addcmul_(step, q, value=-1)
         z = precondition(r)
-        new = groups.sum((r * z).sum(1, keepdim=True))
+        new = _dot(r, z, groups)
         iterations += going
         worst = torch.where(going, worst_of(z, groups), worst)
-        ratio = torch.where(moves, new / torch.where(rz == 0, 1.0, rz), 0.0).index_select(0, owner)
+        ratio = _for_rows(torch.where(moves, new / torch.where(rz == 0, 1.0, rz), 0.0), groups, b.shape[1])
         p = torch.addcmul(z, ratio, p)
         rz = new
         going = moves.squeeze(1) & (worst > target) & (worst < torch.inf)

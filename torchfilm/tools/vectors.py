@@ -43,5 +43,7 @@ def safe_norm(u: Tensor, eps: float = 1e-30) -> Tensor:
 
 def safe_sqrt(x: Tensor, eps: float = 1e-30) -> Tensor:
     """√x, and 0 with zero gradient where x ≤ eps."""
+    if not (torch.is_grad_enabled() and x.requires_grad):
+        return torch.where(x > eps, x.sqrt(), 0.0)
     positive = x > eps
     return torch.where(positive, torch.where(positive, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x))
