@@ -2,6 +2,8 @@
 
     OMP_NUM_THREADS=1 python experiments/tune_check.py                         # some twenty minutes; writes its part of docs/accuracy.md, and a CSV
     OMP_NUM_THREADS=1 python experiments/tune_check.py --scene channel --error 3%
+    OMP_NUM_THREADS=1 python experiments/tune_check.py --scene channel --out channel.csv       # one after another, or side by side, and then
+    python experiments/tune_check.py --gather channel.csv microcolony.csv …                    # the page of what was found
 
 The runs that it has not seen have other seeds and begin with half as many cells again. Of a sweep of six steps with six settings of contacts and two
 tolerances of circuits, the cheapest that holds the error in both runs is timed beside the chosen one: what that one takes over what the sweep's takes
@@ -101,11 +103,12 @@ def main() -> None:
     parser.add_argument("--error", default="1%")
     parser.add_argument("--out", type=Path, help="CSV; by default the one beside the benchmarks, and with --scene none")
     parser.add_argument("--page", type=Path, help="page whose table is written anew; by default docs/accuracy.md, and with --scene none")
+    parser.add_argument("--gather", nargs="+", type=Path, default=[], help="CSV of scenes that were checked by themselves, for the page")
     chosen = parser.parse_args()
     tf.keep_memory()
     torch.set_grad_enabled(False)
-    rows, error = [], parse_error(chosen.error)
-    for name in chosen.scene or tf.scenes.READY:
+    rows, error = [row for path in chosen.gather for row in csv.DictReader(path.open(newline=""))], parse_error(chosen.error)
+    for name in () if rows else chosen.scene or tf.scenes.READY:
         rows.append(check(name, error))
         print(rows[-1], flush=True)
     out, page = chosen.out, chosen.page

@@ -1,12 +1,15 @@
-"""The code in the documentation runs: every page's Python blocks, in order, as one program in an empty folder."""
+"""The code in the documentation runs: a page's Python blocks, in order, as one program in an empty folder; one that begins with a file's name, as that."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FILE = re.compile(r"# (\w+\.py)\n")
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -19,4 +22,8 @@ def test_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict = {"__name__": "docs"}
     for number, code in enumerate(BLOCK.findall(page.read_text())):
+        if file := FILE.match(code):
+            Path(file[1]).write_text(code)
+            subprocess.run([sys.executable, file[1]], check=True)
+            continue
         exec(compile(code, f"{page.name}, block {number}", "exec"), names)
