@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 import torchfilm as tf
-from torchfilm.physics.contacts import Bodies
+from torchfilm.physics.contacts import Bodies, Contacts, Touching, contacts_of
 from torchfilm.physics.solve import CONVERGED
 
 # (normal to the side of the cells, normal · x at the wall)
@@ -134,6 +134,11 @@ def bodies(c, a, length, radius=0.5, *, dtype=torch.float64, device="cpu") -> Bo
     t = lambda x: torch.as_tensor(np.asarray(x), dtype=dtype, device=device)  # noqa: E731
     length = t(length)
     return Bodies(t(c).T.contiguous(), t(a).T.contiguous(), 0.5 * length, t(radius).expand(length.shape).contiguous())
+
+
+def rows_of(cells: Bodies, first: Tensor, second: Tensor, whole_lines: bool = False) -> Contacts:
+    """All rows that overlap among the given pairs (P,), (P,)."""
+    return contacts_of(Touching.among(cells, first, second), whole_lines)
 
 
 def unit(rng: np.random.Generator, count: int, dim: int) -> np.ndarray:

@@ -11,10 +11,25 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import array, bodies, check_always, growth, mechanics, pair_gaps, rotation, run, seeded, segment_distance, unit, wall_overlap, worst_overlap
+from helpers import (
+    array,
+    bodies,
+    check_always,
+    growth,
+    mechanics,
+    pair_gaps,
+    rotation,
+    rows_of,
+    run,
+    seeded,
+    segment_distance,
+    unit,
+    wall_overlap,
+    worst_overlap,
+)
 
 import torchfilm as tf
-from torchfilm.physics.contacts import LINE_CONTACT_SINE, Bodies, closest_points, contact_gaps, find_contacts
+from torchfilm.physics.contacts import LINE_CONTACT_SINE, Bodies, closest_points, contact_gaps
 from torchfilm.physics.walls import find_wall_contacts
 
 MODES = pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
@@ -53,7 +68,7 @@ def test_case_02_same_centre_crossing(device, dtype, measured, unilateral, rate)
     a, b, c = rotation(np.random.default_rng(2), 3)
     cells = tf.Cells(np.zeros((2, 3)), [a, b], 2.0)
     pair = bodies(np.zeros((2, 3)), [a, b], [2.0, 2.0], dtype=dtype, device=device)
-    found = find_contacts(pair, torch.tensor([0], device=device), torch.tensor([1], device=device))
+    found = rows_of(pair, torch.tensor([0], device=device), torch.tensor([1], device=device))
     # unit vectors that are the same but for rounding and sign: their product is ±1 to a few units of float32's 1.2e-7
     assert measured("normal against the cross product", abs(abs(float(array(found.normal)[:, 0] @ c)) - 1), "≤ 1e-6") <= 1e-6
     scene = tf.Scene(growth(rate), mechanics(passes=6, overlap=1e-3, unilateral=unilateral))
@@ -72,7 +87,7 @@ def tilted(angle: float, sign: int, about: np.ndarray, dtype, device) -> Bodies:
 def forces(pair: Bodies, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Generalised forces JᵀD²g (force, torque, elongation), (7,), on cells 0 and 1; the pair given in the order (first, other)."""
     t = lambda k: torch.tensor([k], device=pair.half.device)  # noqa: E731
-    found = find_contacts(pair, t(first), t(1 - first))
+    found = rows_of(pair, t(first), t(1 - first))
     push = (found.weight * found.gap.clamp(max=0)).unsqueeze(1)
     on = array((push * found.row_first).sum(0)), array((push * found.row_second).sum(0))
     return on if first == 0 else on[::-1]
@@ -169,7 +184,7 @@ def test_case_05_spheres(device, dtype, measured, dim):
     one, other = torch.tensor([0], device=device), torch.tensor([1], device=device)
     for _ in range(5):
         centre, axis = np.stack([np.zeros(dim), 0.9 * unit(rng, 1, dim)[0]]), unit(rng, 2, dim)
-        row = find_contacts(bodies(centre, axis, [0.0, 0.0], dtype=dtype, device=device), one, other)
+        row = rows_of(bodies(centre, axis, [0.0, 0.0], dtype=dtype, device=device), one, other)
         for cell, found in ((0, row.row_first), (1, row.row_second)):
             found = array(found)[0]
 

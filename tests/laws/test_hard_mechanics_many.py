@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from helpers import array, check_always, crowd, ends, growth, mechanics, near_pairs, rotation, run, seeded, unit, wall_overlap, worst_overlap
+from helpers import array, check_always, crowd, ends, growth, mechanics, near_pairs, rotation, rows_of, run, seeded, unit, wall_overlap, worst_overlap
 from torch import Tensor
 
 import torchfilm as tf
-from torchfilm.physics.contacts import Bodies, find_contacts
-from torchfilm.physics.neighbours import find_pairs
+from torchfilm.physics.contacts import Bodies
+from torchfilm.physics.neighbours import Neighbourhood
 
 MODES = pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
 DIMS = pytest.mark.parametrize("dim", [2, 3])
@@ -95,8 +95,8 @@ def test_case_13_one_long_cell(device, dtype, measured, dim):
     cells = tf.Cells(position, unit(rng, 201, dim), np.r_[40.0, np.full(200, 2.0)], 0.5)
     state = seeded(tf.Scene(mechanics(dim=dim)), cells, device, dtype)
     local = state.position.to(dtype)
-    first, second = find_pairs(local, state.axis, state.length, state.radius, state.colony, 1, 0.0)
-    found = find_contacts(Bodies(local.T.contiguous(), state.axis.T.contiguous(), 0.5 * state.length, state.radius), first, second)
+    first, second = Neighbourhood(local, state.axis, state.length, state.radius, state.colony, 1).pairs()
+    found = rows_of(Bodies(local.T.contiguous(), state.axis.T.contiguous(), 0.5 * state.length, state.radius), first, second)
     as_set = lambda i, j: {(min(a, b), max(a, b)) for a, b in zip(i.tolist(), j.tolist(), strict=True)}  # noqa: E731
     touching = as_set(found.first, found.second)
     sure, perhaps = near_pairs(state, -1e-5), near_pairs(state, 1e-5)

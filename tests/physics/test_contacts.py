@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import array, bodies, crowd, growth, mechanics, seeded, segment_distance, unit
+from helpers import array, bodies, crowd, growth, mechanics, rows_of, seeded, segment_distance, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import torchfilm as tf
 from torchfilm.physics import capsule
-from torchfilm.physics.contacts import Bodies, closest_points, contact_gaps, contact_points, find_contacts
+from torchfilm.physics.contacts import Bodies, closest_points, contact_gaps, contact_points
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
 
@@ -99,7 +99,7 @@ def test_rows_are_the_derivative_of_the_gap(dim):
     line = contact_points(cells.take(first), cells.take(second))[-1]
     keep = (gap < -0.01) & (gap > -0.95) & ~line
     first, second = first[keep], second[keep]
-    found = find_contacts(cells, first, second)
+    found = rows_of(cells, first, second)
     assert torch.equal(found.first, first) and bool((found.weight == 1).all()) and len(first) > 300
     assert torch.equal(found.gap, gap[keep])
     for which, row in ((first, found.row_first), (second, found.row_second)):
@@ -129,7 +129,7 @@ def test_rows_of_a_line_of_contact(dim, tilt):
     points = [(s[k], t[k], end_a[k], end_b[k]) for k in range(2)]
     both = line & (gap_at(cells, first, second, *points[0], cells.half) < 0) & (gap_at(cells, first, second, *points[1], cells.half) < 0)
     first, second, points = first[both], second[both], [tuple(x[both] for x in p) for p in points]
-    found = find_contacts(cells, first, second)
+    found = rows_of(cells, first, second)
     assert len(first) > 250 and found.gap.numel() == 2 * len(first) and bool((found.weight == 0.5).all())
     for k, point in enumerate(points):
         part = slice(k * len(first), (k + 1) * len(first))
@@ -165,7 +165,7 @@ def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, whole_lines):
         deep = deep | held
         assert held.sum() > 3
         gap = gap.clamp(max=0.0)
-    found = find_contacts(cells, first, second, whole_lines)
+    found = rows_of(cells, first, second, whole_lines)
     assert torch.equal(found.first, torch.cat([first[d] for d in deep])) and torch.equal(found.second, torch.cat([second[d] for d in deep]))
     assert float((found.weight - torch.cat([w[d] for w, d in zip(weight, deep, strict=True)])).abs().max()) <= 1e-3
     assert float((found.gap - torch.cat([g[d] for g, d in zip(gap, deep, strict=True)])).abs().max()) <= 1e-5
@@ -190,7 +190,7 @@ def test_a_cell_squeezed_between_two_comes_to_rest(apart, tilt):
 def forces(cells: Bodies) -> np.ndarray:
     """Force, torque and elongation JᵀD²g on the first cell of each pair, (P, 4 or 7)."""
     first, second = halves(cells)
-    found = find_contacts(cells, first, second)
+    found = rows_of(cells, first, second)
     out = np.zeros((len(first), found.row_first.shape[1]))
     np.add.at(out, array(found.first), array((found.weight * found.gap).unsqueeze(1) * found.row_first))
     return out
@@ -241,7 +241,7 @@ def test_swapping_a_pair_swaps_its_rows(dtype, device, dim):
     rng = np.random.default_rng(3)
     cells = side_by_side(rng, 200, dim, 0.3, dtype=dtype, device=device)
     first, second = halves(cells)
-    one, other = find_contacts(cells, first, second), find_contacts(cells, second, first)
+    one, other = rows_of(cells, first, second), rows_of(cells, second, first)
 
     def rows(found, cell, row):
         """Gap, weight and row, (P, 2, …), of each pair's one or two rows; zeros where there is one."""
@@ -264,7 +264,7 @@ def test_swapping_a_pair_swaps_its_rows(dtype, device, dim):
 def test_action_is_reaction(dtype, device, dim):
     """The two rows of a contact balance: forces exactly, torques about one common point to rounding."""
     cells = side_by_side(np.random.default_rng(4), 200, dim, 0.5, dtype=dtype, device=device)
-    found = find_contacts(cells, *halves(cells))
+    found = rows_of(cells, *halves(cells))
     a, b = found.row_first, found.row_second
     assert torch.equal(a[:, :dim], -b[:, :dim])
     between = array((cells.centre[:, found.second] - cells.centre[:, found.first]).T)
@@ -303,7 +303,7 @@ def test_cells_in_one_place_still_have_a_normal(dtype, device, dim, length):
     axis = unit(rng, 20, dim)
     axis[15:] = axis[5:10]  # five pairs parallel
     cells = bodies(np.zeros((20, dim)), axis, np.full(20, length), dtype=dtype, device=device)
-    found = find_contacts(cells, *halves(cells))
+    found = rows_of(cells, *halves(cells))
     assert bool(torch.isfinite(found.row_first).all() and torch.isfinite(found.row_second).all())
     n = array(found.normal.T)
     assert np.abs(np.linalg.norm(n, axis=1) - 1).max() <= 1e-6

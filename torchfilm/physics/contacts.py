@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfilm.physics.neighbours import find_pairs
+from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
 
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see `contact_points`).
@@ -193,11 +193,6 @@ class Touching:
         return Touching(pick(self.first), pick(self.second), self.a.take(index), self.b.take(index), pick(self.s), pick(self.t))
 
 
-def find_contacts(bodies: Bodies, first: Tensor, second: Tensor, whole_lines: bool = False) -> Contacts:
-    """All rows that overlap among the given pairs (P,), (P,): see `contacts_of`."""
-    return contacts_of(Touching.among(bodies, first, second), whole_lines)
-
-
 def contacts_of(pairs: Touching, whole_lines: bool = False) -> Contacts:
     """All rows of pairs that overlap (gap < 0), and of a line of contact that overlaps at one end what keeps the other from
     swinging in: a row of gap 0, whose weight falls from that of the line to nothing as its end parts as far as the first overlaps. Without it a cell that is
@@ -253,7 +248,7 @@ def gaps_nearby(
     position, axis (N, d); length, radius (N,); colony (N,) int64.
     """
     position, axis, length, radius = position.double(), axis.double(), length.double(), radius.double()
-    first, second = find_pairs(position, axis, length, radius, colony, colonies, within)
+    first, second = Neighbourhood(position, axis, length, radius, colony, colonies, within).pairs()
     bodies = Bodies(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
     return first, second, contact_gaps(bodies, first, second)
 

@@ -28,12 +28,6 @@ MOST_ROWS = 2**17
 CLASS_RATIO = 4.0
 
 
-@torch.no_grad()
-def find_pairs(position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Every pair of a `Neighbourhood`, which takes the same."""
-    return Neighbourhood(position, axis, length, radius, colony, colonies, margin).pairs()
-
-
 class Neighbourhood:
     """Cells of many colonies where they stand, to be asked who is near whom as often as need be.
 
