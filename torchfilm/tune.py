@@ -8,7 +8,8 @@ measured once more with each of its knobs tightened, which tells the knobs' part
 | observable | error                                                                                                                   |
 |------------|-------------------------------------------------------------------------------------------------------------------------|
 | cells      | difference of their number, relative; those that are due to divide at the next step count as two                          |
-| volume     | difference, relative to what the window added (or to a tenth of the whole, if that is more): what a longer run comes to   |
+| volume     | difference of what the window's second half added, relative (or to a tenth of the whole, if that is more): what a longer  |
+|            | run comes to. In the first half cells settle: how deep they overlap goes by the settings, and the start is by others      |
 | radius     | difference, relative                                                                                                    |
 | overlap    | mean overlap of touching cells over their diameter, 0 being right; of soft cells its difference                         |
 | a species  | difference of its mean and standard deviation over cells, relative                                                      |
@@ -141,18 +142,19 @@ class Probe:
         return found, seconds, spent
 
     def due(self, state: State) -> dict[str, Tensor]:
-        """The number of cells after the divisions with which the next step would begin: until then a count is late, by a step that is known."""
+        """The number of cells and their volume after the divisions with which the next step would begin: until then both are late, by a step that is known.
+        (A division costs the volume of two caps' worth of length.)"""
         for effect in self.scene.effects:
             if effect.stage <= DIVISION:
                 state = effect.step(state, self.dt)
-        return {"cells": torch.tensor([float(max(1, state.cells))], dtype=torch.float64)}
+        seen = observables(state)
+        return {name: seen[name] for name in ("cells", "volume")}
 
     def errors(self, found: dict[str, list[Tensor]], against: dict[str, list[Tensor]], apart: bool = False) -> dict[str, float]:
         """By observable of `against`, the greater of the errors in the middle and at the end; infinite where it is not found.
 
         apart: of two runs of which neither is right, so that overlaps, too, are compared and not told."""
         soft = any(isinstance(e, Mechanics) and e.stiffness is not None for e in self.scene.listed)
-        first = observables(self.start)
         out = {}
         for name, rights in against.items():
             values, worst = found.get(name, []), 0.0
@@ -162,7 +164,8 @@ class Probe:
                 elif name.startswith(SIGNAL):
                     error = float(((value - right) / right).abs().max())
                 elif name == "volume":
-                    error = float(((value - right).abs() / torch.maximum((right - first[name]).abs(), 0.1 * right)).max())
+                    added = rights[1] - rights[0]
+                    error = float((values[-1] - values[0] - added).abs() / torch.maximum(added.abs(), 0.1 * rights[1]))
                 else:
                     error = float((value - right).norm() / right.norm().clamp(min=1e-30))
                 worst = max(worst, math.inf if math.isnan(error) else error)
