@@ -114,7 +114,7 @@ def one_thread() -> None:
 
 
 def side_by_side(name: str, device: str, seed: int, processes: int) -> list[dict]:
-    """The case in as many processes of one thread, each with its own colonies; the first to come says how long all took."""
+    """The case in as many processes of one thread, each with its own colonies; the first of them says how long all took."""
     with ProcessPoolExecutor(processes, get_context("spawn"), one_thread) as pool:
         list(pool.map(time.sleep, [1.0] * processes))  # till all have started
         begun = time.perf_counter()
@@ -123,16 +123,18 @@ def side_by_side(name: str, device: str, seed: int, processes: int) -> list[dict
 
 
 def run(name: str, device: str, seed: int, processes: int) -> dict:
+    """What all parts come to together, and how it went in the one with most to do."""
     parts = [grow(name, device, seed)] if processes == 1 else side_by_side(name, device, seed, processes)
     all_of = lambda what: sum(p[what] for p in parts)  # noqa: E731
-    longest = max(parts, key=lambda p: p["cell_steps"])
     seconds = parts[0]["seconds"]
-    return longest | {
+    together = {
         "case": name, "device": device, "processes": processes, "cells": all_of("cells"), "colonies": all_of("colonies"), "seconds": round(seconds, 2),
         "cell_steps": all_of("cell_steps"), "us_per_cell_step": round(1e6 * seconds / all_of("cell_steps"), 2),
-        "contacts": all_of("contacts"), "overlap_mean_um": round(all_of("overlap_sum_um") / max(1, all_of("contacts")), 5),
-        "overlap_worst_um": max(p["overlap_worst_um"] for p in parts), "floor_seconds": round(all_of("bytes") / copy_speed(device), 3),
+        "overlap_mean_um": round(all_of("overlap_sum_um") / max(1, all_of("contacts")), 5), "overlap_worst_um": max(p["overlap_worst_um"] for p in parts),
+        "floor_seconds": round(all_of("bytes") / copy_speed(device), 3),
     }  # fmt: skip
+    longest = max(parts, key=lambda p: p["cell_steps"])
+    return together | {k: v for k, v in longest.items() if k not in (*together, "overlap_sum_um", "contacts", "bytes")}
 
 
 def main() -> None:

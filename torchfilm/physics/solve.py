@@ -380,8 +380,9 @@ def _block_inverse(problem: ContactProblem, active: Tensor) -> Tensor:
     blocks = problem.rows.blocks(active if problem.unilateral else None)
     blocks.diagonal(dim1=1, dim2=2).add_(problem.alpha)
     # no check here: where a colony is not finite so is its inverse, and its residual says so without stopping the others
-    # it comes column by column, which for symmetric blocks is row by row
-    return torch.linalg.inv_ex(blocks).inverse.mT.contiguous()
+    inverse = torch.linalg.inv_ex(blocks).inverse
+    # of a block that is nearly singular rounding leaves an inverse that is not symmetric, and with such CG comes to a stand
+    return (inverse + inverse.mT).mul_(0.5).contiguous()
 
 
 def _attach_gradient(problem: ContactProblem, end: _Iterate, tolerance: Tensor, max_iterations: int) -> Tensor:
