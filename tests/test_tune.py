@@ -128,8 +128,17 @@ def test_settings_with_which_a_colony_fails_are_not_chosen():
     assert tuned.settings.dt < 0.02 and any(math.isinf(t.worst) for t in tuned.tries)
 
 
+def test_settings_are_not_chosen_by_what_is_left_when_the_volume_cannot_be_told():
+    """A number of cells alone would call any settings right, as a whole number of few cells is the same by all of them."""
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2))
+    with pytest.raises(InputError, match="Here volume: two references differ by"):
+        tf.tune(scene, error=1e-6, cells=8, colonies=2)
+    with pytest.raises(InputError, match="Here volume: two references differ by"):
+        tf.tune(scene, error=1e-6, cells=8, colonies=2, of=("cells", "volume"))
+
+
 def test_what_cannot_be_held_or_told_is_said():
-    with pytest.raises(InputError, match=r"the probe can tell\. Here m two references differ by"):
+    with pytest.raises(InputError, match=r"the probe can tell\. Here m: two references differ by"):
         tf.tune(dividing(), 1e-9, cells=8, colonies=2, of=["m"])
 
 

@@ -56,7 +56,7 @@ MOST_STEPS = 2000
 SIGNAL = "signal "
 # Other seeds, and colonies somewhat larger, have somewhat other errors than the probe's. So of the error that is asked for AIM is aimed at, and what is chosen
 # must hold CONFIRM of it in a second probe of other colonies, LARGER times as large; where it does not, a part STRICTER as large is aimed at.
-AIM, CONFIRM, LARGER, STRICTER = 0.75, 0.8, 1.5, 0.8
+AIM, CONFIRM, LARGER, STRICTER = 0.85, 0.9, 1.5, 0.8
 # A long step lets a colony grow too much and a loose solve too little. So a step is not given up where it alone is over what is aimed at, but where it is OFF
 # times over. Circuits may take a SMALL part of it.
 OFF, SMALL = 1.4, 0.3
@@ -261,15 +261,19 @@ class Search:
     @torch.no_grad()
     def run(self) -> Tuned:
         probe = self.probe
-        tight = [probe.observed(self.settings(n, TIGHT_CONTACTS, TIGHT_CIRCUITS))[0] for n in (FINEST, FINEST // 2)]
-        self.unsure = probe.errors(tight[1], tight[0], apart=True)
+        self.reference, self.unsure = self._reference(probe)
+        self.seen_there, unsure_there = self._reference(self.other)
+        # what is drawn at random anew for each length of step differs by chance, now more and now less: so both are asked
+        self.unsure |= {n: max(e, unsure_there[n]) for n, e in self.unsure.items() if math.isfinite(unsure_there.get(n, math.inf))}
         # the coarser reference is off by twice as much as the finer is: their difference is the finer's own error
         said = lambda e: "a reference failed" if math.isinf(e) else f"two references differ by {_percent(e)}"  # noqa: E731
         left_out = {n: said(e) for n, e in self.unsure.items() if e > self.error / 2}
-        self.reference = {n: v for n, v in tight[0].items() if n not in left_out}
-        if not self.reference:
-            worst = ", ".join(f"{n} {why}" for n, why in left_out.items())
-            raise checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}: ask for more, or probe more colonies or cells.")
+        self.reference = {n: v for n, v in self.reference.items() if n not in left_out}
+        # what every knob tells in must be seen, and what was named
+        missing = [n for n in left_out if n in (probe.of or ("volume",))]
+        if missing or not self.reference:
+            worst = ", ".join(f"{n}: {left_out[n]}" for n in missing or left_out)
+            raise checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}. Ask for more, or probe more colonies or cells.")
         own = self._try(Settings())  # first, since a coarse step that takes sub-steps does not tell what a step costs
         best, confirmed = self._confirmed()
         return Tuned(
@@ -277,9 +281,14 @@ class Search:
             list(self.tries.values()), probe.dt * WINDOW, probe.start.cells,
         )  # fmt: skip
 
+    def _reference(self, probe: Probe) -> tuple[dict[str, list[Tensor]], dict[str, float]]:
+        """What is right, by observable, and how far another reference of half as many steps differs from it."""
+        right, other = (probe.observed(self.settings(n, TIGHT_CONTACTS, TIGHT_CIRCUITS))[0] for n in (FINEST, FINEST // 2))
+        return right, probe.errors(other, right, apart=True)
+
     def _confirmed(self) -> tuple[Try, dict[str, float]]:
         """The cheapest that holds the error in the other colonies too, and its errors there, in what can be seen there."""
-        seen = self.other.observed(self.settings(FINEST, TIGHT_CONTACTS, TIGHT_CIRCUITS))[0]
+        seen = self.seen_there
         right = {n: seen[n] for n in self.reference if n in seen and not any(bool(v.isnan().any()) for v in seen[n])}
         while True:
             best = self._cheapest()
