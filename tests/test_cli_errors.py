@@ -104,6 +104,8 @@ ERRORS = {
     "show good.h5 --view xz": ("view", "2-D"),
     "show good.h5 --out nowhere/a.png": ("nowhere", ""),
     "show good.h5 --out a.nonsense": ("nonsense", ""),
+    "show .": ("folder",),
+    "show good.h5 --out nameless": ("nameless", r"ends in \.png"),
     "info unknown": ("unknown", "microcolony"),
     "info text.h5": (r"text\.h5", "not a results file"),
     "info no_such_file.py": (r"no_such_file\.py", "No such file"),

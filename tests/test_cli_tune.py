@@ -62,6 +62,7 @@ def test_explain_says_what_a_preset_would_do(folder):
         (("tune", "mine.py", "--error", "much"), "--error = 'much'"),
         (("tune", "mine.py", "--error", "60%"), "error = 0.6"),
         (("tune", "mine.py", "--error", "3"), "did you mean 3%?"),
+        (("tune", "mine.py", "--error", "200%"), "a share below the whole"),
         (("run", "mine.py", "--preset", "drafty", "--cells", "2"), "'drafty' is not allowed: it must be one of 'draft', 'standard', 'reference'"),
         (("explain", "mine.py", "--preset", "draft", "--settings", "s.json"), "give one of the two"),
         (("tune", "mine.py", "--out", "mine.py"), "no file yet"),

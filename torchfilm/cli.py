@@ -223,6 +223,8 @@ def check_new(name: str, path: Path, overwrite: bool, mend: str) -> None:
 
 def own_picture(results: Path, out: Path | None = None) -> Path:
     """The picture that belongs to a results file, or `out`; never the results file itself."""
+    if results.is_dir():
+        raise checks.refuse("results", str(results), "a results file", "This is a folder.")
     picture = results.with_suffix(".png") if out is None else out
     if picture.absolute() == results.absolute():
         mend = "Give the results a name that does not end in .png, or draw with show --out."

@@ -109,5 +109,6 @@ def parse_error(text: str) -> float:
     except ValueError as error:
         raise checks.refuse("--error", text, "a share, such as 1% or 0.01") from error
     if share >= 1:
-        raise checks.refuse("--error", text, "a share, such as 1% or 0.01", f"{share:g} is {100 * share:g} %; did you mean {text.removesuffix('%')}%?")
+        mend = "" if text.endswith("%") else f"{share:g} is {100 * share:g} %; did you mean {text}%?"
+        raise checks.refuse("--error", text, "a share below the whole, such as 1% or 0.01", mend)
     return share

@@ -85,7 +85,9 @@ def _last_step(state: State, until: float, dt: float) -> int:
     if steps < -1e-6:
         raise checks.refuse("until", until, f"at least the state's own time, {state.time:g} h")
     if abs(steps - round(steps)) > 1e-6 * max(1.0, steps):
-        raise checks.refuse("until", until, f"a whole number of steps of dt = {dt:g} h from {state.time:g} h")
+        beside = [state.time + n * dt for n in (math.floor(steps), math.ceil(steps)) if n]
+        near = " and ".join(f"{t:g}" for t in beside)
+        raise checks.refuse("until", until, f"a whole number of steps of dt = {dt:g} h from {state.time:g} h", f"Next to it: {near} h.")
     return state.step + round(steps)
 
 

@@ -14,7 +14,7 @@ from torchfilm.signals.faces import Faces, Open
 from torchfilm.signals.grid import Batch, Grid
 from torchfilm.signals.layout import Layout
 from torchfilm.signals.operator import operator
-from torchfilm.signals.space import checked_box, checked_flow
+from torchfilm.signals.space import MOST_VOXELS, checked_box, checked_flow
 from torchfilm.signals.transport import METHODS, Stepper, choose, prepare
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
@@ -27,8 +27,6 @@ BEYOND = ("error", "grow", "open")
 SPLITTINGS = ("lie", "strang")
 # A grid that grows with its colony does so by this many voxels at a time, and keeps this many between the cells and its faces.
 BLOCK, MARGIN = 8, 2
-# A colony's grid grows to this many voxels, 0.27 GB a signal in float32: one cell that is flung far away must not take all memory there is.
-MOST_VOXELS = 2**26
 
 
 @dataclass(frozen=True, eq=False)

@@ -225,6 +225,8 @@ def _legend(scales: Sequence[Scale], width: float, taken: float) -> tuple[list[t
 
 
 def save(figure: Figure, path: str | Path) -> Path:
+    if not Path(path).suffix:  # matplotlib would write beside it, and perhaps over something
+        raise checks.refuse("picture", str(path), "a name that ends in .png, .pdf or .svg")
     try:
         figure.savefig(path, dpi=figure.dpi)
     except (OSError, ValueError) as error:  # no such folder; no such kind of picture

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from torchfilm.tools import checks
 
+# The most of a colony's grid, 0.27 GB a signal in float32; where it grows, one cell that is flung far away must not take all memory there is.
+MOST_VOXELS = 2**26
+
 
 def checked_box(box: Any, spacing: Any, depth: float | None, height: float) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Lower and upper corner and size of voxels, checked."""
@@ -26,6 +29,10 @@ def checked_box(box: Any, spacing: Any, depth: float | None, height: float) -> t
         if abs(count - round(count)) > 1e-6:
             whole = max(1, round(count)) * h
             raise checks.refuse(f"Medium.box along {letter}", (a, b), f"a whole number of voxels of {h:g} µm", f"It is {count:g}; make it {whole:g} µm long.")
+    voxels = math.prod(round((b - a) / h) for a, b, h in zip(low, high, voxel, strict=True))
+    if voxels > MOST_VOXELS:
+        mend = f"Here it is {voxels:,}: a larger spacing, or a smaller box."
+        raise checks.refuse("Medium.box", (low, high), f"of at most {MOST_VOXELS:,} voxels of {spacing} µm a colony", mend)
     if depth is not None:
         checks.number("Medium.depth", depth, above=0.0)
         if len(low) == 3:
