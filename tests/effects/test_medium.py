@@ -283,6 +283,7 @@ BAD = {
     "no box": (lambda: tf.Medium(ahl=AHL, box=3.0, spacing=1.0), r"Medium\.box.*two corners"),
     "box inside out": (lambda: tf.Medium(ahl=AHL, box=((1.0, 0.0), (0.0, 1.0)), spacing=1.0), r"Medium\.box.*first below the second"),
     "not a whole number of voxels": (lambda: tf.Medium(ahl=AHL, box=((0, 0), (10, 8)), spacing=4.0), r"along x.*whole number of voxels.*2\.5.*make it 8"),
+    "too many voxels": (lambda: tf.Medium(ahl=AHL, box=((-16e3, -16e3), (16e3, 16e3)), spacing=0.5), r"Medium\.box.*at most 67,108,864.*4,096,000,000"),
     "spacing": (lambda: tf.Medium(ahl=AHL, box=BOX, spacing=0.0), r"Medium\.spacing"),
     "spacing of three for two": (lambda: tf.Medium(ahl=AHL, box=BOX, spacing=(1.0, 1.0, 1.0)), r"Medium\.spacing.*2 numbers"),
     "depth of a box with three": (lambda: tf.Medium(ahl=AHL, box=((0, 0, 0), (4, 4, 4)), spacing=4.0, depth=1.0), r"Medium\.depth"),
