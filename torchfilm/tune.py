@@ -56,7 +56,7 @@ MOST_STEPS = 2000
 SIGNAL = "signal "
 # Other seeds, and colonies somewhat larger, have somewhat other errors than the probe's. So of the error that is asked for AIM is aimed at, and what is chosen
 # must hold CONFIRM of it in a second probe of other colonies, LARGER times as large; where it does not, a part STRICTER as large is aimed at.
-AIM, CONFIRM, LARGER, STRICTER = 0.85, 0.9, 1.5, 0.8
+AIM, CONFIRM, LARGER, STRICTER = 0.75, 0.8, 1.5, 0.8
 # A long step lets a colony grow too much and a loose solve too little. So a step is not given up where it alone is over what is aimed at, but where it is OFF
 # times over. Circuits may take a SMALL part of it.
 OFF, SMALL = 1.4, 0.3
