@@ -11,6 +11,15 @@ from hypothesis import strategies as st
 
 from torchfilm.physics.neighbours import Neighbourhood
 
+# Whatever sizes and densities: all cells in one place, or none near another.
+SCATTERS = {
+    "seed": st.integers(0, 2**32 - 1),
+    "counts": st.lists(st.integers(0, 25), min_size=1, max_size=4),
+    "dim": st.sampled_from([2, 3]),
+    "side": st.sampled_from([0.0, 0.5, 3.0, 20.0]),
+    "lengths": st.lists(st.sampled_from([0.0, 0.1, 2.0, 9.0, 60.0]), min_size=1, max_size=3),
+    "dtype": st.sampled_from([torch.float32, torch.float64]),
+}
 DIMS = pytest.mark.parametrize("dim", [2, 3])
 
 
@@ -69,12 +78,7 @@ def test_pairs_against_brute_force(device, dtype, dim, margin):
 
 @settings(deadline=None, derandomize=True, max_examples=60)
 @given(
-    seed=st.integers(0, 2**32 - 1),
-    counts=st.lists(st.integers(0, 25), min_size=1, max_size=4),
-    dim=st.sampled_from([2, 3]),
-    side=st.sampled_from([0.0, 0.5, 3.0, 20.0]),
-    lengths=st.lists(st.sampled_from([0.0, 0.1, 2.0, 9.0, 60.0]), min_size=1, max_size=3),
-    dtype=st.sampled_from([torch.float32, torch.float64]),
+    **SCATTERS,
     margin=st.sampled_from([0.0, 0.2]),
 )
 def test_pairs_of_any_scatter(seed, counts, dim, side, lengths, dtype, margin):
@@ -84,13 +88,8 @@ def test_pairs_of_any_scatter(seed, counts, dim, side, lengths, dtype, margin):
 
 @settings(deadline=None, derandomize=True, max_examples=60)
 @given(
-    seed=st.integers(0, 2**32 - 1),
-    counts=st.lists(st.integers(0, 25), min_size=1, max_size=4),
-    dim=st.sampled_from([2, 3]),
-    side=st.sampled_from([0.0, 0.5, 3.0, 20.0]),
-    lengths=st.lists(st.sampled_from([0.0, 0.1, 2.0, 9.0, 60.0]), min_size=1, max_size=3),
+    **SCATTERS,
     share=st.sampled_from([0.0, 0.1, 0.5, 1.0]),
-    dtype=st.sampled_from([torch.float32, torch.float64]),
 )
 def test_pairs_of_some_cells_are_those_of_all_that_hold_one(seed, counts, dim, side, lengths, share, dtype):
     """Each once, the cell that was asked for first, whatever its class and its partner's; nothing where nobody is asked for."""

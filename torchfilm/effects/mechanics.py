@@ -273,9 +273,9 @@ class _Run:
         """
         state = self.state
         near, rows, bodies = self._neighbourhood(active)
+        of_active = active.index_select(0, state.colony)
+        walls = self._at_walls(of_active)
         with torch.no_grad():
-            of_active = active.index_select(0, state.colony)
-            walls = self._at_walls(of_active)
             number = torch.full_like(state.colony, -1).index_copy(0, rows, torch.arange(rows.numel(), device=rows.device))
             pairs_of = lambda cells: [rows.index_select(0, side) for side in near.pairs_of(number[cells])]  # noqa: E731
             sum_of = lambda x, one, other: x.index_select(0, one) + x.index_select(0, other)  # noqa: E731
@@ -296,7 +296,7 @@ class _Run:
             first, second = (torch.cat([a, b.index_select(0, new)]) for a, b in zip((first, second), more, strict=True))
             theirs = torch.nonzero(left.index_select(0, first) | left.index_select(0, second)).squeeze(1)
         pairs = Touching.among(bodies, first.index_select(0, theirs), second.index_select(0, theirs))
-        return pairs, self._at_walls(left), left
+        return pairs, walls.take(torch.nonzero(left.index_select(0, walls.cell)).squeeze(1)), left
 
     def _neighbourhood(self, active: Tensor) -> tuple[Neighbourhood, Tensor, Bodies]:
         """The cells of the colonies that are active (others cannot be stepped perhaps), which those are (M,), and every cell's body."""

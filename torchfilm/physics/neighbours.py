@@ -177,18 +177,18 @@ class _Grid:
             second.append(members.index_select(0, run))
         return torch.cat(first), torch.cat(second)
 
-    def pairs_with(self, larger: Tensor) -> tuple[Tensor, Tensor]:
-        """Every pair of one of the cells `larger` (M,), of this class or another, and a member: those of this class meet themselves too."""
+    def pairs_with(self, asked: Tensor) -> tuple[Tensor, Tensor]:
+        """Every pair of one of the cells `asked` (M,), of this class or another, and a member: those of this class meet themselves too."""
         # the hair that windows have been given for rounding is no reason for another row
-        rows_each_way = torch.ceil(self.window.index_select(0, larger) * (1 - 2e-5)).long()
+        rows_each_way = torch.ceil(self.window.index_select(0, asked) * (1 - 2e-5)).long()
         found: list[Tensor] = []
-        query = torch.arange(larger.numel(), device=larger.device)
-        for own_row in torch.floor(self.at[1:].index_select(1, larger)).long():
+        query = torch.arange(asked.numel(), device=asked.device)
+        for own_row in torch.floor(self.at[1:].index_select(1, asked)).long():
             each = rows_each_way.index_select(0, query)
             owner, row = expand_ranges(own_row.index_select(0, query) - each, 2 * each + 1)
             found = [earlier.index_select(0, owner) for earlier in found] + [row]
             query = query.index_select(0, owner)
-        cells = larger.index_select(0, query)
+        cells = asked.index_select(0, query)
         start, count = self._run(cells, torch.stack(found))
         owner, run = expand_ranges(start, count)
         return cells.index_select(0, owner), self.members.index_select(0, run)

@@ -295,6 +295,10 @@ class WallContacts:
     row: Tensor
     surface: Tensor
 
+    def take(self, index: Tensor) -> WallContacts:
+        """The rows at `index`."""
+        return WallContacts(*(x.index_select(0, index) for x in (self.cell, self.gap, self.row, self.surface)))
+
 
 def find_wall_contacts(surfaces: Sequence[Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony_id: Tensor) -> WallContacts:
     """One row for each capsule end that overlaps (gap < 0), and at a sphere met from outside one for the nearest point, wherever it is.
