@@ -1,0 +1,210 @@
+"""What `tune` looks at: a window of some colonies' growth, run again and again from one state, and what one would read off it.
+
+| observable | error                                                                                                                     |
+|------------|---------------------------------------------------------------------------------------------------------------------------|
+| cells      | difference of their number, relative; those that are due to divide at the next step count as two                          |
+| volume     | difference of what the window's second half added, relative (or to a tenth of the whole, if that is more): what a longer  |
+|            | run comes to. In the first half cells settle: how deep they overlap goes by the settings, and the start is by others. Of  |
+|            | the cylinders round the cells, π r² by the length from end to end, which no division changes                              |
+| radius     | difference, relative                                                                                                      |
+| overlap    | mean overlap of touching cells over their diameter, 0 being right; of soft cells its difference                           |
+| a species  | difference of its mean and standard deviation over cells, relative                                                        |
+| signal …   | difference of its amount, and of its mean seen by its own molecules, relative; the greater                                |
+
+Colonies are chaotic: two runs of one law differ by chance. How much of an error that may be is told by the colonies themselves, each left out in turn.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm import measure
+from torchfilm.accuracy import Settings
+from torchfilm.effect import DIVISION
+from torchfilm.effects.circuit import Circuit
+from torchfilm.effects.mechanics import Mechanics
+from torchfilm.scene import Scene
+from torchfilm.simulate import simulate
+from torchfilm.state import State
+from torchfilm.tools.ragged import Groups
+from torchfilm.tools.timing import Timings
+
+# The window, in steps of the scene. Of half as many, most of the second half's error in volume is still the start's settling (measured).
+WINDOW = 24
+# A scene that never has as many cells as asked for is taken as it is after this many steps.
+MOST_STEPS = 2000
+SIGNAL = "signal "
+
+Seen = dict[str, list[Tensor]]
+"""By observable, what it is made of in the middle and at the end, summed over each colony: (B, m) float64; NaN if a colony failed."""
+
+
+@dataclass(frozen=True)
+class Error:
+    """A relative error, and how much of it may be chance: its standard error among colonies (jackknife: Efron and Stein 1981)."""
+
+    value: float
+    noise: float
+
+    @property
+    def most(self) -> float:
+        """What it may well be."""
+        return self.value + self.noise
+
+    def __str__(self) -> str:
+        return "failed" if math.isinf(self.value) else f"{100 * self.value:.2g} ± {100 * self.noise:.1g} %"
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Where all windows begin, and what they are compared with."""
+
+    given: Scene
+    scene: Scene  # as it is probed: molecules by their mean
+    start: State
+    dt: float
+    of: tuple[str, ...] | None
+
+    def steps(self, settings: Settings) -> int:
+        """Into how many steps the window is divided."""
+        return round(WINDOW * self.dt / (settings.dt or self.dt))
+
+    def window(self, settings: Settings) -> tuple[list[State], bool, float, dict[str, float]]:
+        """The states in the middle and at the end of the window, whether a colony failed, the seconds it took, and those of each effect."""
+        made, steps = settings.apply(self.scene), self.steps(settings)
+        dt, state, seen, timings, broken = self.dt * WINDOW / steps, self.start, [], Timings(), False
+        # what other work on the machine takes does not count, where the work is this thread's own
+        clock = time.thread_time if state.device.type == "cpu" else time.perf_counter
+        begun = clock()
+        for k in range(steps):
+            state = made.step(state, dt, timings)
+            broken = broken or any(bool((r.status != 0).any()) for r in state.reports.values())
+            if 2 * (k + 1) % steps == 0:
+                seen.append(state)
+        return seen, broken, clock() - begun, timings.seconds
+
+    def observed(self, settings: Settings) -> tuple[Seen, float, dict[str, float]]:
+        """What is read off in the middle and at the end, the seconds it took, and those of each effect."""
+        states, broken, seconds, spent = self.window(settings)
+        found: Seen = {}
+        for state in states:
+            for name, value in (sums(state) | {"cells": self._due(state)}).items():
+                if self.of is None or name in self.of:
+                    found.setdefault(name, []).append(value * math.nan if broken else value)
+        return found, seconds, spent
+
+    def _due(self, state: State) -> Tensor:
+        """The number of cells after the divisions with which the next step would begin, (B, 1): until then it is late, by a step that is known."""
+        for effect in self.scene.effects:
+            if effect.stage <= DIVISION:
+                state = effect.step(state, self.dt)
+        return state.counts.double().cpu().unsqueeze(1)
+
+    def errors(self, found: Seen, against: Seen, apart: bool = False) -> dict[str, Error]:
+        """By observable of `against`, the greater of the errors in the middle and at the end; infinite where it is not found.
+
+        apart: of two runs of which neither is right, so that overlaps, too, are compared and not told."""
+        out = {}
+        for name, rights in against.items():
+            values = found.get(name, [])
+            if len(values) != len(rights):
+                out[name] = Error(math.inf, 0.0)
+                continue
+            each = self._error(name, _left_out(name, values), _left_out(name, rights), apart)
+            error, without = float(each[0]), each[1:]
+            noise = math.sqrt((len(without) - 1) * float(without.var(correction=0)))
+            out[name] = Error(math.inf, 0.0) if math.isnan(error) else Error(error, noise)
+        return out
+
+    def _error(self, name: str, value: Tensor, right: Tensor, apart: bool) -> Tensor:
+        """Of an observable (J, 2, k) the greater of the errors in the middle and at the end, (J,)."""
+        if name == "volume":
+            added = right[:, -1] - right[:, 0]
+            return ((value[:, -1] - value[:, 0] - added).abs() / torch.maximum(added.abs(), 0.1 * right[:, -1])).squeeze(1)
+        if name == "overlap" and not apart and not any(isinstance(e, Mechanics) and e.stiffness is not None for e in self.scene.listed):
+            each = value
+        elif name == "overlap":
+            each = (value - right).abs()
+        elif name.startswith(SIGNAL):
+            each = ((value - right) / right).abs()
+        else:
+            each = ((value - right).norm(dim=2) / right.norm(dim=2).clamp(min=1e-30)).unsqueeze(2)
+        return each.flatten(1).amax(1)
+
+
+@torch.no_grad()
+def begin(scene: Scene, cells: int, colonies: int, of: Sequence[str] | None = None, seed: int = 0, device: str | torch.device = "cpu") -> Probe:
+    """The scene as it is probed, grown to where the windows begin."""
+    smooth = [e.smooth() if isinstance(e, Circuit) and e.is_stochastic else e for e in scene.listed]
+    made = scene.retuned(smooth, scene.dt, scene.accuracy)
+    fixed = scene.fixed_colonies
+    state = made.seed(fixed if fixed > 1 else colonies, seed=seed, device=device)
+    ends = deque(simulate(made, state, cells=cells, until=MOST_STEPS * scene.dt), maxlen=1)
+    return Probe(scene, made, ends[0] if ends else state, scene.dt, None if of is None else tuple(of))
+
+
+def observables(state: State) -> dict[str, Tensor]:
+    """What is read off a state of a batch: numbers by name, (k,) float64 each. Species and signals that are 0 everywhere are left out."""
+    return {name: _made(name, parts.sum(0)) for name, parts in sums(state).items()}
+
+
+def sums(state: State) -> dict[str, Tensor]:
+    """By observable, what it is made of, summed over each colony: (B, m) float64."""
+    over = lambda *x: torch.stack([state.groups.sum(v.double()) for v in x], 1).cpu()  # noqa: E731
+    one, radius = torch.ones_like(state.length), state.radius.double()
+    out = {"cells": over(one), "volume": over(math.pi * radius**2 * (state.length.double() + 2.0 * radius))}
+    if "displacement" in state.fields:  # cells that do not push each other have no overlap to speak of
+        found = measure.overlaps(state)
+        out["overlap"] = torch.cat([torch.stack([found.mean.double() * found.count, found.count.double()], 1).cpu(), over(2.0 * radius, one)], 1)
+    if int(state.counts.min()) >= 2:
+        of_each = measure.colony_radius(state).double().cpu()
+        out["radius"] = torch.stack([of_each, torch.ones_like(of_each)], 1)
+    for name in species(state):
+        value = state.fields[name].double()
+        if bool((value != 0).any()):
+            out[name] = over(value, value * value, one)
+    for name, grid in state.signals.items():
+        value = grid.double()
+        if bool((value != 0).any()):
+            assert state.layout is not None
+            counts = state.layout.grid.counts
+            voxels = Groups(torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts), len(counts))
+            out[SIGNAL + name] = torch.stack([voxels.sum(value), voxels.sum(value * value)], 1).cpu()
+    return out
+
+
+def _made(name: str, total: Tensor) -> Tensor:
+    """An observable (…, k) of its sums (…, m)."""
+    if name in ("cells", "volume"):
+        return total
+    if name == "overlap":
+        depth, pairs, diameters, cells = total.unbind(-1)
+        return (depth / pairs.clamp(min=1) * cells / diameters).unsqueeze(-1)
+    if name == "radius":
+        return total[..., :1] / total[..., 1:]
+    if name.startswith(SIGNAL):
+        # the amount, and the mean concentration that a molecule of it finds itself in
+        amount, square = total.unbind(-1)
+        return torch.stack([amount, square / amount], -1)
+    first, second, cells = total.unbind(-1)
+    mean = first / cells
+    return torch.stack([mean, (second / cells - mean * mean).clamp(min=0).sqrt()], -1)
+
+
+def _left_out(name: str, parts: Sequence[Tensor]) -> Tensor:
+    """An observable of all colonies, and with each of them left out, in the middle and at the end: (1 + B, 2, k)."""
+    each = torch.stack(list(parts), 1)  # (B, 2, m)
+    total = each.sum(0, keepdim=True)
+    return _made(name, torch.cat([total, total - each]))
+
+
+def species(state: State) -> list[str]:
+    """Names of fields that are concentrations in cells."""
+    return [name for name, f in state.declared.items() if f.scope == "cell" and f.unit == "conc"]
