@@ -24,7 +24,7 @@ from torchfilm.scene import Scene
 from torchfilm.tools import checks
 
 # Into how many steps the window is divided: all even, so that its middle is a step too.
-STEPS = (6, 8, 12, 16, 18, 24, 30, 40, 48, 60, 76, 96, 120, 150)
+STEPS = (6, 8, 12, 16, 18, 20, 24, 30, 40, 48, 60, 76, 96, 120, 150)
 FINEST = 240  # the reference
 # Knobs from loose to tight: (penalty, passes beyond the least, tolerance) of contacts, and rtol of circuits.
 # A larger penalty saves no time, and its overlap grows with the colony beyond what a probe of a small one shows. In the order of what they cost.
@@ -35,12 +35,11 @@ CONTACTS = (
 CIRCUITS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
 TIGHT_CONTACTS = (0.03, 3, 1e-3)
 TIGHT = 1e-3  # circuits, of the error asked for: a ten-thousandth of what they may take of it would not be seen
-# Colonies somewhat larger have somewhat other errors. So what is chosen must hold the error in a second probe of other colonies, LARGER times as large;
-# where it does not, a part STRICTER as large is aimed at.
-LARGER, STRICTER = 1.5, 0.8
-# A long step lets a colony grow too much and a loose solve too little. So a step is not given up where it alone is over what is aimed at, but where it is OFF
+# Colonies somewhat larger have somewhat other errors. So what is chosen must hold the error in a second probe of other colonies, LARGER times as large.
+LARGER = 1.5
+# A long step lets a colony grow too much and a loose solve too little. So a step is not given up where it alone is over what was asked, but where it is OFF
 # times over. Circuits may take a SMALL part of it.
-OFF, SMALL = 1.4, 0.3
+OFF, SMALL = 2.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ class Search:
     """Settings tried from coarse to fine."""
 
     def __init__(self, probe: Probe, other: Probe, error: float):
-        self.probe, self.other, self.error, self.aim = probe, other, error, error
+        self.probe, self.other, self.error = probe, other, error
         self.mechanics = next((e for e in probe.scene.listed if isinstance(e, Mechanics)), None)
         self.circuit = next((e for e in probe.given.listed if isinstance(e, Circuit) and e.method == STIFF), None)
         self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
@@ -122,7 +121,7 @@ class Search:
         self.rtols = tuple(r for r in CIRCUITS if r > self.tight) if self.circuit is not None else (self.tight,)
         self.runs: dict[Settings, tuple[Seen, float, dict[str, float]]] = {}
         self.tries: dict[Settings, Try] = {}
-        self.refuted: set[Settings] = set()
+        self.refuted: dict[Settings, dict[str, Error]] = {}  # what came of them in the other colonies
 
     def settings(self, steps: int, contacts: tuple[float, int, float], rtol: float) -> Settings:
         """As knobs of the scene; those of effects that it does not list stay unset."""
@@ -167,8 +166,7 @@ class Search:
             errors = self.other.errors(self.other.observed(best.settings)[0], right)
             if max((e.most for e in errors.values()), default=0.0) <= self.error:
                 return best, errors
-            self.refuted.add(best.settings)
-            self.aim *= STRICTER
+            self.refuted[best.settings] = errors
 
     def _run(self, settings: Settings) -> tuple[Seen, float, dict[str, float]]:
         if settings not in self.runs:
@@ -182,22 +180,26 @@ class Search:
         return self.tries[settings]
 
     def _cheapest(self) -> Try:
-        """Of the tries within what is aimed at, the one that took the least time, once every step that could be cheaper has been looked at."""
+        """Of the tries that hold the error and are not refuted, the one that took the least time, once every step that could be cheaper has been looked at:
+        the scene's own first, as it is likely to hold it and then tells what is too dear."""
         best: Try | None = None
-        for steps in STEPS:
-            if best is not None and steps * self._least() > best.seconds:
-                break
-            self._look_at(steps)
-            holding = [t for t in self.tries.values() if t.worst <= self.aim and t.settings not in {Settings(), *self.refuted}]
-            best = min(holding, key=lambda t: t.seconds, default=None)
+        for steps in (WINDOW, *STEPS):
+            if best is None or steps * self._least() <= best.seconds:
+                self._look_at(steps, math.inf if best is None else best.seconds)
+                best = min((t for t in self.tries.values() if self._holds(t)), key=lambda t: t.seconds, default=None)
         if best is None:
-            closest = min(self.tries.values(), key=lambda t: t.worst)
-            name = max(closest.errors, key=lambda n: closest.errors[n].most)
+            found = {t.settings: t.errors for t in self.tries.values()} | self.refuted
+            worst = lambda s: max(e.most for e in found[s].values())  # noqa: E731
+            closest = min(found, key=worst)
+            name = max(found[closest], key=lambda n: found[closest][n].most)
             raise checks.refuse(
-                "error", self.error, f"reached by some settings: the closest came to {closest.errors[name]}, in {name!r}, with {_words(closest.settings)}",
-                "Ask for more, or name what matters (of=…).",
+                "error", self.error, f"reached by some settings: the closest came to {found[closest][name]}, in {name!r}, with {_words(closest)}",
+                "Ask for more, probe more colonies, or name what matters (of=…).",
             )  # fmt: skip
         return best
+
+    def _holds(self, tried: Try) -> bool:
+        return tried.worst <= self.error and tried.settings != Settings() and tried.settings not in self.refuted
 
     def _least(self) -> float:
         """What a step would take, s, if every effect took as little as it ever did."""
@@ -208,14 +210,18 @@ class Search:
                 each[name] = min(each.get(name, math.inf), share * spent)
         return sum(each.values())
 
-    def _look_at(self, steps: int) -> None:
-        """Try a window of so many steps with tighter and tighter knobs until the error is held; with the tightest only, where that is far off."""
-        tightest = self._run(self.settings(steps, TIGHT_CONTACTS, self.tight))[0]
-        if max(e.value for e in self.probe.errors(tightest, self.reference).values()) > OFF * self.aim:
+    def _look_at(self, steps: int, limit: float) -> None:
+        """Try a window of so many steps with tighter and tighter knobs until the error is held, or more than `limit` seconds are taken; with the tightest only,
+        where that is far off."""
+        if self._run(self.settings(steps, self.contacts[0], self.rtols[0]))[1] > limit:
             return
-        rtol = next(r for r in (*self.rtols, self.tight) if self._circuits_add(steps, r) <= SMALL * self.aim)
-        for contacts in (*self.contacts, TIGHT_CONTACTS):
-            if self._try(self.settings(steps, contacts, rtol)).worst <= self.aim:
+        tightest = self._run(self.settings(steps, TIGHT_CONTACTS, self.tight))[0]
+        if max(e.value for e in self.probe.errors(tightest, self.reference).values()) > OFF * self.error:
+            return
+        rtol = next(r for r in (*self.rtols, self.tight) if self._circuits_add(steps, r) <= SMALL * self.error)
+        for contacts, r in (*((c, rtol) for c in self.contacts), (TIGHT_CONTACTS, rtol), (TIGHT_CONTACTS, self.tight)):
+            tried = self._try(self.settings(steps, contacts, r))
+            if self._holds(tried) or tried.seconds > limit:
                 return
 
     def _circuits_add(self, steps: int, rtol: float) -> float:
