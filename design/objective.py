@@ -138,7 +138,7 @@ class Objective:
         """The scene in the middle of the space, after one of each option was built and the target looked at its first state."""
         middle = [p.value(0.5) for p in self.space.parameters]
         base = dict(zip(self.space.names, middle, strict=True))
-        trials, made_of = [base], []
+        trials, made_of, still = [base], [], []
         for p in self.space.parameters:
             ends = (p.low, p.high) if isinstance(p, Parameter) else p.options
             trials += [{**base, p.name: int(v) if isinstance(p, Parameter) and p.whole else v} for v in ends]
@@ -153,13 +153,24 @@ class Objective:
                     "tensor with one value per colony; what the scene takes as one plain number or as a name can be searched with whole=True or as a Choice. "
                     "Else narrow the bounds."
                 ) from error
-            if self.until is None:
-                made.check_moves(state)
             self.target.check(state)
             made_of.append((made.listed, made.founders))
+            still.append(self._never_ends(made, state))
+        # one design that does not grow is scored as such; a search of none that does is a mistake
+        if all(still):
+            raise tf.InputError(still[0])
         # what a listing does not show: founders, and what functions do
         self.made_of = tf.digest(made_of)
         return self.scene([base])
+
+    def _never_ends(self, scene: tf.Scene, state: tf.State) -> str:
+        """Why no run would come to the number of cells that ends it; empty where one would."""
+        try:
+            if self.cells is not None and self.until is None:
+                scene.check_moves(state, self.cells)
+        except tf.InputError as error:
+            return str(error)
+        return ""
 
     def scene(self, values: Sequence[Mapping[str, Value]], repeat: int = 1) -> tf.Scene:
         """One scene for several designs alike in what builds it: numbers as one value per colony, each design's `repeat` times."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import shutil
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import time
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -82,6 +84,48 @@ def test_another_scene_is_refused(whole, tmp_path):
             results.state(tf.Scene(tf.Growth(rate=1.0), tf.Mechanics()))
         with pytest.raises(tf.InputError, match=r"it lacks .*birth_length"):
             results.state(tf.Scene(tf.Growth(rate=1.0), tf.Division(added=1.0), tf.Mechanics(dim=2)))
+
+
+def ruled(factor: float) -> tf.Scene:
+    def update(cells):
+        cells.growth_rate = factor * cells.length
+
+    return tf.Scene(tf.Rules(update), tf.Growth(), tf.Division(length=3.0), dt=DT)
+
+
+def test_a_function_that_was_edited_is_another_scene(tmp_path):
+    """The listing calls both `Rules(update=update)`."""
+    path = tmp_path / "run.h5"
+    first, edited = ruled(0.5), ruled(0.6)
+    assert first.listing() == edited.listing()
+    record(first, first.seed(2), path, until=2 * DT)
+    with tf.Results(path) as results:
+        state = results.state(ruled(0.5))
+        with pytest.raises(tf.InputError, match=r"a function of its effects was edited.*resume --changed"):
+            results.state(edited)
+        assert results.state(edited, changed=True).step == state.step
+    with pytest.raises(tf.InputError, match=r"a function of its effects was edited.*Recorder\(…, changed=True\)"):
+        record(edited, state, path, append=True)
+    with tf.Results(path) as results:
+        results.check_alike(first)
+        assert len(results) == 2
+    recorder = tf.Recorder(path, edited, append=True, changed=True)
+    *_, last = tf.simulate(edited, state, until=4 * DT, record=recorder)
+    with tf.Results(path) as results:
+        results.check_alike(edited)
+        assert results.times[-1] == last.time
+        with pytest.raises(tf.InputError, match=r"frame = 'a' .*whole number"):
+            results.frame("a")
+
+
+def test_a_file_of_another_python_is_not_refused_for_its_code(tmp_path):
+    """Versions of Python compile one function in two ways."""
+    path = tmp_path / "run.h5"
+    record(ruled(0.5), ruled(0.5).seed(2), path, until=2 * DT)
+    with h5py.File(path, "r+") as file:
+        file.attrs["code"] = json.dumps(["3.99", *json.loads(file.attrs["code"])[1:2], "another"])
+    with tf.Results(path) as results:
+        assert results.state(ruled(0.5)).step == 2
 
 
 def test_appending_from_another_moment_is_refused_and_harms_nothing(whole, tmp_path):

@@ -109,12 +109,32 @@ def test_an_end_in_the_past_is_refused():
         ({"until": 1.0, "dt": 0.0}, "dt"),
         ({"until": 1.0, "dt": -0.1}, "dt"),
         ({"until": 1.0, "on_failure": "ignore"}, "on_failure"),
+        ({"until": 1.0, "record": 3}, "record = 3"),
+        ({"until": 1.0, "observers": print}, "observers"),
     ],
 )
 def test_bad_options_are_refused_before_anything_runs(options, word):
     scene = alone()
     with pytest.raises(tf.InputError, match=word):
         tf.simulate(scene, scene.seed(), **options)
+
+
+def test_scene_and_state_the_wrong_way_round_are_told():
+    scene = alone()
+    for run in (tf.simulate, tf.rollout):
+        with pytest.raises(tf.InputError, match=r"\(State, Scene, …\) is not allowed: first comes a Scene"):
+            run(scene.seed(), scene, until=1.0)
+
+
+def test_a_number_of_cells_that_no_growth_leads_to_is_refused():
+    """Colony 2 of rate 0 would keep the run going for ever; with as many cells as are wanted, or until a time, it may stand still."""
+    scene = tf.Scene(tf.Growth(rate=[1.0, 0.5, 0.0]), tf.Division(length=3.0))
+    with pytest.raises(tf.InputError, match=r"growth_rate', which is 0 in 1 of 3 colonies, the first of them 2 .*come to 4 cells.*until="):
+        tf.simulate(scene, scene.seed(3), cells=4)
+    assert not list(tf.simulate(scene, scene.seed(3), cells=1))
+    assert len(list(tf.simulate(scene, scene.seed(3), until=0.1))) == 4
+    with pytest.raises(tf.InputError, match=r"growth_rate', which is 0 and which nothing"):
+        tf.simulate(tf.Scene(tf.Growth(rate=0.0)), tf.Scene(tf.Growth(rate=0.0)).seed(2), cells=4)
 
 
 def test_a_state_of_another_scene_is_refused_before_anything_runs():

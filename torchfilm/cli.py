@@ -143,7 +143,7 @@ class Resume:
             dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
         if self.picture:
             own_picture(self.file)
-        recorder = Recorder(self.file, scene, every=every, append=True)
+        recorder = Recorder(self.file, scene, every=every, append=True, changed=self.changed)
         go(scene, state, recorder, cells=self.cells, until=self.until, dt=dt, watch=self.watch, picture=self.picture)
 
 
@@ -322,12 +322,13 @@ def table(scene: Scene, state: State, timings: Timings, seconds: float) -> str:
     walls = next((e.walls for e in scene.effects if isinstance(e, Mechanics)), ())
     found = measure.overlaps(state, walls)
     pairs = found.count.sum().clamp(min=1)
-    counts, radius = state.counts, measure.colony_radius(state)
+    counts = state.counts
+    radius = f"{float(measure.colony_radius(state).nanmean()):.1f} µm (mean)" if state.cells else "-: no cell is left (the lineage says why)"
     lines = [
         f"{'colonies':<28}{state.colonies}",
         f"{'cells':<28}{state.cells} ({int(counts.min())} to {int(counts.max())} a colony)",
         f"{'time':<28}{state.time:g} h in {state.step} steps, {seconds:.1f} s",
-        f"{'colony radius':<28}{float(radius.nanmean()):.1f} µm (mean)",
+        f"{'colony radius':<28}{radius}",
         f"{'overlap':<28}mean {float((found.mean * found.count).sum() / pairs):.4f} µm, worst {float(found.worst.max()):.3f} µm",
     ]
     if walls:

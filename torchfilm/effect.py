@@ -57,7 +57,8 @@ class Effect:
         return ()
 
     def waits_for(self) -> Sequence[str]:
-        """Fields without a value of their own, which another effect, a rule or the first cells must set."""
+        """Fields that must not be 0 everywhere in a colony if it is to have more cells: another effect, a rule or the first cells set them where this does
+        not."""
         return ()
 
     def begin(self, state: State) -> State:

@@ -33,13 +33,13 @@ class Recorder:
     """An observer that writes every `every`-th step (and the last one, on `close`) of a run to an HDF5 file.
 
     path: a new file, unless `overwrite` or `append` says otherwise; `append` goes on in a file whose last frame is the state that
-    the run starts from.
+    the run starts from, by the same scene, or, if `changed`, by one that has the same fields.
     """
 
-    def __init__(self, path: str | Path, scene: Scene, *, every: int = 10, overwrite: bool = False, append: bool = False):
+    def __init__(self, path: str | Path, scene: Scene, *, every: int = 10, overwrite: bool = False, append: bool = False, changed: bool = False):
         if isinstance(every, bool) or not isinstance(every, int) or every < 1:
             raise checks.refuse("every", every, "a whole number of steps from 1")
-        self.path, self.scene, self.every, self.append = Path(path), scene, every, append
+        self.path, self.scene, self.every, self.append, self.changed = Path(path), scene, every, append, changed
         if append and not self.path.exists():
             raise checks.refuse("record", str(path), "an existing results file to append to", "No such file.")
         if self.path.is_dir():
@@ -94,6 +94,8 @@ class Recorder:
             os.replace(rebuilt, self.path)
             mine = (state.seed, str(state.dtype)[6:], state.dim, state.colony_id.tolist(), state.stream.tolist())
             with Results(self.path) as kept:
+                if not self.changed:
+                    kept.check_alike(self.scene)
                 about = kept.attributes
                 there = (int(about["seed"]), str(about["dtype"]), int(about["dim"]), kept.colony_id.tolist(), kept.stream.tolist())
             if mine != there:
@@ -106,8 +108,8 @@ class Recorder:
                 self.file.close()
                 self.file = None
                 raise checks.refuse("state", f"at step {state.step}", f"the last frame of {self.path}, at step {last}", "Start from its last frame.")
-            if "effects" in self.file.attrs:  # of a scene that was changed on purpose, or Results.state would have refused it
-                self.file.attrs["effects"], self.file.attrs["scene"] = json.dumps(self.scene.listing()), self.scene.explain()
+            for name, value in _about(self.scene).items():  # of one that was changed on purpose
+                self.file.attrs[name] = value
             self.file.swmr_mode = True
             self.written, self.first_step = last, int(self.file["frames/step"][0])
             return
@@ -125,7 +127,7 @@ class Recorder:
         attributes = {
             "format": FORMAT, "version": VERSION, "seed": state.seed, "dim": state.dim, "dtype": str(state.dtype)[6:],
             "device": str(state.device), "dt": self.dt, "every": self.every,
-            "scene": scene.explain(), "effects": json.dumps(scene.listing()), "recipe": json.dumps(scene.recipe), "settings": json.dumps(scene.settings),
+            **_about(scene), "recipe": json.dumps(scene.recipe), "settings": json.dumps(scene.settings),
             "accuracy": json.dumps(scene.accuracy),
             "torchfilm": __version__, "torch": str(torch.__version__),
             "declared": json.dumps({f.name: [f.meaning, f.unit, f.scope, list(f.shape), f.at_division] for f in state.declared.values()}),
@@ -236,6 +238,11 @@ class Recorder:
             self._append(f"frames/{name}", np.asarray(row[name])[None], frame)
         file.flush()
         self.births, self.ends = [], []
+
+
+def _about(scene: Scene) -> dict[str, str]:
+    """What tells which scene a file is of."""
+    return {"scene": scene.explain(), "effects": json.dumps(scene.listing()), "code": json.dumps(scene.code())}
 
 
 def _may_go(path: Path) -> bool:

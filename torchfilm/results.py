@@ -155,6 +155,8 @@ class Results:
             dataset.id.refresh()
 
     def _index(self, frame: int) -> int:
+        if isinstance(frame, bool) or not isinstance(frame, (int, np.integer)):
+            raise checks.refuse("frame", frame, "a whole number")
         if not -len(self) <= frame < len(self):
             raise checks.refuse("frame", frame, f"from {-len(self)} to {len(self) - 1}: {self.path} has {len(self)} frames")
         return frame % len(self)
@@ -203,12 +205,23 @@ class Results:
             )
         if self.signal_names and template.layout is None:
             raise InputError(f"{self.path} was recorded with a Medium ({', '.join(self.signal_names)}), and this scene has none.")
+        if not changed:
+            self.check_alike(scene)
+
+    def check_alike(self, scene: Scene) -> None:
+        """Raise InputError unless this is the scene that was recorded, as far as its effects, their parameters and the code of their functions tell."""
         was, now = json.loads(self.file.attrs.get("effects", "null")), scene.listing()
-        if was is not None and was != now and not changed:
+        code, mine = json.loads(self.file.attrs.get("code", "null")), scene.code()
+        differs = ""
+        if was is not None and was != now:
             kinds = {"recorded with": [e for e in was if e not in now], "this scene has": [e for e in now if e not in was]}
+            differs = _told(kinds) or "the same effects in another order"
+        elif code is not None and code[:2] == mine[:2] and code != mine:
+            differs = "a function of its effects was edited since, or what such a function holds on to, or the values that colonies have each for itself"
+        if differs:
             raise InputError(
-                f"{self.path} is of another scene: {_told(kinds) or 'the same effects in another order'}. If the change is meant, say so: "
-                "resume --changed, in Python results.state(scene, changed=True)."
+                f"{self.path} is of another scene: {differs}. If the change is meant, say so: resume --changed, in Python results.state(scene, changed=True) "
+                "and Recorder(…, changed=True)."
             )
 
     def table(self, frame: int | None = None) -> dict[str, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -14,7 +15,8 @@ from torchfilm.effect import BUILT_IN, STAGES, Effect
 from torchfilm.state import CELL, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.timing import Timings
-from torchfilm.tools.told import lasting
+from torchfilm.tools.told import digest, lasting
+from torchfilm.version import __version__
 
 CPU = torch.device("cpu")
 
@@ -110,7 +112,8 @@ class Scene:
         for path, tensor in self._per_colony():
             if tensor.numel() != count:
                 raise checks.InputError(
-                    f"{path} has {tensor.numel()} values, but the batch has {count} colonies: give one number, or one for each of scene.seed(colonies=…)."
+                    f"{path} has {tensor.numel()} values, but the batch has {count} colonies: give one number, or one for each colony "
+                    "(scene.seed(colonies=…), run --colonies)."
                 )
         state = self.unchecked(colonies, seed=seed, streams=_streams(streams, count), cells=cells, device=_known_device(device), dtype=dtype)
         self.check(state)
@@ -156,15 +159,20 @@ class Scene:
                 if name not in state.fields and name not in BUILT_IN:
                     raise checks.InputError(f"{effect.title} needs the field {name!r}, which this state lacks. Make the state with this scene's seed().")
 
-    def check_moves(self, state: State) -> None:
-        """Raise InputError if an effect waits for a field that is 0 everywhere and that nothing sets: a run to a number of cells would never end."""
+    def check_moves(self, state: State, cells: int) -> None:
+        """Raise InputError if an effect waits for a field that is 0 everywhere in a colony that is to have more cells, and that nothing sets: a run to so many
+        cells would never end."""
         for effect in self.effects:
             for name in effect.waits_for():
-                set_by_another = any(e.writes_anything or name in e.writes() for e in self.effects if e is not effect)
-                if not set_by_another and not bool((state.fields[name] != 0).any()):
+                if any(e.writes_anything or name in e.writes() for e in self.effects if e is not effect):
+                    continue
+                still = (state.counts > 0) & (state.counts < cells) & ~state.groups.any(state.fields[name] != 0)
+                if bool(still.any()):
+                    ids = state.colony_id[still].tolist()
+                    where = "" if len(ids) == state.colonies else f" in {len(ids)} of {state.colonies} colonies, the first of them {ids[0]}"
                     raise checks.InputError(
-                        f"{effect.title} waits for {name!r}, which is 0 and which nothing in this scene sets. Give {type(effect).__name__} its own "
-                        "parameter (such as rate=1.0), or a rule that sets it; or end the run by until=…"
+                        f"{effect.title} waits for {name!r}, which is 0{where} and which nothing in this scene sets: no run would come to {cells} cells. Give "
+                        f"{type(effect).__name__} a parameter above 0 (such as rate=1.0), or a rule that sets it; or end the run by a time, until=…"
                     )
 
     def step(self, state: State, dt: float, timings: Timings | None = None) -> State:
@@ -194,6 +202,11 @@ class Scene:
     def listing(self) -> list[str]:
         """Each effect as it was listed, with the parameters that differ from their defaults; what a results file compares by."""
         return [lasting(summary(effect)) for effect in self.listed]
+
+    def code(self) -> list[str]:
+        """Version of Python, of torchfilm, and a digest of the listed effects, what their functions do included: alike where these scenes do the same. A rules
+        file goes by its path: it may change while a run is going."""
+        return [f"{sys.version_info[0]}.{sys.version_info[1]}", __version__, digest(self.listed)]
 
     @property
     def headline(self) -> str:

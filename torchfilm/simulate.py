@@ -41,7 +41,12 @@ def simulate(
     on_failure: "raise" a SimulationError that names the colonies that failed (a solve that did not converge, a cell too short to divide), or "drop"
     their cells, note it, and go on.
     """
+    _check_kinds("simulate", scene, state)
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
+    if record is not None and not isinstance(record, (str, Path, Recorder)):
+        raise checks.refuse("record", record, "the path of a new results file, or a Recorder")
+    if callable(observers) or not all(callable(o) for o in observers):
+        raise checks.refuse("observers", observers, "a list of functions that are called with a state")
     if until is None and cells is None:
         raise checks.InputError("simulate needs an end: give until=… (hours) or cells=… (per colony).")
     checks.choice("on_failure", on_failure, ("raise", "drop"))
@@ -50,7 +55,8 @@ def simulate(
     last = math.inf if until is None else _last_step(state, checks.number("until", until), dt)
     scene.check(state)
     if until is None:
-        scene.check_moves(state)
+        assert cells is not None
+        scene.check_moves(state, cells)
     recorder = Recorder(record, scene) if isinstance(record, (str, Path)) else record
     if recorder is not None:
         if recorder.scene is not scene:
@@ -63,6 +69,7 @@ def rollout(scene: Scene, state: State, *, until: float, dt: float | None = None
     """The state at `until` (h), for gradients through a long run: only every `segment`-th state is kept, and the steps between are taken again on the way
     back (torch.utils.checkpoint), so that memory grows with the number of segments and not of steps. Failures are raised as in `simulate`.
     """
+    _check_kinds("rollout", scene, state)
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
     if isinstance(segment, bool) or not isinstance(segment, int) or segment < 1:
         raise checks.refuse("segment", segment, "a whole number of steps from 1")
@@ -78,6 +85,12 @@ def rollout(scene: Scene, state: State, *, until: float, dt: float | None = None
         steps = min(segment, last - state.step)
         state = checkpoint(advance, state, steps, use_reentrant=False)
     return state
+
+
+def _check_kinds(name: str, scene: object, state: object) -> None:
+    if not isinstance(scene, Scene) or not isinstance(state, State):
+        given = f"{name}({type(scene).__name__}, {type(state).__name__}, …)"
+        raise checks.InputError(f"{given} is not allowed: first comes a Scene, then a State, such as tf.{name}(scene, scene.seed(colonies=8), …).")
 
 
 def _last_step(state: State, until: float, dt: float) -> int:

@@ -83,6 +83,16 @@ AT_SEED = {
 }  # fmt: skip
 
 
+def test_a_misspelt_option_is_not_taken_for_a_parameter(spelt=lambda u, s, p, cell: {"m": p.k + 0.0 * u.m}):
+    """One that the rates do read is a parameter, whatever it looks like."""
+    for name, option in (("rtoll", "rtol"), ("step", "steps"), ("daughter", "daughters")):
+        with pytest.raises(InputError, match=rf"Circuit\.{name} is taken for a parameter, but no rate reads it. Did you mean the option {option}\?"):
+            resting(tf.Circuit(spelt, species=("m",), k=1.0, **{name: 1.0}), 2).seed()
+    resting(tf.Circuit(lambda u, s, p, cell: {"m": p.rate}, species=("m",), rate=1.0), 2).seed()
+    resting(tf.Circuit(spelt, species=("m",), k=1.0, spare=1.0), 2).seed()
+    resting(tf.Circuit([tf.parts.constitutive("m", "rate")], species=("m",), rate=1.0), 2).seed()
+
+
 @pytest.mark.parametrize("case", AT_SEED)
 def test_a_rate_function_is_tried_before_anything_runs(case):
     rates, said = AT_SEED[case]

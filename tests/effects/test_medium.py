@@ -355,3 +355,12 @@ def test_a_value_per_colony_must_have_one_for_each(medium, path):
 def test_two_media_are_one_too_many():
     with pytest.raises(InputError, match="transport 2 times"):
         tf.Scene(tf.Medium(a=AHL, **GOOD), tf.Medium(b=AHL, **GOOD))
+
+
+def test_a_flat_box_in_space_is_refused_unless_it_is_meant():
+    growth, flat = tf.Growth(rate=1.0), ((-8.0, -8.0), (8.0, 8.0))
+    scene = lambda **given: tf.Scene(growth, tf.Mechanics(), tf.Medium(ahl=tf.Signal(diffusion=1.0), box=flat, spacing=4.0, **given))  # noqa: E731
+    with pytest.raises(tf.InputError, match=r"Medium\.box.*of three dimensions in a 3-D scene.*depth"):
+        scene().seed()
+    for given in ({"depth": 2.0}, {"beyond": "grow"}, {"beyond": "open"}):
+        scene(**given).seed()

@@ -207,7 +207,7 @@ class Circuit(Effect):
             for name in made.parameters:
                 if name not in self.parameters:
                     raise checks.InputError(unknown(f"a reaction needs the parameter {name!r}, which Circuit was not given", name, list(self.parameters)))
-        seen: dict[str, set[str]] = {"s": set(), "cell": set()}
+        seen: dict[str, set[str]] = {"s": set(), "cell": set(), "p": {n for made in self.noted.networks.values() for n in made.parameters}}
         given = {}
         contact = state.contact()
         outside = {} if contact is None else contact.found
@@ -217,6 +217,10 @@ class Circuit(Effect):
             rows = (rows if rows.numel() else torch.zeros(1, dtype=torch.int64, device=state.device)).repeat(2)[:64]
             tried = self._circuit(state, rows, kind, (), outside, seen=seen)
             given[kind] = run.trial(tried, self._concentrations(state, rows))
+        for name in self.parameters:
+            near = difflib.get_close_matches(name, [f.name for f in dataclasses.fields(self) if f.init], 1, 0.75)
+            if near and name not in seen["p"]:
+                raise checks.InputError(f"Circuit.{name} is taken for a parameter, but no rate reads it. Did you mean the option {near[0]}?")
         self.noted.given = given
         geometry = {g for n in seen["cell"] for g in GEOMETRY.get(n, (n,) if n in state.fields else ())}
         if seen["s"] or any(given.values()):

@@ -68,7 +68,7 @@ class Growth(Effect):
         return ("growth_rate", "length", "radius")
 
     def waits_for(self) -> tuple[str, ...]:
-        return ("growth_rate",) if self.rate is None else ()
+        return ("growth_rate",)
 
     def writes(self) -> tuple[str, ...]:
         return ("length", "elongation")

@@ -235,6 +235,9 @@ class Medium(Effect):
         return tuple(OUTSIDE + name for name in self.signals)
 
     def check(self, state: State) -> None:
+        if state.dim == 3 and len(self.box[0]) == 2 and self.depth is None and self.beyond == "error":
+            mend = "Give both corners a z; or a depth=…, if all cells stay in one layer; or let the box grow, beyond='grow'."
+            raise checks.refuse("Medium.box", self.box, "of three dimensions in a 3-D scene", mend)
         for name in self.signals:
             self._stepper(name, state, state.layout.grid.batches[0], 1.0)  # type: ignore[union-attr]
 

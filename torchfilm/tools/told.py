@@ -34,6 +34,8 @@ def _add(made: Any, thing: Any, within: set[int]) -> None:
     if isinstance(thing, torch.Tensor):
         thing = thing.detach().cpu().numpy()
     if isinstance(thing, np.ndarray):
+        if thing.dtype.kind == "f":
+            thing = thing.astype(np.float64)  # a number from a file is the number that was written, in whatever precision
         made.update(f"array {thing.dtype} {thing.shape} ".encode() + np.ascontiguousarray(thing).tobytes())
         return
     if isinstance(thing, (str, bytes, int, float, bool, complex, type(None))):
