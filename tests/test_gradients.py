@@ -432,3 +432,20 @@ def test_asking_for_gradients_does_not_change_the_run():
     assert torch.equal(states[0].uid, states[1].uid)
     # solved to 1e-10 of moves of 0.1 µm, ten times
     assert torch.allclose(states[0].position, states[1].position.detach(), rtol=0, atol=1e-9)
+
+
+def test_a_gradient_through_a_loose_solve_is_not_taken_in_silence():
+    """By default contacts are solved to 0.05. Without a gradient, or solved to 1e-6, there is nothing to say."""
+
+    def grown(rate, **given):
+        scene = tf.Scene(tf.Growth(rate=rate), tf.Division(length=2.5), tf.Mechanics(dim=2, **given), dt=0.05)
+        *_, end = tf.simulate(scene, scene.seed(), cells=4)
+        return end
+
+    rate = torch.tensor(1.0, requires_grad=True)
+    grown(1.0)
+    with torch.no_grad():
+        grown(rate)
+    assert grown(rate, tolerance=1e-6).position.requires_grad
+    with pytest.warns(RuntimeWarning, match=r"solved to 0\.05 only.*wrong sign.*tolerance of 1e-6"):
+        grown(rate)

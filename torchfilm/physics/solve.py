@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -49,6 +50,8 @@ LOOKS = 12
 LEAST_LEFT = 1e-3
 # Lengths stopped at their bounds must leave DOWNHILL of a step's slope, or the step is halved; it is made shorter so many times at most.
 DOWNHILL, SHORTER = 0.01, 30
+# A solve to no more than this is taken for exact by its adjoint without a word.
+LOOSE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,12 @@ def solve(problem: ContactProblem, start: Tensor | None, tolerance: float | Tens
     tracked = (problem.gap, problem.rows.row_first, problem.rows.row_wall, problem.alpha, problem.lower, problem.scale)
     y = end.y
     if torch.is_grad_enabled() and any(t.requires_grad for t in tracked):
+        loosest = float(tolerance.max())
+        if loosest > LOOSE:
+            warnings.warn(
+                f"a gradient is asked through contacts that are solved to {loosest:g} only, a matter of overlaps: it may even have the wrong sign. "
+                "Give Mechanics a tolerance of 1e-6 or less (1e-8 in float64), or run under torch.no_grad().", RuntimeWarning, stacklevel=2,
+            )  # fmt: skip
         y = _attach_gradient(problem, end, tolerance, max_iterations)
     return y * problem.scale, report
 
