@@ -184,6 +184,8 @@ def test_chance_is_told_by_how_colonies_differ():
     seen, _, _ = probe.observed(tf.Settings())
     assert all(e == Error(0.0, 0.0) for e in probe.errors(seen, seen, apart=True).values())
     assert math.isinf(probe.errors({}, seen)["m"].value)
+    alone = torch.tensor([[3.0, 9.0, 1.0], [0.0, 0.0, 0.0]], dtype=F64)
+    assert probe.errors({"m": [alone, alone]}, {"m": [alone, alone]})["m"] == Error(0.0, math.inf)
 
 
 def test_no_division_changes_the_volume_that_is_compared():

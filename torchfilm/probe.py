@@ -120,7 +120,8 @@ class Probe:
             each = self._error(name, _left_out(name, values), _left_out(name, rights), apart)
             error, without = float(each[0]), each[1:]
             noise = math.sqrt((len(without) - 1) * float(without.var(correction=0)))
-            out[name] = Error(math.inf, 0.0) if math.isnan(error) else Error(error, noise)
+            # of colonies of which all but one have lost their cells nothing can be told
+            out[name] = Error(math.inf, 0.0) if math.isnan(error) else Error(error, math.inf if math.isnan(noise) else noise)
         return out
 
     def _error(self, name: str, value: Tensor, right: Tensor, apart: bool) -> Tensor:
