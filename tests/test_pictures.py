@@ -9,9 +9,12 @@ import matplotlib.image
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 import torchfilm as tf
-from torchfilm.pictures import Frame, frame_of, outlines, sheet
+from torchfilm.pictures import Frame, frame_of, outlines, scale_bar, sheet
+from torchfilm.pictures.draw import WALL, add_walls, set_window
+from torchfilm.pictures.frames import Recorded
 
 
 def outline(axis, length=2.0, radius=0.5, position=(0.0, 0.0)) -> np.ndarray:
@@ -222,3 +225,45 @@ def test_a_place_that_is_not_there_is_told(recorded, tmp_path):
 def test_a_kind_of_picture_that_is_not_known_is_told(recorded, tmp_path):
     with pytest.raises((tf.InputError, ValueError), match="nonsense"):
         tf.show(recorded, out=tmp_path / "a.nonsense")
+
+
+def walls_drawn(tmp_path, walls, view: str, dim: int = 3, colonies: int = 1) -> list[list]:
+    """The walls in each colony's panel, drawn twice over as in a film, of a run that is read back from its file."""
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=dim, walls=walls), dt=0.05)
+    path = tmp_path / "run.h5"
+    for _ in tf.simulate(scene, scene.seed(colonies), until=0.05, record=path):
+        pass
+    with tf.Results(path) as results:
+        frame = Recorded(results, [-1])[0]
+        panels = []
+        for place in range(colonies):
+            ax = Figure().add_subplot()
+            set_window(ax, (-9.0, 9.0, -5.0, 5.0))
+            scale_bar(ax)
+            for _ in range(2):
+                add_walls(ax, frame.walls, int(frame.colony_id[place]), view)
+            assert ax.get_xlim() == (-9.0, 9.0) and ax.get_ylim() == (-5.0, 5.0)
+            panels.append([a for a in (*ax.lines, *ax.patches) if a.get_gid() == WALL])
+            assert len(ax.lines) + len(ax.patches) == len(panels[-1]) + 1, "the scale bar and nothing else"
+    return panels
+
+
+def test_walls_are_drawn_where_they_stand(tmp_path):
+    """A hard floor and a soft lid are lines from the side and nothing from above; a wall askew is a line nowhere but seen along it."""
+    floor, lid = tf.Plane(z=-0.5, facing="+z"), tf.Plane(z=2.0, facing="-z", stiffness=30.0)
+    askew = tf.Plane(point=(3.0, 0.0, 0.0), normal=(-0.6, 0.8, 0.0))
+    (above,) = walls_drawn(tmp_path, [floor, lid, askew], "xy")
+    assert len(above) == 1 and above[0].get_slope() is None and above[0].get_linestyle() == "-"
+    (x, y), (x2, y2) = above[0].get_xy1(), above[0].get_xy2()
+    assert (-0.6 * x + 0.8 * y, -0.6 * x2 + 0.8 * y2) == (pytest.approx(-1.8), pytest.approx(-1.8)) and (x, y) != (x2, y2)
+    (tmp_path / "run.h5").unlink()
+    (side,) = walls_drawn(tmp_path, [floor, lid, askew], "xz")
+    assert [(line.get_xy1()[1], line.get_xy2()[1], line.get_linestyle()) for line in side] == [(-0.5, -0.5, "-"), (2.0, 2.0, "--")]
+
+
+def test_each_colonys_own_walls_are_drawn(tmp_path):
+    walls = [tf.Channel(width=[4.0, 6.0], low_end=-8.0), tf.Sphere(center=(5.0, 0.0), radius=[1.0, 2.0], inside=False)]
+    first, second = walls_drawn(tmp_path, walls, "xy", dim=2, colonies=2)
+    for drawn, half, radius in ((first, 2.0, 1.0), (second, 3.0, 2.0)):
+        assert sorted(abs(a.get_xy1()[1]) for a in drawn[:-1]) == [0.0, half, half]
+        assert drawn[-1].get_radius() == radius and tuple(drawn[-1].get_center()) == (5.0, 0.0)

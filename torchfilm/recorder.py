@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.effects.mechanics import Mechanics
+from torchfilm.physics.walls import as_data
 from torchfilm.results import CHUNK_ROWS, CHUNK_VOXELS, FATES, FORMAT, FRAME_COLUMNS, LINEAGE, VERSION, Results, committed
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, COLONY, PER_CELL, State
@@ -242,7 +244,8 @@ class Recorder:
 
 def _about(scene: Scene) -> dict[str, str]:
     """What tells which scene a file is of."""
-    return {"scene": scene.explain(), "effects": json.dumps(scene.listing()), "code": json.dumps(scene.code())}
+    walls = [as_data(s) for effect in scene.effects if isinstance(effect, Mechanics) for s in effect.surfaces()]
+    return {"scene": scene.explain(), "effects": json.dumps(scene.listing()), "code": json.dumps(scene.code()), "walls": json.dumps(walls)}
 
 
 def _may_go(path: Path) -> bool:

@@ -147,6 +147,12 @@ class Results:
         """The knobs of accuracy that the scene was given beside its own (`torchfilm.Settings`)."""
         return json.loads(self.file.attrs.get("accuracy", "{}"))
 
+    @property
+    def walls(self) -> list[dict[str, Any]]:
+        """What cells could not pass, surface by surface: "normal" and "offset" (normal · x there, µm) of a flat one, "center" and "radius", µm, of a round one,
+        each entry one number or a list of one per colony; and whether it is "soft"."""
+        return json.loads(self.file.attrs.get("walls", "[]"))
+
     def refresh(self) -> None:
         """See what a run has written since."""
         self.file["frames/step"].id.refresh()  # first: what it counts has been written before it

@@ -220,6 +220,16 @@ class _Round:
 Surface = _Flat | _Round  # what a wall is made of
 
 
+def as_data(surface: Surface) -> dict[str, Any]:
+    """A surface in numbers, for a file: normal and offset (normal · x there, µm) of a flat one, center and radius, µm, of a round one, each entry one number or
+    a list of one per colony; and whether it is soft."""
+    number = lambda x: x.detach().cpu().tolist() if isinstance(x, Tensor) else float(x)  # noqa: E731
+    soft = surface.wall.stiffness is not None
+    if isinstance(surface, _Flat):
+        return {"normal": [number(n) for n in surface.normal], "offset": number(surface.offset), "soft": soft}
+    return {"center": [number(c) for c in surface.center], "radius": number(surface.radius), "soft": soft}
+
+
 def _vector(name: str, given: object) -> Vector:
     """A vector, or one per colony as an array (B, d), by its entries, which keep a tensor's gradient and follow it when it is changed in place.
 

@@ -16,6 +16,7 @@ from torchfilm.tools import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+WALL = "#7a7a7a"
 BEYOND = "#efe4d2"  # what is outside the box of a signal: no grey, so that it is not read as a concentration
 SMALL, TINY = 7.0, 6.0  # points
 ROUND = 0.1  # inches of a µm from which on an outline of few points has corners to be seen
@@ -124,6 +125,26 @@ def add_cells(ax: Axes, cells: Mapping[str, np.ndarray], scales: Sequence[Scale]
     made = PolyCollection(list(shapes), facecolors=paint_cells(cells, scales, look), edgecolors=edge, linewidths=width, zorder=1)
     ax.add_collection(made, autolim=False)
     return made
+
+
+def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: str) -> None:
+    """Draw what the cells of the colony with this id cannot pass, as `Results.walls` tells it, behind them: hard walls as lines, soft ones dashed. A flat wall
+    that is not seen edge-on is left out."""
+    from matplotlib.patches import Circle
+
+    for artist in [a for a in (*ax.lines, *ax.patches) if a.get_gid() == WALL]:
+        artist.remove()
+    own = lambda x: x[colony] if isinstance(x, list) else x  # noqa: E731
+    seen = VIEWS[view]
+    for wall in walls:
+        style: Any = {"color": WALL, "linewidth": 0.8, "linestyle": "--" if wall["soft"] else "-", "zorder": 0.5, "gid": WALL}
+        if "radius" in wall:
+            ax.add_patch(Circle(tuple(own(wall["center"][k]) for k in seen), own(wall["radius"]), fill=False, **style))
+            continue
+        u, v = (own(wall["normal"][k]) for k in seen)
+        if math.hypot(u, v) > 1.0 - 1e-6:
+            x, y = own(wall["offset"]) * u, own(wall["offset"]) * v
+            ax.axline((x, y), (x - v, y + u), **style)
 
 
 def scale_bar(ax: Axes) -> float:

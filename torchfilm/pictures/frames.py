@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ class Frame:
 
     cells: arrays by name as `Results.frame` gives them, the cells of one colony side by side. time: h. colony_id: (B,). units: by name, signals under
     "out.NAME". signals: by name, one array (nx, ny, nz) a colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm.
-    height: z of the plane of 2-D cells, µm, where it is known.
+    height: z of the plane of 2-D cells, µm, where it is known. walls: as `Results.walls` tells them.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -34,6 +35,7 @@ class Frame:
     shape: np.ndarray | None = None
     spacing: np.ndarray | None = None
     height: float | None = None
+    walls: Sequence[Mapping[str, Any]] = ()
 
     @property
     def dim(self) -> int:
@@ -89,11 +91,11 @@ class Recorded(Sequence[Frame]):
         results, place = self.results, self.places[k]
         cells, ids, time = results.frame(place), results.colony_id, float(results.times[place])
         if not results.signal_names:
-            return Frame(cells, time, ids, self.units)
+            return Frame(cells, time, ids, self.units, walls=results.walls)
         origin, shape, spacing = results.grid(place)
         signals = {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
         height = results.attributes.get("height")
-        return Frame(cells, time, ids, self.units, signals, origin, shape, spacing, None if height is None else float(height))
+        return Frame(cells, time, ids, self.units, signals, origin, shape, spacing, None if height is None else float(height), results.walls)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))

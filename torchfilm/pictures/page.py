@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchfilm.pictures.colours import CELLS, MEAN, Look, Scale, Seen, scale_of
-from torchfilm.pictures.draw import add_cells, add_signal, colour_bar, cut, scale_bar, set_window
+from torchfilm.pictures.draw import add_cells, add_signal, add_walls, colour_bar, cut, scale_bar, set_window
 from torchfilm.pictures.frames import Frame
 from torchfilm.pictures.shapes import Window, along, box, span, window
 from torchfilm.tools import checks
@@ -142,6 +142,7 @@ def fill(ax: Axes, frame: Frame, place: int, made: Survey, titles: Sequence[str]
         add_signal(ax, signal_seen(frame, place, made.look, cells), (low[0], high[0], low[1], high[1]), made.behind)
     elif made.look.channels is not None:
         ax.set_facecolor("black")
+    add_walls(ax, frame.walls, int(frame.colony_id[place]), made.look.view)
     add_cells(ax, cells, made.scales, made.look)
     inches = ax.get_position().width * ax.figure.get_figwidth() + 0.5 * GAP  # type: ignore[union-attr]
     ax.set_title(next((t for t in titles if LETTER * len(t) <= inches), ""), fontsize=7, pad=2.5)
