@@ -62,18 +62,18 @@ class Run:
     def of(scene: tf.Scene, cells: int, colonies: int, seed: int) -> Run:
         probe = begin(scene, cells, colonies, seed=seed)
         search = Search(probe, probe, 0.01)
-        return Run(probe, search, probe.observed(search.settings(FINEST, TIGHT_CONTACTS, search.tight))[0])
+        return Run(probe, search, probe.observed(search.settings(FINEST, TIGHT_CONTACTS, search.tight)).found)
 
     def worst(self, settings: tf.Settings, names: Sequence[str]) -> tuple[Error, str, float]:
         """The greatest error, of which observable, and the seconds that the window took."""
-        seen, seconds, _ = self.probe.observed(settings)
-        errors = self.probe.errors(seen, {n: self.reference[n] for n in names})
+        run = self.probe.observed(settings)
+        errors = self.probe.errors(run.found, {n: self.reference[n] for n in names})
         name = max(errors, key=lambda n: errors[n].value)
-        return errors[name], name, seconds
+        return errors[name], name, run.seconds
 
     def seconds(self, settings: tf.Settings) -> float:
         """The least of three."""
-        return min(self.probe.window(settings)[2] for _ in range(3))
+        return min(self.probe.observed(settings).seconds for _ in range(3))
 
 
 def sweep(run: Run) -> list[tf.Settings]:

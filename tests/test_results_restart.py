@@ -118,6 +118,33 @@ def test_a_function_that_was_edited_is_another_scene(tmp_path):
             results.frame("a")
 
 
+def test_a_rule_that_keeps_a_diary_is_not_taken_for_edited(tmp_path):
+    """What it holds on to grows as it runs; that of the file is from before."""
+    path, diary = tmp_path / "run.h5", []
+
+    def update(cells):
+        cells.growth_rate = 1.0
+        diary.append(len(cells.uid))
+
+    scene = tf.Scene(tf.Rules(update), tf.Growth(), tf.Division(length=3.0), dt=DT)
+    last = record(scene, scene.seed(2), path, until=2 * DT)[-1]
+    assert len(diary) > 1
+    record(scene, last, path, until=4 * DT, append=True)
+    with tf.Results(path) as results:
+        assert results.state(scene).step == 4
+
+
+def test_going_on_by_other_settings_is_told_in_the_file(tmp_path):
+    path, base = tmp_path / "run.h5", tf.scenes.microcolony()
+    last = record(base, base.seed(2), path, until=2 * base.dt)[-1]
+    finer = tf.Settings(tolerance=0.01).apply(base)
+    for _ in tf.simulate(finer, last, until=4 * base.dt, record=tf.Recorder(path, finer, append=True, changed=True)):
+        pass
+    with tf.Results(path) as results:
+        again = tf.Settings.named(results.accuracy, str(path)).apply(tf.scenes.build(*results.recipe))
+        assert results.state(again).step == 4
+
+
 def test_a_file_of_another_python_is_not_refused_for_its_code(tmp_path):
     """Versions of Python compile one function in two ways."""
     path = tmp_path / "run.h5"

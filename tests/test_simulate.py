@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -110,7 +111,7 @@ def test_an_end_in_the_past_is_refused():
         ({"until": 1.0, "dt": -0.1}, "dt"),
         ({"until": 1.0, "on_failure": "ignore"}, "on_failure"),
         ({"until": 1.0, "record": 3}, "record = 3"),
-        ({"until": 1.0, "observers": print}, "observers"),
+        ({"until": 1.0, "observers": [print, 3]}, "observers"),
     ],
 )
 def test_bad_options_are_refused_before_anything_runs(options, word):
@@ -135,6 +136,34 @@ def test_a_number_of_cells_that_no_growth_leads_to_is_refused():
     assert len(list(tf.simulate(scene, scene.seed(3), until=0.1))) == 4
     with pytest.raises(tf.InputError, match=r"growth_rate', which is 0 and which nothing"):
         tf.simulate(tf.Scene(tf.Growth(rate=0.0)), tf.Scene(tf.Growth(rate=0.0)).seed(2), cells=4)
+
+
+def test_cells_that_divide_or_lengthen_in_a_way_of_their_own_are_no_mistake():
+    flagged = tf.Scene(tf.Growth(rate=0.0), tf.Division())
+    state = flagged.seed(2).with_fields(divide_flag=torch.ones(2, dtype=torch.bool))
+    *_, end = tf.simulate(flagged, state, cells=2)
+    assert end.counts.tolist() == [2, 2]
+
+    @dataclass(frozen=True)
+    class Stretch(tf.Effect):
+        stage, title = 35, "stretch"
+
+        def writes(self):
+            return ("length",)
+
+        def step(self, state, dt):
+            return state.replace(length=state.length * 1.1)
+
+    scene = tf.Scene(tf.Growth(rate=0.0), Stretch(), tf.Division(length=3.0))
+    *_, end = tf.simulate(scene, scene.seed(1), cells=4)
+    assert end.cells >= 4
+
+
+def test_observers_may_come_one_by_one():
+    scene, seen = alone(), []
+    for _ in tf.simulate(scene, scene.seed(), until=0.1, observers=(o for o in [lambda s: seen.append(s.step)])):
+        pass
+    assert len(seen) > 1
 
 
 def test_a_state_of_another_scene_is_refused_before_anything_runs():

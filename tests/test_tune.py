@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -129,8 +130,8 @@ def test_settings_with_which_a_colony_fails_are_not_chosen():
     tuned = tf.tune(scene, 0.05, cells=2, colonies=2, of=["volume"])
     assert tuned.settings.dt < 0.02
     probe = begin(scene, 2, 2, ["volume"])
-    far, _, _ = probe.observed(tf.Settings(dt=0.02))
-    assert math.isinf(probe.errors(far, probe.observed(tf.Settings())[0])["volume"].value)
+    far = probe.observed(tf.Settings(dt=0.02)).found
+    assert math.isinf(probe.errors(far, probe.observed(tf.Settings()).found)["volume"].value)
 
 
 def test_settings_are_not_chosen_by_what_is_left_when_the_volume_cannot_be_told():
@@ -181,7 +182,7 @@ def test_chance_is_told_by_how_colonies_differ():
     residual = more - ratio * counts  # of the linearised ratio
     assert told.value == pytest.approx(ratio)
     assert told.noise == pytest.approx(float((6 / 5 * (residual**2).sum()).sqrt() / counts.sum()), rel=0.1)
-    seen, _, _ = probe.observed(tf.Settings())
+    seen = probe.observed(tf.Settings()).found
     assert all(e == Error(0.0, 0.0) for e in probe.errors(seen, seen, apart=True).values())
     assert math.isinf(probe.errors({}, seen)["m"].value)
     alone = torch.tensor([[3.0, 9.0, 1.0], [0.0, 0.0, 0.0]], dtype=F64)
@@ -196,3 +197,45 @@ def test_no_division_changes_the_volume_that_is_compared():
     assert divided.cells == 6
     assert float(observables(divided)["volume"]) == pytest.approx(float(observables(state)["volume"]), rel=1e-12)
     assert float(divided.volume.sum()) < float(state.volume.sum()) - 0.5
+
+
+@pytest.mark.parametrize("colonies, times", [(2, 6.314), (5, 2.132), (24, 1.714)])
+def test_the_band_of_few_colonies_is_wide(colonies, times):
+    """Student's t, 95 % on one side, from a printed table."""
+    assert Error(0.5, 0.1, colonies).most == pytest.approx(0.5 + times * 0.1, abs=1e-4)
+
+
+def test_what_larger_colonies_never_hold_is_said_after_a_while(monkeypatch):
+    monkeypatch.setitem(Search._confirmed.__globals__, "MOST_REFUTED", 3)
+
+    class Strict(Probe):
+        def errors(self, found, against, apart=False):
+            return {n: e if apart else Error(0.7, 0.01) for n, e in super().errors(found, against, apart).items()}
+
+    probe, other = begin(dividing(), 8, 4, ["m"]), begin(dividing(), 12, 4, ["m"], seed=1)
+    search = Search(probe, Strict(**vars(other)), 0.05)
+    with pytest.raises(InputError, match=r"in both probes: the closest came to .*, in 'm', with dt"):
+        search.run()
+    assert len(search.refuted) == 3
+
+
+def test_a_reference_that_fails_in_the_larger_colonies_confirms_nothing():
+    class Broken(Probe):
+        def observed(self, settings):
+            run = super().observed(settings)
+            return dataclasses.replace(run, found={n: [v * math.nan for v in parts] for n, parts in run.found.items()})
+
+    probe, other = begin(dividing(), 8, 4, ["m"]), begin(dividing(), 12, 4, ["m"], seed=1)
+    with pytest.raises(InputError, match=r"m: a reference failed in the other, larger colonies"):
+        Search(probe, Broken(**vars(other)), 0.05).run()
+
+
+def test_steps_taken_in_several_do_not_tell_what_a_step_costs():
+    """Of a step that is taken in six a finer one takes a sixth, and is looked at all the same."""
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2), dt=0.12)
+    probe = begin(scene, 20, 2)
+    search = Search(probe, probe, 0.3)
+    coarse, fine = (search._run(search.settings(n, *loose)) for n, loose in ((8, ((0.1, 0, 0.2), 0.1)), (96, ((0.1, 0, 0.2), 0.1))))
+    assert coarse.several and not fine.several
+    own = fine.seconds / 96
+    assert search._least() == pytest.approx(own) and search._least() < coarse.seconds / 8

@@ -20,9 +20,10 @@ import math
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
+from scipy.special import stdtrit
 from torch import Tensor
 
 from torchfilm import measure
@@ -41,7 +42,7 @@ WINDOW = 24
 # A scene that never has as many cells as asked for is taken as it is after this many steps.
 MOST_STEPS = 2000
 SIGNAL = "signal "
-SURE = 1.645  # standard errors: of 20 errors 19 are less than so many above what was measured
+SURE = 0.95  # of 20 errors 19 are at most what is told
 
 Seen = dict[str, list[Tensor]]
 """By observable, what it is made of in the middle and at the end, summed over each colony: (B, m) float64; NaN if a colony failed."""
@@ -49,18 +50,30 @@ Seen = dict[str, list[Tensor]]
 
 @dataclass(frozen=True)
 class Error:
-    """A relative error, and how much of it may be chance: its standard error among colonies (jackknife: Efron and Stein 1981)."""
+    """A relative error, and how much of it may be chance: its standard error among `colonies` (jackknife: Efron and Stein 1981)."""
 
     value: float
     noise: float
+    colonies: int = field(default=2, compare=False)
 
     @property
     def most(self) -> float:
-        """What it is at most, to 95 %."""
-        return self.value + SURE * self.noise
+        """What it is at most, to 95 % (Student's t)."""
+        return self.value + (float(stdtrit(self.colonies - 1, SURE)) * self.noise if self.noise else 0.0)
 
     def __str__(self) -> str:
         return "failed" if math.isinf(self.value) else f"{100 * self.value:.2g} ± {100 * self.noise:.1g} %"
+
+
+@dataclass(frozen=True)
+class Window:
+    """What was found in a window's middle and at its end, the seconds it took, in all (on the CPU of the thread that ran it) and by effect, and whether a
+    step was taken in `several`."""
+
+    found: Seen
+    seconds: float
+    spent: dict[str, float]
+    several: bool
 
 
 @dataclass(frozen=True)
@@ -77,29 +90,26 @@ class Probe:
         """Into how many steps the window is divided."""
         return round(WINDOW * self.dt / (settings.dt or self.dt))
 
-    def window(self, settings: Settings) -> tuple[list[State], bool, float, dict[str, float]]:
-        """The states in the middle and at the end of the window, whether a colony failed, the seconds it took, and those of each effect."""
+    def observed(self, settings: Settings) -> Window:
+        """What is read off the window by these settings."""
         made, steps = settings.apply(self.scene), self.steps(settings)
-        dt, state, seen, timings, broken = self.dt * WINDOW / steps, self.start, [], Timings(), False
+        dt, state, seen, timings, broken, several = self.dt * WINDOW / steps, self.start, [], Timings(), False, False
         # what other work on the machine takes does not count, where the work is this thread's own
         clock = time.thread_time if state.device.type == "cpu" else time.perf_counter
         begun = clock()
         for k in range(steps):
             state = made.step(state, dt, timings)
             broken = broken or any(bool((r.status != 0).any()) for r in state.reports.values())
+            several = several or any(bool((r.substeps > 1).any()) for r in state.reports.values() if hasattr(r, "substeps"))
             if 2 * (k + 1) % steps == 0:
                 seen.append(state)
-        return seen, broken, clock() - begun, timings.seconds
-
-    def observed(self, settings: Settings) -> tuple[Seen, float, dict[str, float]]:
-        """What is read off in the middle and at the end, the seconds it took, and those of each effect."""
-        states, broken, seconds, spent = self.window(settings)
+        seconds = clock() - begun
         found: Seen = {}
-        for state in states:
+        for state in seen:
             for name, value in (sums(state) | {"cells": self._due(state)}).items():
                 if self.of is None or name in self.of:
                     found.setdefault(name, []).append(value * math.nan if broken else value)
-        return found, seconds, spent
+        return Window(found, seconds, timings.seconds, several)
 
     def _due(self, state: State) -> Tensor:
         """The number of cells after the divisions with which the next step would begin, (B, 1): until then it is late, by a step that is known."""
@@ -122,7 +132,7 @@ class Probe:
             error, without = float(each[0]), each[1:]
             noise = math.sqrt((len(without) - 1) * float(without.var(correction=0)))
             # of colonies of which all but one have lost their cells nothing can be told
-            out[name] = Error(math.inf, 0.0) if math.isnan(error) else Error(error, math.inf if math.isnan(noise) else noise)
+            out[name] = Error(math.inf, 0.0) if math.isnan(error) else Error(error, math.inf if math.isnan(noise) else noise, len(without))
         return out
 
     def _error(self, name: str, value: Tensor, right: Tensor, apart: bool) -> Tensor:

@@ -110,7 +110,7 @@ class Recorder:
                 self.file.close()
                 self.file = None
                 raise checks.refuse("state", f"at step {state.step}", f"the last frame of {self.path}, at step {last}", "Start from its last frame.")
-            for name, value in _about(self.scene).items():  # of one that was changed on purpose
+            for name, value in {**_about(self.scene), "dt": self.dt}.items():  # of one that was changed on purpose
                 self.file.attrs[name] = value
             self.file.swmr_mode = True
             self.written, self.first_step = last, int(self.file["frames/step"][0])
@@ -129,8 +129,7 @@ class Recorder:
         attributes = {
             "format": FORMAT, "version": VERSION, "seed": state.seed, "dim": state.dim, "dtype": str(state.dtype)[6:],
             "device": str(state.device), "dt": self.dt, "every": self.every,
-            **_about(scene), "recipe": json.dumps(scene.recipe), "settings": json.dumps(scene.settings),
-            "accuracy": json.dumps(scene.accuracy),
+            **_about(scene),
             "torchfilm": __version__, "torch": str(torch.__version__),
             "declared": json.dumps({f.name: [f.meaning, f.unit, f.scope, list(f.shape), f.at_division] for f in state.declared.values()}),
         }  # fmt: skip
@@ -243,9 +242,12 @@ class Recorder:
 
 
 def _about(scene: Scene) -> dict[str, str]:
-    """What tells which scene a file is of."""
+    """What tells which scene a file is of, and from which it is built again."""
     walls = [as_data(s) for effect in scene.effects if isinstance(effect, Mechanics) for s in effect.surfaces()]
-    return {"scene": scene.explain(), "effects": json.dumps(scene.listing()), "code": json.dumps(scene.code()), "walls": json.dumps(walls)}
+    return {
+        "scene": scene.explain(), "effects": json.dumps(scene.listing()), "code": json.dumps(scene.code), "walls": json.dumps(walls),
+        "recipe": json.dumps(scene.recipe), "settings": json.dumps(scene.settings), "accuracy": json.dumps(scene.accuracy),
+    }  # fmt: skip
 
 
 def _may_go(path: Path) -> bool:

@@ -15,6 +15,7 @@ frames since. Files are data only; nothing in them is executed.
 from __future__ import annotations
 
 import json
+import operator
 from pathlib import Path
 from typing import Any
 
@@ -161,8 +162,10 @@ class Results:
             dataset.id.refresh()
 
     def _index(self, frame: int) -> int:
-        if isinstance(frame, bool) or not isinstance(frame, (int, np.integer)):
-            raise checks.refuse("frame", frame, "a whole number")
+        try:
+            frame = operator.index(frame)
+        except TypeError as error:
+            raise checks.refuse("frame", frame, "a whole number") from error
         if not -len(self) <= frame < len(self):
             raise checks.refuse("frame", frame, f"from {-len(self)} to {len(self) - 1}: {self.path} has {len(self)} frames")
         return frame % len(self)
@@ -217,7 +220,7 @@ class Results:
     def check_alike(self, scene: Scene) -> None:
         """Raise InputError unless this is the scene that was recorded, as far as its effects, their parameters and the code of their functions tell."""
         was, now = json.loads(self.file.attrs.get("effects", "null")), scene.listing()
-        code, mine = json.loads(self.file.attrs.get("code", "null")), scene.code()
+        code, mine = json.loads(self.file.attrs.get("code", "null")), scene.code
         differs = ""
         if was is not None and was != now:
             kinds = {"recorded with": [e for e in was if e not in now], "this scene has": [e for e in now if e not in was]}

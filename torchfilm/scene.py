@@ -27,6 +27,9 @@ class Scene:
 
     name: for results. dt: step that fits the scene, h. founders: cells that a colony starts from; by default one cell, 2 µm long.
     recipe: (name, parameters) of a ready-made scene, from which `resume` builds it again.
+
+    `code`: version of Python, of torchfilm, and a digest of the listed effects, what their functions do included, alike where scenes do the same. A rules
+    file goes by its path: it may change while a run is going.
     """
 
     def __init__(
@@ -59,6 +62,8 @@ class Scene:
         if self.founders.dim != self.dim:
             raise checks.refuse("Scene.founders", f"{self.founders.dim}-D cells", f"{self.dim}-D, as the mechanics are")
         self._check_fields()
+        # now, before any run: what a rule holds on to may change as it runs
+        self.code = [f"{sys.version_info[0]}.{sys.version_info[1]}", __version__, digest(self.listed)]
 
     def retuned(self, effects: Sequence[Effect], dt: float, accuracy: dict[str, float]) -> Scene:
         """The same scene with its effects, in the order in which they are listed, and its step simulated by other knobs (`torchfilm.accuracy`)."""
@@ -164,9 +169,14 @@ class Scene:
         cells would never end."""
         for effect in self.effects:
             for name in effect.waits_for():
-                if any(e.writes_anything or name in e.writes() for e in self.effects if e is not effect):
+                # an effect of the user's own may lengthen cells, or add some, in its own way
+                others = [e for e in self.effects if e is not effect]
+                if any(e.writes_anything or name in e.writes() or not type(e).__module__.startswith("torchfilm.") for e in others):
                     continue
-                still = (state.counts > 0) & (state.counts < cells) & ~state.groups.any(state.fields[name] != 0)
+                moves = state.fields[name] != 0
+                if "divide_flag" in state.fields:
+                    moves = moves | (state.fields["divide_flag"] != 0)
+                still = (state.counts > 0) & (state.counts < cells) & ~state.groups.any(moves)
                 if bool(still.any()):
                     ids = state.colony_id[still].tolist()
                     where = "" if len(ids) == state.colonies else f" in {len(ids)} of {state.colonies} colonies, the first of them {ids[0]}"
@@ -202,11 +212,6 @@ class Scene:
     def listing(self) -> list[str]:
         """Each effect as it was listed, with the parameters that differ from their defaults; what a results file compares by."""
         return [lasting(summary(effect)) for effect in self.listed]
-
-    def code(self) -> list[str]:
-        """Version of Python, of torchfilm, and a digest of the listed effects, what their functions do included: alike where these scenes do the same. A rules
-        file goes by its path: it may change while a run is going."""
-        return [f"{sys.version_info[0]}.{sys.version_info[1]}", __version__, digest(self.listed)]
 
     @property
     def headline(self) -> str:

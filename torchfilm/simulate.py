@@ -45,7 +45,8 @@ def simulate(
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
     if record is not None and not isinstance(record, (str, Path, Recorder)):
         raise checks.refuse("record", record, "the path of a new results file, or a Recorder")
-    if callable(observers) or not all(callable(o) for o in observers):
+    observers = (observers,) if callable(observers) else tuple(observers)
+    if not all(callable(o) for o in observers):
         raise checks.refuse("observers", observers, "a list of functions that are called with a state")
     if until is None and cells is None:
         raise checks.InputError("simulate needs an end: give until=… (hours) or cells=… (per colony).")

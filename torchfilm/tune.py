@@ -19,7 +19,7 @@ import torch
 from torchfilm.accuracy import Settings
 from torchfilm.effects.circuit import STIFF, Circuit
 from torchfilm.effects.mechanics import Mechanics
-from torchfilm.probe import SIGNAL, WINDOW, Error, Probe, Seen, begin, observables, species
+from torchfilm.probe import SIGNAL, WINDOW, Error, Probe, Seen, Window, begin, observables, species
 from torchfilm.scene import Scene
 from torchfilm.tools import checks
 
@@ -37,6 +37,8 @@ TIGHT_CONTACTS = (0.03, 3, 1e-3)
 TIGHT = 1e-3  # circuits, of the error asked for: a ten-thousandth of what they may take of it would not be seen
 # Colonies somewhat larger have somewhat other errors. So what is chosen must hold the error in a second probe of other colonies, LARGER times as large.
 LARGER = 1.5
+# Where so many that hold it in the first do not in the second, it is the larger colonies that cannot.
+MOST_REFUTED = 20
 # A long step lets a colony grow too much and a loose solve too little. So a step is not given up where it alone is over what was asked, but where it is OFF
 # times over. Circuits may take a SMALL part of it.
 OFF, SMALL = 2.0, 0.3
@@ -63,8 +65,9 @@ class Tuned:
 
     scene: with the settings. error: what was asked. chosen: the try that was taken; own: the scene's own settings, for comparison. parts: by knob, how much of
     each observable's error comes from it. confirmed: errors in the other colonies. unsure: by observable, how far two references differ; left_out: observables
-    that cannot be told so finely, with why. tries: all that might have been chosen, in order; runs: how many windows were run. window: hours, cells: at its
-    start. Errors are relative, each with its standard error (`Error.value`, `.noise`).
+    that cannot be told so finely, with why. tries: the scene's own and all that might have been chosen, in order;
+    runs: how many settings the first probe was run by. window: hours, cells: at its start.
+    Errors are relative, each with its standard error (`Error.value`, `.noise`).
     """
 
     scene: Scene
@@ -119,7 +122,7 @@ class Search:
         self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
         self.tight = TIGHT * error
         self.rtols = tuple(r for r in CIRCUITS if r > self.tight) if self.circuit is not None else (self.tight,)
-        self.runs: dict[Settings, tuple[Seen, float, dict[str, float]]] = {}
+        self.runs: dict[Settings, Window] = {}
         self.tries: dict[Settings, Try] = {}
         self.refuted: dict[Settings, dict[str, Error]] = {}  # what came of them in the other colonies
 
@@ -145,8 +148,7 @@ class Search:
         # what every knob tells in must be seen, and what was named
         missing = [n for n in left_out if n in (probe.of or ("volume",))]
         if missing or not self.reference:
-            worst = ", ".join(f"{n}: {left_out[n]}" for n in missing or left_out)
-            raise checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}. Ask for more, or probe more colonies or cells.")
+            raise self._untold({n: left_out[n] for n in missing or left_out})
         own = self._try(Settings())  # first, since a coarse step that takes sub-steps does not tell what a step costs
         best, confirmed = self._confirmed()
         return Tuned(
@@ -155,28 +157,48 @@ class Search:
         )  # fmt: skip
 
     def _seen_finely(self, probe: Probe, steps: int) -> Seen:
-        return probe.observed(self.settings(steps, TIGHT_CONTACTS, self.tight))[0]
+        return probe.observed(self.settings(steps, TIGHT_CONTACTS, self.tight)).found
 
     def _confirmed(self) -> tuple[Try, dict[str, Error]]:
         """The cheapest that holds the error in the other colonies too, and its errors there, in what can be seen there."""
         seen = self._seen_finely(self.other, FINEST)
         right = {n: seen[n] for n in self.reference if n in seen and not any(bool(v.isnan().any()) for v in seen[n])}
+        missing = {n: "a reference failed in the other, larger colonies" for n in self.probe.of or ("volume",) if n in self.reference and n not in right}
+        if missing:
+            raise self._untold(missing)
         while True:
             best = self._cheapest()
-            errors = self.other.errors(self.other.observed(best.settings)[0], right)
+            errors = self.other.errors(self.other.observed(best.settings).found, right)
             if max((e.most for e in errors.values()), default=0.0) <= self.error:
                 return best, errors
             self.refuted[best.settings] = errors
+            if len(self.refuted) == MOST_REFUTED:
+                raise self._out_of_reach()
 
-    def _run(self, settings: Settings) -> tuple[Seen, float, dict[str, float]]:
+    def _untold(self, why: dict[str, str]) -> checks.InputError:
+        worst = ", ".join(f"{name}: {words}" for name, words in why.items())
+        return checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}. Ask for more, or probe more colonies or cells.")
+
+    def _out_of_reach(self) -> checks.InputError:
+        found = {t.settings: t.errors for t in self.tries.values() if t.settings != Settings()} | self.refuted
+        closest = min(found, key=lambda s: max(e.most for e in found[s].values()))
+        name = max(found[closest], key=lambda n: found[closest][n].most)
+        error = found[closest][name]
+        return checks.refuse(
+            "error", self.error,
+            f"reached by some settings, in both probes: the closest came to {error}, at most {_percent(error.most)}, in {name!r}, with {_words(closest)}",
+            "Ask for more, probe more colonies (the scene's own number, where its parameters have one value a colony), or name what matters (of=…).",
+        )  # fmt: skip
+
+    def _run(self, settings: Settings) -> Window:
         if settings not in self.runs:
             self.runs[settings] = self.probe.observed(settings)
         return self.runs[settings]
 
     def _try(self, settings: Settings) -> Try:
         if settings not in self.tries:
-            found, seconds, spent = self._run(settings)
-            self.tries[settings] = Try(settings, self.probe.errors(found, self.reference), seconds, spent)
+            run = self._run(settings)
+            self.tries[settings] = Try(settings, self.probe.errors(run.found, self.reference), run.seconds, run.spent)
         return self.tries[settings]
 
     def _cheapest(self) -> Try:
@@ -188,37 +210,31 @@ class Search:
                 self._look_at(steps, math.inf if best is None else best.seconds)
                 best = min((t for t in self.tries.values() if self._holds(t)), key=lambda t: t.seconds, default=None)
         if best is None:
-            found = {t.settings: t.errors for t in self.tries.values()} | self.refuted
-            worst = lambda s: max(e.most for e in found[s].values())  # noqa: E731
-            closest = min(found, key=worst)
-            name = max(found[closest], key=lambda n: found[closest][n].most)
-            raise checks.refuse(
-                "error", self.error, f"reached by some settings: the closest came to {found[closest][name]}, in {name!r}, with {_words(closest)}",
-                "Ask for more, probe more colonies, or name what matters (of=…).",
-            )  # fmt: skip
+            raise self._out_of_reach()
         return best
 
     def _holds(self, tried: Try) -> bool:
         return tried.worst <= self.error and tried.settings != Settings() and tried.settings not in self.refuted
 
     def _least(self) -> float:
-        """What a step would take, s, if every effect took as little as it ever did."""
+        """What a step would take, s, if every effect took as little as it ever did; 0 as long as nothing tells, since all steps were taken in several."""
         each: dict[str, float] = {}
-        for settings, (_, seconds, by_effect) in self.runs.items():
-            share = seconds / max(1e-9, sum(by_effect.values())) / self.probe.steps(settings)
-            for name, spent in by_effect.items():
+        for settings, run in self.runs.items():
+            share = run.seconds / max(1e-9, sum(run.spent.values())) / self.probe.steps(settings)
+            for name, spent in run.spent.items() if not run.several else ():
                 each[name] = min(each.get(name, math.inf), share * spent)
         return sum(each.values())
 
     def _look_at(self, steps: int, limit: float) -> None:
         """Try a window of so many steps with tighter and tighter knobs until the error is held, or more than `limit` seconds are taken; with the tightest only,
         where that is far off."""
-        if self._run(self.settings(steps, self.contacts[0], self.rtols[0]))[1] > limit:
+        if self._run(self.settings(steps, self.contacts[0], self.rtols[0])).seconds > limit:
             return
-        tightest = self._run(self.settings(steps, TIGHT_CONTACTS, self.tight))[0]
+        tightest = self._run(self.settings(steps, TIGHT_CONTACTS, self.tight)).found
         if max(e.value for e in self.probe.errors(tightest, self.reference).values()) > OFF * self.error:
             return
-        rtol = next(r for r in (*self.rtols, self.tight) if self._circuits_add(steps, r) <= SMALL * self.error)
+        # (where the usual contacts fail, nothing tells what circuits add)
+        rtol = next((r for r in self.rtols if self._circuits_add(steps, r) <= SMALL * self.error), self.tight)
         for contacts, r in (*((c, rtol) for c in self.contacts), (TIGHT_CONTACTS, rtol), (TIGHT_CONTACTS, self.tight)):
             tried = self._try(self.settings(steps, contacts, r))
             if self._holds(tried) or tried.seconds > limit:
@@ -227,14 +243,14 @@ class Search:
     def _circuits_add(self, steps: int, rtol: float) -> float:
         """What circuits at `rtol` change in the worst observable, contacts as they usually are."""
         usual = CONTACTS[3] if self.mechanics is not None else TIGHT_CONTACTS
-        loose, tight = (self._run(self.settings(steps, usual, r))[0] for r in (rtol, self.tight))
+        loose, tight = (self._run(self.settings(steps, usual, r)).found for r in (rtol, self.tight))
         return max(e.value for e in self.probe.errors(loose, {n: v for n, v in tight.items() if n in self.reference}, apart=True).values())
 
     def _parts(self, best: Try) -> dict[str, dict[str, Error]]:
         """By knob, what of each observable's error is gone when it alone is tight; for the step, what is left when all others are."""
         s = best.settings
         tight = self.settings(self.probe.steps(s), TIGHT_CONTACTS, self.tight)
-        parts = {"step": self.probe.errors(self._run(tight)[0], self.reference)}
+        parts = {"step": self.probe.errors(self._run(tight).found, self.reference)}
         if self.mechanics is not None:
             parts["contacts"] = self._difference(s, dataclasses.replace(tight, rtol=s.rtol))
         if self.circuit is not None:
@@ -242,7 +258,7 @@ class Search:
         return parts
 
     def _difference(self, one: Settings, other: Settings) -> dict[str, Error]:
-        found, against = self._run(one)[0], self._run(other)[0]
+        found, against = self._run(one).found, self._run(other).found
         return self.probe.errors(found, {n: v for n, v in against.items() if n in self.reference}, apart=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,6 +28,14 @@ class Thing:
     worked_out: object = field(default=None, repr=False)
 
 
+class Adding:
+    def __init__(self, size):
+        self.size = size
+
+    def to(self, x):
+        return x + self.size
+
+
 @pytest.mark.parametrize(
     "one, other",
     [
@@ -45,6 +54,9 @@ class Thing:
         (made("import math\ndef f(x): return math.sin(x)"), made("import math\ndef f(x): return math.cos(x)")),
         (holding(1), holding(2)),
         (Thing(1.0), Thing(2.0)),
+        (Adding(1.0).to, Adding(2.0).to),
+        (partial(made("def f(x, k): return x + k"), k=1), partial(made("def f(x, k): return x - k"), k=1)),
+        (partial(holding, 1), partial(holding, 2)),
     ],
 )
 def test_what_differs_is_told_apart(one, other):
@@ -59,6 +71,11 @@ def test_what_differs_is_told_apart(one, other):
         (Thing(1.0, worked_out=object()), Thing(1.0)),
         (torch.tensor([1.0, 2.0]), np.array([1.0, 2.0], np.float32)),
         ([object()], [object()]),
+        ((2.0, (1, "a")), [2.0, [1, "a"]]),
+        (made('def f(x):\n  "Adds one."\n  return x + 1'), made('def f(x):\n  "Adds 1 to x."\n  return x + 1')),
+        (made("size = 3\ndef f(x): return x.size"), made("size = 4\ndef f(x): return x.size")),
+        (Adding(1.0).to, Adding(1.0).to),
+        (partial(holding, 1), partial(holding, 1)),
     ],
 )
 def test_what_acts_alike_is_alike(one, other):

@@ -32,6 +32,7 @@ STIFF, LEAP, DIRECT = "rosenbrock", "tau_leap", "direct"
 EXPLICIT = ("euler", *integrators.METHODS)
 METHODS = (STIFF, *EXPLICIT, LEAP, DIRECT)
 GEOMETRY = {"volume": ("length", "radius"), "area": ("length", "radius"), "x": ("position",), "y": ("position",), "z": ("position",)}
+OPTIONS = ("initial", "daughters", "method", "steps", "rtol", "atol", "copies")
 EVERY = "every cell"  # where a circuit runs that is not given by type
 
 
@@ -218,7 +219,7 @@ class Circuit(Effect):
             tried = self._circuit(state, rows, kind, (), outside, seen=seen)
             given[kind] = run.trial(tried, self._concentrations(state, rows))
         for name in self.parameters:
-            near = difflib.get_close_matches(name, [f.name for f in dataclasses.fields(self) if f.init], 1, 0.75)
+            near = difflib.get_close_matches(name, OPTIONS, 1, 0.75)
             if near and name not in seen["p"]:
                 raise checks.InputError(f"Circuit.{name} is taken for a parameter, but no rate reads it. Did you mean the option {near[0]}?")
         self.noted.given = given

@@ -173,7 +173,8 @@ class Mechanics(Effect):
             k = int(torch.nonzero(tight)[0])
             raise checks.InputError(
                 f"{type(surface.wall).__name__}: {float(room[k]):.3g} µm between hard walls are too narrow for cell {int(state.uid[k])} of colony "
-                f"{int(state.own_colony_id[k])}, {2 * float(state.radius[k]):.3g} µm wide. Move the walls apart, or make them soft (stiffness=…)."
+                f"{int(state.own_colony_id[k])}, {2 * float(state.radius[k]):.3g} µm wide. Move the walls apart, or let them yield "
+                "(stiffness=…, or a weight below 1)."
             )
 
     def step(self, state: State, dt: float) -> State:

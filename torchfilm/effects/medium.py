@@ -77,8 +77,9 @@ class MediumReport:
 class Medium(Effect):
     """Signals about the cells, on one grid per colony: `Medium(ahl=Signal(diffusion=10.0), box=((-64, -64), (64, 64)), spacing=4.0)`.
 
-    box: lower and upper corner, µm, in 2 or 3 dimensions; a flat box is one layer `depth` µm thick (by default as thick as a voxel is wide). Cells of
-    a 2-D scene may lie in a box with three: in the plane z = `height`. spacing: of voxels, µm, one number or one an axis.
+    box: lower and upper corner, µm, in 2 or 3 dimensions; a flat box is one layer `depth` µm thick (by default as thick as a voxel is wide; in a 3-D scene
+    that no cell may leave, beyond="error", the depth is to be given). Cells of a 2-D scene may lie in a box with three: in the plane z = `height`.
+    spacing: of voxels, µm, one number or one an axis.
     faces: of the box; without, nothing passes them, or where the medium flows, what it carries. flow: velocity of the medium, µm/h: two or three
     numbers (or one per colony each), or a function from places (M, 3) µm to velocities (M, 3). obstacles: a function from places (M, 3) to
     (M,) bool, true where there is none of the medium.

@@ -41,6 +41,11 @@ class Wall:
         if self.weight is not None:
             object.__setattr__(self, "weight", checks.value(f"{name}.weight", self.weight, above=0.0, most=1.0))
 
+    @property
+    def yields(self) -> bool:
+        """Whether cells may press into it: it is soft, or of less weight than a cell has."""
+        return self.stiffness is not None or (self.weight is not None and bool((torch.as_tensor(self.weight).detach() < 1).any()))
+
     def surfaces(self, dim: int) -> list[Surface]:
         """The wall as planes and spheres in `dim` dimensions."""
         raise NotImplementedError
@@ -224,7 +229,7 @@ def as_data(surface: Surface) -> dict[str, Any]:
     """A surface in numbers, for a file: normal and offset (normal · x there, µm) of a flat one, center and radius, µm, of a round one, each entry one number or
     a list of one per colony; and whether it is soft."""
     number = lambda x: x.detach().cpu().tolist() if isinstance(x, Tensor) else float(x)  # noqa: E731
-    soft = surface.wall.stiffness is not None
+    soft = surface.wall.yields
     if isinstance(surface, _Flat):
         return {"normal": [number(n) for n in surface.normal], "offset": number(surface.offset), "soft": soft}
     return {"center": [number(c) for c in surface.center], "radius": number(surface.radius), "soft": soft}
@@ -356,11 +361,15 @@ def _reaches(surface: Surface, position: Tensor, axis: Tensor, half: Tensor, col
     ]
 
 
+# Walls as far apart as cells are wide, or a little less, hold them tight and no more: growth channels are made so.
+SQUEEZED = 0.05
+
+
 @torch.no_grad()
 def too_narrow(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, colony_id: Tensor) -> tuple[Surface, Tensor, Tensor] | None:
     """Hard walls that face each other, or a hard ball about the cells, between which some cell at (N, d) of radius (N,) does not fit whichever way it lies: one
     of the surfaces, what room they leave each cell, (N,) µm, and which cells that is less than they are wide for, (N,) bool. None where all fit."""
-    hard = [s for s in surfaces if s.wall.stiffness is None]
+    hard = [s for s in surfaces if not s.wall.yields]
     seen = [s.gap_of_points(position, colony_id) for s in hard]
     for k, (surface, (distance, way)) in enumerate(zip(hard, seen, strict=True)):
         if isinstance(surface, _Round):
@@ -369,7 +378,7 @@ def too_narrow(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, co
             across = [torch.where((way * other).sum(0) < 1e-9 - 1.0, distance + far, math.inf) for far, other in seen[k + 1 :]]
             rooms = [room for room, s in zip(across, hard[k + 1 :], strict=True) if isinstance(s, _Flat)]
         for room in rooms:
-            tight = room < 2.0 * radius.double() * (1.0 - 1e-5)
+            tight = room < 2.0 * radius.double() * (1.0 - SQUEEZED)
             if bool(tight.any()):
                 return surface, room, tight
     return None

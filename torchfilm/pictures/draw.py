@@ -16,7 +16,7 @@ from torchfilm.tools import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-WALL = "#7a7a7a"
+WALL = "#a0522d"  # no grey either
 BEYOND = "#efe4d2"  # what is outside the box of a signal: no grey, so that it is not read as a concentration
 SMALL, TINY = 7.0, 6.0  # points
 ROUND = 0.1  # inches of a µm from which on an outline of few points has corners to be seen

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import dis
 import hashlib
 import re
 from collections.abc import Mapping
-from types import CodeType, FunctionType
+from functools import partial
+from types import CodeType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
@@ -21,9 +23,9 @@ def lasting(words: str) -> str:
 def digest(*things: Any) -> str:
     """A short hexadecimal word that differs where numbers, arrays, options or the code of functions differ.
 
-    Functions go by what they do: their code, defaults, what they hold on to and what they use of their own module, not their names or line numbers; objects
-    of a user's class by their attributes and functions. What is imported from elsewhere is not looked into, and versions of Python may compile one function
-    in two ways.
+    Lists and tuples, and floats of any precision, go by what they hold. Functions go by what they do: their code, defaults, what they hold on to and what
+    they use of their own module, not their names, line numbers or docstrings; objects of a user's class by their attributes and functions. What is imported
+    from elsewhere is not looked into, and versions of Python may compile one function in two ways.
     """
     made = hashlib.sha256()
     _add(made, things, set())
@@ -45,7 +47,8 @@ def _add(made: Any, thing: Any, within: set[int]) -> None:
         made.update(b"again;")
         return
     within = within | {id(thing)}
-    made.update(f"{type(thing).__name__}(".encode())
+    # a list may have been a tuple before it was in a file
+    made.update(f"{'list' if isinstance(thing, tuple) else type(thing).__name__}(".encode())
     for part in _parts(thing):
         _add(made, part, within)
     made.update(b")")
@@ -57,7 +60,14 @@ OURS = ("torchfilm", "design", "torch", "numpy", "builtins")
 def _parts(thing: Any) -> list[Any]:
     if isinstance(thing, FunctionType):
         held = [c.cell_contents for c in thing.__closure__ or () if not _is_empty(c)]
-        return [thing.__code__, thing.__defaults__, thing.__kwdefaults__, *held, *_globals(thing)]
+        code = thing.__code__
+        # its first constant may be its docstring, which does nothing
+        used = code.co_consts[1:] if code.co_consts[:1] == (thing.__doc__,) else code.co_consts
+        return [code.co_code, code.co_names, used, thing.__defaults__, thing.__kwdefaults__, *held, *_globals(thing)]
+    if isinstance(thing, MethodType):
+        return [thing.__func__, thing.__self__]
+    if isinstance(thing, partial):
+        return [thing.func, thing.args, thing.keywords]
     if isinstance(thing, CodeType):
         return [thing.co_code, thing.co_names, thing.co_consts]
     if isinstance(thing, Mapping):
@@ -87,7 +97,7 @@ def _globals(function: FunctionType) -> list[Any]:
     codes = [function.__code__]
     while codes:
         code = codes.pop()
-        names += code.co_names
+        names += [i.argval for i in dis.get_instructions(code) if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")]
         codes += [c for c in code.co_consts if isinstance(c, CodeType)]
     used = [function.__globals__.get(name) for name in dict.fromkeys(names)]
     plain = (str, int, float, bool, tuple, list, dict, np.ndarray, torch.Tensor)
