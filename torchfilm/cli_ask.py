@@ -84,7 +84,7 @@ class Tune:
     cells: int = 100
     """Cells in each colony where the probe begins."""
     colonies: int = 24
-    """Colonies of the probe, if the scene's parameters leave it open."""
+    """Colonies of the probe, if the scene's parameters leave it open; where chance would hide the error, twice or four times as many."""
     seed: int = 0
     """Seed of the probe."""
     device: str = "cpu"

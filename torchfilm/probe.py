@@ -3,9 +3,10 @@
 | observable | error                                                                                                                     |
 |------------|---------------------------------------------------------------------------------------------------------------------------|
 | cells      | difference of their number, relative; those that are due to divide at the next step count as two                          |
-| volume     | difference of what the window's second half added, relative (or to a tenth of the whole, if that is more): what a longer  |
-|            | run comes to. In the first half cells settle: how deep they overlap goes by the settings, and the start is by others. Of  |
-|            | the cylinders round the cells, π r² by the length from end to end, which no division changes                              |
+| volume     | difference of what the window's second half added, relative, or to what growth would add if neither pressure nor loss of   |
+|            | cells set it back: what a longer run comes to. In the first half cells settle: how deep they overlap goes by the          |
+|            | settings, and the start is by others. Of the cylinders round the cells, π r² by the length from end to end, which no      |
+|            | division changes                                                                                                          |
 | radius     | difference, relative                                                                                                      |
 | overlap    | mean overlap of touching cells over their diameter, 0 being right; of soft cells its difference                           |
 | a species  | difference of its mean and standard deviation over cells, relative                                                        |
@@ -21,6 +22,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from scipy.special import stdtrit
@@ -28,7 +30,7 @@ from torch import Tensor
 
 from torchfilm import measure
 from torchfilm.accuracy import Settings
-from torchfilm.effect import DIVISION
+from torchfilm.effect import DIVISION, GROWTH
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.scene import Scene
@@ -57,9 +59,14 @@ class Error:
     colonies: int = field(default=2, compare=False)
 
     @property
+    def chance(self) -> float:
+        """How much more it may be, to 95 % (Student's t)."""
+        return float(stdtrit(self.colonies - 1, SURE)) * self.noise if self.noise else 0.0
+
+    @property
     def most(self) -> float:
-        """What it is at most, to 95 % (Student's t)."""
-        return self.value + (float(stdtrit(self.colonies - 1, SURE)) * self.noise if self.noise else 0.0)
+        """What it is at most, to 95 %."""
+        return self.value + self.chance
 
     def __str__(self) -> str:
         return "failed" if math.isinf(self.value) else f"{100 * self.value:.2g} ± {100 * self.noise:.1g} %"
@@ -106,7 +113,8 @@ class Probe:
         seconds = clock() - begun
         found: Seen = {}
         for state in seen:
-            for name, value in (sums(state) | {"cells": self._due(state)}).items():
+            parts = sums(state)
+            for name, value in (parts | {"cells": self._due(state), "volume": torch.cat([parts["volume"], self._wanted(state)], 1)}).items():
                 if self.of is None or name in self.of:
                     found.setdefault(name, []).append(value * math.nan if broken else value)
         return Window(found, seconds, timings.seconds, several)
@@ -117,6 +125,14 @@ class Probe:
             if effect.stage <= DIVISION:
                 state = effect.step(state, self.dt)
         return state.counts.double().cpu().unsqueeze(1)
+
+    def _wanted(self, state: State) -> Tensor:
+        """By how much the volume would grow in an hour if nothing held it back, (B, 1) µm³."""
+        grown = state
+        for effect in self.scene.effects:
+            if effect.stage == GROWTH:
+                grown = effect.step(grown, self.dt)
+        return _over(state, math.pi * state.radius**2 * (grown.length - state.length) / self.dt)
 
     def errors(self, found: Seen, against: Seen, apart: bool = False) -> dict[str, Error]:
         """By observable of `against`, the greater of the errors in the middle and at the end; infinite where it is not found.
@@ -138,8 +154,9 @@ class Probe:
     def _error(self, name: str, value: Tensor, right: Tensor, apart: bool) -> Tensor:
         """Of an observable (J, 2, k) the greater of the errors in the middle and at the end, (J,)."""
         if name == "volume":
-            added = right[:, -1] - right[:, 0]
-            return ((value[:, -1] - value[:, 0] - added).abs() / torch.maximum(added.abs(), 0.1 * right[:, -1])).squeeze(1)
+            # the volume, and by how much it would grow in an hour
+            added, growth = right[:, -1, 0] - right[:, 0, 0], right[:, :, 1].mean(1)
+            return (value[:, -1, 0] - value[:, 0, 0] - added).abs() / torch.maximum(added.abs(), growth * self.dt * WINDOW / 2).clamp(min=1e-30)
         if name == "overlap" and not apart and not any(isinstance(e, Mechanics) and e.stiffness is not None for e in self.scene.listed):
             each = value
         elif name == "overlap":
@@ -169,7 +186,7 @@ def observables(state: State) -> dict[str, Tensor]:
 
 def sums(state: State) -> dict[str, Tensor]:
     """By observable, what it is made of, summed over each colony: (B, m) float64."""
-    over = lambda *x: torch.stack([state.groups.sum(v.double()) for v in x], 1).cpu()  # noqa: E731
+    over = partial(_over, state)
     one, radius = torch.ones_like(state.length), state.radius.double()
     out = {"cells": over(one), "volume": over(math.pi * radius**2 * (state.length.double() + 2.0 * radius))}
     if "displacement" in state.fields:  # cells that do not push each other have no overlap to speak of
@@ -190,6 +207,11 @@ def sums(state: State) -> dict[str, Tensor]:
             voxels = Groups(torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts), len(counts))
             out[SIGNAL + name] = torch.stack([voxels.sum(value), voxels.sum(value * value)], 1).cpu()
     return out
+
+
+def _over(state: State, *values: Tensor) -> Tensor:
+    """Sums over each colony of k values of its cells (N,), (B, k) float64."""
+    return torch.stack([state.groups.sum(v.double()) for v in values], 1).cpu()
 
 
 def _made(name: str, total: Tensor) -> Tensor:

@@ -39,6 +39,7 @@ TIGHT = 1e-3  # circuits, of the error asked for: a ten-thousandth of what they 
 LARGER = 1.5
 # Where so many that hold it in the first do not in the second, it is the larger colonies that cannot.
 MOST_REFUTED = 20
+CERTAIN = 2  # standard errors
 # A long step lets a colony grow too much and a loose solve too little. So a step is not given up where it alone is over what was asked, but where it is OFF
 # times over. Circuits may take a SMALL part of it.
 OFF, SMALL = 2.0, 0.3
@@ -92,10 +93,11 @@ def tune(
     scene: Scene, error: float = 0.01, *, cells: int = 100, colonies: int = 24, of: Sequence[str] | None = None, seed: int = 0,
     device: str | torch.device = "cpu",
 ) -> Tuned:  # fmt: skip
-    """The cheapest settings with which a scene's observables are within `error` (relative, 0.01 for 1 %) of what far tighter settings give; about a minute.
+    """The cheapest settings with which a scene's observables are within `error` (relative, 0.01 for 1 %) of what far tighter settings give; some minutes.
 
     cells: in each of `colonies` colonies (or as many as the scene's parameters are for) where the probe begins; a scene that stays smaller is taken as it
-    is after 2,000 steps. of: names of the observables that matter, by default all: "cells", "volume", "radius", "overlap", species, "signal NAME". Circuits
+    is after 2,000 steps. Where chance would hide the error, twice or four times as many colonies are grown.
+    of: names of the observables that matter, by default all: "cells", "volume", "radius", "overlap", species, "signal NAME". Circuits
     that run molecule by molecule are probed by their smooth mean, since noise is no error. Raises InputError where nothing holds the error, or
     where the probe cannot tell it; SimulationError where the scene fails on the way to where the probe begins.
     """
@@ -104,12 +106,23 @@ def tune(
         if isinstance(given, bool) or not isinstance(given, int) or given < least:
             raise checks.refuse(name, given, f"a whole number from {least}", why)
     probe = begin(scene, cells, colonies, of, seed, device)
+    for more in (2, 4) if scene.fixed_colonies == 1 else ():
+        if _chance(probe) <= error / 2:
+            break
+        probe = begin(scene, cells, more * colonies, of, seed, device)
     if of is not None:
         known = list(dict.fromkeys([*observables(probe.start), *species(probe.start), *(SIGNAL + n for n in probe.start.signals)]))
         for name in of:
             if name not in known:
                 raise checks.refuse("of", name, "among " + ", ".join(known))
-    return Search(probe, begin(scene, math.ceil(LARGER * cells), colonies, of, seed + 1, device), error).run()
+    return Search(probe, begin(scene, math.ceil(LARGER * cells), probe.start.colonies, of, seed + 1, device), error).run()
+
+
+@torch.no_grad()
+def _chance(probe: Probe) -> float:
+    """How much of the error in what must be told, the volume or what was named, may be chance: as runs by the scene's own step and by half of it differ."""
+    one, other = (probe.observed(Settings(dt=dt)).found for dt in (None, probe.dt / 2))
+    return max((e.chance for n, e in probe.errors(one, other, apart=True).items() if n in (probe.of or ("volume",))), default=0.0)
 
 
 class Search:
@@ -125,6 +138,7 @@ class Search:
         self.runs: dict[Settings, Window] = {}
         self.tries: dict[Settings, Try] = {}
         self.refuted: dict[Settings, dict[str, Error]] = {}  # what came of them in the other colonies
+        self.worse: dict[str, float] = {}  # by observable, how many times as great an error is there as here
 
     def settings(self, steps: int, contacts: tuple[float, int, float], rtol: float) -> Settings:
         """As knobs of the scene; those of effects that it does not list stay unset."""
@@ -143,13 +157,18 @@ class Search:
         self.unsure = probe.errors(coarser, self.reference, apart=True)
         # the coarser reference is off by twice as much as the finer is: their difference is the finer's own error
         said = lambda e: "a reference failed" if math.isinf(e.value) else f"two references differ by {e}"  # noqa: E731
-        left_out = {n: said(e) for n, e in self.unsure.items() if e.most > self.error / 2}
+        left_out = {n: said(e) for n, e in self.unsure.items() if max(e.value, e.chance) > self.error / 2}
         self.reference = {n: v for n, v in self.reference.items() if n not in left_out}
         # what every knob tells in must be seen, and what was named
-        missing = [n for n in left_out if n in (probe.of or ("volume",))]
+        needed = probe.of or ("volume",)
+        missing = [n for n in left_out if n in needed]
         if missing or not self.reference:
             raise self._untold({n: left_out[n] for n in missing or left_out})
-        own = self._try(Settings())  # first, since a coarse step that takes sub-steps does not tell what a step costs
+        for name, e in probe.errors(self._run(Settings()).found, self.reference).items():
+            if e.chance > self.error / 2 and name not in needed:
+                left_out[name] = f"much of {e} is chance"
+                del self.reference[name]
+        own = self._try(Settings())
         best, confirmed = self._confirmed()
         return Tuned(
             best.settings.apply(self.probe.given), best.settings, self.error, best, own, confirmed, self._parts(best), self.unsure, left_out,
@@ -172,6 +191,11 @@ class Search:
             if max((e.most for e in errors.values()), default=0.0) <= self.error:
                 return best, errors
             self.refuted[best.settings] = errors
+            for name, e in errors.items():
+                mine = best.errors[name]
+                # where it is more than chance, other settings are taken to be so many times worse there as well
+                if e.most > self.error and mine.value > CERTAIN * mine.noise:
+                    self.worse[name] = max(self.worse.get(name, 1.0), e.value / mine.value)
             if len(self.refuted) == MOST_REFUTED:
                 raise self._out_of_reach()
 
@@ -180,7 +204,7 @@ class Search:
         return checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}. Ask for more, or probe more colonies or cells.")
 
     def _out_of_reach(self) -> checks.InputError:
-        found = {t.settings: t.errors for t in self.tries.values() if t.settings != Settings()} | self.refuted
+        found = {t.settings: t.errors for t in self.tries.values() if t.settings != Settings() and not self._holds(t)} | self.refuted
         closest = min(found, key=lambda s: max(e.most for e in found[s].values()))
         name = max(found[closest], key=lambda n: found[closest][n].most)
         error = found[closest][name]
@@ -203,9 +227,9 @@ class Search:
 
     def _cheapest(self) -> Try:
         """Of the tries that hold the error and are not refuted, the one that took the least time, once every step that could be cheaper has been looked at:
-        the scene's own first, as it is likely to hold it and then tells what is too dear."""
+        from the scene's own to finer ones first, until one holds the error and tells what is too dear."""
         best: Try | None = None
-        for steps in (WINDOW, *STEPS):
+        for steps in (*(n for n in STEPS if n >= WINDOW), *(n for n in STEPS if n < WINDOW)):
             if best is None or steps * self._least() <= best.seconds:
                 self._look_at(steps, math.inf if best is None else best.seconds)
                 best = min((t for t in self.tries.values() if self._holds(t)), key=lambda t: t.seconds, default=None)
@@ -214,7 +238,8 @@ class Search:
         return best
 
     def _holds(self, tried: Try) -> bool:
-        return tried.worst <= self.error and tried.settings != Settings() and tried.settings not in self.refuted
+        within = all(self.worse.get(name, 1.0) * e.value + e.chance <= self.error for name, e in tried.errors.items())
+        return within and tried.settings != Settings() and tried.settings not in self.refuted
 
     def _least(self) -> float:
         """What a step would take, s, if every effect took as little as it ever did; 0 as long as nothing tells, since all steps were taken in several."""
