@@ -391,25 +391,6 @@ def test_walls_that_make_no_sense_are_refused(make):
         make()
 
 
-@pytest.mark.parametrize(
-    "walls, said",
-    [
-        ([tf.Channel(width=0.8)], r"Channel: 0\.8 µm between hard walls are too narrow for cell 0 of colony 0, 1 µm wide"),
-        ([tf.Channel(width=[2.0, 0.9], weight=1.0)], r"Channel: 0\.9 µm .* colony 1"),
-        ([tf.Plane(x=-0.4, facing="+x"), tf.Plane(x=0.5, facing="-x")], r"Plane: 0\.9 µm"),
-        ([tf.Sphere(center=(0.0, 0.0), radius=0.4)], r"Sphere: 0\.8 µm"),
-    ],
-)
-def test_walls_that_no_cell_fits_between_are_refused(walls, said):
-    scene = lambda *w: tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, walls=w))  # noqa: E731
-    with pytest.raises(tf.InputError, match=said):
-        scene(*walls).seed(2)
-    scene(tf.Channel(width=0.8, stiffness=20.0)).seed(2)
-    scene(tf.Channel(width=0.8, weight=0.5)).seed(2)
-    scene(tf.Channel(width=0.96)).seed(2)
-    scene(tf.Plane(x=-0.4, facing="+x"), tf.Plane(y=0.5, facing="-y"), tf.Sphere(radius=0.3, center=(5.0, -5.0), inside=False)).seed(2)
-
-
 def test_cells_behind_a_wall_are_refused_before_the_first_step():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(walls=[tf.Plane(x=1.0, facing="+x")]))
     with pytest.raises(tf.InputError, match="inside out"):

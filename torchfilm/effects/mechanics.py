@@ -14,7 +14,7 @@ from torchfilm.physics.contacts import Bodies, Contacts, Touching, contact_gaps,
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.rows import ContactRows
 from torchfilm.physics.solve import CONVERGED, NOT_FINITE, STATUS, TOO_FAST, ContactProblem, SolveReport, solve
-from torchfilm.physics.walls import Surface, Wall, WallContacts, find_wall_contacts, share_to_walls, too_narrow
+from torchfilm.physics.walls import Surface, Wall, WallContacts, find_wall_contacts, share_to_walls
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
@@ -167,15 +167,6 @@ class Mechanics(Effect):
                     f"{[round(x, 3) for x in state.position[k].tolist()]}, {-float(distance[k]):.3g} µm behind it (cells behind it: {beyond.numel()}). "
                     "Is the wall inside out? Turn it (facing, normal, inside), or move the cells."
                 )
-        found = too_narrow(self.surfaces(), state.position, state.radius, state.own_colony_id)
-        if found is not None:
-            surface, room, tight = found
-            k = int(torch.nonzero(tight)[0])
-            raise checks.InputError(
-                f"{type(surface.wall).__name__}: {float(room[k]):.3g} µm between hard walls are too narrow for cell {int(state.uid[k])} of colony "
-                f"{int(state.own_colony_id[k])}, {2 * float(state.radius[k]):.3g} µm wide. Move the walls apart, or let them yield "
-                "(stiffness=…, or a weight below 1)."
-            )
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:

@@ -361,29 +361,6 @@ def _reaches(surface: Surface, position: Tensor, axis: Tensor, half: Tensor, col
     ]
 
 
-# Walls as far apart as cells are wide, or a little less, hold them tight and no more: growth channels are made so.
-SQUEEZED = 0.05
-
-
-@torch.no_grad()
-def too_narrow(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, colony_id: Tensor) -> tuple[Surface, Tensor, Tensor] | None:
-    """Hard walls that face each other, or a hard ball about the cells, between which some cell at (N, d) of radius (N,) does not fit whichever way it lies: one
-    of the surfaces, what room they leave each cell, (N,) µm, and which cells that is less than they are wide for, (N,) bool. None where all fit."""
-    hard = [s for s in surfaces if not s.wall.yields]
-    seen = [s.gap_of_points(position, colony_id) for s in hard]
-    for k, (surface, (distance, way)) in enumerate(zip(hard, seen, strict=True)):
-        if isinstance(surface, _Round):
-            rooms = [2.0 * _per_cell(surface.radius, colony_id, position) + torch.zeros_like(distance)] if surface.inside else []
-        else:
-            across = [torch.where((way * other).sum(0) < 1e-9 - 1.0, distance + far, math.inf) for far, other in seen[k + 1 :]]
-            rooms = [room for room, s in zip(across, hard[k + 1 :], strict=True) if isinstance(s, _Flat)]
-        for room in rooms:
-            tight = room < 2.0 * radius.double() * (1.0 - SQUEEZED)
-            if bool(tight.any()):
-                return surface, room, tight
-    return None
-
-
 # A ball in the way is looked for at so many places of a move; another wall, which has all cells on one side, at its end.
 PLACES = 8
 
