@@ -191,7 +191,7 @@ def test_chance_is_told_by_how_colonies_differ():
 
 def test_no_division_changes_the_volume_that_is_compared():
     scene = dividing()
-    state = scene.seed(3, dtype=F64).with_fields()
+    state = scene.seed(3, dtype=F64)
     state = state.replace(length=torch.full_like(state.length, 4.6))
     divided = next(e for e in scene.listed if isinstance(e, tf.Division)).step(state, 0.05)
     assert divided.cells == 6
@@ -239,3 +239,10 @@ def test_steps_taken_in_several_do_not_tell_what_a_step_costs():
     assert coarse.several and not fine.several
     own = fine.seconds / 96
     assert search._least() == pytest.approx(own) and search._least() < coarse.seconds / 8
+
+
+def test_an_error_of_which_every_step_is_far_off_is_out_of_reach(monkeypatch):
+    """Then nothing but the scene's own settings was tried."""
+    monkeypatch.setitem(Search._look_at.__globals__, "OFF", -1.0)
+    with pytest.raises(InputError, match=r"the closest came to .* with the scene's own"):
+        tf.tune(dividing(), 0.05, cells=8, colonies=4, of=["m"])

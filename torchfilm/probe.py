@@ -93,6 +93,11 @@ class Probe:
     dt: float
     of: tuple[str, ...] | None
 
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """What must be told: what was named, or the volume, in which every knob tells."""
+        return self.of or ("volume",)
+
     def steps(self, settings: Settings) -> int:
         """Into how many steps the window is divided."""
         return round(WINDOW * self.dt / (settings.dt or self.dt))
@@ -203,8 +208,7 @@ def sums(state: State) -> dict[str, Tensor]:
         value = grid.double()
         if bool((value != 0).any()):
             assert state.layout is not None
-            counts = state.layout.grid.counts
-            voxels = Groups(torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts), len(counts))
+            voxels = Groups(state.layout.grid.owner, state.colonies)
             out[SIGNAL + name] = torch.stack([voxels.sum(value), voxels.sum(value * value)], 1).cpu()
     return out
 

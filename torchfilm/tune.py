@@ -1,10 +1,10 @@
 """The cheapest settings that hold an error: `tune(scene, error=0.01)`.
 
 A few colonies of the scene are grown by its own settings; from that same state a window of some steps is run again and again: once by far tighter settings,
-the reference, and then by settings that are tried from coarse to fine. What a user would read off at the end is compared, observable by observable: the table
-is in `torchfilm.probe`. Each error, with what of it may be chance, must be within what was asked; of the settings that are, the one that took the least time
-is chosen, confirmed in other colonies that are larger by half, and measured once more with each of its knobs tightened, which tells the knobs' parts in the
-error.
+the reference, and then by other settings, each step by knobs from loose to tight. What a user would read off at the end is compared, observable by
+observable: the table is in `torchfilm.probe`. Each error, with what of it may be chance, must be within what was asked; of the settings that are, the one
+that took the least time is chosen, confirmed in other colonies that are larger by half, and measured once more with each of its knobs tightened, which tells
+the knobs' parts in the error.
 """
 
 from __future__ import annotations
@@ -108,15 +108,15 @@ def tune(
         if isinstance(given, bool) or not isinstance(given, int) or given < least:
             raise checks.refuse(name, given, f"a whole number from {least}", why)
     probe = begin(scene, cells, colonies, of, seed, device)
-    for more in (2, 4) if scene.fixed_colonies == 1 else ():
-        if _chance(probe) <= error / 2:
-            break
-        probe = begin(scene, cells, more * colonies, of, seed, device)
     if of is not None:
         known = list(dict.fromkeys([*observables(probe.start), *species(probe.start), *(SIGNAL + n for n in probe.start.signals)]))
         for name in of:
             if name not in known:
                 raise checks.refuse("of", name, "among " + ", ".join(known))
+    for more in (2, 4) if scene.fixed_colonies == 1 else ():
+        if _chance(probe) <= error / 2:
+            break
+        probe = begin(scene, cells, more * colonies, of, seed, device)
     return Search(probe, begin(scene, math.ceil(LARGER * cells), probe.start.colonies, of, seed + 1, device), error).run()
 
 
@@ -124,7 +124,7 @@ def tune(
 def _chance(probe: Probe) -> float:
     """How much of the error in what must be told, the volume or what was named, may be chance: as runs by the scene's own step and by half of it differ."""
     one, other = (probe.observed(Settings(dt=dt)).found for dt in (None, probe.dt / 2))
-    return max((e.chance for n, e in probe.errors(one, other, apart=True).items() if n in (probe.of or ("volume",))), default=0.0)
+    return max((e.chance for n, e in probe.errors(one, other, apart=True).items() if n in probe.needed), default=0.0)
 
 
 class Search:
@@ -161,13 +161,11 @@ class Search:
         said = lambda e: "a reference failed" if math.isinf(e.value) else f"two references differ by {e}"  # noqa: E731
         left_out = {n: said(e) for n, e in self.unsure.items() if max(e.value, e.chance) > self.error / 2}
         self.reference = {n: v for n, v in self.reference.items() if n not in left_out}
-        # what every knob tells in must be seen, and what was named
-        needed = probe.of or ("volume",)
-        missing = [n for n in left_out if n in needed]
+        missing = [n for n in left_out if n in probe.needed]
         if missing or not self.reference:
             raise self._untold({n: left_out[n] for n in missing or left_out})
         for name, e in probe.errors(self._run(Settings()).found, self.reference).items():
-            if e.chance > self.error / 2 and name not in needed:
+            if e.chance > self.error / 2 and name not in probe.needed:
                 left_out[name] = f"much of {e} is chance"
                 del self.reference[name]
         own = self._try(Settings())
@@ -184,7 +182,7 @@ class Search:
         """The cheapest that holds the error in the other colonies too, and its errors there, in what can be seen there."""
         seen = self._seen_finely(self.other, FINEST)
         right = {n: seen[n] for n in self.reference if n in seen and not any(bool(v.isnan().any()) for v in seen[n])}
-        missing = {n: "a reference failed in the other, larger colonies" for n in self.probe.of or ("volume",) if n in self.reference and n not in right}
+        missing = {n: "a reference failed in the other, larger colonies" for n in self.probe.needed if n in self.reference and n not in right}
         if missing:
             raise self._untold(missing)
         while True:
@@ -204,7 +202,8 @@ class Search:
         return checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}. Ask for more, or probe more colonies or cells.")
 
     def _out_of_reach(self) -> checks.InputError:
-        found = {t.settings: t.errors for t in self.tries.values() if t.settings != Settings() and not self._holds(t)} | self.refuted
+        own, *others = self.tries.values()
+        found = {t.settings: t.errors for t in others if not self._holds(t)} | self.refuted or {own.settings: own.errors}
         closest = min(found, key=lambda s: max(e.most for e in found[s].values()))
         name = max(found[closest], key=lambda n: found[closest][n].most)
         error = found[closest][name]
@@ -322,7 +321,7 @@ def _knob(knob: str, s: Settings) -> str:
 
 
 def _words(settings: Settings) -> str:
-    return ", ".join(f"{name} {value:g}" for name, value in settings.given.items())
+    return ", ".join(f"{name} {value:g}" for name, value in settings.given.items()) or "the scene's own"
 
 
 def _percent(error: float) -> str:

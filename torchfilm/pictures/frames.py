@@ -78,7 +78,7 @@ class Recorded(Sequence[Frame]):
     def __init__(self, results: Results, places: Sequence[int], signal: str | None = None):
         self.results, self.places, self.signal = results, [results._index(k) for k in places], signal
         declared = json.loads(results.attributes["declared"])
-        self.units = {name: entry[1] for name, entry in declared.items()}
+        self.units, self.walls = {name: entry[1] for name, entry in declared.items()}, results.walls
         if signal is not None and signal not in results.signal_names:
             raise checks.refuse("background", signal, "a signal of the medium: " + (", ".join(results.signal_names) or "this run has none"))
 
@@ -91,11 +91,11 @@ class Recorded(Sequence[Frame]):
         results, place = self.results, self.places[k]
         cells, ids, time = results.frame(place), results.colony_id, float(results.times[place])
         if not results.signal_names:
-            return Frame(cells, time, ids, self.units, walls=results.walls)
+            return Frame(cells, time, ids, self.units, walls=self.walls)
         origin, shape, spacing = results.grid(place)
         signals = {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
         height = results.attributes.get("height")
-        return Frame(cells, time, ids, self.units, signals, origin, shape, spacing, None if height is None else float(height), results.walls)
+        return Frame(cells, time, ids, self.units, signals, origin, shape, spacing, None if height is None else float(height), self.walls)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
