@@ -4,7 +4,7 @@
 
 Each example draws a scene (sizes, crowding, walls, α or stiffness, γ, growth, division, circuits with Hill terms and stiff decay, signals on grids of odd
 shapes with faces, flow and obstacles, steps from a second to hours) and runs it for a few steps under the laws of `run`. The first example that breaks
-one is made smaller and printed as a `Draw`, which `run` takes again. docs/stability.md lists what was found. tests/test_fuzz.py runs a few dozen.
+one is made smaller and printed as a `Draw`, which `run` takes again. docs/stability.md lists what was found. tests/test_fuzz.py runs a hundred.
 """
 
 from __future__ import annotations
@@ -238,7 +238,8 @@ def medium(draw: Outside, dim: int) -> tf.Medium:
     )  # fmt: skip
 
 
-def circuit(draw: Inside, signals: bool) -> tf.Circuit:
+def circuit(draw: Inside, outside: Outside | None) -> tf.Circuit:
+    signals = outside is not None
     options = {"daughters": draw.daughters, "initial": {"a": tf.Uniform(0.0, 2.0)}}
 
     def hill(u, s, p, cell):
@@ -253,10 +254,11 @@ def circuit(draw: Inside, signals: bool) -> tf.Circuit:
         return {"a": into / cell.volume + back, "b": -back}, ({"ahl": -into} if signals else {})
 
     if draw.kind == "reactions":
-        # molecule by molecule a rate is a number of events: as many as one wants to wait for
+        # molecule by molecule a rate is a number of events: as many as one wants to wait for, however many molecules come in
         fast = draw.fast if draw.method == "rosenbrock" else min(draw.fast, 10.0)
+        pairing = 0.1 if draw.method == "rosenbrock" or outside is None else 0.1 / max(1.0, outside.start)
         passing = [tf.Reaction.of("a -> out.ahl", rate=fast), tf.Reaction.of("out.ahl -> a", rate=0.1)] if signals else []
-        parts = [tf.Reaction.of("a -> b", rate=fast), tf.Reaction.of("2 b -> a", rate=0.1), *passing]
+        parts = [tf.Reaction.of("a -> b", rate=fast), tf.Reaction.of("2 b -> a", rate=pairing), *passing]
         return tf.Circuit(parts, species=("a", "b"), method=draw.method, **options)
     return tf.Circuit(hill if draw.kind == "hill" else exchange, species=("a", "b"), **options)
 
@@ -266,7 +268,7 @@ def scene_of(draw: Draw) -> tuple[tf.Scene, tf.State]:
     effects: list[tf.Effect] = [] if draw.growing is None else growing(draw)
     effects += [] if draw.contacts is None else [mechanics(draw.contacts, draw.bodies)]
     effects += [] if draw.outside is None else [medium(draw.outside, draw.bodies.dim)]
-    effects += [] if draw.inside is None else [circuit(draw.inside, draw.outside is not None)]
+    effects += [] if draw.inside is None else [circuit(draw.inside, draw.outside)]
     effects += rules(draw)
     if draw.beside.leaving:
         side = 0.7 * draw.bodies.within

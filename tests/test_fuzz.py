@@ -1,4 +1,4 @@
-"""A few dozen random scenes, the same each time, under the laws of experiments/fuzz.py; what longer runs of it found; and that it would notice."""
+"""A hundred random scenes, the same each time, under the laws of experiments/fuzz.py; what longer runs of it found; and that it would notice."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENDINGS: list[str] = []
 
 
 @pytest.mark.slow
-@settings(max_examples=40, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=100, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck))
 @given(fuzz.DRAWS)
 def test_random_scenes_obey_the_laws(draw):
     """Finite, nonnegative, unique uids, no escape, amounts conserved, the same alone as in the batch; failures are reported."""
