@@ -255,9 +255,10 @@ def circuit(draw: Inside, outside: Outside | None) -> tf.Circuit:
 
     if draw.kind == "reactions":
         # molecule by molecule a rate is a number of events: as many as one wants to wait for, however many molecules come in
-        fast = draw.fast if draw.method == "rosenbrock" else min(draw.fast, 10.0)
-        pairing = 0.1 if draw.method == "rosenbrock" or outside is None else 0.1 / max(1.0, outside.start)
-        passing = [tf.Reaction.of("a -> out.ahl", rate=fast), tf.Reaction.of("out.ahl -> a", rate=0.1)] if signals else []
+        smooth, outer = draw.method == "rosenbrock", 1.0 if outside is None else max(1.0, outside.start)
+        fast = draw.fast if smooth else min(draw.fast, 10.0)
+        pairing, inwards = 0.1 if smooth else 0.1 / outer, 0.1 / outer if draw.method == "direct" else 0.1
+        passing = [tf.Reaction.of("a -> out.ahl", rate=fast), tf.Reaction.of("out.ahl -> a", rate=inwards)] if signals else []
         parts = [tf.Reaction.of("a -> b", rate=fast), tf.Reaction.of("2 b -> a", rate=pairing), *passing]
         return tf.Circuit(parts, species=("a", "b"), method=draw.method, **options)
     return tf.Circuit(hill if draw.kind == "hill" else exchange, species=("a", "b"), **options)

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -41,8 +40,8 @@ from torchfilm.tools.timing import Timings
 
 # The window, in steps of the scene. Of half as many, most of the second half's error in volume is still the start's settling (measured).
 WINDOW = 24
-# A scene that never has as many cells as asked for is taken as it is after this many steps.
-MOST_STEPS = 2000
+# A scene that never has as many cells as asked for is taken as it is where so many steps have not made it larger by a hundredth, or after MOST_STEPS.
+STILL, MOST_STEPS = 10 * WINDOW, 2000
 SIGNAL = "signal "
 SURE = 0.95  # of 20 errors 19 are at most what is told
 
@@ -179,9 +178,15 @@ def begin(scene: Scene, cells: int, colonies: int, of: Sequence[str] | None = No
     smooth = [e.smooth() if isinstance(e, Circuit) and e.is_stochastic else e for e in scene.listed]
     made = scene.retuned(smooth, scene.dt, scene.accuracy)
     fixed = scene.fixed_colonies
-    state = made.seed(fixed if fixed > 1 else colonies, seed=seed, device=device)
-    ends = deque(simulate(made, state, cells=cells, until=MOST_STEPS * scene.dt), maxlen=1)
-    return Probe(scene, made, ends[0] if ends else state, scene.dt, None if of is None else tuple(of))
+    founded = state = made.seed(fixed if fixed > 1 else colonies, seed=seed, device=device)
+    largest, since = 0.0, 0
+    for state in simulate(made, founded, cells=cells, until=MOST_STEPS * scene.dt):
+        size, since = float(state.volume.sum()), since + 1
+        if size > 1.01 * largest:
+            largest, since = size, 0
+        if since >= STILL:
+            break
+    return Probe(scene, made, state, scene.dt, None if of is None else tuple(of))
 
 
 def observables(state: State) -> dict[str, Tensor]:

@@ -3,8 +3,8 @@
 A few colonies of the scene are grown by its own settings; from that same state a window of some steps is run again and again: once by far tighter settings,
 the reference, and then by other settings, each step by knobs from loose to tight. What a user would read off at the end is compared, observable by
 observable: the table is in `torchfilm.probe`. Each error, with what of it may be chance, must be within what was asked; of the settings that are, the one
-that took the least time is chosen, confirmed in other colonies that are larger by half, and measured once more with each of its knobs tightened, which tells
-the knobs' parts in the error.
+that took the least time is chosen, confirmed in other colonies that are smaller by a third, and measured once more with each of its knobs tightened, which
+tells the knobs' parts in the error.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ CONTACTS = (
 CIRCUITS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
 TIGHT_CONTACTS = (0.03, 3, 1e-3)
 TIGHT = 1e-3  # circuits, of the error asked for: a ten-thousandth of what they may take of it would not be seen
-# Colonies somewhat larger have somewhat other errors. So what is chosen must hold the error in a second probe of other colonies, LARGER times as large.
+# The larger colonies are, the more pressure they are under, and the greater are most errors: two to four times in a full channel, for colonies larger by half.
+# So settings are sought in colonies LARGER times as large as was asked for, and confirmed in others of just that size.
 LARGER = 1.5
-# Where so many that hold it in the first do not in the second, it is the larger colonies that cannot.
+# Of many settings the cheapest that holds the error is also the luckiest, so that some are refuted; where so many are, nothing will be confirmed.
 MOST_REFUTED = 20
-# Each time, other settings are taken to be WORSE times worse there than they were taken to be, in what did not hold: a larger colony's overlaps are some 1.2
-# times as deep, and what chance makes of other observables is soon left behind.
-WORSE = 1.15
-# A long step lets a colony grow too much and a loose solve too little. So a step is not given up where it alone is over what was asked, but where it is OFF
-# times over. Circuits may take a SMALL part of it.
+# What of an error may be chance is to be this part of what was asked, at most, or more colonies are grown.
+UNSURE = 1 / 3
+# A long step lets a colony grow too much and a loose solve too little. So looser settings are not given up where tighter ones are over what was asked, but
+# where they are OFF times over; at once where cells overlap too much, which nothing sets off. Circuits may take a SMALL part of it.
 OFF, SMALL = 2.0, 0.3
 
 
@@ -97,8 +97,9 @@ def tune(
 ) -> Tuned:  # fmt: skip
     """The cheapest settings with which a scene's observables are within `error` (relative, 0.01 for 1 %) of what far tighter settings give; some minutes.
 
-    cells: in each of `colonies` colonies (or as many as the scene's parameters are for) where the probe begins; a scene that stays smaller is taken as it
-    is after 2,000 steps. Where chance would hide the error, twice or four times as many colonies are grown.
+    cells: in each of `colonies` colonies (or as many as the scene's parameters are for) what will be run: settings hold in a probe that begins there and in one
+    that begins with half as many again; a scene that stays smaller is taken as it is where it grows no more. Where chance would hide the error, twice or
+    four times as many colonies are grown.
     of: names of the observables that matter, by default all: "cells", "volume", "radius", "overlap", species, "signal NAME". Circuits
     that run molecule by molecule are probed by their smooth mean, since noise is no error. Raises InputError where nothing holds the error, or
     where the probe cannot tell it; SimulationError where the scene fails on the way to where the probe begins.
@@ -107,17 +108,18 @@ def tune(
     for name, given, least, why in (("cells", cells, 1, ""), ("colonies", colonies, 2, "By how they differ it tells what of an error may be chance.")):
         if isinstance(given, bool) or not isinstance(given, int) or given < least:
             raise checks.refuse(name, given, f"a whole number from {least}", why)
-    probe = begin(scene, cells, colonies, of, seed, device)
+    many = math.ceil(LARGER * cells)
+    probe = begin(scene, many, colonies, of, seed, device)
     if of is not None:
         known = list(dict.fromkeys([*observables(probe.start), *species(probe.start), *(SIGNAL + n for n in probe.start.signals)]))
         for name in of:
             if name not in known:
                 raise checks.refuse("of", name, "among " + ", ".join(known))
     for more in (2, 4) if scene.fixed_colonies == 1 else ():
-        if _chance(probe) <= error / 2:
+        if _chance(probe) <= UNSURE * error:
             break
-        probe = begin(scene, cells, more * colonies, of, seed, device)
-    return Search(probe, begin(scene, math.ceil(LARGER * cells), probe.start.colonies, of, seed + 1, device), error).run()
+        probe = begin(scene, many, more * colonies, of, seed, device)
+    return Search(probe, begin(scene, cells, colonies, of, seed + 1, device), error).run()
 
 
 @torch.no_grad()
@@ -138,9 +140,9 @@ class Search:
         self.tight = TIGHT * error
         self.rtols = tuple(r for r in CIRCUITS if r > self.tight) if self.circuit is not None else (self.tight,)
         self.runs: dict[Settings, Window] = {}
+        self.errors: dict[Settings, dict[str, Error]] = {}
         self.tries: dict[Settings, Try] = {}
         self.refuted: dict[Settings, dict[str, Error]] = {}  # what came of them in the other colonies
-        self.worse: dict[str, float] = {}  # by observable, how many times as great an error is there as here
 
     def settings(self, steps: int, contacts: tuple[float, int, float], rtol: float) -> Settings:
         """As knobs of the scene; those of effects that it does not list stay unset."""
@@ -179,21 +181,19 @@ class Search:
         return probe.observed(self.settings(steps, TIGHT_CONTACTS, self.tight)).found
 
     def _confirmed(self) -> tuple[Try, dict[str, Error]]:
-        """The cheapest that holds the error in the other colonies too, and its errors there, in what can be seen there."""
+        """The cheapest that holds the error in the other colonies too, and its errors there, in what can be seen there. (What of them may be chance has been
+        allowed for in the first.)"""
         seen = self._seen_finely(self.other, FINEST)
         right = {n: seen[n] for n in self.reference if n in seen and not any(bool(v.isnan().any()) for v in seen[n])}
-        missing = {n: "a reference failed in the other, larger colonies" for n in self.probe.needed if n in self.reference and n not in right}
+        missing = {n: "a reference failed in the other colonies" for n in self.probe.needed if n in self.reference and n not in right}
         if missing:
             raise self._untold(missing)
         while True:
             best = self._cheapest()
             errors = self.other.errors(self.other.observed(best.settings).found, right)
-            if max((e.most for e in errors.values()), default=0.0) <= self.error:
+            if max((e.value for e in errors.values()), default=0.0) <= self.error:
                 return best, errors
             self.refuted[best.settings] = errors
-            for name, e in errors.items():
-                if e.most > self.error:
-                    self.worse[name] = WORSE * self.worse.get(name, 1.0)
             if len(self.refuted) == MOST_REFUTED:
                 raise self._out_of_reach()
 
@@ -221,7 +221,7 @@ class Search:
     def _try(self, settings: Settings) -> Try:
         if settings not in self.tries:
             run = self._run(settings)
-            self.tries[settings] = Try(settings, self.probe.errors(run.found, self.reference), run.seconds, run.spent)
+            self.tries[settings] = Try(settings, self._found(settings), run.seconds, run.spent)
         return self.tries[settings]
 
     def _cheapest(self) -> Try:
@@ -237,8 +237,7 @@ class Search:
         return best
 
     def _holds(self, tried: Try) -> bool:
-        within = all(self.worse.get(name, 1.0) * e.value + e.chance <= self.error for name, e in tried.errors.items())
-        return within and tried.settings != Settings() and tried.settings not in self.refuted
+        return tried.worst <= self.error and tried.settings != Settings() and tried.settings not in self.refuted
 
     def _least(self) -> float:
         """What a step would take, s, if every effect took as little as it ever did; 0 as long as nothing tells, since all steps were taken in several."""
@@ -250,19 +249,39 @@ class Search:
         return sum(each.values())
 
     def _look_at(self, steps: int, limit: float) -> None:
-        """Try a window of so many steps with tighter and tighter knobs until the error is held, or more than `limit` seconds are taken; with the tightest only,
-        where that is far off."""
-        if self._run(self.settings(steps, self.contacts[0], self.rtols[0])).seconds > limit:
+        """Try a window of so many steps with tighter and tighter knobs until the error is held, or more than `limit` seconds are taken; not at all what is
+        hopeless."""
+        tightest = self.settings(steps, TIGHT_CONTACTS, self.tight)
+        if self._hopeless(tightest) or self._run(self.settings(steps, self.contacts[0], self.rtols[0])).seconds > limit:
             return
-        tightest = self._run(self.settings(steps, TIGHT_CONTACTS, self.tight)).found
-        if max(e.value for e in self.probe.errors(tightest, self.reference).values()) > OFF * self.error:
+        self._found(tightest)
+        if self._hopeless(tightest):
             return
         # (where the usual contacts fail, nothing tells what circuits add)
         rtol = next((r for r in self.rtols if self._circuits_add(steps, r) <= SMALL * self.error), self.tight)
         for contacts, r in (*((c, rtol) for c in self.contacts), (TIGHT_CONTACTS, rtol), (TIGHT_CONTACTS, self.tight)):
-            tried = self._try(self.settings(steps, contacts, r))
-            if self._holds(tried) or tried.seconds > limit:
-                return
+            settings = self.settings(steps, contacts, r)
+            if not self._hopeless(settings):
+                tried = self._try(settings)
+                if self._holds(tried) or tried.seconds > limit:
+                    return
+
+    def _found(self, settings: Settings) -> dict[str, Error]:
+        """The errors of settings, by observable."""
+        if settings not in self.errors:
+            self.errors[settings] = self.probe.errors(self._run(settings).found, self.reference)
+        return self.errors[settings]
+
+    def _hopeless(self, settings: Settings) -> bool:
+        """Are these looser than others that are far off? By finer steps alone an error falls at most with their square."""
+        for other, errors in self.errors.items():
+            if other.given and _looser(settings, other):
+                finer = min(1.0, self.probe.steps(other) / self.probe.steps(settings)) ** 2
+                # (what fails with tight contacts may run with loose ones)
+                far = {n: finer * (e.value - e.chance) for n, e in errors.items() if not math.isinf(e.value)}
+                if any(error > self.error * (1.0 if name == "overlap" else OFF) for name, error in far.items()):
+                    return True
+        return False
 
     def _circuits_add(self, steps: int, rtol: float) -> float:
         """What circuits at `rtol` change in the worst observable, contacts as they usually are."""
@@ -274,7 +293,7 @@ class Search:
         """By knob, what of each observable's error is gone when it alone is tight; for the step, what is left when all others are."""
         s = best.settings
         tight = self.settings(self.probe.steps(s), TIGHT_CONTACTS, self.tight)
-        parts = {"step": self.probe.errors(self._run(tight).found, self.reference)}
+        parts = {"step": self._found(tight)}
         if self.mechanics is not None:
             parts["contacts"] = self._difference(s, dataclasses.replace(tight, rtol=s.rtol))
         if self.circuit is not None:
@@ -284,6 +303,12 @@ class Search:
     def _difference(self, one: Settings, other: Settings) -> dict[str, Error]:
         found, against = self._run(one).found, self._run(other).found
         return self.probe.errors(found, {n: v for n, v in against.items() if n in self.reference}, apart=True)
+
+
+def _looser(one: Settings, other: Settings) -> bool:
+    """Is every knob but the step at least as loose as the other's, of the same knobs?"""
+    fewer = (one.passes or 0) <= (other.passes or 0)
+    return fewer and all((getattr(one, n) or 0.0) >= (getattr(other, n) or 0.0) for n in ("penalty", "tolerance", "rtol"))
 
 
 def _told(tuned: Tuned) -> list[str]:
