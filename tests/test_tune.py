@@ -105,8 +105,12 @@ def test_what_does_not_hold_in_other_colonies_is_tightened():
 
 
 def test_only_what_is_named_counts():
-    tuned = tf.tune(dividing(), 0.05, cells=8, colonies=4, of=["volume"])
+    told: list[str] = []
+    tuned = tf.tune(dividing(), 0.05, cells=8, colonies=4, of=["volume"], watch=told.append)
     assert set(tuned.chosen.errors) == {"volume"} == set(tuned.own.errors)
+    settings = [words for words in told if words.startswith("setting ")]
+    assert len(settings) <= tuned.runs and settings[1].startswith("setting 2: dt ")
+    assert told[0].startswith("growing 4 colonies to 12 cells") and any(words.startswith("confirming dt ") for words in told)
 
 
 def test_molecules_are_probed_by_their_mean():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -71,7 +73,7 @@ class Explain:
 
 @dataclass
 class Tune:
-    """Find the cheapest settings that hold an error: the scene is run for a moment, by many settings, and compared with a far tighter run."""
+    """Find the cheapest settings that hold an error: a window of the scene is run by many settings, and compared with a far tighter run. Takes some minutes."""
 
     scene: Annotated[str, tyro.conf.Positional]
     """Scene name, Python file or saved design."""
@@ -82,7 +84,7 @@ class Tune:
     of: list[str] = field(default_factory=list)
     """What must be right: cells, volume, radius, overlap, species by name, "signal NAME"; by default all of them."""
     cells: int = 100
-    """Cells in each colony where the probe begins."""
+    """Cells in each colony of what you will run; it is looked at there, and with half as many again."""
     colonies: int = 24
     """Colonies of the probe, if the scene's parameters leave it open; where chance would hide the error, twice or four times as many."""
     seed: int = 0
@@ -96,10 +98,22 @@ class Tune:
         if self.out is not None:
             Settings.check_new(self.out)
         scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
-        tuned = tune(scene, parse_error(self.error), cells=self.cells, colonies=self.colonies, of=self.of or None, seed=self.seed, device=self.device)
+        with _doing() as watch:
+            tuned = tune(
+                scene, parse_error(self.error), cells=self.cells, colonies=self.colonies, of=self.of or None, seed=self.seed, device=self.device, watch=watch
+            )
         print(tuned)
         if self.out is not None:
             print(f"settings  {tuned.settings.save(self.out)}")
+
+
+@contextmanager
+def _doing() -> Iterator[Callable[[str], None]]:
+    """What to tell in words what is being done, which is shown on a terminal, with the time."""
+    from tqdm import tqdm  # part of the `app` extra, as is tyro
+
+    with tqdm(bar_format="[{elapsed}] {desc}", disable=None, leave=False) as line:
+        yield line.set_description_str
 
 
 def parse_error(text: str) -> float:

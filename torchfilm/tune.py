@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -93,22 +93,23 @@ class Tuned:
 
 def tune(
     scene: Scene, error: float = 0.01, *, cells: int = 100, colonies: int = 24, of: Sequence[str] | None = None, seed: int = 0,
-    device: str | torch.device = "cpu",
+    device: str | torch.device = "cpu", watch: Callable[[str], None] | None = None,
 ) -> Tuned:  # fmt: skip
     """The cheapest settings with which a scene's observables are within `error` (relative, 0.01 for 1 %) of what far tighter settings give; some minutes.
 
     cells: in each of `colonies` colonies (or as many as the scene's parameters are for) what will be run: settings hold in a probe that begins there and in one
     that begins with half as many again; a scene that stays smaller is taken as it is where it grows no more. Where chance would hide the error, twice or
     four times as many colonies are grown.
-    of: names of the observables that matter, by default all: "cells", "volume", "radius", "overlap", species, "signal NAME". Circuits
-    that run molecule by molecule are probed by their smooth mean, since noise is no error. Raises InputError where nothing holds the error, or
-    where the probe cannot tell it; SimulationError where the scene fails on the way to where the probe begins.
+    of: names of the observables that matter, by default all: "cells", "volume", "radius", "overlap", species, "signal NAME". Circuits that run molecule by
+    molecule are probed by their smooth mean, since noise is no error. watch: is told in words what is being done. Raises InputError where nothing holds the
+    error, or where the probe cannot tell it; SimulationError where the scene fails on the way to where the probe begins.
     """
     checks.number("error", error, above=0.0, most=0.5)
     for name, given, least, why in (("cells", cells, 1, ""), ("colonies", colonies, 2, "By how they differ it tells what of an error may be chance.")):
         if isinstance(given, bool) or not isinstance(given, int) or given < least:
             raise checks.refuse(name, given, f"a whole number from {least}", why)
-    many = math.ceil(LARGER * cells)
+    many, watch = math.ceil(LARGER * cells), watch or (lambda words: None)
+    watch(f"growing {colonies} colonies to {many} cells")
     probe = begin(scene, many, colonies, of, seed, device)
     if of is not None:
         known = list(dict.fromkeys([*observables(probe.start), *species(probe.start), *(SIGNAL + n for n in probe.start.signals)]))
@@ -118,8 +119,10 @@ def tune(
     for more in (2, 4) if scene.fixed_colonies == 1 else ():
         if _chance(probe) <= UNSURE * error:
             break
+        watch(f"growing {more * colonies} colonies to {many} cells")
         probe = begin(scene, many, more * colonies, of, seed, device)
-    return Search(probe, begin(scene, cells, colonies, of, seed + 1, device), error).run()
+    watch(f"growing {colonies} others to {cells} cells")
+    return Search(probe, begin(scene, cells, colonies, of, seed + 1, device), error, watch).run()
 
 
 @torch.no_grad()
@@ -132,8 +135,8 @@ def _chance(probe: Probe) -> float:
 class Search:
     """Settings tried from coarse to fine."""
 
-    def __init__(self, probe: Probe, other: Probe, error: float):
-        self.probe, self.other, self.error = probe, other, error
+    def __init__(self, probe: Probe, other: Probe, error: float, watch: Callable[[str], None] = lambda words: None):
+        self.probe, self.other, self.error, self.watch = probe, other, error, watch
         self.mechanics = next((e for e in probe.scene.listed if isinstance(e, Mechanics)), None)
         self.circuit = next((e for e in probe.given.listed if isinstance(e, Circuit) and e.method == STIFF), None)
         self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
@@ -178,6 +181,7 @@ class Search:
         )  # fmt: skip
 
     def _seen_finely(self, probe: Probe, steps: int) -> Seen:
+        self.watch(f"a reference in {steps} steps")
         return probe.observed(self.settings(steps, TIGHT_CONTACTS, self.tight)).found
 
     def _confirmed(self) -> tuple[Try, dict[str, Error]]:
@@ -190,6 +194,7 @@ class Search:
             raise self._untold(missing)
         while True:
             best = self._cheapest()
+            self.watch(f"confirming {_words(best.settings)}")
             errors = self.other.errors(self.other.observed(best.settings).found, right)
             if max((e.value for e in errors.values()), default=0.0) <= self.error:
                 return best, errors
@@ -215,6 +220,7 @@ class Search:
 
     def _run(self, settings: Settings) -> Window:
         if settings not in self.runs:
+            self.watch(f"setting {len(self.runs) + 1}: {_words(settings)}")
             self.runs[settings] = self.probe.observed(settings)
         return self.runs[settings]
 
