@@ -26,7 +26,7 @@ import torch
 import torchfilm as tf
 from torchfilm.cli_ask import parse_error
 from torchfilm.probe import Error, Probe, Seen, begin
-from torchfilm.tune import FINEST, TIGHT_CONTACTS, Search
+from torchfilm.tune import TIGHT_CONTACTS, Search
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "benchmarks"))
@@ -59,10 +59,10 @@ class Run:
     reference: Seen
 
     @staticmethod
-    def of(scene: tf.Scene, cells: int, colonies: int, seed: int) -> Run:
+    def of(scene: tf.Scene, cells: int, colonies: int, seed: int, finest: int) -> Run:
         probe = begin(scene, cells, colonies, seed=seed)
         search = Search(probe, probe, 0.01)
-        return Run(probe, search, probe.observed(search.settings(FINEST, TIGHT_CONTACTS, search.tight)).found)
+        return Run(probe, search, probe.observed(search.settings(finest, TIGHT_CONTACTS, search.tight)).found)
 
     def worst(self, settings: tf.Settings, names: Sequence[str]) -> tuple[Error, str, float]:
         """The greatest error, of which observable, and the seconds that the window took."""
@@ -89,7 +89,7 @@ def check(name: str, error: float) -> dict[str, str]:
     scene = tf.scenes.build(name, ROOMIER.get(name))
     tuned = tf.tune(scene, error)
     names = tuple(tuned.chosen.errors)
-    few, many = Run.of(scene, 100, 24, seed=5), Run.of(scene, 150, 48, seed=6)
+    few, many = Run.of(scene, 100, 24, 5, tuned.finest), Run.of(scene, 150, 48, 6, tuned.finest)
     worst, of, _ = max((run.worst(tuned.settings, names) for run in (few, many)), key=lambda found: found[0].value)
     found = {s: few.worst(s, names) for s in sweep(few)}
     holding = sorted((s for s, (e, _, _) in found.items() if e.value <= error), key=lambda s: found[s][2])

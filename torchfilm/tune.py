@@ -25,7 +25,7 @@ from torchfilm.tools import checks
 
 # Into how many steps the window is divided: all even, so that its middle is a step too.
 STEPS = (6, 8, 12, 16, 18, 20, 24, 30, 40, 48, 60, 76, 96, 120, 150)
-FINEST = 240  # the reference
+FINEST = 240  # the reference, or twice as many
 # Knobs from loose to tight: (penalty, passes beyond the least, tolerance) of contacts, and rtol of circuits.
 # A larger penalty saves no time, and its overlap grows with the colony beyond what a probe of a small one shows. In the order of what they cost.
 CONTACTS = (
@@ -69,7 +69,7 @@ class Tuned:
     scene: with the settings. error: what was asked. chosen: the try that was taken; own: the scene's own settings, for comparison. parts: by knob, how much of
     each observable's error comes from it. confirmed: errors in the other colonies. unsure: by observable, how far two references differ; left_out: observables
     that cannot be told so finely, with why. tries: the scene's own and all that might have been chosen, in order;
-    runs: how many settings the first probe was run by. window: hours, cells: at its start.
+    runs: how many settings the first probe was run by. window: hours, cells: at its start, finest: steps of the reference.
     Errors are relative, each with its standard error (`Error.value`, `.noise`).
     """
 
@@ -86,6 +86,7 @@ class Tuned:
     runs: int
     window: float
     cells: int
+    finest: int
 
     def __str__(self) -> str:
         return "\n".join(_told(self))
@@ -142,6 +143,7 @@ class Search:
         self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
         self.tight = TIGHT * error
         self.rtols = tuple(r for r in CIRCUITS if r > self.tight) if self.circuit is not None else (self.tight,)
+        self.finest = FINEST
         self.runs: dict[Settings, Window] = {}
         self.errors: dict[Settings, dict[str, Error]] = {}
         self.tries: dict[Settings, Try] = {}
@@ -159,26 +161,35 @@ class Search:
 
     @torch.no_grad()
     def run(self) -> Tuned:
-        probe = self.probe
-        self.reference, coarser = (self._seen_finely(probe, n) for n in (FINEST, FINEST // 2))
-        self.unsure = probe.errors(coarser, self.reference, apart=True)
+        left_out = self._refer()
+        own = self._try(Settings())
+        best, confirmed = self._confirmed()
+        return Tuned(
+            best.settings.apply(self.probe.given), best.settings, self.error, best, own, confirmed, self._parts(best), self.unsure, left_out,
+            list(self.tries.values()), len(self.runs), self.probe.dt * WINDOW, self.probe.start.cells, self.finest,
+        )  # fmt: skip
+
+    def _refer(self) -> dict[str, str]:
+        """Run the reference, twice as finely where only that can tell what must be told, and say what cannot be told."""
+        probe, half = self.probe, self.error / 2
         # the coarser reference is off by twice as much as the finer is: their difference is the finer's own error
+        coarser, self.reference = (self._seen_finely(probe, n) for n in (FINEST // 2, FINEST))
+        self.unsure = probe.errors(coarser, self.reference, apart=True)
+        if any(half < self.unsure[n].value <= self.error for n in probe.needed if n in self.unsure):
+            self.finest *= 2
+            coarser, self.reference = self.reference, self._seen_finely(probe, self.finest)
+            self.unsure = probe.errors(coarser, self.reference, apart=True)
         said = lambda e: "a reference failed" if math.isinf(e.value) else f"two references differ by {e}"  # noqa: E731
-        left_out = {n: said(e) for n, e in self.unsure.items() if max(e.value, e.chance) > self.error / 2}
+        left_out = {n: said(e) for n, e in self.unsure.items() if max(e.value, e.chance) > half}
         self.reference = {n: v for n, v in self.reference.items() if n not in left_out}
         missing = [n for n in left_out if n in probe.needed]
         if missing or not self.reference:
             raise self._untold({n: left_out[n] for n in missing or left_out})
         for name, e in probe.errors(self._run(Settings()).found, self.reference).items():
-            if e.chance > self.error / 2 and name not in probe.needed:
+            if e.chance > half and name not in probe.needed:
                 left_out[name] = f"much of {e} is chance"
                 del self.reference[name]
-        own = self._try(Settings())
-        best, confirmed = self._confirmed()
-        return Tuned(
-            best.settings.apply(self.probe.given), best.settings, self.error, best, own, confirmed, self._parts(best), self.unsure, left_out,
-            list(self.tries.values()), len(self.runs), probe.dt * WINDOW, probe.start.cells,
-        )  # fmt: skip
+        return left_out
 
     def _seen_finely(self, probe: Probe, steps: int) -> Seen:
         self.watch(f"a reference in {steps} steps")
@@ -187,7 +198,7 @@ class Search:
     def _confirmed(self) -> tuple[Try, dict[str, Error]]:
         """The cheapest that holds the error in the other colonies too, and its errors there, in what can be seen there. (What of them may be chance has been
         allowed for in the first.)"""
-        seen = self._seen_finely(self.other, FINEST)
+        seen = self._seen_finely(self.other, self.finest)
         right = {n: seen[n] for n in self.reference if n in seen and not any(bool(v.isnan().any()) for v in seen[n])}
         missing = {n: "a reference failed in the other colonies" for n in self.probe.needed if n in self.reference and n not in right}
         if missing:
