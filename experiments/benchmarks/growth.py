@@ -4,6 +4,7 @@
     python experiments/benchmarks/growth.py --quick             # small sizes
     python experiments/benchmarks/growth.py --case 2d-32000 --device cuda
     python experiments/benchmarks/growth.py --case 2d-32x1000 --processes 2     # its colonies in batches, one on each core
+    python experiments/benchmarks/growth.py --case 2d-32x1000 --tolerance 0.2   # the contact solve of the draft preset
 
 Growth 1/h by the length law, Δt 0.025 h, division at 3.5–4.0 µm, μ = 1, γ = 10, α = 0.1/γ; everything else is the default.
 Each case is appended to a JSON file with its machine, versions and commit. `floor_seconds` is the least that the solver could
@@ -81,10 +82,10 @@ def copy_speed(device: str) -> float:
     return source.nbytes / best
 
 
-def grow(name: str, device: str, seed: int, part: tuple[int, int] = (0, 1)) -> dict:
+def grow(name: str, device: str, seed: int, tolerance: float | None, part: tuple[int, int] = (0, 1)) -> dict:
     """The case, or of its colonies the k-th of n parts, to the end: what it took and what came of it."""
     dim, colonies, cells = CASES[name]
-    made = scene(dim)
+    made = tf.Settings(tolerance=tolerance).apply(scene(dim))
     k, parts = part
     start = made.seed(colonies, seed=seed, device=device).select(range(k * colonies // parts, (k + 1) * colonies // parts))
     timings, marks, iterations, passes, cell_steps = tf.Timings(), [], 0, 0, 0
@@ -113,23 +114,23 @@ def one_thread() -> None:
     tf.keep_memory()
 
 
-def side_by_side(name: str, device: str, seed: int, processes: int) -> list[dict]:
+def side_by_side(name: str, device: str, seed: int, tolerance: float | None, processes: int) -> list[dict]:
     """The case in as many processes of one thread, each with its own colonies; the first of them says how long all took."""
     with ProcessPoolExecutor(processes, get_context("spawn"), one_thread) as pool:
         list(pool.map(time.sleep, [1.0] * processes))  # till all have started
         begun = time.perf_counter()
-        parts = list(pool.map(partial(grow, name, device, seed), [(k, processes) for k in range(processes)]))
+        parts = list(pool.map(partial(grow, name, device, seed, tolerance), [(k, processes) for k in range(processes)]))
     return [parts[0] | {"seconds": time.perf_counter() - begun}, *parts[1:]]
 
 
-def run(name: str, device: str, seed: int, processes: int) -> dict:
+def run(name: str, device: str, seed: int, tolerance: float | None, processes: int) -> dict:
     """What all parts come to together, and how it went in the one with most to do."""
-    parts = [grow(name, device, seed)] if processes == 1 else side_by_side(name, device, seed, processes)
+    parts = [grow(name, device, seed, tolerance)] if processes == 1 else side_by_side(name, device, seed, tolerance, processes)
     all_of = lambda what: sum(p[what] for p in parts)  # noqa: E731
     seconds = parts[0]["seconds"]
     together = {
-        "case": name, "device": device, "processes": processes, "cells": all_of("cells"), "colonies": all_of("colonies"), "seconds": round(seconds, 2),
-        "cell_steps": all_of("cell_steps"), "us_per_cell_step": round(1e6 * seconds / all_of("cell_steps"), 2),
+        "case": name, "device": device, "processes": processes, "tolerance": tolerance, "cells": all_of("cells"), "colonies": all_of("colonies"),
+        "seconds": round(seconds, 2), "cell_steps": all_of("cell_steps"), "us_per_cell_step": round(1e6 * seconds / all_of("cell_steps"), 2),
         "overlap_mean_um": round(all_of("overlap_sum_um") / max(1, all_of("contacts")), 5), "overlap_worst_um": max(p["overlap_worst_um"] for p in parts),
         "floor_seconds": round(all_of("bytes") / copy_speed(device), 3),
     }  # fmt: skip
@@ -143,13 +144,14 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small sizes only")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--tolerance", type=float, help="of the contact solve, by default what Mechanics takes, 0.05")
     parser.add_argument("--processes", type=int, default=1, help="to share a case's colonies among, each on one thread")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("growth.json"))
     chosen = parser.parse_args()
     tf.keep_memory()
     records = json.loads(chosen.out.read_text()) if chosen.out.exists() else []
     for name in chosen.case or (QUICK if chosen.quick else CASES):
-        result = run(name, chosen.device, chosen.seed, min(chosen.processes, CASES[name][1]))
+        result = run(name, chosen.device, chosen.seed, chosen.tolerance, min(chosen.processes, CASES[name][1]))
         print(
             f"{name:<12} {result['seconds']:>7.1f} s  {result['cells']:>6} cells  {result['steps']:>5} steps  {result['us_per_cell_step']:>6.2f} µs/cell/step  "
             f"overlap {result['overlap_mean_um']:.4f} / {result['overlap_worst_um']:.3f} µm  CG {result['cg_iterations'] / result['steps']:.1f} a step  "
