@@ -53,6 +53,14 @@ def test_run_with_settings(command):
         assert float(results.frame()["length"][0]) == pytest.approx(2 * np.exp(0.25), rel=1e-9)
 
 
+@pytest.mark.parametrize("given", ["--set width=16 --set length=80", "--set=width=16 --every 2 --set=length=80", "--set width=16 length=80"])
+def test_options_given_again_add_to_what_was_given(command, given):
+    """Found in use: of `--set a --set b` the parser kept the last alone, and said nothing."""
+    command("run", "channel", *given.split(), "--until", 0, "--out", "a.h5", "--no-picture")
+    with tf.Results("a.h5") as results:
+        assert results.recipe[1]["width"] == 16 and results.recipe[1]["length"] == 80
+
+
 def test_a_setting_for_each_colony(command):
     command("run", "microcolony", "--set", "rate=[0.5, 1.0]", "--colonies", 2, "--until", 0.5, "--out", "a.h5", "--no-picture")
     with tf.Results("a.h5") as results:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import sys
@@ -9,7 +10,7 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 
@@ -338,6 +339,28 @@ def table(scene: Scene, state: State, timings: Timings, seconds: float) -> str:
     return "\n".join(lines)
 
 
+def _gathered(args: list[str]) -> list[str]:
+    """Options that take several values and are given several times, in one: of `--set a=1 --set b=2` the parser would keep the last alone."""
+    command = COMMANDS.get(args[0]) if args else None
+    several = {f"--{f.name}" for f in dataclasses.fields(command) if str(f.type).startswith("list")} if command else set()
+    gathered: dict[str, list[str]] = {}
+    into: list[str] = []
+    out = [into]  # each option with what follows it
+    for arg in args:
+        name, equals, value = arg.partition("=")
+        if name in several:
+            if name not in gathered:
+                out.append(gathered.setdefault(name, [name]))
+            into = gathered[name]
+            into += [value] if equals else []
+            continue
+        if arg.startswith("--"):
+            into = []
+            out.append(into)
+        into.append(arg)
+    return [word for words in out for word in words]
+
+
 def main() -> None:
     """Entry point of the `torchfilm` command."""
     try:
@@ -350,11 +373,12 @@ def main() -> None:
         raise SystemExit(1) from None
 
 
+COMMANDS: dict[str, type[Any]] = {"run": Run, "resume": Resume, "show": Show, "info": Info, "explain": Explain, "tune": Tune}
+
+
 def _command() -> None:
     command = tyro.extras.subcommand_cli_from_dict(
-        {"run": Run, "resume": Resume, "show": Show, "info": Info, "explain": Explain, "tune": Tune},
-        prog="torchfilm",
-        description="Synthetic microbial biofilms, many colonies at once.",
+        {**COMMANDS}, prog="torchfilm", description="Synthetic microbial biofilms, many colonies at once.", args=_gathered(sys.argv[1:])
     )
     keep_memory()
     try:
