@@ -267,3 +267,23 @@ def test_what_is_looser_than_what_is_far_off_is_not_run():
         assert not any(search._hopeless(of(20, c)) for c in ((0.03, 0, 0.05), (0.1, 1, 0.05), (0.1, 0, 0.02)))
     search.errors = {known: {"overlap": Error(0.0145, 0.01, 4)}, tf.Settings(): {"overlap": Error(9.0, 0.0)}}
     assert not search._hopeless(known) and not search.runs
+
+
+def test_what_chance_leaves_open_is_looked_at_among_more_colonies():
+    """A probe of which every error may be chance chooses nothing, unless other colonies tell more finely; what these are off by is not chosen."""
+
+    class Unsure(Probe):
+        def errors(self, found, against, apart=False):
+            return {n: e if apart else Error(e.value, 0.05) for n, e in super().errors(found, against, apart).items()}
+
+    class Strict(Probe):
+        def errors(self, found, against, apart=False):
+            return {n: e if apart else Error(0.06, 0.0) for n, e in super().errors(found, against, apart).items()}
+
+    probe, other, third = begin(dividing(), 12, 4, ["m"]), begin(dividing(), 8, 4, ["m"], seed=1), begin(dividing(), 12, 12, ["m"], seed=2)
+    unsure = Unsure(**vars(probe))
+    for more in (None, lambda: Strict(**vars(third))):
+        with pytest.raises(InputError, match="reached by some settings"):
+            Search(unsure, other, 0.05, more=more).run()
+    tuned = Search(unsure, other, 0.05, more=lambda: third).run()
+    assert tuned.chosen.errors["m"].most <= 0.05 and tuned.chosen.errors["m"].colonies == 12 and tuned.confirmed["m"].value <= 0.05

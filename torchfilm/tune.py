@@ -40,6 +40,8 @@ TIGHT = 1e-3  # circuits, of the error asked for: a ten-thousandth of what they 
 LARGER = 1.5
 # Of many settings the cheapest that holds the error is also the luckiest, so that some are refuted; where so many are, nothing will be confirmed.
 MOST_REFUTED = 20
+# What holds the error but for chance is looked at among MORE times as many colonies, if it takes less than a WORTH-th of the time; the cheapest so many.
+MORE, WORTH, MOST_UNSURE = 3, 1.2, 8
 # What of an error may be chance is to be this part of what was asked, at most, or more colonies are grown.
 UNSURE = 1 / 3
 # A long step lets a colony grow too much and a loose solve too little. So looser settings are not given up where tighter ones are over what was asked, but
@@ -123,7 +125,8 @@ def tune(
         watch(f"growing {more * colonies} colonies to {many} cells")
         probe = begin(scene, many, more * colonies, of, seed, device)
     watch(f"growing {colonies} others to {cells} cells")
-    return Search(probe, begin(scene, cells, colonies, of, seed + 1, device), error, watch).run()
+    other = begin(scene, cells, colonies, of, seed + 1, device)
+    return Search(probe, other, error, watch, lambda: begin(scene, many, MORE * probe.start.colonies, of, seed + 2, device)).run()
 
 
 @torch.no_grad()
@@ -136,8 +139,10 @@ def _chance(probe: Probe) -> float:
 class Search:
     """Settings tried from coarse to fine."""
 
-    def __init__(self, probe: Probe, other: Probe, error: float, watch: Callable[[str], None] = lambda words: None):
-        self.probe, self.other, self.error, self.watch = probe, other, error, watch
+    def __init__(
+        self, probe: Probe, other: Probe, error: float, watch: Callable[[str], None] = lambda words: None, more: Callable[[], Probe] | None = None,
+    ):  # fmt: skip
+        self.probe, self.other, self.error, self.watch, self.more = probe, other, error, watch, more
         self.mechanics = next((e for e in probe.scene.listed if isinstance(e, Mechanics)), None)
         self.circuit = next((e for e in probe.given.listed if isinstance(e, Circuit) and e.method == STIFF), None)
         self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
@@ -198,20 +203,48 @@ class Search:
     def _confirmed(self) -> tuple[Try, dict[str, Error]]:
         """The cheapest that holds the error in the other colonies too, and its errors there, in what can be seen there. (What of them may be chance has been
         allowed for in the first.)"""
-        seen = self._seen_finely(self.other, self.finest)
+        right = self._right(self.other)
+        while len(self.refuted) < MOST_REFUTED and (best := self._cheapest()) is not None:
+            errors = self._elsewhere(self.other, best, right)
+            if _greatest(errors) <= self.error:
+                return self._surer(right, best.seconds / WORTH) or (best, errors)
+            self.refuted[best.settings] = errors
+        found = self._surer(right, math.inf)
+        if found is None:
+            raise self._out_of_reach()
+        return found
+
+    def _surer(self, right: Seen, limit: float) -> tuple[Try, dict[str, Error]] | None:
+        """Of the tries that hold the error but for chance and take less than `limit` seconds, the cheapest that holds it to 95 % among more colonies, and in
+        the others as it is."""
+        unsure = [t for t in self.tries.values() if t.settings.given and t.settings not in self.refuted and _greatest(t.errors) <= self.error < t.worst]
+        unsure = sorted((t for t in unsure if t.seconds < limit), key=lambda t: t.seconds)[:MOST_UNSURE]
+        if not unsure or self.more is None:
+            return None
+        self.watch("growing more colonies, to tell more finely")
+        probe = self.more()
+        finely = self._right(probe)
+        for tried in unsure:
+            errors = self._elsewhere(probe, tried, finely)
+            if max(e.most for e in errors.values()) <= self.error:
+                others = self._elsewhere(self.other, tried, right)
+                if _greatest(others) <= self.error:
+                    return dataclasses.replace(tried, errors=errors), others
+        return None
+
+    def _right(self, probe: Probe) -> Seen:
+        """The reference in other colonies, of what can be told in the first."""
+        seen = self._seen_finely(probe, self.finest)
         right = {n: seen[n] for n in self.reference if n in seen and not any(bool(v.isnan().any()) for v in seen[n])}
         missing = {n: "a reference failed in the other colonies" for n in self.probe.needed if n in self.reference and n not in right}
         if missing:
             raise self._untold(missing)
-        while True:
-            best = self._cheapest()
-            self.watch(f"confirming {_words(best.settings)}")
-            errors = self.other.errors(self.other.observed(best.settings).found, right)
-            if max((e.value for e in errors.values()), default=0.0) <= self.error:
-                return best, errors
-            self.refuted[best.settings] = errors
-            if len(self.refuted) == MOST_REFUTED:
-                raise self._out_of_reach()
+        return right
+
+    def _elsewhere(self, probe: Probe, tried: Try, right: Seen) -> dict[str, Error]:
+        """What the same settings come to in other colonies."""
+        self.watch(f"confirming {_words(tried.settings)}")
+        return probe.errors(probe.observed(tried.settings).found, right)
 
     def _untold(self, why: dict[str, str]) -> checks.InputError:
         worst = ", ".join(f"{name}: {words}" for name, words in why.items())
@@ -241,7 +274,7 @@ class Search:
             self.tries[settings] = Try(settings, self._found(settings), run.seconds, run.spent)
         return self.tries[settings]
 
-    def _cheapest(self) -> Try:
+    def _cheapest(self) -> Try | None:
         """Of the tries that hold the error and are not refuted, the one that took the least time, once every step that could be cheaper has been looked at:
         from the scene's own to finer ones first, until one holds the error and tells what is too dear."""
         best: Try | None = None
@@ -249,8 +282,6 @@ class Search:
             if best is None or steps * self._least() <= best.seconds:
                 self._look_at(steps, math.inf if best is None else best.seconds)
                 best = min((t for t in self.tries.values() if self._holds(t)), key=lambda t: t.seconds, default=None)
-        if best is None:
-            raise self._out_of_reach()
         return best
 
     def _holds(self, tried: Try) -> bool:
@@ -320,6 +351,11 @@ class Search:
     def _difference(self, one: Settings, other: Settings) -> dict[str, Error]:
         found, against = self._run(one).found, self._run(other).found
         return self.probe.errors(found, {n: v for n, v in against.items() if n in self.reference}, apart=True)
+
+
+def _greatest(errors: dict[str, Error]) -> float:
+    """As measured."""
+    return max((e.value for e in errors.values()), default=0.0)
 
 
 def _looser(one: Settings, other: Settings) -> bool:
