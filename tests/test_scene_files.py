@@ -147,3 +147,28 @@ def test_settings_are_literals_or_text(text, found):
 def test_settings_without_a_name_are_refused(text):
     with pytest.raises(tf.InputError, match=r"--set = .*NAME=VALUE"):
         parse_setting(text)
+
+
+@pytest.mark.parametrize("future", ["", "from __future__ import annotations\n"])
+def test_a_scene_file_may_define_dataclasses(tmp_path, future):
+    """Found in use: the file took this module's way with annotations, and its own module was not to be found."""
+    path = tmp_path / "own.py"
+    path.write_text(f"{future}from dataclasses import dataclass\nimport torchfilm as tf\n\n@dataclass\nclass P:\n    rate: float = 0.7\n\n"
+                    "scene = tf.Scene(tf.Growth(rate=P().rate))\n")  # fmt: skip
+    assert load_scene(str(path), {}).listed[0].rate == 0.7
+
+
+def test_an_error_in_a_scene_file_says_where(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text("import torchfilm as tf\n\nscene = tf.Scene(tf.Growth(rates=1.0))\n")
+    with pytest.raises(tf.InputError, match=r"own\.py cannot be run: TypeError: .*rates.* \(line 3\)"):
+        load_scene(str(path), {})
+
+
+def test_a_scene_file_may_be_called_as_a_module_is(tmp_path):
+    path = tmp_path / "math.py"
+    path.write_text("import torchfilm as tf\nfrom math import pi\n\nscene = tf.Scene(tf.Growth(rate=1.0))\n")
+    assert load_scene(str(path), {}).name == "math"
+    import math
+
+    assert math.pi > 3 and not hasattr(math, "scene")

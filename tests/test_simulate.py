@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import pytest
@@ -417,3 +418,16 @@ def test_colonies_of_one_batch_differ():
     scene = scene_of()
     state = list(tf.simulate(scene, scene.seed(2), until=2.0))[-1]
     assert not torch.equal(state.length[state.colony == 0][:2], state.length[state.colony == 1][:2])
+
+
+def test_a_run_that_may_never_end_is_told():
+    """Found in use: a design whose cells stop growing below the number at which the run ends; the other colony would grow without end."""
+    scene = tf.Scene(tf.Growth(rate=torch.tensor([1e-4, 1.0])), dt=0.001)
+    run = tf.simulate(scene, scene.seed(2), cells=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(1050):
+            next(run)
+    with pytest.warns(RuntimeWarning, match=r"colony 0: no larger than 1000 steps ago, with fewer than the 2 cells"):
+        for _ in range(100):
+            next(run)

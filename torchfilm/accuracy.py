@@ -74,7 +74,7 @@ class Settings:
     def check_new(path: Path) -> None:
         """Refuse to replace a file."""
         if path.exists() or not path.parent.is_dir():
-            raise checks.refuse("settings", str(path), "a path in a folder that exists, where there is no file yet", "Choose another.")
+            raise checks.refuse("the settings' path", str(path), "in a folder that exists, where there is no file yet", "Choose another.")
 
     @staticmethod
     def load(path: str | Path) -> Settings:

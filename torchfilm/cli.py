@@ -386,7 +386,8 @@ def _command() -> None:
     except (InputError, SimulationError) as error:
         raise SystemExit(f"torchfilm: {error}") from None
     except KeyboardInterrupt:
-        raise SystemExit("stopped; what was recorded is safe, `torchfilm resume` goes on from it.") from None
+        safe = "; what was recorded is safe, `torchfilm resume` goes on from it" if isinstance(command, (Run, Resume)) else ""
+        raise SystemExit(f"stopped{safe}.") from None
 
 
 if __name__ == "__main__":

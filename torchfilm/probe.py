@@ -40,7 +40,7 @@ from torchfilm.tools.timing import Timings
 
 # The window, in steps of the scene. Of half as many, most of the second half's error in volume is still the start's settling (measured).
 WINDOW = 24
-# A scene that never has as many cells as asked for is taken as it is where so many steps have not made it larger by a hundredth, or after MOST_STEPS.
+# A scene that never has as many cells as asked for is taken as it is where so many steps have not made a colony larger by a hundredth, or after MOST_STEPS.
 STILL, MOST_STEPS = 10 * WINDOW, 2000
 SIGNAL = "signal "
 SURE = 0.95  # of 20 errors 19 are at most what is told
@@ -179,12 +179,13 @@ def begin(scene: Scene, cells: int, colonies: int, of: Sequence[str] | None = No
     made = scene.retuned(smooth, scene.dt, scene.accuracy)
     fixed = scene.fixed_colonies
     founded = state = made.seed(fixed if fixed > 1 else colonies, seed=seed, device=device)
-    largest, since = 0.0, 0
+    largest, since = torch.zeros_like(founded.groups.sum(founded.volume)), torch.zeros_like(founded.counts)
     for state in simulate(made, founded, cells=cells, until=MOST_STEPS * scene.dt):
-        size, since = float(state.volume.sum()), since + 1
-        if size > 1.01 * largest:
-            largest, since = size, 0
-        if since >= STILL:
+        size = state.groups.sum(state.volume)
+        since = torch.where(size > 1.01 * largest, 0, since + 1)
+        largest = torch.where(since == 0, size, largest)
+        # one colony that stays small is enough: the others would grow without end
+        if bool(((since >= STILL) & (state.counts < cells) & (state.counts > 0)).any()):
             break
     return Probe(scene, made, state, scene.dt, None if of is None else tuple(of))
 

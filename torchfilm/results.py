@@ -32,6 +32,7 @@ from torchfilm.tools.checks import InputError
 
 FORMAT, VERSION = "torchfilm results", 2
 FATES = ("divided", "removed", "left", "failed")
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
 CHUNK_ROWS, CHUNK_VOXELS = 8192, 32768
 LINEAGE = {"births": ("colony_id", "uid", "parent", "step"), "ends": ("colony_id", "uid", "step", "fate")}
 # step last: it commits the frame
@@ -66,10 +67,12 @@ def _open_to_read(path: Path) -> h5py.File:
         raise checks.refuse("results", str(path), "a results file", "No such file.")
     error: Exception | None = None
     with open(path, "rb") as raw:
-        head = raw.read(36)
+        head = raw.read(48)
     # a single-writer open of a file that was cut would wait for the rest for ever: its superblock says how long it should be
-    if head[:8] == b"\x89HDF\r\n\x1a\n" and head[8] >= 2 and int.from_bytes(head[28:36], "little") > path.stat().st_size:
-        raise InputError(f"{path} is truncated: it has {path.stat().st_size} of {int.from_bytes(head[28:36], 'little')} bytes. Use a whole copy of it.")
+    size = path.stat().st_size
+    if head.startswith(SIGNATURE[: len(head)]) and (len(head) < 48 or (head[8] >= 2 and int.from_bytes(head[28:36], "little") > size)):
+        of = f" of {int.from_bytes(head[28:36], 'little')}" if len(head) == 48 else ""
+        raise InputError(f"{path} is truncated: it has {size}{of} bytes. Use a whole copy of it.")
     for options in ({"swmr": True, "libver": "latest"}, {}):
         try:
             return h5py.File(path, "r", **options)

@@ -6,7 +6,9 @@ import ast
 import inspect
 import json
 import sys
+import traceback
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from torchfilm import scenes
@@ -32,12 +34,16 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
     if not path.is_file() or path.suffix != ".py":
         mend = "" if path.exists() else "No such file."
         raise checks.refuse("scene", what, "the name of a ready scene, or the path of a Python file or of a design that was saved", mend)
-    names: dict[str, Any] = {"__name__": path.stem, "__file__": str(path)}
+    names = vars(_module(path))
     sys.path.insert(0, str(path.parent.resolve()))
     try:
-        exec(compile(path.read_text(), str(path), "exec"), names)
-    except (SyntaxError, ImportError) as error:
-        raise InputError(f"{what} cannot be run: {type(error).__name__}: {error}") from error
+        exec(compile(path.read_text(), str(path), "exec", dont_inherit=True), names)
+    except InputError:
+        raise
+    except Exception as error:
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        at = f" (line {lines[-1]})" if lines else ""
+        raise InputError(f"{what} cannot be run: {type(error).__name__}: {error}{at}") from error
     if function not in names:
         raise InputError(f"{what} does not define `{function}`: write `{function} = torchfilm.Scene(…)`, or a function `{function}(…)` that returns one.")
     made = names[function]
@@ -55,6 +61,18 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
         made.name = path.stem
     made.settings = parameters
     return made
+
+
+def _module(path: Path) -> ModuleType:
+    """A new module for what a scene file defines, listed among the others: a dataclass looks up the types of its fields there."""
+    name, there = path.stem, sys.modules.get(path.stem)
+    if there is not None and not hasattr(there, "__scene_file__"):
+        name += "_scene"  # a file may be called as something else that is imported
+    module = ModuleType(name)
+    module.__file__ = str(path)
+    vars(module)["__scene_file__"] = True
+    sys.modules[name] = module
+    return module
 
 
 def design(what: str) -> dict[str, Any]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchfilm.recorder import Recorder
@@ -105,7 +108,36 @@ def _last_step(state: State, until: float, dt: float) -> int:
     return state.step + round(steps)
 
 
+# How often, in steps, a run that ends at a number of cells is asked whether its colonies still grow, and how long they may stand still.
+LOOK, STILL = 100, 1000
+
+
+class _Waiting:
+    """Warns, once, of colonies that do not come nearer to the number of cells at which a run ends: it might go on for ever."""
+
+    def __init__(self, cells: int):
+        self.cells, self.told = cells, False
+        self.sizes: deque[Tensor] = deque(maxlen=STILL // LOOK + 1)
+
+    @torch.no_grad()
+    def __call__(self, state: State) -> None:
+        if self.told or state.step % LOOK:
+            return
+        self.sizes.append(state.groups.sum(state.volume))
+        if len(self.sizes) < STILL // LOOK + 1:
+            return
+        still = (self.sizes[-1] <= 1.01 * self.sizes[0]) & (state.counts > 0) & (state.counts < self.cells)
+        self.told = bool(still.any())
+        if self.told:
+            names = ", ".join(map(str, state.colony_id[still].tolist()[:5]))
+            warnings.warn(
+                f"colony {names}: no larger than {STILL} steps ago, with fewer than the {self.cells} cells at which this run ends. It may go on for ever: "
+                "give a time to stop at as well (until=…, --until).", RuntimeWarning, stacklevel=3,
+            )  # fmt: skip
+
+
 def _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings):
+    waiting = _Waiting(cells) if math.isinf(last) else None
     try:
         for observe in (*([recorder] if recorder else []), *observers):
             observe(state)
@@ -117,6 +149,8 @@ def _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings
                     recorder(state)
             for observe in observers:
                 observe(state)
+            if waiting:
+                waiting(state)
             yield state
     finally:
         if recorder:

@@ -111,6 +111,8 @@ def tune(
     for name, given, least, why in (("cells", cells, 1, ""), ("colonies", colonies, 2, "By how they differ it tells what of an error may be chance.")):
         if isinstance(given, bool) or not isinstance(given, int) or given < least:
             raise checks.refuse(name, given, f"a whole number from {least}", why)
+    if isinstance(of, str):
+        raise checks.refuse("of", of, f"a list of names, such as {[of]}")
     many, watch = math.ceil(LARGER * cells), watch or (lambda words: None)
     watch(f"growing {colonies} colonies to {many} cells")
     probe = begin(scene, many, colonies, of, seed, device)
@@ -153,6 +155,8 @@ class Search:
         self.errors: dict[Settings, dict[str, Error]] = {}
         self.tries: dict[Settings, Try] = {}
         self.refuted: dict[Settings, dict[str, Error]] = {}  # what came of them in the other colonies
+        self.finely: tuple[Probe, Seen] | None = None  # more colonies, once they are asked for
+        self.unheld: set[Settings] = set()  # what did not hold there
 
     def settings(self, steps: int, contacts: tuple[float, int, float], rtol: float) -> Settings:
         """As knobs of the scene; those of effects that it does not list stay unset."""
@@ -209,6 +213,9 @@ class Search:
             if _greatest(errors) <= self.error:
                 return self._surer(right, best.seconds / WORTH) or (best, errors)
             self.refuted[best.settings] = errors
+            # where chance has misled once, more colonies tell more than finer steps do
+            if len(self.refuted) == 1 and (found := self._surer(right, math.inf)) is not None:
+                return found
         found = self._surer(right, math.inf)
         if found is None:
             raise self._out_of_reach()
@@ -217,14 +224,17 @@ class Search:
     def _surer(self, right: Seen, limit: float) -> tuple[Try, dict[str, Error]] | None:
         """Of the tries that hold the error but for chance and take less than `limit` seconds, the cheapest that holds it to 95 % among more colonies, and in
         the others as it is."""
-        unsure = [t for t in self.tries.values() if t.settings.given and t.settings not in self.refuted and _greatest(t.errors) <= self.error < t.worst]
-        unsure = sorted((t for t in unsure if t.seconds < limit), key=lambda t: t.seconds)[:MOST_UNSURE]
+        known = {Settings(), *self.refuted, *self.unheld}
+        unsure = [t for t in self.tries.values() if t.settings not in known and t.seconds < limit and _greatest(t.errors) <= self.error < t.worst]
         if not unsure or self.more is None:
             return None
-        self.watch("growing more colonies, to tell more finely")
-        probe = self.more()
-        finely = self._right(probe)
-        for tried in unsure:
+        if self.finely is None:
+            self.watch("growing more colonies, to tell more finely")
+            probe = self.more()
+            self.finely = probe, self._right(probe)
+        probe, finely = self.finely
+        for tried in sorted(unsure, key=lambda t: t.seconds)[:MOST_UNSURE]:
+            self.unheld.add(tried.settings)
             errors = self._elsewhere(probe, tried, finely)
             if max(e.most for e in errors.values()) <= self.error:
                 others = self._elsewhere(self.other, tried, right)
@@ -248,7 +258,7 @@ class Search:
 
     def _untold(self, why: dict[str, str]) -> checks.InputError:
         worst = ", ".join(f"{name}: {words}" for name, words in why.items())
-        return checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}. Ask for more, or probe more colonies or cells.")
+        return checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}. Ask for a larger error, or probe more colonies or cells.")
 
     def _out_of_reach(self) -> checks.InputError:
         own, *others = self.tries.values()
@@ -259,7 +269,7 @@ class Search:
         return checks.refuse(
             "error", self.error,
             f"reached by some settings, in both probes: the closest came to {error}, at most {_percent(error.most)}, in {name!r}, with {_words(closest)}",
-            "Ask for more, probe more colonies (the scene's own number, where its parameters have one value a colony), or name what matters (of=…).",
+            "Ask for a larger error, probe more colonies (the scene's own number, where its parameters have one value a colony), or name what matters (of=…).",
         )  # fmt: skip
 
     def _run(self, settings: Settings) -> Window:
@@ -378,7 +388,8 @@ def _told(tuned: Tuned) -> list[str]:
     rows = [("", "error", "in other colonies", "with the scene's own settings", "the reference's own")]
     rows += [(n, str(e), str(tuned.confirmed.get(n, "not seen there")), str(own.errors[n]), str(tuned.unsure[n])) for n, e in best.errors.items()]
     lines += _aligned(rows)
-    lines += [f"{name}: not told so finely, since {why}" for name, why in tuned.left_out.items()]
+    lines += ["  (± standard error by chance, which is allowed for in the first column; the parts may set each other off)"]
+    lines += [f"NOT CHECKED: {name}, since {why}. It may be off by more: name it (of) to have it told" for name, why in tuned.left_out.items()]
     ratio = best.seconds / own.seconds
     return [*lines, "", f"{best.seconds:.2g} s for the window, {ratio:.2g} times what the scene's own settings take; {tuned.runs} settings were run"]
 

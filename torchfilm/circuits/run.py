@@ -257,6 +257,8 @@ def trial(circuit: Circuit, concentrations: Tensor) -> tuple[str, ...]:
         # a little of everything, another little in every cell: at 0 a sum over cells would not show
         some = concentrations + 0.1 * torch.arange(1, len(concentrations) + 1, device=concentrations.device).unsqueeze(1)
         crowd, alone = circuit.changes(some, circuit.rows), circuit.changes(some[:1], circuit.rows[:1])
+        with torch.enable_grad():  # the stiff solver asks for derivatives
+            circuit.changes(some.detach().clone().requires_grad_(), circuit.rows)
     except UnknownName as error:
         raise UnknownName(f"{circuit.label}: {error}") from error
     except InputError:
