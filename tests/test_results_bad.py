@@ -34,7 +34,7 @@ for path in sys.argv[1:]:
 
 def told(data: bytes, shares: list[float], folder) -> dict[str, str]:
     """What a reader says of files cut after these shares of their bytes. In a process of its own, because it may never come back."""
-    paths = [folder / f"cut{int(1000 * share)}.h5" for share in shares]
+    paths = [folder / f"cut{int(share * len(data))}.h5" for share in shares]
     for path, share in zip(paths, shares, strict=True):
         path.write_bytes(data[: int(share * len(data))])
     command = [sys.executable, "-c", READ_ALL, *map(str, paths)]
@@ -53,6 +53,14 @@ SHARES = [0.0, 0.001, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99]
 def test_a_truncated_file_is_told(whole, tmp_path):
     """Cut anywhere, a file says so: no crash with something unreadable, no endless wait, no half of the data."""
     found = told(whole[0].read_bytes(), SHARES, tmp_path)
+    assert not {name: said for name, said in found.items() if not (said.startswith("InputError") and name in said)}
+
+
+@pytest.mark.slow
+def test_a_file_of_a_few_bytes_is_told(whole, tmp_path):
+    """Found in use: with not even its superblock left, a file was waited for, or said nothing that helps."""
+    data = whole[0].read_bytes()
+    found = told(data, [(n + 0.5) / len(data) for n in (0, 1, 8, 9, 12, 20, 28, 29, 47, 48, 60)], tmp_path)
     assert not {name: said for name, said in found.items() if not (said.startswith("InputError") and name in said)}
 
 

@@ -287,3 +287,15 @@ def test_what_chance_leaves_open_is_looked_at_among_more_colonies():
             Search(unsure, other, 0.05, more=more).run()
     tuned = Search(unsure, other, 0.05, more=lambda: third).run()
     assert tuned.chosen.errors["m"].most <= 0.05 and tuned.chosen.errors["m"].colonies == 12 and tuned.confirmed["m"].value <= 0.05
+
+
+def test_a_colony_that_grows_no_more_is_not_waited_for():
+    """Found in use: of two designs one never reached the cells that were asked for, and the other grew without end."""
+    scene = tf.Scene(tf.Growth(rate=torch.tensor([1e-5, 1.0])), tf.Division(length=tf.Uniform(3.5, 4.5)), dt=0.01)
+    start = begin(scene, 4, 2).start
+    assert start.counts[0] == 1 and 4 < start.counts[1] < 30 and start.step == 241
+
+
+def test_names_are_a_list():
+    with pytest.raises(InputError, match=r"of = 'm' is not allowed: it must be a list of names, such as \['m'\]"):
+        tf.tune(dividing(), of="m")

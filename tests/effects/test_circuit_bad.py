@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -189,3 +190,9 @@ def test_a_rate_that_pushes_below_zero_is_a_failure():
     scene = resting(tf.Circuit(lambda u, s, p, cell: {"m": -torch.ones_like(u.m)}, species=("m",), initial={"m": 0.25}))
     with pytest.raises(SimulationError, match=r"(?s)step 3.*colony 0.*below zero"):
         list(tf.simulate(scene, scene.seed(dtype=F64), until=1.0, dt=0.1))
+
+
+def test_a_rate_that_numbers_alone_can_follow_is_refused_on_its_trial():
+    """Found in use: numpy takes a tensor of numbers, and not one whose derivative is asked for, as the stiff solver does in the first step."""
+    with pytest.raises(tf.InputError, match=r"use torch\.exp and the like rather than math or numpy"):
+        tf.Scene(tf.Growth(rate=1.0), tf.Circuit(lambda u, s, p, cell: {"m": torch.from_numpy(np.exp(-u.m.numpy()))}, species=("m",))).seed(1)
