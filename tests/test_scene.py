@@ -441,3 +441,23 @@ def test_timings_name_every_effect():
     timings = tf.Timings()
     scene.step(scene.seed(), 0.1, timings)
     assert list(timings.seconds) == ["division", "growth", "mechanics"] and all(s > 0 for s in timings.seconds.values())
+
+
+def test_an_effect_of_ones_own_needs_a_title_and_a_stage():
+    class Ageing(tf.Effect):
+        stage = 35
+
+    class Placeless(tf.Effect):
+        title = "placeless"
+
+    with pytest.raises(tf.InputError, match="Ageing has no title: give the class one"):
+        tf.Scene(Ageing())
+    with pytest.raises(tf.InputError, match="Placeless has no stage: give the class one"):
+        tf.Scene(Placeless())
+
+
+def test_what_drives_what_is_said_once():
+    scene = tf.scenes.quorum_sensing()
+    scene.seed(1)  # what a rate function reads is known once it is tried
+    told = scene.drives()
+    assert "transport -> circuit: out.ahl" in told and "circuit -> transport: out.ahl" in told

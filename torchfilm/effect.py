@@ -19,10 +19,6 @@ from torchfilm.tools import checks
 
 # The paper's stages, in its order; an effect says where it belongs.
 RULES, DIVISION, BEFORE_CELLS, NUTRITION, GROWTH, MECHANICS, COVER, CIRCUIT, TRANSPORT, REMOVAL = 10, 20, 22, 25, 30, 40, 45, 50, 60, 90
-STAGES = {
-    RULES: "rules", DIVISION: "division", BEFORE_CELLS: "transport", NUTRITION: "nutrition", GROWTH: "growth", MECHANICS: "mechanics", COVER: "cover",
-    CIRCUIT: "circuit", TRANSPORT: "transport", REMOVAL: "removal",
-}  # fmt: skip
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.

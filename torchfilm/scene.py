@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.cells import Cells
-from torchfilm.effect import BUILT_IN, STAGES, Effect
+from torchfilm.effect import BUILT_IN, Effect
 from torchfilm.state import CELL, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.timing import Timings
@@ -43,6 +43,9 @@ class Scene:
         for effect in effects:
             if not isinstance(effect, Effect):
                 raise checks.refuse("Scene", effect, "made of effects such as Growth(), Division(), Mechanics()", "Did you forget the brackets?")
+            for what, example in (("title", '"ageing"'), ("stage", "35, after growth (30) and before mechanics (40)")):
+                if not hasattr(effect, what):
+                    raise checks.InputError(f"{type(effect).__name__} has no {what}: give the class one, such as {what} = {example}.")
         if not effects:
             raise checks.InputError("Scene() has no effect: nothing would happen. List at least one, such as tf.Growth(rate=1.0).")
         names = [e.title for e in effects]
@@ -223,13 +226,13 @@ class Scene:
         drives: dict[tuple[str, str], list[str]] = {}
         for writer, name, reader in self.couplings():
             drives.setdefault((writer, reader), []).append(name)
-        return [f"{w} -> {r}: {', '.join(names)}" for (w, r), names in drives.items()] or ["nobody"]
+        return [f"{w} -> {r}: {', '.join(dict.fromkeys(names))}" for (w, r), names in drives.items()] or ["nobody"]
 
     def explain(self) -> str:
         """What this scene simulates, in the order in which it acts, and who drives whom. `torchfilm.explain` tells the methods and what they cost."""
         lines = [self.headline]
         for effect in self.effects:
-            lines.append(f"  {STAGES.get(effect.stage, str(effect.stage)):<10} {summary(effect)}")
+            lines.append(f"  {effect.title:<10} {summary(effect)}")
             lines.append(f"             reads  {', '.join(effect.reads()) or '-'}")
             lines.append(f"             writes {', '.join(effect.writes()) or '-'}")
             for f in effect.declares(self.dim):
