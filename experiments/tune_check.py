@@ -93,19 +93,20 @@ def check(name: str, error: float) -> dict[str, str]:
     few, many = Run.of(scene, 100, 24, 5, tuned.finest), Run.of(scene, 150, 48, 6, tuned.finest)
     worst, of, _ = max((run.worst(tuned.settings, names) for run in (few, many)), key=lambda found: found[0].value)
     found: dict[tf.Settings, tuple[Error, str, float]] = {}
+    words = lambda s: ", ".join(f"{n} {v:g}" for n, v in s.given.items())  # noqa: E731
     for steps in (STEPS, FINER):
         found |= {s: few.worst(s, names) for s in sweep(few, steps)}
         holding = sorted((s for s, (e, _, _) in found.items() if e.value <= error), key=lambda s: found[s][2])
-        if holding:
+        both = ((s, its) for s in holding if (its := many.worst(s, names)[0]).value <= error)
+        of_best = next(both, None)
+        if of_best is not None:
             break
-    words = lambda s: ", ".join(f"{n} {v:g}" for n, v in s.given.items())  # noqa: E731
-    of_best = ("none", "", "")
-    for settings in holding:
-        its, _, _ = many.worst(settings, names)
-        if its.value <= error:
-            of_best = words(settings), str(max(its, found[settings][0], key=lambda e: e.value)), f"{few.seconds(tuned.settings) / few.seconds(settings):.2f}"
-            break
-    told = (name, words(tuned.settings), str(worst), of, *of_best[:2], str(len(found)), str(len(holding)), of_best[2])
+    swept = ("none", "", str(len(found)), str(len(holding)), "")
+    if of_best is not None:
+        s, its = of_best
+        over = few.seconds(tuned.settings) / few.seconds(s)
+        swept = (words(s), str(max(its, found[s][0], key=lambda e: e.value)), str(len(found)), str(len(holding)), f"{over:.2f}")
+    told = (name, words(tuned.settings), str(worst), of, *swept)
     return dict(zip(COLUMNS, told, strict=True))
 
 

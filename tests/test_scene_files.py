@@ -172,3 +172,20 @@ def test_a_scene_file_may_be_called_as_a_module_is(tmp_path):
     import math
 
     assert math.pi > 3 and not hasattr(math, "scene")
+
+
+def test_scene_files_do_not_come_upon_one_another(tmp_path):
+    """What a file is called is no reason for another to import it: `common` is the one beside the file that asks for it. Nor does a broken one stay."""
+    for folder, rate in (("a", 0.5), ("b", 1.5)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "common.py").write_text(f"import torchfilm as tf\nRATE = {rate}\nscene = tf.Scene(tf.Growth(rate=RATE))\n")
+    (tmp_path / "b" / "main.py").write_text("import torchfilm as tf\nfrom common import RATE\nscene = tf.Scene(tf.Growth(rate=RATE))\n")
+    assert load_scene(str(tmp_path / "a" / "common.py"), {}).listed[0].rate == 0.5
+    try:
+        assert load_scene(str(tmp_path / "b" / "main.py"), {}).listed[0].rate == 1.5
+    finally:
+        sys.modules.pop("common", None)
+    (tmp_path / "bad_one.py").write_text("x = 1 / 0\n")
+    with pytest.raises(tf.InputError, match=r"ZeroDivisionError: division by zero \(line 1\)"):
+        load_scene(str(tmp_path / "bad_one.py"), {})
+    assert "bad_one" not in sys.modules

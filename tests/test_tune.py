@@ -109,7 +109,7 @@ def test_only_what_is_named_counts():
     tuned = tf.tune(dividing(), 0.05, cells=8, colonies=4, of=["volume"], watch=told.append)
     assert set(tuned.chosen.errors) == {"volume"} == set(tuned.own.errors)
     settings = [words for words in told if words.startswith("setting ")]
-    assert len(settings) <= tuned.runs and settings[1].startswith("setting 2: dt ")
+    assert len(settings) == tuned.runs and settings[1].startswith("setting 2: dt ")
     assert told[0].startswith("growing 4 colonies to 12 cells") and any(words.startswith("confirming dt ") for words in told)
 
 

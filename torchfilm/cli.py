@@ -343,6 +343,8 @@ def _gathered(args: list[str]) -> list[str]:
     """Options that take several values and are given several times, in one: of `--set a=1 --set b=2` the parser would keep the last alone."""
     command = COMMANDS.get(args[0]) if args else None
     several = {f"--{f.name}" for f in dataclasses.fields(command) if str(f.type).startswith("list")} if command else set()
+    if not any(sum(a.partition("=")[0] == name for a in args) > 1 for name in several):
+        return args
     gathered: dict[str, list[str]] = {}
     into: list[str] = []
     out = [into]  # each option with what follows it

@@ -86,7 +86,7 @@ class Tune:
     cells: int = 100
     """Cells in each colony of what you will run; it is looked at there, and with half as many again."""
     colonies: int = 24
-    """Colonies of the probe, if the scene's parameters leave it open; where chance would hide the error, twice or four times as many."""
+    """Colonies of the probe, if the scene's parameters leave it open; where chance would hide the error, two to twelve times as many."""
     seed: int = 0
     """Seed of the probe."""
     device: str = "cpu"

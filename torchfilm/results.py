@@ -72,7 +72,7 @@ def _open_to_read(path: Path) -> h5py.File:
     size = path.stat().st_size
     if head.startswith(SIGNATURE[: len(head)]) and (len(head) < 48 or (head[8] >= 2 and int.from_bytes(head[28:36], "little") > size)):
         of = f" of {int.from_bytes(head[28:36], 'little')}" if len(head) == 48 else ""
-        raise InputError(f"{path} is truncated: it has {size}{of} bytes. Use a whole copy of it.")
+        raise InputError(f"{path} is truncated: it has {size}{of} bytes. Use a whole copy of it; of a run that just begins, look again.")
     for options in ({"swmr": True, "libver": "latest"}, {}):
         try:
             return h5py.File(path, "r", **options)

@@ -8,13 +8,13 @@ import json
 import sys
 import traceback
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from torchfilm import scenes
 from torchfilm.scene import Scene
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.running import run_file
 
 
 def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -> Scene:
@@ -34,10 +34,9 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
     if not path.is_file() or path.suffix != ".py":
         mend = "" if path.exists() else "No such file."
         raise checks.refuse("scene", what, "the name of a ready scene, or the path of a Python file or of a design that was saved", mend)
-    names = vars(_module(path))
     sys.path.insert(0, str(path.parent.resolve()))
     try:
-        exec(compile(path.read_text(), str(path), "exec", dont_inherit=True), names)
+        names = run_file(path)
     except InputError:
         raise
     except Exception as error:
@@ -61,18 +60,6 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
         made.name = path.stem
     made.settings = parameters
     return made
-
-
-def _module(path: Path) -> ModuleType:
-    """A new module for what a scene file defines, listed among the others: a dataclass looks up the types of its fields there."""
-    name, there = path.stem, sys.modules.get(path.stem)
-    if there is not None and not hasattr(there, "__scene_file__"):
-        name += "_scene"  # a file may be called as something else that is imported
-    module = ModuleType(name)
-    module.__file__ = str(path)
-    vars(module)["__scene_file__"] = True
-    sys.modules[name] = module
-    return module
 
 
 def design(what: str) -> dict[str, Any]:

@@ -4,7 +4,7 @@ A few colonies of the scene are grown by its own settings; from that same state 
 the reference, and then by other settings, each step by knobs from loose to tight. What a user would read off at the end is compared, observable by
 observable: the table is in `torchfilm.probe`. Each error, with what of it may be chance, must be within what was asked; of the settings that are, the one
 that took the least time is chosen, confirmed in other colonies that are smaller by a third, and measured once more with each of its knobs tightened, which
-tells the knobs' parts in the error.
+tells the knobs' parts in the error. Cheaper ones whose error is within it but for chance are looked at among more colonies, and chosen if it is there.
 """
 
 from __future__ import annotations
@@ -68,10 +68,11 @@ class Try:
 class Tuned:
     """Settings that hold an error, and how that is known.
 
-    scene: with the settings. error: what was asked. chosen: the try that was taken; own: the scene's own settings, for comparison. parts: by knob, how much of
-    each observable's error comes from it. confirmed: errors in the other colonies. unsure: by observable, how far two references differ; left_out: observables
-    that cannot be told so finely, with why. tries: the scene's own and all that might have been chosen, in order;
-    runs: how many settings the first probe was run by. window: hours, cells: at its start, finest: steps of the reference.
+    scene: with the settings. error: what was asked. chosen: the try that was taken, its errors as of more colonies where only these could tell; own: the
+    scene's own settings, for comparison. parts: by knob, how much of each observable's error comes from it. confirmed: errors in the other colonies. unsure: by
+    observable, how far two references differ; left_out: observables that cannot be told so finely, with why. tries: the scene's own and all that might have
+    been chosen, in order; runs: how many settings the first probe was run by. window: hours, cells: at its start, least: in the smallest colony that has any,
+    finest: steps of the reference.
     Errors are relative, each with its standard error (`Error.value`, `.noise`).
     """
 
@@ -88,6 +89,7 @@ class Tuned:
     runs: int
     window: float
     cells: int
+    least: int
     finest: int
 
     def __str__(self) -> str:
@@ -102,7 +104,7 @@ def tune(
 
     cells: in each of `colonies` colonies (or as many as the scene's parameters are for) what will be run: settings hold in a probe that begins there and in one
     that begins with half as many again; a scene that stays smaller is taken as it is where it grows no more. Where chance would hide the error, twice or
-    four times as many colonies are grown.
+    four times as many colonies are grown, and three times those again where it hides whether cheaper settings hold it.
     of: names of the observables that matter, by default all: "cells", "volume", "radius", "overlap", species, "signal NAME". Circuits that run molecule by
     molecule are probed by their smooth mean, since noise is no error. watch: is told in words what is being done. Raises InputError where nothing holds the
     error, or where the probe cannot tell it; SimulationError where the scene fails on the way to where the probe begins.
@@ -111,6 +113,7 @@ def tune(
     for name, given, least, why in (("cells", cells, 1, ""), ("colonies", colonies, 2, "By how they differ it tells what of an error may be chance.")):
         if isinstance(given, bool) or not isinstance(given, int) or given < least:
             raise checks.refuse(name, given, f"a whole number from {least}", why)
+    of = of or None
     if isinstance(of, str):
         raise checks.refuse("of", of, f"a list of names, such as {[of]}")
     many, watch = math.ceil(LARGER * cells), watch or (lambda words: None)
@@ -128,7 +131,8 @@ def tune(
         probe = begin(scene, many, more * colonies, of, seed, device)
     watch(f"growing {colonies} others to {cells} cells")
     other = begin(scene, cells, colonies, of, seed + 1, device)
-    return Search(probe, other, error, watch, lambda: begin(scene, many, MORE * probe.start.colonies, of, seed + 2, device)).run()
+    finer = lambda: begin(scene, many, MORE * probe.start.colonies, of, seed + 2, device)  # noqa: E731
+    return Search(probe, other, error, watch, finer if scene.fixed_colonies == 1 else None).run()
 
 
 @torch.no_grad()
@@ -175,7 +179,7 @@ class Search:
         best, confirmed = self._confirmed()
         return Tuned(
             best.settings.apply(self.probe.given), best.settings, self.error, best, own, confirmed, self._parts(best), self.unsure, left_out,
-            list(self.tries.values()), len(self.runs), self.probe.dt * WINDOW, self.probe.start.cells, self.finest,
+            list(self.tries.values()), len(self.runs), self.probe.dt * WINDOW, self.probe.start.cells, _least(self.probe), self.finest,
         )  # fmt: skip
 
     def _refer(self) -> dict[str, str]:
@@ -214,7 +218,8 @@ class Search:
                 return self._surer(right, best.seconds / WORTH) or (best, errors)
             self.refuted[best.settings] = errors
             # where chance has misled once, more colonies tell more than finer steps do
-            if len(self.refuted) == 1 and (found := self._surer(right, math.inf)) is not None:
+            known = min((t.seconds for t in self.tries.values() if self._holds(t)), default=math.inf)
+            if len(self.refuted) == 1 and (found := self._surer(right, known)) is not None:
                 return found
         found = self._surer(right, math.inf)
         if found is None:
@@ -257,7 +262,7 @@ class Search:
         return probe.errors(probe.observed(tried.settings).found, right)
 
     def _untold(self, why: dict[str, str]) -> checks.InputError:
-        worst = ", ".join(f"{name}: {words}" for name, words in why.items())
+        worst = ", ".join(f"{name}: {words}" for name, words in why.items()) or "nothing of what was named is there: it is 0 everywhere"
         return checks.refuse("error", self.error, "one that the probe can tell", f"Here {worst}. Ask for a larger error, or probe more colonies or cells.")
 
     def _out_of_reach(self) -> checks.InputError:
@@ -363,6 +368,12 @@ class Search:
         return self.probe.errors(found, {n: v for n, v in against.items() if n in self.reference}, apart=True)
 
 
+def _least(probe: Probe) -> int:
+    """Cells in the smallest colony that has any."""
+    counts = probe.start.counts
+    return int(counts[counts > 0].min()) if probe.start.cells else 0
+
+
 def _greatest(errors: dict[str, Error]) -> float:
     """As measured."""
     return max((e.value for e in errors.values()), default=0.0)
@@ -378,6 +389,7 @@ def _told(tuned: Tuned) -> list[str]:
     """The tables."""
     best, own = tuned.chosen, tuned.own
     head = f"{tuned.scene.name}: {_percent(tuned.error)} in {', '.join(best.errors)}, over {tuned.window:g} h from {tuned.cells} cells in all"
+    head += f", {tuned.least} in the smallest colony"
     rows: list[tuple[str, ...]] = [("", "chosen", "part of the error", "of the time")]
     total = sum(best.spent.values()) or 1.0
     for knob, errors in tuned.parts.items():

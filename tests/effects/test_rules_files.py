@@ -28,6 +28,14 @@ def test_rules_from_a_file(rules_file):
         assert run(scene, scene.seed(), 1).growth_rate.tolist() == [1.0, 1.0]
 
 
+def test_a_rules_file_may_define_dataclasses(rules_file):
+    rules_file.write_text(
+        "from dataclasses import dataclass\n\n@dataclass\nclass P:\n    rate: float = 0.5\n\ndef update(cells):\n    cells.growth_rate = P().rate\n"
+    )
+    scene = tf.Scene(tf.Rules(rules_file), tf.Growth(), founders=pair_of_cells())
+    assert run(scene, scene.seed(), 1).growth_rate.tolist() == [0.5, 0.5]
+
+
 def test_an_edit_takes_effect_at_the_next_step(rules_file):
     rules, scene = watched(rules_file)
     rates = []

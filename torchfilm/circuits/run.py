@@ -250,15 +250,17 @@ def _not_finite(circuit: Circuit, concentrations: Tensor, k: int, dt: float) -> 
     return []
 
 
-def trial(circuit: Circuit, concentrations: Tensor) -> tuple[str, ...]:
-    """Try the circuit once at concentrations (M, S): raise InputError for what it returns wrongly; the signals that it exchanges."""
+def trial(circuit: Circuit, concentrations: Tensor, derivatives: bool = False) -> tuple[str, ...]:
+    """Try the circuit once at concentrations (M, S), with derivatives where its method asks for them: raise InputError for what it returns wrongly; the
+    signals that it exchanges."""
     try:
         inside, outside = circuit.changes(concentrations, circuit.rows)
         # a little of everything, another little in every cell: at 0 a sum over cells would not show
         some = concentrations + 0.1 * torch.arange(1, len(concentrations) + 1, device=concentrations.device).unsqueeze(1)
         crowd, alone = circuit.changes(some, circuit.rows), circuit.changes(some[:1], circuit.rows[:1])
-        with torch.enable_grad():  # the stiff solver asks for derivatives
-            circuit.changes(some.detach().clone().requires_grad_(), circuit.rows)
+        if derivatives:
+            with torch.enable_grad():
+                circuit.changes(some.detach().clone().requires_grad_(), circuit.rows)
     except UnknownName as error:
         raise UnknownName(f"{circuit.label}: {error}") from error
     except InputError:

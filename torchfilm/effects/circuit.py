@@ -217,7 +217,7 @@ class Circuit(Effect):
             # at least two, so that a function that works for a single cell only is found out
             rows = (rows if rows.numel() else torch.zeros(1, dtype=torch.int64, device=state.device)).repeat(2)[:64]
             tried = self._circuit(state, rows, kind, (), outside, seen=seen)
-            given[kind] = run.trial(tried, self._concentrations(state, rows))
+            given[kind] = run.trial(tried, self._concentrations(state, rows), derivatives=self.method == STIFF)
         for name in self.parameters:
             near = difflib.get_close_matches(name, OPTIONS, 1, 0.75)
             if near and name not in seen["p"]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools import checks
+from torchfilm.tools.running import run_file
 
 Functions = dict[str, Callable[..., None] | None]
 T = TypeVar("T")
@@ -18,9 +18,8 @@ T = TypeVar("T")
 
 def load_functions(path: Path, names: tuple[str, ...]) -> Functions:
     """Run a Python file of the user's and return those of its functions that have one of the names."""
-    module = types.ModuleType(path.stem)
-    exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
-    found = {name: getattr(module, name, None) for name in names}
+    given = run_file(path)
+    found = {name: given.get(name) for name in names}
     if not any(map(callable, found.values())):
         raise checks.InputError(f"{path} defines neither {' nor '.join(names)}.")
     return found
