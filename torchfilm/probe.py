@@ -33,7 +33,7 @@ from torchfilm.effect import DIVISION, GROWTH
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.scene import Scene
-from torchfilm.simulate import simulate
+from torchfilm.simulate import Standstill, simulate
 from torchfilm.state import State
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.timing import Timings
@@ -179,13 +179,10 @@ def begin(scene: Scene, cells: int, colonies: int, of: Sequence[str] | None = No
     made = scene.retuned(smooth, scene.dt, scene.accuracy)
     fixed = scene.fixed_colonies
     founded = state = made.seed(fixed if fixed > 1 else colonies, seed=seed, device=device)
-    largest, since = torch.zeros_like(founded.groups.sum(founded.volume)), torch.zeros_like(founded.counts)
+    standstill = Standstill(cells, STILL)
     for state in simulate(made, founded, cells=cells, until=MOST_STEPS * scene.dt):
-        size = state.groups.sum(state.volume)
-        since = torch.where(size > 1.01 * largest, 0, since + 1)
-        largest = torch.where(since == 0, size, largest)
         # one colony that stays small is enough: the others would grow without end
-        if bool(((since >= STILL) & (state.counts < cells) & (state.counts > 0)).any()):
+        if bool(standstill(state).any()):
             break
     return Probe(scene, made, state, scene.dt, None if of is None else tuple(of))
 

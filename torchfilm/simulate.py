@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -112,27 +111,40 @@ def _last_step(state: State, until: float, dt: float) -> int:
 LOOK, STILL = 100, 1000
 
 
+class Standstill:
+    """Which colonies have fewer than `cells` cells and come no nearer: for `steps` steps none has become larger by a hundredth than it ever was."""
+
+    def __init__(self, cells: int, steps: int):
+        self.cells, self.steps = cells, steps
+        self.largest: Tensor | None = None  # (B,) µm³, and at which step that was
+
+    @torch.no_grad()
+    def __call__(self, state: State) -> Tensor:
+        """(B,) bool, of those that have cells."""
+        size = state.groups.sum(state.volume)
+        if self.largest is None:
+            self.largest, self.since = size, torch.full_like(state.counts, state.step)
+        grown = size > 1.01 * self.largest
+        self.largest, self.since = torch.where(grown, size, self.largest), torch.where(grown, state.step, self.since)
+        return (state.step - self.since >= self.steps) & (state.counts > 0) & (state.counts < self.cells)
+
+
 class _Waiting:
     """Warns, once, of colonies that do not come nearer to the number of cells at which a run ends: it might go on for ever."""
 
     def __init__(self, cells: int):
-        self.cells, self.told = cells, False
-        self.sizes: deque[Tensor] = deque(maxlen=STILL // LOOK + 1)
+        self.standstill, self.told = Standstill(cells, STILL), False
 
-    @torch.no_grad()
     def __call__(self, state: State) -> None:
         if self.told or state.step % LOOK:
             return
-        self.sizes.append(state.groups.sum(state.volume))
-        if len(self.sizes) < STILL // LOOK + 1:
-            return
-        still = (self.sizes[-1] <= 1.01 * self.sizes[0]) & (state.counts > 0) & (state.counts < self.cells)
+        still = self.standstill(state)
         self.told = bool(still.any())
         if self.told:
             names = ", ".join(map(str, state.colony_id[still].tolist()[:5]))
             warnings.warn(
-                f"colony {names}: no larger than {STILL} steps ago, with fewer than the {self.cells} cells at which this run ends. It may go on for ever: "
-                "give a time to stop at as well (until=…, --until).", RuntimeWarning, stacklevel=3,
+                f"colony {names}: no larger than {STILL} steps ago, with fewer than the {self.standstill.cells} cells at which this run ends. It may go on "
+                "for ever: give a time to stop at as well (until=…, --until).", RuntimeWarning, stacklevel=3,
             )  # fmt: skip
 
 

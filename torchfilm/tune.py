@@ -179,7 +179,7 @@ class Search:
         best, confirmed = self._confirmed()
         return Tuned(
             best.settings.apply(self.probe.given), best.settings, self.error, best, own, confirmed, self._parts(best), self.unsure, left_out,
-            list(self.tries.values()), len(self.runs), self.probe.dt * WINDOW, self.probe.start.cells, _least(self.probe), self.finest,
+            list(self.tries.values()), len(self.runs), self.probe.dt * WINDOW, self.probe.start.cells, _smallest(self.probe), self.finest,
         )  # fmt: skip
 
     def _refer(self) -> dict[str, str]:
@@ -350,7 +350,7 @@ class Search:
         """What circuits at `rtol` change in the worst observable, contacts as they usually are."""
         usual = CONTACTS[3] if self.mechanics is not None else TIGHT_CONTACTS
         loose, tight = (self._run(self.settings(steps, usual, r)).found for r in (rtol, self.tight))
-        return max(e.value for e in self.probe.errors(loose, {n: v for n, v in tight.items() if n in self.reference}, apart=True).values())
+        return _greatest(self.probe.errors(loose, {n: v for n, v in tight.items() if n in self.reference}, apart=True))
 
     def _parts(self, best: Try) -> dict[str, dict[str, Error]]:
         """By knob, what of each observable's error is gone when it alone is tight; for the step, what is left when all others are."""
@@ -368,7 +368,7 @@ class Search:
         return self.probe.errors(found, {n: v for n, v in against.items() if n in self.reference}, apart=True)
 
 
-def _least(probe: Probe) -> int:
+def _smallest(probe: Probe) -> int:
     """Cells in the smallest colony that has any."""
     counts = probe.start.counts
     return int(counts[counts > 0].min()) if probe.start.cells else 0
