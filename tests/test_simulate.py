@@ -425,7 +425,7 @@ def test_a_run_that_may_never_end_is_told():
     scene = tf.Scene(tf.Growth(rate=torch.tensor([1e-4, 1.0])), dt=0.001)
     run = tf.simulate(scene, scene.seed(2), cells=2)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", RuntimeWarning)
         for _ in range(1050):
             next(run)
     with pytest.warns(RuntimeWarning, match=r"colony 0: no larger than 1000 steps ago, with fewer than the 2 cells"):
