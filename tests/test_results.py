@@ -287,3 +287,13 @@ def test_colonies_without_cells_are_recorded(tmp_path):
 def test_recipe_of_a_scene_of_ones_own_is_none(whole):
     with tf.Results(whole[0]) as results:
         assert results.recipe is None and json.loads(results.attributes["recipe"]) is None
+
+
+def test_a_reader_of_a_finished_run_sees_what_its_resumption_adds(tmp_path):
+    path, scene = tmp_path / "run.h5", make_scene()
+    record(scene, scene.seed(2, seed=1), path, until=1.0)
+    with tf.Results(path) as results:
+        before = len(results)
+        record(scene, results.state(scene), path, until=2.0, append=True)
+        results.refresh()
+        assert len(results) > before and results.times[-1] == pytest.approx(2.0)

@@ -77,6 +77,23 @@ def test_a_truncated_file_left_by_a_kill_is_told(tmp_path):
     assert not {name: said for name, said in found.items() if not (said.startswith("InputError") and name in said)}
 
 
+@pytest.mark.slow
+def test_damaged_bytes_are_told_or_do_no_harm(whole, tmp_path):
+    """Found in use: where the index of a column was damaged, a finished file was read again and again without end; where a block was, h5py spoke for itself."""
+    data, damaged = whole[0].read_bytes(), {}
+    for k in range(60):
+        at = (2 * k + 1) * len(data) // 120
+        path = tmp_path / f"damaged{at}.h5"
+        path.write_bytes(data[:at] + bytes(b ^ 0x5A for b in data[at : at + 8]) + data[at + 8 :])
+        damaged[str(path)] = path.name
+    command = [sys.executable, "-c", READ_ALL, *damaged]
+    out = subprocess.run(command, capture_output=True, text=True, timeout=60, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True).stdout
+    found = dict(line.split("|", 1) for line in out.splitlines())
+    assert found.keys() == damaged.keys()
+    told = [said for said in found.values() if said != "read to the end"]
+    assert len(told) >= 3 and all(said.startswith("InputError") for said in told), told
+
+
 def test_a_foreign_hdf5_file_is_told(tmp_path):
     path = tmp_path / "foreign.h5"
     with h5py.File(path, "w") as file:

@@ -51,6 +51,8 @@ def explain(scene: Scene, *, cells: int = 1000, colonies: int | None = None, dev
     colonies: by default as many as the scene's parameters and founders have, else 1. seconds: about how long the estimate may measure, by running the scene's
     first steps on `device` in float32, rules included; 0 leaves it out. Raises InputError where the scene cannot be seeded.
     """
+    if not isinstance(scene, Scene):
+        raise checks.refuse("scene", scene, "a Scene, such as tf.scenes.microcolony()")
     for name, given in (("cells", cells), ("colonies", colonies)):
         if given is not None and (isinstance(given, bool) or not isinstance(given, int) or given < 1):
             raise checks.refuse(name, given, "a whole number from 1")

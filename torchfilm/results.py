@@ -16,7 +16,11 @@ from __future__ import annotations
 
 import json
 import operator
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from types import EllipsisType
 from typing import Any
 
 import h5py
@@ -39,9 +43,24 @@ LINEAGE = {"births": ("colony_id", "uid", "parent", "step"), "ends": ("colony_id
 FRAME_COLUMNS = ("first_row", "counts", "next_uid", "births", "ends", "time", "step")
 
 
+@contextmanager
+def _whole(file: h5py.File, name: str) -> Iterator[None]:
+    """What fails in here fails because the file is damaged at `name`."""
+    try:
+        yield
+    except (OSError, KeyError, RuntimeError) as error:
+        raise InputError(f"{file.filename} is damaged: its {name!r} cannot be read ({error}). Use another copy of it, or other frames.") from error
+
+
+def _read(file: h5py.File, name: str, at: int | slice | EllipsisType = ...) -> Any:
+    """What a dataset holds there."""
+    with _whole(file, name):
+        return file[name][at]
+
+
 def _frames(file: h5py.File) -> int:
     """How many frames count: a last step that does not come after the one before was broken off while it was written."""
-    steps = file["frames/step"][...]
+    steps = _read(file, "frames/step")
     count = len(steps)
     while count > 1 and steps[count - 1] <= steps[count - 2]:
         count -= 1
@@ -53,12 +72,12 @@ def committed(file: h5py.File) -> dict[str, int]:
     frames = _frames(file)
     if frames == 0:
         return {"frames": 0, "rows": 0, "voxels": 0, "births": 0, "ends": 0}
-    at = frames - 1
-    rows = int(file["frames/first_row"][at]) + int(file["frames/counts"][at].sum())
+    last = partial(_read, file, at=frames - 1)
+    rows = int(last("frames/first_row")) + int(last("frames/counts").sum())
     voxels = 0
     if "grid" in file["frames"]:
-        voxels = int(file["frames/grid/first_voxel"][at]) + int(file["frames/grid/shape"][at].prod(1).sum())
-    return {"frames": frames, "rows": rows, "voxels": voxels, "births": int(file["frames/births"][at]), "ends": int(file["frames/ends"][at])}
+        voxels = int(last("frames/grid/first_voxel")) + int(last("frames/grid/shape").prod(1).sum())
+    return {"frames": frames, "rows": rows, "voxels": voxels, "births": int(last("frames/births")), "ends": int(last("frames/ends"))}
 
 
 def _open_to_read(path: Path) -> h5py.File:
@@ -73,7 +92,10 @@ def _open_to_read(path: Path) -> h5py.File:
     if head.startswith(SIGNATURE[: len(head)]) and (len(head) < 48 or (head[8] >= 2 and int.from_bytes(head[28:36], "little") > size)):
         of = f" of {int.from_bytes(head[28:36], 'little')}" if len(head) == 48 else ""
         raise InputError(f"{path} is truncated: it has {size}{of} bytes. Use a whole copy of it; of a run that just begins, look again.")
-    for options in ({"swmr": True, "libver": "latest"}, {}):
+    # of a file that nobody writes (or was killed while writing), what cannot be read will not come: a single-writer open would try again for minutes
+    finished = len(head) == 48 and head[8] >= 3 and head[11] == 0
+    ways: tuple[dict[str, Any], ...] = ({"locking": False},) if finished else ({"swmr": True, "libver": "latest"}, {})
+    for options in ways:
         try:
             return h5py.File(path, "r", **options)
         except OSError as found:
@@ -88,7 +110,9 @@ class Results:
         self.path = Path(path)
         self.file = _open_to_read(self.path)
         try:
-            if self.file.attrs.get("format") != FORMAT or "frames/step" not in self.file:
+            with _whole(self.file, "frames/step"):
+                ours = self.file.attrs.get("format") == FORMAT and "frames/step" in self.file
+            if not ours:
                 raise InputError(f"{path} is not a torchfilm results file (its format is {self.file.attrs.get('format')!r}).")
             if int(self.file.attrs["version"]) > VERSION:
                 raise InputError(f"{path} has format version {self.file.attrs['version']}, newer than this torchfilm reads ({VERSION}). Update torchfilm.")
@@ -107,28 +131,36 @@ class Results:
     def __len__(self) -> int:
         return _frames(self.file)
 
+    def _read(self, name: str, at: int | slice | EllipsisType = ...) -> Any:
+        return _read(self.file, name, at)
+
+    def _names(self, group: str) -> tuple[str, ...]:
+        """The datasets of a group, none if it is not there."""
+        with _whole(self.file, group):
+            return tuple(self.file[group]) if group in self.file else ()
+
     @property
     def times(self) -> np.ndarray:
         """(F,) h."""
-        return self.file["frames/time"][: len(self)]
+        return self._read("frames/time", slice(len(self)))
 
     @property
     def steps(self) -> np.ndarray:
-        return self.file["frames/step"][: len(self)]
+        return self._read("frames/step", slice(len(self)))
 
     @property
     def counts(self) -> np.ndarray:
         """(F, B) cells in each colony."""
-        return self.file["frames/counts"][: len(self)]
+        return self._read("frames/counts", slice(len(self)))
 
     @property
     def colony_id(self) -> np.ndarray:
-        return self.file["colony_id"][...]
+        return self._read("colony_id")
 
     @property
     def stream(self) -> np.ndarray:
         """(B,) which course of random numbers each colony follows."""
-        return self.file["stream" if "stream" in self.file else "colony_id"][...]
+        return self._read("stream" if "stream" in self.file else "colony_id")
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -159,6 +191,10 @@ class Results:
 
     def refresh(self) -> None:
         """See what a run has written since."""
+        if not self.file.swmr_mode:  # it was finished, and may have been resumed
+            self.file.close()
+            self.file = _open_to_read(self.path)
+            return
         self.file["frames/step"].id.refresh()  # first: what it counts has been written before it
         groups = ("cells", "signals", "lineage/births", "lineage/ends", "frames/colony", "frames/grid", "frames")
         for dataset in (d for g in groups if g in self.file for n, d in self.file[g].items() if isinstance(d, h5py.Dataset) and n != "step"):
@@ -176,21 +212,21 @@ class Results:
     def frame(self, frame: int = -1) -> dict[str, np.ndarray]:
         """Arrays of one frame by name: colony (place in the batch), uid, parent, position, axis, length, radius and the fields per cell."""
         k = self._index(frame)
-        start = int(self.file["frames/first_row"][k])
-        stop = start + int(self.file["frames/counts"][k].sum())
-        return {name: dataset[start:stop] for name, dataset in self.file["cells"].items()}
+        start = int(self._read("frames/first_row", k))
+        stop = start + int(self._read("frames/counts", k).sum())
+        return {name: self._read(f"cells/{name}", slice(start, stop)) for name in self._names("cells")}
 
     @property
     def signal_names(self) -> tuple[str, ...]:
         """The signals of the medium, if there is one."""
-        return tuple(self.file["signals"]) if "signals" in self.file else ()
+        return self._names("signals")
 
     def grid(self, frame: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where the voxels of a frame are: lower corners (B, 3) µm, numbers of voxels (B, 3), and their spacing (3,) µm."""
         if not self.signal_names:
             raise InputError(f"{self.path} has no medium, so no grid.")
         k = self._index(frame)
-        return self.file["frames/grid/origin"][k], self.file["frames/grid/shape"][k], np.asarray(self.file.attrs["spacing"])
+        return self._read("frames/grid/origin", k), self._read("frames/grid/shape", k), np.asarray(self.file.attrs["spacing"])
 
     def signal(self, name: str, frame: int = -1) -> list[np.ndarray]:
         """Concentrations of a signal at a frame, one array (nx, ny, nz) a colony."""
@@ -198,9 +234,9 @@ class Results:
             raise checks.refuse("signal", name, "one of " + (", ".join(self.signal_names) or "none: the scene has no medium"))
         k = self._index(frame)
         _, shapes, _ = self.grid(k)
-        ends = int(self.file["frames/grid/first_voxel"][k]) + np.concatenate([[0], np.cumsum(shapes.prod(1))])
-        flat = self.file[f"signals/{name}"]
-        return [flat[a:b].reshape(tuple(shape)) for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)]
+        ends = int(self._read("frames/grid/first_voxel", k)) + np.concatenate([[0], np.cumsum(shapes.prod(1))])
+        read = partial(self._read, f"signals/{name}")
+        return [read(slice(a, b)).reshape(tuple(shape)) for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)]
 
     def _check_scene(self, scene: Scene, template: State, changed: bool) -> None:
         """Raise InputError that names what a scene has otherwise than the one that was recorded."""
@@ -261,8 +297,8 @@ class Results:
     def lineage(self) -> dict[str, np.ndarray]:
         """Every cell that was ever born in the recorded run: colony, uid, parent, born (step), ended (step or −1), fate ("alive", "divided", …)."""
         size = committed(self.file)
-        births = {n: self.file[f"lineage/births/{n}"][: size["births"]] for n in LINEAGE["births"]}
-        ends = {n: self.file[f"lineage/ends/{n}"][: size["ends"]] for n in LINEAGE["ends"]}
+        births = {n: self._read(f"lineage/births/{n}", slice(size["births"])) for n in LINEAGE["births"]}
+        ends = {n: self._read(f"lineage/ends/{n}", slice(size["ends"])) for n in LINEAGE["ends"]}
         first = self.frame(0)
         colony = np.concatenate([self.colony_id[first["colony"]], births["colony_id"]])
         uid = np.concatenate([first["uid"], births["uid"]])
@@ -294,7 +330,7 @@ class Results:
             corner, voxels = torch.from_numpy(origin).to(device), torch.from_numpy(shape).to(device)
             layout = layout.on(Grid(corner, voxels, (float(spacing[0]), float(spacing[1]), float(spacing[2]))))
             recorded |= {OUTSIDE + n: np.concatenate([x.reshape(-1) for x in self.signal(n, k)]) for n in self.signal_names}
-        colony_fields = {n: d[k] for n, d in self.file["frames/colony"].items()} if "frames/colony" in self.file else {}
+        colony_fields = {n: self._read(f"frames/colony/{n}", k) for n in self._names("frames/colony")}
         declared = dict(template.declared)
         for name, (meaning, unit, scope, shape, at_division) in json.loads(self.file.attrs["declared"]).items():
             if name not in declared:
@@ -314,7 +350,7 @@ class Results:
         fields = {n: tensor(recorded[n] if n in recorded else colony_fields[n]) for n in declared}
         return template.replace(
             **{n: tensor(recorded[n]) for n in PER_CELL}, colony_id=tensor(self.colony_id), stream=tensor(self.stream),
-            next_uid=tensor(self.file["frames/next_uid"][k]),
+            next_uid=tensor(self._read("frames/next_uid", k)),
             step=int(self.steps[k]), time=float(self.times[k]), fields=fields, declared=declared, layout=layout,
         )  # fmt: skip
 

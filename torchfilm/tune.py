@@ -109,6 +109,8 @@ def tune(
     molecule are probed by their smooth mean, since noise is no error. watch: is told in words what is being done. Raises InputError where nothing holds the
     error, or where the probe cannot tell it; SimulationError where the scene fails on the way to where the probe begins.
     """
+    if not isinstance(scene, Scene):
+        raise checks.refuse("scene", scene, "a Scene, such as tf.scenes.microcolony()")
     checks.number("error", error, above=0.0, most=0.5)
     for name, given, least, why in (("cells", cells, 1, ""), ("colonies", colonies, 2, "By how they differ it tells what of an error may be chance.")):
         if isinstance(given, bool) or not isinstance(given, int) or given < least:

@@ -356,3 +356,21 @@ def test_looking_for_contacts_is_reading_the_geometry():
     scene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=pair_of_cells())
     scene.seed()
     assert {"growth", "mechanics"} <= {w for w, _, r in scene.couplings() if r == "rules"}
+
+
+def test_a_rule_that_would_fail_with_two_cells_is_told_at_once_with_one():
+    def update(cells):
+        if cells.length > 3:
+            cells.growth_rate = 1.0
+
+    scene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division())
+    with pytest.raises(tf.InputError, match=r"test_rules\.py, line \d+ \(if cells\.length > 3:\).*torch\.where"):
+        scene.seed()
+
+
+def test_a_rule_that_names_a_new_variable_sees_one_founder_as_it_is():
+    def update(cells):
+        cells.age = cells.length * 0 + 2.0
+
+    state = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division()).seed()
+    assert state.cells == 1 and state.age.shape == (1,)

@@ -11,6 +11,7 @@ that nothing declares become variables, and what it reads and writes is noted, s
 from __future__ import annotations
 
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -83,14 +84,15 @@ class Rules(Effect):
         """Try `update` once on the first state: new names become fields, and what is read and written is noted."""
         update = self.source.functions["update"]
         if update is not None:
-            view = CellsView(state, TRIAL_STEP, _label(update), declaring=True)
-            update(view)
-            view.check_unharmed()
+            # one cell would let pass what fails with two, such as `if cells.length > 3`
+            tried = state.take(torch.zeros(2, dtype=torch.int64, device=state.device)) if state.cells == 1 else state
+            view = CellsView(tried, TRIAL_STEP, _label(update), declaring=True)
+            _act(update, view)
             for name, value in view._work.items():
                 if name not in state.fields and name != "remove_flag":
                     new = KNOWN_FIELDS.get(name) or Field(name, "variable of the user's rules", dtype=value.dtype, shape=tuple(value.shape[1:]))
-                    state = state.declare(new)
-            changed = [n for n, v in view._work.items() if n != "remove_flag" and not torch.equal(v, state.fields[n])]
+                    state, tried = state.declare(new), tried.declare(new)
+            changed = [n for n, v in view._work.items() if n != "remove_flag" and not torch.equal(v, tried.fields[n])]
             writes = view._written | set(changed)
             self.noted["reads"] = tuple(sorted(view._read))
             self.noted["writes"] = tuple("cells" if n == "remove_flag" else n for n in sorted(writes))
@@ -120,10 +122,26 @@ def _label(rule: Callable[..., None]) -> str:
     return f"rule {getattr(rule, '__module__', '')} {getattr(rule, '__qualname__', type(rule).__name__)}"
 
 
+def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
+    """Let a rule act on what it sees."""
+    try:
+        rule(*views)
+    except RuntimeError as error:
+        if "Boolean value of Tensor" not in str(error):
+            raise
+        # the first line is this one, the next is the rule's
+        at = traceback.extract_tb(error.__traceback__)[1]
+        raise RuleError(
+            f"{Path(at.filename).name}, line {at.lineno} ({at.line}): a rule sees all cells at once, so there is no one truth for `if`, `and` or `not`. "
+            "Write torch.where(condition, a, b) with &, | and ~, or go through them one by one (slow): for cell in cells."
+        ) from error
+    for view in views:
+        view.check_unharmed()
+
+
 def _apply(update: Callable[[CellsView], None], state: State, dt: float) -> State:
     view = CellsView(state, dt, _label(update))
-    update(view)
-    view.check_unharmed()
+    _act(update, view)
     work = dict(view._work)
     if "drag" in work and not bool((work["drag"] > 0).all()):
         raise RuleError(f"cells.drag was set to {float(work['drag'].min()):g}: it must be above 0.")
@@ -168,9 +186,7 @@ def _after_divide(act: Callable[..., None], state: State, births: Births) -> tup
         DivisionView(state, births.first, "daughter1", "divide first"),
         DivisionView(state, births.second, "daughter2", "divide second"),
     )
-    act(*views)
-    for view in views:
-        view.check_unharmed()
+    _act(act, *views)
     return views
 
 

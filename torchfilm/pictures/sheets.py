@@ -203,6 +203,8 @@ def seen_along(look: Look) -> str:
 
 def beside(path: str | Path, out: str | Path | None, ending: str) -> Path:
     """Where a picture goes; never onto the results themselves."""
+    if not isinstance(path, (str, Path)):
+        raise checks.refuse("results", path, "the path of a results file", "A state is drawn by tf.pictures.sheet(state, out).")
     own = Path(path)
     target = Path(out) if out is not None else own.with_name(own.stem + ending)
     if target.absolute() == own.absolute():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
 import inspect
 from collections.abc import Callable
@@ -59,7 +60,9 @@ READY: dict[str, Callable[..., Scene]] = {
 def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
     """The ready-made scene of that name."""
     if name not in READY:
-        raise checks.refuse("scene", name, "one of " + ", ".join(READY) + ", or the path of a Python file that defines `scene`")
+        near = difflib.get_close_matches(name, READY, n=1)
+        mend = f"Did you mean {near[0]}?" if near else ""
+        raise checks.refuse("scene", name, "one of " + ", ".join(READY) + ", or the path of a Python file that defines `scene`", mend)
     allowed = inspect.signature(READY[name]).parameters
     for given in parameters or {}:
         if given not in allowed:
