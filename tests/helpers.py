@@ -136,9 +136,9 @@ def bodies(c, a, length, radius=0.5, *, dtype=torch.float64, device="cpu") -> Bo
     return Bodies(t(c).T.contiguous(), t(a).T.contiguous(), 0.5 * length, t(radius).expand(length.shape).contiguous())
 
 
-def rows_of(cells: Bodies, first: Tensor, second: Tensor, whole_lines: bool = False) -> Contacts:
+def rows_of(cells: Bodies, first: Tensor, second: Tensor, push: bool = False) -> Contacts:
     """All rows that overlap among the given pairs (P,), (P,)."""
-    return contacts_of(Touching.among(cells, first, second), whole_lines)
+    return contacts_of(Touching.among(cells, first, second), push)
 
 
 def unit(rng: np.random.Generator, count: int, dim: int) -> np.ndarray:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchfilm.effect import MECHANICS, Effect, per_cell
 from torchfilm.physics import capsule
-from torchfilm.physics.contacts import Bodies, Contacts, Touching, contact_gaps, contacts_of
+from torchfilm.physics.contacts import NEAR, Bodies, Contacts, Touching, contact_gaps, contacts_of
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.rows import ContactRows
 from torchfilm.physics.solve import CONVERGED, NOT_FINITE, STATUS, TOO_FAST, ContactProblem, SolveReport, solve
@@ -227,6 +227,8 @@ class _Run:
         else:
             self.alpha = (PENALTY / self.length_drag).expand(state.cells)
         self.overlap = self._overlap(coarse.index_select(0, state.colony))
+        # does a first pass, and does a later one, see what nearly touches? Rows that hold would glue what growth takes apart, and soft cells
+        self.sees_near = (settings.unilateral and settings.stiffness is None, settings.stiffness is None)
 
     @torch.no_grad()
     def _overlap(self, coarse: Tensor) -> Tensor:
@@ -245,24 +247,25 @@ class _Run:
             if not bool(active.any()):
                 return
             if number == 0:
-                pairs, walls = self._all_that_touches(active)
+                pairs, walls = self._all_that_touches(active, self.sees_near[0])
             else:
                 pairs, walls, moving = self._left_deep(active, pairs)
                 active = self.state.groups.any(moving)
                 if not bool(active.any()):
                     return
-            move, report = self._solve(contacts_of(pairs, whole_lines=self.settings.unilateral), walls, base, moving, number)
+            contacts = contacts_of(pairs, self.settings.unilateral, self.sees_near[number > 0])
+            move, report = self._solve(contacts, walls, base, moving, number)
             self._move(move, base, moving, report, active)
             self.report = self._noted(report, active)
             if number == 0:
                 self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
 
-    def _all_that_touches(self, active: Tensor) -> tuple[Touching, WallContacts]:
+    def _all_that_touches(self, active: Tensor, sees_near: bool) -> tuple[Touching, WallContacts]:
         """In the colonies that are active, (B,) bool."""
-        near, rows, bodies = self._neighbourhood(active)
+        near, rows, bodies = self._neighbourhood(active, sees_near)
         first, second = (rows.index_select(0, side) for side in near.pairs())
-        walls = self._at_walls(active.index_select(0, self.state.colony))
-        return Touching.among(bodies, first, second), walls
+        walls = self._at_walls(active.index_select(0, self.state.colony), sees_near)
+        return Touching.among(bodies, first, second, sees_near), walls
 
     def _left_deep(self, active: Tensor, pairs: Touching) -> tuple[Touching, WallContacts, Tensor]:
         """After a move, in the colonies that are active: the cells that take part in another pass, (N,) bool, those whose move was cut short, or left
@@ -271,10 +274,10 @@ class _Run:
         Only there is it looked for: of two cells that did not touch, one must have moved by half of what may be left, and two that did must have come
         nearer by what was missing to it.
         """
-        state = self.state
-        near, rows, bodies = self._neighbourhood(active)
+        state, sees_near = self.state, self.sees_near[1]
+        near, rows, bodies = self._neighbourhood(active, sees_near)
         of_active = active.index_select(0, state.colony)
-        walls = self._at_walls(of_active)
+        walls = self._at_walls(of_active, sees_near)
         with torch.no_grad():
             number = torch.full_like(state.colony, -1).index_copy(0, rows, torch.arange(rows.numel(), device=rows.device))
             pairs_of = lambda cells: [rows.index_select(0, side) for side in near.pairs_of(number[cells])]  # noqa: E731
@@ -295,26 +298,28 @@ class _Run:
             new = torch.nonzero(~far.index_select(0, more[1])).squeeze(1)  # the others are known by now
             first, second = (torch.cat([a, b.index_select(0, new)]) for a, b in zip((first, second), more, strict=True))
             theirs = torch.nonzero(left.index_select(0, first) | left.index_select(0, second)).squeeze(1)
-        pairs = Touching.among(bodies, first.index_select(0, theirs), second.index_select(0, theirs))
+        pairs = Touching.among(bodies, first.index_select(0, theirs), second.index_select(0, theirs), sees_near)
         return pairs, walls.take(torch.nonzero(left.index_select(0, walls.cell)).squeeze(1)), left
 
-    def _neighbourhood(self, active: Tensor) -> tuple[Neighbourhood, Tensor, Bodies]:
+    def _neighbourhood(self, active: Tensor, sees_near: bool) -> tuple[Neighbourhood, Tensor, Bodies]:
         """The cells of the colonies that are active (others cannot be stepped perhaps), which those are (M,), and every cell's body."""
         state = self.state
         local = (self.position - self.reference).to(state.dtype)
         bodies = Bodies(local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius)
         rows = torch.nonzero(active.index_select(0, state.colony)).squeeze(1)
         pick = lambda x: x.detach() if rows.numel() == state.cells else x.detach().index_select(0, rows)  # noqa: E731
-        near = Neighbourhood(pick(local), pick(self.axis), pick(self.length), pick(state.radius), pick(state.colony), state.colonies)
+        radius = pick(state.radius)
+        margin = NEAR * radius if sees_near else 0.0
+        near = Neighbourhood(pick(local), pick(self.axis), pick(self.length), radius, pick(state.colony), state.colonies, margin)
         return near, rows, bodies
 
-    def _at_walls(self, which: Tensor) -> WallContacts:
+    def _at_walls(self, which: Tensor, sees_near: bool) -> WallContacts:
         """What touches walls among the cells that are marked, (N,) bool."""
         given = (self.position, self.axis, self.length, self.state.radius, self.colony_ids)
         if bool(which.all()):
-            return find_wall_contacts(self.surfaces, *given)
+            return find_wall_contacts(self.surfaces, *given, push=self.settings.unilateral, near=sees_near)
         rows = torch.nonzero(which).squeeze(1)
-        found = find_wall_contacts(self.surfaces, *(x.index_select(0, rows) for x in given))
+        found = find_wall_contacts(self.surfaces, *(x.index_select(0, rows) for x in given), push=self.settings.unilateral, near=sees_near)
         return replace(found, cell=rows.index_select(0, found.cell))
 
     def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, number: int):

@@ -15,6 +15,8 @@ from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_s
 
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see `contact_points`).
 LINE_CONTACT_SINE = 0.4
+# How near two surfaces are, in radii, that a pass which moves cells again keeps as far apart as they are (see `contacts_of`).
+NEAR = 0.1
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,8 @@ def _end(s: Tensor, half: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Touching:
-    """K pairs of cells that overlap at their closest points: first and second cell (K,), their bodies a and b, the points s and t of `closest_points`."""
+    """K pairs of cells that overlap at their closest points, or are near there: first and second cell (K,), their bodies a and b, the points s and t of
+    `closest_points`."""
 
     first: Tensor
     second: Tensor
@@ -173,13 +176,13 @@ class Touching:
     t: Tensor
 
     @staticmethod
-    def among(bodies: Bodies, first: Tensor, second: Tensor) -> Touching:
-        """Those of the pairs (P,), (P,)."""
+    def among(bodies: Bodies, first: Tensor, second: Tensor, near: bool = False) -> Touching:
+        """Those of the pairs (P,), (P,); near: with those that come within NEAR."""
         a, b = bodies.take(first), bodies.take(second)
         found = Touching(first, second, a, b, *closest_points(a, b))
         with torch.no_grad():
             # no point of a line is nearer than the closest one, but for rounding, of which this is many times more
-            keep = torch.nonzero(found.gap < 1e-3 * (a.radius + b.radius)).squeeze(1)
+            keep = torch.nonzero(found.gap < max(1e-3, 0.5 * NEAR * near) * (a.radius + b.radius)).squeeze(1)
         return found.take(keep)
 
     @property
@@ -193,34 +196,50 @@ class Touching:
         return Touching(pick(self.first), pick(self.second), self.a.take(index), self.b.take(index), pick(self.s), pick(self.t))
 
 
-def contacts_of(pairs: Touching, whole_lines: bool = False) -> Contacts:
+def contacts_of(pairs: Touching, push: bool = False, near: bool = False) -> Contacts:
     """All rows of pairs that overlap (gap < 0), and of a line of contact that overlaps at one end what keeps the other from
     swinging in: a row of gap 0, whose weight falls from that of the line to nothing as its end parts as far as the first overlaps. Without it a cell that is
-    squeezed between two rocks from step to step, and they close in on it. whole_lines: both ends as they are if one of them overlaps, for a
-    solve in which contacts only push, which sees by itself what it would push the other end into."""
+    squeezed between two rocks from step to step, and they close in on it.
+
+    push: for a solve in which contacts only push, which sees by itself what it would push into what: with the gaps as they are, both ends of a line if one of
+    them overlaps. near: for a pass that moves cells again, rows of what is within NEAR too, of gap 0 unless `push`, whose weight falls to nothing on the way
+    there. Half of what a pass has parted is a hair apart: the next one, blind to it, pushed it together again, deeper with every pass where contacts are hard,
+    until a full channel was a heap.
+    """
     first, second, a, b, s, t = pairs.first, pairs.second, pairs.a, pairs.b, pairs.s, pairs.t
     # only the nearly parallel may have a line; all others touch at the closest point
-    near = torch.nonzero(_slide(cross(a.axis, b.axis)).detach() > 0).squeeze(1)
-    near_a, near_b = a.take(near), b.take(near)
-    *of_lines, line = _line_points(near_a, near_b, s.index_select(0, near), t.index_select(0, near))
-    points = [x.index_copy(0, near, ends[0]) for x, ends in zip((s, t, _end(s, a.half), _end(t, b.half)), of_lines, strict=True)]
-    ends = [_gap(near_a, near_b, of_lines[0][k], of_lines[1][k]) for k in (0, 1)]
+    flat = torch.nonzero(_slide(cross(a.axis, b.axis)).detach() > 0).squeeze(1)
+    flat_a, flat_b = a.take(flat), b.take(flat)
+    *of_lines, line = _line_points(flat_a, flat_b, s.index_select(0, flat), t.index_select(0, flat))
+    points = [x.index_copy(0, flat, ends[0]) for x, ends in zip((s, t, _end(s, a.half), _end(t, b.half)), of_lines, strict=True)]
+    ends = [_gap(flat_a, flat_b, of_lines[0][k], of_lines[1][k]) for k in (0, 1)]
+    point, margin = _gap(a, b, points[0], points[1]), 0.5 * NEAR * near * (a.radius + b.radius)
     # cull again without a gradient: a first row for every pair, a second one where there is a line
     with torch.no_grad():
-        deep0, deep1 = _gap(a, b, points[0], points[1]) < 0, line & (ends[1] < 0)
-        either = line & (deep0.index_select(0, near) | deep1) & (whole_lines | (ends[0] + ends[1] < 0))
-        deep0[near] |= either
+        deep0, deep1 = point < margin, line & (ends[1] < margin.index_select(0, flat))
+        either = line & (deep0.index_select(0, flat) | deep1) & (push | (ends[0] + ends[1] < 0))
+        deep0[flat] |= either
         keep0, keep1 = torch.nonzero(deep0).squeeze(1), torch.nonzero(deep1 | either).squeeze(1)
-    share = torch.full_like(ends[0], 0.5) if whole_lines else 0.5 * _held_share(*ends)
-    of_ends = [torch.ones_like(s).index_copy(0, near, torch.where(line, torch.where(end < 0, 0.5, share), 1.0)) for end in ends]
-    weight = torch.cat([of_ends[0].index_select(0, keep0), of_ends[1].index_select(0, near).index_select(0, keep1)])
-    keep = torch.cat([keep0, near.index_select(0, keep1)])
+    share = torch.full_like(ends[0], 0.5) if push else 0.5 * _held_share(*ends)
+    whole = torch.ones_like(s)
+    if near and not push:
+        whole, of_each = _near_share(point, margin), [0.5 * _near_share(end, margin.index_select(0, flat)) for end in ends]
+    else:
+        of_each = [torch.where(end < 0, 0.5, 0.0) for end in ends]
+    of_ends = [whole.index_copy(0, flat, torch.where(line, torch.maximum(each, share), whole.index_select(0, flat))) for each in of_each]
+    weight = torch.cat([of_ends[0].index_select(0, keep0), of_ends[1].index_select(0, flat).index_select(0, keep1)])
+    keep = torch.cat([keep0, flat.index_select(0, keep1)])
     s, t, end_a, end_b = (torch.cat([x.index_select(0, keep0), two[1].index_select(0, keep1)]) for x, two in zip(points, of_lines, strict=True))
     a, b = a.take(keep), b.take(keep)
     gap, row_first, row_second, normal = _rows(a, b, s, t, end_a, end_b)
-    gap = gap if whole_lines else gap.clamp(max=0.0)
+    gap = gap if push else gap.clamp(max=0.0)
     pick = lambda x: x.index_select(0, keep)  # noqa: E731
     return Contacts(pick(first), pick(second), gap, weight, row_first, row_second, normal)
+
+
+def _near_share(gap: Tensor, margin: Tensor) -> Tensor:
+    """1 for what overlaps, 0 for what is `margin` apart: the weight of a row that keeps a gap, whose root falls evenly."""
+    return (1.0 - gap / margin).clamp(min=0.0, max=1.0).square()
 
 
 def _held_share(one: Tensor, other: Tensor) -> Tensor:

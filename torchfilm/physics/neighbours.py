@@ -32,11 +32,12 @@ class Neighbourhood:
     """Cells of many colonies where they stand, to be asked who is near whom as often as need be.
 
     position, axis (N, d) µm and unit; length, radius (N,) µm; colony (N,) int64. A pair (i, j), i ≠ j, is of one colony, and its bounding spheres and
-    bounding boxes come within `margin` µm of each other. No pair whose surfaces are within `margin` is missing. Pairs are two (P,) int64 tensors.
+    bounding boxes come within `margin` µm of each other, one number or the mean of the two cells' own (N,). No pair whose surfaces are within it is missing.
+    Pairs are two (P,) int64 tensors.
     """
 
     @torch.no_grad()
-    def __init__(self, position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float = 0.0):
+    def __init__(self, position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float | Tensor = 0.0):
         self.place, self.reach = position.T.contiguous(), 0.5 * length + radius + 0.5 * margin
         # a hair more, so that rounding loses no pair that touches exactly
         self.box = (0.5 * length * axis.abs().T + radius + 0.5 * margin) * (1 + 1e-5)

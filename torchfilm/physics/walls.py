@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.physics.contacts import NEAR
 from torchfilm.tools import checks
 from torchfilm.tools.vectors import cross, dot, safe_norm, safe_sqrt
 
@@ -315,10 +316,13 @@ class WallContacts:
         return WallContacts(*(x.index_select(0, index) for x in (self.cell, self.gap, self.row, self.surface)))
 
 
-def find_wall_contacts(surfaces: Sequence[Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony_id: Tensor) -> WallContacts:
+def find_wall_contacts(
+    surfaces: Sequence[Surface], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony_id: Tensor, push: bool = False, near: bool = False,
+) -> WallContacts:  # fmt: skip
     """One row for each capsule end that overlaps (gap < 0), and at a sphere met from outside one for the nearest point, wherever it is.
 
-    position (N, d) float64 absolute; axis (N, d), length, radius (N,); colony_id (N,), by which a wall's value per colony is found.
+    position (N, d) float64 absolute; axis (N, d), length, radius (N,); colony_id (N,), by which a wall's value per colony is found. push, near: as of
+    `contacts_of`, of walls that are not soft.
     """
     found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     half = 0.5 * length
@@ -327,9 +331,12 @@ def find_wall_contacts(surfaces: Sequence[Surface], position: Tensor, axis: Tens
             point = position + (s.unsqueeze(1) * axis).to(position.dtype)
             distance, way = surface.gap_of_points(point, colony_id)
             gap = distance.to(length.dtype) - radius
-            keep = torch.nonzero((gap < 0) & (root > 0)).squeeze(1)
+            margin = NEAR * radius if near and surface.wall.stiffness is None else torch.zeros_like(radius)
+            keep = torch.nonzero((gap < margin) & (root > 0)).squeeze(1)
             if keep.numel() == 0:
                 continue
+            if near and not push:
+                root, gap = root * (1.0 - gap / margin.clamp(min=1e-30)).clamp(min=0.0, max=1.0), gap.clamp(max=0.0)
             pick = lambda x, keep=keep: x.index_select(0, keep)  # noqa: E731
             n = way.index_select(1, keep).to(axis.dtype)
             a = pick(axis).T
