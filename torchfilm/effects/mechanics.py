@@ -315,11 +315,12 @@ class _Run:
 
     def _at_walls(self, which: Tensor, sees_near: bool) -> WallContacts:
         """What touches walls among the cells that are marked, (N,) bool."""
-        given = (self.position, self.axis, self.length, self.state.radius, self.colony_ids)
+        position, axis, length, radius, ids = self.position, self.axis, self.length, self.state.radius, self.colony_ids
         if bool(which.all()):
-            return find_wall_contacts(self.surfaces, *given, push=self.settings.unilateral, near=sees_near)
+            return find_wall_contacts(self.surfaces, position, axis, length, radius, ids, self.settings.unilateral, sees_near)
         rows = torch.nonzero(which).squeeze(1)
-        found = find_wall_contacts(self.surfaces, *(x.index_select(0, rows) for x in given), push=self.settings.unilateral, near=sees_near)
+        position, axis, length, radius, ids = (x.index_select(0, rows) for x in (position, axis, length, radius, ids))
+        found = find_wall_contacts(self.surfaces, position, axis, length, radius, ids, self.settings.unilateral, sees_near)
         return replace(found, cell=rows.index_select(0, found.cell))
 
     def _solve(self, contacts: Contacts, walls: WallContacts, base: Tensor, moving: Tensor, number: int):
