@@ -6,8 +6,8 @@
     python experiments/tune_check.py --gather channel.csv microcolony.csv …                    # the page of what was found
 
 The runs that it has not seen have other seeds: 24 colonies that begin with 100 cells, and 48 that begin with half as many again. A sweep of six steps (and
-three finer ones, where none of those holds the error) with six settings of contacts and two tolerances of circuits is made in the first. From the one that took
-the least time on, those that hold the error there are tried in the second as well, until one holds it in both: of so many settings some hold it by luck, and
+three finer ones, where none of those holds the error) with eight settings of contacts and two tolerances of circuits is made in the first. From the one that
+took the least time on, those that hold the error there are tried in the second as well, until one holds it in both: of so many settings some hold it by luck, and
 some at one size only. It is timed beside the chosen one, and what that one takes over what the sweep's takes is the last column.
 """
 
@@ -34,10 +34,8 @@ from record import machine, write_page  # noqa: E402
 
 STEPS = (12, 18, 24, 30, 40, 54)
 FINER = (72, 96, 128)  # where none of those holds the error
-SWEPT = ((0.3, 0, 0.05), (0.1, 0, 0.2), (0.1, 0, 0.05), (0.1, 0, 0.02), (0.1, 0, 0.01), (0.03, 0, 0.02))
+SWEPT = ((0.3, 0, 0.05), (0.1, 0, 0.2), (0.1, 0, 0.05), (0.1, 0, 0.02), (0.1, 0, 0.01), (0.03, 0, 0.02), (0.01, 0, 0.02), (0.01, 0, 0.01))
 RTOLS = (1e-1, 1e-3)
-# A ready scene that holds fewer cells than are wanted is given more room.
-ROOMIER = {"channel": {"width": 16.0, "length": 80.0}}
 COLUMNS = (
     "scene",
     "settings",
@@ -87,7 +85,7 @@ def sweep(run: Run, steps: Sequence[int]) -> list[tf.Settings]:
 
 def check(name: str, error: float) -> dict[str, str]:
     """One scene's row."""
-    scene = tf.scenes.build(name, ROOMIER.get(name))
+    scene = tf.scenes.build(name)
     tuned = tf.tune(scene, error)
     names = tuple(tuned.chosen.errors)
     few, many = Run.of(scene, 100, 24, 5, tuned.finest), Run.of(scene, 150, 48, 6, tuned.finest)

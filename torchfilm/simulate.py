@@ -109,6 +109,9 @@ def _last_step(state: State, until: float, dt: float) -> int:
 
 # How often, in steps, a run that ends at a number of cells is asked whether its colonies still grow, and how long they may stand still.
 LOOK, STILL = 100, 1000
+# A colony whose contacts do not hold has more than this share of its cells (of MANY, if it has fewer) in others for LONG steps. Cells that were thrown on a heap
+# part in a few.
+BURIED, MANY, LONG = 0.1, 50, 20
 
 
 class Standstill:
@@ -148,8 +151,33 @@ class _Waiting:
             )  # fmt: skip
 
 
+class _Collapse:
+    """Warns, once, of colonies in which cells keep lying in one another: their contacts do not hold them apart any more, and no solve says so."""
+
+    def __init__(self) -> None:
+        self.steps: Tensor | None = None
+        self.told = False
+
+    def __call__(self, state: State) -> None:
+        report = state.reports.get("mechanics")
+        if self.told or report is None:
+            return
+        before = torch.zeros_like(state.counts) if self.steps is None else self.steps
+        self.steps = torch.where(report.buried > BURIED * state.counts.clamp(min=MANY), before + 1, 0)
+        fallen = self.steps >= LONG
+        self.told = bool(fallen.any())
+        if self.told:
+            each = zip(state.colony_id[fallen].tolist()[:5], report.buried[fallen].tolist(), strict=False)
+            names = ", ".join(f"{colony} ({cells} cells)" for colony, cells in each)
+            warnings.warn(
+                f"step {state.step} (t = {state.time:g} h): cells have been lying deeper in one another than a radius for {LONG} steps in colony {names}. "
+                "Contacts are too hard for this step, or cells were placed on one another: take a smaller dt or a larger alpha.",
+                RuntimeWarning, stacklevel=3,
+            )  # fmt: skip
+
+
 def _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings):
-    waiting = _Waiting(cells) if math.isinf(last) else None
+    waiting, collapse = _Waiting(cells) if math.isinf(last) else None, _Collapse()
     try:
         for observe in (*([recorder] if recorder else []), *observers):
             observe(state)
@@ -163,6 +191,7 @@ def _run(scene, state, last, cells, dt, recorder, observers, on_failure, timings
                 observe(state)
             if waiting:
                 waiting(state)
+            collapse(state)
             yield state
     finally:
         if recorder:

@@ -154,6 +154,15 @@ def test_more_passes_over_hard_contacts_keep_a_full_channel_apart(full_channel, 
     assert int((state.counts - full_channel.counts).max()) < 30
 
 
+def test_a_colony_whose_contacts_do_not_hold_is_told(full_channel):
+    """A hundred times as hard as the default at the default step: no solve fails, and cells lie on one another."""
+    scene = tf.Settings(penalty=0.001, tolerance=0.02).apply(tf.scenes.channel())
+    with pytest.warns(RuntimeWarning, match=r"colony \d \(\d+ cells\).*larger alpha"):
+        for state in tf.simulate(scene, full_channel, until=full_channel.time + 2.5):
+            if int(state.reports["mechanics"].buried.max()) > 60:
+                break
+
+
 @pytest.mark.parametrize("unilateral", [False, True])
 @pytest.mark.parametrize("alpha", [1e-6, 1e-7])
 def test_nearly_hard_contacts_converge_in_32_bits(alpha, unilateral):

@@ -39,7 +39,7 @@ COARSE_PASSES = 6
 class MechanicsReport:
     """What the last step's contact solves did, per colony (B,). `status` of the worst solve, `iterations` of CG in all, `residual` the
     worst true one; `passes` and `substeps` taken; `limited`: cells whose last move was cut, since it turned them further than MAX_TURN or took them
-    through a wall."""
+    through a wall; `buried`: cells that were deeper in another than a radius when the step began (0 of soft cells, which may be)."""
 
     status: Tensor
     iterations: Tensor
@@ -47,6 +47,7 @@ class MechanicsReport:
     passes: Tensor
     substeps: Tensor
     limited: Tensor
+    buried: Tensor
     mend = "A smaller dt, a larger alpha or more max_iterations may help"
 
     def reason(self, place: int) -> str:
@@ -208,7 +209,7 @@ class _Run:
         self.limited = zero
         # of the last move: which cells it was cut short for, (N,), and how far the surface of each has come at the most, (N,) µm
         self.cut, self.moved = torch.zeros_like(state.colony, dtype=torch.bool), torch.zeros_like(state.radius)
-        self.report = MechanicsReport(status, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero)
+        self.report = MechanicsReport(status, zero, torch.zeros(count, dtype=state.dtype, device=state.device), zero, substeps, zero, zero)
         start = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
         self.reference = state.position.detach().index_select(0, start).index_select(0, state.colony)
         drag_factor = state.fields.get("drag")
@@ -248,6 +249,7 @@ class _Run:
                 return
             if number == 0:
                 pairs, walls = self._all_that_touches(active, self.sees_near[0])
+                self._note_buried(pairs, active)
             else:
                 pairs, walls, moving = self._left_deep(active, pairs)
                 active = self.state.groups.any(moving)
@@ -259,6 +261,15 @@ class _Run:
             self.report = self._noted(report, active)
             if number == 0:
                 self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
+
+    @torch.no_grad()
+    def _note_buried(self, pairs: Touching, active: Tensor) -> None:
+        if self.settings.stiffness is None:
+            deep = torch.nonzero(pairs.gap < -0.5 * (pairs.a.radius + pairs.b.radius)).squeeze(1)
+            cells = torch.zeros_like(self.state.radius)
+            cells[torch.cat([pairs.first.index_select(0, deep), pairs.second.index_select(0, deep)])] = 1.0
+            found = self.state.groups.sum(cells.unsqueeze(1)).squeeze(1).long()
+            self.report = replace(self.report, buried=torch.where(active, found, self.report.buried))
 
     def _all_that_touches(self, active: Tensor, sees_near: bool) -> tuple[Touching, WallContacts]:
         """In the colonies that are active, (B,) bool."""
@@ -412,5 +423,5 @@ class _Run:
             torch.where(active, torch.maximum(old.status, new.status), old.status),
             old.iterations + torch.where(active, new.iterations, 0),
             torch.where(active, torch.maximum(old.residual, new.residual), old.residual),
-            old.passes + active, old.substeps, self.limited,
+            old.passes + active, old.substeps, self.limited, old.buried,
         )  # fmt: skip
