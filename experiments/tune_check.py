@@ -7,8 +7,8 @@
 
 The runs that it has not seen have other seeds: 24 colonies that begin with 100 cells, and 48 that begin with half as many again. A sweep of six steps (and
 three finer ones, where none of those holds the error) with eight settings of contacts and two tolerances of circuits is made in the first. From the one that
-took the least time on, those that hold the error there are tried in the second as well, until one holds it in both: of so many settings some hold it by luck, and
-some at one size only. It is timed beside the chosen one, and what that one takes over what the sweep's takes is the last column.
+took the least time on, those that hold the error there are tried in the second as well, until one holds it in both: of so many settings some hold it by luck,
+and some at one size only. It is timed beside the chosen one, and what that one takes over what the sweep's takes is the last column.
 """
 
 from __future__ import annotations

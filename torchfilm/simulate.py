@@ -109,7 +109,7 @@ def _last_step(state: State, until: float, dt: float) -> int:
 
 # How often, in steps, a run that ends at a number of cells is asked whether its colonies still grow, and how long they may stand still.
 LOOK, STILL = 100, 1000
-# A colony whose contacts do not hold has more than this share of its cells (of MANY, if it has fewer) in others for LONG steps. Cells that were thrown on a heap
+# A colony whose contacts do not hold has more than this share of its cells (of MANY, if it has fewer) in others for LONG steps. Cells thrown on a heap
 # part in a few.
 BURIED, MANY, LONG = 0.1, 50, 20
 
@@ -171,7 +171,7 @@ class _Collapse:
             names = ", ".join(f"{colony} ({cells} cells)" for colony, cells in each)
             warnings.warn(
                 f"step {state.step} (t = {state.time:g} h): cells have been lying deeper in one another than a radius for {LONG} steps in colony {names}. "
-                "Contacts are too hard for this step, or cells were placed on one another: take a smaller dt or a larger alpha.",
+                "Contacts are too hard for this step (take a smaller dt or a larger alpha), or give way too much (take a smaller alpha).",
                 RuntimeWarning, stacklevel=3,
             )  # fmt: skip
 
