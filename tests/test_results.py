@@ -289,11 +289,36 @@ def test_recipe_of_a_scene_of_ones_own_is_none(whole):
         assert results.recipe is None and json.loads(results.attributes["recipe"]) is None
 
 
-def test_a_reader_of_a_finished_run_sees_what_its_resumption_adds(tmp_path):
+@pytest.mark.parametrize("since", ["the end", "before it"])
+def test_a_reader_sees_what_a_resumption_adds(tmp_path, since):
+    """Of a finished run, opened when it was, or while it was written; beside it others read the file, and it goes on."""
     path, scene = tmp_path / "run.h5", make_scene()
-    record(scene, scene.seed(2, seed=1), path, until=1.0)
-    with tf.Results(path) as results:
+    run = tf.simulate(scene, scene.seed(2, seed=1), until=1.0, record=tf.Recorder(path, scene, every=5))
+    for _ in range(12):
+        next(run)
+    live = tf.Results(path) if since == "before it" else None
+    for _ in run:
+        pass
+    with live or tf.Results(path) as results, tf.Results(path) as other:
+        results.refresh()
         before = len(results)
-        record(scene, results.state(scene), path, until=2.0, append=True)
+        assert before == len(other) and results.times[-1] == pytest.approx(1.0)
+        if live is None:
+            with h5py.File(path, "r") as file:
+                assert len(file["frames/step"]) == before
+        record(scene, other.state(scene), path, until=2.0, append=True)
         results.refresh()
         assert len(results) > before and results.times[-1] == pytest.approx(2.0)
+
+
+def test_a_reader_survives_a_file_that_is_away_for_a_moment(tmp_path):
+    path, scene = tmp_path / "run.h5", make_scene()
+    record(scene, scene.seed(2, seed=1), path, until=0.5)
+    with tf.Results(path) as results:
+        path.rename(tmp_path / "away.h5")
+        with pytest.raises(tf.InputError, match="No such file"):
+            results.refresh()
+        assert len(results.frame()["uid"]) > 0
+        (tmp_path / "away.h5").rename(path)
+        results.refresh()
+        assert len(results.frame()["uid"]) > 0

@@ -94,12 +94,14 @@ def _open_to_read(path: Path) -> h5py.File:
         raise InputError(f"{path} is truncated: it has {size}{of} bytes. Use a whole copy of it; of a run that just begins, look again.")
     # of a file that nobody writes (or was killed while writing), what cannot be read will not come: a single-writer open would try again for minutes
     finished = len(head) == 48 and head[8] >= 3 and head[11] == 0
-    ways: tuple[dict[str, Any], ...] = ({"locking": False},) if finished else ({"swmr": True, "libver": "latest"}, {})
-    for options in ways:
+    ways: tuple[dict[str, Any], ...] = ({"swmr": True, "libver": "latest"}, {})
+    for options in reversed(ways) if finished else ways:
         try:
             return h5py.File(path, "r", **options)
         except OSError as found:
             error = found
+            if finished and "match" not in str(found):  # but with what this process has it open with since it was written
+                break
     raise InputError(f"{path} cannot be read as HDF5: it is truncated or not a results file ({error}).") from error
 
 
@@ -109,6 +111,7 @@ class Results:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self.file = _open_to_read(self.path)
+        self._inode: int | None = self.path.stat().st_ino
         try:
             with _whole(self.file, "frames/step"):
                 ours = self.file.attrs.get("format") == FORMAT and "frames/step" in self.file
@@ -191,9 +194,11 @@ class Results:
 
     def refresh(self) -> None:
         """See what a run has written since."""
-        if not self.file.swmr_mode:  # it was finished, and may have been resumed
-            self.file.close()
-            self.file = _open_to_read(self.path)
+        inode = self.path.stat().st_ino if self.path.exists() else None
+        if inode != self._inode:  # resumed, which puts a new file there
+            old, self.file, self._inode = self.file, _open_to_read(self.path), inode
+            old.close()
+        if not self.file.swmr_mode:
             return
         self.file["frames/step"].id.refresh()  # first: what it counts has been written before it
         groups = ("cells", "signals", "lineage/births", "lineage/ends", "frames/colony", "frames/grid", "frames")

@@ -374,3 +374,13 @@ def test_a_rule_that_names_a_new_variable_sees_one_founder_as_it_is():
 
     state = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division()).seed()
     assert state.cells == 1 and state.age.shape == (1,)
+
+
+@pytest.mark.parametrize("ask", [lambda x: x.item(), float, bool])
+def test_one_number_of_all_cells_is_refused_where_cells_divide(ask):
+    def update(cells):
+        cells.growth_rate = 1.0 if ask(cells.length) else 0.0
+
+    with pytest.raises(tf.InputError, match=r"test_rules\.py, line \d+ .*torch\.where"):
+        tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division()).seed()
+    assert tf.Scene(tf.Rules(update), tf.Growth(rate=0.5)).seed().cells == 1

@@ -39,7 +39,8 @@ COARSE_PASSES = 6
 class MechanicsReport:
     """What the last step's contact solves did, per colony (B,). `status` of the worst solve, `iterations` of CG in all, `residual` the
     worst true one; `passes` and `substeps` taken; `limited`: cells whose last move was cut, since it turned them further than MAX_TURN or took them
-    through a wall; `buried`: cells that were deeper in another than a radius when the step began (0 of soft cells, which may be)."""
+    through a wall; `buried`: cells that were deeper in another than a radius when the step, or its last sub-step, began (0 of soft cells, which may
+    be)."""
 
     status: Tensor
     iterations: Tensor

@@ -84,8 +84,9 @@ class Rules(Effect):
         """Try `update` once on the first state: new names become fields, and what is read and written is noted."""
         update = self.source.functions["update"]
         if update is not None:
-            # one cell would let pass what fails with two, such as `if cells.length > 3`
-            tried = state.take(torch.zeros(2, dtype=torch.int64, device=state.device)) if state.cells == 1 else state
+            # one cell would let pass what fails with two, such as `if cells.length > 3`; where none divides, there may never be two
+            twice = state.cells == 1 and "divide_flag" in state.fields
+            tried = state.take(torch.zeros(2, dtype=torch.int64, device=state.device)) if twice else state
             view = CellsView(tried, TRIAL_STEP, _label(update), declaring=True)
             _act(update, view)
             for name, value in view._work.items():
@@ -126,13 +127,13 @@ def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
     """Let a rule act on what it sees."""
     try:
         rule(*views)
-    except RuntimeError as error:
-        if "Boolean value of Tensor" not in str(error):
+    except (RuntimeError, ValueError) as error:
+        if not any(words in str(error) for words in ("Boolean value of Tensor", "converted to Scalar", "only one element tensors")):
             raise
-        # the first line is this one, the next is the rule's
-        at = traceback.extract_tb(error.__traceback__)[1]
+        # the first line is this one; the rule's may be called by torch's
+        at = next(f for f in reversed(traceback.extract_tb(error.__traceback__)) if "torch" not in Path(f.filename).parts)
         raise RuleError(
-            f"{Path(at.filename).name}, line {at.lineno} ({at.line}): a rule sees all cells at once, so there is no one truth for `if`, `and` or `not`. "
+            f"{Path(at.filename).name}, line {at.lineno} ({at.line}): a rule sees all cells at once, so there is no one truth or number for `if`, `and`, `float` or `item`. "
             "Write torch.where(condition, a, b) with &, | and ~, or go through them one by one (slow): for cell in cells."
         ) from error
     for view in views:
