@@ -133,8 +133,8 @@ def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
         # the first line is this one; the rule's may be called by torch's
         at = next(f for f in reversed(traceback.extract_tb(error.__traceback__)) if "torch" not in Path(f.filename).parts)
         raise RuleError(
-            f"{Path(at.filename).name}, line {at.lineno} ({at.line}): a rule sees all cells at once, so there is no one truth or number for `if`, `and`, `float` or `item`. "
-            "Write torch.where(condition, a, b) with &, | and ~, or go through them one by one (slow): for cell in cells."
+            f"{Path(at.filename).name}, line {at.lineno} ({at.line}): a rule sees all cells at once, so there is no one truth or number for `if` or "
+            "`float`. Write torch.where(condition, a, b) with &, | and ~, or go through them one by one (slow): for cell in cells."
         ) from error
     for view in views:
         view.check_unharmed()
