@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import run, seeded
+from helpers import crowd, run, seeded
 
 import torchfilm as tf
 from torchfilm.physics.capsule import rotate
-from torchfilm.physics.solve import NOT_FINITE
+from torchfilm.physics.solve import CONVERGED
 from torchfilm.physics.walls import share_to_walls
 
 X, Y = [1.0, 0.0], [0.0, 1.0]
@@ -60,7 +60,7 @@ def test_a_cell_that_is_thrown_at_a_wall_stays(device, dtype):
 
 @pytest.mark.parametrize("alpha, viscosity, length_drag", [(1e-7, 0.1, 10.0), (1e-6, 0.01, 1.0), (1e-8, 1.0, 100.0)])
 def test_rods_end_to_end_in_a_full_channel(device, alpha, viscosity, length_drag):
-    """Contacts so hard that in float32 rounding leaves nothing of some cells' inverse blocks: the colony moves on, and all is finite."""
+    """Contacts so hard that float32 rounding alone would make some cells' blocks indefinite: every solve converges."""
     rng = np.random.default_rng(0)
     centre = np.stack([1.45 + 2.9 * np.arange(12), 0.02 * rng.normal(size=12)], 1)
     axis = np.stack([np.ones(12), 0.02 * rng.normal(size=12)], 1)
@@ -70,4 +70,21 @@ def test_rods_end_to_end_in_a_full_channel(device, alpha, viscosity, length_drag
     state = seeded(scene, cells, device, torch.float32)
     for _ in range(4):
         state = run(scene, state, 1, dt=0.025, check=False)
-        assert int(state.reports["mechanics"].status.max()) < NOT_FINITE and bool(torch.isfinite(state.position).all())
+        assert int(state.reports["mechanics"].status.max()) == CONVERGED, state.reports["mechanics"]
+        assert bool(torch.isfinite(state.position).all())
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_contacts_do_not_draw_out_a_cell_that_does_not_grow(device, dtype, dim):
+    """In an overlapping crowd bilateral contacts pull on some cells. They may lengthen cells that grow, but a cell whose
+    growth rate is 0 keeps its length to the bit."""
+    cells = crowd(np.random.default_rng(0), 60, dim)
+    scene = tf.Scene(tf.Growth(rate=[0.0, 0.1]), tf.Mechanics(dim=dim))
+    state = scene.seed(2, cells=cells, device=device, dtype=dtype)
+    still, first = state.colony == 0, state.length
+    for _ in range(4):
+        before, state = state, scene.step(state, 0.025)
+        assert torch.equal(state.length[still], first[still]) and bool((state.elongation[still] == 0).all())
+        slack = 1 - 4 * torch.finfo(dtype).eps  # the growth of a step is added and taken off again
+        assert bool((state.length[~still] >= slack * before.length[~still]).all())
+    assert float((state.position - before.position).abs().max()) > 0

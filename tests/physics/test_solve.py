@@ -77,7 +77,8 @@ class Problem:
         gap = t(other.get("gap", self.gap))
         held = torch.zeros_like(gap) if held is None else t(held)
         colonies = Groups(i(self.colony), self.colonies)
-        return ContactProblem(rows, gap, held, t(self.weight).reshape(self.scale.shape), t(self.lower), t(self.scale), colonies, unilateral)
+        rigid = torch.as_tensor(other.get("rigid", np.zeros(len(self.scale), bool)), device=device)
+        return ContactProblem(rows, gap, held, t(self.weight).reshape(self.scale.shape), t(self.lower), t(self.scale), rigid, colonies, unilateral)
 
     def solved(self, unilateral: bool, tolerance: float | torch.Tensor = 1e-12, **options):
         """The solve's y = x / M^(−½), (N, D), and its report."""

@@ -243,7 +243,7 @@ class _Run:
     def substep(self, base: Tensor, growth: Tensor, active: Tensor) -> None:
         """Grow by `growth` (N,) from `base` (N,), and pass over contacts, in the colonies that are active (B,) bool."""
         moving = active.index_select(0, self.state.colony)
-        self.length = torch.where(moving, base + growth, base)
+        self.length, self.rigid = torch.where(moving, base + growth, base), growth.detach() <= 0
         for number in range(int(self.passes.max())):
             active = active & (number < self.passes)
             if not bool(active.any()):
@@ -355,7 +355,7 @@ class _Run:
         soft = torch.cat([torch.full_like(contacts.first, settings.stiffness is not None, dtype=torch.bool), wall_soft])
         held = torch.zeros_like(gap) if number == 0 else torch.where(soft, gap.clamp(max=0), 0.0)
         lower = (base - self.length) / scale[:, -1]
-        problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1).expand_as(scale).contiguous(), lower, scale, state.groups, settings.unilateral)
+        problem = ContactProblem(rows, gap, held, self.alpha.unsqueeze(1).expand_as(scale).contiguous(), lower, scale, self.rigid, state.groups, settings.unilateral)
         start = state.displacement if number == 0 else None
         if bool(moving.all()):
             return solve(problem, start, self._tolerance(), settings.max_iterations)

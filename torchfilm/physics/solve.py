@@ -48,6 +48,8 @@ STEEP, LEVEL = 0.5, 0.1
 LOOKS = 12
 # The inverse block of a cell whose length is held comes of a subtraction that must leave this share of each diagonal entry.
 LEAST_LEFT = 1e-3
+# Units in the last place of its diagonal by which each cell's block is raised before it is inverted.
+BLOCK_FLOOR = 64
 # Lengths stopped at their bounds must leave DOWNHILL of a step's slope, or the step is halved; it is made shorter so many times at most.
 DOWNHILL, SHORTER = 0.01, 30
 # A solve to no more than this is taken for exact by its adjoint without a word.
@@ -69,7 +71,8 @@ class ContactProblem:
     """One linearised contact problem, R rows over N cells in B colonies.
 
     rows: J scaled by weights and drag. gap: (R,) D g. held: (R,) force of each row already spent in this step (soft rows in
-    later passes), D min(0, g) or 0. alpha: (N, D). lower: (N,) least scaled Δl. scale: (N, D) M^(−½).
+    later passes), D min(0, g) or 0. alpha: (N, D). lower: (N,) least scaled Δl. scale: (N, D) M^(−½). rigid: (N,) bool,
+    cells that do not grow: their length is no degree of freedom, so contacts that hold cannot draw it out.
     """
 
     rows: ContactRows
@@ -78,6 +81,7 @@ class ContactProblem:
     alpha: Tensor
     lower: Tensor
     scale: Tensor
+    rigid: Tensor
     colonies: Groups
     unilateral: bool
 
@@ -99,7 +103,7 @@ class ContactProblem:
         rows, places = self.rows.among(moving)
         of_rows, of_cells = (lambda x, index=index: x.index_select(0, index) for index in (places, cells))
         return ContactProblem(
-            rows, of_rows(self.gap), of_rows(self.held), of_cells(self.alpha), of_cells(self.lower), of_cells(self.scale),
+            rows, of_rows(self.gap), of_rows(self.held), of_cells(self.alpha), of_cells(self.lower), of_cells(self.scale), of_cells(self.rigid),
             Groups(of_cells(self.colonies.owner), self.colonies.size), self.unilateral,
         )  # fmt: skip
 
@@ -114,7 +118,7 @@ class ContactProblem:
         return ContactProblem(
             self.rows.part(rows, number, cells.numel()), self.gap.index_select(0, rows), self.held.index_select(0, rows),
             self.alpha.index_select(0, cells), self.lower.index_select(0, cells), self.scale.index_select(0, cells),
-            Groups(owner, which.colonies.numel()), self.unilateral,
+            self.rigid.index_select(0, cells), Groups(owner, which.colonies.numel()), self.unilateral,
         )  # fmt: skip
 
     @cached_property
@@ -149,7 +153,7 @@ def _detached(p: ContactProblem) -> ContactProblem:
     if not torch.is_grad_enabled() and not r.row_first.requires_grad:
         return p
     rows = ContactRows(r.first, r.second, r.row_first.detach(), r.row_second.detach(), r.at_wall, r.row_wall.detach(), r.cells)
-    return ContactProblem(rows, p.gap.detach(), p.held.detach(), p.alpha.detach(), p.lower.detach(), p.scale.detach(), p.colonies, p.unilateral)
+    return ContactProblem(rows, p.gap.detach(), p.held.detach(), p.alpha.detach(), p.lower.detach(), p.scale.detach(), p.rigid, p.colonies, p.unilateral)
 
 
 def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: Tensor, max_iterations: int):
@@ -162,7 +166,7 @@ def _minimise(problem: ContactProblem, start: Tensor | None, tolerance: Tensor, 
     y, after = zero, problem.gap
     if start is not None:
         y = torch.where(still.index_select(0, colonies.owner).unsqueeze(1), zero, start / problem.scale)
-        y[:, -1] = torch.maximum(y[:, -1], problem.lower)
+        y[:, -1] = torch.where(problem.rigid, 0.0, torch.maximum(y[:, -1], problem.lower))
         after = problem.after(y)
         active = problem.acting(after)
         inverse = _block_inverse(problem, active) if problem.unilateral else inverse
@@ -215,7 +219,7 @@ def _newton(problem: ContactProblem, at: _Iterate, tolerance: Tensor, max_iterat
     y, after, active, inverse, scale, previous, iterations = at.y, at.after, at.active, at.inverse, at.scale, at.worst, at.iterations
     within, gradient = _Within(inverse), problem.gradient(y, after * active)
     while True:
-        free = _free(y, gradient, problem.lower)
+        free = _free(y, gradient, problem)
         precondition = within.at(free)
         worst = worst_of(precondition(gradient), colonies)
         target = tolerance * scale
@@ -301,10 +305,11 @@ def _operator(problem: ContactProblem, active: Tensor) -> Map:
     return apply
 
 
-def _free(y: Tensor, gradient: Tensor, lower: Tensor) -> Tensor:
-    """1 for every degree of freedom that may move, 0 for a length at its bound that is pushed further down. (N, D)"""
+def _free(y: Tensor, gradient: Tensor, problem: ContactProblem) -> Tensor:
+    """1 for every degree of freedom that may move, 0 for a rigid length and for one at its bound that is pushed further
+    down. (N, D)"""
     free = torch.ones_like(y)
-    free[:, -1] = (~((y[:, -1] <= lower) & (gradient[:, -1] > 0))).to(y.dtype)
+    free[:, -1] = (~(((y[:, -1] <= problem.lower) & (gradient[:, -1] > 0)) | problem.rigid)).to(y.dtype)
     return free
 
 
@@ -387,16 +392,19 @@ def _least(problem: ContactProblem, after: Tensor, then: Tensor, step: Tensor, s
 def _block_inverse(problem: ContactProblem, active: Tensor) -> Tensor:
     """Block Jacobi: each cell's own D × D block, inverted, (N, D, D)."""
     blocks = problem.rows.blocks(active if problem.unilateral else None)
-    blocks.diagonal(dim1=1, dim2=2).add_(problem.alpha)
-    # no check here: where a colony is not finite so is its inverse, and its residual says so without stopping the others
-    inverse = torch.linalg.inv_ex(blocks).inverse
-    # of a block that is nearly singular rounding leaves an inverse that is not symmetric, and with such CG comes to a stand
-    return (inverse + inverse.mT).mul_(0.5).contiguous()
+    # A sum of products is off by a few units in the last place of its diagonal. Where alpha is smaller than that, rounding
+    # alone makes a block indefinite, and CG needs a positive definite preconditioner: so each block is raised by more.
+    floor = BLOCK_FLOOR * torch.finfo(blocks.dtype).eps
+    blocks.diagonal(dim1=1, dim2=2).mul_(1.0 + floor).add_(problem.alpha)
+    # No check here: a colony that is not finite has such an inverse, and its residual says so without stopping the others.
+    # Inverted in float64, since float32 loses the small eigenvalues of a block whose eigenvalues differ by a million.
+    inverse = torch.linalg.inv_ex(blocks.double()).inverse
+    return (inverse + inverse.mT).mul_(0.5).to(blocks.dtype).contiguous()
 
 
 def _attach_gradient(problem: ContactProblem, end: _Iterate, tolerance: Tensor, max_iterations: int) -> Tensor:
     """y as a differentiable function of the problem: r(y, θ) = 0 gives dy = −A⁻¹ dr, with contacts and bounds as they were found."""
-    at_bound = end.free[:, -1] == 0
+    at_bound = (end.free[:, -1] == 0) & ~problem.rigid
     length = torch.where(at_bound, problem.lower, end.y[:, -1])
     held = torch.cat([end.y[:, :-1], length.unsqueeze(1)], 1)
     residual = problem.gradient(held, problem.after(held) * end.active) * end.free
