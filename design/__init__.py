@@ -1,4 +1,5 @@
-"""The design layer: name a scene, the parameters that may change and the pattern wanted, and search.
+"""The design layer: name a scene, the parameters that may change and the pattern wanted, and
+search.
 
     from design import Parameter, Search, Stripe
 
@@ -12,9 +13,45 @@ from design.parameters import Choice, Parameter, Space
 from design.robust import Robustness, robustness
 from design.search import Best, Search
 from design.study import Study
-from design.targets import Bands, DomainSize, Gradient, Image, Mask, OnFraction, Oscillation, Ring, Stripe, Target
+from design.targets import (
+    Bands,
+    DomainSize,
+    Gradient,
+    Image,
+    Mask,
+    OnFraction,
+    Oscillation,
+    Ring,
+    Stripe,
+    Target,
+)
 
 __all__ = [
-    "CMAES", "Bands", "Batch", "Bayesian", "Best", "Choice", "DomainSize", "Done", "Evaluation", "Gradient", "Image", "Mask", "Method", "Objective",
-    "OnFraction", "Oscillation", "Parameter", "Racing", "Ring", "Robustness", "Search", "Sobol", "Space", "Stripe", "Study", "Target", "robustness",
-]  # fmt: skip
+    "CMAES",
+    "Bands",
+    "Batch",
+    "Bayesian",
+    "Best",
+    "Choice",
+    "DomainSize",
+    "Done",
+    "Evaluation",
+    "Gradient",
+    "Image",
+    "Mask",
+    "Method",
+    "Objective",
+    "OnFraction",
+    "Oscillation",
+    "Parameter",
+    "Racing",
+    "Ring",
+    "Robustness",
+    "Search",
+    "Sobol",
+    "Space",
+    "Stripe",
+    "Study",
+    "Target",
+    "robustness",
+]

@@ -1,5 +1,5 @@
-"""The objective: designs in, losses out. Candidates × replicates are grown in one batch of colonies, on one recorded growth where nothing that is searched
-acts back on it."""
+"""The objective: designs in, losses out. Candidates × replicates are grown in one batch of
+colonies, on one recorded growth where nothing that is searched acts back on it."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ OFF = "replay=False"
 class Evaluation:
     """What became of some designs.
 
-    points (n, D); losses (n, R), of each replicate; loss (n,); cells (n, R), of each colony at its end; reasons, by (row, replicate), why a colony
-    failed; size: share of the full size; regrown: why every colony was grown anew, or "" if all followed a recorded growth; seconds.
+    points (n, D); losses (n, R), of each replicate; loss (n,); cells (n, R), of each colony at its
+    end; reasons, by (row, replicate), why a colony failed; size: share of the full size; regrown:
+    why every colony was grown anew, or "" if all followed a recorded growth; seconds.
     """
 
     points: np.ndarray
@@ -50,7 +51,8 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Piece:
-    """Part of an evaluation: rows of it that are alike in how their scene is built, and their parameters."""
+    """Part of an evaluation: rows of it that are alike in how their scene is built, and their
+    parameters."""
 
     rows: tuple[int, ...]
     values: tuple[dict[str, Value], ...]
@@ -58,7 +60,8 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of a piece: losses and cells (n, R), and reasons by (row of the piece, replicate)."""
+    """What became of a piece: losses and cells (n, R), and reasons by (row of the piece,
+    replicate)."""
 
     losses: np.ndarray
     cells: np.ndarray
@@ -69,12 +72,15 @@ class Outcome:
 class Objective:
     """How far designs of a scene are from a target.
 
-    scene: a function from parameters to a `tf.Scene`, or the name of a ready scene. parameters: what may change, and fixed: further arguments of the scene.
-    A colony ends at `cells` cells or at `until` h, whichever it reaches first. replicates: colonies of each design; the k-th of every design follows
-    stream k of random numbers, so that designs are compared on equal terms. reduce: how their losses become one: "mean", "worst", or a quantile
-    such as 0.75. seed, dt, dtype, device: as for `scene.seed` and `tf.simulate`. replay: let circuits run on recorded growth where they can.
-    most: colonies in one batch; by default as many as memory allows.
-    Raises InputError for a parameter that the scene lacks, bounds that it refuses, and a target that its first state cannot meet.
+    scene: a function from parameters to a `tf.Scene`, or the name of a ready scene. parameters:
+    what may change, and fixed: further arguments of the scene. A colony ends at `cells` cells or at
+    `until` h, whichever it reaches first. replicates: colonies of each design; the k-th of every
+    design follows stream k of random numbers, so that designs are compared on equal terms. reduce:
+    how their losses become one: "mean", "worst", or a quantile such as 0.75. seed, dt, dtype,
+    device: as for `scene.seed` and `tf.simulate`. replay: let circuits run on recorded growth where
+    they can. most: colonies in one batch; by default as many as memory allows. Raises InputError
+    for a parameter that the scene lacks, bounds that it refuses, and a target that its first state
+    cannot meet.
     """
 
     def __init__(
@@ -103,22 +109,42 @@ class Objective:
             raise checks.InputError("a colony needs an end: give cells=… or until=… (hours).")
         self.cells = None if cells is None else _whole("cells", cells, 2)
         self.until = None if until is None else checks.number("until", until, above=0.0)
-        self.replicates, self.most = _whole("replicates", replicates, 1), None if most is None else _whole("most", most, 1)
-        if reduce not in REDUCE and (isinstance(reduce, bool) or not isinstance(reduce, (int, float)) or not 0 < reduce <= 1):
-            raise checks.refuse("reduce", reduce, '"mean", "worst" or a quantile above 0 and at most 1')
+        self.replicates, self.most = (
+            _whole("replicates", replicates, 1),
+            (None if most is None else _whole("most", most, 1)),
+        )
+        if reduce not in REDUCE and (
+            isinstance(reduce, bool) or not isinstance(reduce, (int, float)) or not 0 < reduce <= 1
+        ):
+            raise checks.refuse(
+                "reduce", reduce, '"mean", "worst" or a quantile above 0 and at most 1'
+            )
         _whole("seed", seed, 0)
-        self.reduce, self.seed, self.dtype, self.device, self.replay = reduce, seed, dtype, device, replay
+        self.reduce, self.seed, self.dtype, self.device, self.replay = (
+            reduce,
+            seed,
+            dtype,
+            device,
+            replay,
+        )
         self._check_names()
         probe = self._probe()
         self.founders = int(probe.founders.count)
         if self.cells is not None and self.cells <= self.founders and probe.founders.colony is None:
-            raise checks.refuse("cells", self.cells, f"above the {self.founders} that a colony starts from")
+            raise checks.refuse(
+                "cells", self.cells, f"above the {self.founders} that a colony starts from"
+            )
         self.dt = probe.dt if dt is None else checks.number("dt", dt, above=0.0)
         steps = 1.0 if self.until is None else self.until / self.dt
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise checks.refuse("until", until, f"a whole number of steps of dt = {self.dt:g} h")
-        # a ready scene is built again by its name; a function that calls one has parameters of its own
-        self.recipe = probe.recipe if probe.recipe and self.make is tf.scenes.READY.get(probe.recipe[0]) else None
+        # a ready scene is built again by its name; a function that calls one has parameters of its
+        # own
+        self.recipe = (
+            probe.recipe
+            if probe.recipe and self.make is tf.scenes.READY.get(probe.recipe[0])
+            else None
+        )
         self.listing = probe.listing()
         self.regrown = tf.Course.obstacle(probe) if self.replay else OFF
 
@@ -129,29 +155,37 @@ class Objective:
             self.space.check(list(allowed), name)
             for given in self.fixed:
                 if given not in allowed:
-                    raise checks.refuse("fixed", given, f"a parameter of {name}: {', '.join(allowed)}")
+                    raise checks.refuse(
+                        "fixed", given, f"a parameter of {name}: {', '.join(allowed)}"
+                    )
         both = [n for n in self.fixed if n in self.space.names]
         if both:
             raise checks.refuse("fixed", both[0], "a parameter that is not searched as well")
 
     def _probe(self) -> tf.Scene:
-        """The scene in the middle of the space, after one of each option was built and the target looked at its first state."""
+        """The scene in the middle of the space, after one of each option was built and the target
+        looked at its first state."""
         middle = [p.value(0.5) for p in self.space.parameters]
         base = dict(zip(self.space.names, middle, strict=True))
         trials, made_of, still = [base], [], []
         for p in self.space.parameters:
             ends = (p.low, p.high) if isinstance(p, Parameter) else p.options
-            trials += [{**base, p.name: int(v) if isinstance(p, Parameter) and p.whole else v} for v in ends]
+            trials += [
+                {**base, p.name: int(v) if isinstance(p, Parameter) and p.whole else v}
+                for v in ends
+            ]
         for values in trials:
             try:
-                made = self.scene([values], repeat=2)  # two colonies: a tensor of one number passes for a plain number
+                # two colonies: a tensor of one number passes for a plain number
+                made = self.scene([values], repeat=2)
                 state = made.seed(2, seed=self.seed, dtype=self.dtype, device=self.device)
             except Exception as error:
                 changed = {n: v for n, v in values.items() if v != base[n]} or values
                 raise tf.InputError(
-                    f"the scene cannot be built with {changed}: {type(error).__name__}: {str(error).rstrip('.')}. A plain Parameter reaches the scene as a "
-                    "tensor with one value per colony; what the scene takes as one plain number or as a name can be searched with whole=True or as a Choice. "
-                    "Else narrow the bounds."
+                    f"the scene cannot be built with {changed}: {type(error).__name__}:"
+                    f" {str(error).rstrip('.')}. A plain Parameter reaches the scene as a tensor"
+                    " with one value per colony; what the scene takes as one plain number or as a"
+                    " name can be searched with whole=True or as a Choice. Else narrow the bounds."
                 ) from error
             self.target.check(state)
             made_of.append((made.listed, made.founders))
@@ -173,57 +207,101 @@ class Objective:
         return ""
 
     def scene(self, values: Sequence[Mapping[str, Value]], repeat: int = 1) -> tf.Scene:
-        """One scene for several designs alike in what builds it: numbers as one value per colony, each design's `repeat` times."""
+        """One scene for several designs alike in what builds it: numbers as one value per colony,
+        each design's `repeat` times."""
         arguments = dict(self.fixed)
         for p in self.space.parameters:
             column = [v[p.name] for v in values]
             structural = p.levels is not None
-            arguments[p.name] = column[0] if structural else torch.tensor(column, dtype=torch.float64, device=self.device).repeat_interleave(repeat)
+            arguments[p.name] = (
+                column[0]
+                if structural
+                else torch.tensor(
+                    column, dtype=torch.float64, device=self.device
+                ).repeat_interleave(repeat)
+            )
         made = self.make(**arguments)
         if not isinstance(made, tf.Scene):
             raise checks.refuse("scene", made, "a function that returns a tf.Scene")
         return made
 
     def evaluate(
-        self, points: np.ndarray, *, streams: Sequence[int] | None = None, size: float = 1.0, executor: Executor | None = None, pieces: int = 1,
-    ) -> Evaluation:  # fmt: skip
+        self,
+        points: np.ndarray,
+        *,
+        streams: Sequence[int] | None = None,
+        size: float = 1.0,
+        executor: Executor | None = None,
+        pieces: int = 1,
+    ) -> Evaluation:
         """Grow designs, (n, D) coordinates in [0, 1], and score them.
 
-        streams: of random numbers, one a replicate; by default 0 … replicates − 1. size: share of `cells` and `until`, for cheap first looks. executor: of the
-        `concurrent.futures` kind, for other processes or machines; pieces: how many parts it gets at least. What it loses, as when a worker is killed, is
-        grown all the same, in the end here, with a warning. The outcome is the same to the bit however it is divided, on machines alike.
+        streams: of random numbers, one a replicate; by default 0 … replicates − 1. size: share of
+        `cells` and `until`, for cheap first looks. executor: of the `concurrent.futures` kind, for
+        other processes or machines; pieces: how many parts it gets at least. What it loses, as when
+        a worker is killed, is grown all the same, in the end here, with a warning. The outcome is
+        the same to the bit however it is divided, on machines alike.
         """
         begun = time.perf_counter()
         points = np.asarray(points, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != self.space.size or not len(points) or not bool(((points >= 0) & (points <= 1)).all()):
-            raise checks.refuse("points", points.shape, f"(n, {self.space.size}) coordinates in [0, 1]")
+        if (
+            points.ndim != 2
+            or points.shape[1] != self.space.size
+            or not len(points)
+            or not bool(((points >= 0) & (points <= 1)).all())
+        ):
+            raise checks.refuse(
+                "points", points.shape, f"(n, {self.space.size}) coordinates in [0, 1]"
+            )
         checks.number("size", size, above=0.0, most=1.0)
         chosen = self._streams(streams)
         values = [self.space.values(p) for p in points]
-        losses, cells = np.full((len(points), len(chosen)), np.nan), np.zeros((len(points), len(chosen)), np.int64)
+        losses, cells = (
+            np.full((len(points), len(chosen)), np.nan),
+            np.zeros((len(points), len(chosen)), np.int64),
+        )
         reasons: dict[tuple[int, int], str] = {}
         regrown = ""
-        for piece, found in self._outcomes(self._pieces(values, len(chosen), size, pieces), chosen, size, executor):
+        for piece, found in self._outcomes(
+            self._pieces(values, len(chosen), size, pieces), chosen, size, executor
+        ):
             rows = list(piece.rows)
             losses[rows], cells[rows] = found.losses, found.cells
             reasons |= {(rows[row], k): words for (row, k), words in found.reasons.items()}
             regrown = regrown or found.regrown
-        return Evaluation(points, losses, self.reduced(losses), cells, reasons, size, regrown, time.perf_counter() - begun)
+        return Evaluation(
+            points,
+            losses,
+            self.reduced(losses),
+            cells,
+            reasons,
+            size,
+            regrown,
+            time.perf_counter() - begun,
+        )
 
     def _streams(self, given: Sequence[int] | None) -> tuple[int, ...]:
         """The streams asked for, or those of the replicates."""
         found = tuple(range(self.replicates)) if given is None else tuple(int(s) for s in given)
         if not found or len(set(found)) != len(found) or not all(0 <= s < 2**32 for s in found):
-            raise checks.refuse("streams", given, "different whole numbers from 0 to 2³² − 1, at least one")
+            raise checks.refuse(
+                "streams", given, "different whole numbers from 0 to 2³² − 1, at least one"
+            )
         return found
 
     def reduced(self, losses: np.ndarray) -> np.ndarray:
         """One loss a design, (n,), from those of its replicates (n, R)."""
         if self.reduce == "mean":
             return losses.mean(1)
-        return losses.max(1) if self.reduce == "worst" else np.quantile(losses, float(self.reduce), axis=1)
+        return (
+            losses.max(1)
+            if self.reduce == "worst"
+            else np.quantile(losses, float(self.reduce), axis=1)
+        )
 
-    def _pieces(self, values: Sequence[dict[str, Value]], replicates: int, size: float, least: int) -> list[Piece]:
+    def _pieces(
+        self, values: Sequence[dict[str, Value]], replicates: int, size: float, least: int
+    ) -> list[Piece]:
         """The designs in groups that one scene can hold and one batch can carry."""
         structural = [p.name for p in self.space.parameters if p.levels is not None]
         groups: dict[tuple[str, ...], list[int]] = {}
@@ -232,29 +310,39 @@ class Objective:
         out = []
         for rows in groups.values():
             most = self.most or self._room([values[r] for r in rows], size)
-            wanted = max(math.ceil(len(rows) / max(1, most // replicates)), math.ceil(least * len(rows) / len(values)))
+            wanted = max(
+                math.ceil(len(rows) / max(1, most // replicates)),
+                math.ceil(least * len(rows) / len(values)),
+            )
             count = min(len(rows), wanted)
             cuts = [len(rows) * k // count for k in range(count + 1)]  # as even as can be
-            out += [Piece(tuple(rows[a:b]), tuple(values[r] for r in rows[a:b])) for a, b in itertools.pairwise(cuts)]
+            out += [
+                Piece(tuple(rows[a:b]), tuple(values[r] for r in rows[a:b]))
+                for a, b in itertools.pairwise(cuts)
+            ]
         return out
 
     def _room(self, values: Sequence[dict[str, Value]], size: float) -> int:
-        """How many colonies of designs alike in what builds them memory takes at once; the first that the scene does not refuse tells."""
+        """How many colonies of designs alike in what builds them memory takes at once; the first
+        that the scene does not refuse tells."""
         for design in values:
             with contextlib.suppress(tf.InputError):
-                return room.colonies(self.scene([design]), self.end(size)[0], self.dtype, self.device)
+                return room.colonies(
+                    self.scene([design]), self.end(size)[0], self.dtype, self.device
+                )
         return 1
 
     def _outcomes(
         self, pieces: list[Piece], streams: tuple[int, ...], size: float, executor: Executor | None
-    ) -> Iterator[tuple[Piece, Outcome]]:  # fmt: skip
+    ) -> Iterator[tuple[Piece, Outcome]]:
         """Each piece with what became of it, once."""
         if executor is None:
             return ((piece, self.run(piece, streams, size)) for piece in pieces)
         return machines.outcomes(self, pieces, streams, size, executor)
 
     def resized(self, factor: float) -> Objective:
-        """The same with colonies `factor` times as large, or `factor` times as many hours: above 1 too."""
+        """The same with colonies `factor` times as large, or `factor` times as many hours: above 1
+        too."""
         other = copy.copy(self)
         other.cells, other.until = self.end(checks.number("factor", factor, above=0.0))
         return other
@@ -262,30 +350,49 @@ class Objective:
     def end(self, size: float) -> tuple[int | None, float | None]:
         """Cells and hours at which colonies of a share of the full size end."""
         cells = None if self.cells is None else max(self.founders + 1, round(self.cells * size))
-        return cells, None if self.until is None else max(1, round(self.until * size / self.dt)) * self.dt
+        return cells, (
+            None if self.until is None else max(1, round(self.until * size / self.dt)) * self.dt
+        )
 
     def run(self, piece: Piece, streams: tuple[int, ...], size: float) -> Outcome:
-        """Grow a piece in one batch; in halves where it does not fit, or where the scene refuses one of its designs."""
+        """Grow a piece in one batch; in halves where it does not fit, or where the scene refuses
+        one of its designs."""
         count, replicates = len(piece.rows), len(streams)
         try:
             return self._score(piece, streams, size)
         except (tf.InputError, tf.SimulationError) as error:
             if count == 1:
                 words = {(0, k): str(error) for k in range(replicates)}
-                return Outcome(np.full((1, replicates), self.target.failed), np.zeros((1, replicates), np.int64), words, "")
+                return Outcome(
+                    np.full((1, replicates), self.target.failed),
+                    np.zeros((1, replicates), np.int64),
+                    words,
+                    "",
+                )
         except (MemoryError, RuntimeError) as error:
             if count == 1 or not room.is_lack_of_memory(error):
                 raise
         half = count // 2
         parts = [Piece(piece.rows[a:b], piece.values[a:b]) for a, b in ((0, half), (half, count))]
         first, second = (self.run(part, streams, size) for part in parts)
-        reasons = {**first.reasons, **{(row + half, k): words for (row, k), words in second.reasons.items()}}
-        return Outcome(np.concatenate([first.losses, second.losses]), np.concatenate([first.cells, second.cells]), reasons, first.regrown or second.regrown)
+        reasons = {
+            **first.reasons,
+            **{(row + half, k): words for (row, k), words in second.reasons.items()},
+        }
+        return Outcome(
+            np.concatenate([first.losses, second.losses]),
+            np.concatenate([first.cells, second.cells]),
+            reasons,
+            first.regrown or second.regrown,
+        )
 
     @torch.no_grad()
     def _score(self, piece: Piece, streams: tuple[int, ...], size: float) -> Outcome:
         count, replicates = len(piece.rows), len(streams)
-        losses, cells = np.full(count * replicates, self.target.failed, np.float64), np.zeros(count * replicates, np.int64)
+        losses, cells = (
+            np.full(count * replicates, self.target.failed, np.float64),
+            np.zeros(count * replicates, np.int64),
+        )
         reasons: dict[tuple[int, int], str] = {}
         step, state, regrown = self._start(piece.values, streams)
         most_cells, until = self.end(size)
@@ -296,16 +403,27 @@ class Objective:
             ids = event.state.colony_id.tolist()
             found = self.target.loss(event.state, event.history)
             if not isinstance(found, torch.Tensor) or found.shape != (len(ids),):
-                raise TypeError(f"{type(self.target).__name__}.loss must return a tensor of shape ({len(ids)},), one number for each colony")
+                raise TypeError(
+                    f"{type(self.target).__name__}.loss must return a tensor of shape"
+                    f" ({len(ids)},), one number for each colony"
+                )
             score = found.double().cpu().numpy()
             for colony_id, number in zip(ids, score.tolist(), strict=True):
                 if not math.isfinite(number):
                     reasons[divmod(colony_id, replicates)] = f"the target's loss was {number}"
-            losses[ids], cells[ids] = np.where(np.isfinite(score), score, self.target.failed), event.state.counts.cpu().numpy()
-        return Outcome(losses.reshape(count, replicates), cells.reshape(count, replicates), reasons, regrown)
+            losses[ids], cells[ids] = (
+                np.where(np.isfinite(score), score, self.target.failed),
+                event.state.counts.cpu().numpy(),
+            )
+        return Outcome(
+            losses.reshape(count, replicates), cells.reshape(count, replicates), reasons, regrown
+        )
 
-    def _start(self, values: Sequence[dict[str, Value]], streams: tuple[int, ...]) -> tuple[Callable[[tf.State], tf.State], tf.State, str]:
-        """The step of a batch, its first state, and why it does not follow a recorded growth, or ""."""
+    def _start(
+        self, values: Sequence[dict[str, Value]], streams: tuple[int, ...]
+    ) -> tuple[Callable[[tf.State], tf.State], tf.State, str]:
+        """The step of a batch, its first state, and why it does not follow a recorded growth, or
+        ""."""
         scene = self.scene(values, repeat=len(streams))
         tiled = torch.tensor(streams).repeat(len(values))
         why = tf.Course.obstacle(scene) if self.replay else OFF
@@ -315,28 +433,49 @@ class Objective:
             course = courses.of(self, scene, usual if set(streams) <= set(usual) else streams)
             replay = tf.Replay(scene, course)
             return replay.step, replay.seed(tiled.numel(), streams=tiled), ""
-        state = scene.seed(tiled.numel(), seed=self.seed, streams=tiled, dtype=self.dtype, device=self.device)
+        state = scene.seed(
+            tiled.numel(), seed=self.seed, streams=tiled, dtype=self.dtype, device=self.device
+        )
         return (lambda s: scene.step(s, self.dt)), state, why
 
     @torch.no_grad()
-    def final(self, point: np.ndarray, *, streams: Sequence[int] | None = None, size: float = 1.0) -> list[Done]:
-        """The colonies of one design at their ends, for pictures and measures; those that fail are left out."""
+    def final(
+        self, point: np.ndarray, *, streams: Sequence[int] | None = None, size: float = 1.0
+    ) -> list[Done]:
+        """The colonies of one design at their ends, for pictures and measures; those that fail are
+        left out."""
         try:
-            step, state, _ = self._start([self.space.values(np.asarray(point))], self._streams(streams))
+            step, state, _ = self._start(
+                [self.space.values(np.asarray(point))], self._streams(streams)
+            )
         except tf.InputError:  # the scene refuses this design
             return []
         cells, until = self.end(size)
-        return [e for e in grow(step, state, cells=cells, until=until, note=self.target.note) if isinstance(e, Done)]
+        return [
+            e
+            for e in grow(step, state, cells=cells, until=until, note=self.target.note)
+            if isinstance(e, Done)
+        ]
 
     def describe(self) -> dict[str, Any]:
-        """What the losses depend on, as plain data: a study is gone on with only by an objective that says the same."""
+        """What the losses depend on, as plain data: a study is gone on with only by an objective
+        that says the same."""
         return {
-            "scene": self.recipe[0] if self.recipe else getattr(self.make, "__name__", "scene"), "fixed": {n: _lasting(v) for n, v in self.fixed.items()},
-            "effects": self.listing, "founders and functions": self.made_of,
-            "parameters": self.space.describe(), "code of the target": tf.digest(self.target),
-            "target": _told(self.target), "cells": self.cells, "until": self.until,
-            "replicates": self.replicates, "reduce": self.reduce, "seed": self.seed, "dt": self.dt, "dtype": str(self.dtype)[6:],
-        }  # fmt: skip
+            "scene": self.recipe[0] if self.recipe else getattr(self.make, "__name__", "scene"),
+            "fixed": {n: _lasting(v) for n, v in self.fixed.items()},
+            "effects": self.listing,
+            "founders and functions": self.made_of,
+            "parameters": self.space.describe(),
+            "code of the target": tf.digest(self.target),
+            "target": _told(self.target),
+            "cells": self.cells,
+            "until": self.until,
+            "replicates": self.replicates,
+            "reduce": self.reduce,
+            "seed": self.seed,
+            "dt": self.dt,
+            "dtype": str(self.dtype)[6:],
+        }
 
 
 def _told(target: Target) -> str:
@@ -352,10 +491,21 @@ def _lasting(value: Any) -> str:
 def _scene_function(scene: Callable[..., tf.Scene] | str) -> Callable[..., tf.Scene]:
     if isinstance(scene, str):
         if scene not in tf.scenes.READY:
-            raise checks.refuse("scene", scene, "one of " + ", ".join(tf.scenes.READY) + ", or a function from parameters to a tf.Scene")
+            raise checks.refuse(
+                "scene",
+                scene,
+                "one of "
+                + ", ".join(tf.scenes.READY)
+                + ", or a function from parameters to a tf.Scene",
+            )
         return tf.scenes.READY[scene]
     if isinstance(scene, tf.Scene) or not callable(scene):
-        raise checks.refuse("scene", scene, "a function from parameters to a tf.Scene", "Give the function, not the scene that it made: def scene(k3=1.0): …")
+        raise checks.refuse(
+            "scene",
+            scene,
+            "a function from parameters to a tf.Scene",
+            "Give the function, not the scene that it made: def scene(k3=1.0): …",
+        )
     return scene
 
 

@@ -1,4 +1,5 @@
-"""What a search may change: named parameters of a scene, each with its bounds or its options, and the unit cube that they span."""
+"""What a search may change: named parameters of a scene, each with its bounds or its options, and
+the unit cube that they span."""
 
 from __future__ import annotations
 
@@ -20,9 +21,10 @@ Value = Any
 class Parameter:
     """A number between two bounds: `Parameter("k3", 0.1, 10, log=True)`.
 
-    name: of the scene function's argument. log: spread evenly in its logarithm, for what may lie anywhere over decades; bounds above 0. whole: a whole
-    number, both bounds among them. A whole number makes a scene of its own for each value, so that it may say how a circuit is built, such as how many
-    genes; others are given to one scene as one value per colony.
+    name: of the scene function's argument. log: spread evenly in its logarithm, for what may lie
+    anywhere over decades; bounds above 0. whole: a whole number, both bounds among them. A whole
+    number makes a scene of its own for each value, so that it may say how a circuit is built, such
+    as how many genes; others are given to one scene as one value per colony.
     """
 
     name: str
@@ -34,17 +36,36 @@ class Parameter:
     def __post_init__(self) -> None:
         _check_name("Parameter", self.name)
         for bound in ("low", "high"):
-            object.__setattr__(self, bound, checks.number(f"Parameter({self.name!r}).{bound}", getattr(self, bound)))
+            object.__setattr__(
+                self,
+                bound,
+                checks.number(f"Parameter({self.name!r}).{bound}", getattr(self, bound)),
+            )
         if not self.low < self.high:
-            raise checks.refuse(f"Parameter({self.name!r})", (self.low, self.high), "low < high", "Swap the two, or give a value that is fixed with fixed=….")
+            raise checks.refuse(
+                f"Parameter({self.name!r})",
+                (self.low, self.high),
+                "low < high",
+                "Swap the two, or give a value that is fixed with fixed=….",
+            )
         if self.log and self.low <= 0:
             raise checks.refuse(
-                f"Parameter({self.name!r}).low", self.low, "above 0 with log=True", "A logarithm has no zero: raise the bound, or leave log out."
+                f"Parameter({self.name!r}).low",
+                self.low,
+                "above 0 with log=True",
+                "A logarithm has no zero: raise the bound, or leave log out.",
             )
         if self.log and self.whole:
-            raise checks.refuse(f"Parameter({self.name!r})", "log=True, whole=True", "one of the two", "Whole numbers have equal shares, whatever their size.")
+            raise checks.refuse(
+                f"Parameter({self.name!r})",
+                "log=True, whole=True",
+                "one of the two",
+                "Whole numbers have equal shares, whatever their size.",
+            )
         if self.whole and not (self.low.is_integer() and self.high.is_integer()):
-            raise checks.refuse(f"Parameter({self.name!r})", (self.low, self.high), "whole numbers with whole=True")
+            raise checks.refuse(
+                f"Parameter({self.name!r})", (self.low, self.high), "whole numbers with whole=True"
+            )
 
     @property
     def levels(self) -> int | None:
@@ -68,7 +89,9 @@ class Parameter:
                 raise checks.refuse(self.name, value, "a whole number")
             return (number - self.low + 0.5) / (self.high - self.low + 1)
         if self.log:
-            return (math.log(number) - math.log(self.low)) / (math.log(self.high) - math.log(self.low))
+            return (math.log(number) - math.log(self.low)) / (
+                math.log(self.high) - math.log(self.low)
+            )
         return (number - self.low) / (self.high - self.low)
 
     def describe(self) -> str:
@@ -78,9 +101,11 @@ class Parameter:
 
 @dataclass(frozen=True, init=False)
 class Choice:
-    """One of several options, such as promoters: `Choice("promoter", ("weak", "strong"))`. Each option makes a scene of its own.
+    """One of several options, such as promoters: `Choice("promoter", ("weak", "strong"))`. Each
+    option makes a scene of its own.
 
-    name: of the scene function's argument. options: at least two, all different, each a text, a number, True or False, so that a file can keep it.
+    name: of the scene function's argument. options: at least two, all different, each a text, a
+    number, True or False, so that a file can keep it.
     """
 
     name: str
@@ -91,10 +116,19 @@ class Choice:
         listed = isinstance(options, Sequence) and not isinstance(options, str)
         odd = [o for o in options if not isinstance(o, (str, bool, int, float))] if listed else []
         if odd:
-            raise checks.refuse(f"Choice({name!r}).options", odd[0], "texts, numbers, True or False", "Name what stands for it, and let the scene look it up.")
+            raise checks.refuse(
+                f"Choice({name!r}).options",
+                odd[0],
+                "texts, numbers, True or False",
+                "Name what stands for it, and let the scene look it up.",
+            )
         # 1 and True are equal, and could not be told apart by their value
         if not listed or len(options) < 2 or len(set(options)) != len(options):
-            raise checks.refuse(f"Choice({name!r}).options", options, "at least two different ones, such as ('weak', 'strong')")
+            raise checks.refuse(
+                f"Choice({name!r}).options",
+                options,
+                "at least two different ones, such as ('weak', 'strong')",
+            )
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "options", tuple(options))
 
@@ -123,8 +157,14 @@ class Space:
     """
 
     def __init__(self, parameters: Sequence[Parameter | Choice]):
-        if not isinstance(parameters, Sequence) or not parameters or not all(isinstance(p, (Parameter, Choice)) for p in parameters):
-            raise checks.refuse("parameters", parameters, "a list of Parameter(…) and Choice(…), at least one")
+        if (
+            not isinstance(parameters, Sequence)
+            or not parameters
+            or not all(isinstance(p, (Parameter, Choice)) for p in parameters)
+        ):
+            raise checks.refuse(
+                "parameters", parameters, "a list of Parameter(…) and Choice(…), at least one"
+            )
         self.parameters = tuple(parameters)
         self.names = tuple(p.name for p in self.parameters)
         twice = [n for n in self.names if self.names.count(n) > 1]
@@ -141,7 +181,12 @@ class Space:
         """The coordinates (D,) of one design."""
         wrong = [n for n in (*values, *self.names) if n not in values or n not in self.names]
         if wrong:
-            raise checks.refuse("values", list(values), "one for each of " + ", ".join(self.names), f"Look at {wrong[0]!r}.")
+            raise checks.refuse(
+                "values",
+                list(values),
+                "one for each of " + ", ".join(self.names),
+                f"Look at {wrong[0]!r}.",
+            )
         return np.array([p.coordinate(values[p.name]) for p in self.parameters])
 
     def check(self, allowed: Sequence[str], scene: str) -> None:
@@ -150,7 +195,9 @@ class Space:
             if name not in allowed:
                 near = difflib.get_close_matches(name, allowed, 1)
                 mend = f"Did you mean {near[0]!r}?" if near else ""
-                raise checks.refuse("Parameter", name, f"a parameter of {scene}: {', '.join(allowed)}", mend)
+                raise checks.refuse(
+                    "Parameter", name, f"a parameter of {scene}: {', '.join(allowed)}", mend
+                )
 
     def describe(self) -> list[str]:
         return [p.describe() for p in self.parameters]

@@ -2,8 +2,9 @@
 
     python experiments/bands.py --colonies 1000
 
-A morphogen enters at the left face and decays on its way. Blue is switched on where there is much of it, red where there is little, and green, by one
-promoter that needs it and one that it shuts, in between. Searched: the four thresholds and how sharp they are.
+A morphogen enters at the left face and decays on its way. Blue is switched on where there is much
+of it, red where there is little, and green, by one promoter that needs it and one that it shuts, in
+between. Searched: the four thresholds and how sharp they are.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ SIDE = 32.0  # µm from the middle to each face
 def genes(u, s, p, cell):
     """Three fluorescent proteins and what the morphogen does to each: Hill functions."""
     m = s.morphogen
-    on = lambda threshold: m**p.n / (threshold**p.n + m**p.n)  # noqa: E731
+    on = lambda threshold: m**p.n / (threshold**p.n + m**p.n)
     return {
         "blue": p.make * on(p.blue_above) - p.decay * u.blue,
         "green": p.make * on(p.green_above) * (1 - on(p.green_below)) - p.decay * u.green,
@@ -32,24 +33,40 @@ def genes(u, s, p, cell):
 
 
 def flag(blue_above=0.5, green_above=0.2, green_below=0.5, red_below=0.2, n=4.0) -> tf.Scene:
-    """A colony that grows in a gradient; the thresholds are shares of the morphogen's level at the left face."""
-    steady = lambda places: torch.exp(-(places[:, 0] + SIDE) / REACH)  # noqa: E731
+    """A colony that grows in a gradient; the thresholds are shares of the morphogen's level at the
+    left face."""
+    steady = lambda places: torch.exp(-(places[:, 0] + SIDE) / REACH)
     return tf.Scene(
-        tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2),
+        tf.Growth(rate=1.0),
+        tf.Division(length=tf.Uniform(3.5, 4.5)),
+        tf.Mechanics(dim=2),
         tf.Circuit(
-            genes, species=("blue", "green", "red"), blue_above=blue_above, green_above=green_above, green_below=green_below, red_below=red_below, n=n,
-            make=10.0, decay=4.0, rtol=1e-2,
+            genes,
+            species=("blue", "green", "red"),
+            blue_above=blue_above,
+            green_above=green_above,
+            green_below=green_below,
+            red_below=red_below,
+            n=n,
+            make=10.0,
+            decay=4.0,
+            rtol=1e-2,
         ),
         tf.Medium(
-            morphogen=tf.Signal(diffusion=10 * REACH**2, decay=10.0, initial=steady), box=((-SIDE, -SIDE), (SIDE, SIDE)), spacing=4.0,
+            morphogen=tf.Signal(diffusion=10 * REACH**2, decay=10.0, initial=steady),
+            box=((-SIDE, -SIDE), (SIDE, SIDE)),
+            spacing=4.0,
             faces=tf.Faces(x=(tf.Fixed(1.0), tf.NoFlux())),
         ),
         name="flag",
-    )  # fmt: skip
+    )
 
 
 PARAMETERS = [
-    *(Parameter(name, 1e-3, 1.0, log=True) for name in ("blue_above", "green_above", "green_below", "red_below")),
+    *(
+        Parameter(name, 1e-3, 1.0, log=True)
+        for name in ("blue_above", "green_above", "green_below", "red_below")
+    ),
     Parameter("n", 1.0, 8.0),
 ]
 TARGET = Bands(("blue", "green", "red"), (-40.0, -4.0, 4.0, 40.0), floor=0.1)
@@ -57,9 +74,13 @@ COLONY = {"cells": 100, "dt": 0.05}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--colonies", type=int, default=1000)
-    parser.add_argument("--out", type=Path, default=Path("bands"), help="stem of the files that are written")
+    parser.add_argument(
+        "--out", type=Path, default=Path("bands"), help="stem of the files that are written"
+    )
     options = parser.parse_args()
     tf.keep_memory()
     search = Search(flag, PARAMETERS, TARGET, **COLONY, method=CMAES(population=24), replicates=4)

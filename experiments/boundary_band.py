@@ -1,11 +1,14 @@
-"""The band of Fig. 5: where it stands, how wide and how strong it is, what AiiA does to it, and what flow does.
+"""The band of Fig. 5: where it stands, how wide and how strong it is, what AiiA does to it, and
+what flow does.
 
     python experiments/boundary_band.py                     # 8 seeds of 5,000 cells in 8 conditions, about half an hour on two cores
     python experiments/boundary_band.py --cells 500 --seeds 2
 
-Each condition is one batch of colonies. For every colony the sink cells are put into strips along the channel by their distance from the border, which is
-the place with the fewest cells on the wrong side of it; the profile of mean YFP over these strips gives the band's peak, its place, its full
-width at half maximum and the middle of that, and its contrast: the peak over the mean of sinks far inside (farther than 40 µm from the border).
+Each condition is one batch of colonies. For every colony the sink cells are put into strips along
+the channel by their distance from the border, which is the place with the fewest cells on the wrong
+side of it; the profile of mean YFP over these strips gives the band's peak, its place, its full
+width at half maximum and the middle of that, and its contrast: the peak over the mean of sinks far
+inside (farther than 40 µm from the border).
 """
 
 from __future__ import annotations
@@ -37,7 +40,8 @@ CONDITIONS = {
 
 
 def border(x: np.ndarray, sink: np.ndarray) -> float:
-    """The place along the channel with the fewest cells on the wrong side: sinks before it, sources after it. µm."""
+    """The place along the channel with the fewest cells on the wrong side: sinks before it, sources
+    after it. µm."""
     order = np.argsort(x)
     sinks = sink[order]
     wrong = np.cumsum(sinks) + (~sinks).sum() - np.cumsum(~sinks)
@@ -66,15 +70,22 @@ def band(state: tf.State, place: int) -> dict[str, float]:
         right += 1
     inside, sources = at[sink] > FAR, at[~sink] < -FAR
     return {
-        "cells": float(mine.sum()), "place_um": float(centres[top]),
-        "middle_um": float(0.5 * (centres[left] + centres[right])), "width_um": float(centres[right] - centres[left] + STRIP), "peak": float(profile[top]),
-        "contrast": float(profile[top] / yfp[sink][inside].mean()) if inside.any() else float("nan"),
+        "cells": float(mine.sum()),
+        "place_um": float(centres[top]),
+        "middle_um": float(0.5 * (centres[left] + centres[right])),
+        "width_um": float(centres[right] - centres[left] + STRIP),
+        "peak": float(profile[top]),
+        "contrast": (
+            float(profile[top] / yfp[sink][inside].mean()) if inside.any() else float("nan")
+        ),
         "cfp_inside": float(cfp[~sink][sources].mean()) if sources.any() else float("nan"),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cells", type=int, default=5000)
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--only", nargs="*", choices=list(CONDITIONS), default=list(CONDITIONS))
@@ -83,19 +94,49 @@ def main() -> None:
     options = parser.parse_args()
     tf.keep_memory()
     found = json.loads(options.out.read_text()) if options.out.exists() else {}
-    print(f"{'condition':<14} {'cells':>6} {'place µm':>14} {'middle µm':>14} {'width µm':>14} {'YFP peak':>20} {'contrast':>16} {'seconds':>8}")
+    print(
+        f"{'condition':<14} {'cells':>6} {'place µm':>14} {'middle µm':>14} {'width µm':>14}"
+        f" {'YFP peak':>20} {'contrast':>16} {'seconds':>8}"
+    )
     for name in options.only:
         scene = tf.scenes.boundary_detector(**CONDITIONS[name])
-        record = None if options.record is None else tf.Recorder(options.record / (re.sub(r"\W+", "_", name) + ".h5"), scene, every=40, overwrite=True)
+        record = (
+            None
+            if options.record is None
+            else tf.Recorder(
+                options.record / (re.sub(r"\W+", "_", name) + ".h5"),
+                scene,
+                every=40,
+                overwrite=True,
+            )
+        )
         begun = time.perf_counter()
-        state = deque(tf.simulate(scene, scene.seed(options.seeds, seed=0), cells=options.cells, record=record), maxlen=1).pop()
+        state = deque(
+            tf.simulate(
+                scene, scene.seed(options.seeds, seed=0), cells=options.cells, record=record
+            ),
+            maxlen=1,
+        ).pop()
         bands = [band(state, k) for k in range(options.seeds)]
         row = {key: [b[key] for b in bands] for key in bands[0]}
         found[name] = row | {"seconds": time.perf_counter() - begun, "time_h": state.time}
         options.out.write_text(json.dumps(found, indent=1))
         shown = {k: f"{np.mean(v):.4g} ± {np.std(v):.2g}" for k, v in row.items()}
-        columns = [f"{shown[key]:>{size}}" for key, size in (("place_um", 14), ("middle_um", 14), ("width_um", 14), ("peak", 20), ("contrast", 16))]
-        print(f"{name:<14} {np.mean(row['cells']):6.0f} {' '.join(columns)} {found[name]['seconds']:8.1f}", flush=True)
+        columns = [
+            f"{shown[key]:>{size}}"
+            for key, size in (
+                ("place_um", 14),
+                ("middle_um", 14),
+                ("width_um", 14),
+                ("peak", 20),
+                ("contrast", 16),
+            )
+        ]
+        print(
+            f"{name:<14} {np.mean(row['cells']):6.0f} {' '.join(columns)}"
+            f" {found[name]['seconds']:8.1f}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -3,8 +3,9 @@
     python experiments/cluster.py                           # two workers on this machine
     python experiments/cluster.py --scheduler tcp://…:8786  # workers of one's own, one of which is killed
 
-Designs of the boundary detector are scored for a stripe at the border three times: in this process, by the workers, and by the workers while one of them is
-killed. All losses must be the same to the bit. Needs distributed (the `cluster` extra).
+Designs of the boundary detector are scored for a stripe at the border three times: in this process,
+by the workers, and by the workers while one of them is killed. All losses must be the same to the
+bit. Needs distributed (the `cluster` extra).
 """
 
 from __future__ import annotations
@@ -26,29 +27,57 @@ def end(pid: int) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scheduler", help="address of a running scheduler; by default a cluster of two workers here")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scheduler",
+        help="address of a running scheduler; by default a cluster of two workers here",
+    )
     parser.add_argument("--cells", type=int, default=60)
     parser.add_argument("--designs", type=int, default=32)
     parser.add_argument("--pieces", type=int, default=4)
     options = parser.parse_args()
-    parameters, target = [Parameter("k3", 0.1, 10, log=True), Parameter("d3", 1e-3, 1.0, log=True)], Stripe("yfp", width=8.0, cell_type=1)
-    objective = Objective("boundary_detector", parameters, target, cells=options.cells, replicates=2)
+    parameters, target = (
+        [Parameter("k3", 0.1, 10, log=True), Parameter("d3", 1e-3, 1.0, log=True)],
+        Stripe("yfp", width=8.0, cell_type=1),
+    )
+    objective = Objective(
+        "boundary_detector", parameters, target, cells=options.cells, replicates=2
+    )
     points = np.random.default_rng(0).random((options.designs, 2))
     here = objective.evaluate(points)
-    print(f"here: {here.losses.size} colonies in {here.seconds:.1f} s, best loss {here.loss.min():.4f}", flush=True)
-    cluster = options.scheduler or LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    print(
+        f"here: {here.losses.size} colonies in {here.seconds:.1f} s, best loss"
+        f" {here.loss.min():.4f}",
+        flush=True,
+    )
+    cluster = options.scheduler or LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    )
     with Client(cluster) as client:
         executor = client.get_executor(pure=False)
         objective.evaluate(points[:2], executor=executor, pieces=2)  # workers import torch once
         calm = objective.evaluate(points, executor=executor, pieces=options.pieces)
-        print(f"{len(client.run(os.getpid))} workers: {calm.seconds:.1f} s, the same bits: {np.array_equal(calm.losses, here.losses)}", flush=True)
+        print(
+            f"{len(client.run(os.getpid))} workers: {calm.seconds:.1f} s, the same bits:"
+            f" {np.array_equal(calm.losses, here.losses)}",
+            flush=True,
+        )
         address, pid = next(iter(client.run(os.getpid).items()))
-        killer = threading.Timer(0.5 * calm.seconds, lambda: client.run(end, pid, workers=[address], on_error="ignore"))
+        killer = threading.Timer(
+            0.5 * calm.seconds, lambda: client.run(end, pid, workers=[address], on_error="ignore")
+        )
         killer.start()
         struck = objective.evaluate(points, executor=executor, pieces=options.pieces)
-        print(f"worker {pid} killed after {0.5 * calm.seconds:.1f} s of {struck.seconds:.1f} s; workers now {list(client.run(os.getpid).values())}")
-        print(f"{np.isnan(struck.losses).sum()} colonies lost, the same bits: {np.array_equal(struck.losses, here.losses)}")
+        print(
+            f"worker {pid} killed after {0.5 * calm.seconds:.1f} s of {struck.seconds:.1f} s;"
+            f" workers now {list(client.run(os.getpid).values())}"
+        )
+        print(
+            f"{np.isnan(struck.losses).sum()} colonies lost, the same bits:"
+            f" {np.array_equal(struck.losses, here.losses)}"
+        )
         killer.join()
     if not options.scheduler:
         cluster.close()

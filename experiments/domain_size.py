@@ -1,9 +1,12 @@
-"""How large are the patches into which a colony of toggle switches falls? Find switches that make them as large as wanted.
+"""How large are the patches into which a colony of toggle switches falls? Find switches that make
+them as large as wanted.
 
     python experiments/domain_size.py --size 12 --colonies 400
 
-Two genes repress each other, molecule by molecule. Founders start at the tipping point; a cell that has fallen to one side takes its descendants along.
-How early they fall, and whether they fall back, is up to the switch: its strength, how fast it turns over, where it starts, and how many molecules it has.
+Two genes repress each other, molecule by molecule. Founders start at the tipping point; a cell that
+has fallen to one side takes its descendants along. How early they fall, and whether they fall back,
+is up to the switch: its strength, how fast it turns over, where it starts, and how many molecules
+it has.
 """
 
 from __future__ import annotations
@@ -23,13 +26,24 @@ COLONY = {"cells": 100, "dt": 0.05}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", type=float, default=12.0, help="wanted, µm")
     parser.add_argument("--colonies", type=int, default=400)
-    parser.add_argument("--out", type=Path, default=Path("domain_size"), help="stem of the files that are written")
+    parser.add_argument(
+        "--out", type=Path, default=Path("domain_size"), help="stem of the files that are written"
+    )
     options = parser.parse_args()
     tf.keep_memory()
-    search = Search("toggle_switch", PARAMETERS, DomainSize(("red", "green"), options.size), **COLONY, method=CMAES(population=16), replicates=4)
+    search = Search(
+        "toggle_switch",
+        PARAMETERS,
+        DomainSize(("red", "green"), options.size),
+        **COLONY,
+        method=CMAES(population=16),
+        replicates=4,
+    )
     best = search.run(options.colonies, study=options.out.with_suffix(".h5"))
     print(best.table())
     print(best.save(options.out.with_suffix(".json")), best.plot(options.out.with_suffix(".png")))

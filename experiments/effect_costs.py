@@ -1,12 +1,15 @@
-"""What each effect costs, in every ready-made scene: time, operators and bytes of a step; and that an effect which is not listed costs nothing.
+"""What each effect costs, in every ready-made scene: time, operators and bytes of a step; and that
+an effect which is not listed costs nothing.
 
     OMP_NUM_THREADS=1 python experiments/effect_costs.py                     # five to ten minutes; writes its part of docs/effects.md and a JSON record
     OMP_NUM_THREADS=1 python experiments/effect_costs.py --cells 50 --out costs.json --page ''
 
-Each scene is grown from its founders to 200 cells in each of 4 colonies, or as many as it has after 12 h. From there 20 steps are taken twice: once
-timed, once with every operator counted that they dispatch, and the bytes allocated for its results. Operators and bytes are the same whatever else the
-machine does; times are told as shares of one run. Then growth, division and mechanics are taken alone and beside other effects that do not act on them:
-the same cells, the same operators, the same bytes.
+Each scene is grown from its founders to 200 cells in each of 4 colonies, or as many as it has after
+12 h. From there 20 steps are taken twice: once timed, once with every operator counted that they
+dispatch, and the bytes allocated for its results. Operators and bytes are the same whatever else
+the machine does; times are told as shares of one run. Then growth, division and mechanics are taken
+alone and beside other effects that do not act on them: the same cells, the same operators, the same
+bytes.
 """
 
 from __future__ import annotations
@@ -37,7 +40,9 @@ BODY = ("growth", "mechanics", "division")
 
 def grown(scene: tf.Scene, cells: int, colonies: int) -> tf.State:
     """The scene's colonies at so many cells each, or after HOURS."""
-    run = tf.simulate(scene, scene.seed(colonies, seed=0), cells=cells, until=round(HOURS / scene.dt) * scene.dt)
+    run = tf.simulate(
+        scene, scene.seed(colonies, seed=0), cells=cells, until=round(HOURS / scene.dt) * scene.dt
+    )
     return deque(run, maxlen=1).pop()
 
 
@@ -69,11 +74,22 @@ def of_scene(name: str, cells: int, colonies: int) -> dict:
     ms, spent = timed(scene, state, STEPS), counted(scene, state, STEPS)
     effects = {
         title: {
-            "ms": round(ms[title], 4), "share": round(ms[title] / sum(ms.values()), 4),
-            "operators": sum(sum(s.calls[title].values()) for s in spent) / STEPS, "bytes": sum(s.bytes[title] for s in spent) / STEPS,
-        } for title in ms
-    }  # fmt: skip
-    return {"case": "scene", "scene": name, "settings": SETTINGS.get(name, {}), "cells": state.cells, "colonies": colonies, "steps": STEPS, "effects": effects}
+            "ms": round(ms[title], 4),
+            "share": round(ms[title] / sum(ms.values()), 4),
+            "operators": sum(sum(s.calls[title].values()) for s in spent) / STEPS,
+            "bytes": sum(s.bytes[title] for s in spent) / STEPS,
+        }
+        for title in ms
+    }
+    return {
+        "case": "scene",
+        "scene": name,
+        "settings": SETTINGS.get(name, {}),
+        "cells": state.cells,
+        "colonies": colonies,
+        "steps": STEPS,
+        "effects": effects,
+    }
 
 
 def _watching(cells: tf.State) -> None:
@@ -86,33 +102,69 @@ def _made(u, s, p, cell):
 
 def additions() -> dict[str, Sequence[tf.Effect]]:
     """Effects that leave growth, division and mechanics what they are."""
-    medium = tf.Medium(ahl=tf.Signal(diffusion=10.0), box=((-64.0, -64.0), (64.0, 64.0)), spacing=4.0, beyond="grow")
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=10.0),
+        box=((-64.0, -64.0), (64.0, 64.0)),
+        spacing=4.0,
+        beyond="grow",
+    )
     smooth = tf.Circuit(_made, species=("m",))
-    molecules = tf.Circuit([tf.parts.constitutive("m", 1.0), tf.parts.degradation("m", 1.0)], species=("m",), method="tau_leap")
+    molecules = tf.Circuit(
+        [tf.parts.constitutive("m", 1.0), tf.parts.degradation("m", 1.0)],
+        species=("m",),
+        method="tau_leap",
+    )
     return {
-        "nothing": (), "a circuit": (smooth,), "a circuit, molecule by molecule": (molecules,), "a medium": (medium,),
-        "a circuit and a medium": (smooth, medium), "rules": (tf.Rules(_watching),), "removal": (tf.Removal((-500.0, -500.0), (500.0, 500.0)),),
-    }  # fmt: skip
+        "nothing": (),
+        "a circuit": (smooth,),
+        "a circuit, molecule by molecule": (molecules,),
+        "a medium": (medium,),
+        "a circuit and a medium": (smooth, medium),
+        "rules": (tf.Rules(_watching),),
+        "removal": (tf.Removal((-500.0, -500.0), (500.0, 500.0)),),
+    }
 
 
 def beside(cells: int, colonies: int) -> list[dict]:
-    """Operators and bytes of STEPS steps of growth, division and mechanics, alone and beside other effects."""
+    """Operators and bytes of STEPS steps of growth, division and mechanics, alone and beside other
+    effects."""
     records = []
     for name, more in additions().items():
-        scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2), *more)
+        scene = tf.Scene(
+            tf.Growth(rate=1.0),
+            tf.Division(length=tf.Uniform(3.5, 4.5)),
+            tf.Mechanics(dim=2),
+            *more,
+        )
         state = grown(scene, cells, colonies)
         spent = counted(scene, state, STEPS)
-        record: dict = {"case": "beside", "beside": name, "cells": state.cells, "colonies": colonies, "steps": STEPS}
+        record: dict = {
+            "case": "beside",
+            "beside": name,
+            "cells": state.cells,
+            "colonies": colonies,
+            "steps": STEPS,
+        }
         for title in BODY:
             calls = sum((s.calls[title] for s in spent), Counter())
-            record[title] = {"operators": sum(calls.values()), "bytes": sum(s.bytes[title] for s in spent), "by_name": dict(sorted(calls.items()))}
+            record[title] = {
+                "operators": sum(calls.values()),
+                "bytes": sum(s.bytes[title] for s in spent),
+                "by_name": dict(sorted(calls.items())),
+            }
         others = [title for title in spent[0].calls if title not in BODY]
-        record["others"] = {"operators": sum(sum(s.calls[t].values()) for s in spent for t in others), "bytes": sum(s.bytes[t] for s in spent for t in others)}
+        record["others"] = {
+            "operators": sum(sum(s.calls[t].values()) for s in spent for t in others),
+            "bytes": sum(s.bytes[t] for s in spent for t in others),
+        }
         records.append(record)
         alone = records[0]
         for title in ("growth", "mechanics"):
             if record[title] != alone[title] or state.cells != alone["cells"]:
-                raise SystemExit(f"{title} beside {name} does not cost what it costs alone: {record[title]} instead of {alone[title]}")
+                raise SystemExit(
+                    f"{title} beside {name} does not cost what it costs alone: {record[title]}"
+                    f" instead of {alone[title]}"
+                )
         print(f"beside {name}: growth and mechanics the same", flush=True)
     return records
 
@@ -121,9 +173,15 @@ def scene_rows(record: dict) -> list[str]:
     """A scene's rows of the table."""
     effects = record["effects"]
     total = {key: sum(e[key] for e in effects.values()) for key in ("ms", "operators", "bytes")}
-    rows = [f"| **{record['scene']}**, {record['cells']} cells | {total['ms']:.1f} ms | {total['operators']:.0f} | {total['bytes'] / 1e6:.2f} |"]
+    rows = [
+        f"| **{record['scene']}**, {record['cells']} cells | {total['ms']:.1f} ms |"
+        f" {total['operators']:.0f} | {total['bytes'] / 1e6:.2f} |"
+    ]
     for title, e in sorted(effects.items(), key=lambda item: -item[1]["ms"]):
-        rows.append(f"| {title} | {100 * e['share']:.1f} % | {e['operators']:.0f} | {e['bytes'] / 1e6:.2f} |")
+        rows.append(
+            f"| {title} | {100 * e['share']:.1f} % | {e['operators']:.0f} |"
+            f" {e['bytes'] / 1e6:.2f} |"
+        )
     return rows
 
 
@@ -131,25 +189,61 @@ def tables(noted: dict, records: list[dict]) -> str:
     """The page's tables in Markdown."""
     scenes, body = ([r for r in records if r["case"] == case] for case in ("scene", "beside"))
     lines = [
-        f"Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']}, Python {noted['python']}, {noted['threads']} thread(s), "
-        f"{noted['processor']}, float32. Means over {STEPS} steps of {scenes[0]['colonies']} colonies; times are medians, as shares of the step.",
-        "", "| scene, effect | time of a step | operators a step | MB allocated a step |", "|---|---|---|---|", *(row for r in scenes for row in scene_rows(r)),
-        "", "### What is not listed costs nothing", "",
-        f"{body[0]['cells']} cells in {body[0]['colonies']} colonies, {STEPS} steps: operators dispatched and bytes allocated, in all.", "",
-        "| growth, division and mechanics beside | growth | mechanics | division | the other effects |", "|---|---|---|---|---|",
-    ]  # fmt: skip
-    show: Callable[[dict], str] = lambda cost: f"{cost['operators']}, {cost['bytes']:,} B"  # noqa: E731
-    lines += [f"| {r['beside']} | " + " | ".join(show(r[key]) for key in (*BODY, "others")) + " |" for r in body]
+        (
+            f"Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']},"
+            f" Python {noted['python']}, {noted['threads']} thread(s), {noted['processor']},"
+            f" float32. Means over {STEPS} steps of {scenes[0]['colonies']} colonies; times are"
+            " medians, as shares of the step."
+        ),
+        "",
+        "| scene, effect | time of a step | operators a step | MB allocated a step |",
+        "|---|---|---|---|",
+        *(row for r in scenes for row in scene_rows(r)),
+        "",
+        "### What is not listed costs nothing",
+        "",
+        (
+            f"{body[0]['cells']} cells in {body[0]['colonies']} colonies, {STEPS} steps: operators"
+            " dispatched and bytes allocated, in all."
+        ),
+        "",
+        (
+            "| growth, division and mechanics beside | growth | mechanics | division | the other"
+            " effects |"
+        ),
+        "|---|---|---|---|---|",
+    ]
+    show: Callable[[dict], str] = lambda cost: f"{cost['operators']}, {cost['bytes']:,} B"
+    lines += [
+        f"| {r['beside']} | " + " | ".join(show(r[key]) for key in (*BODY, "others")) + " |"
+        for r in body
+    ]
     return "\n".join(lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", action="append", choices=tuple(tf.scenes.READY), help="one scene; may be given again")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scene",
+        action="append",
+        choices=tuple(tf.scenes.READY),
+        help="one scene; may be given again",
+    )
     parser.add_argument("--cells", type=int, default=200, help="in each colony")
     parser.add_argument("--colonies", type=int, default=4)
-    parser.add_argument("--out", type=Path, default=HERE / "benchmarks" / "effect_costs.json", help="JSON record, written anew")
-    parser.add_argument("--page", default=str(HERE.parent / "docs" / "effects.md"), help="page whose tables are written anew; '' for none")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=HERE / "benchmarks" / "effect_costs.json",
+        help="JSON record, written anew",
+    )
+    parser.add_argument(
+        "--page",
+        default=str(HERE.parent / "docs" / "effects.md"),
+        help="page whose tables are written anew; '' for none",
+    )
     chosen = parser.parse_args()
     tf.keep_memory()
     torch.set_grad_enabled(False)

@@ -2,10 +2,12 @@
 
     python experiments/long_run.py --steps 100000 --out runs/long_run.csv
 
-Cells grow, divide and leave a channel at its open end. About the closed end (x < 8 µm) they stand in a reservoir and take up AHL; farther on they exchange it
-with the medium on a grid and carry it out at the end, and it switches LuxI on. Nothing makes or takes AHL, so what is in cells and medium, what left with
-cells and what came from the reservoir add up to what there was: the drift of that sum is told relative to all that has passed. Writes a line of CSV every
-500 steps (in a short run every hundredth of it), and prints one for docs/stability.md.
+Cells grow, divide and leave a channel at its open end. About the closed end (x < 8 µm) they stand
+in a reservoir and take up AHL; farther on they exchange it with the medium on a grid and carry it
+out at the end, and it switches LuxI on. Nothing makes or takes AHL, so what is in cells and medium,
+what left with cells and what came from the reservoir add up to what there was: the drift of that
+sum is told relative to all that has passed. Writes a line of CSV every 500 steps (in a short run
+every hundredth of it), and prints one for docs/stability.md.
 """
 
 from __future__ import annotations
@@ -23,12 +25,26 @@ import torchfilm as tf
 from torchfilm.effect import REMOVAL
 
 LENGTH, WIDTH = 32.0, 4.0
-COLUMNS = ("step", "hours", "rss_mb", "cells", "tensors_mb", "held", "passed", "drift", "luxi", "seconds")
+COLUMNS = (
+    "step",
+    "hours",
+    "rss_mb",
+    "cells",
+    "tensors_mb",
+    "held",
+    "passed",
+    "drift",
+    "luxi",
+    "seconds",
+)
 
 
 def lux(u, s, p, cell):
     into = 20.0 * (s.ahl - u.ahl) * cell.area
-    return {"luxi": 0.01 + 5.0 * tf.kinetics.activation(u.ahl, 0.3, 2) - 2.0 * u.luxi, "ahl": into / cell.volume}, {"ahl": -into}
+    return {
+        "luxi": 0.01 + 5.0 * tf.kinetics.activation(u.ahl, 0.3, 2) - 2.0 * u.luxi,
+        "ahl": into / cell.volume,
+    }, {"ahl": -into}
 
 
 @dataclass(frozen=True)
@@ -39,7 +55,15 @@ class Carried(tf.Effect):
     title = "carried"
 
     def declares(self, dim: int) -> tuple[tf.Field, ...]:
-        return (tf.Field("carried", "AHL that left with cells", "conc·µm³", scope="colony", dtype=torch.float64),)
+        return (
+            tf.Field(
+                "carried",
+                "AHL that left with cells",
+                "conc·µm³",
+                scope="colony",
+                dtype=torch.float64,
+            ),
+        )
 
     def step(self, state: tf.State, dt: float) -> tf.State:
         leaves = state.position[:, 0] > LENGTH
@@ -50,11 +74,20 @@ class Carried(tf.Effect):
 def channel() -> tf.Scene:
     half = WIDTH / 2
     return tf.Scene(
-        tf.Growth(rate=tf.Uniform(0.8, 1.2)), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2, walls=[tf.Channel(WIDTH, low_end=0.0)]),
+        tf.Growth(rate=tf.Uniform(0.8, 1.2)),
+        tf.Division(length=tf.Uniform(3.5, 4.5)),
+        tf.Mechanics(dim=2, walls=[tf.Channel(WIDTH, low_end=0.0)]),
         tf.Circuit(lux, species=("luxi", "ahl"), daughters="amount", rtol=0.01),
-        tf.Medium(ahl=tf.Signal(diffusion=50.0, beyond=1.0), box=((8.0, -half), (LENGTH, half)), spacing=2.0, beyond="open"),
-        Carried(), tf.Removal(low=(-1.0, -WIDTH), high=(LENGTH, WIDTH)), founders=tf.Cells([[2.0, 0.0]], [[1.0, 0.0]]),
-    )  # fmt: skip
+        tf.Medium(
+            ahl=tf.Signal(diffusion=50.0, beyond=1.0),
+            box=((8.0, -half), (LENGTH, half)),
+            spacing=2.0,
+            beyond="open",
+        ),
+        Carried(),
+        tf.Removal(low=(-1.0, -WIDTH), high=(LENGTH, WIDTH)),
+        founders=tf.Cells([[2.0, 0.0]], [[1.0, 0.0]]),
+    )
 
 
 def resident() -> float:
@@ -64,22 +97,32 @@ def resident() -> float:
 
 def tensors(state: tf.State) -> float:
     """Memory of a state's own tensors, MB."""
-    every = [v for v in (*vars(state).values(), *state.fields.values()) if isinstance(v, torch.Tensor)]
+    every = [
+        v for v in (*vars(state).values(), *state.fields.values()) if isinstance(v, torch.Tensor)
+    ]
     return sum(v.numel() * v.element_size() for v in every) / 2**20
 
 
 def balance(state: tf.State) -> tuple[float, float, float]:
-    """What is held in cells and medium, what has passed (in from the reservoir), and the sum that should stay 0, conc·µm³."""
+    """What is held in cells and medium, what has passed (in from the reservoir), and the sum that
+    should stay 0, conc·µm³."""
     assert state.layout is not None
-    held = float((state.ahl.double() * state.circuit_volume.double()).sum() + state.signals["ahl"].double().sum() * state.layout.grid.voxel_volume)
+    held = float(
+        (state.ahl.double() * state.circuit_volume.double()).sum()
+        + state.signals["ahl"].double().sum() * state.layout.grid.voxel_volume
+    )
     given = float(state.ahl_beyond.double().sum())
     return held, -given, held + given + float(state.carried.sum())
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--steps", type=int, default=100_000)
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop earlier, after as long")
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), help="stop earlier, after as long"
+    )
     parser.add_argument("--dtype", choices=("float32", "float64"), default="float32")
     parser.add_argument("--out", type=Path, default=Path("runs/long_run.csv"))
     chosen = parser.parse_args()
@@ -96,7 +139,18 @@ def main() -> None:
             seconds = time.perf_counter() - begun
             if state.step % every == 0:
                 held, passed, left = balance(state)
-                row = (state.step, state.time, resident(), state.cells, tensors(state), held, passed, left / passed, float(state.luxi.mean()), seconds)
+                row = (
+                    state.step,
+                    state.time,
+                    resident(),
+                    state.cells,
+                    tensors(state),
+                    held,
+                    passed,
+                    left / passed,
+                    float(state.luxi.mean()),
+                    seconds,
+                )
                 rows.append(row)
                 table.writerow(row)
                 file.flush()
@@ -105,9 +159,11 @@ def main() -> None:
     settled = [r for r in rows if r[0] >= rows[-1][0] / 5]
     memory, count, luxi = ([r[k] for r in settled] for k in (2, 3, 8))
     print(
-        f"{state.step:,} steps ({state.time:.0f} h, {settled[-1][9]:.0f} s) in {chosen.dtype}: from a fifth of the run on {min(count)}-{max(count)} cells, "
-        f"LuxI {min(luxi):.3g}-{max(luxi):.3g}, memory {memory[0]:.1f} MB then and {memory[-1]:.1f} MB at the end ({min(memory):.1f}-{max(memory):.1f}); "
-        f"{settled[-1][6]:.4g} conc·µm³ passed, of which {max(abs(r[7]) for r in rows):.2g} at most is not accounted for."
+        f"{state.step:,} steps ({state.time:.0f} h, {settled[-1][9]:.0f} s) in {chosen.dtype}: from"
+        f" a fifth of the run on {min(count)}-{max(count)} cells, LuxI"
+        f" {min(luxi):.3g}-{max(luxi):.3g}, memory {memory[0]:.1f} MB then and {memory[-1]:.1f} MB"
+        f" at the end ({min(memory):.1f}-{max(memory):.1f}); {settled[-1][6]:.4g} conc·µm³ passed,"
+        f" of which {max(abs(r[7]) for r in rows):.2g} at most is not accounted for."
     )
 
 

@@ -1,8 +1,10 @@
-"""A ring: cells light up at some distance from a source in the middle (Basu et al. 2005), where there is neither too much nor too little of a signal.
+"""A ring: cells light up at some distance from a source in the middle (Basu et al. 2005), where
+there is neither too much nor too little of a signal.
 
     python experiments/ring.py --colonies 1000
 
-The choice of promoter is searched along with its constants: "steep" ones bind four molecules of the signal, "shallow" ones two.
+The choice of promoter is searched along with its constants: "steep" ones bind four molecules of the
+signal, "shallow" ones two.
 """
 
 from __future__ import annotations
@@ -17,9 +19,16 @@ POWERS = {"shallow": 2.0, "steep": 4.0}
 
 
 def detector(u, s, p, cell):
-    """GFP where the signal is above one threshold and below another; the repressor takes time to be made."""
-    low, high = s.signal**p.n / (p.above**p.n + s.signal**p.n), s.signal**p.n / (p.below**p.n + s.signal**p.n)
-    return {"repressor": 20.0 * high - p.decay * u.repressor, "gfp": p.make * low / (1 + u.repressor**2) - p.decay * u.gfp}
+    """GFP where the signal is above one threshold and below another; the repressor takes time to be
+    made."""
+    low, high = (
+        s.signal**p.n / (p.above**p.n + s.signal**p.n),
+        s.signal**p.n / (p.below**p.n + s.signal**p.n),
+    )
+    return {
+        "repressor": 20.0 * high - p.decay * u.repressor,
+        "gfp": p.make * low / (1 + u.repressor**2) - p.decay * u.gfp,
+    }
 
 
 def middle(places):
@@ -30,13 +39,26 @@ def middle(places):
 def band_detector(above=0.05, below=0.3, make=10.0, decay=2.0, promoter="steep") -> tf.Scene:
     """A colony of band detectors about a source."""
     return tf.Scene(
-        tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2),
+        tf.Growth(rate=1.0),
+        tf.Division(length=tf.Uniform(3.5, 4.5)),
+        tf.Mechanics(dim=2),
         tf.Circuit(
-            detector, species=("repressor", "gfp"), above=above, below=below, make=make, decay=decay, n=POWERS[promoter], rtol=1e-2,
+            detector,
+            species=("repressor", "gfp"),
+            above=above,
+            below=below,
+            make=make,
+            decay=decay,
+            n=POWERS[promoter],
+            rtol=1e-2,
         ),
-        tf.Medium(signal=tf.Signal(diffusion=250.0, decay=10.0, source=middle), box=((-34, -34), (34, 34)), spacing=4.0),
+        tf.Medium(
+            signal=tf.Signal(diffusion=250.0, decay=10.0, source=middle),
+            box=((-34, -34), (34, 34)),
+            spacing=4.0,
+        ),
         name="band_detector",
-    )  # fmt: skip
+    )
 
 
 PARAMETERS = [
@@ -51,12 +73,18 @@ COLONY = {"cells": 150, "dt": 0.05}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--colonies", type=int, default=1000)
-    parser.add_argument("--out", type=Path, default=Path("ring"), help="stem of the files that are written")
+    parser.add_argument(
+        "--out", type=Path, default=Path("ring"), help="stem of the files that are written"
+    )
     options = parser.parse_args()
     tf.keep_memory()
-    search = Search(band_detector, PARAMETERS, TARGET, **COLONY, method=CMAES(population=24), replicates=4)
+    search = Search(
+        band_detector, PARAMETERS, TARGET, **COLONY, method=CMAES(population=24), replicates=4
+    )
     best = search.run(options.colonies, study=options.out.with_suffix(".h5"))
     print(best.table())
     print(best.save(options.out.with_suffix(".json")), best.plot(options.out.with_suffix(".png")))

@@ -1,4 +1,5 @@
-"""Shared by the tests of the command line: the command in a shell, a scene file, and what a file or a picture holds."""
+"""Shared by the tests of the command line: the command in a shell, a scene file, and what a file or
+a picture holds."""
 
 from __future__ import annotations
 
@@ -25,7 +26,16 @@ def scene(rate=1.0, longest=4.0):
 def shell(*arguments: object, folder: Path, **options) -> subprocess.CompletedProcess:
     """The command as a user types it."""
     command = [sys.executable, "-m", "torchfilm.cli", *map(str, arguments)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, env=ENVIRONMENT, check=False, **options)
+    return subprocess.run(
+        command,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=ENVIRONMENT,
+        check=False,
+        **options,
+    )
 
 
 def frames(path) -> dict:

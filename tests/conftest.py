@@ -25,8 +25,9 @@ def dtype(request) -> torch.dtype:
 
 @pytest.fixture
 def measured(record_property):
-    """`measured("overlap, µm", value, "≤ 0.05")` beside a hard case's assertion notes the value for docs/stability.md, and gives it back. Of several of one
-    case the page shows the worst: the least where the criterion is "≥ …", else the greatest."""
+    """`measured("overlap, µm", value, "≤ 0.05")` beside a hard case's assertion notes the value for
+    docs/stability.md, and gives it back. Of several of one case the page shows the worst: the least
+    where the criterion is "≥ …", else the greatest."""
 
     def note(what: str, value, criterion: str):
         record_property("measured", (what, float(value), criterion))
@@ -46,7 +47,8 @@ def deterministic():
 
 @pytest.fixture
 def command(tmp_path, monkeypatch):
-    """The command line without a new process: `command("run", "microcolony", …)` in a folder of its own."""
+    """The command line without a new process: `command("run", "microcolony", …)` in a folder of its
+    own."""
     from torchfilm import cli
 
     monkeypatch.chdir(tmp_path)

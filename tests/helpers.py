@@ -1,4 +1,5 @@
-"""Shared by the tests: states from arrays, and geometry worked out a second time, plainly and in float64."""
+"""Shared by the tests: states from arrays, and geometry worked out a second time, plainly and in
+float64."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ Flat = tuple[Sequence[float], float]
 
 def mechanics(**options) -> tf.Mechanics:
     """The hard cases' mechanics: γ = 10, μ = 1, α = 1/γ, solved well below what the cases ask."""
-    return tf.Mechanics(**{"alpha": 0.1, "length_drag": 10.0, "viscosity": 1.0, "tolerance": 1e-4, **options})
+    return tf.Mechanics(
+        **{"alpha": 0.1, "length_drag": 10.0, "viscosity": 1.0, "tolerance": 1e-4, **options}
+    )
 
 
 def growth(rate: float | Tensor = 1.0, law: str = "length") -> tf.Growth:
@@ -27,11 +30,15 @@ def growth(rate: float | Tensor = 1.0, law: str = "length") -> tf.Growth:
     return tf.Growth(rate=rate, law=law)
 
 
-def seeded(scene: tf.Scene, cells: tf.Cells, device: torch.device, dtype: torch.dtype, **options) -> tf.State:
+def seeded(
+    scene: tf.Scene, cells: tf.Cells, device: torch.device, dtype: torch.dtype, **options
+) -> tf.State:
     return scene.seed(cells=cells, device=device, dtype=dtype, **options)
 
 
-def run(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.01, check: bool = True) -> tf.State:
+def run(
+    scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.01, check: bool = True
+) -> tf.State:
     """The state `steps` steps later; `check` applies `check_always` to each state on the way."""
     for _ in range(steps):
         state = scene.step(state, dt)
@@ -41,7 +48,8 @@ def run(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.01, check: b
 
 
 def check_always(state: tf.State, scene: tf.Scene | None = None) -> None:
-    """What the hard cases ask of every state: finite, |axis| = 1 ± 1e-6, length ≥ 0, every colony's solve converged."""
+    """What the hard cases ask of every state: finite, |axis| = 1 ± 1e-6, length ≥ 0, every colony's
+    solve converged."""
     for name in ("position", "axis", "length", "radius"):
         assert torch.isfinite(getattr(state, name)).all(), name
     for name, value in state.fields.items():
@@ -66,10 +74,11 @@ def array(x: Tensor) -> np.ndarray:
 
 
 def segment_distance(c1, a1, h1, c2, a2, h2) -> np.ndarray:
-    """Least distance of segments c ± h a, (P, d), (P, d), (P,), by search: no formula shared with torchfilm.
+    """Least distance of segments c ± h a, (P, d), (P, d), (P,), by search: no formula shared with
+    torchfilm.
 
-    The distance of a point of one segment to the other segment is convex along the first, so the search between its ends
-    cannot miss; after 90 rounds the bracket is 1e-16 of the segment.
+    The distance of a point of one segment to the other segment is convex along the first, so the
+    search between its ends cannot miss; after 90 rounds the bracket is 1e-16 of the segment.
     """
     c1, a1, h1, c2, a2, h2 = (np.asarray(x, dtype=np.float64) for x in (c1, a1, h1, c2, a2, h2))
 
@@ -88,20 +97,28 @@ def segment_distance(c1, a1, h1, c2, a2, h2) -> np.ndarray:
 
 def pair_gaps(state: tf.State, pairs: np.ndarray) -> np.ndarray:
     """Signed gaps (P,) µm of pairs (P, 2), in float64."""
-    c, a, h, r = array(state.position), array(state.axis), 0.5 * array(state.length), array(state.radius)
+    c, a, h, r = (
+        array(state.position),
+        array(state.axis),
+        0.5 * array(state.length),
+        array(state.radius),
+    )
     i, j = pairs.T
     return segment_distance(c[i], a[i], h[i], c[j], a[j], h[j]) - r[i] - r[j]
 
 
 def near_pairs(state: tf.State, margin: float = 0.0) -> np.ndarray:
-    """All pairs (P, 2), i < j, of one colony with a gap under `margin`, from every pair whose centres are near enough."""
+    """All pairs (P, 2), i < j, of one colony with a gap under `margin`, from every pair whose
+    centres are near enough."""
     reach = 0.5 * array(state.length) + array(state.radius)
     colony, found = array(state.colony), [np.zeros((0, 2), dtype=np.int64)]
     for k in range(state.colonies):
         members = np.flatnonzero(colony == k)
         if len(members) > 1:
             tree = cKDTree(array(state.position)[members])
-            found.append(members[tree.query_pairs(2 * reach[members].max() + margin, output_type="ndarray")])
+            found.append(
+                members[tree.query_pairs(2 * reach[members].max() + margin, output_type="ndarray")]
+            )
     pairs = np.concatenate(found)
     return pairs[pair_gaps(state, pairs) < margin] if len(pairs) else pairs
 
@@ -113,9 +130,12 @@ def ends(state: tf.State) -> np.ndarray:
 
 
 def wall_overlap(state: tf.State, walls: Sequence[Flat]) -> np.ndarray:
-    """How deep each cell's surface is behind each flat wall, (walls, N) µm; negative where there is room."""
+    """How deep each cell's surface is behind each flat wall, (walls, N) µm; negative where there is
+    room."""
     points, radius = ends(state), array(state.radius)
-    return np.array([radius - (points @ np.asarray(n, dtype=np.float64) - at).min(0) for n, at in walls])
+    return np.array(
+        [radius - (points @ np.asarray(n, dtype=np.float64) - at).min(0) for n, at in walls]
+    )
 
 
 def worst_overlap(state: tf.State, walls: Sequence[Flat] = ()) -> float:
@@ -131,9 +151,14 @@ def worst_overlap(state: tf.State, walls: Sequence[Flat] = ()) -> float:
 
 def bodies(c, a, length, radius=0.5, *, dtype=torch.float64, device="cpu") -> Bodies:
     """Capsules from arrays (N, d), (N, d), (N,)."""
-    t = lambda x: torch.as_tensor(np.asarray(x), dtype=dtype, device=device)  # noqa: E731
+    t = lambda x: torch.as_tensor(np.asarray(x), dtype=dtype, device=device)
     length = t(length)
-    return Bodies(t(c).T.contiguous(), t(a).T.contiguous(), 0.5 * length, t(radius).expand(length.shape).contiguous())
+    return Bodies(
+        t(c).T.contiguous(),
+        t(a).T.contiguous(),
+        0.5 * length,
+        t(radius).expand(length.shape).contiguous(),
+    )
 
 
 def rows_of(cells: Bodies, first: Tensor, second: Tensor, push: bool = False) -> Contacts:
@@ -157,13 +182,17 @@ def rotation(rng: np.random.Generator, dim: int) -> np.ndarray:
 
 
 def crowd(rng: np.random.Generator, count: int, dim: int, tilt: float = 0.1) -> tf.Cells:
-    """Overlapping cells in no order, none through another: a wall of bricks, jittered and tilted, either way round. Most
-    overlap several neighbours, by up to 0.4 µm.
+    """Overlapping cells in no order, none through another: a wall of bricks, jittered and tilted,
+    either way round. Most overlap several neighbours, by up to 0.4 µm.
     """
     side = int(np.ceil(count ** (1 / dim)))
-    place = np.stack(np.meshgrid(*[np.arange(side)] * dim, indexing="ij"), -1).reshape(-1, dim)[:count]
+    place = np.stack(np.meshgrid(*[np.arange(side)] * dim, indexing="ij"), -1).reshape(-1, dim)[
+        :count
+    ]
     position = place * np.array([3.0, 0.93, 0.93])[:dim] + 0.03 * rng.uniform(-1, 1, (count, dim))
     position[:, 0] += 1.5 * (place[:, 1:].sum(1) % 2) + 0.1 * rng.uniform(-1, 1, count)
-    axis = np.eye(dim)[0] * rng.choice([-1.0, 1.0], count)[:, None] + tilt * rng.uniform(-1, 1, (count, dim))
+    axis = np.eye(dim)[0] * rng.choice([-1.0, 1.0], count)[:, None] + tilt * rng.uniform(
+        -1, 1, (count, dim)
+    )
     shuffled = rng.permutation(count)
     return tf.Cells(position[shuffled], axis[shuffled], rng.uniform(1.7, 2.1, count), 0.5)

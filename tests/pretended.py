@@ -1,7 +1,8 @@
-"""Tensors of the CPU that say they are on CUDA, and refuse to meet others: what a machine without a GPU can tell about device="cuda".
+"""Tensors of the CPU that say they are on CUDA, and refuse to meet others: what a machine without a
+GPU can tell about device="cuda".
 
-Not that it is fast, or that its sums are ordered; but that every tensor is made on the device that was asked for, that none is read by NumPy, and that the
-ways taken on CUDA only do what they should.
+Not that it is fast, or that its sums are ordered; but that every tensor is made on the device that
+was asked for, that none is read by NumPy, and that the ways taken on CUDA only do what they should.
 """
 
 from __future__ import annotations
@@ -15,7 +16,21 @@ from torch.utils._pytree import tree_flatten, tree_map
 
 CUDA = torch.device("cuda:0")
 # What CUDA, too, lets tensors of two devices take part in.
-MAY_MEET = {"copy_", "to", "__getitem__", "__setitem__", "type_as", "__get__", "__set__", "new_tensor", "as_tensor", "tensor", "cpu", "__repr__", "__format__"}
+MAY_MEET = {
+    "copy_",
+    "to",
+    "__getitem__",
+    "__setitem__",
+    "type_as",
+    "__get__",
+    "__set__",
+    "new_tensor",
+    "as_tensor",
+    "tensor",
+    "cpu",
+    "__repr__",
+    "__format__",
+}
 # What must see the very tensors that it is given, and not others that share their numbers.
 OF_LEAVES = {"grad", "requires_grad_", "backward"}
 AS_TENSOR = torch.as_tensor
@@ -39,7 +54,13 @@ class PretendedCuda(TorchFunctionMode):
 @pytest.fixture
 def pretended_cuda(monkeypatch):
     """In a test that asks for this, device="cuda" is to be had."""
-    for name, value in (("is_available", True), ("device_count", 1), ("current_device", 0), ("synchronize", None), ("_lazy_init", None)):
+    for name, value in (
+        ("is_available", True),
+        ("device_count", 1),
+        ("current_device", 0),
+        ("synchronize", None),
+        ("_lazy_init", None),
+    ):
         monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
     monkeypatch.setattr(torch, "as_tensor", _as_tensor)
     with PretendedCuda():
@@ -47,7 +68,9 @@ def pretended_cuda(monkeypatch):
 
 
 def _is_device(x: Any) -> bool:
-    return isinstance(x, torch.device) or (isinstance(x, str) and (x == "cpu" or x.startswith("cuda")))
+    return isinstance(x, torch.device) or (
+        isinstance(x, str) and (x == "cpu" or x.startswith("cuda"))
+    )
 
 
 def _is_cuda(x: Any) -> bool:
@@ -77,7 +100,10 @@ def _work(func: Any, args: tuple, kwargs: dict) -> Any:
     there = [x for x in tensors if type(x) is Pretended]
     here = [x for x in tensors if type(x) is not Pretended and x.dim() > 0]
     if there and (name == "numpy" or (here and name not in MAY_MEET)):
-        raise RuntimeError(f"{name}: tensors on cuda {[tuple(x.shape) for x in there]} and on cpu {[tuple(x.shape) for x in here]}")
+        raise RuntimeError(
+            f"{name}: tensors on cuda {[tuple(x.shape) for x in there]} and on cpu"
+            f" {[tuple(x.shape) for x in here]}"
+        )
     bare = (lambda x: x) if name in OF_LEAVES else _plain
     with torch._C.DisableTorchFunctionSubclass():
         out = func(*tree_map(bare, args), **tree_map(bare, kwargs))
@@ -86,7 +112,9 @@ def _work(func: Any, args: tuple, kwargs: dict) -> Any:
     if isinstance(kwargs.get("out"), torch.Tensor):
         return kwargs["out"]
     stays = _result_is_there(name, args, kwargs, bool(there))
-    return tree_map(lambda x: x.as_subclass(Pretended) if stays and isinstance(x, torch.Tensor) else x, out)
+    return tree_map(
+        lambda x: x.as_subclass(Pretended) if stays and isinstance(x, torch.Tensor) else x, out
+    )
 
 
 def _result_is_there(name: str, args: tuple, kwargs: dict, there: bool) -> bool:

@@ -1,4 +1,5 @@
-"""Shared by the tests of results: a scene that a restart must carry on whole, its runs, and comparison bit for bit."""
+"""Shared by the tests of results: a scene that a restart must carry on whole, its runs, and
+comparison bit for bit."""
 
 from __future__ import annotations
 
@@ -17,14 +18,20 @@ def removing(cells):
 
 
 def make_scene() -> tf.Scene:
-    """Divisions at random, a rule with draws of its own, and removals: everything that a restart must carry on."""
+    """Divisions at random, a rule with draws of its own, and removals: everything that a restart
+    must carry on."""
     return tf.Scene(
-        tf.Rules(removing, variables={"mark": 0.0}), tf.Growth(rate=tf.Uniform(0.8, 1.2)), tf.Division(length=tf.Uniform(3.0, 4.0)),
-        tf.Mechanics(dim=2), dt=DT,
-    )  # fmt: skip
+        tf.Rules(removing, variables={"mark": 0.0}),
+        tf.Growth(rate=tf.Uniform(0.8, 1.2)),
+        tf.Division(length=tf.Uniform(3.0, 4.0)),
+        tf.Mechanics(dim=2),
+        dt=DT,
+    )
 
 
-def record(scene: tf.Scene, state: tf.State, path, until: float = UNTIL, **options) -> list[tf.State]:
+def record(
+    scene: tf.Scene, state: tf.State, path, until: float = UNTIL, **options
+) -> list[tf.State]:
     """All states of a run, the first included."""
     recorder = tf.Recorder(path, scene, **{"every": EVERY, **options})
     return [state, *tf.simulate(scene, state, until=until, record=recorder)]
@@ -51,6 +58,9 @@ def assert_same_file(path, other, frames: list[int] | None = None) -> None:
                 x, y = a.frame(k), b.frame(j)
                 assert set(x) == set(y) and a.times[k] == b.times[j]
                 for name in x:
-                    assert x[name].dtype == y[name].dtype and np.array_equal(x[name], y[name]), (step, name)
+                    assert x[name].dtype == y[name].dtype and np.array_equal(x[name], y[name]), (
+                        step,
+                        name,
+                    )
         for name, x in a.lineage().items():
             assert np.array_equal(x, b.lineage()[name]), name

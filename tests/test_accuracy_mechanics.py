@@ -1,4 +1,5 @@
-"""The work–precision studies of mechanics, in small: the laws that their figures must obey, whatever the figures are."""
+"""The work–precision studies of mechanics, in small: the laws that their figures must obey,
+whatever the figures are."""
 
 from __future__ import annotations
 
@@ -29,19 +30,26 @@ def run(kind: str, dim: int):
 
 
 def check_front(study) -> None:
-    """Along the front error falls as work grows, and nothing else is better in both; the default is there."""
+    """Along the front error falls as work grows, and nothing else is better in both; the default is
+    there."""
     assert any(p.default for p in study.points) and set(study.shown) <= set(study.errors)
     for error in study.errors:
         front = study.front(error)
-        assert all(a.work < b.work and a.errors[error] > b.errors[error] for a, b in pairwise(front))
-        assert all(any(f.work <= p.work and f.errors[error] <= p.errors[error] for f in front) for p in study.points)
+        assert all(
+            a.work < b.work and a.errors[error] > b.errors[error] for a, b in pairwise(front)
+        )
+        assert all(
+            any(f.work <= p.work and f.errors[error] <= p.errors[error] for f in front)
+            for p in study.points
+        )
 
 
 @pytest.mark.slow
 @DIMS
 def test_soft_cells_converge_to_their_motion_at_first_order(dim):
-    """Both kinds of contact, to one and the same limit: a tight solve by either leaves nothing but Δt. The four steps are an octave apart; second terms
-    of a few per cent are left at the coarsest."""
+    """Both kinds of contact, to one and the same limit: a tight solve by either leaves nothing but
+    Δt. The four steps are an octave apart; second terms of a few per cent are left at the coarsest.
+    """
     study = run("order", dim)
     check_front(study)
     for error in study.errors:
@@ -49,7 +57,11 @@ def test_soft_cells_converge_to_their_motion_at_first_order(dim):
         for series in ("Δt", "Δt, unilateral"):
             assert 0.9 < orders[series] < 1.1, (error, series)
         finest = min(p.step for p in study.points if p.step)
-        one, other = (p.errors[error] for p in study.points if p.step == finest and p.series in ("Δt", "Δt, unilateral"))
+        one, other = (
+            p.errors[error]
+            for p in study.points
+            if p.step == finest and p.series in ("Δt", "Δt, unilateral")
+        )
         assert one == pytest.approx(other, rel=0.2)
 
 
@@ -62,8 +74,15 @@ def test_a_window_shows_what_each_knob_is_for(dim):
     # a softer penalty leaves more overlap, whatever else
     assert by["dt=0.025, alpha=0.1"].errors["overlap"] > by["dt=0.025"].errors["overlap"]
     # a tighter solve reads more rows, and so do smaller steps
-    assert by["dt=0.025, tolerance=0.02"].work > by["dt=0.025"].work > by["dt=0.025, tolerance=0.2"].work
-    assert all(any(p.default for p in study.points if p.series == s) for s in ("Δt", "α", "passes", "tolerance"))
+    assert (
+        by["dt=0.025, tolerance=0.02"].work
+        > by["dt=0.025"].work
+        > by["dt=0.025, tolerance=0.2"].work
+    )
+    assert all(
+        any(p.default for p in study.points if p.series == s)
+        for s in ("Δt", "α", "passes", "tolerance")
+    )
     assert by["dt=0.0125"].work > by["dt=0.025"].work
     fine, loose = mechanics.tight(tf.Mechanics(dim=dim), True)
     assert not {fine.words, loose.words} & set(by) and fine.mechanics.unilateral
@@ -73,12 +92,17 @@ def test_a_window_shows_what_each_knob_is_for(dim):
 def test_whole_runs_are_compared_with_other_seeds():
     study = run("long", 2)
     check_front(study)
-    assert all(p.band[name] >= 0 and np.isfinite(p.errors[name]) for p in study.points for name in study.errors)
+    assert all(
+        p.band[name] >= 0 and np.isfinite(p.errors[name])
+        for p in study.points
+        for name in study.errors
+    )
     assert any(p.band["radius"] > 0 for p in study.points) and all(p.work > 0 for p in study.points)
 
 
 def test_the_motion_by_numpy_obeys_action_and_reaction():
-    """Without walls forces, and torques about the origin, add up to nothing; a pair that does not touch only grows."""
+    """Without walls forces, and torques about the origin, add up to nothing; a pair that does not
+    touch only grows."""
     rng = np.random.default_rng(1)
     axis = rng.normal(size=(30, 3))
     axis /= np.linalg.norm(axis, axis=1)[:, None]
@@ -88,13 +112,19 @@ def test_the_motion_by_numpy_obeys_action_and_reaction():
     force, torque = move * whole, np.cross(motion.axis, turn) * whole**3 / 12
     assert np.abs(force).max() > 1.0
     # sums of some hundred forces of size 100 in float64
-    assert np.abs(force.sum(0)).max() < 1e-10 and np.abs((np.cross(motion.centre, force) + torque).sum(0)).max() < 1e-10
+    assert (
+        np.abs(force.sum(0)).max() < 1e-10
+        and np.abs((np.cross(motion.centre, force) + torque).sum(0)).max() < 1e-10
+    )
     far = dataclasses.replace(motion, centre=100.0 * np.arange(90.0).reshape(30, 3))
     assert np.array_equal(far.velocity(), np.concatenate([np.zeros(180), motion.length + 2 / 3]))
 
 
 def test_difference_is_welch():
-    one, other = torch.randn(9, generator=torch.Generator().manual_seed(1)).double(), 3 * torch.rand(14, dtype=torch.float64) + 1
+    one, other = (
+        torch.randn(9, generator=torch.Generator().manual_seed(1)).double(),
+        3 * torch.rand(14, dtype=torch.float64) + 1,
+    )
     far, half = mechanics.difference(one, other)
     found = stats.ttest_ind(one, other, equal_var=False).confidence_interval(0.95)
     assert (far - half, far + half) == pytest.approx((found.low, found.high), rel=1e-9)
@@ -103,7 +133,8 @@ def test_difference_is_welch():
 
 @DIMS
 def test_local_order(dim):
-    """1 among cells side by side; crossed at right angles −1 in the plane and −½ in space; a colony each."""
+    """1 among cells side by side; crossed at right angles −1 in the plane and −½ in space; a colony
+    each."""
     x, y = np.eye(dim)[:2]
     cells = tf.Cells([0 * y, 1.1 * y, 0 * y, 2.1 * y], [x, -x, x, y], 2.0, colony=[0, 0, 1, 1])
     state = tf.Scene(tf.Mechanics(dim=dim), founders=cells).seed()
@@ -113,13 +144,30 @@ def test_local_order(dim):
 def test_a_choice_says_what_a_user_would_type():
     plain = tf.Mechanics(dim=2)
     assert mechanics.Choice("", plain).words == "dt=0.025"
-    turned = mechanics.Choice("", dataclasses.replace(plain, alpha=0.003, tolerance=0.02, unilateral=True), 0.05, torch.float64)
+    turned = mechanics.Choice(
+        "",
+        dataclasses.replace(plain, alpha=0.003, tolerance=0.02, unilateral=True),
+        0.05,
+        torch.float64,
+    )
     assert turned.words == "dt=0.05, alpha=0.003, tolerance=0.02, unilateral=True, float64"
     scene = tf.scenes.microcolony(dim=2)
     draft, settings = mechanics.Choice.of_preset("draft", scene), tf.preset("draft", scene)
-    assert draft.words == f"preset draft: dt={settings.dt:g}, alpha=0.01, tolerance={settings.tolerance:g}"
-    assert draft.scene(scene).dt == settings.dt and mechanics.mechanics_of(settings.apply(scene)) == draft.mechanics
+    assert (
+        draft.words
+        == f"preset draft: dt={settings.dt:g}, alpha=0.01, tolerance={settings.tolerance:g}"
+    )
+    assert (
+        draft.scene(scene).dt == settings.dt
+        and mechanics.mechanics_of(settings.apply(scene)) == draft.mechanics
+    )
     made = turned.scene(scene)
-    assert made.dt == 0.05 and mechanics.mechanics_of(made) == turned.mechanics and len(made.listed) == len(scene.listed)
+    assert (
+        made.dt == 0.05
+        and mechanics.mechanics_of(made) == turned.mechanics
+        and len(made.listed) == len(scene.listed)
+    )
     state = turned.start(scene.seed())
-    assert state.dtype == torch.float64 == state.displacement.dtype and state.uid.dtype == torch.int64
+    assert (
+        state.dtype == torch.float64 == state.displacement.dtype and state.uid.dtype == torch.int64
+    )

@@ -1,4 +1,5 @@
-"""Settings of accuracy: what they change in a scene and what not, as data in files and results, and as presets."""
+"""Settings of accuracy: what they change in a scene and what not, as data in files and results, and
+as presets."""
 
 from __future__ import annotations
 
@@ -18,7 +19,12 @@ def made(u, s, p, cell):
 
 def scene(**mechanics) -> tf.Scene:
     return tf.Scene(
-        tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2, **mechanics), tf.Circuit(made, species=("m",)), name="mine", dt=0.02
+        tf.Growth(rate=1.0),
+        tf.Division(length=tf.Uniform(3.5, 4.5)),
+        tf.Mechanics(dim=2, **mechanics),
+        tf.Circuit(made, species=("m",)),
+        name="mine",
+        dt=0.02,
     )
 
 
@@ -30,10 +36,23 @@ def test_knobs_reach_their_effects_and_nothing_else():
     first = scene(length_drag=20.0, walls=[tf.Channel(8.0)])
     second = tf.Settings(dt=0.01, penalty=0.2, passes=3, tolerance=0.01, rtol=1e-3).apply(first)
     mechanics, circuit = of(second, tf.Mechanics), of(second, tf.Circuit)
-    assert (second.dt, mechanics.alpha, mechanics.passes, mechanics.tolerance, circuit.rtol) == (0.01, 0.01, 3, 0.01, 1e-3)
+    assert (second.dt, mechanics.alpha, mechanics.passes, mechanics.tolerance, circuit.rtol) == (
+        0.01,
+        0.01,
+        3,
+        0.01,
+        1e-3,
+    )
     assert mechanics.walls == of(first, tf.Mechanics).walls and mechanics.length_drag == 20.0
-    assert circuit.rates == of(first, tf.Circuit).rates and circuit.noted is not of(first, tf.Circuit).noted
-    assert second.listed[:2] == first.listed[:2] and second.name == "mine" and second.founders is first.founders
+    assert (
+        circuit.rates == of(first, tf.Circuit).rates
+        and circuit.noted is not of(first, tf.Circuit).noted
+    )
+    assert (
+        second.listed[:2] == first.listed[:2]
+        and second.name == "mine"
+        and second.founders is first.founders
+    )
     assert first.dt == 0.02 and of(first, tf.Mechanics).passes is None  # the first is as it was
 
 
@@ -45,7 +64,11 @@ def test_without_knobs_the_scene_stays_as_it_is():
 
 def test_physical_softness_and_molecules_are_no_knobs():
     soft = tf.Settings(penalty=0.2, passes=2).apply(scene(stiffness=100.0))
-    assert of(soft, tf.Mechanics).stiffness == 100.0 and of(soft, tf.Mechanics).alpha is None and of(soft, tf.Mechanics).passes == 2
+    assert (
+        of(soft, tf.Mechanics).stiffness == 100.0
+        and of(soft, tf.Mechanics).alpha is None
+        and of(soft, tf.Mechanics).passes == 2
+    )
     molecules = tf.Circuit([tf.parts.constitutive("m", 1.0)], species="m", method="tau_leap")
     grown = tf.Settings(rtol=1e-2).apply(tf.Scene(tf.Growth(rate=1.0), molecules))
     assert of(grown, tf.Circuit) is molecules
@@ -58,7 +81,18 @@ def test_one_penalty_for_drags_that_differ_between_colonies():
     assert alpha.tolist() == pytest.approx([0.01, 0.005])
 
 
-@pytest.mark.parametrize("wrong", [{"dt": 0.0}, {"penalty": -1.0}, {"passes": 0}, {"passes": 1.5}, {"tolerance": 0.7}, {"rtol": 0.5}, {"rtol": "small"}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"dt": 0.0},
+        {"penalty": -1.0},
+        {"passes": 0},
+        {"passes": 1.5},
+        {"tolerance": 0.7},
+        {"rtol": 0.5},
+        {"rtol": "small"},
+    ],
+)
 def test_knobs_that_make_no_sense_are_refused(wrong):
     with pytest.raises(InputError, match=f"Settings.{next(iter(wrong))}"):
         tf.Settings(**wrong)
@@ -84,7 +118,8 @@ def test_files_hold_what_was_saved_and_nothing_else_is_taken(tmp_path):
 
 
 def test_presets_are_ordered_by_what_they_cost_and_by_overlap():
-    """Draft to reference: smaller steps and, measured, less overlap. One colony of 40 cells each."""
+    """Draft to reference: smaller steps and, measured, less overlap. One colony of 40 cells
+    each."""
     first = tf.scenes.microcolony()
     steps, overlaps = [], []
     for name in PRESETS:
@@ -103,7 +138,12 @@ def test_results_say_how_accurately_and_go_on_so(tmp_path):
     drafted = tf.preset("draft", first).apply(first)
     *_, last = tf.simulate(drafted, drafted.seed(2, seed=1), until=0.4, record=tmp_path / "a.h5")
     with tf.Results(tmp_path / "a.h5") as results:
-        assert results.accuracy == {"dt": pytest.approx(0.04), "penalty": 0.1, "tolerance": 0.2, "rtol": 0.01}
+        assert results.accuracy == {
+            "dt": pytest.approx(0.04),
+            "penalty": 0.1,
+            "tolerance": 0.2,
+            "rtol": 0.01,
+        }
         built = tf.Settings.named(results.accuracy, "a.h5").apply(tf.scenes.build(*results.recipe))
         assert torch.equal(results.state(built).position, last.position)
         with pytest.raises(InputError, match="another scene"):

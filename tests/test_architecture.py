@@ -1,4 +1,5 @@
-"""Who may import whom. The imports are read, not run, and the test fails where a lower room imports a higher one."""
+"""Who may import whom. The imports are read, not run, and the test fails where a lower room imports
+a higher one."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ PACKAGE = ROOT / "torchfilm"
 
 @dataclass(frozen=True)
 class Room:
-    """A room of the package: its level, and the modules in it (a package stands for all its modules)."""
+    """A room of the package: its level, and the modules in it (a package stands for all its
+    modules)."""
 
     level: int
     modules: tuple[str, ...]
@@ -29,8 +31,11 @@ class Room:
 # To add a room, or a module to one, write it here. A module that is not listed belongs to the last.
 ROOMS = {
     "tools": Room(0, ("torchfilm.tools", "torchfilm.version")),
-    # a state tells its cells' volume and area, so it knows the capsule; its signals' values mean nothing without their layout
-    "state": Room(1, ("torchfilm.state",), besides=("torchfilm.physics.capsule", "torchfilm.signals.layout")),
+    # a state tells its cells' volume and area, so it knows the capsule; its signals' values mean
+    # nothing without their layout
+    "state": Room(
+        1, ("torchfilm.state",), besides=("torchfilm.physics.capsule", "torchfilm.signals.layout")
+    ),
     "effect": Room(2, ("torchfilm.effect",)),
     "kernels": Room(3, ("torchfilm.physics", "torchfilm.signals", "torchfilm.circuits")),
     # what rules see: made of states and kernels, used by one effect and by whoever writes rules
@@ -66,7 +71,8 @@ def room_of(module: str) -> str:
 
 
 def imports(source: str, module: str, is_package: bool = False) -> set[str]:
-    """Every module of the package that the source imports, at the top, in a function or under TYPE_CHECKING."""
+    """Every module of the package that the source imports, at the top, in a function or under
+    TYPE_CHECKING."""
     found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -77,8 +83,12 @@ def imports(source: str, module: str, is_package: bool = False) -> set[str]:
                 above = module.split(".") if is_package else module.split(".")[:-1]
                 above = above[: len(above) - (node.level - 1)]
                 base = ".".join([*above, *([base] if base else [])])
-            # `from torchfilm.tools import checks` imports a module, `from torchfilm.state import State` a name
-            found |= {f"{base}.{alias.name}" if f"{base}.{alias.name}" in MODULES else base for alias in node.names}
+            # `from torchfilm.tools import checks` imports a module, `from torchfilm.state import
+            # State` a name
+            found |= {
+                f"{base}.{alias.name}" if f"{base}.{alias.name}" in MODULES else base
+                for alias in node.names
+            }
     return {name for name in found if within(name, "torchfilm")}
 
 
@@ -89,7 +99,10 @@ def crossings(module: str, imported: set[str]) -> list[str]:
     for other in sorted(imported - {module}):
         there = room_of(other)
         if ROOMS[there].level > room.level and other not in room.besides:
-            wrong.append(f"{module} ({name}, level {room.level}) imports {other} ({there}, level {ROOMS[there].level})")
+            wrong.append(
+                f"{module} ({name}, level {room.level}) imports {other} ({there}, level"
+                f" {ROOMS[there].level})"
+            )
         elif there == name and not room.talk and other not in room.modules:
             wrong.append(f"{module} imports {other}: {name} never import each other")
         elif name == TENSORS_ONLY and any(within(other, m) for m in NOT_FOR_KERNELS):
@@ -126,10 +139,28 @@ def test_crossings_are_noticed(module, source):
 @pytest.mark.parametrize(
     "module, source",
     [
-        ("torchfilm.state", "from torchfilm.physics import capsule\nfrom torchfilm.tools import checks, random"),
-        ("torchfilm.effects.growth", "import torch\nfrom torchfilm.effect import Effect\nfrom torchfilm.physics import capsule"),
-        ("torchfilm.physics.solve", "from torchfilm.physics.rows import ContactRows\nfrom torchfilm.tools.cg import worst_of"),
-        ("torchfilm.cli", "from torchfilm import scenes, measure\nfrom torchfilm.simulate import simulate"),
+        (
+            "torchfilm.state",
+            "from torchfilm.physics import capsule\nfrom torchfilm.tools import checks, random",
+        ),
+        (
+            "torchfilm.effects.growth",
+            (
+                "import torch\nfrom torchfilm.effect import Effect\nfrom torchfilm.physics import"
+                " capsule"
+            ),
+        ),
+        (
+            "torchfilm.physics.solve",
+            (
+                "from torchfilm.physics.rows import ContactRows\nfrom torchfilm.tools.cg import"
+                " worst_of"
+            ),
+        ),
+        (
+            "torchfilm.cli",
+            "from torchfilm import scenes, measure\nfrom torchfilm.simulate import simulate",
+        ),
     ],
 )
 def test_what_is_allowed_passes(module, source):
@@ -137,14 +168,22 @@ def test_what_is_allowed_passes(module, source):
 
 
 def test_design_uses_public_names_only():
-    """design/ is written as its users would write: `import torchfilm as tf`, or names that the package lists as its own."""
+    """design/ is written as its users would write: `import torchfilm as tf`, or names that the
+    package lists as its own."""
     wrong = []
     for path in sorted((ROOT / "design").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 names = [a.name for a in node.names if a.name.startswith("torchfilm.")]
-            elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "torchfilm":
-                names = [a.name for a in node.names if node.module != "torchfilm" or a.name not in torchfilm.__all__]
+            elif (
+                isinstance(node, ast.ImportFrom)
+                and (node.module or "").split(".")[0] == "torchfilm"
+            ):
+                names = [
+                    a.name
+                    for a in node.names
+                    if node.module != "torchfilm" or a.name not in torchfilm.__all__
+                ]
             else:
                 continue
             wrong += [f"{path.relative_to(ROOT)}: {name}" for name in names]
@@ -158,7 +197,8 @@ def test_public_names_exist():
 
 @pytest.mark.parametrize("module", MODULES)
 def test_files_are_small_enough_to_read(module):
-    """Files up to about 400 lines, functions up to about 60: a tenth more is not a tenth too many."""
+    """Files up to about 400 lines, functions up to about 60: a tenth more is not a tenth too
+    many."""
     source = MODULES[module].read_text()
     assert len(source.splitlines()) <= 440
     for node in ast.walk(ast.parse(source)):

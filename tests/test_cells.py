@@ -16,16 +16,23 @@ def seed(cells: tf.Cells, colonies: int = 1, **options) -> tf.State:
     return tf.Scene(tf.Growth(), founders=cells).seed(colonies, **options)
 
 
-# --- arrays ---------------------------------------------------------------------------------------------------------------
+# --- arrays ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [list, np.asarray, torch.as_tensor])
 def test_from_lists_arrays_or_tensors(kind):
-    cells = tf.Cells(kind([[0.0, 1.0], [2.0, 3.0]]), kind([[3.0, 4.0], [0.0, -2.0]]), kind([1.0, 2.5]), kind([0.5, 0.25]))
+    cells = tf.Cells(
+        kind([[0.0, 1.0], [2.0, 3.0]]),
+        kind([[3.0, 4.0], [0.0, -2.0]]),
+        kind([1.0, 2.5]),
+        kind([0.5, 0.25]),
+    )
     assert (cells.count, cells.dim) == (2, 2)
     state = seed(cells, dtype=torch.float64)
     assert state.position.tolist() == [[0.0, 1.0], [2.0, 3.0]]
-    assert state.axis.tolist() == [[pytest.approx(0.6), pytest.approx(0.8)], [0.0, -1.0]], "axes of any length are made unit"
+    assert state.axis.tolist() == [[pytest.approx(0.6), pytest.approx(0.8)], [0.0, -1.0]], (
+        "axes of any length are made unit"
+    )
     assert state.length.tolist() == [1.0, 2.5] and state.radius.tolist() == [0.5, 0.25]
 
 
@@ -49,10 +56,14 @@ def test_a_copy_for_each_colony():
 
 
 def test_a_colony_for_each_cell():
-    cells = tf.Cells([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]], [1.0, 0.0], colony=[2, 0, 2, 0])
+    cells = tf.Cells(
+        [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]], [1.0, 0.0], colony=[2, 0, 2, 0]
+    )
     state = seed(cells)
     assert state.colonies == 3 and state.counts.tolist() == [2, 0, 2]
-    assert state.position[:, 0].tolist() == [1.0, 3.0, 0.0, 2.0], "in their own order within a colony"
+    assert state.position[:, 0].tolist() == [1.0, 3.0, 0.0, 2.0], (
+        "in their own order within a colony"
+    )
     assert state.uid.tolist() == [0, 1, 0, 1]
     assert seed(cells, 5).counts.tolist() == [2, 0, 2, 0, 0]
     with pytest.raises(tf.InputError, match="at least 3"):
@@ -60,7 +71,9 @@ def test_a_colony_for_each_cell():
 
 
 def test_types_and_extra_columns_become_fields():
-    cells = tf.Cells([[0.0, 0.0], [5.0, 0.0]], [1.0, 0.0], cell_type=[0, 3], extra={"gfp": [0.5, 1.5]})
+    cells = tf.Cells(
+        [[0.0, 0.0], [5.0, 0.0]], [1.0, 0.0], cell_type=[0, 3], extra={"gfp": [0.5, 1.5]}
+    )
     state = seed(cells)
     assert state.cell_type.tolist() == [0, 3] and state.cell_type.dtype == torch.int64
     assert state.gfp.tolist() == [0.5, 1.5]
@@ -82,17 +95,22 @@ def test_cells_given_at_seeding_replace_the_founders():
 @pytest.mark.parametrize("dim", [2, 3])
 def test_single(dim):
     cell = tf.Cells.single(dim)
-    assert cell.position.tolist() == [[0.0] * dim] and cell.axis.tolist() == [[1.0] + [0.0] * (dim - 1)]
+    assert cell.position.tolist() == [[0.0] * dim] and cell.axis.tolist() == [
+        [1.0] + [0.0] * (dim - 1)
+    ]
 
 
-# --- overlaps -------------------------------------------------------------------------------------------------------------
+# --- overlaps -------------------------------------------------------------------------------------
 
 
 def test_overlaps_are_reported_deepest_first():
     """Parallel rods side by side: the overlap is 1 − distance."""
     cells = tf.Cells([[0.0, 0.0], [0.0, 0.9], [0.0, 1.5], [0.0, 9.0]], [1.0, 0.0])
     found = cells.overlaps()
-    assert [(sorted(f[:2]), pytest.approx(f[2], abs=1e-12)) for f in found] == [([1, 2], 0.4), ([0, 1], 0.1)]
+    assert [(sorted(f[:2]), pytest.approx(f[2], abs=1e-12)) for f in found] == [
+        ([1, 2], 0.4),
+        ([0, 1], 0.1),
+    ]
     assert [sorted(f[:2]) for f in cells.overlaps(0.2)] == [[1, 2]]
 
 
@@ -105,7 +123,7 @@ def test_no_cell_no_overlap():
     assert tf.Cells(np.zeros((0, 2)), np.zeros((0, 2))).overlaps() == []
 
 
-# --- CSV and HDF5 ---------------------------------------------------------------------------------------------------------
+# --- CSV and HDF5 ---------------------------------------------------------------------------------
 
 CSV = "x,y,angle,length,radius,cell_type,colony,gfp\n0,1,0,2.0,0.5,1,0,0.25\n10,1,1.5707963267948966,3.0,0.4,0,1,0.75\n"
 
@@ -117,7 +135,11 @@ def test_csv(tmp_path):
     assert cells.position.tolist() == [[0.0, 1.0], [10.0, 1.0]]
     assert np.allclose(cells.axis, [[1.0, 0.0], [0.0, 1.0]], rtol=0, atol=1e-15)
     assert cells.length.tolist() == [2.0, 3.0] and cells.radius.tolist() == [0.5, 0.4]
-    assert cells.cell_type.tolist() == [1, 0] and cells.colony.tolist() == [0, 1] and cells.extra["gfp"].tolist() == [0.25, 0.75]
+    assert (
+        cells.cell_type.tolist() == [1, 0]
+        and cells.colony.tolist() == [0, 1]
+        and cells.extra["gfp"].tolist() == [0.25, 0.75]
+    )
     assert seed(cells).counts.tolist() == [1, 1]
 
 
@@ -133,10 +155,19 @@ def test_csv_in_space_with_axes(tmp_path):
 def test_hdf5(tmp_path, group):
     path = tmp_path / "cells.h5"
     with h5py.File(path, "w") as file:
-        for name, values in {"x": [0.0, 5.0], "y": [1.0, 1.0], "angle": [0.0, 0.0], "length": [2.0, 3.0], "cell_type": [0, 2]}.items():
+        for name, values in {
+            "x": [0.0, 5.0],
+            "y": [1.0, 1.0],
+            "angle": [0.0, 0.0],
+            "length": [2.0, 3.0],
+            "cell_type": [0, 2],
+        }.items():
             file[f"{group}/{name}"] = values
     cells = tf.Cells.from_hdf5(path, group) if group != "/" else tf.Cells.from_hdf5(path)
-    assert cells.position.tolist() == [[0.0, 1.0], [5.0, 1.0]] and cells.cell_type.tolist() == [0, 2]
+    assert cells.position.tolist() == [[0.0, 1.0], [5.0, 1.0]] and cells.cell_type.tolist() == [
+        0,
+        2,
+    ]
 
 
 def test_table():
@@ -154,13 +185,19 @@ def test_a_run_from_a_csv_file(tmp_path):
     assert state.counts.tolist()[0] > 2
 
 
-# --- bad input ------------------------------------------------------------------------------------------------------------
+# --- bad input ------------------------------------------------------------------------------------
 
 P, A = [[0.0, 0.0], [3.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]]
 
 BAD = {
-    "position nan": (lambda: tf.Cells([[0.0, math.nan]], [[1.0, 0.0]]), r"position\[0, 1\].*nan.*finite"),
-    "position infinite": (lambda: tf.Cells([[math.inf, 0.0]], [[1.0, 0.0]]), r"position\[0, 0\].*inf"),
+    "position nan": (
+        lambda: tf.Cells([[0.0, math.nan]], [[1.0, 0.0]]),
+        r"position\[0, 1\].*nan.*finite",
+    ),
+    "position infinite": (
+        lambda: tf.Cells([[math.inf, 0.0]], [[1.0, 0.0]]),
+        r"position\[0, 0\].*inf",
+    ),
     "position flat": (lambda: tf.Cells([0.0, 0.0], [1.0, 0.0]), r"position.*\(2,\).*\(N, 2\)"),
     "position 4-D": (lambda: tf.Cells([[0.0] * 4], [[1.0] * 4]), r"position.*\(N, 2\)"),
     "position text": (lambda: tf.Cells([["a", "b"]], [[1.0, 0.0]]), r"position.*numbers"),
@@ -187,11 +224,30 @@ BAD = {
     "extra nan": (lambda: tf.Cells(P, A, extra={"gfp": [1.0, math.nan]}), r"gfp\[1\].*finite"),
     "extra reserved": (lambda: tf.Cells(P, A, extra={"volume": [1.0, 2.0]}), r"volume"),
     "extra no name": (lambda: tf.Cells(P, A, extra={"mean gfp": [1.0, 2.0]}), r"mean gfp"),
-    "table without x": (lambda: tf.Cells.from_table({"y": [0.0], "length": [1.0], "angle": [0.0]}), r"lacks the column 'x'.*y, length"),
-    "table without length": (lambda: tf.Cells.from_table({"x": [0.0], "y": [0.0], "angle": [0.0]}), r"lacks the column 'length'"),
-    "table without direction": (lambda: tf.Cells.from_table({"x": [0.0], "y": [0.0], "length": [1.0]}), r"'angle'.*axis_x, axis_y"),
-    "table unequal": (lambda: tf.Cells.from_table({"x": [0.0, 1.0], "y": [0.0], "angle": [0.0, 0.0], "length": [2.0, 2.0]}), r"\by\b"),
-    "table axis unequal": (lambda: tf.Cells.from_table({"x": [0.0, 1.0], "y": [0.0, 1.0], "angle": [0.0], "length": [2.0, 2.0]}), r"angle|axis"),
+    "table without x": (
+        lambda: tf.Cells.from_table({"y": [0.0], "length": [1.0], "angle": [0.0]}),
+        r"lacks the column 'x'.*y, length",
+    ),
+    "table without length": (
+        lambda: tf.Cells.from_table({"x": [0.0], "y": [0.0], "angle": [0.0]}),
+        r"lacks the column 'length'",
+    ),
+    "table without direction": (
+        lambda: tf.Cells.from_table({"x": [0.0], "y": [0.0], "length": [1.0]}),
+        r"'angle'.*axis_x, axis_y",
+    ),
+    "table unequal": (
+        lambda: tf.Cells.from_table(
+            {"x": [0.0, 1.0], "y": [0.0], "angle": [0.0, 0.0], "length": [2.0, 2.0]}
+        ),
+        r"\by\b",
+    ),
+    "table axis unequal": (
+        lambda: tf.Cells.from_table(
+            {"x": [0.0, 1.0], "y": [0.0, 1.0], "angle": [0.0], "length": [2.0, 2.0]}
+        ),
+        r"angle|axis",
+    ),
 }
 
 
@@ -205,7 +261,10 @@ def test_bad_cells_are_refused_by_name(kind):
 BAD_CSV = {
     "text": ("x,y,angle,length\n0,0,0,2\n1,zero,0,2\n", r"line 3, column 'y'.*'zero'"),
     "blank": ("x,y,angle,length\n0,0,0,2\n1,,0,2\n", r"line 3, column 'y'"),
-    "short row": ("x,y,angle,length\n0,0,0,2\n1,0,0,2\n1,0,0\n", r"line 4, column 'length'.*3 values.*4 columns"),
+    "short row": (
+        "x,y,angle,length\n0,0,0,2\n1,0,0,2\n1,0,0\n",
+        r"line 4, column 'length'.*3 values.*4 columns",
+    ),
     "one word": ("x,y,angle,length\n0,0,0,2\nend\n", r"line 3, column 'y'.*1 value .*4 columns"),
     "long row": ("x,y,angle,length\n0,0,0,2\n1,0,0,2,9\n", r"line 3"),
     "decimal commas": ("x,y,angle,length\n0,0,0,2\n1,5,0,0,2,0\n", r"line 3"),
@@ -213,10 +272,19 @@ BAD_CSV = {
     "blank lines only": ("\n\n", r"cells\.csv.*empty"),
     "header only": ("x,y,angle,length\n", r"cells\.csv.*no cell.*header"),
     "semicolons": ("x;y;angle;length\n0;0;0;2\n", r"cells\.csv, line 1.*semicolon.*comma"),
-    "semicolons and decimal commas": ("x;y;angle;length\n0,5;0;0;2,0\n", r"cells\.csv, line 1.*semicolon.*comma.*decimal point"),
+    "semicolons and decimal commas": (
+        "x;y;angle;length\n0,5;0;0;2,0\n",
+        r"cells\.csv, line 1.*semicolon.*comma.*decimal point",
+    ),
     "tabs": ("x\ty\tangle\tlength\n0\t0\t0\t2\n", r"cells\.csv, line 1.*tab.*comma"),
-    "angle and axis": ("x,y,angle,axis_x,axis_y,length\n0,0,0,1,0,2\n", r"cells\.csv.*'angle'.*'axis_x'.*one of the two"),
-    "angle and half an axis": ("x,y,angle,axis_y,length\n0,0,0,1,2\n", r"'angle'.*'axis_y'.*one of the two"),
+    "angle and axis": (
+        "x,y,angle,axis_x,axis_y,length\n0,0,0,1,0,2\n",
+        r"cells\.csv.*'angle'.*'axis_x'.*one of the two",
+    ),
+    "angle and half an axis": (
+        "x,y,angle,axis_y,length\n0,0,0,1,2\n",
+        r"'angle'.*'axis_y'.*one of the two",
+    ),
     "a name twice": ("x,y,angle,length,x\n0,0,0,2,1\n", r"cells\.csv, line 1.*'x' twice"),
     "no header": ("0,0,0,2\n1,0,0,2\n", r"lacks the column 'x'"),
     "nan": ("x,y,angle,length\n0,0,0,2\nnan,0,0,2\n", r"position\[1, 0\].*finite"),
@@ -236,7 +304,11 @@ def test_bad_csv_files_are_refused_with_the_place(tmp_path, kind):
         assert "cells.csv" in str(caught.value)
 
 
-@pytest.mark.parametrize("data", [b"x,y,angle,length\n0,0,0,\xff\xfe\n", b"x,y,angle,length\n0,0,\x00,2\n"], ids=["not UTF-8", "a zero byte"])
+@pytest.mark.parametrize(
+    "data",
+    [b"x,y,angle,length\n0,0,0,\xff\xfe\n", b"x,y,angle,length\n0,0,\x00,2\n"],
+    ids=["not UTF-8", "a zero byte"],
+)
 def test_a_csv_file_that_is_no_text_is_told(tmp_path, data):
     path = tmp_path / "cells.csv"
     path.write_bytes(data)

@@ -21,7 +21,7 @@ from commands import ENVIRONMENT, OWN, assert_same, drawn, frames, shell
 
 import torchfilm as tf
 
-# --- run ------------------------------------------------------------------------------------------------------------------
+# --- run ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -30,10 +30,22 @@ def test_run_as_a_newcomer_types_it(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     with tf.Results(tmp_path / "microcolony.h5") as results:
-        assert results.counts.shape[1] == 3 and (results.counts[-1] >= 6).all() and not (results.counts[-2] >= 6).all()
+        assert (
+            results.counts.shape[1] == 3
+            and (results.counts[-1] >= 6).all()
+            and not (results.counts[-2] >= 6).all()
+        )
         total = int(results.counts[-1].sum())
     assert drawn(tmp_path / "microcolony.png") > 0.02
-    for part in ("microcolony.h5", "microcolony.png", f"{total} (", "colony radius", "overlap", "time for mechanics", "time for recording"):
+    for part in (
+        "microcolony.h5",
+        "microcolony.png",
+        f"{total} (",
+        "colony radius",
+        "overlap",
+        "time for mechanics",
+        "time for recording",
+    ):
         assert part in done.stdout, part
 
 
@@ -44,16 +56,40 @@ def test_the_command_is_installed():
 
 
 def test_run_with_settings(command):
-    command("run", "microcolony", "--set", "dim=3", "rate=0.5", "law=length", "--until", 0.5, "--out", "a.h5", "--every", 4, "--double")
+    command(
+        "run",
+        "microcolony",
+        "--set",
+        "dim=3",
+        "rate=0.5",
+        "law=length",
+        "--until",
+        0.5,
+        "--out",
+        "a.h5",
+        "--every",
+        4,
+        "--double",
+    )
     with tf.Results("a.h5") as results:
-        assert results.recipe == ("microcolony", {**results.recipe[1], "dim": 3, "rate": 0.5, "law": "length"})
+        assert results.recipe == (
+            "microcolony",
+            {**results.recipe[1], "dim": 3, "rate": 0.5, "law": "length"},
+        )
         assert results.attributes["dtype"] == "float64" and results.attributes["dim"] == 3
         assert results.steps.tolist() == [0, 4, 8, 12, 16, 20]
         # one free cell by the law of length
         assert float(results.frame()["length"][0]) == pytest.approx(2 * np.exp(0.25), rel=1e-9)
 
 
-@pytest.mark.parametrize("given", ["--set width=16 --set length=80", "--set=width=16 --every 2 --set=length=80", "--set width=16 length=80"])
+@pytest.mark.parametrize(
+    "given",
+    [
+        "--set width=16 --set length=80",
+        "--set=width=16 --every 2 --set=length=80",
+        "--set width=16 length=80",
+    ],
+)
 def test_options_given_again_add_to_what_was_given(command, given):
     """Found in use: of `--set a --set b` the parser kept the last alone, and said nothing."""
     command("run", "channel", *given.split(), "--until", 0, "--out", "a.h5", "--no-picture")
@@ -62,7 +98,19 @@ def test_options_given_again_add_to_what_was_given(command, given):
 
 
 def test_a_setting_for_each_colony(command):
-    command("run", "microcolony", "--set", "rate=[0.5, 1.0]", "--colonies", 2, "--until", 0.5, "--out", "a.h5", "--no-picture")
+    command(
+        "run",
+        "microcolony",
+        "--set",
+        "rate=[0.5, 1.0]",
+        "--colonies",
+        2,
+        "--until",
+        0.5,
+        "--out",
+        "a.h5",
+        "--no-picture",
+    )
     with tf.Results("a.h5") as results:
         assert results.frame()["growth_rate"].tolist() == [0.5, 1.0]
     assert not list(Path().glob("*.png"))
@@ -73,7 +121,9 @@ def test_the_same_as_the_library(command):
     scene = tf.scenes.microcolony()
     state = list(tf.simulate(scene, scene.seed(2, seed=5), until=3.0))[-1]
     found = frames("a.h5")
-    assert np.array_equal(found["position"], state.position.numpy()) and np.array_equal(found["uid"], state.uid.numpy())
+    assert np.array_equal(found["position"], state.position.numpy()) and np.array_equal(
+        found["uid"], state.uid.numpy()
+    )
 
 
 def test_a_scene_file_of_ones_own(command):
@@ -86,16 +136,24 @@ def test_a_scene_file_of_ones_own(command):
 
 def test_a_scene_file_may_hold_the_scene_itself_and_import_its_neighbours(command):
     Path("parts.py").write_text("RATE = 0.25\n")
-    Path("mine.py").write_text("import torchfilm as tf\nfrom parts import RATE\nscene = tf.Scene(tf.Growth(rate=RATE), dt=0.1)\n")
+    Path("mine.py").write_text(
+        "import torchfilm as tf\nfrom parts import RATE\nscene = tf.Scene(tf.Growth(rate=RATE),"
+        " dt=0.1)\n"
+    )
     command("run", "mine.py", "--until", 0.5)
     assert frames("mine.h5")["growth_rate"].tolist() == [0.25]
 
 
 def test_rules_beside_the_scene_file_are_found_from_anywhere(command, tmp_path):
-    """`Rules("rules.py")` in a scene file means the file beside it, wherever the command is typed."""
+    """`Rules("rules.py")` in a scene file means the file beside it, wherever the command is
+    typed."""
     (tmp_path / "model").mkdir()
-    (tmp_path / "model" / "rules.py").write_text("def update(cells):\n    cells.growth_rate = 0.5\n")
-    (tmp_path / "model" / "mine.py").write_text('import torchfilm as tf\nscene = tf.Scene(tf.Rules("rules.py"), tf.Growth(), dt=0.1)\n')
+    (tmp_path / "model" / "rules.py").write_text(
+        "def update(cells):\n    cells.growth_rate = 0.5\n"
+    )
+    (tmp_path / "model" / "mine.py").write_text(
+        'import torchfilm as tf\nscene = tf.Scene(tf.Rules("rules.py"), tf.Growth(), dt=0.1)\n'
+    )
     command("run", "model/mine.py", "--until", 0.5, "--out", "a.h5")
     assert frames("a.h5")["growth_rate"].tolist() == [0.5]
 
@@ -122,10 +180,14 @@ def test_programmed_growth_and_channel_run(command):
         assert drawn(f"{name}.png") > 0.02
 
 
-# --- resume ---------------------------------------------------------------------------------------------------------------
+# --- resume ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [[], ["--dt", 0.05], ["--double", "--set", "rate=0.8", "shortest=3.0"]], ids=["plain", "own step", "own scene"])
+@pytest.mark.parametrize(
+    "options",
+    [[], ["--dt", 0.05], ["--double", "--set", "rate=0.8", "shortest=3.0"]],
+    ids=["plain", "own step", "own scene"],
+)
 def test_resume_bit_for_bit(command, options):
     """Also with a step of its own: what was given to `run` holds for `resume`."""
     command("run", "microcolony", "--colonies", 2, "--until", 3, "--out", "whole.h5", *options)
@@ -146,7 +208,8 @@ def test_resume_of_ones_own_scene(command):
 
 
 def test_resume_of_ones_own_scene_with_its_settings(command):
-    """Settings of a scene file are not data of the file's cells only: a resumed run must not fall back to the defaults."""
+    """Settings of a scene file are not data of the file's cells only: a resumed run must not fall
+    back to the defaults."""
     Path("mine.py").write_text(OWN)
     command("run", "mine.py", "--set", "longest=3.2", "--until", 4, "--out", "whole.h5")
     command("run", "mine.py", "--set", "longest=3.2", "--until", 1, "--out", "parts.h5")
@@ -173,8 +236,12 @@ def started(folder: Path, results: str, *arguments: str) -> subprocess.Popen:
     """The command in a process of its own, from when its results file is there."""
     child = subprocess.Popen(
         [sys.executable, "-m", "torchfilm.cli", "run", *arguments],
-        cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        cwd=folder,
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     for _ in range(500):
         time.sleep(0.02)
         if (folder / results).exists():
@@ -185,33 +252,47 @@ def started(folder: Path, results: str, *arguments: str) -> subprocess.Popen:
 @pytest.mark.slow
 @pytest.mark.parametrize("attempt", range(3))
 def test_interrupted_from_the_keyboard(tmp_path, attempt):
-    """Ctrl-C at whatever moment: it stops, with a word instead of a traceback, leaves a whole file, and resume goes on.
+    """Ctrl-C at whatever moment: it stops, with a word instead of a traceback, leaves a whole file,
+    and resume goes on.
 
-    Several times, because an interrupt that falls into a callback of the interpreter is easily swallowed there.
+    Several times, because an interrupt that falls into a callback of the interpreter is easily
+    swallowed there.
     """
-    child = started(tmp_path, "microcolony.h5", "microcolony", "--colonies", "2", "--until", "8", "--every", "1")
+    child = started(
+        tmp_path, "microcolony.h5", "microcolony", "--colonies", "2", "--until", "8", "--every", "1"
+    )
     time.sleep(0.3 + 0.1 * attempt)
     child.send_signal(signal.SIGINT)
     _, errors = child.communicate(timeout=60)
-    assert child.returncode not in (0, -signal.SIGINT), f"the run went on to its end, or died of the signal: {errors[-300:]}"
+    assert child.returncode not in (0, -signal.SIGINT), (
+        f"the run went on to its end, or died of the signal: {errors[-300:]}"
+    )
     assert "Traceback" not in errors and "resume" in errors, errors
     with tf.Results(tmp_path / "microcolony.h5") as results:
         last = int(results.steps[-1])
         assert results.steps.tolist() == list(range(last + 1))
-    done = shell("resume", "microcolony.h5", "--until", (last + 4) * 0.025, "--no-picture", folder=tmp_path)
+    done = shell(
+        "resume", "microcolony.h5", "--until", (last + 4) * 0.025, "--no-picture", folder=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     with tf.Results(tmp_path / "microcolony.h5") as results:
         assert results.steps[-1] == last + 4
 
 
-# --- watch and progress ---------------------------------------------------------------------------------------------------
+# --- watch and progress ---------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_watch_takes_up_an_edit_while_running(tmp_path):
-    (tmp_path / "rules.py").write_text("import time\ndef update(cells):\n    time.sleep(0.02)\n    cells.growth_rate = 0.5\n")
-    (tmp_path / "mine.py").write_text('import torchfilm as tf\nscene = tf.Scene(tf.Rules("rules.py"), tf.Growth(), dt=0.01)\n')
-    child = started(tmp_path, "mine.h5", "mine.py", "--until", "1.5", "--watch", "--every", "1", "--no-picture")
+    (tmp_path / "rules.py").write_text(
+        "import time\ndef update(cells):\n    time.sleep(0.02)\n    cells.growth_rate = 0.5\n"
+    )
+    (tmp_path / "mine.py").write_text(
+        'import torchfilm as tf\nscene = tf.Scene(tf.Rules("rules.py"), tf.Growth(), dt=0.01)\n'
+    )
+    child = started(
+        tmp_path, "mine.h5", "mine.py", "--until", "1.5", "--watch", "--every", "1", "--no-picture"
+    )
     time.sleep(0.4)
     (tmp_path / "rules.py").write_text("def update(cells)\n")
     time.sleep(0.4)
@@ -236,8 +317,11 @@ def test_progress_shows_cells_time_rate_and_the_estimated_end(tmp_path, end):
     fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 160, 0, 0))
     child = subprocess.Popen(
         [sys.executable, "-m", "torchfilm.cli", "run", "microcolony", *end, "--no-picture"],
-        cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=follower,
-    )  # fmt: skip
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        stdout=subprocess.DEVNULL,
+        stderr=follower,
+    )
     os.close(follower)
     seen = b""
     while True:

@@ -12,7 +12,7 @@ from commands import OWN, frames, shell
 
 import torchfilm as tf
 
-# --- errors ---------------------------------------------------------------------------------------------------------------
+# --- errors ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -28,13 +28,18 @@ def spoilt(tmp_path_factory) -> Path:
     with h5py.File(folder / "foreign.h5", "w") as file:
         file["x"] = [1.0]
     (folder / "mine.py").write_text(OWN)
-    (folder / "fixed.py").write_text("import torchfilm as tf\nscene = tf.Scene(tf.Growth(rate=1.0))\n")
+    (folder / "fixed.py").write_text(
+        "import torchfilm as tf\nscene = tf.Scene(tf.Growth(rate=1.0))\n"
+    )
     (folder / "empty.py").write_text("")
     (folder / "number.py").write_text("scene = 3\n")
     (folder / "syntax.py").write_text("scene = = 3\n")
-    (folder / "raises.py").write_text("import torchfilm as tf\nscene = tf.Scene(tf.Growth(rate=-1.0))\n")
+    (folder / "raises.py").write_text(
+        "import torchfilm as tf\nscene = tf.Scene(tf.Growth(rate=-1.0))\n"
+    )
     (folder / "rule.py").write_text(
-        "import torchfilm as tf\ndef update(cells):\n    cells.growth_rate = cells.volumee\nscene = tf.Scene(tf.Rules(update), tf.Growth())\n"
+        "import torchfilm as tf\ndef update(cells):\n    cells.growth_rate = cells.volumee\nscene ="
+        " tf.Scene(tf.Rules(update), tf.Growth())\n"
     )
     (folder / "imports.py").write_text("import no_such_module\n")
     scene = tf.scenes.microcolony()
@@ -114,7 +119,8 @@ ERRORS = {
 
 @pytest.mark.parametrize("line", list(ERRORS))
 def test_errors_are_one_line_that_names_the_cause(command, tmp_path, spoilt, line):
-    """No traceback: anything but SystemExit escaping from `main` would be one. And nothing new is left in the folder."""
+    """No traceback: anything but SystemExit escaping from `main` would be one. And nothing new is
+    left in the folder."""
     shutil.copytree(spoilt, tmp_path, dirs_exist_ok=True)
     before = {p: p.read_bytes() for p in tmp_path.iterdir()}
     with pytest.raises(SystemExit) as caught:
@@ -129,7 +135,9 @@ def test_errors_are_one_line_that_names_the_cause(command, tmp_path, spoilt, lin
     assert all(after[p] == data for p, data in before.items()), "a file was changed"
 
 
-@pytest.mark.parametrize("arguments", [["run"], ["run", "microcolony", "--colonies", "two"], ["fly"], []])
+@pytest.mark.parametrize(
+    "arguments", [["run"], ["run", "microcolony", "--colonies", "two"], ["fly"], []]
+)
 def test_words_that_cannot_be_parsed_are_refused(command, arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         command(*arguments)
@@ -141,15 +149,17 @@ def test_an_error_in_the_shell(tmp_path):
     """What the shell sees: status 1, one line on standard error, none on standard output."""
     done = shell("run", "microcolony", "--set", "rate=-1", folder=tmp_path)
     assert done.returncode == 1 and done.stdout == ""
-    assert len(done.stderr.strip().splitlines()) == 1 and done.stderr.startswith("torchfilm: Growth.rate")
+    assert len(done.stderr.strip().splitlines()) == 1 and done.stderr.startswith(
+        "torchfilm: Growth.rate"
+    )
 
 
 def test_a_failed_solve_in_the_command_line(command):
     """The colonies that failed are named; the file holds what was there before."""
     Path("mine.py").write_text(
-        "import torchfilm as tf\n"
-        "cells = tf.Cells([[0.3 * k, 0.45 * (k % 3)] for k in range(8)], [[1.0, 0.1 * k] for k in range(8)])\n"
-        "scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6), founders=cells, dt=0.1)\n"
+        "import torchfilm as tf\ncells = tf.Cells([[0.3 * k, 0.45 * (k % 3)] for k in range(8)],"
+        " [[1.0, 0.1 * k] for k in range(8)])\nscene = tf.Scene(tf.Growth(rate=1.0),"
+        " tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6), founders=cells, dt=0.1)\n"
     )
     with pytest.raises(SystemExit) as caught:
         command("run", "mine.py", "--until", 1)
@@ -160,8 +170,14 @@ def test_a_failed_solve_in_the_command_line(command):
 
 def test_resume_with_an_edited_scene_says_which_fields_differ(command):
     """Not that it is another scene, which the user knows better."""
-    rules = "import torchfilm as tf\nscene = tf.Scene(tf.Rules(lambda cells: None, variables={}), tf.Growth(rate=1.0), dt=0.05)\n"
-    for name, variables in (("mine.py", "{'age': 0.0, 'energy': 1.0}"), ("more.py", "{'age': 0.0, 'mass': 1.0, 'energie': 1.0}")):
+    rules = (
+        "import torchfilm as tf\nscene = tf.Scene(tf.Rules(lambda cells: None, variables={}),"
+        " tf.Growth(rate=1.0), dt=0.05)\n"
+    )
+    for name, variables in (
+        ("mine.py", "{'age': 0.0, 'energy': 1.0}"),
+        ("more.py", "{'age': 0.0, 'mass': 1.0, 'energie': 1.0}"),
+    ):
         Path(name).write_text(rules.replace("{}", variables))
     command("run", "mine.py", "--until", 1)
     before = frames("mine.h5")
@@ -175,7 +191,10 @@ def test_resume_with_an_edited_scene_says_which_fields_differ(command):
 
 
 def test_resume_with_a_field_of_another_shape_is_told(command):
-    rules = "import torchfilm as tf\ndef update(cells):\n    cells.mark = cells.{}\nscene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), dt=0.05)\n"
+    rules = (
+        "import torchfilm as tf\ndef update(cells):\n    cells.mark = cells.{}\nscene ="
+        " tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), dt=0.05)\n"
+    )
     Path("mine.py").write_text(rules.format("length * 2"))
     command("run", "mine.py", "--until", 1)
     Path("mine.py").write_text(rules.format("position * 2"))
@@ -183,7 +202,7 @@ def test_resume_with_a_field_of_another_shape_is_told(command):
         command("resume", "mine.h5", "--scene", "mine.py", "--until", 2)
 
 
-# --- notes on the cells to start from ---------------------------------------------------------------------------------------
+# --- notes on the cells to start from -------------------------------------------------------------
 
 CELLS = "x,y,angle,length,colony\n0,0,0,2,0\n5,0,0,2,0\n0,0,0,2,2\n"
 
@@ -192,7 +211,10 @@ CELLS = "x,y,angle,length,colony\n0,0,0,2,0\n5,0,0,2,0\n0,0,0,2,2\n"
     ("colonies", "note"),
     [
         ([], "note: colony 1 of 3 stays empty: cells.csv has cells for colonies 0, 2 only."),
-        (["--colonies", 5], "note: colonies 1, 3, 4 of 5 stay empty: cells.csv has cells for colonies 0, 2 only."),
+        (
+            ["--colonies", 5],
+            "note: colonies 1, 3, 4 of 5 stay empty: cells.csv has cells for colonies 0, 2 only.",
+        ),
     ],
     ids=["gaps", "more than the file has"],
 )
@@ -201,7 +223,9 @@ def test_colonies_without_a_cell_in_the_file_are_noted(command, capsys, colonies
     command("run", "microcolony", "--start", "cells.csv", "--cells", 4, *colonies)
     assert note in capsys.readouterr().out.splitlines()
     with tf.Results("microcolony.h5") as results:
-        assert [int(n) > 0 for n in results.counts[-1]] == [True, False, True, False, False][: results.counts.shape[1]]
+        assert [int(n) > 0 for n in results.counts[-1]] == [True, False, True, False, False][
+            : results.counts.shape[1]
+        ]
 
 
 def test_fewer_colonies_than_the_file_has_are_refused(command):
@@ -214,5 +238,16 @@ def test_a_file_whose_every_colony_has_cells_needs_no_note(command, capsys):
     Path("cells.csv").write_text(CELLS.replace(",2\n", ",1\n"))
     command("run", "microcolony", "--start", "cells.csv", "--until", 0.5)
     Path("copies.csv").write_text("x,y,angle,length\n0,0,0,2\n")
-    command("run", "microcolony", "--start", "copies.csv", "--colonies", 3, "--until", 0.5, "--out", "copies.h5")
+    command(
+        "run",
+        "microcolony",
+        "--start",
+        "copies.csv",
+        "--colonies",
+        3,
+        "--until",
+        0.5,
+        "--out",
+        "copies.h5",
+    )
     assert "note" not in capsys.readouterr().out

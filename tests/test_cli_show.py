@@ -12,11 +12,23 @@ from commands import ENVIRONMENT, OWN, drawn
 
 import torchfilm as tf
 
-# --- show and info --------------------------------------------------------------------------------------------------------
+# --- show and info --------------------------------------------------------------------------------
 
 
 def test_show(command, capsys):
-    command("run", "microcolony", "--set", "dim=3", "--colonies", 2, "--until", 3, "--out", "a.h5", "--no-picture")
+    command(
+        "run",
+        "microcolony",
+        "--set",
+        "dim=3",
+        "--colonies",
+        2,
+        "--until",
+        3,
+        "--out",
+        "a.h5",
+        "--no-picture",
+    )
     capsys.readouterr()
     command("show", "a.h5")
     assert capsys.readouterr().out.strip() == "a.png"
@@ -43,7 +55,19 @@ scene = tf.Scene(
 def shining(command, capsys):
     """Two colonies with something to show: three frames of yfp, cfp and ahl."""
     Path("mine.py").write_text(SIGNAL)
-    command("run", "mine.py", "--colonies", 2, "--until", 0.6, "--every", 3, "--out", "a.h5", "--no-picture")
+    command(
+        "run",
+        "mine.py",
+        "--colonies",
+        2,
+        "--until",
+        0.6,
+        "--every",
+        3,
+        "--out",
+        "a.h5",
+        "--no-picture",
+    )
     capsys.readouterr()
 
 
@@ -61,30 +85,86 @@ def asked(monkeypatch, name: str) -> list[dict]:
 
 def test_show_passes_on_what_is_asked(command, shining, monkeypatch):
     seen = asked(monkeypatch, "show")
-    command("show", "a.h5", "--channels", "cfp=cyan", "yfp=#ffff00", "--background", "ahl", "--limits", "yfp=0:2", "out.ahl=1e-3:0.5", "--section", "-2.5",
-            "--whole", "--colonies", 1, "--frame", 1)  # fmt: skip
-    assert seen == [{
-        "out": Path("a.png"), "frame": 1, "colour": None, "channels": {"cfp": "cyan", "yfp": "#ffff00"}, "background": "ahl",
-        "limits": {"yfp": (0.0, 2.0), "out.ahl": (1e-3, 0.5)}, "view": "xy", "section": -2.5, "whole": True, "colonies": [1],
-    }]  # fmt: skip
+    command(
+        "show",
+        "a.h5",
+        "--channels",
+        "cfp=cyan",
+        "yfp=#ffff00",
+        "--background",
+        "ahl",
+        "--limits",
+        "yfp=0:2",
+        "out.ahl=1e-3:0.5",
+        "--section",
+        "-2.5",
+        "--whole",
+        "--colonies",
+        1,
+        "--frame",
+        1,
+    )
+    assert seen == [
+        {
+            "out": Path("a.png"),
+            "frame": 1,
+            "colour": None,
+            "channels": {"cfp": "cyan", "yfp": "#ffff00"},
+            "background": "ahl",
+            "limits": {"yfp": (0.0, 2.0), "out.ahl": (1e-3, 0.5)},
+            "view": "xy",
+            "section": -2.5,
+            "whole": True,
+            "colonies": [1],
+        }
+    ]
     command("show", "a.h5")
     assert seen[1] == {
-        "out": Path("a.png"), "frame": -1, "colour": None, "channels": None, "background": None, "limits": {}, "view": "xy", "section": "cells",
-        "whole": False, "colonies": None,
-    }  # fmt: skip
+        "out": Path("a.png"),
+        "frame": -1,
+        "colour": None,
+        "channels": None,
+        "background": None,
+        "limits": {},
+        "view": "xy",
+        "section": "cells",
+        "whole": False,
+        "colonies": None,
+    }
 
 
 def test_strips_and_films_pass_on_what_is_asked(command, shining, monkeypatch):
     strips, films = asked(monkeypatch, "strip"), asked(monkeypatch, "movie")
-    look = ["--colour", "yfp", "--background", "ahl", "--limits", "yfp=0:2", "--section", "mean", "--colonies", 0, 1]
+    look = [
+        "--colour",
+        "yfp",
+        "--background",
+        "ahl",
+        "--limits",
+        "yfp=0:2",
+        "--section",
+        "mean",
+        "--colonies",
+        0,
+        1,
+    ]
     wanted = {
-        "colour": "yfp", "channels": None, "background": "ahl", "limits": {"yfp": (0.0, 2.0)}, "view": "xy", "section": "mean", "whole": False,
+        "colour": "yfp",
+        "channels": None,
+        "background": "ahl",
+        "limits": {"yfp": (0.0, 2.0)},
+        "view": "xy",
+        "section": "mean",
+        "whole": False,
         "colonies": [0, 1],
-    }  # fmt: skip
+    }
     command("show", "a.h5", "--strip", 3, *look)
     command("show", "a.h5", "--times", 0.1, 0.5, "--out", "b.png", *look)
     command("show", "a.h5", "--movie", "b.gif", "--fps", 4, *look)
-    assert strips == [{"out": Path("a_strip.png"), "frames": 3, "times": None, **wanted}, {"out": Path("b.png"), "frames": None, "times": [0.1, 0.5], **wanted}]
+    assert strips == [
+        {"out": Path("a_strip.png"), "frames": 3, "times": None, **wanted},
+        {"out": Path("b.png"), "frames": None, "times": [0.1, 0.5], **wanted},
+    ]
     assert films == [{"out": Path("b.gif"), "fps": 4.0, **wanted}]
 
 
@@ -93,7 +173,11 @@ def test_pictures_strips_and_films_are_drawn(command, shining, capsys):
     command("show", "a.h5", "--colour", "yfp", "--strip", 2)
     command("show", "a.h5", "--colour", "yfp", "--movie", "a.gif")
     assert capsys.readouterr().out.split() == ["a.png", "a_strip.png", "a.gif"]
-    assert drawn("a.png") > 0.01 and drawn("a_strip.png") > 0.005 and Path("a.gif").read_bytes().startswith(b"GIF89a")
+    assert (
+        drawn("a.png") > 0.01
+        and drawn("a_strip.png") > 0.005
+        and Path("a.gif").read_bytes().startswith(b"GIF89a")
+    )
 
 
 @pytest.mark.parametrize(
@@ -122,7 +206,10 @@ def test_show_tells_what_it_cannot_draw(command, shining, line, message):
     assert {p.name for p in Path().iterdir()} <= {"a.h5", "mine.py", "__pycache__"}
 
 
-@pytest.mark.parametrize("line, name", [("--strip 2", "a_strip.png"), ("--strip 2 --out b.png", "b.png"), ("--movie b.gif", "b.gif")])
+@pytest.mark.parametrize(
+    "line, name",
+    [("--strip 2", "a_strip.png"), ("--strip 2 --out b.png", "b.png"), ("--movie b.gif", "b.gif")],
+)
 def test_strips_and_films_replace_nothing_unasked(command, shining, line, name):
     Path(name).write_text("my holidays")
     with pytest.raises(SystemExit, match=rf"{name}.*no file yet.*--overwrite"):
@@ -151,26 +238,56 @@ def test_info_of_a_scene_with_settings_and_of_a_file(command, capsys):
 
 @pytest.mark.parametrize("name", ["a.h5", "results.dat"])
 def test_info_of_a_results_file(command, capsys, name):
-    command("run", "microcolony", "--colonies", 2, "--until", 0.5, "--seed", 3, "--out", name, "--no-picture")
+    command(
+        "run",
+        "microcolony",
+        "--colonies",
+        2,
+        "--until",
+        0.5,
+        "--seed",
+        3,
+        "--out",
+        name,
+        "--no-picture",
+    )
     capsys.readouterr()
     command("info", name)
     out = capsys.readouterr().out
-    for part in (name, "3 frames", "t = 0 to 0.5 h", "2 colonies", "seed 3", tf.__version__, str(torch.__version__), "microcolony: 2-D", "growth_rate"):
+    for part in (
+        name,
+        "3 frames",
+        "t = 0 to 0.5 h",
+        "2 colonies",
+        "seed 3",
+        tf.__version__,
+        str(torch.__version__),
+        "microcolony: 2-D",
+        "growth_rate",
+    ):
         assert part in out, part
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["info", "microcolony"], ["--help"]], ids=["info", "help"])
 def test_a_reader_that_has_read_enough_is_no_error(tmp_path, arguments):
-    """`torchfilm info microcolony | head -1`: the reader is gone before all is written. No traceback, no complaint at the interpreter's end."""
+    """`torchfilm info microcolony | head -1`: the reader is gone before all is written. No
+    traceback, no complaint at the interpreter's end."""
     command = [sys.executable, "-m", "torchfilm.cli", *arguments]
-    with subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as child:
         child.stdout.close()  # long before the command has something to say
         said = child.stderr.read()
         assert child.wait(timeout=60) == 1 and said == ""
 
 
-# --- pictures that are there already ---------------------------------------------------------------------------------------
+# --- pictures that are there already --------------------------------------------------------------
 
 
 @pytest.fixture
@@ -199,7 +316,9 @@ def test_the_runs_own_picture_is_drawn_anew_by_show_and_resume(command, run_once
 
 def test_run_replaces_no_picture_unasked(command, run_once):
     """Told before anything runs, and nothing is written."""
-    with pytest.raises(SystemExit, match=r"picture = 'mine\.png'.*no file yet.*--overwrite.*--no-picture"):
+    with pytest.raises(
+        SystemExit, match=r"picture = 'mine\.png'.*no file yet.*--overwrite.*--no-picture"
+    ):
         command("run", "microcolony", "--until", 0.5, "--out", "mine.h5")
     assert Path("mine.png").read_text() == "my holidays" and not Path("mine.h5").exists()
     command("run", "microcolony", "--until", 0.5, "--out", "mine.h5", "--no-picture")

@@ -1,4 +1,5 @@
-"""`torchfilm tune`, `run --settings` and `run --preset`: what is printed, written, recorded and gone on with."""
+"""`torchfilm tune`, `run --settings` and `run --preset`: what is printed, written, recorded and
+gone on with."""
 
 from __future__ import annotations
 
@@ -33,11 +34,34 @@ def done(folder, *arguments) -> str:
 
 
 def test_tune_prints_what_it_chose_and_writes_it_for_a_run(folder):
-    out = done(folder, "tune", "mine.py", "--error", "5%", "--cells", "4", "--colonies", "2", "--out", "s.json")
+    out = done(
+        folder,
+        "tune",
+        "mine.py",
+        "--error",
+        "5%",
+        "--cells",
+        "4",
+        "--colonies",
+        "2",
+        "--out",
+        "s.json",
+    )
     assert "mine: 5 % in cells, volume" in out and "settings  s.json" in out
     saved = tf.Settings.load(folder / "s.json")
     assert f"dt {saved.dt:g} h" in out and f"rtol {saved.rtol:g}" in out
-    done(folder, "run", "mine.py", "--settings", "s.json", "--cells", "4", "--out", "a.h5", "--no-picture")
+    done(
+        folder,
+        "run",
+        "mine.py",
+        "--settings",
+        "s.json",
+        "--cells",
+        "4",
+        "--out",
+        "a.h5",
+        "--no-picture",
+    )
     with tf.Results(folder / "a.h5") as results:
         assert results.accuracy == saved.given and results.attributes["dt"] == saved.dt
     done(folder, "resume", "a.h5", "--scene", "mine.py", "--cells", "8", "--no-picture")
@@ -46,13 +70,27 @@ def test_tune_prints_what_it_chose_and_writes_it_for_a_run(folder):
 
 
 def test_a_run_by_a_preset_says_so_in_its_results(folder):
-    done(folder, "run", "mine.py", "--preset", "draft", "--cells", "2", "--out", "a.h5", "--no-picture")
+    done(
+        folder,
+        "run",
+        "mine.py",
+        "--preset",
+        "draft",
+        "--cells",
+        "2",
+        "--out",
+        "a.h5",
+        "--no-picture",
+    )
     with tf.Results(folder / "a.h5") as results:
         assert results.attributes["dt"] == pytest.approx(0.08) and results.accuracy["rtol"] == 0.01
 
 
 def test_explain_says_what_a_preset_would_do(folder):
-    words = [done(folder, "explain", "mine.py", "--seconds", "0", *more) for more in ((), ("--preset", "draft"))]
+    words = [
+        done(folder, "explain", "mine.py", "--seconds", "0", *more)
+        for more in ((), ("--preset", "draft"))
+    ]
     assert "0.05 h" in words[0] and "0.08 h" in words[1]
 
 
@@ -63,10 +101,19 @@ def test_explain_says_what_a_preset_would_do(folder):
         (("tune", "mine.py", "--error", "60%"), "error = 0.6"),
         (("tune", "mine.py", "--error", "3"), "did you mean 3%?"),
         (("tune", "mine.py", "--error", "200%"), "a share below the whole"),
-        (("run", "mine.py", "--preset", "drafty", "--cells", "2"), "'drafty' is not allowed: it must be one of 'draft', 'standard', 'reference'"),
-        (("explain", "mine.py", "--preset", "draft", "--settings", "s.json"), "give one of the two"),
+        (
+            ("run", "mine.py", "--preset", "drafty", "--cells", "2"),
+            "'drafty' is not allowed: it must be one of 'draft', 'standard', 'reference'",
+        ),
+        (
+            ("explain", "mine.py", "--preset", "draft", "--settings", "s.json"),
+            "give one of the two",
+        ),
         (("tune", "mine.py", "--out", "mine.py"), "no file yet"),
-        (("run", "mine.py", "--preset", "draft", "--settings", "s.json", "--cells", "2"), "give one of the two"),
+        (
+            ("run", "mine.py", "--preset", "draft", "--settings", "s.json", "--cells", "2"),
+            "give one of the two",
+        ),
         (("run", "mine.py", "--settings", "none.json", "--cells", "2"), "cannot be read"),
         (("run", "mine.py", "--settings", "empty.json", "--cells", "2"), "no settings of accuracy"),
     ],

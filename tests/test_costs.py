@@ -1,8 +1,10 @@
-"""A scene pays for what it lists and for nothing else, proved by counting: operators dispatched and bytes allocated, not seconds.
+"""A scene pays for what it lists and for nothing else, proved by counting: operators dispatched and
+bytes allocated, not seconds.
 
-Four claims. The steps of growth, division and mechanics cost exactly the same operators and bytes whatever else the scene lists. What a scene does
-not list is not called: with every public function of its rooms taken away the scene runs as before. Its fields are not there. And operators are for the whole
-batch: many colonies ask for no more of them than two.
+Four claims. The steps of growth, division and mechanics cost exactly the same operators and bytes
+whatever else the scene lists. What a scene does not list is not called: with every public function
+of its rooms taken away the scene runs as before. Its fields are not there. And operators are for
+the whole batch: many colonies ask for no more of them than two.
 """
 
 from __future__ import annotations
@@ -40,7 +42,11 @@ def circuit(**options) -> tf.Circuit:
 
 
 def reactions() -> tf.Circuit:
-    return tf.Circuit([tf.parts.constitutive("m", 1.0), tf.parts.degradation("m", 1.0)], species=("m",), method="tau_leap")
+    return tf.Circuit(
+        [tf.parts.constitutive("m", 1.0), tf.parts.degradation("m", 1.0)],
+        species=("m",),
+        method="tau_leap",
+    )
 
 
 def medium(**options) -> tf.Medium:
@@ -48,14 +54,26 @@ def medium(**options) -> tf.Medium:
 
 
 LISTED = {
-    "circuit": lambda: [circuit()], "molecules": lambda: [reactions()], "medium": lambda: [medium()], "both": lambda: [circuit(), medium(beyond="grow")],
-    "rules": lambda: [tf.Rules(watching)], "removal": lambda: [tf.Removal((-50, -50), (50, 50))],
-    "everything": lambda: [tf.Rules(watching), circuit(), medium(beyond="open"), tf.Removal((-50, -50), (50, 50))],
-}  # fmt: skip
+    "circuit": lambda: [circuit()],
+    "molecules": lambda: [reactions()],
+    "medium": lambda: [medium()],
+    "both": lambda: [circuit(), medium(beyond="grow")],
+    "rules": lambda: [tf.Rules(watching)],
+    "removal": lambda: [tf.Removal((-50, -50), (50, 50))],
+    "everything": lambda: [
+        tf.Rules(watching),
+        circuit(),
+        medium(beyond="open"),
+        tf.Removal((-50, -50), (50, 50)),
+    ],
+}
 
 
-def spend(scene: tf.Scene, state: tf.State) -> tuple[dict[str, tuple[dict[str, int], int]], tf.State]:
-    """What each effect of a step asks for, by its title: (operators by name, bytes), and the state after it."""
+def spend(
+    scene: tf.Scene, state: tf.State
+) -> tuple[dict[str, tuple[dict[str, int], int]], tf.State]:
+    """What each effect of a step asks for, by its title: (operators by name, bytes), and the state
+    after it."""
     state, here = state.replace(births=(), ended=(), reports={}), {}
     for effect in scene.effects:
         with Operators() as seen:
@@ -64,8 +82,11 @@ def spend(scene: tf.Scene, state: tf.State) -> tuple[dict[str, tuple[dict[str, i
     return here, state.replace(step=state.step + 1, time=state.time + 0.05)
 
 
-def costs(scene: tf.Scene, steps: int = 30) -> tuple[list[dict[str, tuple[dict[str, int], int]]], list[tf.State]]:
-    """What each effect of each step asked for, by its title: (operators by name, bytes), and the states."""
+def costs(
+    scene: tf.Scene, steps: int = 30
+) -> tuple[list[dict[str, tuple[dict[str, int], int]]], list[tf.State]]:
+    """What each effect of each step asked for, by its title: (operators by name, bytes), and the
+    states."""
     state, spent, states = scene.seed(seed=5, dtype=torch.float64), [], []
     for _ in range(steps):
         here, state = spend(scene, state)
@@ -84,7 +105,8 @@ def bare():
 
 @pytest.mark.parametrize("listed", LISTED)
 def test_growth_division_and_mechanics_cost_the_same_whatever_else_is_listed(listed, bare):
-    """The same cells, the same operators by name and count. Only where cells divide, a scene with more fields per cell has more to hand on."""
+    """The same cells, the same operators by name and count. Only where cells divide, a scene with
+    more fields per cell has more to hand on."""
     scene = tf.Scene(*body(), *LISTED[listed]())
     spent, states = costs(scene)
     assert torch.equal(states[-1].position, bare[1][-1].position)
@@ -93,7 +115,9 @@ def test_growth_division_and_mechanics_cost_the_same_whatever_else_is_listed(lis
             if title != "division" or not state.births or listed in ("medium", "removal"):
                 assert here[title] == there[title], (title, state.step)
         extra = set(here) - set(there)
-        assert all(sum(here[title][0].values()) > 0 or title == "cover" for title in extra), "an effect that is listed and does nothing proves nothing"
+        assert all(sum(here[title][0].values()) > 0 or title == "cover" for title in extra), (
+            "an effect that is listed and does nothing proves nothing"
+        )
 
 
 def test_the_counter_sees_what_it_should(bare):
@@ -106,19 +130,43 @@ def test_the_counter_sees_what_it_should(bare):
     spent, _ = costs(tf.Scene(Wasteful(rate=1.0), *body()[1:]), steps=2)
     calls, size = spent[0]["growth"]
     wanted, allowed = bare[0][0]["growth"]
-    assert sum(calls.values()) == sum(wanted.values()) + 1 and size == allowed + 8  # one cell of float64
+    # one cell of float64
+    assert sum(calls.values()) == sum(wanted.values()) + 1 and size == allowed + 8
 
 
 def test_on_the_same_cells_nutrition_leaves_the_others_costs_alone():
-    """Nutrition changes how cells grow, so the runs differ; but on the cells of any moment growth and mechanics cost the same with and without it."""
-    fed, unfed = (tf.Scene(*body(None), *more) for more in ([tf.Monod("ahl"), tf.Medium(ahl=tf.Signal(diffusion=10.0, initial=9.0), **BOX)], []))
+    """Nutrition changes how cells grow, so the runs differ; but on the cells of any moment growth
+    and mechanics cost the same with and without it."""
+    fed, unfed = (
+        tf.Scene(*body(None), *more)
+        for more in (
+            [tf.Monod("ahl"), tf.Medium(ahl=tf.Signal(diffusion=10.0, initial=9.0), **BOX)],
+            [],
+        )
+    )
     state, bare = fed.seed(seed=5, dtype=torch.float64), unfed.seed(seed=5, dtype=torch.float64)
     compared = 0
     for _ in range(30):
-        same = {n: getattr(state, n) for n in ("colony", "uid", "parent", "position", "axis", "length", "radius", "next_uid", "step", "time")}
+        same = {
+            n: getattr(state, n)
+            for n in (
+                "colony",
+                "uid",
+                "parent",
+                "position",
+                "axis",
+                "length",
+                "radius",
+                "next_uid",
+                "step",
+                "time",
+            )
+        }
         twin = bare.replace(**same, fields={n: state.fields[n] for n in bare.fields})
         with_food, state = spend(fed, state)
-        twin = twin.with_fields(growth_rate=state.growth_rate if state.cells == twin.cells else twin.growth_rate)
+        twin = twin.with_fields(
+            growth_rate=state.growth_rate if state.cells == twin.cells else twin.growth_rate
+        )
         without, after = spend(unfed, twin)
         if not state.births:
             assert torch.equal(after.position, state.position)
@@ -130,26 +178,47 @@ def test_on_the_same_cells_nutrition_leaves_the_others_costs_alone():
 
 @pytest.mark.parametrize("listed", ["circuit", "medium", "both", "rules"])
 def test_many_colonies_ask_for_no_more_operators_than_two(listed):
-    """Colonies of one stream are alike in all, so whatever is asked for two is asked once for all nine: the same operators by name in every step. (Not than
-    one, which goes without what tells colonies apart.)"""
+    """Colonies of one stream are alike in all, so whatever is asked for two is asked once for all
+    nine: the same operators by name in every step. (Not than one, which goes without what tells
+    colonies apart.)"""
     scene = tf.Scene(*body(), *LISTED[listed]())
     two, nine = (scene.seed(n, seed=5, streams=[3] * n, dtype=torch.float64) for n in (2, 9))
     for _ in range(30):
         (here, two), (there, nine) = spend(scene, two), spend(scene, nine)
-        assert {title: calls for title, (calls, _) in here.items()} == {title: calls for title, (calls, _) in there.items()}, two.step
+        assert {title: calls for title, (calls, _) in here.items()} == {
+            title: calls for title, (calls, _) in there.items()
+        }, two.step
     assert 2 * nine.cells == 9 * two.cells > 18
 
 
 def functions(*rooms: str) -> list[tuple[object, str]]:
-    """Every function and class of some packages, wherever a module has it under a name: (module, name)."""
+    """Every function and class of some packages, wherever a module has it under a name: (module,
+    name)."""
     own = set()
     for room in rooms:
         package = importlib.import_module(room)
-        modules = [importlib.import_module(f"{room}.{m.name}") for m in pkgutil.iter_modules(package.__path__)] if hasattr(package, "__path__") else [package]
+        modules = (
+            [
+                importlib.import_module(f"{room}.{m.name}")
+                for m in pkgutil.iter_modules(package.__path__)
+            ]
+            if hasattr(package, "__path__")
+            else [package]
+        )
         for module in modules:
-            own |= {id(f) for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__}
+            own |= {
+                id(f)
+                for f in vars(module).values()
+                if inspect.isfunction(f) and f.__module__ == module.__name__
+            }
     assert own
-    return [(m, name) for key, m in list(sys.modules.items()) if key.startswith("torchfilm") for name, f in list(vars(m).items()) if id(f) in own]
+    return [
+        (m, name)
+        for key, m in list(sys.modules.items())
+        if key.startswith("torchfilm")
+        for name, f in list(vars(m).items())
+        if id(f) in own
+    ]
 
 
 def forbid(monkeypatch, *rooms: str) -> None:
@@ -172,13 +241,25 @@ def run(scene: tf.Scene, steps: int = 30) -> tf.State:
 
 
 WITHOUT = {
-    "neither signals nor circuits": (lambda: [tf.Rules(watching), tf.Removal((-50, -50), (50, 50))], ("torchfilm.signals", "torchfilm.circuits")),
+    "neither signals nor circuits": (
+        lambda: [tf.Rules(watching), tf.Removal((-50, -50), (50, 50))],
+        ("torchfilm.signals", "torchfilm.circuits"),
+    ),
     "no signals": (lambda: [circuit()], ("torchfilm.signals",)),
-    "no signals, molecules": (lambda: [reactions()], ("torchfilm.signals", "torchfilm.circuits.rosenbrock", "torchfilm.circuits.integrators")),
-    "no noise": (lambda: [circuit()], [f"torchfilm.circuits.{m}" for m in ("stochastic", "draws", "partition", "network")]),
+    "no signals, molecules": (
+        lambda: [reactions()],
+        ("torchfilm.signals", "torchfilm.circuits.rosenbrock", "torchfilm.circuits.integrators"),
+    ),
+    "no noise": (
+        lambda: [circuit()],
+        [f"torchfilm.circuits.{m}" for m in ("stochastic", "draws", "partition", "network")],
+    ),
     "no circuits": (lambda: [medium()], ("torchfilm.circuits",)),
-    "nobody who exchanges": (lambda: [medium()], ("torchfilm.signals.implicit", "torchfilm.signals.iterative")),
-}  # fmt: skip
+    "nobody who exchanges": (
+        lambda: [medium()],
+        ("torchfilm.signals.implicit", "torchfilm.signals.iterative"),
+    ),
+}
 
 
 @pytest.mark.parametrize("case", WITHOUT)
@@ -193,8 +274,13 @@ def test_what_a_scene_does_not_list_is_never_called(case, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("listed", "room"), [("circuit", "circuits.rosenbrock"), ("molecules", "circuits.stochastic"), ("medium", "signals.transport")]
-)  # fmt: skip
+    ("listed", "room"),
+    [
+        ("circuit", "circuits.rosenbrock"),
+        ("molecules", "circuits.stochastic"),
+        ("medium", "signals.transport"),
+    ],
+)
 def test_what_a_scene_lists_is_called(listed, room, monkeypatch):
     """The other way round, so that the test above could fail."""
     forbid(monkeypatch, f"torchfilm.{room}")
@@ -205,13 +291,20 @@ def test_what_a_scene_lists_is_called(listed, room, monkeypatch):
 def test_fields_and_stages_are_those_of_the_effects_listed():
     plain = tf.Scene(*body())
     state = run(plain, 1)
-    assert state.layout is None and state.signals == {} and not any(n.startswith(OUTSIDE) for n in state.fields)
+    assert (
+        state.layout is None
+        and state.signals == {}
+        and not any(n.startswith(OUTSIDE) for n in state.fields)
+    )
     known = {"divide_flag", "division_threshold", "growth_rate", "elongation", "displacement"}
     assert set(state.fields) == known and set(state.reports) == {"mechanics"}
     for more, added in (
-        ([circuit()], {"m", "circuit_volume"}), ([medium()], {"out.ahl"}), ([medium(beyond="open")], {"out.ahl", "ahl_beyond"}),
-        ([tf.Circuit({0: made}, species=("m",))], {"m", "circuit_volume", "cell_type"}), ([tf.Rules(watching)], {"mark"}),
-    ):  # fmt: skip
+        ([circuit()], {"m", "circuit_volume"}),
+        ([medium()], {"out.ahl"}),
+        ([medium(beyond="open")], {"out.ahl", "ahl_beyond"}),
+        ([tf.Circuit({0: made}, species=("m",))], {"m", "circuit_volume", "cell_type"}),
+        ([tf.Rules(watching)], {"mark"}),
+    ):
         found = run(tf.Scene(*body(), *more), 1)
         assert set(found.fields) - known == added
         assert (found.layout is None) == ("out.ahl" not in added)
@@ -220,6 +313,7 @@ def test_fields_and_stages_are_those_of_the_effects_listed():
 
 
 def test_a_circuit_that_exchanges_nothing_costs_the_medium_nothing_but_reading():
-    """Beside a Medium, a circuit that neither reads nor gives writes nothing to it: the grid is that of the medium alone, bit for bit."""
+    """Beside a Medium, a circuit that neither reads nor gives writes nothing to it: the grid is
+    that of the medium alone, bit for bit."""
     alone, beside = (run(tf.Scene(*body(), *more, medium()), 5) for more in ([], [circuit()]))
     assert torch.equal(alone.signals["ahl"], beside.signals["ahl"])

@@ -1,4 +1,5 @@
-"""device="cuda" on a machine without one: all that is made is made there, and comes to what the CPU's own ways come to."""
+"""device="cuda" on a machine without one: all that is made is made there, and comes to what the
+CPU's own ways come to."""
 
 from __future__ import annotations
 
@@ -8,7 +9,15 @@ from pretended import pretended_cuda  # noqa: F401
 
 import torchfilm as tf
 
-STEPS = {"microcolony": 60, "channel": 60, "programmed_growth": 20, "quorum_sensing": 8, "boundary_detector": 8, "random_partition": 8, "nutrient_limited": 8}
+STEPS = {
+    "microcolony": 60,
+    "channel": 60,
+    "programmed_growth": 20,
+    "quorum_sensing": 8,
+    "boundary_detector": 8,
+    "random_partition": 8,
+    "nutrient_limited": 8,
+}
 
 
 def grown(name: str, device: str) -> tf.State:
@@ -26,8 +35,13 @@ def grown(name: str, device: str) -> tf.State:
 def test_a_scene_runs_where_it_was_asked_to(pretended_cuda, name):  # noqa: F811
     there, here = grown(name, "cuda"), grown(name, "cpu")
     assert there.position.device.type == "cuda" and here.position.device.type == "cpu"
-    every = [(n, getattr(there, n), getattr(here, n)) for n in ("position", "axis", "length", "uid", "parent", "colony")]
-    every += [(n, there.fields[n], here.fields[n]) for n in here.fields] + [(n, there.signals[n], here.signals[n]) for n in here.signals]
+    every = [
+        (n, getattr(there, n), getattr(here, n))
+        for n in ("position", "axis", "length", "uid", "parent", "colony")
+    ]
+    every += [(n, there.fields[n], here.fields[n]) for n in here.fields] + [
+        (n, there.signals[n], here.signals[n]) for n in here.signals
+    ]
     for n, found, right in every:
         assert found.device.type == "cuda", n
         assert torch.allclose(found.cpu().double(), right.double(), rtol=1e-6, atol=1e-9), n
@@ -35,7 +49,9 @@ def test_a_scene_runs_where_it_was_asked_to(pretended_cuda, name):  # noqa: F811
 
 def test_pretended_tensors_refuse_others(pretended_cuda):  # noqa: F811
     one = torch.zeros(3, device="cuda")
-    assert (one + 1).device.type == "cuda" and one.cpu().device.type == "cpu" and float(one.sum()) == 0
+    assert (
+        (one + 1).device.type == "cuda" and one.cpu().device.type == "cpu" and float(one.sum()) == 0
+    )
     with pytest.raises(RuntimeError, match=r"on cuda .* and on cpu"):
         one + torch.zeros(3)
     with pytest.raises(RuntimeError, match="numpy"):

@@ -1,4 +1,5 @@
-"""The code in the documentation runs: a page's Python blocks, in order, as one program in an empty folder; one that begins with a file's name, as that."""
+"""The code in the documentation runs: a page's Python blocks, in order, as one program in an empty
+folder; one that begins with a file's name, as that."""
 
 import re
 import subprocess
@@ -17,7 +18,9 @@ def test_there_are_pages_with_code():
     assert sum(bool(BLOCK.search(page.read_text())) for page in PAGES) >= 6
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=lambda p: p.name
+)
 def test_blocks_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict = {"__name__": "docs"}

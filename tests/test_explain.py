@@ -1,4 +1,5 @@
-"""What explain says is what will be done: methods are those chosen, tolerances those used, and the estimate is the arithmetic that it claims to be."""
+"""What explain says is what will be done: methods are those chosen, tolerances those used, and the
+estimate is the arithmetic that it claims to be."""
 
 from __future__ import annotations
 
@@ -12,7 +13,20 @@ import torchfilm as tf
 from torchfilm.effects import medium as medium_module
 from torchfilm.effects.mechanics import TOLERANCE
 from torchfilm.effects.medium import Cover
-from torchfilm.explain import COLUMNS, KNOWN, ROWS, Block, Probe, Spending, crowd, how, left_out, replayed, state_bytes, transport
+from torchfilm.explain import (
+    COLUMNS,
+    KNOWN,
+    ROWS,
+    Block,
+    Probe,
+    Spending,
+    crowd,
+    how,
+    left_out,
+    replayed,
+    state_bytes,
+    transport,
+)
 from torchfilm.tools.counting import Operators
 
 BODY = (tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2))
@@ -39,18 +53,30 @@ def graded(places):
     return 0.01 * (places[:, 0] + 40.0)
 
 
-# --- methods --------------------------------------------------------------------------------------------------------------------
+# --- methods --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "made, words",
     [
-        (medium(), "no obstacle"), (medium(flow=(1.0, 0.0)), "no obstacle"), (medium(decay=torch.tensor([0.1, 0.2])), "no obstacle"),
-        (medium(obstacles=pillar), "because of obstacles"), (medium(flow=swirl), "a flow that differs"), (medium(decay=graded), "a decay that differs"),
+        (medium(), "no obstacle"),
+        (medium(flow=(1.0, 0.0)), "no obstacle"),
+        (medium(decay=torch.tensor([0.1, 0.2])), "no obstacle"),
+        (medium(obstacles=pillar), "because of obstacles"),
+        (medium(flow=swirl), "a flow that differs"),
+        (medium(decay=graded), "a decay that differs"),
         (medium(flow=swirl, obstacles=pillar), "obstacles and a flow"),
     ],
-    ids=["plain", "uniform flow", "decay per colony", "obstacle", "varying flow", "varying decay", "two reasons"],
-)  # fmt: skip
+    ids=[
+        "plain",
+        "uniform flow",
+        "decay per colony",
+        "obstacle",
+        "varying flow",
+        "varying decay",
+        "two reasons",
+    ],
+)
 def test_the_way_of_transport_told_is_the_one_that_is_chosen(made, words, monkeypatch):
     chosen, choose = [], medium_module.choose
     monkeypatch.setattr(medium_module, "choose", lambda op: chosen.append(choose(op)) or chosen[-1])
@@ -69,20 +95,66 @@ def test_a_way_of_transport_that_was_asked_for_is_told(method):
 @pytest.mark.parametrize(
     "effect, words",
     [
-        (tf.Mechanics(dim=2), ("bilateral", "α = 0.1/γ = 0.01 (default)", "at most 1 a step", "residual of 0.05 (default)", "at most 2000 iterations")),
+        (
+            tf.Mechanics(dim=2),
+            (
+                "bilateral",
+                "α = 0.1/γ = 0.01 (default)",
+                "at most 1 a step",
+                "residual of 0.05 (default)",
+                "at most 2000 iterations",
+            ),
+        ),
         (tf.Mechanics(dim=2, length_drag=40.0), ("α = 0.1/γ = 0.0025 (default)",)),
-        (tf.Mechanics(dim=2, unilateral=True, tolerance=0.03), ("unilateral", "at most 2 a step", "residual of 0.03, at most")),
-        (tf.Mechanics(dim=2, stiffness=[100.0, 200.0]), ("stiffness 100 to 200 μ·µm/h", "= 0.2 to 0.4")),  # 1/(k Δt), Δt = 0.025
-        (tf.Mechanics(dim=2, alpha=0.5, passes=4, overlap=0.01), ("α = 0.5", "at most 4 a step", "over 0.01 µm")),
-        (tf.Mechanics(dim=2, walls=[tf.Plane(y=-2.0, facing="+y"), tf.Plane(y=2.0, facing="-y", stiffness=3.0)]), ("1 hard, 1 with a stiffness",)),
+        (
+            tf.Mechanics(dim=2, unilateral=True, tolerance=0.03),
+            ("unilateral", "at most 2 a step", "residual of 0.03, at most"),
+        ),
+        # 1/(k Δt), Δt = 0.025
+        (
+            tf.Mechanics(dim=2, stiffness=[100.0, 200.0]),
+            ("stiffness 100 to 200 μ·µm/h", "= 0.2 to 0.4"),
+        ),
+        (
+            tf.Mechanics(dim=2, alpha=0.5, passes=4, overlap=0.01),
+            ("α = 0.5", "at most 4 a step", "over 0.01 µm"),
+        ),
+        (
+            tf.Mechanics(
+                dim=2,
+                walls=[tf.Plane(y=-2.0, facing="+y"), tf.Plane(y=2.0, facing="-y", stiffness=3.0)],
+            ),
+            ("1 hard, 1 with a stiffness",),
+        ),
         (tf.Circuit(plain, species="m"), ("stiff solver", "1e-09 + 0.0001·|u|")),
         (tf.Circuit(plain, species="m", rtol=1e-2, atol=1e-6), ("1e-06 + 0.01·|u|",)),
-        (tf.Circuit(plain, species="m", method="rk4", steps=5), ("rk4, 5 equal step(s) of 0.005 h",)),
-        (tf.Circuit([tf.parts.constitutive("m", 1.0)], species="m", method="tau_leap", copies=0.6022), ("tau-leaping", "0.6022 molecules")),
-        (tf.Circuit([tf.parts.constitutive("m", 1.0)], species="m", method="direct"), ("one event after the other", "1 molecules")),
-        (medium(beyond="grow", grows="x"), ("along x, 8 voxels", "8 × 8 × 1 voxels of 8 × 8 × 8 µm", "dt·K/h² = 0.003906")),  # 0.025 · 10/64
-        (medium(method="crank_nicolson", steps=5), ("order 2 in steps of 0.0025 h", "failure", "Strang")),
-        (medium(method="implicit", splitting="lie", steps=5), ("order 1 in steps of 0.005 h", "Lie")),
+        (
+            tf.Circuit(plain, species="m", method="rk4", steps=5),
+            ("rk4, 5 equal step(s) of 0.005 h",),
+        ),
+        (
+            tf.Circuit(
+                [tf.parts.constitutive("m", 1.0)], species="m", method="tau_leap", copies=0.6022
+            ),
+            ("tau-leaping", "0.6022 molecules"),
+        ),
+        (
+            tf.Circuit([tf.parts.constitutive("m", 1.0)], species="m", method="direct"),
+            ("one event after the other", "1 molecules"),
+        ),
+        # 0.025 · 10/64
+        (
+            medium(beyond="grow", grows="x"),
+            ("along x, 8 voxels", "8 × 8 × 1 voxels of 8 × 8 × 8 µm", "dt·K/h² = 0.003906"),
+        ),
+        (
+            medium(method="crank_nicolson", steps=5),
+            ("order 2 in steps of 0.0025 h", "failure", "Strang"),
+        ),
+        (
+            medium(method="implicit", splitting="lie", steps=5),
+            ("order 1 in steps of 0.005 h", "Lie"),
+        ),
         (medium(beyond="open"), ("reservoir",)),
     ],
 )
@@ -98,7 +170,10 @@ def test_methods_and_tolerances_are_those_of_the_scene(effect, words):
 def test_defaults_told_of_contacts_are_those_used(dim, unilateral):
     effect = tf.Mechanics(dim=dim, unilateral=unilateral)
     said = " ".join(how(effect, tf.Scene(effect, tf.Growth(rate=1.0)).seed(), 0.025))
-    assert f"at most {effect.most_passes} a step" in said and f"residual of {TOLERANCE:g} (default)" in said
+    assert (
+        f"at most {effect.most_passes} a step" in said
+        and f"residual of {TOLERANCE:g} (default)" in said
+    )
 
 
 def test_what_is_exchanged_is_named():
@@ -107,7 +182,11 @@ def test_what_is_exchanged_is_named():
 
 
 def test_every_effect_that_torchfilm_has_is_known_and_has_words():
-    public = {x for x in vars(tf).values() if isinstance(x, type) and issubclass(x, tf.Effect) and x is not tf.Effect}
+    public = {
+        x
+        for x in vars(tf).values()
+        if isinstance(x, type) and issubclass(x, tf.Effect) and x is not tf.Effect
+    }
     assert public == set(KNOWN)
     assert all(how.dispatch(kind) is not how.dispatch(object) for kind in (*KNOWN, Cover))
 
@@ -123,7 +202,7 @@ def test_an_effect_of_ones_own_is_told_by_its_name_alone():
     assert "mine" in tf.explain(tf.Scene(Mine(rate=1.0)), seconds=0)
 
 
-# --- who, what not, and again ---------------------------------------------------------------------------------------------------
+# --- who, what not, and again ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", tf.scenes.READY)
@@ -131,7 +210,9 @@ def test_what_is_listed_and_what_is_left_out_are_all(name):
     scene = tf.scenes.build(name)
     listed, left = [e.title for e in scene.listed], left_out(scene)
     assert sorted(listed + left) == sorted(kind.title for kind in KNOWN)
-    assert f"not simulated: {', '.join(left)} (no field, no operation)" in tf.explain(scene, seconds=0)
+    assert f"not simulated: {', '.join(left)} (no field, no operation)" in tf.explain(
+        scene, seconds=0
+    )
 
 
 @pytest.mark.parametrize("name", tf.scenes.READY)
@@ -149,8 +230,12 @@ def test_whether_growth_serves_many_designs_is_what_a_course_says(name):
 def test_couplings_are_those_of_the_scene(name):
     scene = tf.scenes.build(name)
     said, info = tf.explain(scene, seconds=0), scene.explain()
-    assert scene.drives() and all(f"    {line}\n" in said and f"    {line}" in info for line in scene.drives())
-    assert {tuple(line.split(": ")[0].split(" -> ")) for line in scene.drives()} == {(w, r) for w, _, r in scene.couplings()}
+    assert scene.drives() and all(
+        f"    {line}\n" in said and f"    {line}" in info for line in scene.drives()
+    )
+    assert {tuple(line.split(": ")[0].split(" -> ")) for line in scene.drives()} == {
+        (w, r) for w, _, r in scene.couplings()
+    }
 
 
 def test_without_an_estimate_nothing_runs(monkeypatch):
@@ -162,11 +247,12 @@ def test_without_an_estimate_nothing_runs(monkeypatch):
     assert "estimated" not in said and said == tf.explain(tf.scenes.boundary_detector(), seconds=0)
 
 
-# --- the estimate ---------------------------------------------------------------------------------------------------------------
+# --- the estimate ---------------------------------------------------------------------------------
 
 
 def test_a_fit_gives_back_what_is_linear():
-    """Time a + b · cells of a body, a + c · colonies of a grid: least squares of exact data are the data's own a, b, c."""
+    """Time a + b · cells of a body, a + c · colonies of a grid: least squares of exact data are the
+    data's own a, b, c."""
     scene = tf.Scene(*BODY, medium())
     truth = {
         "growth": (2e-5, 1e-8, 0.0),
@@ -176,8 +262,9 @@ def test_a_fit_gives_back_what_is_linear():
         "division": (0.0, 0.0, 0.0),
     }
     blocks = [
-        Block(n, b, {t: x + y * n + z * b for t, (x, y, z) in truth.items()}, {}) for n, b in ((32, 1), (40, 1), (256, 8), (300, 8), (420, 8))
-    ]  # fmt: skip
+        Block(n, b, {t: x + y * n + z * b for t, (x, y, z) in truth.items()}, {})
+        for n, b in ((32, 1), (40, 1), (256, 8), (300, 8), (420, 8))
+    ]
     state = scene.seed()
     found = Probe(blocks, state, state, "", True).fit(scene, "seconds")
     for title, expected in truth.items():
@@ -185,19 +272,29 @@ def test_a_fit_gives_back_what_is_linear():
 
 
 def test_a_run_is_foretold_from_the_pace_of_growth():
-    """Nothing but dV/dt = V: a thousandfold takes ln(1000)/0.025 = 276.3 steps, whatever the machine."""
+    """Nothing but dV/dt = V: a thousandfold takes ln(1000)/0.025 = 276.3 steps, whatever the
+    machine."""
     said = tf.explain(tf.Scene(tf.Growth(rate=1.0)), cells=1000, seconds=0.01)
     assert "  a run    277 steps (6.93 h)" in said
     assert "  a run    0 steps" in tf.explain(tf.Scene(tf.Growth(rate=1.0)), cells=1, seconds=0.01)
     assert "not foretold" in tf.explain(tf.Scene(tf.Growth(rate=0.0)), seconds=0.01)
 
 
-@pytest.mark.parametrize("name", ["microcolony", "boundary_detector", "nutrient_limited", "programmed_growth", "channel"])
+@pytest.mark.parametrize(
+    "name", ["microcolony", "boundary_detector", "nutrient_limited", "programmed_growth", "channel"]
+)
 def test_an_estimate_has_all_its_parts_and_shares_that_add_up(name):
     said = tf.explain(tf.scenes.build(name), cells=300, colonies=4, seconds=0.05)
-    assert "estimated cost at 300 cells in each of 4 colonies, cpu, float32" in said and "warning" not in said
-    shares = next(line for line in said.splitlines() if "a step   " in line).split(": ")[1].split(", ")
-    assert sum(float(share.split()[-2]) for share in shares) == pytest.approx(100, abs=0.5 * len(shares) + 0.5 * len(tf.scenes.build(name).effects))
+    assert (
+        "estimated cost at 300 cells in each of 4 colonies, cpu, float32" in said
+        and "warning" not in said
+    )
+    shares = (
+        next(line for line in said.splitlines() if "a step   " in line).split(": ")[1].split(", ")
+    )
+    assert sum(float(share.split()[-2]) for share in shares) == pytest.approx(
+        100, abs=0.5 * len(shares) + 0.5 * len(tf.scenes.build(name).effects)
+    )
     assert f"from {ROWS * COLUMNS} cells laid side by side" in said
 
 
@@ -215,21 +312,34 @@ def test_a_probe_that_fails_says_why():
 @pytest.mark.parametrize(
     "founders",
     [
-        tf.Cells([[0.0, 0.0]], [[0.6, 0.8]]), tf.Cells([[3.0, 1.0, 0.5]], [[0.0, 0.0, 1.0]], 3.0, 0.4),
-        tf.Cells([[-1.5, 0.0], [1.5, 0.0]], [[1.0, 0.0], [1.0, 0.0]], [1.0, 2.0], cell_type=[0, 1], extra={"dye": [2.0, 5.0]}),
+        tf.Cells([[0.0, 0.0]], [[0.6, 0.8]]),
+        tf.Cells([[3.0, 1.0, 0.5]], [[0.0, 0.0, 1.0]], 3.0, 0.4),
+        tf.Cells(
+            [[-1.5, 0.0], [1.5, 0.0]],
+            [[1.0, 0.0], [1.0, 0.0]],
+            [1.0, 2.0],
+            cell_type=[0, 1],
+            extra={"dye": [2.0, 5.0]},
+        ),
         tf.Cells([[0.0, 0.0], [9.0, 9.0]], [[1.0, 0.0], [0.0, 1.0]], [1.0, 2.0], colony=[0, 1]),
     ],
     ids=["tilted", "upright", "two types", "two colonies"],
-)  # fmt: skip
+)
 def test_a_crowd_does_not_overlap_and_is_like_its_founders(founders):
     laid = crowd(founders)
     assert laid.count == ROWS * COLUMNS and laid.overlaps(1e-9) == []
     first = 0 if founders.colony is None else founders.colony == 0
-    middle = founders.position.mean(0) if founders.colony is None else founders.position[first].mean(0)
+    middle = (
+        founders.position.mean(0) if founders.colony is None else founders.position[first].mean(0)
+    )
     assert laid.position.mean(0) == pytest.approx(middle, abs=1e-9)
     if founders.cell_type is not None:
         right = laid.position[:, 0] > 0
-        assert (laid.cell_type == right).all() and (laid.length == 1.0 + right).all() and (laid.extra["dye"] == 2.0 + 3.0 * right).all()
+        assert (
+            (laid.cell_type == right).all()
+            and (laid.length == 1.0 + right).all()
+            and (laid.extra["dye"] == 2.0 + 3.0 * right).all()
+        )
 
 
 @pytest.mark.parametrize("name", ["microcolony", "quorum_sensing"])
@@ -238,31 +348,42 @@ def test_bytes_of_a_state_are_those_of_its_tensors(name):
     state = scene.seed(3, cells=crowd(scene.founders))
     cell, grid = state_bytes(state)
     names = ("colony", "uid", "parent", "position", "axis", "length", "radius")
-    held = sum(getattr(state, n).nbytes for n in names) + sum(v.nbytes for v in state.fields.values())
+    held = sum(getattr(state, n).nbytes for n in names) + sum(
+        v.nbytes for v in state.fields.values()
+    )
     assert cell * state.cells + grid * 3 == held and (grid > 0) == (name == "quorum_sensing")
 
 
 def test_spending_is_what_the_operators_are():
-    """The step with every effect counted apart, against the same step counted as a whole: nothing is left between effects but the step's own clock."""
+    """The step with every effect counted apart, against the same step counted as a whole: nothing
+    is left between effects but the step's own clock."""
     scene = tf.scenes.quorum_sensing()
-    one, other, spent = scene.seed(), scene.seed(), Spending()  # two, since a state keeps what was worked out of it
+    # two, since a state keeps what was worked out of it
+    one, other, spent = scene.seed(), scene.seed(), Spending()
     with Operators() as seen:
         scene.step(one, scene.dt)
     scene.step(other, scene.dt, spent)
-    assert seen.total == sum(c.total() for c in spent.calls.values()) and seen.bytes == sum(spent.bytes.values())
+    assert seen.total == sum(c.total() for c in spent.calls.values()) and seen.bytes == sum(
+        spent.bytes.values()
+    )
     assert list(spent.calls) == list(dict.fromkeys(e.title for e in scene.effects))
 
 
-# --- input and the command line -------------------------------------------------------------------------------------------------
+# --- input and the command line -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "options, word",
     [
-        ({"cells": 0}, "cells = 0"), ({"cells": True}, "cells = True"), ({"colonies": 0}, "colonies = 0"), ({"colonies": 1.5}, "colonies = 1.5"),
-        ({"seconds": -1}, "seconds = -1"), ({"seconds": math.nan}, "seconds = nan"), ({"device": "banana"}, "device = 'banana'"),
+        ({"cells": 0}, "cells = 0"),
+        ({"cells": True}, "cells = True"),
+        ({"colonies": 0}, "colonies = 0"),
+        ({"colonies": 1.5}, "colonies = 1.5"),
+        ({"seconds": -1}, "seconds = -1"),
+        ({"seconds": math.nan}, "seconds = nan"),
+        ({"device": "banana"}, "device = 'banana'"),
     ],
-)  # fmt: skip
+)
 def test_bad_options_are_refused(options, word):
     with pytest.raises(tf.InputError, match=word):
         tf.explain(tf.scenes.microcolony(), **options)
@@ -278,7 +399,9 @@ def test_as_many_colonies_as_the_parameters_are_for():
 def test_the_command_says_what_the_function_says(command, capsys):
     command("explain", "microcolony", "--set", "dim=3", "--seconds", 0)
     assert capsys.readouterr().out == tf.explain(tf.scenes.microcolony(dim=3), seconds=0) + "\n"
-    Path("mine.py").write_text("import torchfilm as tf\nscene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0))\n")
+    Path("mine.py").write_text(
+        "import torchfilm as tf\nscene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0))\n"
+    )
     command("explain", "mine.py", "--cells", 20, "--colonies", 2, "--seconds", 0.02)
     out = capsys.readouterr().out
     assert out.startswith("mine: 3-D") and "20 cells in each of 2 colonies" in out

@@ -1,4 +1,5 @@
-"""A hundred random scenes, the same each time, under the laws of experiments/fuzz.py; what longer runs of it found; and that it would notice."""
+"""A hundred random scenes, the same each time, under the laws of experiments/fuzz.py; what longer
+runs of it found; and that it would notice."""
 
 from __future__ import annotations
 
@@ -18,29 +19,44 @@ ENDINGS: list[str] = []
 
 
 @pytest.mark.slow
-@settings(max_examples=100, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+@settings(
+    max_examples=100,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
 @given(fuzz.DRAWS)
 def test_random_scenes_obey_the_laws(draw):
-    """Finite, nonnegative, unique uids, no escape, amounts conserved, the same alone as in the batch; failures are reported."""
+    """Finite, nonnegative, unique uids, no escape, amounts conserved, the same alone as in the
+    batch; failures are reported."""
     ENDINGS.append(fuzz.run(draw))
 
 
 def test_most_random_scenes_run():
-    """A fuzzer whose scenes are mostly refused tests nothing: at least half of those above ran to their end."""
+    """A fuzzer whose scenes are mostly refused tests nothing: at least half of those above ran to
+    their end."""
     if not ENDINGS:  # this test alone
         test_random_scenes_obey_the_laws()
     assert ENDINGS.count("ran") >= len(ENDINGS) / 2
 
 
 def far_apart(distance: float) -> tuple[tf.Scene, tf.Cells]:
-    """A medium that grows with its colony, voxels of 0.3 µm, and two cells `distance` µm apart along each axis; a colony of one beside it."""
-    medium = tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=1.0), box=((-1.2,) * 3, (1.2,) * 3), spacing=0.3, beyond="grow")
+    """A medium that grows with its colony, voxels of 0.3 µm, and two cells `distance` µm apart
+    along each axis; a colony of one beside it."""
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=1.0, initial=1.0),
+        box=((-1.2,) * 3, (1.2,) * 3),
+        spacing=0.3,
+        beyond="grow",
+    )
     cells = tf.Cells([[0.0] * 3, [distance] * 3, [0.0] * 3], [1.0, 0.0, 0.0], colony=[0, 0, 1])
     return tf.Scene(medium, founders=tf.Cells.single(3)), cells
 
 
 def test_a_medium_does_not_grow_without_end():
-    """Found by the fuzzer: cells 1 mm apart on a grid of 0.3 µm asked for 3.7e10 voxels, which no machine has. Refused at the start."""
+    """Found by the fuzzer: cells 1 mm apart on a grid of 0.3 µm asked for 3.7e10 voxels, which no
+    machine has. Refused at the start."""
     scene, cells = far_apart(1e3)
     with pytest.raises(tf.InputError, match=r"too small for colony 0.*at most 67,108,864 voxels"):
         scene.seed(2, cells=cells)
@@ -48,7 +64,8 @@ def test_a_medium_does_not_grow_without_end():
 
 @pytest.mark.parametrize("distance", [1e3, float("inf"), float("nan")])
 def test_a_cell_that_flies_away_fails_its_own_colony(device, dtype, distance):
-    """The same in the middle of a run: that colony is reported and the other goes on as it would have alone."""
+    """The same in the middle of a run: that colony is reported and the other goes on as it would
+    have alone."""
     scene, cells = far_apart(1.0)
     state = scene.seed(2, cells=cells, device=device, dtype=dtype)
     position = state.position.clone()
@@ -57,18 +74,27 @@ def test_a_cell_that_flies_away_fails_its_own_colony(device, dtype, distance):
     (failure,) = tf.failures(after)
     assert failure.colony_id == 0 and "1 cell(s) are beyond the box" in failure.reason
     assert all(bool(torch.isfinite(v).all()) for v in after.signals.values())
-    assert torch.equal(after.select([1]).signals["ahl"], scene.step(state.select([1]), 0.01).signals["ahl"])
+    assert torch.equal(
+        after.select([1]).signals["ahl"], scene.step(state.select([1]), 0.01).signals["ahl"]
+    )
 
 
 @pytest.mark.parametrize("law", ["volume", "length", "linear"])
-@pytest.mark.parametrize("more", [(), (tf.Division(length=4.0),), (tf.Mechanics(dim=3),)], ids=["alone", "division", "mechanics"])
+@pytest.mark.parametrize(
+    "more",
+    [(), (tf.Division(length=4.0),), (tf.Mechanics(dim=3),)],
+    ids=["alone", "division", "mechanics"],
+)
 def test_growth_past_all_numbers_is_reported(device, dtype, law, more):
-    """Found beside the fuzzer: e^10000 µm is no length, and without mechanics nobody said so; a step later cells were nowhere.
+    """Found beside the fuzzer: e^10000 µm is no length, and without mechanics nobody said so; a
+    step later cells were nowhere.
 
     The other colony goes on, and what is left of the failed one is finite.
     """
     huge = 1e38 if dtype == torch.float32 else 1e308
-    scene = tf.Scene(tf.Growth(rate=torch.tensor([huge, 0.01], dtype=torch.float64), law=law), *more)
+    scene = tf.Scene(
+        tf.Growth(rate=torch.tensor([huge, 0.01], dtype=torch.float64), law=law), *more
+    )
     start = scene.seed(2, device=device, dtype=dtype)
     state = scene.step(start, 100.0)
     assert "growth rate" in next(f for f in tf.failures(state) if f.colony_id == 0).reason
@@ -81,8 +107,11 @@ def test_growth_past_all_numbers_is_reported(device, dtype, law, more):
 
 @pytest.mark.parametrize("name", ["length", "axis", "a"])
 def test_the_fuzzer_notices_a_number_that_is_none(name):
-    """Each of its laws is broken on purpose: this one by a NaN in one cell of one colony, and only if that colony did not fail."""
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Circuit(lambda u, s, p, cell: {"a": -u.a}, species=("a",)))
+    """Each of its laws is broken on purpose: this one by a NaN in one cell of one colony, and only
+    if that colony did not fail."""
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Circuit(lambda u, s, p, cell: {"a": -u.a}, species=("a",))
+    )
     state = scene.seed(2)
     value = (state.fields[name] if name in state.fields else getattr(state, name)).clone()
     value[1] = torch.nan
@@ -93,7 +122,9 @@ def test_the_fuzzer_notices_a_number_that_is_none(name):
 
 
 def test_the_fuzzer_notices_cells_that_do_not_add_up():
-    state = tf.Scene(tf.Growth(rate=1.0), founders=tf.Cells([[0.0, 0.0], [9.0, 0.0]], [1.0, 0.0])).seed(1)
+    state = tf.Scene(
+        tf.Growth(rate=1.0), founders=tf.Cells([[0.0, 0.0], [9.0, 0.0]], [1.0, 0.0])
+    ).seed(1)
     fuzz.counted(state, state)
     with pytest.raises(AssertionError, match="unique"):
         fuzz.counted(state, state.replace(uid=torch.zeros_like(state.uid)))
@@ -102,15 +133,23 @@ def test_the_fuzzer_notices_cells_that_do_not_add_up():
 
 
 def test_hard_contacts_fling_no_cell_through_a_wall():
-    """Found by the fuzzer: two crossing cells in a corner at α γ = 1e-6, where next to nothing holds what no contact does: the exact solve moves them by
-    1.2 µm, one to a worst residual of 0.05 (or, by rounding, of less) by 6 µm, which took one through the wall by 2.7 µm. A move through a wall is cut."""
+    """Found by the fuzzer: two crossing cells in a corner at α γ = 1e-6, where next to nothing
+    holds what no contact does: the exact solve moves them by 1.2 µm, one to a worst residual of
+    0.05 (or, by rounding, of less) by 6 µm, which took one through the wall by 2.7 µm. A move
+    through a wall is cut.
+    """
     contacts = fuzz.Contacts(1e-6, 1.0, 1.0, False, None, "box", 0.3, None)
     bodies = fuzz.Bodies((7,), 5.0, (2.0, 3.0), 0.5, 2, 0)
-    draw = fuzz.Draw(bodies, contacts, None, None, None, fuzz.Beside(False, None, False), 0.01, 1, "float32", 0)
+    draw = fuzz.Draw(
+        bodies, contacts, None, None, None, fuzz.Beside(False, None, False), 0.01, 1, "float32", 0
+    )
     assert fuzz.run(draw) == "ran"
     scene, start = fuzz.scene_of(draw)
     state = tf.Settings(tolerance=0.05).apply(scene).step(start, 0.01)
     assert float(state.displacement[:, :2].norm(dim=1).max()) > 5.0, "the solve must fling a cell"
     assert int(state.reports["mechanics"].limited) >= 1
-    deepest = lambda state: min(float(s.gap_of_points(state.position, state.own_colony_id)[0].min()) for s in scene.listed[0].surfaces())  # noqa: E731
+    deepest = lambda state: min(
+        float(s.gap_of_points(state.position, state.own_colony_id)[0].min())
+        for s in scene.listed[0].surfaces()
+    )
     assert deepest(start) > 0 and deepest(state) > -0.5

@@ -1,10 +1,13 @@
-"""Gradients of whole runs against finite differences in float64: through growth, contacts, walls, bounds and division.
+"""Gradients of whole runs against finite differences in float64: through growth, contacts, walls,
+bounds and division.
 
-A run is a function of its parameters with jumps where a contact or a division comes or goes; between them it is smooth, and that is where
-its gradient is asked. Each run here is checked to have the same cells and the same contacts at both ends of the difference, so that
-the two can be compared. The central difference at h = 1e-5 is off by its truncation, h² ≈ 1e-10 relative, and by the rounding of the solves:
-they stop at 1e-10 of displacements of about 0.1 µm, over 2h that is at most 1e-10 · 0.1/2e-5 ≈ 5e-7 a step. Hence a relative bound of
-1e-5 of the gradient's size for a dozen steps.
+A run is a function of its parameters with jumps where a contact or a division comes or goes;
+between them it is smooth, and that is where its gradient is asked. Each run here is checked to have
+the same cells and the same contacts at both ends of the difference, so that the two can be
+compared. The central difference at h = 1e-5 is off by its truncation, h² ≈ 1e-10 relative, and by
+the rounding of the solves: they stop at 1e-10 of displacements of about 0.1 µm, over 2h that is at
+most 1e-10 · 0.1/2e-5 ≈ 5e-7 a step. Hence a relative bound of 1e-5 of the gradient's size for a
+dozen steps.
 """
 
 from __future__ import annotations
@@ -24,7 +27,8 @@ F64 = torch.float64
 
 
 def scattered(dim: int, count: int = 5) -> tf.Cells:
-    """Rods at generic angles, near enough to push each other, none of them in a special position."""
+    """Rods at generic angles, near enough to push each other, none of them in a special
+    position."""
     generator = torch.Generator().manual_seed(5)
     position = torch.zeros(count, dim, dtype=F64)
     position[:, 1] = 0.93 * torch.arange(count)
@@ -61,11 +65,20 @@ def run(scene: tf.Scene, state: tf.State, steps: int = 8, dt: float = 0.05) -> t
 Experiment = Callable[[Tensor], tf.State]
 
 
-def compare(outcome: Callable[[tf.State], Tensor], experiment: Experiment, at: list[float] | float, *, divides: bool = False) -> Tensor:
-    """Compare d outcome / d parameters with central differences, one parameter at a time; returns the gradient."""
+def compare(
+    outcome: Callable[[tf.State], Tensor],
+    experiment: Experiment,
+    at: list[float] | float,
+    *,
+    divides: bool = False,
+) -> Tensor:
+    """Compare d outcome / d parameters with central differences, one parameter at a time; returns
+    the gradient."""
     value = torch.tensor(at, dtype=F64, requires_grad=True)
     last = experiment(value)
-    assert (last.parent >= 0).any() == divides, "the run should have divided" if divides else "the run should not have divided"
+    assert (last.parent >= 0).any() == divides, (
+        "the run should have divided" if divides else "the run should not have divided"
+    )
     (gradient,) = torch.autograd.grad(outcome(last), value)
     assert torch.isfinite(gradient).all()
     flat, found = value.detach().reshape(-1), []
@@ -82,7 +95,10 @@ def compare(outcome: Callable[[tf.State], Tensor], experiment: Experiment, at: l
     difference = torch.tensor(found, dtype=F64).reshape(value.shape)
     size = float(difference.abs().max())
     assert size > 1e-3, "nothing depends on it: the comparison would prove nothing"
-    assert float((gradient - difference).abs().max()) <= RELATIVE * size, (gradient.tolist(), difference.tolist())
+    assert float((gradient - difference).abs().max()) <= RELATIVE * size, (
+        gradient.tolist(),
+        difference.tolist(),
+    )
     return gradient
 
 
@@ -90,17 +106,21 @@ check = partial(compare, outcome)
 
 
 def growing(dim: int, rate: Tensor, *more: tf.Effect, law: str = "volume", **options) -> tf.Scene:
-    return tf.Scene(tf.Growth(rate=rate, law=law), *more, mechanics(dim, **options), founders=scattered(dim))
+    return tf.Scene(
+        tf.Growth(rate=rate, law=law), *more, mechanics(dim, **options), founders=scattered(dim)
+    )
 
 
 def seeded(scene: tf.Scene, **options) -> tf.State:
     return scene.seed(dtype=F64, **options)
 
 
-MODES = [pytest.param({"unilateral": u}, id="unilateral" if u else "bilateral") for u in (False, True)]
+MODES = [
+    pytest.param({"unilateral": u}, id="unilateral" if u else "bilateral") for u in (False, True)
+]
 
 
-# --- growth through contacts ----------------------------------------------------------------------------------------------
+# --- growth through contacts ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -146,7 +166,8 @@ def test_growth_in_sub_steps():
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_growth_rate_across_divisions(dim, mode):
-    """The threshold is fixed and passed in the midst of a step, so that ±h divides the same cells at the same steps."""
+    """The threshold is fixed and passed in the midst of a step, so that ±h divides the same cells
+    at the same steps."""
 
     def experiment(rate):
         scene = growing(dim, rate, tf.Division(length=2.4, axis_noise=0.05), **mode)
@@ -181,16 +202,22 @@ def test_the_bounds_of_a_drawn_rate():
     check(experiment, [0.6, 1.1], divides=True)
 
 
-# --- walls ----------------------------------------------------------------------------------------------------------------
+# --- walls ----------------------------------------------------------------------------------------
 
 
 def between_walls(dim: int, **soft) -> list[tf.Plane]:
     """Two walls that press on the row of cells; in space two more across."""
     walls = [tf.Plane(y=-0.75, facing="+y", **soft), tf.Plane(y=4.4, facing="-y")]
-    return walls if dim == 2 else [*walls, tf.Plane(z=-0.8, facing="+z", **soft), tf.Plane(z=0.8, facing="-z")]
+    return (
+        walls
+        if dim == 2
+        else [*walls, tf.Plane(z=-0.8, facing="+z", **soft), tf.Plane(z=0.8, facing="-z")]
+    )
 
 
-@pytest.mark.parametrize("soft", [{}, {"stiffness": 3.0}, {"weight": 0.5}], ids=["hard", "soft", "weighted"])
+@pytest.mark.parametrize(
+    "soft", [{}, {"stiffness": 3.0}, {"weight": 0.5}], ids=["hard", "soft", "weighted"]
+)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_growth_rate_between_walls(dim, soft):
     def experiment(rate):
@@ -228,7 +255,11 @@ def test_place_of_a_wall_for_each_colony():
 
 def test_stiffness_of_a_wall():
     def experiment(stiffness):
-        scene = growing(2, torch.tensor(0.5, dtype=F64), walls=[tf.Plane(y=-0.5, facing="+y", stiffness=stiffness)])
+        scene = growing(
+            2,
+            torch.tensor(0.5, dtype=F64),
+            walls=[tf.Plane(y=-0.5, facing="+y", stiffness=stiffness)],
+        )
         return run(scene, seeded(scene))
 
     check(experiment, 3.0)
@@ -244,7 +275,7 @@ def test_radius_of_a_sphere_around(dim):
     check(experiment, 2.6)
 
 
-# --- the solve's own parameters -------------------------------------------------------------------------------------------
+# --- the solve's own parameters -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -276,15 +307,17 @@ def test_stiffness_and_drag(name):
     check(experiment, {"stiffness": 40.0, "viscosity": 1.3, "length_drag": 2.0}[name])
 
 
-# --- bounds of the length -------------------------------------------------------------------------------------------------
+# --- bounds of the length -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_cells_held_at_their_length_bound(dim, mode):
-    """A row of cells, head on, between two hard walls that leave no room: their length cannot grow, and must not shrink.
+    """A row of cells, head on, between two hard walls that leave no room: their length cannot grow,
+    and must not shrink.
 
-    With little drag on the length, growth is what gives way first, so that the bound Δl ≥ −growth is met.
+    With little drag on the length, growth is what gives way first, so that the bound Δl ≥ −growth
+    is met.
     """
     cells = scattered(dim, 3)
     position = torch.zeros(3, dim, dtype=F64)
@@ -297,7 +330,10 @@ def test_cells_held_at_their_length_bound(dim, mode):
     held = []
 
     def experiment(rate):
-        effect = mechanics(dim, walls=walls, length_drag=0.2, alpha=0.02, passes=1, tolerance=1e-12, **mode)  # stiffer, so solved further
+        # stiffer, so solved further
+        effect = mechanics(
+            dim, walls=walls, length_drag=0.2, alpha=0.02, passes=1, tolerance=1e-12, **mode
+        )
         scene = tf.Scene(tf.Growth(rate=rate), effect, founders=cells)
         state = run(scene, seeded(scene), steps=2)
         held.append(int((state.elongation == 0).sum()))
@@ -307,13 +343,14 @@ def test_cells_held_at_their_length_bound(dim, mode):
     assert min(held) > 0, "no cell was held at its bound: the comparison would prove nothing"
 
 
-# --- geometry -------------------------------------------------------------------------------------------------------------
+# --- geometry -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("name", ["position", "axis", "length", "radius"])
 def test_first_geometry(dim, name):
-    """Where the cells start, how they lie, how long and how thick they are: contact geometry passes gradients."""
+    """Where the cells start, how they lie, how long and how thick they are: contact geometry passes
+    gradients."""
     scene = growing(dim, torch.tensor(0.5, dtype=F64))
     first = seeded(scene)
 
@@ -337,7 +374,7 @@ def test_side_by_side_where_one_row_becomes_two():
     check(experiment, 0.8)
 
 
-# --- rules ----------------------------------------------------------------------------------------------------------------
+# --- rules ----------------------------------------------------------------------------------------
 
 
 def test_a_parameter_of_a_rule():
@@ -345,7 +382,13 @@ def test_a_parameter_of_a_rule():
         def update(cells):
             cells.growth_rate = gain * (1 + 0.3 * torch.sin(cells.position[:, 1].to(F64)))
 
-        scene = tf.Scene(tf.Rules(update), tf.Growth(), tf.Division(length=2.4), mechanics(2), founders=scattered(2))
+        scene = tf.Scene(
+            tf.Rules(update),
+            tf.Growth(),
+            tf.Division(length=2.4),
+            mechanics(2),
+            founders=scattered(2),
+        )
         return run(scene, seeded(scene), steps=10)
 
     check(experiment, 0.8, divides=True)
@@ -359,32 +402,44 @@ def test_a_parameter_of_a_divide_rule():
             daughter1.growth_rate = parent.growth_rate * gain
             daughter2.growth_rate = parent.growth_rate * (2 - gain)
 
-        scene = tf.Scene(tf.Rules(divide=divide), tf.Growth(rate=0.8), tf.Division(length=2.4), mechanics(2), founders=scattered(2))
+        scene = tf.Scene(
+            tf.Rules(divide=divide),
+            tf.Growth(rate=0.8),
+            tf.Division(length=2.4),
+            mechanics(2),
+            founders=scattered(2),
+        )
         return run(scene, seeded(scene), steps=10)
 
     check(experiment, 0.7, divides=True)
 
 
-# --- using it -------------------------------------------------------------------------------------------------------------
+# --- using it -------------------------------------------------------------------------------------
 
 
 def test_one_scene_serves_many_backward_passes():
-    """A search goes on with the same scene: a second run and backward pass give the same gradient as the first."""
+    """A search goes on with the same scene: a second run and backward pass give the same gradient
+    as the first."""
     y = torch.tensor(-0.55, dtype=F64, requires_grad=True)
     rate = torch.tensor(0.5, dtype=F64, requires_grad=True)
     scene = growing(2, rate, walls=[tf.Plane(y=y, facing="+y")])
-    first, second = (torch.autograd.grad(outcome(run(scene, seeded(scene))), (rate, y)) for _ in range(2))
+    first, second = (
+        torch.autograd.grad(outcome(run(scene, seeded(scene))), (rate, y)) for _ in range(2)
+    )
     assert [float(g) for g in first] == [float(g) for g in second]
 
 
 def test_a_parameter_changed_in_place_changes_the_run():
-    """An optimiser moves its parameters in place; a scene that holds them must follow, walls included."""
+    """An optimiser moves its parameters in place; a scene that holds them must follow, walls
+    included."""
     for name in ("rate", "y"):
         given = {"rate": torch.tensor(0.5, dtype=F64), "y": torch.tensor(-0.55, dtype=F64)}
         scene = growing(2, given["rate"], walls=[tf.Plane(y=given["y"], facing="+y")])
         given[name] += 0.05
         fresh = growing(2, given["rate"], walls=[tf.Plane(y=given["y"], facing="+y")])
-        assert torch.equal(run(scene, seeded(scene)).position, run(fresh, seeded(fresh)).position), name
+        assert torch.equal(
+            run(scene, seeded(scene)).position, run(fresh, seeded(fresh)).position
+        ), name
 
 
 def test_simulate_passes_gradients():
@@ -409,7 +464,9 @@ def test_gradients_in_float32():
 
 @pytest.mark.parametrize("mode", MODES)
 def test_no_graph_is_built_when_nothing_asks_for_one(mode):
-    scene = growing(2, torch.tensor(0.8, dtype=F64), tf.Division(length=2.4), walls=between_walls(2), **mode)
+    scene = growing(
+        2, torch.tensor(0.8, dtype=F64), tf.Division(length=2.4), walls=between_walls(2), **mode
+    )
     state = run(scene, seeded(scene), steps=10)
     assert state.cells > 5
     for name in ("position", "axis", "length", "radius", *state.fields):
@@ -426,19 +483,26 @@ def test_no_graph_is_built_under_no_grad():
 
 
 def test_asking_for_gradients_does_not_change_the_run():
-    """The same cells and the same contacts; only the last bits may differ, the sums being taken by other operators."""
+    """The same cells and the same contacts; only the last bits may differ, the sums being taken by
+    other operators."""
     plain, asked = torch.tensor(0.8, dtype=F64), torch.tensor(0.8, dtype=F64, requires_grad=True)
-    states = [run(scene := growing(2, rate, tf.Division(length=2.4)), seeded(scene), steps=10) for rate in (plain, asked)]
+    states = [
+        run(scene := growing(2, rate, tf.Division(length=2.4)), seeded(scene), steps=10)
+        for rate in (plain, asked)
+    ]
     assert torch.equal(states[0].uid, states[1].uid)
     # solved to 1e-10 of moves of 0.1 µm, ten times
     assert torch.allclose(states[0].position, states[1].position.detach(), rtol=0, atol=1e-9)
 
 
 def test_a_gradient_through_a_loose_solve_is_not_taken_in_silence():
-    """By default contacts are solved to 0.05. Without a gradient, or solved to 1e-6, there is nothing to say."""
+    """By default contacts are solved to 0.05. Without a gradient, or solved to 1e-6, there is
+    nothing to say."""
 
     def grown(rate, **given):
-        scene = tf.Scene(tf.Growth(rate=rate), tf.Division(length=2.5), tf.Mechanics(dim=2, **given), dt=0.05)
+        scene = tf.Scene(
+            tf.Growth(rate=rate), tf.Division(length=2.5), tf.Mechanics(dim=2, **given), dt=0.05
+        )
         *_, end = tf.simulate(scene, scene.seed(), cells=4)
         return end
 

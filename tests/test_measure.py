@@ -1,4 +1,5 @@
-"""What is measured on a state: overlaps with walls, wherever along a cell they are deepest, and neighbours."""
+"""What is measured on a state: overlaps with walls, wherever along a cell they are deepest, and
+neighbours."""
 
 from __future__ import annotations
 
@@ -17,9 +18,18 @@ WALLS = {
         lambda d: tf.Sphere((0.2, 0.0, 0.1)[:d], 1.5, inside=False),
         lambda p: np.linalg.norm(p - np.array([0.2, 0.0, 0.1])[: p.shape[-1]], axis=-1) - 1.5,
     ),
-    "sphere": (lambda d: tf.Sphere((0.2, 0.0, 0.1)[:d], 2.5), lambda p: 2.5 - np.linalg.norm(p - np.array([0.2, 0.0, 0.1])[: p.shape[-1]], axis=-1)),
-    "box": (lambda d: tf.Box((-1, -2, -INF)[:d], (1.5, 2, 1)[:d]), lambda p: _in_box(p, (-1, -2, -INF), (1.5, 2, 1))),
-    "plane": (lambda d: tf.Plane(point=(0.1,) * d, normal=(1.0, 2.0, -0.5)[:d]), lambda p: _above(p, 0.1, np.array([1.0, 2.0, -0.5]))),
+    "sphere": (
+        lambda d: tf.Sphere((0.2, 0.0, 0.1)[:d], 2.5),
+        lambda p: 2.5 - np.linalg.norm(p - np.array([0.2, 0.0, 0.1])[: p.shape[-1]], axis=-1),
+    ),
+    "box": (
+        lambda d: tf.Box((-1, -2, -INF)[:d], (1.5, 2, 1)[:d]),
+        lambda p: _in_box(p, (-1, -2, -INF), (1.5, 2, 1)),
+    ),
+    "plane": (
+        lambda d: tf.Plane(point=(0.1,) * d, normal=(1.0, 2.0, -0.5)[:d]),
+        lambda p: _above(p, 0.1, np.array([1.0, 2.0, -0.5])),
+    ),
 }
 
 
@@ -36,20 +46,30 @@ def _above(p: np.ndarray, at: float, normal: np.ndarray) -> np.ndarray:
 def cells(dim: int, count: int = 400) -> tf.Cells:
     """A colony for each rod, near the origin and every way round."""
     rng = np.random.default_rng(3)
-    return tf.Cells(rng.uniform(-2, 2, (count, dim)), unit(rng, count, dim), rng.uniform(0, 4, count), rng.uniform(0.3, 0.6, count), colony=np.arange(count))
+    return tf.Cells(
+        rng.uniform(-2, 2, (count, dim)),
+        unit(rng, count, dim),
+        rng.uniform(0, 4, count),
+        rng.uniform(0.3, 0.6, count),
+        colony=np.arange(count),
+    )
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("kind", list(WALLS))
 def test_overlap_with_a_wall_is_the_deepest_along_the_cell(device, dtype, dim, kind):
-    """Against 4,001 points along each rod of up to 4 µm. A distance changes no faster than its point moves, so between two samples, 1e-3 µm apart,
-    at most 5e-4 µm are missed; float32 rounds lengths, radii and axes, 3e-7 µm each and a few of them.
+    """Against 4,001 points along each rod of up to 4 µm. A distance changes no faster than its
+    point moves, so between two samples, 1e-3 µm apart, at most 5e-4 µm are missed; float32 rounds
+    lengths, radii and axes, 3e-7 µm each and a few of them.
     """
     wall, distance = WALLS[kind]
     given = cells(dim)
     state = tf.Scene(tf.Growth(), founders=given).seed(device=device, dtype=dtype)
     found = tf.measure.overlaps(state, [wall(dim)]).walls.cpu().numpy()
-    samples = given.position + np.linspace(-0.5, 0.5, 4001)[:, None, None] * given.length[:, None] * given.axis
+    samples = (
+        given.position
+        + np.linspace(-0.5, 0.5, 4001)[:, None, None] * given.length[:, None] * given.axis
+    )
     deepest = np.maximum((given.radius - distance(samples)).max(0), 0)
     rounding = 2e-6 if dtype == torch.float32 else 1e-12
     assert (found >= deepest - rounding).all() and (found <= deepest + 5e-4 + rounding).all()
@@ -58,14 +78,18 @@ def test_overlap_with_a_wall_is_the_deepest_along_the_cell(device, dtype, dim, k
 
 def test_a_ball_under_the_middle_of_a_rod_is_seen(device, dtype):
     """Neither end touches; the middle is 0.25 µm deep, exactly in binary."""
-    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).seed(2, device=device, dtype=dtype)
+    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).seed(
+        2, device=device, dtype=dtype
+    )
     found = tf.measure.overlaps(state, [tf.Sphere((0.5, -0.75), 0.5, inside=False)])
     assert found.walls.tolist() == [0.25, 0.25] and found.walls.dtype == torch.float64
 
 
 def test_a_wall_for_each_colony_is_measured_in_its_own(device):
     """Colonies taken out of their batch too: a wall goes by the colony's id."""
-    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).seed(3, device=device)
+    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).seed(
+        3, device=device
+    )
     ball = tf.Sphere([[0.5, -0.75], [0.5, -0.875], [0.5, -5.0]], 0.5, inside=False)
     assert tf.measure.overlaps(state, [ball]).walls.tolist() == [0.25, 0.125, 0.0]
     assert tf.measure.overlaps(state.select([2, 1]), [ball]).walls.tolist() == [0.0, 0.125]
@@ -74,17 +98,24 @@ def test_a_wall_for_each_colony_is_measured_in_its_own(device):
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("gap", [0.0, 0.5, 3.0])
 def test_neighbours_are_all_pairs_of_a_colony_within_the_gap(device, dtype, dim, gap):
-    """Against every pair whose centres are near enough, both from the state's own numbers; two colonies in one place see nothing of each other."""
+    """Against every pair whose centres are near enough, both from the state's own numbers; two
+    colonies in one place see nothing of each other."""
     scene = tf.Scene(tf.Growth(), founders=crowd(np.random.default_rng(7), 150, dim))
     state = scene.seed(2, device=device, dtype=dtype)
     i, j, distance = tf.measure.neighbours(state, gap)
     found = {(min(p), max(p)) for p in zip(i.tolist(), j.tolist(), strict=True)}
     assert len(found) == i.numel() and found == set(map(tuple, near_pairs(state, gap).tolist()))
     place = state.position
-    assert distance.dtype == torch.float64 and torch.allclose(distance, (place[i] - place[j]).norm(dim=1), rtol=1e-14)
+    assert distance.dtype == torch.float64 and torch.allclose(
+        distance, (place[i] - place[j]).norm(dim=1), rtol=1e-14
+    )
     alone = tf.measure.neighbours(state.select([1]), gap)
     second = state.colony[i] == 1
-    assert torch.equal(alone[0] + 150, i[second]) and torch.equal(alone[1] + 150, j[second]) and torch.equal(alone[2], distance[second])
+    assert (
+        torch.equal(alone[0] + 150, i[second])
+        and torch.equal(alone[1] + 150, j[second])
+        and torch.equal(alone[2], distance[second])
+    )
 
 
 @pytest.mark.parametrize("gap", [-1.0, math.inf, "near"])

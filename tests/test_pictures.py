@@ -19,7 +19,9 @@ from torchfilm.pictures.frames import Recorded
 
 def outline(axis, length=2.0, radius=0.5, position=(0.0, 0.0)) -> np.ndarray:
     """One polygon, (2·CAP_POINTS, 2)."""
-    return outlines(np.array([position]), np.array([axis], dtype=float), np.array([length]), np.array([radius]))[0]
+    return outlines(
+        np.array([position]), np.array([axis], dtype=float), np.array([length]), np.array([radius])
+    )[0]
 
 
 def area(polygon: np.ndarray) -> float:
@@ -33,11 +35,12 @@ def distance_to_segment(points: np.ndarray, half: float, axis: np.ndarray) -> np
     return np.linalg.norm(points - s[:, None] * axis, axis=1)
 
 
-# --- outlines -------------------------------------------------------------------------------------------------------------
+# --- outlines -------------------------------------------------------------------------------------
 
 
 def test_an_upright_cell_is_a_circle():
-    """Seen end on: every point of the outline lies at the radius, whatever the length, and all around."""
+    """Seen end on: every point of the outline lies at the radius, whatever the length, and all
+    around."""
     polygon = outline((0.0, 0.0), length=7.0, radius=0.4, position=(3.0, -2.0))
     from_centre = polygon - (3.0, -2.0)
     assert np.allclose(np.linalg.norm(from_centre, axis=1), 0.4, rtol=1e-12)
@@ -49,29 +52,46 @@ def test_an_upright_cell_is_a_circle():
 def test_a_lying_cell_is_a_capsule(angle):
     axis = np.array([math.cos(angle), math.sin(angle)])
     polygon = outline(axis, 3.0, 0.5)
-    assert np.allclose(distance_to_segment(polygon, 1.5, axis), 0.5, rtol=1e-12), "points of the outline lie at the radius"
-    assert (polygon @ axis).max() == pytest.approx(2.0) and (polygon @ axis).min() == pytest.approx(-2.0)
-    # rectangle 2rl and two half circles, as polygons of the 6 chords that 7 points make: 2 · 6 · ½ r² sin 30° = 3 r²
-    assert abs(area(polygon)) == pytest.approx(2 * 0.5 * 3.0 + 3 * 0.25, rel=1e-12), "or the polygon crosses itself"
+    assert np.allclose(distance_to_segment(polygon, 1.5, axis), 0.5, rtol=1e-12), (
+        "points of the outline lie at the radius"
+    )
+    assert (polygon @ axis).max() == pytest.approx(2.0) and (polygon @ axis).min() == pytest.approx(
+        -2.0
+    )
+    # rectangle 2rl and two half circles, as polygons of the 6 chords that 7 points make: 2 · 6 · ½
+    # r² sin 30° = 3 r²
+    assert abs(area(polygon)) == pytest.approx(2 * 0.5 * 3.0 + 3 * 0.25, rel=1e-12), (
+        "or the polygon crosses itself"
+    )
 
 
 def test_a_tilted_cell_is_foreshortened():
-    """Half out of the plane: the projection of the centreline is half as long, the caps are as round as ever."""
-    assert abs(area(outline((0.5, 0.0), 3.0, 0.5))) == pytest.approx(2 * 0.5 * 1.5 + 3 * 0.25, rel=1e-12)
+    """Half out of the plane: the projection of the centreline is half as long, the caps are as
+    round as ever."""
+    assert abs(area(outline((0.5, 0.0), 3.0, 0.5))) == pytest.approx(
+        2 * 0.5 * 1.5 + 3 * 0.25, rel=1e-12
+    )
 
 
 def test_many_outlines_at_once_are_each_their_own():
     rng = np.random.default_rng(0)
-    position, axis, length, radius = rng.normal(size=(5, 2)), rng.normal(size=(5, 2)), rng.uniform(0, 3, 5), rng.uniform(0.3, 1, 5)
+    position, axis, length, radius = (
+        rng.normal(size=(5, 2)),
+        rng.normal(size=(5, 2)),
+        rng.uniform(0, 3, 5),
+        rng.uniform(0.3, 1, 5),
+    )
     axis /= np.linalg.norm(axis, axis=1, keepdims=True) * 1.3
     together = outlines(position, axis, length, radius)
     assert together.shape[0] == 5
     for k in range(5):
-        assert np.array_equal(together[k], outlines(*(x[k : k + 1] for x in (position, axis, length, radius)))[0])
+        assert np.array_equal(
+            together[k], outlines(*(x[k : k + 1] for x in (position, axis, length, radius)))[0]
+        )
     assert np.isfinite(outlines(position, 0 * axis, 0 * length, radius)).all()
 
 
-# --- sheets ---------------------------------------------------------------------------------------------------------------
+# --- sheets ---------------------------------------------------------------------------------------
 
 
 def cells_of(state: tf.State) -> Frame:
@@ -95,14 +115,18 @@ def coloured(path) -> float:
 @pytest.mark.parametrize("view", ["xy", "xz", "yz"])
 @pytest.mark.parametrize("colour", ["angle", "length", "uid", "growth_rate", "divide_flag"])
 def test_a_sheet_is_written(grown, tmp_path, view, colour):
-    path = sheet(cells_of(grown), tmp_path / "sheet.png", view=view, colour=colour, title="three colonies")
+    path = sheet(
+        cells_of(grown), tmp_path / "sheet.png", view=view, colour=colour, title="three colonies"
+    )
     assert path == tmp_path / "sheet.png" and path.stat().st_size > 2000
     assert coloured(path) > 0.01
 
 
 def test_a_frame_of_a_state_is_that_of_its_file(grown, tmp_path):
     scene = tf.scenes.microcolony(dim=3)
-    for _ in tf.simulate(scene, grown, until=grown.time + 0.025, record=tf.Recorder(tmp_path / "run.h5", scene)):
+    for _ in tf.simulate(
+        scene, grown, until=grown.time + 0.025, record=tf.Recorder(tmp_path / "run.h5", scene)
+    ):
         pass
     with tf.Results(tmp_path / "run.h5") as results:
         recorded = results.frame(0)
@@ -113,13 +137,16 @@ def test_a_frame_of_a_state_is_that_of_its_file(grown, tmp_path):
 
 
 def test_one_cell_is_as_large_as_it_should_be(tmp_path):
-    """A rod of 4 × 1 µm in a picture of its own: about its share of a square around it, and four times as wide as high."""
+    """A rod of 4 × 1 µm in a picture of its own: about its share of a square around it, and four
+    times as wide as high."""
     state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 3.0)).seed()
     path = sheet(cells_of(state), tmp_path / "one.png")
     image = matplotlib.image.imread(path)[..., :3]
     image = image[: int(0.8 * len(image))]  # below stands the legend
     y, x = np.nonzero((image.max(2) - image.min(2)) > 0.15)
-    assert (np.ptp(x) + 1) / (np.ptp(y) + 1) == pytest.approx(4.0, rel=0.05), "the scale differs along x and y"
+    assert (np.ptp(x) + 1) / (np.ptp(y) + 1) == pytest.approx(4.0, rel=0.05), (
+        "the scale differs along x and y"
+    )
 
 
 @pytest.mark.parametrize("away", [(1e4, -1e4), (-50.0, 0.0), (0.0, 300.0)])
@@ -131,7 +158,9 @@ def test_a_colony_far_from_the_origin_is_drawn(tmp_path, away):
         state = tf.Scene(tf.Growth(), founders=cells).seed()
         shares.append(coloured(sheet(cells_of(state), tmp_path / f"{name}.png")))
     assert shares[0] > 0.02
-    assert shares[1] == pytest.approx(shares[0], rel=0.05), "it is the same colony and should look the same"
+    assert shares[1] == pytest.approx(shares[0], rel=0.05), (
+        "it is the same colony and should look the same"
+    )
 
 
 def test_colonies_far_apart_are_each_in_the_middle_of_their_panel(tmp_path):
@@ -139,7 +168,9 @@ def test_colonies_far_apart_are_each_in_the_middle_of_their_panel(tmp_path):
     one = tf.Cells([[0.0, 0.0]], [1.0, 0.0])
     two = tf.Scene(tf.Growth(), founders=cells).seed()
     both = tf.Scene(tf.Growth(), founders=one).seed(2)
-    shares = [coloured(sheet(cells_of(s), tmp_path / f"{k}.png")) for k, s in enumerate((two, both))]
+    shares = [
+        coloured(sheet(cells_of(s), tmp_path / f"{k}.png")) for k, s in enumerate((two, both))
+    ]
     assert shares[0] == pytest.approx(shares[1], rel=0.05)
 
 
@@ -153,11 +184,19 @@ def test_too_many_colonies_are_cut_and_it_is_said(tmp_path, monkeypatch):
 
     titles = []
     real = Figure.suptitle
-    monkeypatch.setattr(Figure, "suptitle", lambda self, text, **options: titles.append(text) or real(self, text, **options))
+    monkeypatch.setattr(
+        Figure,
+        "suptitle",
+        lambda self, text, **options: titles.append(text) or real(self, text, **options),
+    )
     state = tf.Scene(tf.Growth(), founders=tf.Cells.single(2)).seed(40)
     sheet(cells_of(state), tmp_path / "sheet.png", title="many")
     sheet(cells_of(state), tmp_path / "few.png", title="few", most=4)
-    assert titles[0].startswith("many") and "first 36 of 40" in titles[0] and "first 4 of 40" in titles[1]
+    assert (
+        titles[0].startswith("many")
+        and "first 36 of 40" in titles[0]
+        and "first 4 of 40" in titles[1]
+    )
 
 
 def test_axes_of_a_2_d_state_need_no_third_coordinate(tmp_path):
@@ -165,7 +204,7 @@ def test_axes_of_a_2_d_state_need_no_third_coordinate(tmp_path):
     assert coloured(sheet(cells_of(state), tmp_path / "sheet.png")) > 0.02
 
 
-# --- show -----------------------------------------------------------------------------------------------------------------
+# --- show -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +267,8 @@ def test_a_kind_of_picture_that_is_not_known_is_told(recorded, tmp_path):
 
 
 def walls_drawn(tmp_path, walls, view: str, dim: int = 3, colonies: int = 1) -> list[list]:
-    """The walls in each colony's panel, drawn twice over as in a film, of a run that is read back from its file."""
+    """The walls in each colony's panel, drawn twice over as in a film, of a run that is read back
+    from its file."""
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=dim, walls=walls), dt=0.05)
     path = tmp_path / "run.h5"
     for _ in tf.simulate(scene, scene.seed(colonies), until=0.05, record=path):
@@ -244,25 +284,37 @@ def walls_drawn(tmp_path, walls, view: str, dim: int = 3, colonies: int = 1) -> 
                 add_walls(ax, frame.walls, int(frame.colony_id[place]), view)
             assert ax.get_xlim() == (-9.0, 9.0) and ax.get_ylim() == (-5.0, 5.0)
             panels.append([a for a in (*ax.lines, *ax.patches) if a.get_gid() == WALL])
-            assert len(ax.lines) + len(ax.patches) == len(panels[-1]) + 1, "the scale bar and nothing else"
+            assert len(ax.lines) + len(ax.patches) == len(panels[-1]) + 1, (
+                "the scale bar and nothing else"
+            )
     return panels
 
 
 def test_walls_are_drawn_where_they_stand(tmp_path):
-    """A hard floor and a soft lid are lines from the side and nothing from above; a wall askew is a line nowhere but seen along it."""
+    """A hard floor and a soft lid are lines from the side and nothing from above; a wall askew is a
+    line nowhere but seen along it."""
     floor, lid = tf.Plane(z=-0.5, facing="+z"), tf.Plane(z=2.0, facing="-z", stiffness=30.0)
     askew = tf.Plane(point=(3.0, 0.0, 0.0), normal=(-0.6, 0.8, 0.0))
     (above,) = walls_drawn(tmp_path, [floor, lid, askew], "xy")
     assert len(above) == 1 and above[0].get_slope() is None and above[0].get_linestyle() == "-"
     (x, y), (x2, y2) = above[0].get_xy1(), above[0].get_xy2()
-    assert (-0.6 * x + 0.8 * y, -0.6 * x2 + 0.8 * y2) == (pytest.approx(-1.8), pytest.approx(-1.8)) and (x, y) != (x2, y2)
+    assert (-0.6 * x + 0.8 * y, -0.6 * x2 + 0.8 * y2) == (
+        pytest.approx(-1.8),
+        pytest.approx(-1.8),
+    ) and (x, y) != (x2, y2)
     (tmp_path / "run.h5").unlink()
     (side,) = walls_drawn(tmp_path, [floor, lid, askew], "xz")
-    assert [(line.get_xy1()[1], line.get_xy2()[1], line.get_linestyle()) for line in side] == [(-0.5, -0.5, "-"), (2.0, 2.0, "--")]
+    assert [(line.get_xy1()[1], line.get_xy2()[1], line.get_linestyle()) for line in side] == [
+        (-0.5, -0.5, "-"),
+        (2.0, 2.0, "--"),
+    ]
 
 
 def test_each_colonys_own_walls_are_drawn(tmp_path):
-    walls = [tf.Channel(width=[4.0, 6.0], low_end=-8.0), tf.Sphere(center=(5.0, 0.0), radius=[1.0, 2.0], inside=False)]
+    walls = [
+        tf.Channel(width=[4.0, 6.0], low_end=-8.0),
+        tf.Sphere(center=(5.0, 0.0), radius=[1.0, 2.0], inside=False),
+    ]
     first, second = walls_drawn(tmp_path, walls, "xy", dim=2, colonies=2)
     for drawn, half, radius in ((first, 2.0, 1.0), (second, 3.0, 2.0)):
         assert sorted(abs(a.get_xy1()[1]) for a in drawn[:-1]) == [0.0, half, half]

@@ -1,4 +1,5 @@
-"""Pictures: what colour a cell or a place of the medium gets, which part of it is seen, and what the legend says of it."""
+"""Pictures: what colour a cell or a place of the medium gets, which part of it is seen, and what
+the legend says of it."""
 
 from __future__ import annotations
 
@@ -23,21 +24,48 @@ from torchfilm.signals.grid import Grid
 NEAR = 2 / 255
 
 
-def frame(position, *, colony=None, signals=None, origin=(-8.0, -8.0, -4.0), spacing=(1.0, 1.0, 1.0), height=None, **fields) -> Frame:
-    """Round cells of radius 1 at (N, d), with any fields; signals (nx, ny, nz) are the same for all colonies."""
+def frame(
+    position,
+    *,
+    colony=None,
+    signals=None,
+    origin=(-8.0, -8.0, -4.0),
+    spacing=(1.0, 1.0, 1.0),
+    height=None,
+    **fields,
+) -> Frame:
+    """Round cells of radius 1 at (N, d), with any fields; signals (nx, ny, nz) are the same for all
+    colonies."""
     position = np.asarray(position, dtype=float)
     n, dim = position.shape
     colony = np.zeros(n, dtype=int) if colony is None else np.asarray(colony)
     axis = np.zeros((n, dim))
     axis[:, 0] = 1
-    cells = {"colony": colony, "uid": np.arange(n), "position": position, "axis": axis, "length": np.zeros(n), "radius": np.ones(n)}
+    cells = {
+        "colony": colony,
+        "uid": np.arange(n),
+        "position": position,
+        "axis": axis,
+        "length": np.zeros(n),
+        "radius": np.ones(n),
+    }
     cells |= {name: np.asarray(value) for name, value in fields.items()}
     ids = np.arange(colony.max() + 1)
     if signals is None:
         return Frame(cells, 0.0, ids)
     shape = np.tile(next(iter(signals.values())).shape, (len(ids), 1))
     grids = {name: [np.asarray(v, dtype=float)] * len(ids) for name, v in signals.items()}
-    return Frame(cells, 0.0, ids, {}, grids, np.tile(np.array(origin, dtype=float), (len(ids), 1)), shape, np.array(spacing), height)
+    return Frame(
+        cells,
+        0.0,
+        ids,
+        {},
+        grids,
+        np.tile(np.array(origin, dtype=float), (len(ids), 1)),
+        shape,
+        np.array(spacing),
+        height,
+    )
 
 
 class Drawn:
@@ -65,7 +93,7 @@ def viridis(level: float) -> np.ndarray:
     return np.array(colormaps["viridis"](level)[:3])
 
 
-# --- cells ----------------------------------------------------------------------------------------------------------------
+# --- cells ----------------------------------------------------------------------------------------
 
 
 def test_the_lowest_and_the_highest_cell_get_the_ends_of_the_map():
@@ -77,33 +105,57 @@ def test_the_lowest_and_the_highest_cell_get_the_ends_of_the_map():
 def test_given_limits_hold_whatever_the_cells_have():
     a = Drawn(frame([[0, 0], [4, 0]], yfp=[1.0, 3.0]), colour="yfp", limits={"yfp": (0, 4)})
     b = Drawn(frame([[0, 0], [4, 0]], yfp=[1.0, 9.0]), colour="yfp", limits={"yfp": (0, 4)})
-    assert a.at(0, 0) == pytest.approx(viridis(0.25), abs=NEAR) and np.array_equal(a.at(0, 0), b.at(0, 0))
+    assert a.at(0, 0) == pytest.approx(viridis(0.25), abs=NEAR) and np.array_equal(
+        a.at(0, 0), b.at(0, 0)
+    )
     assert b.at(4, 0) == pytest.approx(viridis(1.0), abs=NEAR)
-    assert [x.survey.scales[0].beyond for x in (a, b)] == ["neither", "max"], "the legend must tell that a cell is beyond it"
+    assert [x.survey.scales[0].beyond for x in (a, b)] == ["neither", "max"], (
+        "the legend must tell that a cell is beyond it"
+    )
 
 
 def test_one_range_for_all_colonies():
     drawn = Drawn(frame([[0, 0], [0, 0]], colony=[0, 1], yfp=[0.0, 1.0]), colour="yfp")
-    assert drawn.at(0, 0, 0) == pytest.approx(viridis(0.0), abs=NEAR) and drawn.at(0, 0, 1) == pytest.approx(viridis(1.0), abs=NEAR)
+    assert drawn.at(0, 0, 0) == pytest.approx(viridis(0.0), abs=NEAR) and drawn.at(
+        0, 0, 1
+    ) == pytest.approx(viridis(1.0), abs=NEAR)
 
 
 def test_lights_of_channels_add_up():
-    """cyan + yellow is white; a cell that gives off no light is dark, but not as dark as the paper."""
-    drawn = Drawn(frame([[0, 0], [4, 0], [8, 0], [12, 0]], cfp=[2.0, 0, 2.0, 0], yfp=[0, 0.5, 0.5, 0]), channels={"cfp": "cyan", "yfp": "yellow"})
-    for x, colour in ((0, (FLOOR, 1, 1)), (4, (1, 1, FLOOR)), (8, (1, 1, 1)), (12, (FLOOR, FLOOR, FLOOR))):
+    """cyan + yellow is white; a cell that gives off no light is dark, but not as dark as the
+    paper."""
+    drawn = Drawn(
+        frame([[0, 0], [4, 0], [8, 0], [12, 0]], cfp=[2.0, 0, 2.0, 0], yfp=[0, 0.5, 0.5, 0]),
+        channels={"cfp": "cyan", "yfp": "yellow"},
+    )
+    for x, colour in (
+        (0, (FLOOR, 1, 1)),
+        (4, (1, 1, FLOOR)),
+        (8, (1, 1, 1)),
+        (12, (FLOOR, FLOOR, FLOOR)),
+    ):
         assert drawn.at(x, 0) == pytest.approx(colour, abs=NEAR)
-    assert drawn.at(2, 1.0) == pytest.approx((0, 0, 0), abs=NEAR), "between the cells of a fluorescence picture it is black"
+    assert drawn.at(2, 1.0) == pytest.approx((0, 0, 0), abs=NEAR), (
+        "between the cells of a fluorescence picture it is black"
+    )
 
 
 def test_each_channel_has_its_own_range_from_zero():
-    made = Drawn(frame([[0, 0], [4, 0]], cfp=[100.0, 200.0], yfp=[0.1, 0.2]), channels={"cfp": "cyan", "yfp": "#ffff00"}).survey
-    assert [s.limits for s in made.scales] == [(0.0, 200.0), (0.0, 0.2)] and [s.name for s in made.scales] == ["cfp", "yfp"]
+    made = Drawn(
+        frame([[0, 0], [4, 0]], cfp=[100.0, 200.0], yfp=[0.1, 0.2]),
+        channels={"cfp": "cyan", "yfp": "#ffff00"},
+    ).survey
+    assert [s.limits for s in made.scales] == [(0.0, 200.0), (0.0, 0.2)] and [
+        s.name for s in made.scales
+    ] == ["cfp", "yfp"]
 
 
 def test_the_legend_of_a_channel_shows_the_colours_of_its_cells():
     drawn = Drawn(frame([[0, 0], [4, 0]], cfp=[0.5, 1.0]), channels={"cfp": "cyan"})
     # the map has 256 steps
-    assert drawn.survey.scales[0].paint(np.array([0.5]))[0, :3] == pytest.approx(drawn.at(0, 0), abs=1 / 255 + NEAR)
+    assert drawn.survey.scales[0].paint(np.array([0.5]))[0, :3] == pytest.approx(
+        drawn.at(0, 0), abs=1 / 255 + NEAR
+    )
 
 
 @pytest.mark.parametrize("options", [{"colour": "yfp"}, {"channels": {"yfp": "yellow"}}])
@@ -118,26 +170,39 @@ def test_kinds_of_cells_have_a_colour_each():
     assert drawn.survey.scales[0].kinds == (0, 3, 7)
     colours = {tuple(drawn.at(x, 0)) for x in (0, 4, 8)}
     assert len(colours) == 3
-    with_limits = Drawn(frame([[0, 0], [4, 0], [8, 0]], cell_type=[0, 7, 3]), colour="cell_type", limits={"cell_type": (0, 7)})
+    with_limits = Drawn(
+        frame([[0, 0], [4, 0], [8, 0]], cell_type=[0, 7, 3]),
+        colour="cell_type",
+        limits={"cell_type": (0, 7)},
+    )
     assert with_limits.at(4, 0) == pytest.approx(viridis(1.0), abs=NEAR)
-    assert Drawn(frame(np.arange(24).reshape(12, 2) * 3.0), colour="uid").survey.scales[0].kinds == (), "twelve are no kinds"
+    assert (
+        Drawn(frame(np.arange(24).reshape(12, 2) * 3.0), colour="uid").survey.scales[0].kinds == ()
+    ), "twelve are no kinds"
 
 
 @pytest.mark.parametrize("view, nearest", [("xy", 2), ("xz", 1), ("yz", 0)])
 def test_the_cell_nearest_to_the_eye_hides_the_others(view, nearest):
-    """x, y, z turn right: one looks down on xy from above, at xz from the side where y is low, at yz from that where x is high."""
+    """x, y, z turn right: one looks down on xy from above, at xz from the side where y is low, at
+    yz from that where x is high."""
     position = np.zeros((2, 3))
     position[0, nearest] = -3.0 if view == "xz" else 3.0
     drawn = Drawn(frame(position, yfp=[1.0, 0.0]), colour="yfp", view=view)
     assert drawn.at(0, 0) == pytest.approx(viridis(1.0), abs=NEAR)
 
 
-# --- signals --------------------------------------------------------------------------------------------------------------
+# --- signals --------------------------------------------------------------------------------------
 
 
 def ramp(axis: int, shape=(16, 16, 8)) -> np.ndarray:
     """0 to 1 from the first voxel to the last along an axis."""
-    return np.moveaxis(np.broadcast_to(np.linspace(0, 1, shape[axis]), np.moveaxis(np.empty(shape), axis, -1).shape), -1, axis)
+    return np.moveaxis(
+        np.broadcast_to(
+            np.linspace(0, 1, shape[axis]), np.moveaxis(np.empty(shape), axis, -1).shape
+        ),
+        -1,
+        axis,
+    )
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -152,14 +217,22 @@ def test_white_is_lowest_and_black_highest_at_the_right_places(axis):
 
 @pytest.mark.parametrize("view", ["xy", "xz", "yz"])
 def test_a_section_is_what_cells_there_would_read(view, dtype, device):
-    grid = Grid(torch.tensor([[-3.0, 2.0, 5.0]], dtype=torch.float64, device=device), torch.tensor([[5, 6, 7]], device=device), (1.0, 2.0, 0.5))
-    values = torch.rand(grid.nodes, dtype=dtype, device=device, generator=torch.Generator(device).manual_seed(0))
+    grid = Grid(
+        torch.tensor([[-3.0, 2.0, 5.0]], dtype=torch.float64, device=device),
+        torch.tensor([[5, 6, 7]], device=device),
+        (1.0, 2.0, 0.5),
+    )
+    values = torch.rand(
+        grid.nodes, dtype=dtype, device=device, generator=torch.Generator(device).manual_seed(0)
+    )
     places = grid.centres()
     k = {"xy": 2, "xz": 1, "yz": 0}[view]
     low, high = float(grid.origin[0, k]), float(grid.high[0, k])
     for at in (low + 1e-6, low + 0.3 * (high - low), 0.5 * (low + high), high - 1e-6):
         places[:, k] = at
-        met = stencil(grid, places, torch.zeros(len(places), dtype=torch.int64, device=device), dtype=dtype)
+        met = stencil(
+            grid, places, torch.zeros(len(places), dtype=torch.int64, device=device), dtype=dtype
+        )
         wanted = read(values, met).reshape(5, 6, 7).cpu().numpy()
         origin, spacing = grid.origin[0].cpu().numpy(), np.array(grid.spacing)
         found = section(values.reshape(5, 6, 7).cpu().numpy(), origin, spacing, view=view, at=at)
@@ -170,11 +243,14 @@ def test_a_section_is_what_cells_there_would_read(view, dtype, device):
 def test_the_mean_is_that_along_the_line_of_sight():
     values = np.random.default_rng(0).random((3, 4, 5))
     for view, k in (("xy", 2), ("xz", 1), ("yz", 0)):
-        assert np.allclose(section(values, np.zeros(3), np.ones(3), view=view, at=None), values.mean(k))
+        assert np.allclose(
+            section(values, np.zeros(3), np.ones(3), view=view, at=None), values.mean(k)
+        )
 
 
 def test_a_section_is_at_the_height_of_the_cells():
-    """Cells of three dimensions: their mean. Those of two: their plane, if it is known. The legend says where."""
+    """Cells of three dimensions: their mean. Those of two: their plane, if it is known. The legend
+    says where."""
     values = ramp(2)  # centres at −3.5 … 3.5 µm: at z it is (z + 3.5)/7
     deep = frame([[0, 0, 1.0], [0, 4, 2.0]], signals={"ahl": values})
     flat = frame([[0, 0]], signals={"ahl": values}, height=-2.0)
@@ -202,7 +278,9 @@ def test_a_plane_of_cells_that_is_not_known_is_asked_for():
 
 def test_cells_and_signal_of_one_name_keep_their_own_limits():
     what = frame([[0, 0]], signals={"ahl": ramp(0)}, ahl=[0.3])
-    both = survey([what], [0], Look(colour="ahl", background="ahl", limits={"ahl": (0, 5), "out.ahl": (0, 7)}))
+    both = survey(
+        [what], [0], Look(colour="ahl", background="ahl", limits={"ahl": (0, 5), "out.ahl": (0, 7)})
+    )
     assert both.scales[0].limits == (0, 5) and both.behind.limits == (0, 7)
     bare = survey([what], [0], Look(colour="ahl", background="ahl", limits={"ahl": (0, 5)}))
     assert bare.scales[0].limits == (0, 5) and bare.behind.limits == (0, 1)
@@ -210,21 +288,25 @@ def test_cells_and_signal_of_one_name_keep_their_own_limits():
     assert alone.behind.limits == (0, 5) and alone.behind.title == "ahl outside, z = 0 µm"
 
 
-# --- windows --------------------------------------------------------------------------------------------------------------
+# --- windows --------------------------------------------------------------------------------------
 
 
 def test_a_window_is_cropped_to_the_cells_and_stays_in_the_box():
     what = frame([[6.5, 0.0], [-4.0, 0.0]], colony=[0, 1], signals={"ahl": ramp(0)})
     made = survey([what], [0, 1], Look(background="ahl"))
     sizes = {(round(r - l, 9), round(t - b, 9)) for l, r, b, t in made.windows.values()}  # noqa: E741
-    assert len(sizes) == 1 and 2.0 < made.size[0] < 8.0, "panels of one size, about the cell of 2 µm with some room"
+    assert len(sizes) == 1 and 2.0 < made.size[0] < 8.0, (
+        "panels of one size, about the cell of 2 µm with some room"
+    )
     assert made.windows[0][1] == pytest.approx(8.0), "pushed back into the box, which ends at 8 µm"
     assert sum(made.windows[1][:2]) == pytest.approx(-8.0), "in the middle where there is room"
 
 
 def test_the_whole_box():
     what = frame([[6.5, 0.0]], signals={"ahl": ramp(0)})
-    assert survey([what], [0], Look(background="ahl", whole=True)).windows[0] == pytest.approx((-8, 8, -8, 8))
+    assert survey([what], [0], Look(background="ahl", whole=True)).windows[0] == pytest.approx(
+        (-8, 8, -8, 8)
+    )
 
 
 def test_what_is_beyond_the_box_is_no_concentration():
@@ -246,13 +328,19 @@ def test_pages_have_even_numbers_of_pixels(dpi):
 
 
 def boxes(figure: Figure) -> list:
-    """Where everything on a page is, pixels: panels, legends with their numbers, titles, scale bar."""
+    """Where everything on a page is, pixels: panels, legends with their numbers, titles, scale
+    bar."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     renderer = canvas.get_renderer()
     panels = [ax for ax in figure.axes if ax.get_visible()]
     # what stands outside the frame of its axes
-    outside = [t for ax in panels for t in (ax.title, *ax.get_xticklabels(), *ax.texts, *ax.lines) if not isinstance(t, Text) or t.get_text()]
+    outside = [
+        t
+        for ax in panels
+        for t in (ax.title, *ax.get_xticklabels(), *ax.texts, *ax.lines)
+        if not isinstance(t, Text) or t.get_text()
+    ]
     return [x.get_window_extent(renderer) for x in (*panels, *outside, *figure.texts)]
 
 
@@ -260,7 +348,14 @@ def boxes(figure: Figure) -> list:
     "count, apart, options",
     [
         (1, 3.0, {"colour": "yfp"}),
-        (1, 100.0, {"channels": {"yfp": "yellow", "cfp": "cyan", "rfp": "red", "length": "lime"}, "background": "ahl"}),
+        (
+            1,
+            100.0,
+            {
+                "channels": {"yfp": "yellow", "cfp": "cyan", "rfp": "red", "length": "lime"},
+                "background": "ahl",
+            },
+        ),
         (5, 20.0, {"colour": "cell_type", "background": "ahl", "whole": True}),
         (36, 8.0, {}),
     ],
@@ -268,17 +363,31 @@ def boxes(figure: Figure) -> list:
 def test_nothing_on_a_page_overlaps(count, apart, options):
     position = [[x, 0.0] for _ in range(count) for x in (0.0, apart)]
     fields = {n: np.linspace(1e-7, 2e-7, 2 * count) for n in ("yfp", "cfp", "rfp")}
-    what = frame(position, colony=np.repeat(np.arange(count), 2), signals={"ahl": 1e5 * ramp(0)}, cell_type=np.arange(2 * count) % 3, **fields)
-    figure = sheet_figure(what, range(count), Look(**options), "a title of some length, which has to be broken where the page is narrow", 100)
+    what = frame(
+        position,
+        colony=np.repeat(np.arange(count), 2),
+        signals={"ahl": 1e5 * ramp(0)},
+        cell_type=np.arange(2 * count) % 3,
+        **fields,
+    )
+    figure = sheet_figure(
+        what,
+        range(count),
+        Look(**options),
+        "a title of some length, which has to be broken where the page is narrow",
+        100,
+    )
     found = boxes(figure)
     for i, a in enumerate(found):
-        assert a.x0 >= 0 and a.y0 >= 0 and a.x1 <= figure.bbox.x1 and a.y1 <= figure.bbox.y1, "off the page"
+        assert a.x0 >= 0 and a.y0 >= 0 and a.x1 <= figure.bbox.x1 and a.y1 <= figure.bbox.y1, (
+            "off the page"
+        )
         for b in found[:i]:
             wide, high = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
             assert wide <= 0 or high <= 0, (a, b)
 
 
-# --- legends --------------------------------------------------------------------------------------------------------------
+# --- legends --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -296,7 +405,10 @@ def test_numbers_of_a_legend(values, words):
     assert numbers(np.array(values, dtype=float)) == words
 
 
-@pytest.mark.parametrize("high, title", [(2.0, "yfp (nM)"), (2e-5, "yfp (10⁻⁵ nM)"), (3e7, "yfp (10⁷ nM)"), (0.5, "yfp (nM)")])
+@pytest.mark.parametrize(
+    "high, title",
+    [(2.0, "yfp (nM)"), (2e-5, "yfp (10⁻⁵ nM)"), (3e7, "yfp (10⁷ nM)"), (0.5, "yfp (nM)")],
+)
 def test_a_legend_takes_out_the_power_of_ten(high, title):
     seen = Seen()
     seen.note(np.array([0.0, high]))
@@ -314,11 +426,14 @@ def test_a_range_is_never_empty(values):
         seen = Seen()
         seen.note(np.array(values, dtype=float))
         scale = scale_of("yfp", seen, look, {})
-        assert scale.limits[0] < scale.limits[1] and np.isfinite(scale.paint(np.array([0.0, 5.0]))).all()
+        assert (
+            scale.limits[0] < scale.limits[1]
+            and np.isfinite(scale.paint(np.array([0.0, 5.0]))).all()
+        )
         colour_bar(Figure().add_subplot(), scale)
 
 
-# --- figures of one's own ---------------------------------------------------------------------------------------------------
+# --- figures of one's own -------------------------------------------------------------------------
 
 
 def test_a_figure_of_ones_own():
@@ -328,7 +443,9 @@ def test_a_figure_of_ones_own():
     what = frame([[-2.0, 0.0], [2.0, 0.0]], yfp=[0.0, 1.0])
     behind = draw_signal(ax, ramp(0), (-8, -8, -4), (1, 1, 1), name="ahl", limits=(0, 2))
     assert ax.get_xlim() == (-8, 8) and behind.limits == (0, 2)
-    (scale,) = draw_cells(ax, what.cells, colour="yfp", limits={"yfp": (0, 3)}, window=(-6, 6, -4, 4))
+    (scale,) = draw_cells(
+        ax, what.cells, colour="yfp", limits={"yfp": (0, 3)}, window=(-6, 6, -4, 4)
+    )
     assert ax.get_xlim() == (-6, 6) and ax.get_ylim() == (-4, 4) and scale.limits == (0, 3)
     assert scale_bar(ax) == 2.0, "the largest of 1, 2, 5, 10, … up to 0.3 of 12 µm"
     colour_bar(below, scale)
@@ -339,7 +456,9 @@ def test_a_figure_of_ones_own():
     assert pixels[len(pixels) - 1 - int(v), int(u)] == pytest.approx(viridis(1 / 3), abs=NEAR)
     u, v = ax.transData.transform((5.0, 3.0))
     # the subplot is some 250 pixels for 12 µm, of which each is 0.0016 of the range
-    assert pixels[len(pixels) - 1 - int(v), int(u)] == pytest.approx([1 - (12.5 / 15) / 2] * 3, abs=NEAR + 0.002)
+    assert pixels[len(pixels) - 1 - int(v), int(u)] == pytest.approx(
+        [1 - (12.5 / 15) / 2] * 3, abs=NEAR + 0.002
+    )
 
 
 def test_a_bar_is_as_long_as_it_says():
@@ -354,7 +473,7 @@ def test_a_bar_is_as_long_as_it_says():
     assert ends[1] - ends[0] == pytest.approx(wanted[1] - wanted[0], rel=1e-9) and size == 10.0
 
 
-# --- what cannot be drawn ---------------------------------------------------------------------------------------------------
+# --- what cannot be drawn -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -369,7 +488,10 @@ def test_a_bar_is_as_long_as_it_says():
         ({"background": "lactose"}, r"background = 'lactose'.*ahl"),
         ({"limits": {"yfp": (0, 1)}}, r"limits = 'yfp'.*nothing that has a range"),
         ({"colour": "yfp", "limits": {"cfp": (0, 1)}}, r"limits = 'cfp'.*'yfp'"),
-        ({"colour": "yfp", "limits": {"yfp": (1, 1)}}, r"limits\['yfp'\] = \(1.0, 1.0\).*first below"),
+        (
+            {"colour": "yfp", "limits": {"yfp": (1, 1)}},
+            r"limits\['yfp'\] = \(1.0, 1.0\).*first below",
+        ),
         ({"colour": "yfp", "limits": {"yfp": (0, np.inf)}}, r"limits\['yfp'\].*finite"),
         ({"colour": "yfp", "limits": {"yfp": 3}}, r"limits\['yfp'\] = 3"),
         ({"background": "ahl", "section": "top"}, r"section = 'top'"),
@@ -390,10 +512,19 @@ def test_a_scene_without_a_medium_has_no_box_and_no_background():
 
 def test_a_state_is_a_frame(dtype, device):
     """Signals of grids of several colonies each find their own, and know where they are."""
-    medium = tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=lambda x: 20 + x[:, 0] + 0.1 * x[:, 2]), box=((-8, -4, -2), (8, 4, 6)), spacing=2.0, height=1.0)
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=1.0, initial=lambda x: 20 + x[:, 0] + 0.1 * x[:, 2]),
+        box=((-8, -4, -2), (8, 4, 6)),
+        spacing=2.0,
+        height=1.0,
+    )
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), medium)
     made = frame_of(scene.seed(3, dtype=dtype, device=device))
-    assert made.height == 1.0 and made.origin.tolist() == [[-8.0, -4.0, -2.0]] * 3 and made.spacing.tolist() == [2.0] * 3
+    assert (
+        made.height == 1.0
+        and made.origin.tolist() == [[-8.0, -4.0, -2.0]] * 3
+        and made.spacing.tolist() == [2.0] * 3
+    )
     assert [x.shape for x in made.signals["ahl"]] == [(8, 4, 4)] * 3
     # centres at x = −7, −5, …, z = −1, 1, …
     assert made.signals["ahl"][2][1, 0, 1] == pytest.approx(20 - 5 + 0.1, rel=1e-6)

@@ -29,12 +29,26 @@ def brighter(cells):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
-    """Two colonies of a few cells that shine brighter with time, in a medium from which a signal fades. Six frames. To be read only."""
+    """Two colonies of a few cells that shine brighter with time, in a medium from which a signal
+    fades. Six frames. To be read only."""
     path = tmp_path_factory.mktemp("times") / "run.h5"
-    medium = tf.Medium(ahl=tf.Signal(diffusion=1.0, decay=1.0, initial=1.0), box=((-16, -8, -4), (16, 8, 4)), spacing=4.0)
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=1.0, decay=1.0, initial=1.0),
+        box=((-16, -8, -4), (16, 8, 4)),
+        spacing=4.0,
+    )
     rules = tf.Rules(brighter, variables={"yfp": 0.0, "cfp": 0.0})
-    scene = tf.Scene(rules, tf.Growth(rate=1.2), tf.Division(length=tf.Uniform(3.0, 4.0)), tf.Mechanics(dim=2), medium, dt=0.1)
-    for _ in tf.simulate(scene, scene.seed(2, seed=3), until=UNTIL, record=tf.Recorder(path, scene, every=4)):
+    scene = tf.Scene(
+        rules,
+        tf.Growth(rate=1.2),
+        tf.Division(length=tf.Uniform(3.0, 4.0)),
+        tf.Mechanics(dim=2),
+        medium,
+        dt=0.1,
+    )
+    for _ in tf.simulate(
+        scene, scene.seed(2, seed=3), until=UNTIL, record=tf.Recorder(path, scene, every=4)
+    ):
         pass
     return path
 
@@ -43,7 +57,7 @@ def pixels(path) -> np.ndarray:
     return matplotlib.image.imread(path)[..., :3]
 
 
-# --- one range, one window ------------------------------------------------------------------------------------------------
+# --- one range, one window ------------------------------------------------------------------------
 
 
 def test_ranges_and_windows_are_those_of_all_frames(run):
@@ -54,9 +68,13 @@ def test_ranges_and_windows_are_those_of_all_frames(run):
         made = survey(frames, [0, 1], look)
         every = [results.frame(k)["yfp"] for k in range(len(results))]
         signal = [x for k in range(len(results)) for x in results.signal("ahl", k)]
-        assert made.scales[0].limits == pytest.approx((min(v.min() for v in every), max(v.max() for v in every)))
+        assert made.scales[0].limits == pytest.approx(
+            (min(v.min() for v in every), max(v.max() for v in every))
+        )
         # cut at z = 0, between two layers that are alike
-        assert made.behind.limits == pytest.approx((min(v.min() for v in signal), max(v.max() for v in signal)), rel=1e-5)
+        assert made.behind.limits == pytest.approx(
+            (min(v.min() for v in signal), max(v.max() for v in signal)), rel=1e-5
+        )
         last = results.frame(-1)
         for place, (left, right, bottom, top) in made.windows.items():
             x, y = last["position"][last["colony"] == place].T
@@ -66,19 +84,30 @@ def test_ranges_and_windows_are_those_of_all_frames(run):
 def test_a_frame_is_read_when_it_is_asked_for(run):
     with tf.Results(run) as results:
         frames = Recorded(results, [0, -1], None)
-        assert len(frames) == 2 and frames[0].signals == {} and len(frames[1].cells["uid"]) == results.counts[-1].sum()
-        assert len(Recorded(results, [0, 1, 2], "ahl")[1:]) == 2 and frames.present.tolist() == [True, True]
+        assert (
+            len(frames) == 2
+            and frames[0].signals == {}
+            and len(frames[1].cells["uid"]) == results.counts[-1].sum()
+        )
+        assert len(Recorded(results, [0, 1, 2], "ahl")[1:]) == 2 and frames.present.tolist() == [
+            True,
+            True,
+        ]
         with pytest.raises(tf.InputError, match=r"background = 'lactose'.*ahl"):
             Recorded(results, [0], "lactose")
 
 
-# --- strips ---------------------------------------------------------------------------------------------------------------
+# --- strips ---------------------------------------------------------------------------------------
 
 
 def test_frames_of_a_strip():
     times = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.1])
     assert picked(times, None, None) == [0, 1, 3, 5]  # 0, 0.7, 1.4, 2.1
-    assert picked(times, None, 1) == [5] and picked(times, None, 2) == [0, 5] and picked(times, None, 99) == [0, 1, 2, 3, 4, 5]
+    assert (
+        picked(times, None, 1) == [5]
+        and picked(times, None, 2) == [0, 5]
+        and picked(times, None, 99) == [0, 1, 2, 3, 4, 5]
+    )
     assert picked(times, [1.1, 0.2], None) == [2, 0] and picked(times, [2.3], None) == [5]
     for bad in ([2.5], [-0.3], [0.0, 99.0]):
         with pytest.raises(tf.InputError, match=r"times = .*0 to 2.1 h"):
@@ -94,7 +123,14 @@ def test_frames_of_a_strip():
 
 def test_a_strip_writes_its_times(run, tmp_path):
     """The times that were recorded, not those that were asked for."""
-    made = tf.pictures.strip(run, times=[0.1, 1.1, 2.0], channels={"yfp": "yellow"}, background="ahl", colonies=[1], out=tmp_path / "a.svg")
+    made = tf.pictures.strip(
+        run,
+        times=[0.1, 1.1, 2.0],
+        channels={"yfp": "yellow"},
+        background="ahl",
+        colonies=[1],
+        out=tmp_path / "a.svg",
+    )
     text = made.read_text()  # matplotlib writes each text as a comment beside its shapes
     for time in ("0 h", "1.2 h", "2 h", "colony 1", "yfp", "ahl outside", "z = 0 µm", "µm"):
         assert time in text, time
@@ -103,7 +139,8 @@ def test_a_strip_writes_its_times(run, tmp_path):
 
 @pytest.fixture
 def laid_out(monkeypatch) -> dict:
-    """What strips are made of: the (rows, columns) of the page, and (time, place, survey, axes) of each panel."""
+    """What strips are made of: the (rows, columns) of the page, and (time, place, survey, axes) of
+    each panel."""
     seen: dict = {"panels": []}
     page, fill = sheets.page, sheets.fill
 
@@ -122,25 +159,47 @@ def laid_out(monkeypatch) -> dict:
 
 
 def test_a_colony_is_a_row_and_time_runs_along_it(run, tmp_path, laid_out):
-    tf.pictures.strip(run, times=[0.0, 0.8, 2.0], colour="yfp", background="ahl", whole=True, out=tmp_path / "a.png")
+    tf.pictures.strip(
+        run,
+        times=[0.0, 0.8, 2.0],
+        colour="yfp",
+        background="ahl",
+        whole=True,
+        out=tmp_path / "a.png",
+    )
     # the box is 32 × 16 µm: twice as wide as high, not more
     assert laid_out["shape"] == (2, 3)
     assert [(k, t, p) for k, t, p, _ in laid_out["panels"]] == [
-        (0, 0.0, 0), (3, 0.0, 1), (1, pytest.approx(0.8), 0), (4, pytest.approx(0.8), 1), (2, pytest.approx(2.0), 0), (5, pytest.approx(2.0), 1)
-    ]  # fmt: skip
-    assert len({id(made) for *_, made in laid_out["panels"]}) == 1, "all panels are drawn with one set of scales and windows"
+        (0, 0.0, 0),
+        (3, 0.0, 1),
+        (1, pytest.approx(0.8), 0),
+        (4, pytest.approx(0.8), 1),
+        (2, pytest.approx(2.0), 0),
+        (5, pytest.approx(2.0), 1),
+    ]
+    assert len({id(made) for *_, made in laid_out["panels"]}) == 1, (
+        "all panels are drawn with one set of scales and windows"
+    )
 
 
 def test_wide_panels_stand_one_below_the_other(run, tmp_path, laid_out):
-    """Cells in a row seen without the box: more than twice as wide as high. A colony is a column then."""
+    """Cells in a row seen without the box: more than twice as wide as high. A colony is a column
+    then."""
     tf.pictures.strip(run, times=[0.0, 0.4], out=tmp_path / "a.png")
     width, height = laid_out["panels"][0][3].size
     assert width > 2 * height and laid_out["shape"] == (2, 2)
-    assert [(k, round(t, 6), p) for k, t, p, _ in laid_out["panels"]] == [(0, 0.0, 0), (1, 0.0, 1), (2, 0.4, 0), (3, 0.4, 1)]
+    assert [(k, round(t, 6), p) for k, t, p, _ in laid_out["panels"]] == [
+        (0, 0.0, 0),
+        (1, 0.0, 1),
+        (2, 0.4, 0),
+        (3, 0.4, 1),
+    ]
 
 
 def test_one_colony_is_one_row_and_the_title_names_it(run, tmp_path, laid_out):
-    tf.pictures.strip(run, frames=4, colonies=[1], background="ahl", whole=True, out=tmp_path / "a.png")
+    tf.pictures.strip(
+        run, frames=4, colonies=[1], background="ahl", whole=True, out=tmp_path / "a.png"
+    )
     assert laid_out["shape"] == (1, 4) and laid_out["title"].endswith("colony 1")
 
 
@@ -152,7 +211,9 @@ def test_a_strip_stands_beside_the_results(run):
 
 def test_a_colony_that_has_no_cells_yet_or_any_more_is_drawn_empty(tmp_path):
     """Removed in mid-run: its panel stays, with the signal in it."""
-    medium = tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=1.0), box=((-16, -8, -4), (16, 8, 4)), spacing=4.0)
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=1.0, initial=1.0), box=((-16, -8, -4), (16, 8, 4)), spacing=4.0
+    )
 
     def end(cells):
         cells.remove_flag = (cells.colony == 1) & (cells.time > 0.45)
@@ -169,18 +230,23 @@ def test_a_colony_that_has_no_cells_yet_or_any_more_is_drawn_empty(tmp_path):
         tf.show(path, colonies=[1], out=tmp_path / "b.png")
 
 
-# --- show -----------------------------------------------------------------------------------------------------------------
+# --- show -----------------------------------------------------------------------------------------
 
 
 def test_show_draws_the_signal(run, tmp_path):
-    """The signal is uniform, and so in the middle of its range, which is that of the frame: paper of one colour about the cells, white lowest."""
+    """The signal is uniform, and so in the middle of its range, which is that of the frame: paper
+    of one colour about the cells, white lowest."""
     low = pixels(tf.show(run, background="ahl", limits={"ahl": (0, 10)}, out=tmp_path / "low.png"))
-    high = pixels(tf.show(run, background="ahl", limits={"ahl": (0, 1e-3)}, out=tmp_path / "high.png"))
+    high = pixels(
+        tf.show(run, background="ahl", limits={"ahl": (0, 1e-3)}, out=tmp_path / "high.png")
+    )
     dark = [(image.max(2) < 0.05).mean() for image in (low, high)]
     assert dark[0] < 0.1 and dark[1] > 0.3
 
 
-@pytest.mark.parametrize("draw", [tf.show, tf.pictures.strip, lambda path, out: tf.pictures.movie(path, out)])
+@pytest.mark.parametrize(
+    "draw", [tf.show, tf.pictures.strip, lambda path, out: tf.pictures.movie(path, out)]
+)
 def test_no_picture_replaces_the_results(run, tmp_path, draw):
     """Not even where the results are called like a picture."""
     own = tmp_path / "run.gif"
@@ -190,13 +256,15 @@ def test_no_picture_replaces_the_results(run, tmp_path, draw):
     assert own.read_bytes() == run.read_bytes()
 
 
-@pytest.mark.parametrize("colonies, message", [([7], r"colonies = \[7\].*0, 1"), ([], r"colonies = \[\]")])
+@pytest.mark.parametrize(
+    "colonies, message", [([7], r"colonies = \[7\].*0, 1"), ([], r"colonies = \[\]")]
+)
 def test_colonies_that_are_not_there_are_told(run, tmp_path, colonies, message):
     with pytest.raises(tf.InputError, match=message):
         tf.show(run, colonies=colonies, out=tmp_path / "a.png")
 
 
-# --- films ----------------------------------------------------------------------------------------------------------------
+# --- films ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -221,8 +289,11 @@ def test_every_other_frame_and_the_last(run, tmp_path, film_options):
 
 
 def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
-    """Greys are 255/103 apart, so a grey pixel is off by 1.3 at most, rounded 2. The 151 other colours serve two maps, each a line of length 310 in the
-    space of colours, and a few cells between them: about 4 apart, and so no cell's is off by more than 8. What blends at an edge is in no legend."""
+    """Greys are 255/103 apart, so a grey pixel is off by 1.3 at most, rounded 2. The 151 other
+    colours serve two maps, each a line of length 310 in the space of colours, and a few cells
+    between them: about 4 apart, and so no cell's is off by more than 8. What blends at an edge is
+    in no legend.
+    """
     made = tf.pictures.movie(run, tmp_path / "a.gif", **film_options)
     with tf.Results(run) as results, Image.open(made) as film:
         frames = Recorded(results, range(len(results)), "ahl")
@@ -234,14 +305,21 @@ def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
             difference = np.abs(found - wanted).max(2)
             grey = np.ptp(wanted, 2) == 0
             assert grey.any() and difference[grey].max() <= 2
-            cells = np.unique(np.round(255 * paint_cells(frames[k].cells, shared.scales, shared.look)[:, :3]).astype(int), axis=0)
+            cells = np.unique(
+                np.round(
+                    255 * paint_cells(frames[k].cells, shared.scales, shared.look)[:, :3]
+                ).astype(int),
+                axis=0,
+            )
             flat = (wanted[:, :, None] == cells).all(3).any(2)
             assert flat.any() and difference[flat].max() <= 8
 
 
 def test_the_nearest_colour_is_the_nearest():
     rng = np.random.default_rng(0)
-    palette, picture = (rng.integers(0, 256, size).astype(np.uint8) for size in ((256, 3), (20, 30, 3)))
+    palette, picture = (
+        rng.integers(0, 256, size).astype(np.uint8) for size in ((256, 3), (20, 30, 3))
+    )
     found = palette[_nearest(picture, palette)].astype(int)
     every = ((picture[:, :, None].astype(int) - palette.astype(int)) ** 2).sum(3)
     assert np.array_equal(((picture.astype(int) - found) ** 2).sum(2), every.min(2))
@@ -256,7 +334,9 @@ def test_a_film_moves_neither_its_window_nor_its_legend(run, film_options):
     assert first.shape == last.shape
     panel = film.axes[0].get_window_extent()
     below = int(len(first) - panel.y0) + 2
-    assert np.array_equal(first[below:], last[below:]) and not np.array_equal(first[:below], last[:below])
+    assert np.array_equal(first[below:], last[below:]) and not np.array_equal(
+        first[:below], last[:below]
+    )
 
 
 @pytest.mark.parametrize(
@@ -284,7 +364,8 @@ def test_mp4_names_what_it_needs(run, tmp_path, monkeypatch):
 
 
 def test_a_film_that_breaks_off_leaves_the_old_one(run, tmp_path, monkeypatch, film_options):
-    """A full disk in the middle of it: told, nothing half written stays, and a film of that name that was there is still whole."""
+    """A full disk in the middle of it: told, nothing half written stays, and a film of that name
+    that was there is still whole."""
     old = tmp_path / "a.gif"
     old.write_bytes(b"an old film")
 
@@ -299,7 +380,9 @@ def test_a_film_that_breaks_off_leaves_the_old_one(run, tmp_path, monkeypatch, f
 
 
 # the reader of imageio-ffmpeg leaves its pipes to the collector
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
+)
 def test_an_mp4_has_every_frame(run, tmp_path, film_options):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     made = tf.pictures.movie(run, tmp_path / "a.mp4", fps=5, **film_options)
@@ -310,7 +393,12 @@ def test_an_mp4_has_every_frame(run, tmp_path, film_options):
     assert facts["fps"] == 5
     with tf.Results(run) as results:
         shown = Recorded(results, range(len(results)), "ahl")
-        drawn = Film(shown, survey(shown, [0, 1], Look(channels=film_options["channels"], background="ahl")), "", 50)
+        drawn = Film(
+            shown,
+            survey(shown, [0, 1], Look(channels=film_options["channels"], background="ahl")),
+            "",
+            50,
+        )
         for k in (0, 5):
             # the codec halves the resolution of colour and rounds, so edges differ and areas do not
             assert np.median(np.abs(frames[k].astype(int) - drawn[k].astype(int))) <= 3
@@ -318,7 +406,13 @@ def test_an_mp4_has_every_frame(run, tmp_path, film_options):
 
 
 @pytest.mark.parametrize(
-    "times, words", [([0, 1, 2], ["0", "1", "2"]), ([0.25, 1.0], ["0.25", "1.00"]), ([1 / 3, 1], ["0.333", "1.000"]), ([0.1 + 0.2], ["0.3"])]
+    "times, words",
+    [
+        ([0, 1, 2], ["0", "1", "2"]),
+        ([0.25, 1.0], ["0.25", "1.00"]),
+        ([1 / 3, 1], ["0.333", "1.000"]),
+        ([0.1 + 0.2], ["0.3"]),
+    ],
 )
 def test_times_of_a_film_are_equally_long(times, words):
     assert clock(np.array(times, dtype=float)) == words

@@ -1,4 +1,5 @@
-"""Grow once, replay for all: a replay is the full run, bit for bit, and is refused where designs act on growth."""
+"""Grow once, replay for all: a replay is the full run, bit for bit, and is refused where designs
+act on growth."""
 
 from __future__ import annotations
 
@@ -22,7 +23,10 @@ def reporter(u, s, p, cell):
 
 def lit(make=1.0, rate=1.0, **options):
     return tf.Scene(
-        tf.Growth(rate=rate), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2), tf.Circuit(reporter, species=("gfp",), make=make, **options)
+        tf.Growth(rate=rate),
+        tf.Division(length=tf.Uniform(3.5, 4.5)),
+        tf.Mechanics(dim=2),
+        tf.Circuit(reporter, species=("gfp",), make=make, **options),
     )
 
 
@@ -50,7 +54,10 @@ DESIGNS = {
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", DESIGNS)
 def test_a_replay_is_the_full_run(name, dtype):
-    values, streams = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64).repeat_interleave(2), torch.tensor([7, 3] * 3)
+    values, streams = (
+        torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64).repeat_interleave(2),
+        torch.tensor([7, 3] * 3),
+    )
     scene = DESIGNS[name](values)
     full = stepped(scene, scene.seed(6, seed=5, streams=streams, dtype=dtype), 130)
     course = tf.Course(DESIGNS[name](1.0), streams=(3, 7), seed=5, dtype=dtype)
@@ -100,19 +107,26 @@ def test_a_course_grows_as_far_as_it_is_asked_and_no_further():
 )
 def test_what_follows_is_found_from_what_is_declared(scene, follows, why):
     found = split(scene)
-    assert tuple(e.title for k, e in enumerate(scene.listed) if k not in found.growth) == follows or why
+    assert (
+        tuple(e.title for k, e in enumerate(scene.listed) if k not in found.growth) == follows
+        or why
+    )
     assert found.obstacle.startswith(why) and bool(found.obstacle) == bool(why)
 
 
 def test_a_design_that_acts_on_growth_is_refused():
-    with pytest.raises(tf.InputError, match=r"Growth\.rate differs between colonies and acts on their growth"):
+    with pytest.raises(
+        tf.InputError, match=r"Growth\.rate differs between colonies and acts on their growth"
+    ):
         tf.Course(lit(rate=torch.tensor([1.0, 2.0])), streams=(0, 1))
     with pytest.raises(tf.InputError, match="rules may read and write anything"):
         tf.Course(tf.scenes.random_partition(), streams=(0,))
     course = tf.Course(lit(), streams=(0,))
     with pytest.raises(tf.InputError, match="does not grow as the course did: Growth\\(rate=2"):
         tf.Replay(lit(rate=2.0), course)
-    with pytest.raises(tf.InputError, match="streams = 1 is not allowed: it must be of the course: 0"):
+    with pytest.raises(
+        tf.InputError, match="streams = 1 is not allowed: it must be of the course: 0"
+    ):
         tf.Replay(lit(), course).seed(2, streams=[0, 1])
 
 
@@ -125,7 +139,12 @@ def test_other_founders_are_another_growth():
 
 def test_what_fails_in_the_course_fails_in_every_replay():
     # a cell due to divide by volume while shorter than its two new caps
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(added=0.2), tf.Circuit(reporter, species=("gfp",), make=1.0), founders=tf.Cells.single(2, length=0.3))
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Division(added=0.2),
+        tf.Circuit(reporter, species=("gfp",), make=1.0),
+        founders=tf.Cells.single(2, length=0.3),
+    )
     replay = tf.Replay(scene, tf.Course(scene, streams=(0, 1)))
     state = replay.seed(3, streams=[1, 0, 1])
     while not tf.failures(state):
@@ -143,13 +162,22 @@ def test_streams_are_whole_numbers_one_a_colony(streams):
 
 def test_streams_are_kept_in_results(tmp_path):
     scene, path = lit(torch.tensor([1.0, 2.0])), tmp_path / "r.h5"
-    state = deque(tf.simulate(scene, scene.seed(2, streams=[9, 9]), until=1.0, record=path), maxlen=1).pop()
+    state = deque(
+        tf.simulate(scene, scene.seed(2, streams=[9, 9]), until=1.0, record=path), maxlen=1
+    ).pop()
     with tf.Results(path) as results:
         again = results.state(scene)
     assert again.stream.tolist() == [9, 9]
     same(again, state)
     with pytest.raises(tf.InputError, match="streams"):
-        list(tf.simulate(scene, state.replace(stream=torch.tensor([9, 8])), until=1.1, record=tf.Recorder(path, scene, append=True)))
+        list(
+            tf.simulate(
+                scene,
+                state.replace(stream=torch.tensor([9, 8])),
+                until=1.1,
+                record=tf.Recorder(path, scene, append=True),
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -174,7 +202,10 @@ class Measured(tf.Effect):
 def test_an_effect_between_growth_and_mechanics_sees_the_state_between():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2), Measured())
     replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
-    full, found = stepped(scene, scene.seed(1), 120), stepped(replay, replay.seed(1, streams=[0]), 120)
+    full, found = (
+        stepped(scene, scene.seed(1), 120),
+        stepped(replay, replay.seed(1, streams=[0]), 120),
+    )
     assert not torch.equal(full.longest, full.length)  # contacts held some back
     same(found, full)
 
@@ -183,12 +214,16 @@ def test_what_founders_bring_keeps_the_rule_of_its_circuit_at_division():
     founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], extra={"gfp": [3.0]})
     scene = tf.Scene(*lit(torch.tensor([1.0, 2.0]), daughters="amount").listed, founders=founders)
     replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
-    same(stepped(replay, replay.seed(2, streams=[0, 0]), 90), stepped(scene, scene.seed(2, streams=[0, 0]), 90))
+    same(
+        stepped(replay, replay.seed(2, streams=[0, 0]), 90),
+        stepped(scene, scene.seed(2, streams=[0, 0]), 90),
+    )
 
 
 @dataclass(frozen=True)
 class Started(tf.Effect):
-    """A field with a first value of its own, at birth or at the start; listed, it does nothing else."""
+    """A field with a first value of its own, at birth or at the start; listed, it does nothing
+    else."""
 
     name: str
     initial: Callable
@@ -197,7 +232,9 @@ class Started(tf.Effect):
     stage, title = 30, "started"
 
     def declares(self, dim):
-        return (tf.Field(self.name, "set once", initial=self.initial, at_division=self.at_division),)
+        return (
+            tf.Field(self.name, "set once", initial=self.initial, at_division=self.at_division),
+        )
 
     def step(self, state, dt):
         return state
@@ -220,7 +257,14 @@ def test_what_growth_reads_belongs_to_it_also_where_nothing_writes_it():
     replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
     full = stepped(scene, scene.seed(2, streams=[0, 0]), 110)
     same(stepped(replay, replay.seed(2, streams=[0, 0]), 110), full)
-    assert not torch.equal(full.position, stepped(lit(torch.tensor([1.0, 2.0])), lit(torch.tensor([1.0, 2.0])).seed(2, streams=[0, 0]), 110).position)
+    assert not torch.equal(
+        full.position,
+        stepped(
+            lit(torch.tensor([1.0, 2.0])),
+            lit(torch.tensor([1.0, 2.0])).seed(2, streams=[0, 0]),
+            110,
+        ).position,
+    )
 
 
 def test_growth_is_told_by_what_its_functions_do():
@@ -231,9 +275,15 @@ def test_growth_is_told_by_what_its_functions_do():
 
 
 def test_daughters_fields_start_from_what_they_see_where_cells_divide():
-    """A field that starts anew from another that does, growth_rate drawn at birth: it sees the parent's, as in the full run."""
+    """A field that starts anew from another that does, growth_rate drawn at birth: it sees the
+    parent's, as in the full run."""
     circuit = tf.Circuit(reporter, species=("gfp",), make=torch.tensor([1.0, 2.0]))
-    scene = tf.Scene(tf.Growth(rate=tf.Uniform(0.5, 1.5)), tf.Division(length=3.5), circuit, Started("born_rate", rate_at_birth, "reset"))
+    scene = tf.Scene(
+        tf.Growth(rate=tf.Uniform(0.5, 1.5)),
+        tf.Division(length=3.5),
+        circuit,
+        Started("born_rate", rate_at_birth, "reset"),
+    )
     replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
     full = stepped(scene, scene.seed(2, streams=[0, 0]), 110)
     assert full.cells > 8 and not torch.equal(full.born_rate, full.growth_rate)
@@ -245,7 +295,12 @@ def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
         stage = 30
 
     early = dataclass(frozen=True)(Early)()
-    scene = tf.Scene(early, tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Circuit(reporter, species=("gfp",), make=1.0))
+    scene = tf.Scene(
+        early,
+        tf.Growth(rate=1.0),
+        tf.Division(length=3.5),
+        tf.Circuit(reporter, species=("gfp",), make=1.0),
+    )
     replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
     full = stepped(scene, scene.seed(1), 20)
     assert float(full.longest.max()) < float(full.length.max())
@@ -256,7 +311,13 @@ def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
     "scene, why",
     [
         (lambda: lit(rate=torch.tensor(1.0, requires_grad=True)), "wants a gradient"),
-        (lambda: tf.Scene(*lit().listed, founders=tf.Cells([[0.0, 0.0], [1.0, 0.0]], [[1.0, 0.0]] * 2, colony=[0, 1])), "its first cells name their colonies"),
+        (
+            lambda: tf.Scene(
+                *lit().listed,
+                founders=tf.Cells([[0.0, 0.0], [1.0, 0.0]], [[1.0, 0.0]] * 2, colony=[0, 1]),
+            ),
+            "its first cells name their colonies",
+        ),
     ],
 )
 def test_more_that_cannot_be_kept(scene, why):

@@ -19,7 +19,7 @@ import torchfilm as tf
 from torchfilm.effect import Effect
 from torchfilm.state import PER_CELL
 
-# --- round trip -----------------------------------------------------------------------------------------------------------
+# --- round trip -----------------------------------------------------------------------------------
 
 
 def test_every_seventh_step_and_the_last_are_there(whole):
@@ -90,7 +90,10 @@ def test_a_file_holds_numbers_and_text_only(whole):
         look("/", file)
         file.visititems(look)
         assert all(b"cbuiltins" not in str(v).encode() for v in file.attrs.values())
-        assert file["cells/position"].compression == "gzip" and file["cells/position"].chunks is not None
+        assert (
+            file["cells/position"].compression == "gzip"
+            and file["cells/position"].chunks is not None
+        )
 
 
 def test_the_table_has_a_row_for_each_cell(whole):
@@ -100,11 +103,27 @@ def test_the_table_has_a_row_for_each_cell(whole):
         last = results.table(-1)
         total = int(results.counts.sum())
     assert {len(v) for v in table.values()} == {total}
-    for name in ("frame", "time", "colony", "uid", "parent", "x", "y", "axis_x", "axis_y", "length", "radius", "growth_rate", "mark"):
+    for name in (
+        "frame",
+        "time",
+        "colony",
+        "uid",
+        "parent",
+        "x",
+        "y",
+        "axis_x",
+        "axis_y",
+        "length",
+        "radius",
+        "growth_rate",
+        "mark",
+    ):
         assert name in table, name
     assert "z" not in table and all(v.ndim == 1 for v in table.values())
     assert np.array_equal(np.unique(table["frame"]), np.arange(10))
-    assert np.array_equal(last["x"], states[-1].position[:, 0].numpy()) and np.array_equal(last["colony"], states[-1].colony.numpy())
+    assert np.array_equal(last["x"], states[-1].position[:, 0].numpy()) and np.array_equal(
+        last["colony"], states[-1].colony.numpy()
+    )
     assert (last["time"] == states[-1].time).all()
 
 
@@ -119,7 +138,7 @@ def test_colonies_of_a_selection_keep_their_ids(tmp_path):
     assert state.colony_id.tolist() == [3, 1]
 
 
-# --- lineage --------------------------------------------------------------------------------------------------------------
+# --- lineage --------------------------------------------------------------------------------------
 
 
 def test_lineage_is_consistent(whole):
@@ -135,21 +154,31 @@ def test_lineage_is_consistent(whole):
             assert found["born"][k] == 0
             continue
         p = row[(colony, parent)]
-        assert found["fate"][p] == "divided" and found["ended"][p] == found["born"][k], "a daughter is born when its parent ends"
+        assert found["fate"][p] == "divided" and found["ended"][p] == found["born"][k], (
+            "a daughter is born when its parent ends"
+        )
         assert found["born"][p] < found["born"][k]
     ended = found["ended"] >= 0
     assert (found["ended"][ended] >= found["born"][ended]).all()
     assert ((found["fate"] == "alive") == ~ended).all()
     assert set(found["fate"]) == {"alive", "divided", "removed"}
-    daughters = np.bincount([row[(c, int(p))] for (c, _), p in zip(keys, found["parent"], strict=True) if p >= 0], minlength=len(keys))
+    daughters = np.bincount(
+        [row[(c, int(p))] for (c, _), p in zip(keys, found["parent"], strict=True) if p >= 0],
+        minlength=len(keys),
+    )
     assert (daughters == np.where(found["fate"] == "divided", 2, 0)).all()
     for state in states:  # who is alive at each step is who has been born and has not ended
-        alive = (found["born"] <= state.step) & ((found["ended"] < 0) | (found["ended"] > state.step))
-        assert sorted(np.array(keys)[alive].tolist()) == sorted([list(k) for k in zip(state.colony.tolist(), state.uid.tolist(), strict=True)])
+        alive = (found["born"] <= state.step) & (
+            (found["ended"] < 0) | (found["ended"] > state.step)
+        )
+        assert sorted(np.array(keys)[alive].tolist()) == sorted(
+            [list(k) for k in zip(state.colony.tolist(), state.uid.tolist(), strict=True)]
+        )
 
 
 def test_lineage_of_a_run_that_starts_in_the_middle_of_another(tmp_path):
-    """The state of a run's last step still carries that step's births; a new file must not count them again."""
+    """The state of a run's last step still carries that step's births; a new file must not count
+    them again."""
     scene = make_scene()
     state = scene.seed(2, seed=1)
     while not state.births:
@@ -169,7 +198,7 @@ def test_lineage_of_a_run_that_starts_in_the_middle_of_another(tmp_path):
     assert sorted(alive) == sorted(zip(last["colony"].tolist(), last["uid"].tolist(), strict=True))
 
 
-# --- reading while it grows -----------------------------------------------------------------------------------------------
+# --- reading while it grows -----------------------------------------------------------------------
 
 
 READ = """
@@ -182,7 +211,15 @@ with tf.Results(sys.argv[1]) as results:
 def python(code: str, *arguments: object, **options) -> subprocess.CompletedProcess:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment, check=False, **options)
+    return subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=environment,
+        check=False,
+        **options,
+    )
 
 
 @pytest.mark.slow
@@ -228,7 +265,9 @@ class Plate(Effect):
 
 def test_fields_of_colonies_are_recorded_and_come_back(tmp_path):
     path, scene = tmp_path / "run.h5", tf.Scene(tf.Growth(rate=1.0), Plate())
-    run = tf.simulate(scene, scene.seed(3), until=0.5, dt=0.1, record=tf.Recorder(path, scene, every=1))
+    run = tf.simulate(
+        scene, scene.seed(3), until=0.5, dt=0.1, record=tf.Recorder(path, scene, every=1)
+    )
     next(run)
     with tf.Results(path) as results:
         assert results.state(scene).plate.tolist() == [[1.0, 1.0]] * 3
@@ -258,7 +297,9 @@ def test_observers_and_the_recorder_may_be_used_by_hand(tmp_path):
 def test_a_run_that_is_given_up_is_closed_and_complete(tmp_path):
     """Leaving the loop early writes the last state."""
     scene = make_scene()
-    for state in tf.simulate(scene, scene.seed(), until=1.0, record=tf.Recorder(tmp_path / "run.h5", scene, every=10)):
+    for state in tf.simulate(
+        scene, scene.seed(), until=1.0, record=tf.Recorder(tmp_path / "run.h5", scene, every=10)
+    ):
         if state.step == 13:
             break
     del state
@@ -275,7 +316,9 @@ def test_colonies_without_cells_are_recorded(tmp_path):
     def update(cells):
         cells.remove_flag = cells.time > 0.1
 
-    scene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=cells, dt=DT)
+    scene = tf.Scene(
+        tf.Rules(update), tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=cells, dt=DT
+    )
     states = record(scene, scene.seed(3), tmp_path / "run.h5", until=0.5, every=1)
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.counts[0].tolist() == [0, 1, 0] and results.counts[-1].tolist() == [0, 0, 0]
@@ -291,9 +334,12 @@ def test_recipe_of_a_scene_of_ones_own_is_none(whole):
 
 @pytest.mark.parametrize("since", ["the end", "before it"])
 def test_a_reader_sees_what_a_resumption_adds(tmp_path, since):
-    """Of a finished run, opened when it was, or while it was written; beside it others read the file, and it goes on."""
+    """Of a finished run, opened when it was, or while it was written; beside it others read the
+    file, and it goes on."""
     path, scene = tmp_path / "run.h5", make_scene()
-    run = tf.simulate(scene, scene.seed(2, seed=1), until=1.0, record=tf.Recorder(path, scene, every=5))
+    run = tf.simulate(
+        scene, scene.seed(2, seed=1), until=1.0, record=tf.Recorder(path, scene, every=5)
+    )
     for _ in range(12):
         next(run)
     live = tf.Results(path) if since == "before it" else None

@@ -13,7 +13,7 @@ from recorded import DT, UNTIL, assert_same_file, assert_same_state, make_scene,
 
 import torchfilm as tf
 
-# --- bad files ------------------------------------------------------------------------------------------------------------
+# --- bad files ------------------------------------------------------------------------------------
 
 
 READ_ALL = """
@@ -33,13 +33,21 @@ for path in sys.argv[1:]:
 
 
 def told(data: bytes, shares: list[float], folder) -> dict[str, str]:
-    """What a reader says of files cut after these shares of their bytes. In a process of its own, because it may never come back."""
+    """What a reader says of files cut after these shares of their bytes. In a process of its own,
+    because it may never come back."""
     paths = [folder / f"cut{int(share * len(data))}.h5" for share in shares]
     for path, share in zip(paths, shares, strict=True):
         path.write_bytes(data[: int(share * len(data))])
     command = [sys.executable, "-c", READ_ALL, *map(str, paths)]
     try:
-        out = subprocess.run(command, capture_output=True, text=True, timeout=15, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False).stdout
+        out = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=15,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            check=False,
+        ).stdout
     except subprocess.TimeoutExpired as expired:
         out = (expired.stdout or b"").decode()
     found = dict(line.split("|", 1) for line in out.splitlines())
@@ -51,35 +59,55 @@ SHARES = [0.0, 0.001, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99]
 
 @pytest.mark.slow
 def test_a_truncated_file_is_told(whole, tmp_path):
-    """Cut anywhere, a file says so: no crash with something unreadable, no endless wait, no half of the data."""
+    """Cut anywhere, a file says so: no crash with something unreadable, no endless wait, no half of
+    the data."""
     found = told(whole[0].read_bytes(), SHARES, tmp_path)
-    assert not {name: said for name, said in found.items() if not (said.startswith("InputError") and name in said)}
+    assert not {
+        name: said
+        for name, said in found.items()
+        if not (said.startswith("InputError") and name in said)
+    }
 
 
 @pytest.mark.slow
 def test_a_file_of_a_few_bytes_is_told(whole, tmp_path):
-    """Found in use: with not even its superblock left, a file was waited for, or said nothing that helps."""
+    """Found in use: with not even its superblock left, a file was waited for, or said nothing that
+    helps."""
     data = whole[0].read_bytes()
-    found = told(data, [(n + 0.5) / len(data) for n in (0, 1, 8, 9, 12, 20, 28, 29, 47, 48, 60)], tmp_path)
-    assert not {name: said for name, said in found.items() if not (said.startswith("InputError") and name in said)}
+    found = told(
+        data, [(n + 0.5) / len(data) for n in (0, 1, 8, 9, 12, 20, 28, 29, 47, 48, 60)], tmp_path
+    )
+    assert not {
+        name: said
+        for name, said in found.items()
+        if not (said.startswith("InputError") and name in said)
+    }
 
 
 @pytest.mark.slow
 def test_a_truncated_file_left_by_a_kill_is_told(tmp_path):
-    """As above for a file that its writer never closed, as it is while a run goes on, copied in part."""
+    """As above for a file that its writer never closed, as it is while a run goes on, copied in
+    part."""
     path, scene = tmp_path / "open.h5", make_scene()
-    run = tf.simulate(scene, scene.seed(3, seed=11), until=UNTIL, record=tf.Recorder(path, scene, every=1))
+    run = tf.simulate(
+        scene, scene.seed(3, seed=11), until=UNTIL, record=tf.Recorder(path, scene, every=1)
+    )
     for _ in range(50):
         next(run)
     data = path.read_bytes()
     run.close()
     found = told(data, SHARES, tmp_path)
-    assert not {name: said for name, said in found.items() if not (said.startswith("InputError") and name in said)}
+    assert not {
+        name: said
+        for name, said in found.items()
+        if not (said.startswith("InputError") and name in said)
+    }
 
 
 @pytest.mark.slow
 def test_damaged_bytes_are_told_or_do_no_harm(whole, tmp_path):
-    """Found in use: where the index of a column was damaged, a finished file was read again and again without end; where a block was, h5py spoke for itself."""
+    """Found in use: where the index of a column was damaged, a finished file was read again and
+    again without end; where a block was, h5py spoke for itself."""
     data, damaged = whole[0].read_bytes(), {}
     for k in range(60):
         at = (2 * k + 1) * len(data) // 120
@@ -87,7 +115,14 @@ def test_damaged_bytes_are_told_or_do_no_harm(whole, tmp_path):
         path.write_bytes(data[:at] + bytes(b ^ 0x5A for b in data[at : at + 8]) + data[at + 8 :])
         damaged[str(path)] = path.name
     command = [sys.executable, "-c", READ_ALL, *damaged]
-    out = subprocess.run(command, capture_output=True, text=True, timeout=60, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True).stdout
+    out = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        check=True,
+    ).stdout
     found = dict(line.split("|", 1) for line in out.splitlines())
     assert found.keys() == damaged.keys()
     told = [said for said in found.values() if said != "read to the end"]
@@ -135,7 +170,7 @@ def test_a_file_with_no_finished_frame_is_told(whole, tmp_path):
         tf.Results(path)
 
 
-# --- bad places to write --------------------------------------------------------------------------------------------------
+# --- bad places to write --------------------------------------------------------------------------
 
 
 def test_an_existing_file_is_not_overwritten_unasked(whole, tmp_path):
@@ -152,7 +187,8 @@ def test_an_existing_file_is_not_overwritten_unasked(whole, tmp_path):
 
 
 def test_a_run_that_cannot_start_leaves_the_old_file_alone(whole, tmp_path):
-    """Overwriting begins with the first frame: a scene that is refused before must not cost the old results."""
+    """Overwriting begins with the first frame: a scene that is refused before must not cost the old
+    results."""
     path, scene = tmp_path / "run.h5", make_scene()
     shutil.copy(whole[0], path)
     recorder = tf.Recorder(path, scene, overwrite=True)
@@ -192,7 +228,9 @@ def test_a_full_disk_is_told_and_loses_no_frame(tmp_path, monkeypatch, every_ste
         return real(self, key, value)
 
     monkeypatch.setattr(h5py.Dataset, "__setitem__", write)
-    run = tf.simulate(scene, scene.seed(3, seed=11), until=UNTIL, record=tf.Recorder(path, scene, every=1))
+    run = tf.simulate(
+        scene, scene.seed(3, seed=11), until=UNTIL, record=tf.Recorder(path, scene, every=1)
+    )
     for _ in range(20):
         next(run)
     full.append(True)
@@ -207,10 +245,25 @@ def test_a_full_disk_is_told_and_loses_no_frame(tmp_path, monkeypatch, every_ste
     assert_same_file(every_step[0], path)
 
 
-@pytest.mark.parametrize("column", ["cells/uid", "lineage/births/uid", "frames/first_row", "frames/counts", "frames/time", "frames/step"])
-@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["disk", "Ctrl-C"])
-def test_a_frame_broken_off_at_any_column_is_no_frame(tmp_path, monkeypatch, every_step, column, failure):
-    """Writing breaks off once, somewhere in the 20th frame: no frame may hold half of it, and what is resumed is whole."""
+@pytest.mark.parametrize(
+    "column",
+    [
+        "cells/uid",
+        "lineage/births/uid",
+        "frames/first_row",
+        "frames/counts",
+        "frames/time",
+        "frames/step",
+    ],
+)
+@pytest.mark.parametrize(
+    "failure", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["disk", "Ctrl-C"]
+)
+def test_a_frame_broken_off_at_any_column_is_no_frame(
+    tmp_path, monkeypatch, every_step, column, failure
+):
+    """Writing breaks off once, somewhere in the 20th frame: no frame may hold half of it, and what
+    is resumed is whole."""
     path, scene = tmp_path / "run.h5", make_scene()
     real, armed = h5py.Dataset.__setitem__, []
 
@@ -221,7 +274,9 @@ def test_a_frame_broken_off_at_any_column_is_no_frame(tmp_path, monkeypatch, eve
         return real(self, key, value)
 
     monkeypatch.setattr(h5py.Dataset, "__setitem__", write)
-    run = tf.simulate(scene, scene.seed(3, seed=11), until=UNTIL, record=tf.Recorder(path, scene, every=1))
+    run = tf.simulate(
+        scene, scene.seed(3, seed=11), until=UNTIL, record=tf.Recorder(path, scene, every=1)
+    )
     state = None
     while state is None or state.step < 19:
         state = next(run)
@@ -232,7 +287,9 @@ def test_a_frame_broken_off_at_any_column_is_no_frame(tmp_path, monkeypatch, eve
         next(run)
     assert not armed, "nothing was broken off"
     with tf.Results(path) as results:
-        assert results.steps.tolist() == list(range(len(results))) and len(results) >= state.step + 1
+        assert (
+            results.steps.tolist() == list(range(len(results))) and len(results) >= state.step + 1
+        )
         resumed = results.state(scene)
     record(scene, resumed, path, every=1, append=True)
     assert_same_file(every_step[0], path)
@@ -258,9 +315,13 @@ def test_a_file_that_can_really_grow_no_further(tmp_path, every_step):
     """The system refuses to write beyond 120 kB: HDF5's own caches are involved, unlike above."""
     path = tmp_path / "run.h5"
     done = subprocess.run(
-        [sys.executable, "-c", LIMITED, str(path)], capture_output=True, text=True, timeout=120, check=False,
+        [sys.executable, "-c", LIMITED, str(path)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
         env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.path.dirname(__file__)},
-    )  # fmt: skip
+    )
     assert done.returncode == 7, (done.returncode, done.stdout, done.stderr[-2000:])
     assert "run.h5" in done.stdout
     scene = make_scene()
@@ -301,18 +362,36 @@ print("resumed")
 
 @pytest.mark.slow
 def test_a_disk_that_is_really_full(tmp_path, every_step):
-    """A disk of 200 kB of its own, where the system lets us make one: what fails there is the writing of HDF5's caches, which is late
-    and easily missed. The run must stop and say so, the frames before must be whole, and with more room it must go on.
+    """A disk of 200 kB of its own, where the system lets us make one: what fails there is the
+    writing of HDF5's caches, which is late and easily missed. The run must stop and say so, the
+    frames before must be whole, and with more room it must go on.
     """
     private = ["unshare", "-Urm"]
     trial = [*private, "sh", "-c", f"mount -t tmpfs -o size=200k tmpfs {tmp_path}"]
-    if shutil.which("unshare") is None or subprocess.run(trial, capture_output=True, check=False).returncode:
+    if (
+        shutil.which("unshare") is None
+        or subprocess.run(trial, capture_output=True, check=False).returncode
+    ):
         pytest.skip("this system does not let us make a small disk")
     (tmp_path / "disk").mkdir()
     done = subprocess.run(
-        [*private, sys.executable, "-c", SMALL_DISK, str(tmp_path / "disk"), str(tmp_path / "run.h5")],
-        capture_output=True, text=True, timeout=120, check=False,
+        [
+            *private,
+            sys.executable,
+            "-c",
+            SMALL_DISK,
+            str(tmp_path / "disk"),
+            str(tmp_path / "run.h5"),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
         env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.path.dirname(__file__)},
-    )  # fmt: skip
-    assert done.stdout.splitlines() == ["told", "frames whole", "resumed"], (done.returncode, done.stdout, done.stderr[-1000:])
+    )
+    assert done.stdout.splitlines() == ["told", "frames whole", "resumed"], (
+        done.returncode,
+        done.stdout,
+        done.stderr[-1000:],
+    )
     assert_same_file(every_step[0], tmp_path / "run.h5")

@@ -28,12 +28,18 @@ def test_a_run_from_any_frame_is_the_run_itself(whole, frame):
         state = results.state(scene, frame)
     last = list(tf.simulate(scene, state, until=UNTIL))[-1]
     assert_same_state(last, states[-1])
-    assert all(torch.equal(getattr(last.reports["mechanics"], n), getattr(states[-1].reports["mechanics"], n)) for n in ("iterations", "residual"))
+    assert all(
+        torch.equal(
+            getattr(last.reports["mechanics"], n), getattr(states[-1].reports["mechanics"], n)
+        )
+        for n in ("iterations", "residual")
+    )
 
 
 @pytest.mark.parametrize("stop", [1.05, 1.3], ids=["on a frame", "between frames"])
 def test_resume_bit_for_bit(tmp_path, whole, stop):
-    """Stopped and resumed, the file holds what the uninterrupted run's file holds, and the lineage is the same."""
+    """Stopped and resumed, the file holds what the uninterrupted run's file holds, and the lineage
+    is the same."""
     path, scene = tmp_path / "run.h5", make_scene()
     record(scene, scene.seed(3, seed=11), path, until=stop)
     scene = make_scene()
@@ -59,22 +65,42 @@ def test_every_step_can_be_resumed_from(tmp_path):
 
 
 def test_a_run_from_given_cells_can_be_resumed_where_the_founders_could_not_stand(tmp_path):
-    """The wall is at x = 5 and the default founder at 0: only the given cells matter, and they are on the right side."""
+    """The wall is at x = 5 and the default founder at 0: only the given cells matter, and they are
+    on the right side."""
 
     def scene_of():
-        return tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2, walls=[tf.Plane(x=5.0, facing="+x")]), dt=DT)
+        return tf.Scene(
+            tf.Growth(rate=1.0),
+            tf.Division(length=3.5),
+            tf.Mechanics(dim=2, walls=[tf.Plane(x=5.0, facing="+x")]),
+            dt=DT,
+        )
 
     path, scene = tmp_path / "run.h5", scene_of()
-    states = record(scene, scene.seed(2, cells=tf.Cells([[8.0, 0.0]], [[1.0, 0.0]], extra={"gfp": [0.5]})), path, until=1.0)
+    states = record(
+        scene,
+        scene.seed(2, cells=tf.Cells([[8.0, 0.0]], [[1.0, 0.0]], extra={"gfp": [0.5]})),
+        path,
+        until=1.0,
+    )
     with tf.Results(path) as results:
         assert_same_state(results.state(scene_of()), states[-1])
 
 
 def test_a_colony_that_has_sunk_into_a_soft_wall_can_be_resumed(tmp_path):
-    """A soft wall yields, so a centre may come to lie behind its surface: physics, and no wall inside out."""
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(walls=[tf.Plane(z=-0.5, facing="+z", stiffness=0.5), tf.Plane(z=0.5, facing="-z")]), dt=DT)
+    """A soft wall yields, so a centre may come to lie behind its surface: physics, and no wall
+    inside out."""
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Mechanics(
+            walls=[tf.Plane(z=-0.5, facing="+z", stiffness=0.5), tf.Plane(z=0.5, facing="-z")]
+        ),
+        dt=DT,
+    )
     states = record(scene, scene.seed(), tmp_path / "run.h5", until=0.5)
-    sunk = states[-1].replace(position=states[-1].position - torch.tensor([0.0, 0.0, 0.6], dtype=torch.float64))
+    sunk = states[-1].replace(
+        position=states[-1].position - torch.tensor([0.0, 0.0, 0.6], dtype=torch.float64)
+    )
     assert len(list(tf.simulate(scene, sunk, until=sunk.time + 2 * DT))) == 2
 
 
@@ -83,7 +109,9 @@ def test_another_scene_is_refused(whole, tmp_path):
         with pytest.raises(tf.InputError, match="2-D"):
             results.state(tf.Scene(tf.Growth(rate=1.0), tf.Mechanics()))
         with pytest.raises(tf.InputError, match=r"it lacks .*birth_length"):
-            results.state(tf.Scene(tf.Growth(rate=1.0), tf.Division(added=1.0), tf.Mechanics(dim=2)))
+            results.state(
+                tf.Scene(tf.Growth(rate=1.0), tf.Division(added=1.0), tf.Mechanics(dim=2))
+            )
 
 
 def ruled(factor: float) -> tf.Scene:
@@ -101,10 +129,14 @@ def test_a_function_that_was_edited_is_another_scene(tmp_path):
     record(first, first.seed(2), path, until=2 * DT)
     with tf.Results(path) as results:
         state = results.state(ruled(0.5))
-        with pytest.raises(tf.InputError, match=r"a function of its effects was edited.*resume --changed"):
+        with pytest.raises(
+            tf.InputError, match=r"a function of its effects was edited.*resume --changed"
+        ):
             results.state(edited)
         assert results.state(edited, changed=True).step == state.step
-    with pytest.raises(tf.InputError, match=r"a function of its effects was edited.*Recorder\(…, changed=True\)"):
+    with pytest.raises(
+        tf.InputError, match=r"a function of its effects was edited.*Recorder\(…, changed=True\)"
+    ):
         record(edited, state, path, append=True)
     with tf.Results(path) as results:
         results.check_alike(first)
@@ -138,10 +170,14 @@ def test_going_on_by_other_settings_is_told_in_the_file(tmp_path):
     path, base = tmp_path / "run.h5", tf.scenes.microcolony()
     last = record(base, base.seed(2), path, until=2 * base.dt)[-1]
     finer = tf.Settings(tolerance=0.01).apply(base)
-    for _ in tf.simulate(finer, last, until=4 * base.dt, record=tf.Recorder(path, finer, append=True, changed=True)):
+    for _ in tf.simulate(
+        finer, last, until=4 * base.dt, record=tf.Recorder(path, finer, append=True, changed=True)
+    ):
         pass
     with tf.Results(path) as results:
-        again = tf.Settings.named(results.accuracy, str(path)).apply(tf.scenes.build(*results.recipe))
+        again = tf.Settings.named(results.accuracy, str(path)).apply(
+            tf.scenes.build(*results.recipe)
+        )
         assert results.state(again).step == 4
 
 
@@ -189,7 +225,8 @@ for _ in tf.simulate(scene, scene.seed(3, seed=11), until=3.0, record=tf.Recorde
 @pytest.mark.slow
 @pytest.mark.parametrize("attempt", range(3))
 def test_killed_at_any_moment_the_file_opens_and_the_run_resumes(tmp_path, every_step, attempt):
-    """kill −9 at a moment drawn at random: no frame that was finished is lost, and the resumed run ends as if nothing had happened."""
+    """kill −9 at a moment drawn at random: no frame that was finished is lost, and the resumed run
+    ends as if nothing had happened."""
     path = tmp_path / "run.h5"
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.path.dirname(__file__)}
     child = subprocess.Popen([sys.executable, "-c", WRITE, str(path)], env=environment)
@@ -209,7 +246,9 @@ def test_killed_at_any_moment_the_file_opens_and_the_run_resumes(tmp_path, every
         if child.poll() is None:
             child.send_signal(signal.SIGKILL)
         child.wait()
-    assert child.returncode == -signal.SIGKILL, "the run was over before it was killed: nothing tested"
+    assert child.returncode == -signal.SIGKILL, (
+        "the run was over before it was killed: nothing tested"
+    )
     scene = make_scene()
     with tf.Results(path) as results:
         assert len(results) >= max(1, seen)

@@ -1,4 +1,5 @@
-"""Signals and circuits in results: what a file gives back, and a colony that goes on bit for bit from it, alone, or in another batch."""
+"""Signals and circuits in results: what a file gives back, and a colony that goes on bit for bit
+from it, alone, or in another batch."""
 
 from __future__ import annotations
 
@@ -17,7 +18,10 @@ BOX = {"box": ((-8.0, -8.0), (8.0, 8.0)), "spacing": 2.0}
 
 def lux(u, s, p, cell):
     into = p.D1 * (s.ahl - u.ahl) * cell.area
-    return {"luxi": p.basal + u.ahl**2 / (1 + u.ahl**2) - u.luxi, "ahl": p.make * u.luxi + into / cell.volume}, {"ahl": -into}
+    return {
+        "luxi": p.basal + u.ahl**2 / (1 + u.ahl**2) - u.luxi,
+        "ahl": p.make * u.luxi + into / cell.volume,
+    }, {"ahl": -into}
 
 
 def body() -> list[tf.Effect]:
@@ -27,20 +31,53 @@ def body() -> list[tf.Effect]:
 def smooth() -> tf.Scene:
     """Constants of circuit and signal per colony, and grids that grow, each with its colony."""
     return tf.Scene(
-        tf.Growth(rate=[1.0, 1.5, 2.0]), *body(),
-        tf.Circuit(lux, species=("luxi", "ahl"), initial={"luxi": tf.Uniform(0.5, 1.0)}, D1=[1.0, 2.0, 3.0], basal=0.1, make=2.0, daughters="amount"),
-        tf.Medium(ahl=tf.Signal(diffusion=[10.0, 20.0, 30.0], decay=[0.1, 0.2, 0.3]), flow=([1.0, 0.0, -1.0], 0.0), beyond="grow", **BOX), dt=DT,
-    )  # fmt: skip
+        tf.Growth(rate=[1.0, 1.5, 2.0]),
+        *body(),
+        tf.Circuit(
+            lux,
+            species=("luxi", "ahl"),
+            initial={"luxi": tf.Uniform(0.5, 1.0)},
+            D1=[1.0, 2.0, 3.0],
+            basal=0.1,
+            make=2.0,
+            daughters="amount",
+        ),
+        tf.Medium(
+            ahl=tf.Signal(diffusion=[10.0, 20.0, 30.0], decay=[0.1, 0.2, 0.3]),
+            flow=([1.0, 0.0, -1.0], 0.0),
+            beyond="grow",
+            **BOX,
+        ),
+        dt=DT,
+    )
 
 
 def leaping() -> tf.Scene:
     """Molecule by molecule, in a box in a reservoir."""
-    reactions = [tf.parts.constitutive("m", "make"), tf.parts.degradation("m", 1.0), tf.parts.exchange("m", 1.0)]
+    reactions = [
+        tf.parts.constitutive("m", "make"),
+        tf.parts.degradation("m", 1.0),
+        tf.parts.exchange("m", 1.0),
+    ]
     return tf.Scene(
-        tf.Growth(rate=1.7), *body(),
-        tf.Circuit(reactions, species=("m",), initial={"m": 3.0}, method="tau_leap", make=[5.0, 10.0, 20.0], copies=[1.0, 2.0, 3.0]),
-        tf.Medium(m=tf.Signal(diffusion=5.0, beyond=[0.0, 0.5, 1.0]), box=((-2.0, -2.0), (2.0, 2.0)), spacing=2.0, beyond="open"), dt=DT,
-    )  # fmt: skip
+        tf.Growth(rate=1.7),
+        *body(),
+        tf.Circuit(
+            reactions,
+            species=("m",),
+            initial={"m": 3.0},
+            method="tau_leap",
+            make=[5.0, 10.0, 20.0],
+            copies=[1.0, 2.0, 3.0],
+        ),
+        tf.Medium(
+            m=tf.Signal(diffusion=5.0, beyond=[0.0, 0.5, 1.0]),
+            box=((-2.0, -2.0), (2.0, 2.0)),
+            spacing=2.0,
+            beyond="open",
+        ),
+        dt=DT,
+    )
 
 
 def typed() -> tf.Scene:
@@ -48,9 +85,18 @@ def typed() -> tf.Scene:
     exchange = [tf.parts.constitutive("a", "make"), tf.parts.exchange("a", "D1")]
     cells = tf.Cells([[0.0, -1.0], [0.0, 1.0]], [[1.0, 0.0]] * 2, cell_type=[0, 1])
     return tf.Scene(
-        tf.Growth(rate=1.3), *body(), tf.Circuit({0: exchange, 1: taken}, species=("a",), make=[1.0, 2.0, 3.0], D1=1.0, k=2.0),
-        tf.Medium(a=tf.Signal(diffusion=10.0), obstacles=lambda at: at[:, 0] > 12.0, box=((-16.0, -16.0), (16.0, 16.0)), spacing=4.0), founders=cells, dt=DT,
-    )  # fmt: skip
+        tf.Growth(rate=1.3),
+        *body(),
+        tf.Circuit({0: exchange, 1: taken}, species=("a",), make=[1.0, 2.0, 3.0], D1=1.0, k=2.0),
+        tf.Medium(
+            a=tf.Signal(diffusion=10.0),
+            obstacles=lambda at: at[:, 0] > 12.0,
+            box=((-16.0, -16.0), (16.0, 16.0)),
+            spacing=4.0,
+        ),
+        founders=cells,
+        dt=DT,
+    )
 
 
 def taken(u, s, p, cell):
@@ -60,13 +106,20 @@ def taken(u, s, p, cell):
 
 def fed() -> tf.Scene:
     return tf.Scene(
-        tf.Monod("food", rate=[1.0, 1.5, 2.0], half=0.2), tf.Growth(), *body(),
+        tf.Monod("food", rate=[1.0, 1.5, 2.0], half=0.2),
+        tf.Growth(),
+        *body(),
         tf.Medium(
-            food=tf.Signal(diffusion=20.0, initial=[1.0, 2.0, 3.0]), faces=tf.Faces(x=tf.Fixed([1.0, 2.0, 3.0])), beyond="grow", grows="y", depth=1.0,
-            box=((-16.0, -8.0), (16.0, 8.0)), spacing=4.0,
+            food=tf.Signal(diffusion=20.0, initial=[1.0, 2.0, 3.0]),
+            faces=tf.Faces(x=tf.Fixed([1.0, 2.0, 3.0])),
+            beyond="grow",
+            grows="y",
+            depth=1.0,
+            box=((-16.0, -8.0), (16.0, 8.0)),
+            spacing=4.0,
         ),
         dt=DT,
-    )  # fmt: skip
+    )
 
 
 SCENES = {"smooth": smooth, "molecules": leaping, "types": typed, "food": fed}
@@ -77,8 +130,15 @@ def make(request):
     return SCENES[request.param]
 
 
-def record(scene: tf.Scene, state: tf.State, path, until: float = UNTIL, **options) -> list[tf.State]:
-    return [state, *tf.simulate(scene, state, until=until, record=tf.Recorder(path, scene, every=EVERY, **options))]
+def record(
+    scene: tf.Scene, state: tf.State, path, until: float = UNTIL, **options
+) -> list[tf.State]:
+    return [
+        state,
+        *tf.simulate(
+            scene, state, until=until, record=tf.Recorder(path, scene, every=EVERY, **options)
+        ),
+    ]
 
 
 def assert_same(a: tf.State, b: tf.State) -> None:
@@ -124,7 +184,11 @@ def test_appending_is_as_if_never_stopped(tmp_path):
     with tf.Results(tmp_path / "whole.h5") as a, tf.Results(tmp_path / "two.h5") as b:
         assert a.steps.tolist() == b.steps.tolist() and a.signal_names == b.signal_names == ("ahl",)
         for k in range(len(a)):
-            for x, y in zip((*a.grid(k), *a.signal("ahl", k), *a.frame(k).values()), (*b.grid(k), *b.signal("ahl", k), *b.frame(k).values()), strict=True):
+            for x, y in zip(
+                (*a.grid(k), *a.signal("ahl", k), *a.frame(k).values()),
+                (*b.grid(k), *b.signal("ahl", k), *b.frame(k).values()),
+                strict=True,
+            ):
                 assert np.array_equal(x, y)
 
 
@@ -144,7 +208,10 @@ def test_a_half_written_frame_is_not_there(tmp_path):
     record(scene, scene.seed(3, seed=7), tmp_path / "whole.h5")
     with tf.Results(tmp_path / "whole.h5") as a, tf.Results(tmp_path / "run.h5") as b:
         for k in range(len(a)):
-            assert all(np.array_equal(x, y) for x, y in zip(a.signal("ahl", k), b.signal("ahl", k), strict=True))
+            assert all(
+                np.array_equal(x, y)
+                for x, y in zip(a.signal("ahl", k), b.signal("ahl", k), strict=True)
+            )
 
 
 def test_what_a_file_tells_of_signals(tmp_path):
@@ -155,12 +222,20 @@ def test_what_a_file_tells_of_signals(tmp_path):
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.signal_names == ("ahl",)
         origin, shape, spacing = results.grid()
-        assert np.array_equal(origin, grid.origin.numpy()) and np.array_equal(shape, grid.shape.numpy()) and spacing.tolist() == [2.0, 2.0, 2.0]
+        assert (
+            np.array_equal(origin, grid.origin.numpy())
+            and np.array_equal(shape, grid.shape.numpy())
+            and spacing.tolist() == [2.0, 2.0, 2.0]
+        )
         found = results.signal("ahl")
         assert [x.shape for x in found] == list(grid.shapes)
-        assert np.array_equal(np.concatenate([x.reshape(-1) for x in found]), last.signals["ahl"].numpy())
+        assert np.array_equal(
+            np.concatenate([x.reshape(-1) for x in found]), last.signals["ahl"].numpy()
+        )
         assert [x.shape for x in results.signal("ahl", 0)] == [(8, 8, 1)] * 3
-        assert {"luxi", "ahl", "circuit_volume"} <= set(results.table(-1)) and "out.ahl" not in results.table(-1)
+        assert {"luxi", "ahl", "circuit_volume"} <= set(
+            results.table(-1)
+        ) and "out.ahl" not in results.table(-1)
         with pytest.raises(InputError, match=r"signal = 'luxi'.*one of ahl"):
             results.signal("luxi")
 
@@ -169,7 +244,9 @@ def test_files_without_a_medium_say_so_and_hold_nothing_of_it(tmp_path):
     scene = tf.Scene(tf.Growth(rate=1.0), *body())
     record(scene, scene.seed(), tmp_path / "run.h5", until=0.3)
     with h5py.File(tmp_path / "run.h5") as file:
-        assert "signals" not in file and "grid" not in file["frames"] and "spacing" not in file.attrs
+        assert (
+            "signals" not in file and "grid" not in file["frames"] and "spacing" not in file.attrs
+        )
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.signal_names == ()
         with pytest.raises(InputError, match="no medium"):

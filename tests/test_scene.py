@@ -1,4 +1,5 @@
-"""The scene: order, couplings, parameters per colony, bad input, and that nothing runs which was not asked for."""
+"""The scene: order, couplings, parameters per colony, bad input, and that nothing runs which was
+not asked for."""
 
 from __future__ import annotations
 
@@ -48,21 +49,42 @@ def cells_in(dim: int, count: int = 2) -> tf.Cells:
     return tf.Cells(position, axis)
 
 
-# --- order and couplings --------------------------------------------------------------------------------------------------
+# --- order and couplings --------------------------------------------------------------------------
 
 
 def test_effects_act_in_stage_order_whatever_order_they_are_listed_in():
     order: list[str] = []
-    effects = [named(order, name, at) for name, at in (("late", 70), ("early", 5), ("middle", 35), ("last", 95), ("also middle", 35))]
+    effects = [
+        named(order, name, at)
+        for name, at in (
+            ("late", 70),
+            ("early", 5),
+            ("middle", 35),
+            ("last", 95),
+            ("also middle", 35),
+        )
+    ]
     scene = tf.Scene(*effects)
     scene.step(scene.seed(), 0.1)
     assert order == ["early", "middle", "also middle", "late", "last"]
 
 
 def test_the_built_in_effects_follow_the_papers_stages():
-    listed = (tf.Removal((-9, -9), (9, 9)), tf.Mechanics(dim=2), tf.Growth(rate=1.0), tf.Division(), tf.Rules(lambda cells: None))
+    listed = (
+        tf.Removal((-9, -9), (9, 9)),
+        tf.Mechanics(dim=2),
+        tf.Growth(rate=1.0),
+        tf.Division(),
+        tf.Rules(lambda cells: None),
+    )
     scene = tf.Scene(*listed)
-    assert [e.title for e in scene.effects] == ["rules", "division", "growth", "mechanics", "removal"]
+    assert [e.title for e in scene.effects] == [
+        "rules",
+        "division",
+        "growth",
+        "mechanics",
+        "removal",
+    ]
     assert scene.listed == listed
 
 
@@ -78,12 +100,16 @@ def test_order_of_listing_does_not_change_the_result():
             state = scene.step(state, 0.1)
         states.append(state)
     assert states[0].cells > 6
-    assert torch.equal(states[0].position, states[1].position) and torch.equal(states[0].uid, states[1].uid)
+    assert torch.equal(states[0].position, states[1].position) and torch.equal(
+        states[0].uid, states[1].uid
+    )
 
 
 def test_couplings_say_who_drives_whom():
     order: list[str] = []
-    source = named(order, "source", 10, writes=("heat",), declares=(tf.Field("heat", "of the medium"),))
+    source = named(
+        order, "source", 10, writes=("heat",), declares=(tf.Field("heat", "of the medium"),)
+    )
     sink = named(order, "sink", 20, reads=("heat",))
     needy = named(order, "needy", 30, needs=("heat",), writes=("length",))
     scene = tf.Scene(needy, source, sink)
@@ -107,23 +133,37 @@ def test_growth_alone_is_driven_by_nobody():
 
 def test_explain_names_stages_parameters_fields_and_couplings():
     text = tf.Scene(
-        tf.Growth(rate=[0.5, 1.5]), tf.Division(length=tf.Uniform(3.0, 4.0)), tf.Mechanics(dim=2, walls=[tf.Plane(y=-2.0, facing="+y")]), name="mine"
+        tf.Growth(rate=[0.5, 1.5]),
+        tf.Division(length=tf.Uniform(3.0, 4.0)),
+        tf.Mechanics(dim=2, walls=[tf.Plane(y=-2.0, facing="+y")]),
+        name="mine",
     ).explain()
-    for part in ("mine", "2-D", "Growth(rate=<2 values, 0.5 to 1.5>", "Uniform(low=3.0, high=4.0)", "Plane(y=-2.0", "division_threshold", "µm"):
+    for part in (
+        "mine",
+        "2-D",
+        "Growth(rate=<2 values, 0.5 to 1.5>",
+        "Uniform(low=3.0, high=4.0)",
+        "Plane(y=-2.0",
+        "division_threshold",
+        "µm",
+    ):
         assert part in text, part
     assert "growth -> mechanics: length, elongation" in text
     assert text.index("Division(") < text.index("Growth(") < text.index("Mechanics(")
 
 
 def test_repr_shows_the_effects():
-    assert repr(tf.Scene(tf.Growth(rate=1.0), name="mine")) == "Scene(Growth(rate=1.0), name='mine')"
+    assert (
+        repr(tf.Scene(tf.Growth(rate=1.0), name="mine")) == "Scene(Growth(rate=1.0), name='mine')"
+    )
 
 
-# --- one number, or one per colony ----------------------------------------------------------------------------------------
+# --- one number, or one per colony ----------------------------------------------------------------
 
 
 def two_designs(make, colonies: int = 2) -> list[tf.State]:
-    """Each colony of a batch with a parameter per colony, and the same colony in a scene with its one number."""
+    """Each colony of a batch with a parameter per colony, and the same colony in a scene with its
+    one number."""
     batch = make(torch.tensor([1.0, 2.0], dtype=torch.float64))
     return [run_a_little(batch, colonies)] + [run_a_little(make(v), colonies) for v in (1.0, 2.0)]
 
@@ -152,28 +192,60 @@ PER_COLONY = {
     "Division.length": lambda v: tf.Scene(PUSH, tf.Division(length=v + 1.5), founders=crowd()),
     "Division.volume": lambda v: tf.Scene(PUSH, tf.Division(volume=v + 1.5), founders=crowd()),
     "Division.added": lambda v: tf.Scene(PUSH, tf.Division(added=v * 0.4), founders=crowd()),
-    "Division.fraction": lambda v: tf.Scene(PUSH, tf.Division(length=2.5, fraction=v * 0.3), founders=crowd()),
-    "Division.axis_noise": lambda v: tf.Scene(PUSH, tf.Division(length=2.5, axis_noise=v * 0.01), founders=crowd()),
-    "Mechanics.viscosity": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, viscosity=v), founders=crowd()),
-    "Mechanics.length_drag": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, length_drag=v), founders=crowd()),
+    "Division.fraction": lambda v: tf.Scene(
+        PUSH, tf.Division(length=2.5, fraction=v * 0.3), founders=crowd()
+    ),
+    "Division.axis_noise": lambda v: tf.Scene(
+        PUSH, tf.Division(length=2.5, axis_noise=v * 0.01), founders=crowd()
+    ),
+    "Mechanics.viscosity": lambda v: tf.Scene(
+        PUSH, tf.Mechanics(dim=2, viscosity=v), founders=crowd()
+    ),
+    "Mechanics.length_drag": lambda v: tf.Scene(
+        PUSH, tf.Mechanics(dim=2, length_drag=v), founders=crowd()
+    ),
     "Mechanics.alpha": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, alpha=v), founders=crowd()),
-    "Mechanics.stiffness": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, stiffness=v * 10), founders=crowd()),
-    "Plane.y": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, walls=[tf.Plane(y=v + 1.8, facing="-y")]), founders=crowd()),
-    "Plane.stiffness": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, walls=[tf.Plane(y=2.5, facing="-y", stiffness=v)]), founders=crowd()),
-    "Plane.weight": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, walls=[tf.Plane(y=2.5, facing="-y", weight=v / 2)]), founders=crowd()),
-    "Sphere.radius": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, walls=[tf.Sphere((0.0, 1.2), v + 1.0)]), founders=crowd()),
-    "Channel.width": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, walls=[tf.Channel(v + 4.0)]), founders=crowd()),
-    "Box.high": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, walls=[tf.Box((-9.0, -9.0), (9.0, v + 1.5))]), founders=crowd()),
-    "Removal.high": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2), tf.Removal((-9.0, -9.0), (9.0, v + 1.5)), founders=crowd()),
+    "Mechanics.stiffness": lambda v: tf.Scene(
+        PUSH, tf.Mechanics(dim=2, stiffness=v * 10), founders=crowd()
+    ),
+    "Plane.y": lambda v: tf.Scene(
+        PUSH, tf.Mechanics(dim=2, walls=[tf.Plane(y=v + 1.8, facing="-y")]), founders=crowd()
+    ),
+    "Plane.stiffness": lambda v: tf.Scene(
+        PUSH,
+        tf.Mechanics(dim=2, walls=[tf.Plane(y=2.5, facing="-y", stiffness=v)]),
+        founders=crowd(),
+    ),
+    "Plane.weight": lambda v: tf.Scene(
+        PUSH,
+        tf.Mechanics(dim=2, walls=[tf.Plane(y=2.5, facing="-y", weight=v / 2)]),
+        founders=crowd(),
+    ),
+    "Sphere.radius": lambda v: tf.Scene(
+        PUSH, tf.Mechanics(dim=2, walls=[tf.Sphere((0.0, 1.2), v + 1.0)]), founders=crowd()
+    ),
+    "Channel.width": lambda v: tf.Scene(
+        PUSH, tf.Mechanics(dim=2, walls=[tf.Channel(v + 4.0)]), founders=crowd()
+    ),
+    "Box.high": lambda v: tf.Scene(
+        PUSH, tf.Mechanics(dim=2, walls=[tf.Box((-9.0, -9.0), (9.0, v + 1.5))]), founders=crowd()
+    ),
+    "Removal.high": lambda v: tf.Scene(
+        PUSH, tf.Mechanics(dim=2), tf.Removal((-9.0, -9.0), (9.0, v + 1.5)), founders=crowd()
+    ),
 }
 
 
 @pytest.mark.parametrize("name", list(PER_COLONY))
 def test_every_physical_parameter_may_differ_from_colony_to_colony(name):
-    """A colony of a batch with many designs is, bit for bit, that colony in a batch of its own design."""
+    """A colony of a batch with many designs is, bit for bit, that colony in a batch of its own
+    design."""
     batch, *each = two_designs(PER_COLONY[name])
     first, second = (state.select([0]) for state in each)
-    assert any(not torch.equal(getattr(first, part), getattr(second, part)) for part in ("position", "axis", "length"))
+    assert any(
+        not torch.equal(getattr(first, part), getattr(second, part))
+        for part in ("position", "axis", "length")
+    )
     for k in range(2):
         mine, alone = batch.select([k]), each[k].select([k])
         for part in ("uid", "position", "axis", "length"):
@@ -188,7 +260,9 @@ SHORT = {
     "Mechanics.viscosity": lambda v: (tf.Mechanics(dim=2, viscosity=v),),
     "Mechanics.alpha": lambda v: (tf.Mechanics(dim=2, alpha=v),),
     "Plane.y": lambda v: (tf.Mechanics(dim=2, walls=[tf.Plane(y=v + 5, facing="-y")]),),
-    "Plane.stiffness": lambda v: (tf.Mechanics(dim=2, walls=[tf.Plane(y=5.0, facing="-y", stiffness=v)]),),
+    "Plane.stiffness": lambda v: (
+        tf.Mechanics(dim=2, walls=[tf.Plane(y=5.0, facing="-y", stiffness=v)]),
+    ),
     "Sphere.radius": lambda v: (tf.Mechanics(dim=2, walls=[tf.Sphere((0.0, 0.0), v + 9)]),),
 }
 
@@ -202,13 +276,14 @@ def test_too_few_values_are_refused_by_name(name):
 
 @pytest.mark.parametrize("name", list(SHORT))
 def test_too_many_values_are_refused_by_name(name):
-    """Four designs for three colonies: one would never be looked at, which can only be a mistake."""
+    """Four designs for three colonies: one would never be looked at, which can only be a
+    mistake."""
     scene = tf.Scene(*SHORT[name](torch.tensor([1.0, 2.0, 1.0, 2.0])), founders=cells_in(2))
     with pytest.raises(tf.InputError, match=name.split(".")[1]):
         scene.seed(3)
 
 
-# --- bad scenes -----------------------------------------------------------------------------------------------------------
+# --- bad scenes -----------------------------------------------------------------------------------
 
 
 def test_an_empty_scene_is_refused():
@@ -222,7 +297,9 @@ def test_missing_brackets_are_told(made):
         tf.Scene(made)
 
 
-@pytest.mark.parametrize("effect", [lambda: tf.Growth(rate=1.0), lambda: tf.Division(), lambda: tf.Mechanics(dim=2)])
+@pytest.mark.parametrize(
+    "effect", [lambda: tf.Growth(rate=1.0), lambda: tf.Division(), lambda: tf.Mechanics(dim=2)]
+)
 def test_an_effect_listed_twice_is_refused(effect):
     with pytest.raises(tf.InputError, match="2 times"):
         tf.Scene(effect(), effect())
@@ -230,7 +307,9 @@ def test_an_effect_listed_twice_is_refused(effect):
 
 def test_two_rules_are_two_effects():
     order: list[str] = []
-    scene = tf.Scene(tf.Rules(lambda cells: order.append("one")), tf.Rules(lambda cells: order.append("two")))
+    scene = tf.Scene(
+        tf.Rules(lambda cells: order.append("one")), tf.Rules(lambda cells: order.append("two"))
+    )
     state = scene.seed()
     order.clear()
     scene.step(state, 0.1)
@@ -239,7 +318,9 @@ def test_two_rules_are_two_effects():
 
 def test_a_field_declared_twice_is_refused():
     order: list[str] = []
-    first, second = (named(order, n, 10, declares=(tf.Field("heat", "of the medium"),)) for n in ("one", "two"))
+    first, second = (
+        named(order, n, 10, declares=(tf.Field("heat", "of the medium"),)) for n in ("one", "two")
+    )
     with pytest.raises(tf.InputError, match=r"'heat'.*one.*two"):
         tf.Scene(first, second)
 
@@ -283,14 +364,18 @@ def test_a_bad_seed_is_refused(seed):
         tf.Scene(tf.Growth(rate=1.0)).seed(seed=seed)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64, torch.complex64, "float32"])
+@pytest.mark.parametrize(
+    "dtype", [torch.float16, torch.bfloat16, torch.int64, torch.complex64, "float32"]
+)
 def test_a_bad_dtype_is_refused(dtype):
     with pytest.raises(tf.InputError, match=r"dtype.*float32"):
         tf.Scene(tf.Growth(rate=1.0)).seed(dtype=dtype)
 
 
 def unavailable() -> list[object]:
-    return ["banana", 3.5, "mps"] + ([] if torch.cuda.is_available() else ["cuda", torch.device("cuda:1")])
+    return ["banana", 3.5, "mps"] + (
+        [] if torch.cuda.is_available() else ["cuda", torch.device("cuda:1")]
+    )
 
 
 @pytest.mark.parametrize("device", unavailable(), ids=str)
@@ -359,7 +444,7 @@ def test_one_wall_instead_of_a_list_is_told():
         tf.Mechanics(dim=2, walls=tf.Plane(y=-1.0, facing="+y"))
 
 
-# --- only what is asked ---------------------------------------------------------------------------------------------------
+# --- only what is asked ---------------------------------------------------------------------------
 
 
 class Operators(TorchDispatchMode):
@@ -384,18 +469,35 @@ def operators(*effects: Effect, steps: int = 1) -> Counter[str]:
 
 
 def test_growth_alone_is_a_handful_of_operators():
-    """The law by length takes four (rate·dt, expm1, times l, plus l), the law by volume two more for l + 4r/3; two may be for care."""
-    by_length, by_volume = operators(tf.Growth(rate=1.0, law="length")), operators(tf.Growth(rate=1.0))
+    """The law by length takes four (rate·dt, expm1, times l, plus l), the law by volume two more
+    for l + 4r/3; two may be for care."""
+    by_length, by_volume = (
+        operators(tf.Growth(rate=1.0, law="length")),
+        operators(tf.Growth(rate=1.0)),
+    )
     assert sum(by_length.values()) <= 6, by_length
     assert sum(by_volume.values()) <= 8, by_volume
     assert by_length["expm1"] == by_volume["expm1"] == 1
 
 
 def test_the_cost_of_growth_does_not_depend_on_the_number_of_steps_before():
-    assert sum(operators(tf.Growth(rate=1.0), steps=5).values()) == 5 * sum(operators(tf.Growth(rate=1.0)).values())
+    assert sum(operators(tf.Growth(rate=1.0), steps=5).values()) == 5 * sum(
+        operators(tf.Growth(rate=1.0)).values()
+    )
 
 
-HEAVY = ("sort", "argsort", "sparse", "csr", "mm", "bmm", "inv", "searchsorted", "scatter", "repeat_interleave")
+HEAVY = (
+    "sort",
+    "argsort",
+    "sparse",
+    "csr",
+    "mm",
+    "bmm",
+    "inv",
+    "searchsorted",
+    "scatter",
+    "repeat_interleave",
+)
 
 
 def heavy(seen: Counter[str]) -> list[str]:
@@ -403,9 +505,16 @@ def heavy(seen: Counter[str]) -> list[str]:
 
 
 def test_without_mechanics_no_pair_is_looked_for_and_nothing_is_solved():
-    growing = (tf.Growth(rate=1.0), tf.Division(length=9.0), tf.Removal((-99.0, -99.0), (99.0, 99.0)), tf.Rules(lambda c: c.growth_rate))
+    growing = (
+        tf.Growth(rate=1.0),
+        tf.Division(length=9.0),
+        tf.Removal((-99.0, -99.0), (99.0, 99.0)),
+        tf.Rules(lambda c: c.growth_rate),
+    )
     assert not heavy(operators(*growing))
-    assert heavy(operators(tf.Growth(rate=1.0), tf.Mechanics(dim=2))), "this test must be able to see them"
+    assert heavy(operators(tf.Growth(rate=1.0), tf.Mechanics(dim=2))), (
+        "this test must be able to see them"
+    )
 
 
 def test_rules_that_do_not_ask_for_contacts_do_not_pay_for_them():
@@ -416,7 +525,10 @@ def test_rules_that_do_not_ask_for_contacts_do_not_pay_for_them():
 def test_an_effect_that_is_not_listed_leaves_no_field_and_no_report():
     state = tf.Scene(tf.Growth(rate=1.0)).seed()
     assert set(state.fields) == {"growth_rate", "elongation"} and not state.reports
-    assert set(tf.Scene(tf.Division(length=3.0)).seed().fields) == {"divide_flag", "division_threshold"}
+    assert set(tf.Scene(tf.Division(length=3.0)).seed().fields) == {
+        "divide_flag",
+        "division_threshold",
+    }
     scene = tf.Scene(tf.Mechanics(dim=2))
     assert set(scene.seed().fields) == {"displacement"}
     assert set(scene.step(scene.seed(), 0.1).reports) == {"mechanics"}
@@ -424,23 +536,41 @@ def test_an_effect_that_is_not_listed_leaves_no_field_and_no_report():
 
 def test_a_step_does_not_touch_the_state_before():
     aging = tf.Rules(lambda c: setattr(c, "age", c.age + 1), variables={"age": 0.0})
-    scene = tf.Scene(aging, tf.Growth(rate=1.0), tf.Division(length=2.3), tf.Mechanics(dim=2), founders=crowd())
+    scene = tf.Scene(
+        aging, tf.Growth(rate=1.0), tf.Division(length=2.3), tf.Mechanics(dim=2), founders=crowd()
+    )
     state = scene.seed(2)
-    names = ("colony", "uid", "parent", "position", "axis", "length", "radius", "colony_id", "next_uid")
-    before = {n: getattr(state, n).clone() for n in names} | {n: v.clone() for n, v in state.fields.items()}
+    names = (
+        "colony",
+        "uid",
+        "parent",
+        "position",
+        "axis",
+        "length",
+        "radius",
+        "colony_id",
+        "next_uid",
+    )
+    before = {n: getattr(state, n).clone() for n in names} | {
+        n: v.clone() for n, v in state.fields.items()
+    }
     after = state
     for _ in range(5):
         after = scene.step(after, 0.1)
     assert after.cells > state.cells and state.step == 0 and state.time == 0.0
     for name, value in before.items():
-        assert torch.equal(getattr(state, name), value), f"the step changed {name} of the state before"
+        assert torch.equal(getattr(state, name), value), (
+            f"the step changed {name} of the state before"
+        )
 
 
 def test_timings_name_every_effect():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Mechanics(dim=2))
     timings = tf.Timings()
     scene.step(scene.seed(), 0.1, timings)
-    assert list(timings.seconds) == ["division", "growth", "mechanics"] and all(s > 0 for s in timings.seconds.values())
+    assert list(timings.seconds) == ["division", "growth", "mechanics"] and all(
+        s > 0 for s in timings.seconds.values()
+    )
 
 
 def test_an_effect_of_ones_own_needs_a_title_and_a_stage():

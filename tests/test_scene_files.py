@@ -1,4 +1,5 @@
-"""Scenes by what a user types: names, Python files and saved designs; what is none of them is refused in words."""
+"""Scenes by what a user types: names, Python files and saved designs; what is none of them is
+refused in words."""
 
 from __future__ import annotations
 
@@ -23,7 +24,13 @@ ready = tf.scenes.microcolony(rate=0.5)
 number = 3
 """
 
-READY = {"scene": "microcolony", "parameters": {"rate": 0.5, "dim": 2}, "seed": 3, "dt": 0.05, "cells": 4}
+READY = {
+    "scene": "microcolony",
+    "parameters": {"rate": 0.5, "dim": 2},
+    "seed": 3,
+    "dt": 0.05,
+    "cells": 4,
+}
 
 
 @pytest.fixture
@@ -47,9 +54,24 @@ def test_a_design_of_a_ready_scene_is_that_scene(folder):
 
 
 def test_a_design_of_a_file_is_its_function(folder):
-    made = load_scene(saved(folder, {"scene": "lamp", "file": str(folder / "mine.py"), "function": "lamp", "parameters": {"rate": 0.7, "longest": 3.5}}), {})
+    made = load_scene(
+        saved(
+            folder,
+            {
+                "scene": "lamp",
+                "file": str(folder / "mine.py"),
+                "function": "lamp",
+                "parameters": {"rate": 0.7, "longest": 3.5},
+            },
+        ),
+        {},
+    )
     assert made.listing()[:2] == ["Growth(rate=0.7)", "Division(length=Uniform(low=3.0, high=3.5))"]
-    assert (made.name, made.dt, made.settings) == ("mine", 0.05, {"rate": 0.7, "longest": 3.5}) and made.recipe is None
+    assert (made.name, made.dt, made.settings) == (
+        "mine",
+        0.05,
+        {"rate": 0.7, "longest": 3.5},
+    ) and made.recipe is None
 
 
 def test_settings_come_before_those_saved(folder):
@@ -63,8 +85,14 @@ def test_only_a_json_file_is_a_design(folder):
 
 
 def test_a_design_of_one_colony_starts_as_the_ready_scene_does(folder):
-    one, other = load_scene(saved(folder, READY), {}).seed(2, seed=3), tf.scenes.microcolony(rate=0.5).seed(2, seed=3)
-    assert one.position.tolist() == other.position.tolist() and one.division_threshold.tolist() == other.division_threshold.tolist()
+    one, other = (
+        load_scene(saved(folder, READY), {}).seed(2, seed=3),
+        tf.scenes.microcolony(rate=0.5).seed(2, seed=3),
+    )
+    assert (
+        one.position.tolist() == other.position.tolist()
+        and one.division_threshold.tolist() == other.division_threshold.tolist()
+    )
 
 
 @pytest.mark.parametrize(
@@ -80,15 +108,30 @@ def test_a_design_of_one_colony_starts_as_the_ready_scene_does(folder):
         ({"scene": 5, "parameters": {}}, "is no saved design"),
         ({**READY, "scene": "microcolonie"}, "scene = 'microcolonie'.*one of microcolony"),
         ({**READY, "scene": "none.py"}, "scene = 'none.py'.*No such file"),
-        ({**READY, "scene": "best.json"}, "scene in .*best.json = 'best.json'.*a ready scene, or the path of a Python file"),
-        ({**READY, "file": "other.json"}, "'other.json'.*a ready scene, or the path of a Python file"),
+        (
+            {**READY, "scene": "best.json"},
+            "scene in .*best.json = 'best.json'.*a ready scene, or the path of a Python file",
+        ),
+        (
+            {**READY, "file": "other.json"},
+            "'other.json'.*a ready scene, or the path of a Python file",
+        ),
         ({**READY, "parameters": {"rates": 1.0}}, "parameter of microcolony = 'rates'.*one of dim"),
         ({**READY, "parameters": {"rate": "fast"}}, "rate = 'fast'.*a number"),
         ({**READY, "dt": 0}, "dt in .*best.json = 0.*above 0"),
         ({**READY, "dt": "0.1"}, "dt in .*best.json = '0.1'.*a number"),
-        ({"scene": "<lambda>", "file": "mine.py", "function": "<lambda>", "parameters": {}}, "mine.py does not define `<lambda>`"),
-        ({"scene": "lamp", "file": "mine.py", "function": "lamp", "parameters": {"speed": 1}}, r"lamp\(…\) in mine.py: .*'speed'.*Its parameters are \(rate"),
-        ({"scene": "number", "file": "mine.py", "function": "number", "parameters": {}}, "number in mine.py = 3.*a Scene, or a function"),
+        (
+            {"scene": "<lambda>", "file": "mine.py", "function": "<lambda>", "parameters": {}},
+            "mine.py does not define `<lambda>`",
+        ),
+        (
+            {"scene": "lamp", "file": "mine.py", "function": "lamp", "parameters": {"speed": 1}},
+            r"lamp\(…\) in mine.py: .*'speed'.*Its parameters are \(rate",
+        ),
+        (
+            {"scene": "number", "file": "mine.py", "function": "number", "parameters": {}},
+            "number in mine.py = 3.*a Scene, or a function",
+        ),
     ],
 )
 def test_a_bad_design_is_refused_in_words(folder, told, words):
@@ -137,7 +180,13 @@ def test_what_a_design_says_of_its_run_is_checked(folder, command, told, words):
 
 
 @pytest.mark.parametrize(
-    "text, found", [("dim=3", ("dim", 3)), ("rate=[0.5, 1]", ("rate", [0.5, 1])), ("law=length", ("law", "length")), ("name=", ("name", ""))]
+    "text, found",
+    [
+        ("dim=3", ("dim", 3)),
+        ("rate=[0.5, 1]", ("rate", [0.5, 1])),
+        ("law=length", ("law", "length")),
+        ("name=", ("name", "")),
+    ],
 )
 def test_settings_are_literals_or_text(text, found):
     assert parse_setting(text) == found
@@ -151,23 +200,30 @@ def test_settings_without_a_name_are_refused(text):
 
 @pytest.mark.parametrize("future", ["", "from __future__ import annotations\n"])
 def test_a_scene_file_may_define_dataclasses(tmp_path, future):
-    """Found in use: the file took this module's way with annotations, and its own module was not to be found."""
+    """Found in use: the file took this module's way with annotations, and its own module was not to
+    be found."""
     path = tmp_path / "own.py"
-    path.write_text(f"{future}from dataclasses import dataclass\nimport torchfilm as tf\n\n@dataclass\nclass P:\n    rate: float = 0.7\n\n"
-                    "scene = tf.Scene(tf.Growth(rate=P().rate))\n")  # fmt: skip
+    path.write_text(
+        f"{future}from dataclasses import dataclass\nimport torchfilm as tf\n\n@dataclass\nclass"
+        " P:\n    rate: float = 0.7\n\nscene = tf.Scene(tf.Growth(rate=P().rate))\n"
+    )
     assert load_scene(str(path), {}).listed[0].rate == 0.7
 
 
 def test_an_error_in_a_scene_file_says_where(tmp_path):
     path = tmp_path / "own.py"
     path.write_text("import torchfilm as tf\n\nscene = tf.Scene(tf.Growth(rates=1.0))\n")
-    with pytest.raises(tf.InputError, match=r"own\.py cannot be run: TypeError: .*rates.* \(line 3\)"):
+    with pytest.raises(
+        tf.InputError, match=r"own\.py cannot be run: TypeError: .*rates.* \(line 3\)"
+    ):
         load_scene(str(path), {})
 
 
 def test_a_scene_file_may_be_called_as_a_module_is(tmp_path):
     path = tmp_path / "math.py"
-    path.write_text("import torchfilm as tf\nfrom math import pi\n\nscene = tf.Scene(tf.Growth(rate=1.0))\n")
+    path.write_text(
+        "import torchfilm as tf\nfrom math import pi\n\nscene = tf.Scene(tf.Growth(rate=1.0))\n"
+    )
     assert load_scene(str(path), {}).name == "math"
     import math
 
@@ -175,11 +231,16 @@ def test_a_scene_file_may_be_called_as_a_module_is(tmp_path):
 
 
 def test_scene_files_do_not_come_upon_one_another(tmp_path):
-    """What a file is called is no reason for another to import it: `common` is the one beside the file that asks for it. Nor does a broken one stay."""
+    """What a file is called is no reason for another to import it: `common` is the one beside the
+    file that asks for it. Nor does a broken one stay."""
     for folder, rate in (("a", 0.5), ("b", 1.5)):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / "common.py").write_text(f"import torchfilm as tf\nRATE = {rate}\nscene = tf.Scene(tf.Growth(rate=RATE))\n")
-    (tmp_path / "b" / "main.py").write_text("import torchfilm as tf\nfrom common import RATE\nscene = tf.Scene(tf.Growth(rate=RATE))\n")
+        (tmp_path / folder / "common.py").write_text(
+            f"import torchfilm as tf\nRATE = {rate}\nscene = tf.Scene(tf.Growth(rate=RATE))\n"
+        )
+    (tmp_path / "b" / "main.py").write_text(
+        "import torchfilm as tf\nfrom common import RATE\nscene = tf.Scene(tf.Growth(rate=RATE))\n"
+    )
     assert load_scene(str(tmp_path / "a" / "common.py"), {}).listed[0].rate == 0.5
     try:
         assert load_scene(str(tmp_path / "b" / "main.py"), {}).listed[0].rate == 1.5

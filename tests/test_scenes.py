@@ -45,7 +45,8 @@ def test_every_ready_scene_is_tested_here():
 
 @pytest.mark.parametrize("kind", list(SMALL))
 def test_it_runs_and_its_recipe_builds_it_again(kind):
-    """The recipe, after a journey through JSON as in a results file, gives the same course bit for bit."""
+    """The recipe, after a journey through JSON as in a results file, gives the same course bit for
+    bit."""
     scene = small(kind)
     again = build(*json.loads(json.dumps(scene.recipe)))
     assert scene.name == again.name == kind.split()[0]
@@ -64,13 +65,15 @@ def test_it_explains_itself(kind):
 
 
 def test_unknown_scenes_and_parameters_are_told():
-    with pytest.raises(tf.InputError, match=r"'macrocolony'.*microcolony, programmed_growth, channel"):
+    with pytest.raises(
+        tf.InputError, match=r"'macrocolony'.*microcolony, programmed_growth, channel"
+    ):
         build("macrocolony")
     with pytest.raises(tf.InputError, match=r"'speed'.*rate"):
         build("microcolony", {"speed": 2})
 
 
-# --- microcolony ----------------------------------------------------------------------------------------------------------
+# --- microcolony ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -84,15 +87,18 @@ def test_a_microcolony_in_the_plane_is_round():
         mine = state.select([k])
         centred = mine.position - tf.measure.colony_centre(mine)
         spread = torch.linalg.eigvalsh(centred.T @ centred)
-        # a file of cells would have a ratio near 0; the young colonies of a hundred rods are still a little long
+        # a file of cells would have a ratio near 0; the young colonies of a hundred rods are still
+        # a little long
         assert float(spread[0] / spread[1]) > 0.15
 
 
 def test_volume_doubles_in_ln2_over_rate():
-    """Free growth: the cells' volume before the first division, which a free cell's mechanics does not hold back."""
+    """Free growth: the cells' volume before the first division, which a free cell's mechanics does
+    not hold back."""
     scene = tf.scenes.microcolony(rate=1.3)
     first = scene.seed(dtype=torch.float64)
-    # ln 2 / 1.3 = 0.533 h; the founder, l = 2, is then 4.67 long in all and would have divided, so go a third of the way
+    # ln 2 / 1.3 = 0.533 h; the founder, l = 2, is then 4.67 long in all and would have divided, so
+    # go a third of the way
     last = run(scene, first, 0.175)
     assert last.cells == 1
     assert float(last.volume / first.volume) == pytest.approx(math.exp(1.3 * 0.175), rel=1e-9)
@@ -106,12 +112,16 @@ def test_a_microcolony_in_space_stays_between_agarose_and_coverslip():
     walls = scene.effects[-1].walls
     reach = 0.5 * state.length * state.axis[:, 2].abs() + state.radius
     top, bottom = state.position[:, 2] + reach, state.position[:, 2] - reach
-    # the coverslip is hard: no deeper than the growth of one step can push, 0.025 h · 1/h · (4.5 + 2/3) µm
+    # the coverslip is hard: no deeper than the growth of one step can push, 0.025 h · 1/h · (4.5 +
+    # 2/3) µm
     assert float(top.max()) - 0.5 < 0.13
-    # the agarose is soft: a few cells stand in it, no deeper than the dome that the model's page gives for 5,000 cells, the others lie on it
+    # the agarose is soft: a few cells stand in it, no deeper than the dome that the model's page
+    # gives for 5,000 cells, the others lie on it
     below = -0.5 - bottom
     assert 0.0 < float(below.max()) < 2.3 and float(below.median()) < 0.05
-    assert float(tf.measure.overlaps(state, walls[1:]).walls.max()) == pytest.approx(max(0.0, float(top.max()) - 0.5), abs=1e-6)
+    assert float(tf.measure.overlaps(state, walls[1:]).walls.max()) == pytest.approx(
+        max(0.0, float(top.max()) - 0.5), abs=1e-6
+    )
     assert float(tf.measure.tilt(state).median()) < 0.2, "rad; a young colony lies in its plane"
 
 
@@ -124,7 +134,7 @@ def test_softer_agarose_gives_way_more():
     assert depth[0] > depth[1] + 0.02
 
 
-# --- programmed growth ----------------------------------------------------------------------------------------------------
+# --- programmed growth ----------------------------------------------------------------------------
 
 
 def row(length: float) -> tf.Cells:
@@ -140,12 +150,15 @@ def test_only_cells_near_the_right_edge_grow():
     near = first.position[:, 0] >= float(first.position[:, 0].max()) - 10.0
     assert bool(near.any()) and not bool(near.all())
     assert torch.equal(state.growth_rate, torch.where(near, 1.0, 0.0))
-    assert (state.length[~near] == first.length[~near]).all() and (state.length[near] > first.length[near]).all()
+    assert (state.length[~near] == first.length[~near]).all() and (
+        state.length[near] > first.length[near]
+    ).all()
 
 
 @pytest.mark.slow
 def test_the_tip_moves_right():
-    """From the default founder: the right edge runs away from the left one, which hardly moves once growth has left it behind."""
+    """From the default founder: the right edge runs away from the left one, which hardly moves once
+    growth has left it behind."""
     scene = tf.scenes.programmed_growth(edge=3.0)
     early = run(scene, scene.seed(2), 4.0)
     late = run(scene, early, 8.0)
@@ -162,10 +175,12 @@ def test_cells_left_behind_do_not_grow_any_more():
     still = state.growth_rate == 0
     assert bool(still.any()) and (state.elongation[still] == 0).all()
     x = state.position[:, 0]
-    assert float((x.max() - x)[state.growth_rate > 0].max()) < 3.0 + 0.2, "positions moved since the rule looked by less than one step's push"
+    assert float((x.max() - x)[state.growth_rate > 0].max()) < 3.0 + 0.2, (
+        "positions moved since the rule looked by less than one step's push"
+    )
 
 
-# --- channel --------------------------------------------------------------------------------------------------------------
+# --- channel --------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -174,11 +189,15 @@ def test_an_open_channel_keeps_its_sides_and_loses_cells_at_its_end(tmp_path):
     states = list(tf.simulate(scene, scene.seed(2), until=8.0, record=tmp_path / "run.h5"))
     last = states[-1]
     walls = scene.effects[-2].walls
-    # three times the growth of the longest cell in a step, as for any closed channel: 3 · 0.025 · (4.5 + 2/3)
+    # three times the growth of the longest cell in a step, as for any closed channel: 3 · 0.025 ·
+    # (4.5 + 2/3)
     deep = 3 * 0.025 * (4.5 + 2 / 3)
     for state in states[::20]:
         assert float(tf.measure.overlaps(state, walls).walls.max()) < deep
-        assert float(state.position[:, 1].abs().max()) < 2.0 and float(state.position[:, 0].min()) > 0.0
+        assert (
+            float(state.position[:, 1].abs().max()) < 2.0
+            and float(state.position[:, 0].min()) > 0.0
+        )
     assert float(last.position[:, 0].max()) <= 15.0
     with tf.Results(tmp_path / "run.h5") as results:
         fate = results.lineage()["fate"]
@@ -192,7 +211,11 @@ def test_a_closed_channel_loses_none_and_pressure_stops_growth():
     scene = tf.scenes.channel(width=4.0, length=8.0, open_ended=False)
     states = list(tf.simulate(scene, scene.seed(2), until=7.0))
     last = states[-1]
-    assert (last.position[:, 0] > 0).all() and (last.position[:, 0] < 8).all() and (last.position[:, 1].abs() < 2).all()
+    assert (
+        (last.position[:, 0] > 0).all()
+        and (last.position[:, 0] < 8).all()
+        and (last.position[:, 1].abs() < 2).all()
+    )
     wanted = 0.025 * (last.length + 2 / 3)
     # full: cells get little of the growth that they want, where they had all of it at first
     assert float((last.elongation / wanted).mean()) < 0.3

@@ -1,4 +1,5 @@
-"""The ready scenes with signals and circuits: each shows in small what its docstring claims. Their full size is for the experiments."""
+"""The ready scenes with signals and circuits: each shows in small what its docstring claims. Their
+full size is for the experiments."""
 
 from __future__ import annotations
 
@@ -11,8 +12,18 @@ from torchfilm.tools.checks import InputError
 F64 = torch.float64
 
 
-def ran(scene: tf.Scene, until: float, *, dt: float = 0.1, seed: int = 1, colonies: int = 1, dtype: torch.dtype = torch.float32) -> tf.State:
-    return list(tf.simulate(scene, scene.seed(colonies, seed=seed, dtype=dtype), until=until, dt=dt))[-1]
+def ran(
+    scene: tf.Scene,
+    until: float,
+    *,
+    dt: float = 0.1,
+    seed: int = 1,
+    colonies: int = 1,
+    dtype: torch.dtype = torch.float32,
+) -> tf.State:
+    return list(
+        tf.simulate(scene, scene.seed(colonies, seed=seed, dtype=dtype), until=until, dt=dt)
+    )[-1]
 
 
 def correlation(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -25,12 +36,13 @@ def centre_of(state: tf.State, name: str) -> float:
     return float((state.layout.grid.centres()[:, 0] * value).sum() / value.sum())
 
 
-# --- boundary detection ---------------------------------------------------------------------------------------------------
+# --- boundary detection ---------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def boundary() -> tf.State:
-    """The published constants but for a LuxI thirty times as busy, so that a small colony is bright: at 70 cells the published ones lie near the basal rate."""
+    """The published constants but for a LuxI thirty times as busy, so that a small colony is
+    bright: at 70 cells the published ones lie near the basal rate."""
     return ran(tf.scenes.boundary_detector(k1=30.0), 4.8)
 
 
@@ -47,26 +59,38 @@ def test_yfp_of_sinks_falls_with_the_distance_from_the_boundary(boundary):
 
 def test_each_population_shows_its_own_colour(boundary):
     sinks = boundary.cell_type == 1
-    assert float(boundary.cfp[~sinks].min()) > 0 and float(boundary.luxi[~sinks].min()) > 0 and float(boundary.aiia[sinks].min()) > 0
+    assert (
+        float(boundary.cfp[~sinks].min()) > 0
+        and float(boundary.luxi[~sinks].min()) > 0
+        and float(boundary.aiia[sinks].min()) > 0
+    )
     for name, there in (("cfp", sinks), ("luxi", sinks), ("aiia", ~sinks), ("yfp", ~sinks)):
         assert float(boundary.fields[name][there].abs().max()) == 0, name
 
 
 def test_the_channel_holds_the_colony_and_the_grid_grows_along_it_only(boundary):
     grid = boundary.layout.grid
-    assert float(boundary.position[:, 1].abs().max()) < 16 and grid.shapes[0][1:] == (8, 12) and grid.spacing == (4.0, 4.0, 4.0)
+    assert (
+        float(boundary.position[:, 1].abs().max()) < 16
+        and grid.shapes[0][1:] == (8, 12)
+        and grid.spacing == (4.0, 4.0, 4.0)
+    )
     assert tf.scenes.boundary_detector().seed().layout.grid.shapes == ((64, 8, 12),)
 
 
 def test_sinks_without_aiia_take_nothing_apart():
     """d3 = 0: the same cells, more AHL at the end."""
-    with_it, without = (ran(tf.scenes.boundary_detector(k1=30.0, k5=5.0, **more), 2.5) for more in ({}, {"d3": 0.0}))
+    with_it, without = (
+        ran(tf.scenes.boundary_detector(k1=30.0, k5=5.0, **more), 2.5) for more in ({}, {"d3": 0.0})
+    )
     assert torch.equal(with_it.uid, without.uid) and float(without.aiia.max()) == 0
     assert float(without.signals["ahl"].sum()) > float(with_it.signals["ahl"].sum())
 
 
 def test_flow_shifts_the_ahl_downstream():
-    still, there, back = (centre_of(ran(tf.scenes.boundary_detector(flow=v), 2.0), "ahl") for v in (0.0, 20.0, -20.0))
+    still, there, back = (
+        centre_of(ran(tf.scenes.boundary_detector(flow=v), 2.0), "ahl") for v in (0.0, 20.0, -20.0)
+    )
     assert there > still + 5 and back < still - 5
 
 
@@ -75,20 +99,30 @@ def test_flow_per_colony():
     assert centre_of(last.select([1]), "ahl") > centre_of(last.select([0]), "ahl") + 3
 
 
-# --- quorum sensing -------------------------------------------------------------------------------------------------------
+# --- quorum sensing -------------------------------------------------------------------------------
 
 
 def test_luxi_switches_on_with_density():
-    """The same eight cells, in a box of 32 µm and in one of 256: where AHL gathers they switch on, where it is lost they do not.
+    """The same eight cells, in a box of 32 µm and in one of 256: where AHL gathers they switch on,
+    where it is lost they do not.
 
-    Not with Table 2's constants: with k3 = k4 = 1 and growth of 1/h the feedback cannot hold LuxI up at all (see the next test), and where
-    D1 A/V is no faster than growth a cell answers to its own AHL. Here the membrane is fast and the threshold √k4 low.
+    Not with Table 2's constants: with k3 = k4 = 1 and growth of 1/h the feedback cannot hold LuxI
+    up at all (see the next test), and where D1 A/V is no faster than growth a cell answers to its
+    own AHL. Here the membrane is fast and the threshold √k4 low.
     """
     crowd, lonely = (
-        ran(tf.scenes.quorum_sensing(size=size, spacing=8.0, D1=100.0, k1=100.0, k4=1e-4, diffusion=1000.0), 3.0, seed=1) for size in (32.0, 256.0)
+        ran(
+            tf.scenes.quorum_sensing(
+                size=size, spacing=8.0, D1=100.0, k1=100.0, k4=1e-4, diffusion=1000.0
+            ),
+            3.0,
+            seed=1,
+        )
+        for size in (32.0, 256.0)
     )
     assert torch.equal(crowd.uid, lonely.uid) and crowd.cells >= 8
-    assert float(crowd.luxi.min()) > 0.2 > 0.05 > float(lonely.luxi.max())  # fully on is (d2 + k3)/(g1 + growth) ≈ 0.9
+    # fully on is (d2 + k3)/(g1 + growth) ≈ 0.9
+    assert float(crowd.luxi.min()) > 0.2 > 0.05 > float(lonely.luxi.max())
 
 
 def test_with_the_published_constants_luxi_stays_low():
@@ -98,17 +132,22 @@ def test_with_the_published_constants_luxi_stays_low():
 
 
 def test_cells_and_medium_keep_what_the_synthase_makes():
-    """AHL is made at k1 LuxI/(k2 + LuxI) and lost only in the caps of daughters: without division, the sum is what was made, to the order of the step."""
+    """AHL is made at k1 LuxI/(k2 + LuxI) and lost only in the caps of daughters: without division,
+    the sum is what was made, to the order of the step."""
     scene = tf.scenes.quorum_sensing(rate=0.3, D1=10.0, k1=1.0, k4=1.0, diffusion=100.0)
     state, made = scene.seed(dtype=F64), 0.0
     for _ in range(20):
         state = scene.step(state, 0.05)
         made += 0.05 * float((state.luxi / (1 + state.luxi) * state.volume).sum())
-    total = float((state.ahl * state.volume).sum() + state.signals["ahl"].sum() * state.layout.grid.voxel_volume)
-    assert state.cells == 1 and total == pytest.approx(made, rel=0.06)  # a right-hand sum of 20 terms that grow from 0: half of the last, 2/20, at most
+    total = float(
+        (state.ahl * state.volume).sum()
+        + state.signals["ahl"].sum() * state.layout.grid.voxel_volume
+    )
+    # a right-hand sum of 20 terms that grow from 0: half of the last, 2/20, at most
+    assert state.cells == 1 and total == pytest.approx(made, rel=0.06)
 
 
-# --- cells that compute on their own --------------------------------------------------------------------------------------
+# --- cells that compute on their own --------------------------------------------------------------
 
 
 def test_random_partition_keeps_the_amount_and_spreads_the_cells():
@@ -116,18 +155,23 @@ def test_random_partition_keeps_the_amount_and_spreads_the_cells():
     state = scene.seed(3, seed=1, dtype=F64)
     last = list(tf.simulate(scene, state, until=3.0, dt=0.1))[-1]
     total = torch.zeros(3, dtype=F64).index_add(0, last.colony, last.plasmid * last.volume)
-    assert int(last.counts.min()) >= 8 and total.tolist() == pytest.approx((2.0 * state.volume).tolist(), rel=1e-12)
+    assert int(last.counts.min()) >= 8 and total.tolist() == pytest.approx(
+        (2.0 * state.volume).tolist(), rel=1e-12
+    )
     amount = last.plasmid * last.volume
     assert float(amount.std() / amount.mean()) > 0.5
 
 
 def test_random_partition_gives_every_share_alike():
-    """The share of a daughter is uniform: of 600 divisions, mean 1/2 to 5 standard errors of √(1/12/600), and each quarter holds a quarter, to 5 of its own."""
+    """The share of a daughter is uniform: of 600 divisions, mean 1/2 to 5 standard errors of
+    √(1/12/600), and each quarter holds a quarter, to 5 of its own."""
     scene = tf.scenes.random_partition()
     state = scene.seed(600, seed=2, dtype=F64, cells=tf.Cells.single(2, length=3.4))
     after = scene.step(state.with_fields(divide_flag=torch.ones(600, dtype=torch.bool)), 1e-3)
     share = (after.plasmid * after.volume)[after.births[-1].first] / (state.plasmid * state.volume)
-    assert after.cells == 1200 and float(share.mean()) == pytest.approx(0.5, abs=5 * (1 / 12 / 600) ** 0.5)
+    assert after.cells == 1200 and float(share.mean()) == pytest.approx(
+        0.5, abs=5 * (1 / 12 / 600) ** 0.5
+    )
     quarters = torch.histc(share, 4, 0, 1) / 600
     assert float((quarters - 0.25).abs().max()) < 5 * (0.25 * 0.75 / 600) ** 0.5
 
@@ -142,11 +186,15 @@ def test_toggle_cells_end_on_one_side():
 
 def test_toggle_without_noise_stays_on_its_saddle():
     last = ran(tf.scenes.toggle_switch(noise=False, speed=4.0, start=2.0), 1.5)
-    assert torch.equal(last.red, last.green) and float(last.red.mean()) == pytest.approx(1.88, rel=0.04)  # 10/(1 + x²) = x (1 + 0.7/4); at a step of 0.1 h
+    # 10/(1 + x²) = x (1 + 0.7/4); at a step of 0.1 h
+    assert torch.equal(last.red, last.green) and float(last.red.mean()) == pytest.approx(
+        1.88, rel=0.04
+    )
 
 
 def test_repressilator_goes_round():
-    """In one cell that hardly grows: three genes in turn, a period of the model's 8.69/speed for β = 5."""
+    """In one cell that hardly grows: three genes in turn, a period of the model's 8.69/speed for β
+    = 5."""
     scene = tf.scenes.repressilator(noise=False, rate=0.0, speed=3.0, beta=5.0)
     state = scene.seed(dtype=F64)
     tracks = []
@@ -156,7 +204,8 @@ def test_repressilator_goes_round():
     track = torch.tensor(tracks, dtype=F64)[20:]
     rising = [[k for k in range(1, 110) if track[k - 1, g] < 30 <= track[k, g]] for g in range(3)]
     periods = torch.tensor(rising[0], dtype=F64).diff() * 0.1
-    assert periods.numel() >= 2 and float(periods.mean()) == pytest.approx(8.6893 / 3.0, rel=0.03)  # told to steps of 0.1 h, over two turns or more
+    # told to steps of 0.1 h, over two turns or more
+    assert periods.numel() >= 2 and float(periods.mean()) == pytest.approx(8.6893 / 3.0, rel=0.03)
     first = rising[0][0]
     after = [next(k for k in rising[g] if k > first) for g in (1, 2)]
     assert first < min(after) < max(after) < rising[0][1]
@@ -168,31 +217,57 @@ def test_repressilator_molecule_by_molecule_has_whole_numbers():
     assert float((n - n.round()).abs().max()) < 1e-9 and float(n.sum()) > 0
 
 
-# --- nutrients ------------------------------------------------------------------------------------------------------------
+# --- nutrients ------------------------------------------------------------------------------------
 
 
 def test_only_a_rim_grows_where_food_is_short():
-    cells = tf.Cells([[2.9 * (k % 9 - 4), 1.05 * (k // 9 - 12)] for k in range(225)], [[1.0, 0.0]] * 225, length=1.8)
-    scene = tf.scenes.nutrient_limited(supply=0.3, diffusion=3.0, half=0.3, growth_yield=0.2, size=80.0)
+    cells = tf.Cells(
+        [[2.9 * (k % 9 - 4), 1.05 * (k // 9 - 12)] for k in range(225)],
+        [[1.0, 0.0]] * 225,
+        length=1.8,
+    )
+    scene = tf.scenes.nutrient_limited(
+        supply=0.3, diffusion=3.0, half=0.3, growth_yield=0.2, size=80.0
+    )
     state = scene.seed(cells=cells, dtype=F64)
     for _ in range(8):
         state = scene.step(state, 0.1)
     away = state.position.norm(dim=1)
-    rim, centre = state.growth_rate[away > 0.9 * away.max()], state.growth_rate[away < 0.3 * away.max()]
-    assert rim.numel() >= 3 and centre.numel() >= 3 and float(rim.mean()) > 2 * float(centre.mean()) > 0
+    rim, centre = (
+        state.growth_rate[away > 0.9 * away.max()],
+        state.growth_rate[away < 0.3 * away.max()],
+    )
+    assert (
+        rim.numel() >= 3
+        and centre.numel() >= 3
+        and float(rim.mean()) > 2 * float(centre.mean()) > 0
+    )
     assert correlation(away, state.growth_rate) > 0.6  # the colony is square
 
 
 def test_what_is_eaten_times_the_yield_is_what_is_grown():
-    """While nothing holds growth back: one cell, then none touching for long. Without division, to rounding."""
+    """While nothing holds growth back: one cell, then none touching for long. Without division, to
+    rounding."""
     scene = tf.scenes.nutrient_limited(growth_yield=0.5, size=80.0)
     state = scene.seed(dtype=F64)
     last = list(tf.simulate(scene, state, until=0.3, dt=0.05))[-1]
     assert last.cells == 1
-    assert float(last.volume - state.volume) == pytest.approx(0.5 * float(last.nutrient_eaten), rel=1e-12)
+    assert float(last.volume - state.volume) == pytest.approx(
+        0.5 * float(last.nutrient_eaten), rel=1e-12
+    )
 
 
-@pytest.mark.parametrize("name", ["quorum_sensing", "boundary_detector", "random_partition", "repressilator", "toggle_switch", "nutrient_limited"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "quorum_sensing",
+        "boundary_detector",
+        "random_partition",
+        "repressilator",
+        "toggle_switch",
+        "nutrient_limited",
+    ],
+)
 def test_every_scene_explains_itself_and_refuses_nonsense(name):
     make = getattr(tf.scenes, name)
     said = make().explain()

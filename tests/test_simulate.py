@@ -1,4 +1,5 @@
-"""The loop: where it ends, what it does when a solve fails, who is called, restarts and batches bit for bit."""
+"""The loop: where it ends, what it does when a solve fails, who is called, restarts and batches bit
+for bit."""
 
 from __future__ import annotations
 
@@ -15,7 +16,12 @@ from torchfilm.state import PER_CELL
 
 
 def scene_of(**mechanics) -> tf.Scene:
-    return tf.Scene(tf.Growth(rate=tf.Uniform(0.8, 1.2)), tf.Division(length=tf.Uniform(3.0, 4.0)), tf.Mechanics(**{"dim": 2, **mechanics}), dt=0.05)
+    return tf.Scene(
+        tf.Growth(rate=tf.Uniform(0.8, 1.2)),
+        tf.Division(length=tf.Uniform(3.0, 4.0)),
+        tf.Mechanics(**{"dim": 2, **mechanics}),
+        dt=0.05,
+    )
 
 
 def alone() -> tf.Scene:
@@ -30,7 +36,7 @@ def assert_same(a: tf.State, b: tf.State) -> None:
     assert (a.step, a.time) == (b.step, b.time)
 
 
-# --- where it ends --------------------------------------------------------------------------------------------------------
+# --- where it ends --------------------------------------------------------------------------------
 
 
 def test_until_a_time():
@@ -68,7 +74,9 @@ def test_a_run_that_is_at_its_end_does_nothing():
     assert list(tf.simulate(scene, scene.seed(), cells=1)) == []
 
 
-@pytest.mark.parametrize(("dt", "until"), [(0.025, 0.5), (0.05, 3.0), (0.1, 0.8), (0.01, 1.0), (0.3, 2.7)])
+@pytest.mark.parametrize(
+    ("dt", "until"), [(0.025, 0.5), (0.05, 3.0), (0.1, 0.8), (0.01, 1.0), (0.3, 2.7)]
+)
 def test_an_end_that_has_been_reached_is_not_in_the_past(dt, until):
     """Whatever rounding the time has gathered, a run to 0.5 h has reached 0.5 h."""
     scene = alone()
@@ -124,14 +132,23 @@ def test_bad_options_are_refused_before_anything_runs(options, word):
 def test_scene_and_state_the_wrong_way_round_are_told():
     scene = alone()
     for run in (tf.simulate, tf.rollout):
-        with pytest.raises(tf.InputError, match=r"\(State, Scene, …\) is not allowed: first comes a Scene"):
+        with pytest.raises(
+            tf.InputError, match=r"\(State, Scene, …\) is not allowed: first comes a Scene"
+        ):
             run(scene.seed(), scene, until=1.0)
 
 
 def test_a_number_of_cells_that_no_growth_leads_to_is_refused():
-    """Colony 2 of rate 0 would keep the run going for ever; with as many cells as are wanted, or until a time, it may stand still."""
+    """Colony 2 of rate 0 would keep the run going for ever; with as many cells as are wanted, or
+    until a time, it may stand still."""
     scene = tf.Scene(tf.Growth(rate=[1.0, 0.5, 0.0]), tf.Division(length=3.0))
-    with pytest.raises(tf.InputError, match=r"growth_rate', which is 0 in 1 of 3 colonies, the first of them 2 .*come to 4 cells.*until="):
+    with pytest.raises(
+        tf.InputError,
+        match=(
+            r"growth_rate', which is 0 in 1 of 3 colonies, the first of them 2 .*come to 4"
+            r" cells.*until="
+        ),
+    ):
         tf.simulate(scene, scene.seed(3), cells=4)
     assert not list(tf.simulate(scene, scene.seed(3), cells=1))
     assert len(list(tf.simulate(scene, scene.seed(3), until=0.1))) == 4
@@ -162,7 +179,9 @@ def test_cells_that_divide_or_lengthen_in_a_way_of_their_own_are_no_mistake():
 
 def test_observers_may_come_one_by_one():
     scene, seen = alone(), []
-    for _ in tf.simulate(scene, scene.seed(), until=0.1, observers=(o for o in [lambda s: seen.append(s.step)])):
+    for _ in tf.simulate(
+        scene, scene.seed(), until=0.1, observers=(o for o in [lambda s: seen.append(s.step)])
+    ):
         pass
     assert len(seen) > 1
 
@@ -177,11 +196,12 @@ def test_a_state_of_another_scene_is_refused_before_anything_runs():
         tf.simulate(tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=3)), state, until=1.0)
 
 
-# --- failures -------------------------------------------------------------------------------------------------------------
+# --- failures -------------------------------------------------------------------------------------
 
 
 def lonely_and_crowded() -> tf.Cells:
-    """Colonies 0 and 2: one cell, at rest. Colony 1: a heap that no solve settles in one iteration."""
+    """Colonies 0 and 2: one cell, at rest. Colony 1: a heap that no solve settles in one
+    iteration."""
     heap = [[0.3 * k, 0.45 * (k % 3)] for k in range(8)]
     position = [[0.0, 0.0], *heap, [0.0, 0.0]]
     axis = [[1.0, 0.0], *([math.cos(k), math.sin(k)] for k in range(8)), [1.0, 0.0]]
@@ -189,13 +209,17 @@ def lonely_and_crowded() -> tf.Cells:
 
 
 def failing() -> tuple[tf.Scene, tf.State]:
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6), dt=0.1)
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6), dt=0.1
+    )
     return scene, scene.seed(cells=lonely_and_crowded())
 
 
 def test_a_failed_solve_is_raised_and_names_the_colony():
     scene, state = failing()
-    with pytest.raises(tf.SimulationError, match=r"1 of 3 colonies.*\n.*colony 1 \(8 cells\).*iteration limit") as caught:
+    with pytest.raises(
+        tf.SimulationError, match=r"1 of 3 colonies.*\n.*colony 1 \(8 cells\).*iteration limit"
+    ) as caught:
         list(tf.simulate(scene, state, until=1.0))
     assert caught.value.colonies == (1,)
     assert "colony 0" not in str(caught.value)
@@ -219,12 +243,24 @@ def test_all_failed_colonies_are_named_at_once():
 
 def test_dropping_a_failed_colony_goes_on_with_the_others(tmp_path):
     scene, state = failing()
-    states = list(tf.simulate(scene, state, until=1.0, on_failure="drop", record=tmp_path / "run.h5"))
-    assert len(states) == 10 and states[0].counts.tolist() == [1, 0, 1] and states[-1].counts.tolist() == [1, 0, 1]
+    states = list(
+        tf.simulate(scene, state, until=1.0, on_failure="drop", record=tmp_path / "run.h5")
+    )
+    assert (
+        len(states) == 10
+        and states[0].counts.tolist() == [1, 0, 1]
+        and states[-1].counts.tolist() == [1, 0, 1]
+    )
     (note,) = states[0].ended
-    assert note.fate == "failed" and note.colony_id.tolist() == [1] * 8 and note.uid.tolist() == list(range(8))
+    assert (
+        note.fate == "failed"
+        and note.colony_id.tolist() == [1] * 8
+        and note.uid.tolist() == list(range(8))
+    )
     others = list(tf.simulate(scene, state.select([0, 2]), until=1.0))[-1]
-    assert torch.equal(states[-1].length, others.length), "the others go on as if it had not been there"
+    assert torch.equal(states[-1].length, others.length), (
+        "the others go on as if it had not been there"
+    )
     with tf.Results(tmp_path / "run.h5") as results:
         found = results.lineage()
     assert found["fate"].tolist() == ["alive"] + ["failed"] * 8 + ["alive"]
@@ -239,7 +275,8 @@ def with_nan(state: tf.State, colony: int) -> tf.State:
 
 @pytest.mark.parametrize("unilateral", [False, True])
 def test_a_colony_that_is_not_finite_fails_alone(unilateral, dtype):
-    """NaN in one of three colonies: it is named, and dropped the other two go on to the same bits as without it."""
+    """NaN in one of three colonies: it is named, and dropped the other two go on to the same bits
+    as without it."""
     scene = scene_of(unilateral=unilateral)
     good = list(tf.simulate(scene, scene.seed(3, dtype=dtype), until=2.0))[-1]
     assert (good.counts >= 4).all()
@@ -254,8 +291,14 @@ def test_a_colony_that_is_not_finite_fails_alone(unilateral, dtype):
 
 
 def too_short(*others: tf.Effect) -> tuple[tf.Scene, tf.State]:
-    """Three colonies of a long cell and a short one, all told to divide; only in colony 1 is the short one too short. A cell of colony 0 has 2 µm."""
-    cells = tf.Cells([[0.0, 0.0], [9.0, 0.0]] * 3, [0.0, 1.0], [3.0, 2.0, 3.0, 0.6, 3.0, 1.5], colony=[0, 0, 1, 1, 2, 2])
+    """Three colonies of a long cell and a short one, all told to divide; only in colony 1 is the
+    short one too short. A cell of colony 0 has 2 µm."""
+    cells = tf.Cells(
+        [[0.0, 0.0], [9.0, 0.0]] * 3,
+        [0.0, 1.0],
+        [3.0, 2.0, 3.0, 0.6, 3.0, 1.5],
+        colony=[0, 0, 1, 1, 2, 2],
+    )
     scene = tf.Scene(tf.Division(), *others, founders=cells, dt=0.1)
     state = scene.seed()
     return scene, state.with_fields(divide_flag=torch.ones_like(state.divide_flag))
@@ -264,7 +307,11 @@ def too_short(*others: tf.Effect) -> tuple[tf.Scene, tf.State]:
 def test_a_cell_too_short_to_divide_is_raised_and_names_the_colony():
     scene, state = too_short(tf.Growth(rate=0.1))
     with pytest.raises(
-        tf.SimulationError, match=r"1 of 3 colonies.*\n.*colony 1 \(2 cells\): cell 1.*0\.6 µm.*1 µm.*\n.*[Ll]onger cells.*on_failure"
+        tf.SimulationError,
+        match=(
+            r"1 of 3 colonies.*\n.*colony 1 \(2 cells\): cell 1.*0\.6 µm.*1 µm.*\n.*[Ll]onger"
+            r" cells.*on_failure"
+        ),
     ) as caught:
         list(tf.simulate(scene, state, until=1.0))
     assert caught.value.colonies == (1,)
@@ -273,19 +320,40 @@ def test_a_cell_too_short_to_divide_is_raised_and_names_the_colony():
     assert caught.value.colonies == (1,)
 
 
-@pytest.mark.parametrize("others", [(tf.Growth(rate=0.1),), (tf.Growth(rate=0.1), tf.Mechanics(dim=2))], ids=["alone", "with contacts"])
+@pytest.mark.parametrize(
+    "others",
+    [(tf.Growth(rate=0.1),), (tf.Growth(rate=0.1), tf.Mechanics(dim=2))],
+    ids=["alone", "with contacts"],
+)
 def test_dropping_a_colony_that_cannot_divide_goes_on_with_the_others(tmp_path, others):
     scene, state = too_short(*others)
-    states = list(tf.simulate(scene, state, until=1.0, on_failure="drop", record=tmp_path / "run.h5"))
-    assert len(states) == 10 and states[0].counts.tolist() == [4, 0, 4] and states[-1].counts.tolist() == [4, 0, 4]
+    states = list(
+        tf.simulate(scene, state, until=1.0, on_failure="drop", record=tmp_path / "run.h5")
+    )
+    assert (
+        len(states) == 10
+        and states[0].counts.tolist() == [4, 0, 4]
+        and states[-1].counts.tolist() == [4, 0, 4]
+    )
     divided, failed = states[0].ended
     assert divided.fate == "divided" and divided.colony_id.tolist() == [0, 0, 2, 2]
-    assert failed.fate == "failed" and failed.colony_id.tolist() == [1, 1] and failed.uid.tolist() == [0, 1], "nobody divides where one cannot"
+    assert (
+        failed.fate == "failed"
+        and failed.colony_id.tolist() == [1, 1]
+        and failed.uid.tolist() == [0, 1]
+    ), "nobody divides where one cannot"
     without = list(tf.simulate(scene, state.select([0, 2]), until=1.0))[-1]
     assert_same(states[-1].select([0, 2]), without.select([0, 1]))
     with tf.Results(tmp_path / "run.h5") as results:
         found = results.lineage()
-    assert found["fate"][:6].tolist() == ["divided", "divided", "failed", "failed", "divided", "divided"]
+    assert found["fate"][:6].tolist() == [
+        "divided",
+        "divided",
+        "failed",
+        "failed",
+        "divided",
+        "divided",
+    ]
 
 
 def test_failures_of_two_kinds_are_raised_together():
@@ -297,14 +365,25 @@ def test_failures_of_two_kinds_are_raised_together():
         [0.6] + [2.0] * 8 + [0.6] + [2.0] * 8,
         colony=[0] + [1] * 8 + [2] * 9,
     )
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(), tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6), founders=cells, dt=0.1)
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Division(),
+        tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6),
+        founders=cells,
+        dt=0.1,
+    )
     state = scene.seed()
     state = state.with_fields(divide_flag=state.length < 1)
     with pytest.raises(tf.SimulationError, match=r"3 of 3 colonies") as caught:
         list(tf.simulate(scene, state, until=1.0))
     assert caught.value.colonies == (0, 1, 2)
     said = str(caught.value)
-    assert said.count("two new caps") == 2 and said.count("iteration limit") == 2 and "smaller dt" in said and "longer cells" in said
+    assert (
+        said.count("two new caps") == 2
+        and said.count("iteration limit") == 2
+        and "smaller dt" in said
+        and "longer cells" in said
+    )
 
 
 def test_a_failed_step_says_what_may_help():
@@ -320,13 +399,20 @@ def test_a_healthy_run_reports_every_colony_converged():
         assert (report.status == CONVERGED).all() and report.status.shape == (4,)
 
 
-# --- observers and timings ------------------------------------------------------------------------------------------------
+# --- observers and timings ------------------------------------------------------------------------
 
 
 def test_observers_see_the_first_state_and_every_step_in_order():
     scene, seen = alone(), []
     first = scene.seed()
-    yielded = list(tf.simulate(scene, first, until=0.3, observers=[lambda s: seen.append(("a", s)), lambda s: seen.append(("b", s))]))
+    yielded = list(
+        tf.simulate(
+            scene,
+            first,
+            until=0.3,
+            observers=[lambda s: seen.append(("a", s)), lambda s: seen.append(("b", s))],
+        )
+    )
     assert [name for name, _ in seen] == ["a", "b"] * 4
     assert [s for name, s in seen if name == "a"] == [first, *yielded]
 
@@ -338,7 +424,11 @@ def test_an_observers_error_closes_the_file(tmp_path):
 
     scene = alone()
     with pytest.raises(RuntimeError, match="no luck"):
-        list(tf.simulate(scene, scene.seed(), until=1.0, record=tmp_path / "run.h5", observers=[fail]))
+        list(
+            tf.simulate(
+                scene, scene.seed(), until=1.0, record=tmp_path / "run.h5", observers=[fail]
+            )
+        )
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.steps.tolist() == [0, 2], "what was done until then is kept"
 
@@ -358,7 +448,7 @@ def test_nothing_runs_before_the_first_state_is_asked_for(tmp_path):
     assert (tmp_path / "run.h5").exists()
 
 
-# --- restarts and batches -------------------------------------------------------------------------------------------------
+# --- restarts and batches -------------------------------------------------------------------------
 
 
 def every_step(scene: tf.Scene, state: tf.State, until: float) -> list[tf.State]:
@@ -366,20 +456,27 @@ def every_step(scene: tf.Scene, state: tf.State, until: float) -> list[tf.State]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"unilateral": True}, {"dim": 3}], ids=["bilateral", "unilateral", "3-D"])
+@pytest.mark.parametrize(
+    "options", [{}, {"unilateral": True}, {"dim": 3}], ids=["bilateral", "unilateral", "3-D"]
+)
 def test_going_on_from_any_state_is_bit_for_bit_the_same(options):
-    """From every tenth step, cells that are just due to divide included; through a fresh scene, as after a restart."""
+    """From every tenth step, cells that are just due to divide included; through a fresh scene, as
+    after a restart."""
     scene = scene_of(**options)
     states = every_step(scene, scene.seed(2, seed=5), 3.0)
     assert states[-1].cells > 12
-    starts = {10, 25, 40, 55} | {s.step for s in states[:-1] if bool((s.length >= s.division_threshold).any())}
+    starts = {10, 25, 40, 55} | {
+        s.step for s in states[:-1] if bool((s.length >= s.division_threshold).any())
+    }
     for start in sorted(starts)[:8]:
         again = list(tf.simulate(scene_of(**options), states[start], until=3.0))[-1]
         assert_same(again, states[-1])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"unilateral": True}, {"dim": 3}], ids=["bilateral", "unilateral", "3-D"])
+@pytest.mark.parametrize(
+    "options", [{}, {"unilateral": True}, {"dim": 3}], ids=["bilateral", "unilateral", "3-D"]
+)
 def test_one_by_one_equals_the_batch_bit_for_bit(options, dtype):
     scene = scene_of(**options)
     first = scene.seed(4, seed=2, dtype=dtype)
@@ -389,7 +486,10 @@ def test_one_by_one_equals_the_batch_bit_for_bit(options, dtype):
         alone = list(tf.simulate(scene, first.select([k]), until=2.5))[-1]
         assert_same(alone, batch.select([k]))
         for name in ("iterations", "residual", "passes", "substeps"):
-            assert torch.equal(getattr(alone.reports["mechanics"], name)[0], getattr(batch.reports["mechanics"], name)[k]), name
+            assert torch.equal(
+                getattr(alone.reports["mechanics"], name)[0],
+                getattr(batch.reports["mechanics"], name)[k],
+            ), name
 
 
 def test_the_order_of_colonies_does_not_matter():
@@ -421,13 +521,17 @@ def test_colonies_of_one_batch_differ():
 
 
 def test_a_run_that_may_never_end_is_told():
-    """Found in use: a design whose cells stop growing below the number at which the run ends; the other colony would grow without end."""
+    """Found in use: a design whose cells stop growing below the number at which the run ends; the
+    other colony would grow without end."""
     scene = tf.Scene(tf.Growth(rate=torch.tensor([1e-4, 1.0])), dt=0.001)
     run = tf.simulate(scene, scene.seed(2), cells=2)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         for _ in range(1050):
             next(run)
-    with pytest.warns(RuntimeWarning, match=r"colony 0: no larger than 1000 steps ago, with fewer than the 2 cells"):
+    with pytest.warns(
+        RuntimeWarning,
+        match=r"colony 0: no larger than 1000 steps ago, with fewer than the 2 cells",
+    ):
         for _ in range(100):
             next(run)

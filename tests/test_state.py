@@ -16,7 +16,11 @@ def batch(counts: tuple[int, ...] = (2, 0, 3, 1), **options) -> tf.State:
     """A bare state with colonies of these sizes; cell k of colony c stands at (10 c, k)."""
     colony = [c for c, n in enumerate(counts) for _ in range(n)]
     within = [k for n in counts for k in range(n)]
-    cells = tf.Cells([[10.0 * c, 1.0 * k] for c, k in zip(colony, within, strict=True)], [[1.0, 0.0]] * len(colony), colony=colony)
+    cells = tf.Cells(
+        [[10.0 * c, 1.0 * k] for c, k in zip(colony, within, strict=True)],
+        [[1.0, 0.0]] * len(colony),
+        colony=colony,
+    )
     return tf.Scene(tf.Growth(rate=1.0), founders=cells).seed(len(counts), **options)
 
 
@@ -33,7 +37,9 @@ def test_dtype_and_device(device, dtype):
     state = batch(device=device, dtype=dtype)
     assert state.dtype == dtype and state.device.type == device.type
     assert state.axis.dtype == state.radius.dtype == state.growth_rate.dtype == dtype
-    assert state.position.dtype == torch.float64, "positions keep their resolution far from the origin"
+    assert state.position.dtype == torch.float64, (
+        "positions keep their resolution far from the origin"
+    )
     assert state.uid.dtype == state.colony.dtype == torch.int64
 
 
@@ -63,11 +69,22 @@ def test_fields_are_attributes_and_unknown_names_are_told():
 
 
 def test_an_unknown_signal_is_named_beside_those_there_are():
-    medium = tf.Medium(ahl=tf.Signal(diffusion=1.0), food=tf.Signal(diffusion=1.0), box=((-4, -4), (4, 4)), spacing=4.0)
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=1.0),
+        food=tf.Signal(diffusion=1.0),
+        box=((-4, -4), (4, 4)),
+        spacing=4.0,
+    )
     signals = tf.Scene(medium, founders=tf.Cells.single(2)).seed().signals
-    assert list(signals) == ["ahl", "food"] and signals["ahl"].numel() == 4 and signals.get("alh") is None
+    assert (
+        list(signals) == ["ahl", "food"]
+        and signals["ahl"].numel() == 4
+        and signals.get("alh") is None
+    )
     for error in (tf.InputError, KeyError):
-        with pytest.raises(error, match=r"^the state has no signal 'alh'; its signals are ahl, food$"):
+        with pytest.raises(
+            error, match=r"^the state has no signal 'alh'; its signals are ahl, food$"
+        ):
             signals["alh"]
     with pytest.raises(tf.InputError, match=r"no signal 'ahl'.*none: list a Medium"):
         batch().signals["ahl"]
@@ -87,7 +104,7 @@ def test_counts_follow_a_replaced_colony():
     assert state.take(torch.tensor([0, 2, 3])).counts.tolist() == [1, 2]
 
 
-# --- select, take, remove -------------------------------------------------------------------------------------------------
+# --- select, take, remove -------------------------------------------------------------------------
 
 
 def test_select_in_the_order_given():
@@ -103,7 +120,9 @@ def test_select_of_a_selection_keeps_the_first_ids():
 
 
 def test_select_takes_fields_per_colony_along():
-    field = tf.Field("medium", "of a colony", scope="colony", initial=lambda s, rows: rows.double() * 10)
+    field = tf.Field(
+        "medium", "of a colony", scope="colony", initial=lambda s, rows: rows.double() * 10
+    )
     part = batch().declare(field).select([2, 0])
     assert part.medium.tolist() == [20.0, 0.0]
     assert part.growth_rate.tolist() == [1.0] * 5
@@ -126,7 +145,11 @@ def test_take_keeps_every_colony():
 
 
 def test_take_may_repeat_a_cell():
-    assert batch().take(torch.tensor([0, 0, 1])).position.tolist() == [[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]]
+    assert batch().take(torch.tensor([0, 0, 1])).position.tolist() == [
+        [0.0, 0.0],
+        [0.0, 0.0],
+        [0.0, 1.0],
+    ]
 
 
 def test_take_passes_gradients():
@@ -141,7 +164,9 @@ def test_remove_notes_the_end():
     gone = torch.tensor([False, True, False, False, True, False])
     left = state.remove(gone, "removed")
     assert left.cells == 4 and left.counts.tolist() == [1, 0, 2, 1]
-    assert left.uid.tolist() == [0, 0, 1, 0] and left.next_uid.tolist() == [2, 0, 3, 1], "ids are not given out again"
+    assert left.uid.tolist() == [0, 0, 1, 0] and left.next_uid.tolist() == [2, 0, 3, 1], (
+        "ids are not given out again"
+    )
     (note,) = left.ended
     assert (note.fate, note.colony_id.tolist(), note.uid.tolist()) == ("removed", [0, 2], [1, 2])
     again = left.remove(torch.tensor([True, False, False, False]), "left")
@@ -158,7 +183,7 @@ def test_remove_in_a_selection_names_the_colonies_own_ids():
     assert note.colony_id.tolist() == [3] and note.uid.tolist() == [0]
 
 
-# --- declare and with_fields ----------------------------------------------------------------------------------------------
+# --- declare and with_fields ----------------------------------------------------------------------
 
 
 def test_declare_fields_of_every_kind():
@@ -167,9 +192,13 @@ def test_declare_fields_of_every_kind():
     state = state.declare(tf.Field("pair", "two numbers", shape=(2,), initial=1.0))
     state = state.declare(tf.Field("kind", "a whole number", dtype=torch.int64, initial=3))
     state = state.declare(tf.Field("plate", "per colony", scope="colony"))
-    state = state.declare(tf.Field("own", "worked out", initial=lambda s, rows: s.position[rows, 1]))
+    state = state.declare(
+        tf.Field("own", "worked out", initial=lambda s, rows: s.position[rows, 1])
+    )
     assert state.heat.tolist() == [2.5] * 6 and state.heat.dtype == state.dtype
-    assert state.pair.shape == (6, 2) and state.kind.dtype == torch.int64 and state.plate.shape == (4,)
+    assert (
+        state.pair.shape == (6, 2) and state.kind.dtype == torch.int64 and state.plate.shape == (4,)
+    )
     assert state.own.tolist() == [0.0, 1.0, 0.0, 1.0, 2.0, 0.0] and state.own.dtype == state.dtype
 
 
@@ -178,7 +207,9 @@ def test_declare_refuses_a_first_value_of_wrong_length():
         batch().declare(tf.Field("heat", "three numbers", initial=lambda s, rows: torch.ones(3)))
 
 
-@pytest.mark.parametrize("name", ["length", "uid", "volume", "select", "fields", "two words", "3rd"])
+@pytest.mark.parametrize(
+    "name", ["length", "uid", "volume", "select", "fields", "two words", "3rd"]
+)
 def test_field_names_that_cannot_be_used_are_refused(name):
     with pytest.raises(tf.InputError, match=r"Field\.name"):
         tf.Field(name, "no good")
@@ -195,7 +226,7 @@ def test_with_fields_refuses_what_is_not_declared():
         batch().with_fields(heat=torch.zeros(6))
 
 
-# --- device and draws -----------------------------------------------------------------------------------------------------
+# --- device and draws -----------------------------------------------------------------------------
 
 
 def test_to_moves_everything(device):
@@ -215,9 +246,17 @@ def test_draws_are_keyed_by_seed_colony_cell_step_and_purpose():
     assert torch.equal(drawn, state.uniform(rows, "test")), "a draw is a function, not an event"
     assert torch.equal(state.select([1]).uniform(torch.arange(2), "test"), drawn[2:])
     assert torch.equal(state.uniform(torch.tensor([3]), "test"), drawn[3:])
-    for other in (state.uniform(rows, "another"), state.replace(step=1).uniform(rows, "test"), state.replace(seed=1).uniform(rows, "test")):
+    for other in (
+        state.uniform(rows, "another"),
+        state.replace(step=1).uniform(rows, "test"),
+        state.replace(seed=1).uniform(rows, "test"),
+    ):
         assert not (other == drawn).any()
 
 
 def test_repr_is_one_line_of_what_matters():
-    assert repr(batch()) == "State(4 colonies, 6 cells, 2-D, t = 0 h, step 0, float32 on cpu, fields: growth_rate, elongation)"
+    assert (
+        repr(batch())
+        == "State(4 colonies, 6 cells, 2-D, t = 0 h, step 0, float32 on cpu, fields: growth_rate,"
+        " elongation)"
+    )

@@ -20,7 +20,8 @@ from torchfilm.tune import tune
 
 @dataclass
 class Info:
-    """Say what a scene simulates, field by field, and who drives whom, or what a results file holds."""
+    """Say what a scene simulates, field by field, and who drives whom, or what a results file
+    holds."""
 
     what: Annotated[str, tyro.conf.Positional]
     """Scene name, Python file, saved design, or results file."""
@@ -29,25 +30,38 @@ class Info:
 
     def __call__(self) -> None:
         path = Path(self.what)
-        if path.suffix in (".h5", ".hdf5") or (path.suffix not in (".py", ".json") and path.is_file()):
+        if path.suffix in (".h5", ".hdf5") or (
+            path.suffix not in (".py", ".json") and path.is_file()
+        ):
             return self._of_results()
         scene = load_scene(self.what, dict(map(parse_setting, self.set)))
-        scene.unchecked(1)  # rules are tried on a first state, so that what they read and write is known
+        # rules are tried on a first state, so that what they read and write is known
+        scene.unchecked(1)
         print(scene.explain())
 
     def _of_results(self) -> None:
         with Results(self.what) as results:
             a, counts = results.attributes, results.counts
-            print(f"{self.what}: {len(results)} frames, t = {results.times[0]:g} to {results.times[-1]:g} h, {counts.shape[1]} colonies")
-            print(f"cells in the last frame: {counts[-1].sum()} ({counts[-1].min()} to {counts[-1].max()} a colony)")
-            print(f"seed {a['seed']}, {a['dtype']}, dt {a['dt']:g} h, torchfilm {a['torchfilm']}, torch {a['torch']}, {a['device']}")
+            print(
+                f"{self.what}: {len(results)} frames, t = {results.times[0]:g} to"
+                f" {results.times[-1]:g} h, {counts.shape[1]} colonies"
+            )
+            print(
+                f"cells in the last frame: {counts[-1].sum()} ({counts[-1].min()} to"
+                f" {counts[-1].max()} a colony)"
+            )
+            print(
+                f"seed {a['seed']}, {a['dtype']}, dt {a['dt']:g} h, torchfilm {a['torchfilm']},"
+                f" torch {a['torch']}, {a['device']}"
+            )
             print("quantities per cell: " + ", ".join(results.file["cells"]))
             print(a["scene"])
 
 
 @dataclass
 class Explain:
-    """Say how a scene will be simulated: methods and tolerances, who drives whom, what is left out, and an estimate of what it costs."""
+    """Say how a scene will be simulated: methods and tolerances, who drives whom, what is left out,
+    and an estimate of what it costs."""
 
     scene: Annotated[str, tyro.conf.Positional]
     """Scene name, Python file or saved design."""
@@ -56,7 +70,8 @@ class Explain:
     cells: int = 1000
     """Cells in each colony, for which to estimate."""
     colonies: int | None = None
-    """Colonies for which to estimate; by default as many as the scene's parameters are for, else 1."""
+    """Colonies for which to estimate; by default as many as the scene's parameters are for, else
+    1."""
     device: str = "cpu"
     """cpu or cuda."""
     preset: str | None = None
@@ -67,13 +82,24 @@ class Explain:
     """About how long to measure, by running the scene's first steps; 0 leaves the estimate out."""
 
     def __call__(self) -> None:
-        scene = accurate(load_scene(self.scene, dict(map(parse_setting, self.set))), self.preset, self.settings)
-        print(explain(scene, cells=self.cells, colonies=self.colonies, device=self.device, seconds=self.seconds))
+        scene = accurate(
+            load_scene(self.scene, dict(map(parse_setting, self.set))), self.preset, self.settings
+        )
+        print(
+            explain(
+                scene,
+                cells=self.cells,
+                colonies=self.colonies,
+                device=self.device,
+                seconds=self.seconds,
+            )
+        )
 
 
 @dataclass
 class Tune:
-    """Find the cheapest settings that hold an error: a window of the scene is run by many settings, and compared with a far tighter run. Takes some minutes."""
+    """Find the cheapest settings that hold an error: a window of the scene is run by many settings,
+    and compared with a far tighter run. Takes some minutes."""
 
     scene: Annotated[str, tyro.conf.Positional]
     """Scene name, Python file or saved design."""
@@ -82,11 +108,14 @@ class Tune:
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE."""
     of: list[str] = field(default_factory=list)
-    """What must be right: cells, volume, radius, overlap, species by name, "signal NAME"; by default all of them."""
+    """What must be right: cells, volume, radius, overlap, species by name, "signal NAME"; by
+    default all of them."""
     cells: int = 100
-    """Cells in each colony of what you will run; it is looked at there, and with half as many again."""
+    """Cells in each colony of what you will run; it is looked at there, and with half as many
+    again."""
     colonies: int = 24
-    """Colonies of the probe, if the scene's parameters leave it open; where chance would hide the error, two to twelve times as many."""
+    """Colonies of the probe, if the scene's parameters leave it open; where chance would hide the
+    error, two to twelve times as many."""
     seed: int = 0
     """Seed of the probe."""
     device: str = "cpu"
@@ -100,7 +129,14 @@ class Tune:
         scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
         with _doing() as watch:
             tuned = tune(
-                scene, parse_error(self.error), cells=self.cells, colonies=self.colonies, of=self.of or None, seed=self.seed, device=self.device, watch=watch
+                scene,
+                parse_error(self.error),
+                cells=self.cells,
+                colonies=self.colonies,
+                of=self.of or None,
+                seed=self.seed,
+                device=self.device,
+                watch=watch,
             )
         print(tuned)
         if self.out is not None:
@@ -123,6 +159,8 @@ def parse_error(text: str) -> float:
     except ValueError as error:
         raise checks.refuse("--error", text, "a share, such as 1% or 0.01") from error
     if share >= 1:
-        mend = "" if text.endswith("%") else f"{share:g} is {100 * share:g} %; did you mean {text}%?"
+        mend = (
+            "" if text.endswith("%") else f"{share:g} is {100 * share:g} %; did you mean {text}%?"
+        )
         raise checks.refuse("--error", text, "a share below the whole, such as 1% or 0.01", mend)
     return share

@@ -1,7 +1,8 @@
 """What an effect is: a step of the model that declares the fields it reads and writes.
 
-An effect is a frozen dataclass with a `stage`, the fields it `declares`, what it `reads` and `writes`, and a
-`step(state, dt) -> state`. Effects never import each other; they meet only through named fields.
+An effect is a frozen dataclass with a `stage`, the fields it `declares`, what it `reads` and
+`writes`, and a `step(state, dt) -> state`. Effects never import each other; they meet only through
+named fields.
 """
 
 from __future__ import annotations
@@ -18,7 +19,18 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 
 # The paper's stages, in its order; an effect says where it belongs.
-RULES, DIVISION, BEFORE_CELLS, NUTRITION, GROWTH, MECHANICS, COVER, CIRCUIT, TRANSPORT, REMOVAL = 10, 20, 22, 25, 30, 40, 45, 50, 60, 90
+RULES, DIVISION, BEFORE_CELLS, NUTRITION, GROWTH, MECHANICS, COVER, CIRCUIT, TRANSPORT, REMOVAL = (
+    10,
+    20,
+    22,
+    25,
+    30,
+    40,
+    45,
+    50,
+    60,
+    90,
+)
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.
@@ -41,11 +53,13 @@ class Effect:
         return ()
 
     def reads(self) -> Sequence[str]:
-        """Names of what `step` looks at: "position", "axis", "length", "radius", "cells" (how many, which) or fields."""
+        """Names of what `step` looks at: "position", "axis", "length", "radius", "cells" (how many,
+        which) or fields."""
         return ()
 
     def needs(self) -> Sequence[str]:
-        """Those names among what it reads without which it cannot run; the others it does without."""
+        """Those names among what it reads without which it cannot run; the others it does
+        without."""
         return ()
 
     def writes(self) -> Sequence[str]:
@@ -53,8 +67,8 @@ class Effect:
         return ()
 
     def waits_for(self) -> Sequence[str]:
-        """Fields that must not be 0 everywhere in a colony if it is to have more cells: another effect, a rule or the first cells set them where this does
-        not."""
+        """Fields that must not be 0 everywhere in a colony if it is to have more cells: another
+        effect, a rule or the first cells set them where this does not."""
         return ()
 
     def begin(self, state: State) -> State:
@@ -66,7 +80,8 @@ class Effect:
         return state
 
     def check(self, state: State) -> None:
-        """Raise InputError if this effect cannot start from this seeded state; a state in mid-run is not asked again."""
+        """Raise InputError if this effect cannot start from this seeded state; a state in mid-run
+        is not asked again."""
 
     def step(self, state: State, dt: float) -> State:
         """The state after this effect has acted for dt hours."""
@@ -74,7 +89,8 @@ class Effect:
 
 
 def per_colony(value: float | Tensor, state: State) -> Tensor:
-    """A parameter as (B,) or 0-dim tensor of the state's dtype, looked up by colony id where it is given per colony."""
+    """A parameter as (B,) or 0-dim tensor of the state's dtype, looked up by colony id where it is
+    given per colony."""
     if not isinstance(value, Tensor):
         return torch.tensor(value, dtype=state.dtype, device=state.device)
     value = value.to(dtype=state.dtype, device=state.device)
@@ -91,7 +107,8 @@ def per_cell(value: float | Tensor, state: State) -> Tensor:
 
 @dataclass(frozen=True)
 class Distribution:
-    """A random parameter, drawn once for each cell at its birth. Subclasses: Uniform, Normal, LogNormal."""
+    """A random parameter, drawn once for each cell at its birth. Subclasses: Uniform, Normal,
+    LogNormal."""
 
     def draw(self, state: State, rows: Tensor, purpose: str) -> Tensor:
         """One value for each of the cells `rows` (M,) -> (M,)."""
@@ -132,7 +149,8 @@ class Uniform(Distribution):
 
 @dataclass(frozen=True)
 class Normal(Distribution):
-    """Gaussian of mean and sd, its tails beyond 4 sd (one draw in 16,000) folded back inside; each one number or one per colony."""
+    """Gaussian of mean and sd, its tails beyond 4 sd (one draw in 16,000) folded back inside; each
+    one number or one per colony."""
 
     mean: float | Tensor
     sd: float | Tensor
@@ -155,7 +173,8 @@ class Normal(Distribution):
 
 @dataclass(frozen=True)
 class LogNormal(Distribution):
-    """The exponential of a Gaussian: its median, and sigma of the logarithm; each one number or one per colony."""
+    """The exponential of a Gaussian: its median, and sigma of the logarithm; each one number or one
+    per colony."""
 
     median: float | Tensor
     sigma: float | Tensor
@@ -166,20 +185,35 @@ class LogNormal(Distribution):
 
     def draw(self, state: State, rows: Tensor, purpose: str) -> Tensor:
         z = Normal(0.0, 1.0).draw(state, rows, purpose)
-        return draw("median", self.median, state, rows) * torch.exp(draw("sigma", self.sigma, state, rows) * z)
+        return draw("median", self.median, state, rows) * torch.exp(
+            draw("sigma", self.sigma, state, rows) * z
+        )
 
     def least(self) -> float:
-        return float((torch.as_tensor(self.median) * torch.exp(-4 * torch.as_tensor(self.sigma))).min())
+        return float(
+            (torch.as_tensor(self.median) * torch.exp(-4 * torch.as_tensor(self.sigma))).min()
+        )
 
     def greatest(self) -> float:
-        return float((torch.as_tensor(self.median) * torch.exp(4 * torch.as_tensor(self.sigma))).max())
+        return float(
+            (torch.as_tensor(self.median) * torch.exp(4 * torch.as_tensor(self.sigma))).max()
+        )
 
 
-def parameter(name: str, value: object, *, above: float = -math.inf, least: float = -math.inf, most: float = math.inf) -> float | Tensor | Distribution:
+def parameter(
+    name: str,
+    value: object,
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> float | Tensor | Distribution:
     """Check a parameter that may be one number, one per colony, or a distribution over cells."""
     if isinstance(value, Distribution):
         checks.number(f"least value of {name}", value.least(), above=above, least=least, most=most)
-        checks.number(f"greatest value of {name}", value.greatest(), above=above, least=least, most=most)
+        checks.number(
+            f"greatest value of {name}", value.greatest(), above=above, least=least, most=most
+        )
         return value
     return checks.value(name, value, above=above, least=least, most=most)
 

@@ -1,4 +1,5 @@
-"""What one measures on a state: overlaps, radius, depth, alignment, per colony, and who is whose neighbour."""
+"""What one measures on a state: overlaps, radius, depth, alignment, per colony, and who is whose
+neighbour."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ from torchfilm.tools.vectors import safe_norm
 
 @dataclass(frozen=True)
 class Overlap:
-    """For each colony, (B,): `mean` and `worst` overlap of the pairs that overlap, µm (0 where none does), `count` of such pairs, and `walls`, the worst
-    overlap with a wall."""
+    """For each colony, (B,): `mean` and `worst` overlap of the pairs that overlap, µm (0 where none
+    does), `count` of such pairs, and `walls`, the worst overlap with a wall."""
 
     mean: Tensor
     worst: Tensor
@@ -29,7 +30,8 @@ class Overlap:
 
 @torch.no_grad()
 def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
-    """Overlaps between cells, and with the given walls wherever along a cell they are deepest, in float64."""
+    """Overlaps between cells, and with the given walls wherever along a cell they are deepest, in
+    float64."""
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
     i, _, gap = gaps_nearby(state.position, axis, length, radius, state.colony, state.colonies)
     depth = -gap
@@ -54,7 +56,8 @@ def colony_centre(state: State) -> Tensor:
 
 @torch.no_grad()
 def colony_radius(state: State) -> Tensor:
-    """Radius of the disc (2-D, or seen from above) with the same second moment as the cells, (B,) µm: √2 · RMS distance from the centre."""
+    """Radius of the disc (2-D, or seen from above) with the same second moment as the cells, (B,)
+    µm: √2 · RMS distance from the centre."""
     from_centre = (state.position - colony_centre(state).index_select(0, state.colony))[:, :2]
     square = (from_centre * from_centre).sum(1, keepdim=True)
     return (2.0 * state.groups.sum(square).squeeze(1) / state.counts).sqrt()
@@ -89,10 +92,19 @@ def tilt(state: State) -> Tensor:
 
 @torch.no_grad()
 def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of cells of one colony whose surfaces are less than `gap` µm apart, each once: first and second (P,) int64, and the distance of their centres,
-    (P,) float64 µm. A colony's pairs and their order do not depend on what else is in the batch."""
+    """Pairs of cells of one colony whose surfaces are less than `gap` µm apart, each once: first
+    and second (P,) int64, and the distance of their centres, (P,) float64 µm. A colony's pairs and
+    their order do not depend on what else is in the batch."""
     checks.number("neighbours(gap)", gap, least=0.0)
-    i, j, apart = gaps_nearby(state.position, state.axis, state.length, state.radius, state.colony, state.colonies, within=gap)
+    i, j, apart = gaps_nearby(
+        state.position,
+        state.axis,
+        state.length,
+        state.radius,
+        state.colony,
+        state.colonies,
+        within=gap,
+    )
     near = torch.nonzero(apart < gap).squeeze(1)
     i, j = i.index_select(0, near), j.index_select(0, near)
     between = state.position.index_select(0, j) - state.position.index_select(0, i)

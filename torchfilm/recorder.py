@@ -1,4 +1,5 @@
-"""Writing results: an observer that puts a run into one HDF5 file as it goes. The layout is told in `torchfilm.results`."""
+"""Writing results: an observer that puts a run into one HDF5 file as it goes. The layout is told in
+`torchfilm.results`."""
 
 from __future__ import annotations
 
@@ -16,7 +17,17 @@ from torch import Tensor
 
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.physics.walls import as_data
-from torchfilm.results import CHUNK_ROWS, CHUNK_VOXELS, FATES, FORMAT, FRAME_COLUMNS, LINEAGE, VERSION, Results, committed
+from torchfilm.results import (
+    CHUNK_ROWS,
+    CHUNK_VOXELS,
+    FATES,
+    FORMAT,
+    FRAME_COLUMNS,
+    LINEAGE,
+    VERSION,
+    Results,
+    committed,
+)
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, COLONY, PER_CELL, State
 from torchfilm.tools import checks
@@ -32,18 +43,37 @@ ROOM_TO_SPARE = 65536  # bytes that HDF5 may need beside a frame's own
 
 
 class Recorder:
-    """An observer that writes every `every`-th step (and the last one, on `close`) of a run to an HDF5 file.
+    """An observer that writes every `every`-th step (and the last one, on `close`) of a run to an
+    HDF5 file.
 
-    path: a new file, unless `overwrite` or `append` says otherwise; `append` goes on in a file whose last frame is the state that
-    the run starts from, by the same scene, or, if `changed`, by one that has the same fields.
+    path: a new file, unless `overwrite` or `append` says otherwise; `append` goes on in a file
+    whose last frame is the state that the run starts from, by the same scene, or, if `changed`, by
+    one that has the same fields.
     """
 
-    def __init__(self, path: str | Path, scene: Scene, *, every: int = 10, overwrite: bool = False, append: bool = False, changed: bool = False):
+    def __init__(
+        self,
+        path: str | Path,
+        scene: Scene,
+        *,
+        every: int = 10,
+        overwrite: bool = False,
+        append: bool = False,
+        changed: bool = False,
+    ):
         if isinstance(every, bool) or not isinstance(every, int) or every < 1:
             raise checks.refuse("every", every, "a whole number of steps from 1")
-        self.path, self.scene, self.every, self.append, self.changed = Path(path), scene, every, append, changed
+        self.path, self.scene, self.every, self.append, self.changed = (
+            Path(path),
+            scene,
+            every,
+            append,
+            changed,
+        )
         if append and not self.path.exists():
-            raise checks.refuse("record", str(path), "an existing results file to append to", "No such file.")
+            raise checks.refuse(
+                "record", str(path), "an existing results file to append to", "No such file."
+            )
         if self.path.is_dir():
             raise checks.refuse("record", str(path), "a file, not a folder")
         if self.path.exists() and not append and not overwrite:
@@ -51,14 +81,20 @@ class Recorder:
                 "record",
                 str(path),
                 "a path where there is no file yet",
-                "Choose another (--out), replace it (--overwrite; in Python tf.Recorder(path, scene, overwrite=True)), or resume from it.",
+                "Choose another (--out), replace it (--overwrite; in Python tf.Recorder(path,"
+                " scene, overwrite=True)), or resume from it.",
             )
         if self.path.exists() and not append and not _may_go(self.path):
             raise checks.refuse(
-                "record", str(path), "a results file, where it replaces one", "This is another kind of file, such as a study. Choose another (--out)."
+                "record",
+                str(path),
+                "a results file, where it replaces one",
+                "This is another kind of file, such as a study. Choose another (--out).",
             )
         if not self.path.parent.is_dir():
-            raise checks.refuse("record", str(path), "in a folder that exists", f"Make {self.path.parent} first.")
+            raise checks.refuse(
+                "record", str(path), "in a folder that exists", f"Make {self.path.parent} first."
+            )
         self.overwrite = overwrite
         self.file: h5py.File | None = None
         self.dt = scene.dt  # `simulate` sets the one that it uses
@@ -94,30 +130,56 @@ class Recorder:
             rebuilt = self.path.with_name(self.path.name + ".resumed")
             _copy_committed(self.path, rebuilt)
             os.replace(rebuilt, self.path)
-            mine = (state.seed, str(state.dtype)[6:], state.dim, state.colony_id.tolist(), state.stream.tolist())
+            mine = (
+                state.seed,
+                str(state.dtype)[6:],
+                state.dim,
+                state.colony_id.tolist(),
+                state.stream.tolist(),
+            )
             with Results(self.path) as kept:
                 if not self.changed:
                     kept.check_alike(self.scene)
                 about = kept.attributes
-                there = (int(about["seed"]), str(about["dtype"]), int(about["dim"]), kept.colony_id.tolist(), kept.stream.tolist())
+                there = (
+                    int(about["seed"]),
+                    str(about["dtype"]),
+                    int(about["dim"]),
+                    kept.colony_id.tolist(),
+                    kept.stream.tolist(),
+                )
             if mine != there:
                 raise checks.refuse(
-                    "state", f"of (seed, dtype, dim, colonies, streams) {mine}", f"of {there}, as {self.path} is", "Record to a file of its own."
+                    "state",
+                    f"of (seed, dtype, dim, colonies, streams) {mine}",
+                    f"of {there}, as {self.path} is",
+                    "Record to a file of its own.",
                 )
             self.file = h5py.File(self.path, "r+", libver="latest")
             last = int(self.file["frames/step"][-1])
             if last != state.step:
                 self.file.close()
                 self.file = None
-                raise checks.refuse("state", f"at step {state.step}", f"the last frame of {self.path}, at step {last}", "Start from its last frame.")
-            for name, value in {**_about(self.scene), "dt": self.dt}.items():  # of one that was changed on purpose
+                raise checks.refuse(
+                    "state",
+                    f"at step {state.step}",
+                    f"the last frame of {self.path}, at step {last}",
+                    "Start from its last frame.",
+                )
+            # of one that was changed on purpose
+            for name, value in {**_about(self.scene), "dt": self.dt}.items():
                 self.file.attrs[name] = value
             self.file.swmr_mode = True
             self.written, self.first_step = last, int(self.file["frames/step"][0])
             return
         self.first_step = state.step
         if self.path.exists() and not self.overwrite:
-            raise checks.refuse("record", str(self.path), "a path where there is no file yet", "A Recorder writes one run; make another for the next.")
+            raise checks.refuse(
+                "record",
+                str(self.path),
+                "a path where there is no file yet",
+                "A Recorder writes one run; make another for the next.",
+            )
         self.file = h5py.File(self.path, "w", libver="latest")
         self._create(state)
         self.file.swmr_mode = True
@@ -127,12 +189,24 @@ class Recorder:
         file, scene = self.file, self.scene
         assert file is not None
         attributes = {
-            "format": FORMAT, "version": VERSION, "seed": state.seed, "dim": state.dim, "dtype": str(state.dtype)[6:],
-            "device": str(state.device), "dt": self.dt, "every": self.every,
+            "format": FORMAT,
+            "version": VERSION,
+            "seed": state.seed,
+            "dim": state.dim,
+            "dtype": str(state.dtype)[6:],
+            "device": str(state.device),
+            "dt": self.dt,
+            "every": self.every,
             **_about(scene),
-            "torchfilm": __version__, "torch": str(torch.__version__),
-            "declared": json.dumps({f.name: [f.meaning, f.unit, f.scope, list(f.shape), f.at_division] for f in state.declared.values()}),
-        }  # fmt: skip
+            "torchfilm": __version__,
+            "torch": str(torch.__version__),
+            "declared": json.dumps(
+                {
+                    f.name: [f.meaning, f.unit, f.scope, list(f.shape), f.at_division]
+                    for f in state.declared.values()
+                }
+            ),
+        }
         for name, value in attributes.items():
             file.attrs[name] = value
         file.create_dataset("colony_id", data=_numpy(state.colony_id))
@@ -140,14 +214,21 @@ class Recorder:
         for name, value in _cell_columns(state).items():
             _growing(file, f"cells/{name}", value.dtype, value.shape[1:], CHUNK_ROWS)
         colonies = (state.colonies,)
-        shapes = {"counts": (colonies, np.int64), "next_uid": (colonies, np.int64), "time": ((), np.float64)}
+        shapes = {
+            "counts": (colonies, np.int64),
+            "next_uid": (colonies, np.int64),
+            "time": ((), np.float64),
+        }
         for name in FRAME_COLUMNS:
             shape, dtype = shapes.get(name, ((), np.int64))
             _growing(file, f"frames/{name}", dtype, shape, 64)
         for name, value in _colony_columns(state).items():
             _growing(file, f"frames/colony/{name}", value.dtype, value.shape, 64)
         if state.layout is not None:
-            file.attrs["spacing"], file.attrs["height"] = state.layout.grid.spacing, state.layout.height
+            file.attrs["spacing"], file.attrs["height"] = (
+                state.layout.grid.spacing,
+                state.layout.height,
+            )
             for name, value in _voxels(state).items():
                 _growing(file, f"signals/{name}", value.dtype, (), CHUNK_VOXELS)
             for name, value in _grid_columns(state).items():
@@ -160,9 +241,18 @@ class Recorder:
         for b in state.births:
             parents = torch.cat([b.parents.uid, b.parents.uid])
             ids = torch.cat([b.parents.own_colony_id, b.parents.own_colony_id])
-            self.births.append((_numpy(ids), _numpy(b.uid), _numpy(parents), np.full(parents.numel(), state.step)))
+            self.births.append(
+                (_numpy(ids), _numpy(b.uid), _numpy(parents), np.full(parents.numel(), state.step))
+            )
         for e in state.ended:
-            self.ends.append((_numpy(e.colony_id), _numpy(e.uid), np.full(e.uid.numel(), state.step), np.full(e.uid.numel(), FATES.index(e.fate))))
+            self.ends.append(
+                (
+                    _numpy(e.colony_id),
+                    _numpy(e.uid),
+                    np.full(e.uid.numel(), state.step),
+                    np.full(e.uid.numel(), FATES.index(e.fate)),
+                )
+            )
 
     def _write(self, state: State) -> None:
         assert self.file is not None
@@ -172,15 +262,19 @@ class Recorder:
         except (OSError, RuntimeError) as error:  # HDF5 reports a failed flush as a RuntimeError
             self.last = None  # nothing more is written: the file ends with the last whole frame
             raise SimulationError(
-                f"could not write step {state.step} to {self.path}: {error}. Is the disk full? Frames up to step {self.written} are safe; "
-                "free some room and resume."
+                f"could not write step {state.step} to {self.path}: {error}. Is the disk full?"
+                f" Frames up to step {self.written} are safe; free some room and resume."
             ) from error
         self.written = state.step
 
     def _check_room(self, state: State) -> None:
         """Stop while the file is still whole: HDF5 does not survive a disk that fills under it."""
         columns = (*_cell_columns(state).values(), *_voxels(state).values())
-        needed = sum(v.nbytes for v in columns) + sum(c.nbytes for e in (*self.births, *self.ends) for c in e) + ROOM_TO_SPARE
+        needed = (
+            sum(v.nbytes for v in columns)
+            + sum(c.nbytes for e in (*self.births, *self.ends) for c in e)
+            + ROOM_TO_SPARE
+        )
         room = shutil.disk_usage(self.path.parent).free
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0] if resource else -1
         if limit >= 0:
@@ -188,12 +282,14 @@ class Recorder:
         if room < needed:
             self.last = None
             raise SimulationError(
-                f"no room to write step {state.step} to {self.path}: {room} bytes are left, and a frame may need {needed}. Frames up to step "
-                f"{self.written} are safe; free some room and resume."
+                f"no room to write step {state.step} to {self.path}: {room} bytes are left, and a"
+                f" frame may need {needed}. Frames up to step {self.written} are safe; free some"
+                " room and resume."
             )
 
     def _append(self, name: str, value: np.ndarray, at: int) -> None:
-        """Put rows at `at`, and see them to the disk: a handle dropped with rows in its cache would lose a failure to write them."""
+        """Put rows at `at`, and see them to the disk: a handle dropped with rows in its cache would
+        lose a failure to write them."""
         assert self.file is not None
         table = self.tables.setdefault(name, self.file[name])
         try:
@@ -210,7 +306,8 @@ class Recorder:
         unknown = [n for n in columns if f"cells/{n}" not in file]
         if unknown:
             raise SimulationError(
-                f"the field {unknown[0]!r} came up in mid-run, after {self.path} was laid out: give it a first value in Rules(…, variables=…) and start anew."
+                f"the field {unknown[0]!r} came up in mid-run, after {self.path} was laid out: give"
+                " it a first value in Rules(…, variables=…) and start anew."
             )
         counted = committed(file)
         first_row, first_voxel = counted["rows"], counted["voxels"]
@@ -219,15 +316,24 @@ class Recorder:
         lineage = counted
         for table, events in (("births", self.births), ("ends", self.ends)):
             names = list(LINEAGE[table])
-            merged = [np.concatenate(c) for c in zip(*events, strict=True)] if events else [np.empty(0, np.int64)] * len(names)
+            merged = (
+                [np.concatenate(c) for c in zip(*events, strict=True)]
+                if events
+                else [np.empty(0, np.int64)] * len(names)
+            )
             for name, value in zip(names, merged, strict=True):
                 self._append(f"lineage/{table}/{name}", value, lineage[table])
             lineage[table] += len(merged[0])
         frame = lineage["frames"]
         row = {
-            "first_row": first_row, "counts": _numpy(state.counts), "next_uid": _numpy(state.next_uid), "births": lineage["births"],
-            "ends": lineage["ends"], "time": state.time, "step": state.step,
-        }  # fmt: skip
+            "first_row": first_row,
+            "counts": _numpy(state.counts),
+            "next_uid": _numpy(state.next_uid),
+            "births": lineage["births"],
+            "ends": lineage["ends"],
+            "time": state.time,
+            "step": state.step,
+        }
         for name, value in _colony_columns(state).items():
             self._append(f"frames/colony/{name}", value[None], frame)
         for name, value in _voxels(state).items():
@@ -243,11 +349,21 @@ class Recorder:
 
 def _about(scene: Scene) -> dict[str, str]:
     """What tells which scene a file is of, and from which it is built again."""
-    walls = [as_data(s) for effect in scene.effects if isinstance(effect, Mechanics) for s in effect.surfaces()]
+    walls = [
+        as_data(s)
+        for effect in scene.effects
+        if isinstance(effect, Mechanics)
+        for s in effect.surfaces()
+    ]
     return {
-        "scene": scene.explain(), "effects": json.dumps(scene.listing()), "code": json.dumps(scene.code), "walls": json.dumps(walls),
-        "recipe": json.dumps(scene.recipe), "settings": json.dumps(scene.settings), "accuracy": json.dumps(scene.accuracy),
-    }  # fmt: skip
+        "scene": scene.explain(),
+        "effects": json.dumps(scene.listing()),
+        "code": json.dumps(scene.code),
+        "walls": json.dumps(walls),
+        "recipe": json.dumps(scene.recipe),
+        "settings": json.dumps(scene.settings),
+        "accuracy": json.dumps(scene.accuracy),
+    }
 
 
 def _may_go(path: Path) -> bool:
@@ -265,7 +381,9 @@ def _numpy(x: Tensor) -> np.ndarray:
 
 def _cell_columns(state: State) -> dict[str, np.ndarray]:
     columns = {name: _numpy(getattr(state, name)) for name in PER_CELL}
-    return columns | {n: _numpy(v) for n, v in state.fields.items() if state.declared[n].scope == CELL}
+    return columns | {
+        n: _numpy(v) for n, v in state.fields.items() if state.declared[n].scope == CELL
+    }
 
 
 def _colony_columns(state: State) -> dict[str, np.ndarray]:
@@ -281,7 +399,11 @@ def _grid_columns(state: State, first_voxel: int = 0) -> dict[str, np.ndarray]:
     if state.layout is None:
         return {}
     grid = state.layout.grid
-    return {"origin": _numpy(grid.origin), "shape": _numpy(grid.shape), "first_voxel": np.asarray(first_voxel, np.int64)}
+    return {
+        "origin": _numpy(grid.origin),
+        "shape": _numpy(grid.shape),
+        "first_voxel": np.asarray(first_voxel, np.int64),
+    }
 
 
 def _growing(file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk: int) -> None:
@@ -297,13 +419,20 @@ def _growing(file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk
 
 
 def _copy_committed(source: Path, target: Path) -> None:
-    """A clean copy with only what was committed: free of the marks and half frames that a kill leaves."""
+    """A clean copy with only what was committed: free of the marks and half frames that a kill
+    leaves."""
     with Results(source) as results, h5py.File(target, "w", libver="latest") as out:
         file = results.file
         keep = committed(file)
         for name, value in file.attrs.items():
             out.attrs[name] = value
-        sizes = {"cells": keep["rows"], "signals": keep["voxels"], "frames": keep["frames"], "lineage/births": keep["births"], "lineage/ends": keep["ends"]}
+        sizes = {
+            "cells": keep["rows"],
+            "signals": keep["voxels"],
+            "frames": keep["frames"],
+            "lineage/births": keep["births"],
+            "lineage/ends": keep["ends"],
+        }
 
         def copy(name: str, item: Any) -> None:
             if not isinstance(item, h5py.Dataset):

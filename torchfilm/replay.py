@@ -1,5 +1,5 @@
-"""Grow once, replay for all: where nothing that a design changes acts back on growth or motion, the cells' courses are simulated once, and circuits and
-signals of any number of designs run on them.
+"""Grow once, replay for all: where nothing that a design changes acts back on growth or motion, the
+cells' courses are simulated once, and circuits and signals of any number of designs run on them.
 
     course = tf.Course(scene, streams=range(4))          # grows only as far as it is asked
     replay = tf.Replay(designs, course)                   # `designs`: the same scene with other circuits, one value per colony
@@ -27,17 +27,20 @@ FIRST = -1  # the part of what happens before all effects
 
 @dataclass(frozen=True)
 class Split:
-    """Which of a scene's effects, by their places in `scene.listed`, move, grow, divide or remove cells or drive what does (`growth`); the others only
-    follow. `obstacle`: why the followers cannot be run alone, or "" if they can."""
+    """Which of a scene's effects, by their places in `scene.listed`, move, grow, divide or remove
+    cells or drive what does (`growth`); the others only follow. `obstacle`: why the followers
+    cannot be run alone, or "" if they can."""
 
     growth: tuple[int, ...]
     obstacle: str = ""
 
 
 def split(scene: Scene) -> Split:
-    """Which effects of a scene grow the colonies and which only follow, by what they declare to read and write.
+    """Which effects of a scene grow the colonies and which only follow, by what they declare to
+    read and write.
 
-    Rules are the user's own Python, and what they read and write is known from one trial only: a scene with rules is not split.
+    Rules are the user's own Python, and what they read and write is known from one trial only: a
+    scene with rules is not split.
     """
     everything = tuple(range(len(scene.listed)))
     rules = [e.title for e in scene.listed if e.writes_anything]
@@ -64,7 +67,10 @@ def split(scene: Scene) -> Split:
     obstacle = "every effect acts on growth or motion" if len(growth) == len(everything) else ""
     for place, name in wide.items():
         if place in growth:
-            obstacle = f"{scene.listed[place].title} acts on growth or motion by {name!r}, which is no quantity of cells"
+            obstacle = (
+                f"{scene.listed[place].title} acts on growth or motion by {name!r}, which is no"
+                " quantity of cells"
+            )
     if scene.founders.colony is not None:
         obstacle = "its first cells name their colonies, so that these do not start alike"
     return Split(tuple(sorted(growth)), obstacle or _held(scene, sorted(growth)))
@@ -84,9 +90,10 @@ def _held(scene: Scene, growth: Iterable[int]) -> str:
 class Change:
     """What an effect changed in one step of a course, for its R colonies side by side.
 
-    part: which of the course's effects, or FIRST. counts, next_uid (R,) after it. source: place of each cell among its colony's cells before it (N,), or
-    None if these stay. values: what changed, by name, (N, …). births: (R,) their number, and the places of first and second daughters within their colony,
-    (M,) each; None without.
+    part: which of the course's effects, or FIRST. counts, next_uid (R,) after it. source: place of
+    each cell among its colony's cells before it (N,), or None if these stay. values: what changed,
+    by name, (N, …). births: (R,) their number, and the places of first and second daughters within
+    their colony, (M,) each; None without.
     """
 
     part: int
@@ -110,23 +117,34 @@ class CourseReport:
 
 
 class Course:
-    """The growth and motion of some colonies of a scene, without what only follows: grown step by step as far as it is asked, and kept.
+    """The growth and motion of some colonies of a scene, without what only follows: grown step by
+    step as far as it is asked, and kept.
 
-    scene: any design of it; streams: courses of random numbers, one colony each; seed, dt (h, by default the scene's), dtype and device as in
-    `scene.seed` and `simulate`. cells: a colony that has as many is not grown on, and is empty from the next step; None: all go on.
-    `Course.nbytes` tells what it holds. Raises InputError where growth depends on what would only follow.
+    scene: any design of it; streams: courses of random numbers, one colony each; seed, dt (h, by
+    default the scene's), dtype and device as in `scene.seed` and `simulate`. cells: a colony that
+    has as many is not grown on, and is empty from the next step; None: all go on. `Course.nbytes`
+    tells what it holds. Raises InputError where growth depends on what would only follow.
     """
 
     def __init__(
-        self, scene: Scene, *, streams: Iterable[int], seed: int = 0, dt: float | None = None, dtype: torch.dtype = torch.float32,
-        device: str | torch.device = "cpu", cells: int | None = None,
-    ):  # fmt: skip
+        self,
+        scene: Scene,
+        *,
+        streams: Iterable[int],
+        seed: int = 0,
+        dt: float | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: str | torch.device = "cpu",
+        cells: int | None = None,
+    ):
         self.scene = Course.scene_of(scene)
         self.dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
         self.streams, self.cells = tuple(streams), cells
         if len(set(self.streams)) != len(self.streams):
             raise checks.refuse("streams", self.streams, "different whole numbers")
-        self.state = self.scene.seed(len(self.streams), seed=seed, streams=self.streams, dtype=dtype, device=device)
+        self.state = self.scene.seed(
+            len(self.streams), seed=seed, streams=self.streams, dtype=dtype, device=device
+        )
         self.steps: list[list[Change]] = []
         self.failed: dict[int, tuple[int, str]] = {}
 
@@ -137,21 +155,37 @@ class Course:
 
     @staticmethod
     def scene_of(scene: Scene) -> Scene:
-        """The scene without what only follows. Raises InputError where its growth cannot be kept."""
+        """The scene without what only follows. Raises InputError where its growth cannot be
+        kept."""
         parts = split(scene)
         if parts.obstacle:
-            raise checks.InputError(f"the growth of this scene cannot be kept for other designs: {parts.obstacle}. Run the scene itself.")
-        return Scene(*(scene.listed[k] for k in parts.growth), name=scene.name, dt=scene.dt, founders=scene.founders)
+            raise checks.InputError(
+                f"the growth of this scene cannot be kept for other designs: {parts.obstacle}. Run"
+                " the scene itself."
+            )
+        return Scene(
+            *(scene.listed[k] for k in parts.growth),
+            name=scene.name,
+            dt=scene.dt,
+            founders=scene.founders,
+        )
 
     @staticmethod
     def made_of(scene: Scene) -> str:
-        """A word that is the same for scenes that grow alike, and for no others. Raises InputError where the growth cannot be kept."""
+        """A word that is the same for scenes that grow alike, and for no others. Raises InputError
+        where the growth cannot be kept."""
         return _made_of(Course.scene_of(scene))
 
     @property
     def nbytes(self) -> int:
         """Bytes that the kept steps take."""
-        return sum(x.nbytes for step in self.steps for c in step for x in (c.counts, c.source, *(c.births or ()), *c.values.values()) if x is not None)
+        return sum(
+            x.nbytes
+            for step in self.steps
+            for c in step
+            for x in (c.counts, c.source, *(c.births or ()), *c.values.values())
+            if x is not None
+        )
 
     @torch.no_grad()
     def changes(self, step: int) -> list[Change]:
@@ -197,20 +231,27 @@ def _change(part: int, before: State, after: State) -> Change:
         values[name] = new
     births = None
     if len(after.births) > len(before.births) + 1:
-        raise checks.SimulationError("an effect divided cells more than once in one step: such growth cannot be kept for other designs. Give replay=False.")
+        raise checks.SimulationError(
+            "an effect divided cells more than once in one step: such growth cannot be kept for"
+            " other designs. Give replay=False."
+        )
     if len(after.births) > len(before.births):
         made = after.births[-1]
         start = offsets(after.counts)[:-1]
         owner = after.colony.index_select(0, made.first)
         first, second = (rows - start.index_select(0, owner) for rows in (made.first, made.second))
         births = (torch.bincount(owner, minlength=after.colonies), first, second)
-    within = None if source is None else source - offsets(before.counts)[:-1].index_select(0, after.colony)
+    within = (
+        None
+        if source is None
+        else source - offsets(before.counts)[:-1].index_select(0, after.colony)
+    )
     return Change(part, after.counts, after.next_uid, within, values, births)
 
 
 def _sources(before: State, after: State) -> Tensor:
     """The row that each cell had before, or its parent had, (N,)."""
-    key = lambda colony, uid: colony << 40 | uid  # noqa: E731
+    key = lambda colony, uid: colony << 40 | uid
     old, order = torch.sort(key(before.colony, before.uid))
     mine, parents = key(after.colony, after.uid), key(after.colony, after.parent.clamp(min=0))
     at = torch.searchsorted(old, mine).clamp(max=max(0, old.numel() - 1))
@@ -218,15 +259,18 @@ def _sources(before: State, after: State) -> Tensor:
     above = torch.searchsorted(old, parents).clamp(max=max(0, old.numel() - 1))
     if bool((~was_there & (old.index_select(0, above) != parents)).any()):
         raise checks.SimulationError(
-            "cells came in that no cell of their colony gave birth to: such growth cannot be kept for other designs. Give replay=False."
+            "cells came in that no cell of their colony gave birth to: such growth cannot be kept"
+            " for other designs. Give replay=False."
         )
     return order.index_select(0, torch.where(was_there, at, above))
 
 
 class Replay:
-    """Designs of a scene on the course of their colonies: `seed` and `step` as those of the scene, and the same outcome, without growth and mechanics.
+    """Designs of a scene on the course of their colonies: `seed` and `step` as those of the scene,
+    and the same outcome, without growth and mechanics.
 
-    scene: with the course's own growth, and whatever follows, one value or one per colony. What cells ended as is not told (`state.ended` stays empty).
+    scene: with the course's own growth, and whatever follows, one value or one per colony. What
+    cells ended as is not told (`state.ended` stays empty).
     """
 
     def __init__(self, scene: Scene, course: Course):
@@ -234,24 +278,37 @@ class Replay:
         grown = Course.scene_of(scene)
         if _made_of(grown) != _made_of(course.scene):
             raise checks.InputError(
-                f"this scene does not grow as the course did: {', '.join(grown.listing())} and its founders, instead of "
-                f"{', '.join(course.scene.listing())}. Make a Course of this scene."
+                f"this scene does not grow as the course did: {', '.join(grown.listing())} and its"
+                f" founders, instead of {', '.join(course.scene.listing())}. Make a Course of this"
+                " scene."
             )
         device = course.state.device
         self.streams, self.order = torch.sort(torch.tensor(course.streams, device=device))
         kept = {id(effect) for effect in grown.listed}
         # each effect with its number among those of the course, or None if it only follows
         numbers = iter(range(len(grown.effects)))
-        self.parts = [(part, next(numbers) if id(scene.listed[k]) in kept else None) for k, part in zip(scene.places, scene.effects, strict=True)]
-        self.own = [f.name for part, number in self.parts if number is None for f in part.declares(scene.dim)]
+        self.parts = [
+            (part, next(numbers) if id(scene.listed[k]) in kept else None)
+            for k, part in zip(scene.places, scene.effects, strict=True)
+        ]
+        self.own = [
+            f.name
+            for part, number in self.parts
+            if number is None
+            for f in part.declares(scene.dim)
+        ]
 
     def seed(self, colonies: int, *, streams: Sequence[int] | Tensor) -> State:
         """The first state of `colonies` colonies that follow these streams of the course, (B,)."""
         first = self.course.state
-        state = self.scene.seed(colonies, seed=first.seed, streams=streams, dtype=first.dtype, device=first.device)
+        state = self.scene.seed(
+            colonies, seed=first.seed, streams=streams, dtype=first.dtype, device=first.device
+        )
         strange = sorted(set(state.stream.tolist()) - set(self.course.streams))
         if strange:
-            raise checks.refuse("streams", strange[0], f"of the course: {', '.join(map(str, self.course.streams))}")
+            raise checks.refuse(
+                "streams", strange[0], f"of the course: {', '.join(map(str, self.course.streams))}"
+            )
         return state
 
     def step(self, state: State) -> State:
@@ -275,28 +332,45 @@ class Replay:
         """The state after a change of the course, whose colonies at `place` (B,) ours follow."""
         counts = change.counts.index_select(0, place)
         owner, rows = expand_ranges(offsets(change.counts)[:-1].index_select(0, place), counts)
-        taken = {name: value.index_select(0, rows) for name, value in change.values.items() if name not in self.own}
+        taken = {
+            name: value.index_select(0, rows)
+            for name, value in change.values.items()
+            if name not in self.own
+        }
         old = state
         if change.source is not None:
-            source = change.source.index_select(0, rows) + offsets(state.counts)[:-1].index_select(0, owner)
+            source = change.source.index_select(0, rows) + offsets(state.counts)[:-1].index_select(
+                0, owner
+            )
             state = state.take(source).replace(next_uid=change.next_uid.index_select(0, place))
         state = state.replace(**{n: taken.pop(n) for n in PER_CELL if n in taken})
         if change.births is None:
             return state.with_fields(**taken)
         number, firsts, seconds = change.births
-        mine, at = expand_ranges(offsets(number)[:-1].index_select(0, place), number.index_select(0, place))
+        mine, at = expand_ranges(
+            offsets(number)[:-1].index_select(0, place), number.index_select(0, place)
+        )
         start = offsets(counts)[:-1].index_select(0, mine)
         first, second = firsts.index_select(0, at) + start, seconds.index_select(0, at) + start
         daughters = torch.cat([first, second])
         parents = old.take(source.index_select(0, first))
-        state = state.replace(births=(*state.births, Births(first, second, state.uid.index_select(0, daughters), parents)))
+        state = state.replace(
+            births=(
+                *state.births,
+                Births(first, second, state.uid.index_select(0, daughters), parents),
+            )
+        )
         # as where cells divide: what starts anew does so from the parents' values of all that does
         return state.reset_at_division(daughters, self.own).with_fields(**taken)
 
     def _with_failures(self, state: State, number: int) -> State:
         """The state with a report of what failed in the course in this step."""
         streams = state.stream.tolist()
-        words = {k: self.course.failed[s][1] for k, s in enumerate(streams) if s in self.course.failed and self.course.failed[s][0] == number}
+        words = {
+            k: self.course.failed[s][1]
+            for k, s in enumerate(streams)
+            if s in self.course.failed and self.course.failed[s][0] == number
+        }
         if not words:
             return state
         status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)

@@ -1,4 +1,5 @@
-"""Results: one HDF5 file of ragged frames, readable while it is written, from which a run resumes bit for bit.
+"""Results: one HDF5 file of ragged frames, readable while it is written, from which a run resumes
+bit for bit.
 
     /                 attributes: format, version, scene, recipe, seed, dim, dtype, versions
     /colony_id, /stream   (B,)
@@ -7,9 +8,10 @@
     /signals/NAME     (in scenes with a medium) voxels of all colonies and frames one after the other; /frames/grid/origin, shape (B, 3), first_voxel
     /lineage/births   colony_id, uid, parent, step · /lineage/ends   colony_id, uid, step, fate
 
-A frame holds the whole state, so every frame is a checkpoint. `frames/step` is written last: what is not counted there did
-not happen. The file is written in HDF5's single-writer mode and flushed each frame, so that a kill costs at most the
-frames since. Files are data only; nothing in them is executed.
+A frame holds the whole state, so every frame is a checkpoint. `frames/step` is written last: what
+is not counted there did not happen. The file is written in HDF5's single-writer mode and flushed
+each frame, so that a kill costs at most the frames since. Files are data only; nothing in them is
+executed.
 """
 
 from __future__ import annotations
@@ -38,7 +40,10 @@ FORMAT, VERSION = "torchfilm results", 2
 FATES = ("divided", "removed", "left", "failed")
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 CHUNK_ROWS, CHUNK_VOXELS = 8192, 32768
-LINEAGE = {"births": ("colony_id", "uid", "parent", "step"), "ends": ("colony_id", "uid", "step", "fate")}
+LINEAGE = {
+    "births": ("colony_id", "uid", "parent", "step"),
+    "ends": ("colony_id", "uid", "step", "fate"),
+}
 # step last: it commits the frame
 FRAME_COLUMNS = ("first_row", "counts", "next_uid", "births", "ends", "time", "step")
 
@@ -49,7 +54,10 @@ def _whole(file: h5py.File, name: str) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyError, RuntimeError) as error:
-        raise InputError(f"{file.filename} is damaged: its {name!r} cannot be read ({error}). Use another copy of it, or other frames.") from error
+        raise InputError(
+            f"{file.filename} is damaged: its {name!r} cannot be read ({error}). Use another copy"
+            " of it, or other frames."
+        ) from error
 
 
 def _read(file: h5py.File, name: str, at: int | slice | EllipsisType = ...) -> Any:
@@ -59,7 +67,8 @@ def _read(file: h5py.File, name: str, at: int | slice | EllipsisType = ...) -> A
 
 
 def _frames(file: h5py.File) -> int:
-    """How many frames count: a last step that does not come after the one before was broken off while it was written."""
+    """How many frames count: a last step that does not come after the one before was broken off
+    while it was written."""
     steps = _read(file, "frames/step")
     count = len(steps)
     while count > 1 and steps[count - 1] <= steps[count - 2]:
@@ -77,7 +86,13 @@ def committed(file: h5py.File) -> dict[str, int]:
     voxels = 0
     if "grid" in file["frames"]:
         voxels = int(last("frames/grid/first_voxel")) + int(last("frames/grid/shape").prod(1).sum())
-    return {"frames": frames, "rows": rows, "voxels": voxels, "births": int(last("frames/births")), "ends": int(last("frames/ends"))}
+    return {
+        "frames": frames,
+        "rows": rows,
+        "voxels": voxels,
+        "births": int(last("frames/births")),
+        "ends": int(last("frames/ends")),
+    }
 
 
 def _open_to_read(path: Path) -> h5py.File:
@@ -87,12 +102,19 @@ def _open_to_read(path: Path) -> h5py.File:
     error: Exception | None = None
     with open(path, "rb") as raw:
         head = raw.read(48)
-    # a single-writer open of a file that was cut would wait for the rest for ever: its superblock says how long it should be
+    # a single-writer open of a file that was cut would wait for the rest for ever: its superblock
+    # says how long it should be
     size = path.stat().st_size
-    if head.startswith(SIGNATURE[: len(head)]) and (len(head) < 48 or (head[8] >= 2 and int.from_bytes(head[28:36], "little") > size)):
+    if head.startswith(SIGNATURE[: len(head)]) and (
+        len(head) < 48 or (head[8] >= 2 and int.from_bytes(head[28:36], "little") > size)
+    ):
         of = f" of {int.from_bytes(head[28:36], 'little')}" if len(head) == 48 else ""
-        raise InputError(f"{path} is truncated: it has {size}{of} bytes. Use a whole copy of it; of a run that just begins, look again.")
-    # of a file that nobody writes (or was killed while writing), what cannot be read will not come: a single-writer open would try again for minutes
+        raise InputError(
+            f"{path} is truncated: it has {size}{of} bytes. Use a whole copy of it; of a run that"
+            " just begins, look again."
+        )
+    # of a file that nobody writes (or was killed while writing), what cannot be read will not come:
+    # a single-writer open would try again for minutes
     finished = len(head) == 48 and head[8] >= 3 and head[11] == 0
     ways: tuple[dict[str, Any], ...] = ({"swmr": True, "libver": "latest"}, {})
     for options in reversed(ways) if finished else ways:
@@ -100,13 +122,17 @@ def _open_to_read(path: Path) -> h5py.File:
             return h5py.File(path, "r", **options)
         except OSError as found:
             error = found
-            if finished and "match" not in str(found):  # but with what this process has it open with since it was written
+            # but with what this process has it open with since it was written
+            if finished and "match" not in str(found):
                 break
-    raise InputError(f"{path} cannot be read as HDF5: it is truncated or not a results file ({error}).") from error
+    raise InputError(
+        f"{path} cannot be read as HDF5: it is truncated or not a results file ({error})."
+    ) from error
 
 
 class Results:
-    """A results file to read: `len(results)` frames; `results.frame(k)`, `results.table(k)`, `results.lineage()`, `results.state(scene, k)`."""
+    """A results file to read: `len(results)` frames; `results.frame(k)`, `results.table(k)`,
+    `results.lineage()`, `results.state(scene, k)`."""
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
@@ -116,9 +142,15 @@ class Results:
             with _whole(self.file, "frames/step"):
                 ours = self.file.attrs.get("format") == FORMAT and "frames/step" in self.file
             if not ours:
-                raise InputError(f"{path} is not a torchfilm results file (its format is {self.file.attrs.get('format')!r}).")
+                raise InputError(
+                    f"{path} is not a torchfilm results file (its format is"
+                    f" {self.file.attrs.get('format')!r})."
+                )
             if int(self.file.attrs["version"]) > VERSION:
-                raise InputError(f"{path} has format version {self.file.attrs['version']}, newer than this torchfilm reads ({VERSION}). Update torchfilm.")
+                raise InputError(
+                    f"{path} has format version {self.file.attrs['version']}, newer than this"
+                    f" torchfilm reads ({VERSION}). Update torchfilm."
+                )
             if len(self) == 0:
                 raise InputError(f"{path} holds no finished frame.")
         except InputError:
@@ -188,8 +220,9 @@ class Results:
 
     @property
     def walls(self) -> list[dict[str, Any]]:
-        """What cells could not pass, surface by surface: "normal" and "offset" (normal · x there, µm) of a flat one, "center" and "radius", µm, of a round one,
-        each entry one number or a list of one per colony; and whether it is "soft"."""
+        """What cells could not pass, surface by surface: "normal" and "offset" (normal · x there,
+        µm) of a flat one, "center" and "radius", µm, of a round one, each entry one number or a
+        list of one per colony; and whether it is "soft"."""
         return json.loads(self.file.attrs.get("walls", "[]"))
 
     def refresh(self) -> None:
@@ -201,8 +234,22 @@ class Results:
         if not self.file.swmr_mode:
             return
         self.file["frames/step"].id.refresh()  # first: what it counts has been written before it
-        groups = ("cells", "signals", "lineage/births", "lineage/ends", "frames/colony", "frames/grid", "frames")
-        for dataset in (d for g in groups if g in self.file for n, d in self.file[g].items() if isinstance(d, h5py.Dataset) and n != "step"):
+        groups = (
+            "cells",
+            "signals",
+            "lineage/births",
+            "lineage/ends",
+            "frames/colony",
+            "frames/grid",
+            "frames",
+        )
+        for dataset in (
+            d
+            for g in groups
+            if g in self.file
+            for n, d in self.file[g].items()
+            if isinstance(d, h5py.Dataset) and n != "step"
+        ):
             dataset.id.refresh()
 
     def _index(self, frame: int) -> int:
@@ -211,15 +258,22 @@ class Results:
         except TypeError as error:
             raise checks.refuse("frame", frame, "a whole number") from error
         if not -len(self) <= frame < len(self):
-            raise checks.refuse("frame", frame, f"from {-len(self)} to {len(self) - 1}: {self.path} has {len(self)} frames")
+            raise checks.refuse(
+                "frame",
+                frame,
+                f"from {-len(self)} to {len(self) - 1}: {self.path} has {len(self)} frames",
+            )
         return frame % len(self)
 
     def frame(self, frame: int = -1) -> dict[str, np.ndarray]:
-        """Arrays of one frame by name: colony (place in the batch), uid, parent, position, axis, length, radius and the fields per cell."""
+        """Arrays of one frame by name: colony (place in the batch), uid, parent, position, axis,
+        length, radius and the fields per cell."""
         k = self._index(frame)
         start = int(self._read("frames/first_row", k))
         stop = start + int(self._read("frames/counts", k).sum())
-        return {name: self._read(f"cells/{name}", slice(start, stop)) for name in self._names("cells")}
+        return {
+            name: self._read(f"cells/{name}", slice(start, stop)) for name in self._names("cells")
+        }
 
     @property
     def signal_names(self) -> tuple[str, ...]:
@@ -227,25 +281,42 @@ class Results:
         return self._names("signals")
 
     def grid(self, frame: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the voxels of a frame are: lower corners (B, 3) µm, numbers of voxels (B, 3), and their spacing (3,) µm."""
+        """Where the voxels of a frame are: lower corners (B, 3) µm, numbers of voxels (B, 3), and
+        their spacing (3,) µm."""
         if not self.signal_names:
             raise InputError(f"{self.path} has no medium, so no grid.")
         k = self._index(frame)
-        return self._read("frames/grid/origin", k), self._read("frames/grid/shape", k), np.asarray(self.file.attrs["spacing"])
+        return (
+            self._read("frames/grid/origin", k),
+            self._read("frames/grid/shape", k),
+            np.asarray(self.file.attrs["spacing"]),
+        )
 
     def signal(self, name: str, frame: int = -1) -> list[np.ndarray]:
         """Concentrations of a signal at a frame, one array (nx, ny, nz) a colony."""
         if name not in self.signal_names:
-            raise checks.refuse("signal", name, "one of " + (", ".join(self.signal_names) or "none: the scene has no medium"))
+            raise checks.refuse(
+                "signal",
+                name,
+                "one of " + (", ".join(self.signal_names) or "none: the scene has no medium"),
+            )
         k = self._index(frame)
         _, shapes, _ = self.grid(k)
-        ends = int(self._read("frames/grid/first_voxel", k)) + np.concatenate([[0], np.cumsum(shapes.prod(1))])
+        ends = int(self._read("frames/grid/first_voxel", k)) + np.concatenate(
+            [[0], np.cumsum(shapes.prod(1))]
+        )
         read = partial(self._read, f"signals/{name}")
-        return [read(slice(a, b)).reshape(tuple(shape)) for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)]
+        return [
+            read(slice(a, b)).reshape(tuple(shape))
+            for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)
+        ]
 
     def _check_scene(self, scene: Scene, template: State, changed: bool) -> None:
         """Raise InputError that names what a scene has otherwise than the one that was recorded."""
-        there = {name: (scope, tuple(shape)) for name, (_, _, scope, shape, _) in json.loads(self.file.attrs["declared"]).items()}
+        there = {
+            name: (scope, tuple(shape))
+            for name, (_, _, scope, shape, _) in json.loads(self.file.attrs["declared"]).items()
+        }
         here = {f.name: (f.scope, tuple(f.shape)) for f in template.declared.values()}
         kinds = {
             "it lacks": [n for n in here if n not in there],
@@ -254,31 +325,44 @@ class Results:
         if any(kinds.values()):
             kinds["not in this scene:"] = [n for n in there if n not in here]
             raise InputError(
-                f"{self.path} was recorded with other fields than this scene has ({_told(kinds)}). Take the edit back to go on with it, or start a new run."
+                f"{self.path} was recorded with other fields than this scene has ({_told(kinds)})."
+                " Take the edit back to go on with it, or start a new run."
             )
         if self.signal_names and template.layout is None:
-            raise InputError(f"{self.path} was recorded with a Medium ({', '.join(self.signal_names)}), and this scene has none.")
+            raise InputError(
+                f"{self.path} was recorded with a Medium ({', '.join(self.signal_names)}), and this"
+                " scene has none."
+            )
         if not changed:
             self.check_alike(scene)
 
     def check_alike(self, scene: Scene) -> None:
-        """Raise InputError unless this is the scene that was recorded, as far as its effects, their parameters and the code of their functions tell."""
+        """Raise InputError unless this is the scene that was recorded, as far as its effects, their
+        parameters and the code of their functions tell."""
         was, now = json.loads(self.file.attrs.get("effects", "null")), scene.listing()
         code, mine = json.loads(self.file.attrs.get("code", "null")), scene.code
         differs = ""
         if was is not None and was != now:
-            kinds = {"recorded with": [e for e in was if e not in now], "this scene has": [e for e in now if e not in was]}
+            kinds = {
+                "recorded with": [e for e in was if e not in now],
+                "this scene has": [e for e in now if e not in was],
+            }
             differs = _told(kinds) or "the same effects in another order"
         elif code is not None and code[:2] == mine[:2] and code != mine:
-            differs = "a function of its effects was edited since, or what such a function holds on to, or the values that colonies have each for itself"
+            differs = (
+                "a function of its effects was edited since, or what such a function holds on to,"
+                " or the values that colonies have each for itself"
+            )
         if differs:
             raise InputError(
-                f"{self.path} is of another scene: {differs}. If the change is meant, say so: resume --changed, in Python results.state(scene, changed=True) "
-                "and Recorder(…, changed=True)."
+                f"{self.path} is of another scene: {differs}. If the change is meant, say so:"
+                " resume --changed, in Python results.state(scene, changed=True) and Recorder(…,"
+                " changed=True)."
             )
 
     def table(self, frame: int | None = None) -> dict[str, np.ndarray]:
-        """One column a quantity, one row a cell, for `pandas.DataFrame(results.table())`: of one frame, or of all with time and frame."""
+        """One column a quantity, one row a cell, for `pandas.DataFrame(results.table())`: of one
+        frame, or of all with time and frame."""
         frames = range(len(self)) if frame is None else [self._index(frame)]
         parts = []
         for k in frames:
@@ -293,16 +377,21 @@ class Results:
                 if value.ndim == 1:
                     columns[name] = value
                 else:
-                    letters = "xyz" if name in ("position", "axis") else map(str, range(value.shape[1]))
+                    letters = (
+                        "xyz" if name in ("position", "axis") else map(str, range(value.shape[1]))
+                    )
                     for j, letter in zip(range(value.shape[1]), letters, strict=False):
                         columns[letter if name == "position" else f"{name}_{letter}"] = value[:, j]
             parts.append(columns)
         return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
 
     def lineage(self) -> dict[str, np.ndarray]:
-        """Every cell that was ever born in the recorded run: colony, uid, parent, born (step), ended (step or −1), fate ("alive", "divided", …)."""
+        """Every cell that was ever born in the recorded run: colony, uid, parent, born (step),
+        ended (step or −1), fate ("alive", "divided", …)."""
         size = committed(self.file)
-        births = {n: self._read(f"lineage/births/{n}", slice(size["births"])) for n in LINEAGE["births"]}
+        births = {
+            n: self._read(f"lineage/births/{n}", slice(size["births"])) for n in LINEAGE["births"]
+        }
         ends = {n: self._read(f"lineage/ends/{n}", slice(size["ends"])) for n in LINEAGE["ends"]}
         first = self.frame(0)
         colony = np.concatenate([self.colony_id[first["colony"]], births["colony_id"]])
@@ -316,28 +405,58 @@ class Results:
         fate = np.full(len(uid), "alive", dtype="<U8")
         ended[at] = ends["step"]
         fate[at] = np.asarray(FATES)[ends["fate"]]
-        return {"colony": colony, "uid": uid, "parent": parent, "born": born, "ended": ended, "fate": fate}
+        return {
+            "colony": colony,
+            "uid": uid,
+            "parent": parent,
+            "born": born,
+            "ended": ended,
+            "fate": fate,
+        }
 
-    def state(self, scene: Scene, frame: int = -1, *, device: str | torch.device | None = None, changed: bool = False) -> State:
-        """The state at a frame, from which `simulate` goes on as if it had never stopped. The scene must be the one that was run, or, if
-        `changed`, one that has the same fields."""
+    def state(
+        self,
+        scene: Scene,
+        frame: int = -1,
+        *,
+        device: str | torch.device | None = None,
+        changed: bool = False,
+    ) -> State:
+        """The state at a frame, from which `simulate` goes on as if it had never stopped. The scene
+        must be the one that was run, or, if `changed`, one that has the same fields."""
         k = self._index(frame)
         dtype = getattr(torch, str(self.file.attrs["dtype"]))
         device = torch.device(device if device is not None else "cpu")
-        template = scene.unchecked(int(self.colony_id.max()) + 1, seed=int(self.file.attrs["seed"]), dtype=dtype, device=device)
+        template = scene.unchecked(
+            int(self.colony_id.max()) + 1,
+            seed=int(self.file.attrs["seed"]),
+            dtype=dtype,
+            device=device,
+        )
         if template.dim != int(self.file.attrs["dim"]):
-            raise checks.refuse("scene", f"{template.dim}-D", f"{self.file.attrs['dim']}-D, as {self.path} is")
+            raise checks.refuse(
+                "scene", f"{template.dim}-D", f"{self.file.attrs['dim']}-D, as {self.path} is"
+            )
         self._check_scene(scene, template, changed)
         recorded = self.frame(k)
         layout = template.layout
         if layout is not None:
             origin, shape, spacing = self.grid(k)
             corner, voxels = torch.from_numpy(origin).to(device), torch.from_numpy(shape).to(device)
-            layout = layout.on(Grid(corner, voxels, (float(spacing[0]), float(spacing[1]), float(spacing[2]))))
-            recorded |= {OUTSIDE + n: np.concatenate([x.reshape(-1) for x in self.signal(n, k)]) for n in self.signal_names}
-        colony_fields = {n: self._read(f"frames/colony/{n}", k) for n in self._names("frames/colony")}
+            layout = layout.on(
+                Grid(corner, voxels, (float(spacing[0]), float(spacing[1]), float(spacing[2])))
+            )
+            recorded |= {
+                OUTSIDE + n: np.concatenate([x.reshape(-1) for x in self.signal(n, k)])
+                for n in self.signal_names
+            }
+        colony_fields = {
+            n: self._read(f"frames/colony/{n}", k) for n in self._names("frames/colony")
+        }
         declared = dict(template.declared)
-        for name, (meaning, unit, scope, shape, at_division) in json.loads(self.file.attrs["declared"]).items():
+        for name, (meaning, unit, scope, shape, at_division) in json.loads(
+            self.file.attrs["declared"]
+        ).items():
             if name not in declared:
                 declared[name] = Field(
                     name,
@@ -345,7 +464,9 @@ class Results:
                     unit,
                     scope,
                     tuple(shape),
-                    torch.from_numpy(recorded[name] if name in recorded else np.atleast_1d(colony_fields[name])).dtype,
+                    torch.from_numpy(
+                        recorded[name] if name in recorded else np.atleast_1d(colony_fields[name])
+                    ).dtype,
                     at_division=at_division,
                 )
 
@@ -354,14 +475,22 @@ class Results:
 
         fields = {n: tensor(recorded[n] if n in recorded else colony_fields[n]) for n in declared}
         return template.replace(
-            **{n: tensor(recorded[n]) for n in PER_CELL}, colony_id=tensor(self.colony_id), stream=tensor(self.stream),
+            **{n: tensor(recorded[n]) for n in PER_CELL},
+            colony_id=tensor(self.colony_id),
+            stream=tensor(self.stream),
             next_uid=tensor(self._read("frames/next_uid", k)),
-            step=int(self.steps[k]), time=float(self.times[k]), fields=fields, declared=declared, layout=layout,
-        )  # fmt: skip
+            step=int(self.steps[k]),
+            time=float(self.times[k]),
+            fields=fields,
+            declared=declared,
+            layout=layout,
+        )
 
 
 def _told(kinds: dict[str, list[str]]) -> str:
-    return "; ".join(f"{kind} {', '.join(map(repr, names))}" for kind, names in kinds.items() if names)
+    return "; ".join(
+        f"{kind} {', '.join(map(repr, names))}" for kind, names in kinds.items() if names
+    )
 
 
 def _pair(colony: np.ndarray, uid: np.ndarray) -> np.ndarray:

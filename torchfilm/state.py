@@ -29,9 +29,11 @@ DivisionRule = str | Callable[["State", "Tensor"], "Tensor"]
 class Field:
     """A named quantity that an effect declares. What no effect declares does not exist.
 
-    scope: "cell" (one row a cell), "colony" (one row a colony) or "grid" (one row a voxel of the state's layout; the name begins with
-    "out."). shape: of one row. unit and meaning: for people. initial: a number, or a function (state, rows) -> (M, *shape) tensor, called for
-    new rows: at the start and, where at_division = "reset", for daughters, when `state.births[-1]` tells of their parents. at_division: "copy" or "reset".
+    scope: "cell" (one row a cell), "colony" (one row a colony) or "grid" (one row a voxel of the
+    state's layout; the name begins with "out."). shape: of one row. unit and meaning: for people.
+    initial: a number, or a function (state, rows) -> (M, *shape) tensor, called for new rows: at
+    the start and, where at_division = "reset", for daughters, when `state.births[-1]` tells of
+    their parents. at_division: "copy" or "reset".
     """
 
     name: str
@@ -48,20 +50,24 @@ class Field:
         checks.choice(f"Field({self.name!r}).at_division", self.at_division, ("copy", "reset"))
         plain = self.name.removeprefix(OUTSIDE) if self.scope == GRID else self.name
         if not plain.isidentifier() or self.name in RESERVED:
-            raise checks.refuse("Field.name", self.name, "an identifier that the state does not use itself")
+            raise checks.refuse(
+                "Field.name", self.name, "an identifier that the state does not use itself"
+            )
 
     def start(self, state: State, rows: Tensor) -> Tensor:
         """Initial values for the given rows (M,) of the state: (M, *shape)."""
         dtype = self.dtype or state.dtype
         if callable(self.initial):
             return self.initial(state, rows).to(dtype)
-        return torch.full((rows.numel(), *self.shape), self.initial, dtype=dtype, device=state.device)
+        return torch.full(
+            (rows.numel(), *self.shape), self.initial, dtype=dtype, device=state.device
+        )
 
 
 @dataclass(frozen=True)
 class Births:
-    """Divisions of one step: rows (M,) of both daughters in the state right after, their uids (2M,), first daughters first, and the
-    parents, M cells, as they were."""
+    """Divisions of one step: rows (M,) of both daughters in the state right after, their uids
+    (2M,), first daughters first, and the parents, M cells, as they were."""
 
     first: Tensor
     second: Tensor
@@ -71,7 +77,8 @@ class Births:
 
 @dataclass(frozen=True)
 class Ended:
-    """Cells that left in one step: colony ids and uids (M,) int64, and why ("divided", "removed", "left", "failed")."""
+    """Cells that left in one step: colony ids and uids (M,) int64, and why ("divided", "removed",
+    "left", "failed")."""
 
     colony_id: Tensor
     uid: Tensor
@@ -88,20 +95,25 @@ class Signals(dict[str, Tensor]):
     """Values of signals by name."""
 
     def __missing__(self, name: str) -> Tensor:
-        raise UnknownSignal(f"the state has no signal {name!r}; its signals are {', '.join(self) or 'none: list a Medium in the scene'}")
+        raise UnknownSignal(
+            f"the state has no signal {name!r}; its signals are"
+            f" {', '.join(self) or 'none: list a Medium in the scene'}"
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Cells of B colonies, N in all, those of one colony side by side. Frozen: a step returns a new one.
+    """Cells of B colonies, N in all, those of one colony side by side. Frozen: a step returns a new
+    one.
 
-    colony (N,) int64, place of its colony in this batch · uid, parent (N,) int64, unique within a colony, founders have
-    parent −1 · position (N, d) µm, always float64, so that a colony far from the origin keeps its resolution · axis (N, d)
-    unit · length (N,) µm, of the centreline · radius (N,) µm · fields, by name.
-    colony_id (B,): which colony of the scene each is; parameters per colony go by it. stream (B,): which course of random numbers each follows, by default
-    its colony_id; colonies of one stream and alike in their parameters are alike in all. next_uid (B,).
-    A field is also an attribute: `state.growth_rate`. layout: where the voxels of signals are, in a scene that has a medium; a signal's values are
-    `state.signals["ahl"]`, (nodes,).
+    colony (N,) int64, place of its colony in this batch · uid, parent (N,) int64, unique within a
+    colony, founders have parent −1 · position (N, d) µm, always float64, so that a colony far from
+    the origin keeps its resolution · axis (N, d) unit · length (N,) µm, of the centreline · radius
+    (N,) µm · fields, by name. colony_id (B,): which colony of the scene each is; parameters per
+    colony go by it. stream (B,): which course of random numbers each follows, by default its
+    colony_id; colonies of one stream and alike in their parameters are alike in all. next_uid (B,).
+    A field is also an attribute: `state.growth_rate`. layout: where the voxels of signals are, in a
+    scene that has a medium; a signal's values are `state.signals["ahl"]`, (nodes,).
     """
 
     colony: Tensor
@@ -132,7 +144,9 @@ class State:
         fields = self.__dict__.get("fields", {})
         if name in fields:
             return fields[name]
-        raise AttributeError(f"the state has no {name!r}; its fields are {', '.join(fields) or 'none'}")
+        raise AttributeError(
+            f"the state has no {name!r}; its fields are {', '.join(fields) or 'none'}"
+        )
 
     @property
     def cells(self) -> int:
@@ -178,13 +192,21 @@ class State:
     @property
     def signals(self) -> dict[str, Tensor]:
         """Values of each signal by name, (nodes,), laid out as `layout.grid` says."""
-        return Signals({name.removeprefix(OUTSIDE): value for name, value in self.fields.items() if name.startswith(OUTSIDE)})
+        return Signals(
+            {
+                name.removeprefix(OUTSIDE): value
+                for name, value in self.fields.items()
+                if name.startswith(OUTSIDE)
+            }
+        )
 
     def contact(self) -> Contact | None:
         """Where cells meet the medium and what they find there; None in a scene without one."""
         if self.layout is None:
             return None
-        return self.layout.contact(self.position, self.colony, self.own_colony_id, self.signals, self.dtype)
+        return self.layout.contact(
+            self.position, self.colony, self.own_colony_id, self.signals, self.dtype
+        )
 
     @property
     def own_colony_id(self) -> Tensor:
@@ -204,34 +226,56 @@ class State:
         """A state with some of its fields replaced; each must have been declared."""
         unknown = set(values) - set(self.declared)
         if unknown:
-            raise checks.refuse("field", sorted(unknown), f"declared; known are {', '.join(self.declared) or 'none'}")
+            raise checks.refuse(
+                "field",
+                sorted(unknown),
+                f"declared; known are {', '.join(self.declared) or 'none'}",
+            )
         return self.replace(fields={**self.fields, **values})
 
     def declare(self, field: Field) -> State:
         """A state that has one more field, at its initial value."""
         declared = self.replace(declared={**self.declared, field.name: field})
         if field.scope == GRID and self.layout is None:
-            raise checks.InputError(f"the field {field.name!r} needs a grid, and this state has none: list a Medium in the scene.")
-        rows = self.cells if field.scope == CELL else self.colonies if field.scope == COLONY else self.layout.grid.nodes  # type: ignore[union-attr]
+            raise checks.InputError(
+                f"the field {field.name!r} needs a grid, and this state has none: list a Medium in"
+                " the scene."
+            )
+        rows = (
+            self.cells
+            if field.scope == CELL
+            else self.colonies
+            if field.scope == COLONY
+            else self.layout.grid.nodes
+        )  # type: ignore[union-attr]
         start = field.start(declared, torch.arange(rows, device=self.device))
         if start.shape[0] != rows:
-            raise checks.refuse(f"initial value of {field.name}", tuple(start.shape), f"of {rows} rows")
+            raise checks.refuse(
+                f"initial value of {field.name}", tuple(start.shape), f"of {rows} rows"
+            )
         return declared.with_fields(**{field.name: start})
 
     def take(self, index: Tensor) -> State:
-        """The cells at `index` (M,), which keeps colonies side by side; colonies stay, if need be empty."""
-        fields = {name: value.index_select(0, index) if self.declared[name].scope == CELL else value for name, value in self.fields.items()}
+        """The cells at `index` (M,), which keeps colonies side by side; colonies stay, if need be
+        empty."""
+        fields = {
+            name: value.index_select(0, index) if self.declared[name].scope == CELL else value
+            for name, value in self.fields.items()
+        }
         part = {name: getattr(self, name).index_select(0, index) for name in PER_CELL}
         return self.replace(**part, fields=fields)
 
     def reset_at_division(self, daughters: Tensor, names: Iterable[str]) -> State:
-        """The state right after divisions (`births[-1]` tells of them) in which those of the named fields that a division resets start anew in the
-        cells `daughters` (M,), first daughters first; the others they have from their parents."""
+        """The state right after divisions (`births[-1]` tells of them) in which those of the named
+        fields that a division resets start anew in the cells `daughters` (M,), first daughters
+        first; the others they have from their parents."""
         changed = {}
         for name in names:
             declared = self.declared[name]
             if declared.scope == CELL and declared.at_division == "reset":
-                changed[name] = self.fields[name].index_copy(0, daughters, declared.start(self, daughters))
+                changed[name] = self.fields[name].index_copy(
+                    0, daughters, declared.start(self, daughters)
+                )
         return self.with_fields(**changed)
 
     def remove(self, gone: Tensor, fate: str) -> State:
@@ -243,48 +287,88 @@ class State:
         return self.take(kept).replace(ended=(*self.ended, note))
 
     def select(self, colonies: Tensor | list[int]) -> State:
-        """Some colonies of the batch, by their places, in the order given. Each goes on as it would have in the whole."""
+        """Some colonies of the batch, by their places, in the order given. Each goes on as it would
+        have in the whole."""
         places = torch.as_tensor(colonies, dtype=torch.int64, device=self.device).reshape(-1)
         if places.numel() == 0 or bool((places < 0).any()) or bool((places >= self.colonies).any()):
-            raise checks.refuse("colonies", places.tolist(), f"places from 0 to {self.colonies - 1}, at least one")
+            raise checks.refuse(
+                "colonies", places.tolist(), f"places from 0 to {self.colonies - 1}, at least one"
+            )
         if torch.unique(places).numel() != places.numel():
             raise checks.refuse("colonies", places.tolist(), "different places")
         start = offsets(self.counts)
         counts = self.counts.index_select(0, places)
         owner = torch.repeat_interleave(torch.arange(places.numel(), device=self.device), counts)
-        within = torch.arange(owner.numel(), device=self.device) - offsets(counts)[:-1].index_select(0, owner)
+        within = torch.arange(owner.numel(), device=self.device) - offsets(counts)[
+            :-1
+        ].index_select(0, owner)
         taken = self.take(start.index_select(0, places).index_select(0, owner) + within)
         layout, nodes = (None, None) if self.layout is None else self.layout.take(places)
         kept = {CELL: None, COLONY: places, GRID: nodes}
-        fields = {n: v if (index := kept[self.declared[n].scope]) is None else v.index_select(0, index) for n, v in taken.fields.items()}
+        fields = {
+            n: v if (index := kept[self.declared[n].scope]) is None else v.index_select(0, index)
+            for n, v in taken.fields.items()
+        }
         return taken.replace(
-            colony=owner, fields=fields, layout=layout, births=(), ended=(), reports={},
+            colony=owner,
+            fields=fields,
+            layout=layout,
+            births=(),
+            ended=(),
+            reports={},
             **{name: getattr(self, name).index_select(0, places) for name in PER_COLONY},
-        )  # fmt: skip
+        )
 
     def to(self, device: str | torch.device) -> State:
         """The same state on another device."""
         move = {name: getattr(self, name).to(device) for name in (*PER_CELL, *PER_COLONY)}
         layout = None if self.layout is None else self.layout.to(device)
-        return self.replace(**move, fields={n: v.to(device) for n, v in self.fields.items()}, layout=layout, births=(), ended=(), reports={})
+        return self.replace(
+            **move,
+            fields={n: v.to(device) for n, v in self.fields.items()},
+            layout=layout,
+            births=(),
+            ended=(),
+            reports={},
+        )
 
     def uniform(self, rows: Tensor, purpose: str) -> Tensor:
-        """A draw from (0, 1) for each of the given cells (M,), the same whatever the batch: keyed by seed, stream, uid, step, purpose."""
-        return random.uniform(self.seed, self.own_stream.index_select(0, rows), self.uid.index_select(0, rows), self.step, purpose, self.dtype)
+        """A draw from (0, 1) for each of the given cells (M,), the same whatever the batch: keyed
+        by seed, stream, uid, step, purpose."""
+        return random.uniform(
+            self.seed,
+            self.own_stream.index_select(0, rows),
+            self.uid.index_select(0, rows),
+            self.step,
+            purpose,
+            self.dtype,
+        )
 
     def normal(self, rows: Tensor, purpose: str) -> Tensor:
         """Four standard normal draws for each of the given cells, (M, 4), keyed as `uniform`."""
-        return random.normal(self.seed, self.own_stream.index_select(0, rows), self.uid.index_select(0, rows), self.step, purpose, self.dtype)
+        return random.normal(
+            self.seed,
+            self.own_stream.index_select(0, rows),
+            self.uid.index_select(0, rows),
+            self.step,
+            purpose,
+            self.dtype,
+        )
 
     def __repr__(self) -> str:
         return (
-            f"State({self.colonies} colonies, {self.cells} cells, {self.dim}-D, t = {self.time:g} h, step {self.step}, "
-            f"{str(self.dtype)[6:]} on {self.device}, fields: {', '.join(self.fields) or 'none'})"
+            f"State({self.colonies} colonies, {self.cells} cells, {self.dim}-D, t = {self.time:g}"
+            f" h, step {self.step}, {str(self.dtype)[6:]} on {self.device}, fields:"
+            f" {', '.join(self.fields) or 'none'})"
         )
 
 
 PER_CELL = ("colony", "uid", "parent", "position", "axis", "length", "radius")
 PER_COLONY = ("colony_id", "stream", "next_uid")
-RESERVED = frozenset(f.name for f in dataclasses.fields(State)) | {n for n in vars(State) if not n.startswith("__")}
+RESERVED = frozenset(f.name for f in dataclasses.fields(State)) | {
+    n for n in vars(State) if not n.startswith("__")
+}
 # A field that first cells may bring and rules may set.
-CELL_TYPE = Field("cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64)
+CELL_TYPE = Field(
+    "cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64
+)

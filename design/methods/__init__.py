@@ -11,7 +11,12 @@ from design.methods.racing import Racing
 from design.methods.sobol import Sobol
 from torchfilm import checks
 
-METHODS: dict[str, type[Any]] = {"sobol": Sobol, "cmaes": CMAES, "bayesian": Bayesian, "racing": Racing}
+METHODS: dict[str, type[Any]] = {
+    "sobol": Sobol,
+    "cmaes": CMAES,
+    "bayesian": Bayesian,
+    "racing": Racing,
+}
 
 __all__ = ["CMAES", "METHODS", "Batch", "Bayesian", "Method", "Racing", "Sobol", "method_of"]
 
@@ -22,12 +27,18 @@ def method_of(given: str | Method) -> Method:
         checks.choice("method", given, tuple(METHODS))
         made: Method = METHODS[given]()
         return made
-    missing = [name for name in ("start", "ask", "tell") if not callable(getattr(given, name, None))]
+    missing = [
+        name for name in ("start", "ask", "tell") if not callable(getattr(given, name, None))
+    ]
     if isinstance(given, type) or missing:
         raise checks.refuse(
             "method",
             given,
             "one of " + ", ".join(map(repr, METHODS)) + ", or an object with start, ask and tell",
-            "A class is not yet an object: write CMAES()." if isinstance(given, type) else f"It has no {' and no '.join(missing)}.",
+            (
+                "A class is not yet an object: write CMAES()."
+                if isinstance(given, type)
+                else f"It has no {' and no '.join(missing)}."
+            ),
         )
     return given

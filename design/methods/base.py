@@ -12,11 +12,14 @@ from scipy.stats import qmc
 
 from torchfilm import checks
 
-AGAIN = "Tell all batches, in order, to a method with the same settings, space, seed and replicates."
+AGAIN = (
+    "Tell all batches, in order, to a method with the same settings, space, seed and replicates."
+)
 
 
 class Dimensions(Protocol):
-    """What a method knows of a space: how many dimensions, and the levels of each (None: continuous)."""
+    """What a method knows of a space: how many dimensions, and the levels of each (None:
+    continuous)."""
 
     @property
     def size(self) -> int: ...
@@ -29,8 +32,8 @@ class Dimensions(Protocol):
 class Batch:
     """What a method wants tried.
 
-    points: (n, D), each coordinate in [0, 1]. size: share of the full colony size to grow, above 0, at most 1. replicates: how many of the replicates
-    to grow of each point; None is all.
+    points: (n, D), each coordinate in [0, 1]. size: share of the full colony size to grow, above 0,
+    at most 1. replicates: how many of the replicates to grow of each point; None is all.
     """
 
     points: np.ndarray
@@ -44,7 +47,9 @@ class Batch:
         bad = ~((points >= 0) & (points <= 1)).all(1)
         if bad.any():
             row = int(bad.argmax())
-            raise checks.refuse(f"Batch.points[{row}]", points[row].tolist(), "within [0, 1] in every dimension")
+            raise checks.refuse(
+                f"Batch.points[{row}]", points[row].tolist(), "within [0, 1] in every dimension"
+            )
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
         checks.number("Batch.size", self.size, above=0.0, most=1.0)
@@ -53,10 +58,12 @@ class Batch:
 
 
 class Method(Protocol):
-    """How a search chooses what to try next. Any object with these three can be given to a search as its method.
+    """How a search chooses what to try next. Any object with these three can be given to a search
+    as its method.
 
-    What `ask` returns must depend on nothing but what `start` was given, the method's settings, and all that was told: a search that was stopped is
-    continued by a new method that is told what is known. A method with `describe() -> str` is recognised when a search is continued.
+    What `ask` returns must depend on nothing but what `start` was given, the method's settings, and
+    all that was told: a search that was stopped is continued by a new method that is told what is
+    known. A method with `describe() -> str` is recognised when a search is continued.
     """
 
     def start(self, space: Dimensions, seed: int, replicates: int) -> None: ...
@@ -67,7 +74,8 @@ class Method(Protocol):
 
 
 class Source(Method, Protocol):
-    """A method whose points may be sieved before it hears of them, as `Racing` does: it draws as many as are wanted and takes the losses of some."""
+    """A method whose points may be sieved before it hears of them, as `Racing` does: it draws as
+    many as are wanted and takes the losses of some."""
 
     @property
     def wanted(self) -> int:
@@ -85,7 +93,8 @@ class Source(Method, Protocol):
 
 
 class Turns:
-    """Asks and tells in turns: what the ready methods share. Asked again before it was told, a method answers the same.
+    """Asks and tells in turns: what the ready methods share. Asked again before it was told, a
+    method answers the same.
 
     A method says what comes next in `_next` and learns in `_take`; `_begin` is called by `start`.
     """
@@ -96,11 +105,17 @@ class Turns:
     _replicates: int = 1
 
     def start(self, space: Dimensions, seed: int, replicates: int) -> None:
-        """Begin, or begin anew. seed: a whole number from 0; replicates: how many the search grows of each design."""
+        """Begin, or begin anew. seed: a whole number from 0; replicates: how many the search grows
+        of each design."""
         if len(space.levels) != space.size or space.size < 1:
-            raise checks.refuse("space.levels", space.levels, "one entry for each of at least one dimension")
+            raise checks.refuse(
+                "space.levels", space.levels, "one entry for each of at least one dimension"
+            )
         self._space = space
-        self._seed, self._replicates = whole("seed", seed, least=0), whole("replicates", replicates, least=1)
+        self._seed, self._replicates = (
+            whole("seed", seed, least=0),
+            whole("replicates", replicates, least=1),
+        )
         self._batch = None
         self._begin()
 
@@ -112,9 +127,11 @@ class Turns:
         return self._batch
 
     def tell(self, batch: Batch, loss: np.ndarray) -> None:
-        """How good the points of a batch are: (n,), lower is better, finite (a design that failed has a bad but finite loss).
+        """How good the points of a batch are: (n,), lower is better, finite (a design that failed
+        has a bad but finite loss).
 
-        Batches are told in the order in which they were asked. InputError for another batch than was asked.
+        Batches are told in the order in which they were asked. InputError for another batch than
+        was asked.
         """
         self._started()
         self._meet(batch)
@@ -128,7 +145,10 @@ class Turns:
 
     def _started(self) -> Dimensions:
         if self._space is None:
-            raise checks.InputError(f"{type(self).__name__} has no space yet: call start(space, seed, replicates) first.")
+            raise checks.InputError(
+                f"{type(self).__name__} has no space yet: call start(space, seed, replicates)"
+                " first."
+            )
         return self._space
 
     def _meet(self, batch: Batch) -> None:
@@ -149,34 +169,52 @@ def alike(asked: tuple[int, int, float, int | None], told: Batch, name: str) -> 
     """Refuse a batch of another kind than was asked: (points, dimensions, size, replicates)."""
     given = (*told.points.shape, told.size, told.replicates)
     if given != asked:
-        raise checks.refuse(f"{name}.tell: (points, dimensions, size, replicates)", given, f"{asked}, as asked", AGAIN)
+        raise checks.refuse(
+            f"{name}.tell: (points, dimensions, size, replicates)",
+            given,
+            f"{asked}, as asked",
+            AGAIN,
+        )
 
 
 def same(asked: Batch, told: Batch, name: str) -> None:
-    """Refuse a batch that is not the one asked. Another machine may round another way, so the points may differ by 1e-6."""
+    """Refuse a batch that is not the one asked. Another machine may round another way, so the
+    points may differ by 1e-6."""
     alike((*asked.points.shape, asked.size, asked.replicates), told, name)
     far = (np.abs(asked.points - told.points) > 1e-6).any(1)
     if far.any():
         row = int(far.argmax())
-        raise checks.refuse(f"{name}.tell: points[{row}]", told.points[row].tolist(), f"{asked.points[row].tolist()}, as asked", AGAIN)
+        raise checks.refuse(
+            f"{name}.tell: points[{row}]",
+            told.points[row].tolist(),
+            f"{asked.points[row].tolist()}, as asked",
+            AGAIN,
+        )
 
 
 def scores(batch: Batch, loss: Any) -> np.ndarray:
     """The losses of a batch, (n,) float64, finite."""
     out = np.array(loss, dtype=np.float64)
     if out.shape != (len(batch.points),):
-        raise checks.refuse("loss of shape", out.shape, f"({len(batch.points)},), one number for each point")
+        raise checks.refuse(
+            "loss of shape", out.shape, f"({len(batch.points)},), one number for each point"
+        )
     bad = ~np.isfinite(out)
     if bad.any():
         row = int(bad.argmax())
         raise checks.refuse(
-            f"loss[{row}]", float(out[row]), "finite", f"{int(bad.sum())} of {len(out)} are not; give a design that failed a bad finite loss, such as 1.5."
+            f"loss[{row}]",
+            float(out[row]),
+            "finite",
+            f"{int(bad.sum())} of {len(out)} are not; give a design that failed a bad finite loss,"
+            " such as 1.5.",
         )
     return out
 
 
 def snap(points: np.ndarray, levels: Sequence[int | None]) -> np.ndarray:
-    """Points with the coordinates of levels in the middle of their level, (level + ½) / k; others clipped to [0, 1]."""
+    """Points with the coordinates of levels in the middle of their level, (level + ½) / k; others
+    clipped to [0, 1]."""
     out = np.clip(points, 0.0, 1.0)
     for axis, count in enumerate(levels):
         if count is not None:
@@ -187,8 +225,17 @@ def snap(points: np.ndarray, levels: Sequence[int | None]) -> np.ndarray:
 def sobol(space: Dimensions, seed: int, at: int, count: int) -> np.ndarray:
     """Points number `at` … `at + count` of the scrambled Sobol sequence of a seed, (count, D)."""
     engine = qmc.Sobol(space.size, scramble=True, rng=np.random.default_rng(seed))
-    if not at:  # scipy warns where the first draw is no power of two; one is, and the sequence goes on from there
-        return snap(np.concatenate([engine.random(1), engine.random(count - 1)]) if count > 1 else engine.random(1), space.levels)
+    # scipy warns where the first draw is no power of two; one is, and the sequence goes on from
+    # there
+    if not at:
+        return snap(
+            (
+                np.concatenate([engine.random(1), engine.random(count - 1)])
+                if count > 1
+                else engine.random(1)
+            ),
+            space.levels,
+        )
     return snap(engine.fast_forward(at).random(count), space.levels)
 
 
@@ -201,7 +248,8 @@ def whole(name: str, value: object, *, least: int) -> int:
 
 @contextmanager
 def numpy_kept(seed: Sequence[int]) -> Iterator[None]:
-    """Inside, numpy's global generator starts from `seed`; outside it is as if nobody had drawn from it. For libraries that do."""
+    """Inside, numpy's global generator starts from `seed`; outside it is as if nobody had drawn
+    from it. For libraries that do."""
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(np.random.SeedSequence(list(seed)).generate_state(4))  # noqa: NPY002
     try:

@@ -1,4 +1,5 @@
-"""Bayesian optimisation: a smooth model of the loss, with its own doubts, says where it pays to look."""
+"""Bayesian optimisation: a smooth model of the loss, with its own doubts, says where it pays to
+look."""
 
 from __future__ import annotations
 
@@ -18,14 +19,18 @@ RESTARTS, SAMPLES = 4, 128
 
 @dataclass(kw_only=True, eq=False)
 class Bayesian(Turns):
-    """A Gaussian process of the loss and the noisy expected improvement over all that was tried (Ament et al., NeurIPS 2023), by botorch.
+    """A Gaussian process of the loss and the noisy expected improvement over all that was tried
+    (Ament et al., NeurIPS 2023), by botorch.
 
-    For colonies so expensive that only some hundreds can be grown; a batch takes seconds to choose, and more with every point told.
-    batch: points in a batch. first: Sobol points before there is a model, one batch; None is 2 (D + 1), at least `batch`.
+    For colonies so expensive that only some hundreds can be grown; a batch takes seconds to choose,
+    and more with every point told. batch: points in a batch. first: Sobol points before there is a
+    model, one batch; None is 2 (D + 1), at least `batch`.
 
-    Loss is standardised, noise is inferred. A loss worse than the median by more than twice what the best is better counts as that, so that failed
-    designs do not flatten the model. Levels are rounded as the points are chosen; a point already tried is replaced by a Sobol point. While
-    all losses are equal, Sobol points are asked. The same bits need the same machine, versions and number of threads.
+    Loss is standardised, noise is inferred. A loss worse than the median by more than twice what
+    the best is better counts as that, so that failed designs do not flatten the model. Levels are
+    rounded as the points are chosen; a point already tried is replaced by a Sobol point. While all
+    losses are equal, Sobol points are asked. The same bits need the same machine, versions and
+    number of threads.
     """
 
     batch: int = 8
@@ -36,7 +41,10 @@ class Bayesian(Turns):
         if self.first is not None:
             whole("Bayesian.first", self.first, least=2)
         if find_spec("botorch") is None:
-            raise checks.InputError('Bayesian needs the package botorch, which is not installed: pip install "torchfilm[bayes]".')
+            raise checks.InputError(
+                "Bayesian needs the package botorch, which is not installed: pip install"
+                ' "torchfilm[bayes]".'
+            )
 
     def _begin(self) -> None:
         size = self._started().size
@@ -45,7 +53,8 @@ class Bayesian(Turns):
         self._open = self.first or max(self.batch, 2 * (size + 1))
 
     def _meet(self, batch: Batch) -> None:
-        """Choosing costs seconds, so a history is told without choosing it again; only its shape is seen to."""
+        """Choosing costs seconds, so a history is told without choosing it again; only its shape is
+        seen to."""
         if self._batch is not None or not len(self._loss):
             super()._meet(batch)
         else:
@@ -59,10 +68,16 @@ class Bayesian(Turns):
         loss = tamed(self._loss)
         if loss.std() == 0:
             return Batch(spare)
-        with warnings.catch_warnings(), torch.random.fork_rng(devices=[]), numpy_kept([self._seed, known]):
+        with (
+            warnings.catch_warnings(),
+            torch.random.fork_rng(devices=[]),
+            numpy_kept([self._seed, known]),
+        ):
             warnings.simplefilter("ignore")
             # of this generator alone: torch.manual_seed would change those of the devices too
-            torch.default_generator.manual_seed(int(np.random.SeedSequence([self._seed, known]).generate_state(1)[0]))
+            torch.default_generator.manual_seed(
+                int(np.random.SeedSequence([self._seed, known]).generate_state(1)[0])
+            )
             points = self._choose(loss)
         tried = {row.tobytes() for row in self._points}
         for place, row in enumerate(points):
@@ -72,7 +87,8 @@ class Bayesian(Turns):
         return Batch(points)
 
     def _choose(self, loss: np.ndarray) -> np.ndarray:
-        """The points of most expected improvement, (batch, D), one after the other, each knowing those before it."""
+        """The points of most expected improvement, (batch, D), one after the other, each knowing
+        those before it."""
         from botorch.acquisition.logei import qLogNoisyExpectedImprovement
         from botorch.fit import fit_gpytorch_mll
         from botorch.models import SingleTaskGP
@@ -82,15 +98,27 @@ class Bayesian(Turns):
 
         levels = self._started().levels
         known = torch.from_numpy(self._points.copy())
-        model = SingleTaskGP(known, -torch.from_numpy((loss - loss.mean()) / loss.std()).unsqueeze(1), outcome_transform=None)
+        model = SingleTaskGP(
+            known,
+            -torch.from_numpy((loss - loss.mean()) / loss.std()).unsqueeze(1),
+            outcome_transform=None,
+        )
         fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
         sampler = SobolQMCNormalSampler(torch.Size([128]), seed=len(loss))
-        acquisition = qLogNoisyExpectedImprovement(model, known, sampler=sampler, prune_baseline=True)
+        acquisition = qLogNoisyExpectedImprovement(
+            model, known, sampler=sampler, prune_baseline=True
+        )
         found, _ = optimize_acqf(
-            acquisition, torch.tensor([[0.0], [1.0]], dtype=torch.float64).expand(2, known.shape[1]), q=self.batch,
-            num_restarts=RESTARTS, raw_samples=SAMPLES, sequential=True,
-            post_processing_func=lambda x: torch.from_numpy(snap(x.reshape(-1, x.shape[-1]).numpy(), levels)).reshape(x.shape),
-        )  # fmt: skip
+            acquisition,
+            torch.tensor([[0.0], [1.0]], dtype=torch.float64).expand(2, known.shape[1]),
+            q=self.batch,
+            num_restarts=RESTARTS,
+            raw_samples=SAMPLES,
+            sequential=True,
+            post_processing_func=lambda x: torch.from_numpy(
+                snap(x.reshape(-1, x.shape[-1]).numpy(), levels)
+            ).reshape(x.shape),
+        )
         return snap(found.numpy(), levels)
 
     def _take(self, batch: Batch, loss: np.ndarray) -> None:
@@ -99,7 +127,8 @@ class Bayesian(Turns):
 
 
 def tamed(loss: np.ndarray) -> np.ndarray:
-    """Losses, with those far worse than the median brought to the median and twice what the best is better; as they are where the median is the best."""
+    """Losses, with those far worse than the median brought to the median and twice what the best is
+    better; as they are where the median is the best."""
     middle = float(np.median(loss))
     room = middle - float(loss.min())
     return np.minimum(loss, middle + 2.0 * room) if room > 0 else loss

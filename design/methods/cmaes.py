@@ -15,26 +15,32 @@ import numpy as np
 from design.methods.base import Batch, Turns, numpy_kept, snap, sobol, whole
 from torchfilm import checks
 
-# A restart doubles the population up to this many times the first: the batch must still fit the machine.
+# A restart doubles the population up to this many times the first: the batch must still fit the
+# machine.
 MOST = 16
-# Learning rate of the mean and damping of the step size, for losses with noise; cma's own are 1 and 1 (docs/methods.md has what was measured).
+# Learning rate of the mean and damping of the step size, for losses with noise; cma's own are 1 and
+# 1 (docs/methods.md has what was measured).
 SLOW = {"CMA_cmean": 0.4, "CSA_dampfac": 3.0}
 
 
 @dataclass(kw_only=True, eq=False)
 class CMAES(Turns):
-    """Covariance matrix adaptation (Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772), by the package cma.
+    """Covariance matrix adaptation (Hansen, "The CMA evolution strategy: a tutorial",
+    arXiv:1604.00772), by the package cma.
 
-    population: points in a batch; None is 4 + 3 ln D, rounded down, or, where there are levels, 6 + 3 ln(D · dimensions with levels). sigma: width of
-    the first cloud, as a share of each range. noisy: learn slowly, for losses with noise. A search grows every design on the same seeds, so that its losses
-    have none; those of a user's own may.
-    restarts: when a cloud has converged, begin another with twice the population (IPOP: Auger and Hansen, CEC 2005), at most 16 times the first; False
-    stays with the first cloud for ever.
+    population: points in a batch; None is 4 + 3 ln D, rounded down, or, where there are levels, 6 +
+    3 ln(D · dimensions with levels). sigma: width of the first cloud, as a share of each range.
+    noisy: learn slowly, for losses with noise. A search grows every design on the same seeds, so
+    that its losses have none; those of a user's own may. restarts: when a cloud has converged,
+    begin another with twice the population (IPOP: Auger and Hansen, CEC 2005), at most 16 times the
+    first; False stays with the first cloud for ever.
 
-    Every cloud begins at the best of a batch of Sobol points, and no cloud begins while these are all equally good, as where every design fails. A
-    cloud that ended where all is equally bad, worse than where it began, is followed by one no larger.
-    Levels are whole numbers for cma, in their order, with its lower bounds on their widths and its centring (Marty et al., PPSN 2024). Dimensions with
-    one level are left out; where fewer than the two dimensions that cma needs are left, it gets idle ones that change nothing.
+    Every cloud begins at the best of a batch of Sobol points, and no cloud begins while these are
+    all equally good, as where every design fails. A cloud that ended where all is equally bad,
+    worse than where it began, is followed by one no larger. Levels are whole numbers for cma, in
+    their order, with its lower bounds on their widths and its centring (Marty et al., PPSN 2024).
+    Dimensions with one level are left out; where fewer than the two dimensions that cma needs are
+    left, it gets idle ones that change nothing.
     """
 
     population: int | None = None
@@ -49,7 +55,10 @@ class CMAES(Turns):
         for name in ("restarts", "noisy"):
             checks.choice(f"CMAES.{name}", getattr(self, name), (True, False))
         if find_spec("cma") is None:
-            raise checks.InputError('CMAES needs the package cma, which is not installed: pip install "torchfilm[design]".')
+            raise checks.InputError(
+                "CMAES needs the package cma, which is not installed: pip install"
+                ' "torchfilm[design]".'
+            )
 
     def _begin(self) -> None:
         space = self._started()
@@ -67,7 +76,9 @@ class CMAES(Turns):
         self._random = np.random.default_rng(self._seed)
 
     def _usual(self, size: int) -> int:
-        return int(6 + 3 * math.log(size * len(self._whole)) if self._whole else 4 + 3 * math.log(size))
+        return int(
+            6 + 3 * math.log(size * len(self._whole)) if self._whole else 4 + 3 * math.log(size)
+        )
 
     @property
     def wanted(self) -> int:
@@ -94,7 +105,10 @@ class CMAES(Turns):
     def take(self, rows: np.ndarray, loss: np.ndarray) -> None:
         if self._cloud is None:
             if loss.min() < loss.max():
-                self._cloud, self._start = self._new(self._points[rows[int(loss.argmin())]]), float(loss.min())
+                self._cloud, self._start = (
+                    self._new(self._points[rows[int(loss.argmin())]]),
+                    float(loss.min()),
+                )
             return
         with self._quiet():
             # cma must find its own points again, to the last bit
@@ -119,17 +133,29 @@ class CMAES(Turns):
         idle = [0.5] * self._idle
         settings: dict[str, Any] = {
             "bounds": [[*low, *(0.0 for _ in idle)], [*high, *(1.0 for _ in idle)]],
-            "CMA_stds": [*self._scale, *(1.0 for _ in idle)], "integer_variables": self._whole,
-            "popsize": self._size, "CMA_mirrors": 0, **(SLOW if self.noisy else {}),
-            "minstd": 1e-9, "tolx": 1e-7, "tolfun": 1e-9, "tolfunhist": 1e-10,
-            "randn": lambda *shape: self._random.standard_normal(shape), "seed": math.nan, "verbose": -9, "signals_filename": None,
-        }  # fmt: skip
+            "CMA_stds": [*self._scale, *(1.0 for _ in idle)],
+            "integer_variables": self._whole,
+            "popsize": self._size,
+            "CMA_mirrors": 0,
+            **(SLOW if self.noisy else {}),
+            "minstd": 1e-9,
+            "tolx": 1e-7,
+            "tolfun": 1e-9,
+            "tolfunhist": 1e-10,
+            "randn": lambda *shape: self._random.standard_normal(shape),
+            "seed": math.nan,
+            "verbose": -9,
+            "signals_filename": None,
+        }
         with self._quiet():
-            return cma.CMAEvolutionStrategy([*(start[self._free] * self._scale - self._shift), *idle], self.sigma, settings)
+            return cma.CMAEvolutionStrategy(
+                [*(start[self._free] * self._scale - self._shift), *idle], self.sigma, settings
+            )
 
     @contextmanager
     def _quiet(self) -> Iterator[None]:
-        """Round calls of cma: it warns about what is handled here, and draws from numpy's global generator in an assertion of its centring."""
+        """Round calls of cma: it warns about what is handled here, and draws from numpy's global
+        generator in an assertion of its centring."""
         with warnings.catch_warnings(), numpy_kept([self._seed, self._draws]):
             warnings.simplefilter("ignore")
             yield

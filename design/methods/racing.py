@@ -19,17 +19,24 @@ RATE = 0.2
 
 @dataclass(kw_only=True, eq=False)
 class Racing(Turns):
-    """Draws more points than another method wants, grows them as small colonies, and goes on at each size with the best of them.
+    """Draws more points than another method wants, grows them as small colonies, and goes on at
+    each size with the best of them.
 
-    inner: the method that draws the points and learns from those that were grown in full, CMAES or Sobol; None is CMAES(). sizes: shares of the full
-    size, rising, the last 1. keep: the share of the points that goes on from one size to the next. small: replicates grown at all sizes but the last.
-    agree: the race is left out, and as many points as `inner` wants are grown in full at once, where small and full colonies agree less than this about
-    the order of the finalists (Kendall's tau, smoothed over races, from 1). -1 races always. A new cloud of CMAES trusts small colonies again.
+    inner: the method that draws the points and learns from those that were grown in full, CMAES or
+    Sobol; None is CMAES(). sizes: shares of the full size, rising, the last 1. keep: the share of
+    the points that goes on from one size to the next. small: replicates grown at all sizes but the
+    last. agree: the race is left out, and as many points as `inner` wants are grown in full at
+    once, where small and full colonies agree less than this about the order of the finalists
+    (Kendall's tau, smoothed over races, from 1). -1 races always. A new cloud of CMAES trusts small
+    colonies again.
 
-    One race is one bracket of successive halving (Jamieson and Talwalkar, AISTATS 2016), and what it hands to CMA-ES a pre-selection (Ulmer, Streichert
-    and Zell, CEC 2003): all points come from the present cloud, and the method hears only losses of full colonies. Should small colonies tell nothing,
-    the finalists are a random part of the cloud, so the step is CMA-ES's own and only the price of the small colonies is lost; should they mislead,
-    `agree` ends it. Brackets across generations were not taken: a point that was drawn from an earlier cloud says little about the present one.
+    One race is one bracket of successive halving (Jamieson and Talwalkar, AISTATS 2016), and what
+    it hands to CMA-ES a pre-selection (Ulmer, Streichert and Zell, CEC 2003): all points come from
+    the present cloud, and the method hears only losses of full colonies. Should small colonies tell
+    nothing, the finalists are a random part of the cloud, so the step is CMA-ES's own and only the
+    price of the small colonies is lost; should they mislead, `agree` ends it. Brackets across
+    generations were not taken: a point that was drawn from an earlier cloud says little about the
+    present one.
     """
 
     inner: Source | None = None
@@ -41,11 +48,26 @@ class Racing(Turns):
     def __post_init__(self) -> None:
         self._source: Source = CMAES() if self.inner is None else self.inner
         self.inner = self._source
-        if isinstance(self.inner, type) or not all(hasattr(type(self.inner), name) for name in ("wanted", "fresh", "draw", "take")):
-            raise checks.refuse("Racing.inner", self.inner, "a method whose points can be sieved, such as CMAES() or Sobol()")
+        if isinstance(self.inner, type) or not all(
+            hasattr(type(self.inner), name) for name in ("wanted", "fresh", "draw", "take")
+        ):
+            raise checks.refuse(
+                "Racing.inner",
+                self.inner,
+                "a method whose points can be sieved, such as CMAES() or Sobol()",
+            )
         self.sizes = checks.vector("Racing.sizes", self.sizes)
-        if len(self.sizes) < 2 or self.sizes[0] <= 0 or self.sizes[-1] != 1 or any(a >= b for a, b in zip(self.sizes, self.sizes[1:], strict=False)):
-            raise checks.refuse("Racing.sizes", self.sizes, "two or more rising shares above 0, the last of them 1, such as (0.25, 1)")
+        if (
+            len(self.sizes) < 2
+            or self.sizes[0] <= 0
+            or self.sizes[-1] != 1
+            or any(a >= b for a, b in zip(self.sizes, self.sizes[1:], strict=False))
+        ):
+            raise checks.refuse(
+                "Racing.sizes",
+                self.sizes,
+                "two or more rising shares above 0, the last of them 1, such as (0.25, 1)",
+            )
         checks.number("Racing.keep", self.keep, least=0.01, most=0.99)
         whole("Racing.small", self.small, least=1)
         checks.number("Racing.agree", self.agree, least=-1.0, most=1.0)
@@ -78,7 +100,11 @@ class Racing(Turns):
                 self._rung = self._last
             self._points = self._source.draw(self._count(self._rung))
             self._left = np.arange(len(self._points))
-        return Batch(self._points[self._left], size=self.sizes[self._rung], replicates=min(self.small, self._replicates) if self._rung < self._last else None)
+        return Batch(
+            self._points[self._left],
+            size=self.sizes[self._rung],
+            replicates=min(self.small, self._replicates) if self._rung < self._last else None,
+        )
 
     def _take(self, batch: Batch, loss: np.ndarray) -> None:
         if self._rung < self._last:

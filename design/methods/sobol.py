@@ -11,7 +11,8 @@ from design.methods.base import Batch, Turns, sobol, whole
 
 @dataclass(kw_only=True, eq=False)
 class Sobol(Turns):
-    """Points of a scrambled Sobol sequence (Owen 1998; scipy.stats.qmc): the measure of every other method, and a map of the whole space.
+    """Points of a scrambled Sobol sequence (Owen 1998; scipy.stats.qmc): the measure of every other
+    method, and a map of the whole space.
 
     batch: points in a batch, any number; the sequence goes on from batch to batch.
     """

@@ -6,4 +6,15 @@ from design.targets.oscillation import Oscillation
 from design.targets.patterns import DomainSize, OnFraction
 from design.targets.stripe import Stripe
 
-__all__ = ["Bands", "DomainSize", "Gradient", "Image", "Mask", "OnFraction", "Oscillation", "Ring", "Stripe", "Target"]
+__all__ = [
+    "Bands",
+    "DomainSize",
+    "Gradient",
+    "Image",
+    "Mask",
+    "OnFraction",
+    "Oscillation",
+    "Ring",
+    "Stripe",
+    "Target",
+]

@@ -14,14 +14,18 @@ from torchfilm import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-OUTSIDE = "out."  # a signal where the cell is, "out.ahl", beside what the cell itself holds under that name
+# a signal where the cell is, "out.ahl", beside what the cell itself holds under that name
+OUTSIDE = "out."
 
 
 class Target:
-    """A pattern wanted. Its ready kinds are frozen dataclasses whose parameters are checked when they are made.
+    """A pattern wanted. Its ready kinds are frozen dataclasses whose parameters are checked when
+    they are made.
 
-    A loss is one number for each colony: 0 is perfect and, for the ready targets, 1 the worst; a colony that failed scores `failed`. It follows from that
-    colony's own cells alone, whatever else is in the batch, and carries gradients to the levels in the cells; places, types and volumes count as given.
+    A loss is one number for each colony: 0 is perfect and, for the ready targets, 1 the worst; a
+    colony that failed scores `failed`. It follows from that colony's own cells alone, whatever else
+    is in the batch, and carries gradients to the levels in the cells; places, types and volumes
+    count as given.
     """
 
     failed: ClassVar[float] = 1.5
@@ -35,7 +39,8 @@ class Target:
         """Raises `tf.InputError` if a first state has not what the target looks at."""
 
     def note(self, state: tf.State) -> Tensor | None:
-        """What to keep of a state after every step, (B, k), for a target that needs the history; None: nothing."""
+        """What to keep of a state after every step, (B, k), for a target that needs the history;
+        None: nothing."""
         return None
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
@@ -43,11 +48,13 @@ class Target:
         raise NotImplementedError(f"{type(self).__name__}.loss")
 
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """What a person wants to know of the pattern that is there, (B,) by name; NaN where there is no such number."""
+        """What a person wants to know of the pattern that is there, (B,) by name; NaN where there
+        is no such number."""
         return {}
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """Draw what is wanted of the colony at `place` of the batch on axes that show that colony, in µm."""
+        """Draw what is wanted of the colony at `place` of the batch on axes that show that colony,
+        in µm."""
 
     def describe(self) -> str:
         """The pattern in one line."""
@@ -56,7 +63,11 @@ class Target:
 
 def known(state: tf.State) -> list[str]:
     """What a target can look at: fields with one number a cell, and signals as "out.NAME"."""
-    fields = [name for name, value in state.fields.items() if state.declared[name].scope == "cell" and value.dim() == 1]
+    fields = [
+        name
+        for name, value in state.fields.items()
+        if state.declared[name].scope == "cell" and value.dim() == 1
+    ]
     return [*fields, *(OUTSIDE + name for name in state.signals)]
 
 
@@ -67,11 +78,21 @@ def require(state: tf.State, names: tuple[str, ...]) -> None:
         if name not in there:
             near = difflib.get_close_matches(name, there, 1, cutoff=0.5)
             mend = f"Did you mean {near[0]!r}?" if near else ""
-            raise checks.refuse("species", name, "one of " + ", ".join(map(repr, there)) if there else "a species of a Circuit; the scene has none", mend)
+            raise checks.refuse(
+                "species",
+                name,
+                (
+                    "one of " + ", ".join(map(repr, there))
+                    if there
+                    else "a species of a Circuit; the scene has none"
+                ),
+                mend,
+            )
 
 
 def levels(state: tf.State, name: str) -> Tensor:
-    """A field of the cells by its name, or, as "out.NAME", a signal where each cell is: (N,), with its gradient."""
+    """A field of the cells by its name, or, as "out.NAME", a signal where each cell is: (N,), with
+    its gradient."""
     require(state, (name,))
     if not name.startswith(OUTSIDE):
         return state.fields[name]
@@ -81,7 +102,8 @@ def levels(state: tf.State, name: str) -> Tensor:
 
 
 def seen(state: tf.State, names: tuple[str, ...]) -> tuple[Tensor, Tensor]:
-    """Levels of several species, (N, k) float64, none below 0, and which colonies can be scored, (B,) bool: those with cells, all of whose levels are finite.
+    """Levels of several species, (N, k) float64, none below 0, and which colonies can be scored,
+    (B,) bool: those with cells, all of whose levels are finite.
 
     A level that is not finite counts as 0, so that no NaN gets into a sum or a gradient.
     """
@@ -98,7 +120,11 @@ def weights(state: tf.State) -> Tensor:
 
 def total(state: tf.State, value: Tensor) -> Tensor:
     """The sum over each colony of (N,) or (N, k): (B,) or (B, k)."""
-    return state.groups.sum(value.unsqueeze(1)).squeeze(1) if value.dim() == 1 else state.groups.sum(value)
+    return (
+        state.groups.sum(value.unsqueeze(1)).squeeze(1)
+        if value.dim() == 1
+        else state.groups.sum(value)
+    )
 
 
 def ratio(above: Tensor, below: Tensor, otherwise: float) -> Tensor:
@@ -110,13 +136,20 @@ def ratio(above: Tensor, below: Tensor, otherwise: float) -> Tensor:
 def species_name(name: str, given: object) -> None:
     """Raises `tf.InputError` unless this may be the name of a species or signal."""
     if not isinstance(given, str) or not given.removeprefix(OUTSIDE).isidentifier():
-        raise checks.refuse(name, given, 'the name of a species, such as "yfp", or of a signal, such as "out.ahl"')
+        raise checks.refuse(
+            name, given, 'the name of a species, such as "yfp", or of a signal, such as "out.ahl"'
+        )
 
 
 def species_names(name: str, given: object, count: int | None = None) -> tuple[str, ...]:
     """Several different species as a tuple."""
     wanted = f"{'some' if count is None else count} different names of species"
-    if isinstance(given, str) or not isinstance(given, (tuple, list)) or not given or (count is not None and len(given) != count):
+    if (
+        isinstance(given, str)
+        or not isinstance(given, (tuple, list))
+        or not given
+        or (count is not None and len(given) != count)
+    ):
         raise checks.refuse(name, given, wanted, 'Write ("cfp", "yfp").')
     for one in given:
         species_name(name, one)

@@ -1,4 +1,5 @@
-"""Targets that say how bright each cell should be: bands, a ring, a gradient, an image. (The stripe at a border has its own file.)"""
+"""Targets that say how bright each cell should be: bands, a ring, a gradient, an image. (The stripe
+at a border has its own file.)"""
 
 from __future__ import annotations
 
@@ -15,7 +16,16 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target, ratio, require, seen, species_name, species_names, total, weights
+from design.targets.base import (
+    Target,
+    ratio,
+    require,
+    seen,
+    species_name,
+    species_names,
+    total,
+    weights,
+)
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -23,7 +33,8 @@ if TYPE_CHECKING:
 
 Centre = Literal["colony"] | tuple[float, float]
 ALONG = ("x", "y", "radius")
-COLOURS = ("#c2185b", "#1976d2", "#388e3c", "#f57c00", "#7b1fa2", "#5d4037")  # of what is wanted, one a species
+# of what is wanted, one a species
+COLOURS = ("#c2185b", "#1976d2", "#388e3c", "#f57c00", "#7b1fa2", "#5d4037")
 LEAST = 1e-3  # a cell that is wanted less bright than this is wanted dark
 WITHIN = 0.5  # what is wanted of a cell that lies within an edge
 
@@ -31,14 +42,17 @@ WITHIN = 0.5  # what is wanted of a cell that lies within an edge
 class Mask(Target):
     """Targets that give a wanted profile m, one number from 0 to 1 for each cell and species.
 
-    With volumes w of the cells that count, levels y ≥ 0 and the level `floor` from which a cell counts as lit, the loss of a species is
+    With volumes w of the cells that count, levels y ≥ 0 and the level `floor` from which a cell
+    counts as lit, the loss of a species is
 
         L = 1 − (Σ w m y)² / (Σ w m² · (Σ w y² + floor² Σ w m²))
 
-    and that of several their mean. By Cauchy–Schwarz 0 ≤ (Σ w m y)² ≤ Σ w m² · Σ w y², so L is in [0, 1]. Where y = c·m for all cells, L = floor²/(c² +
-    floor²): 0 for floor = 0, at any brightness, and 1/2 where the brightest are just at the floor. Evenly lit cells have 1 − (Σ w m)²/(Σ w Σ w m²): what
-    share of the colony is wanted dark. A colony in which no cell lies where it is wanted lit (m above `least`), or none is lit, has 1, with a finite
-    gradient. Seen from above in 3-D.
+    and that of several their mean. By Cauchy–Schwarz 0 ≤ (Σ w m y)² ≤ Σ w m² · Σ w y², so L is in
+    [0, 1]. Where y = c·m for all cells, L = floor²/(c² + floor²): 0 for floor = 0, at any
+    brightness, and 1/2 where the brightest are just at the floor. Evenly lit cells have 1 − (Σ w
+    m)²/(Σ w Σ w m²): what share of the colony is wanted dark. A colony in which no cell lies where
+    it is wanted lit (m above `least`), or none is lit, has 1, with a finite gradient. Seen from
+    above in 3-D.
     """
 
     floor: float
@@ -50,7 +64,8 @@ class Mask(Target):
 
     @property
     def least(self) -> float:
-        """A colony without a cell whose m is above this has not the place where the pattern should be."""
+        """A colony without a cell whose m is above this has not the place where the pattern should
+        be."""
         return 0.0
 
     def wanted(self, state: tf.State) -> Tensor:
@@ -73,18 +88,22 @@ class Mask(Target):
         each = 1.0 - ratio(both * both, lit * (light + self.floor**2 * lit), 0.0)
         # the soft tail of an edge that the colony does not reach is no pattern
         each = torch.where(total(state, w * (m > self.least)) > 0, each, 1.0)
-        # rounding may take a perfect colony below 0; one after the other, for a sum along a tensor may depend on the batch
+        # rounding may take a perfect colony below 0; one after the other, for a sum along a tensor
+        # may depend on the batch
         mean = sum(each.clamp(min=0.0).unbind(1), torch.zeros_like(each[:, 0])) / each.shape[1]
         return torch.where(sound, mean, self.failed)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """Of each species: mean level `inside`, where more than half is wanted, and `outside`, and `contrast`, the one over the other."""
+        """Of each species: mean level `inside`, where more than half is wanted, and `outside`, and
+        `contrast`, the one over the other."""
         y, _ = seen(state, self.names)
         w = torch.where(self.counted(state), weights(state), 0.0).unsqueeze(1)
         within = (self.wanted(state) > WITHIN).double()
         inside = ratio(total(state, w * within * y), total(state, w * within), math.nan)
-        outside = ratio(total(state, w * (1 - within) * y), total(state, w * (1 - within)), math.nan)
+        outside = ratio(
+            total(state, w * (1 - within) * y), total(state, w * (1 - within)), math.nan
+        )
         found: dict[str, Tensor] = {}
         for k, name in enumerate(self.names):
             before = f"{name}_" if len(self.names) > 1 else ""
@@ -95,11 +114,13 @@ class Mask(Target):
 
 @dataclass(frozen=True)
 class Bands(Mask):
-    """Bands side by side, or rings about each other, as in a French flag: the k-th species is wanted between edges[k] and edges[k + 1].
+    """Bands side by side, or rings about each other, as in a French flag: the k-th species is
+    wanted between edges[k] and edges[k + 1].
 
-    edges: ascending, µm from `centre`, one more than species; the first may be −inf and the last inf. along: "x", "y" or "radius". centre: (x, y) µm, or
-    "colony" for the colony's own. floor: level from which a cell counts as lit. soft: µm, how soft the edges are: logistic, from 0.27 to 0.73 within one to
-    either side.
+    edges: ascending, µm from `centre`, one more than species; the first may be −inf and the last
+    inf. along: "x", "y" or "radius". centre: (x, y) µm, or "colony" for the colony's own. floor:
+    level from which a cell counts as lit. soft: µm, how soft the edges are: logistic, from 0.27 to
+    0.73 within one to either side.
     """
 
     species: tuple[str, ...]
@@ -115,9 +136,15 @@ class Bands(Mask):
         checks.choice("Bands.along", self.along, ALONG)
         edges = self.edges
         rule = f"{len(self.species) + 1} ascending places in µm, one more than species"
-        if isinstance(edges, str) or not isinstance(edges, Sequence) or len(edges) != len(self.species) + 1:
+        if (
+            isinstance(edges, str)
+            or not isinstance(edges, Sequence)
+            or len(edges) != len(self.species) + 1
+        ):
             raise checks.refuse("Bands.edges", edges, rule)
-        if not all(isinstance(e, (int, float)) and not math.isnan(e) for e in edges) or any(a >= b for a, b in itertools.pairwise(edges)):
+        if not all(isinstance(e, (int, float)) and not math.isnan(e) for e in edges) or any(
+            a >= b for a, b in itertools.pairwise(edges)
+        ):
             raise checks.refuse("Bands.edges", edges, rule)
         if self.along == "radius" and edges[0] < 0:
             raise checks.refuse("Bands.edges[0]", edges[0], "at least 0 along the radius")
@@ -136,7 +163,11 @@ class Bands(Mask):
     def wanted(self, state: tf.State) -> Tensor:
         x = coordinate(state, self.along, self.centre)
         # there is nothing on the other side of the centre
-        edges = (-math.inf, *self.edges[1:]) if self.along == "radius" and self.edges[0] == 0 else self.edges
+        edges = (
+            (-math.inf, *self.edges[1:])
+            if self.along == "radius" and self.edges[0] == 0
+            else self.edges
+        )
         return torch.stack([between(x, a, b, self.soft) for a, b in itertools.pairwise(edges)], 1)
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
@@ -145,13 +176,17 @@ class Bands(Mask):
             lines(ax, self.along, middle, self.edges[k : k + 2], COLOURS[k % len(COLOURS)])
 
     def describe(self) -> str:
-        parts = [f"{s} from {a:g} to {b:g}" for s, a, b in zip(self.species, self.edges, self.edges[1:], strict=False)]
+        parts = [
+            f"{s} from {a:g} to {b:g}"
+            for s, a, b in zip(self.species, self.edges, self.edges[1:], strict=False)
+        ]
         return f"bands along {self.along}, µm: " + ", ".join(parts)
 
 
 @dataclass(frozen=True)
 class Ring(Mask):
-    """A ring: the species is wanted between radius − width/2 and radius + width/2, µm from `centre`, "colony" for the colony's own or (x, y) µm.
+    """A ring: the species is wanted between radius − width/2 and radius + width/2, µm from
+    `centre`, "colony" for the colony's own or (x, y) µm.
 
     A ring as wide as twice its radius is a disc. floor, soft: as of `Bands`.
     """
@@ -169,7 +204,12 @@ class Ring(Mask):
         checks.number("Ring.radius", self.radius, above=0.0)
         checks.number("Ring.width", self.width, above=0.0)
         if self.width > 2 * self.radius:
-            raise checks.refuse("Ring.width", self.width, f"at most {2 * self.radius:g}, twice the radius", "A disc is a ring with width = 2·radius.")
+            raise checks.refuse(
+                "Ring.width",
+                self.width,
+                f"at most {2 * self.radius:g}, twice the radius",
+                "A disc is a ring with width = 2·radius.",
+            )
         object.__setattr__(self, "centre", centre_of("Ring.centre", self.centre))
         common("Ring", self.floor, self.soft)
 
@@ -188,16 +228,26 @@ class Ring(Mask):
 
     def wanted(self, state: tf.State) -> Tensor:
         low, high = self.edges
-        return between(coordinate(state, "radius", self.centre), low if low > 0 else -math.inf, high, self.soft).unsqueeze(1)
+        return between(
+            coordinate(state, "radius", self.centre), low if low > 0 else -math.inf, high, self.soft
+        ).unsqueeze(1)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """Those of every mask, and `radius_um`, the mean distance from the centre of what is brighter than the mean of the cells outside the ring."""
+        """Those of every mask, and `radius_um`, the mean distance from the centre of what is
+        brighter than the mean of the cells outside the ring."""
         found = super().measures(state)
         y, _ = seen(state, self.names)
         dark = torch.nan_to_num(found["outside"]).index_select(0, state.colony)
         light = weights(state) * (y[:, 0] - dark).clamp(min=0.0)
-        return {"radius_um": ratio(total(state, light * coordinate(state, "radius", self.centre)), total(state, light), math.nan), **found}
+        return {
+            "radius_um": ratio(
+                total(state, light * coordinate(state, "radius", self.centre)),
+                total(state, light),
+                math.nan,
+            ),
+            **found,
+        }
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         lines(ax, "radius", centre_at(state, self.centre, place), self.edges, COLOURS[0])
@@ -208,7 +258,8 @@ class Ring(Mask):
 
 @dataclass(frozen=True)
 class Gradient(Mask):
-    """A gradient: the wanted level falls in a straight line from 1 at `low` to 0 at `high`, µm from `centre` along "x", "y" or "radius", and stays so beyond.
+    """A gradient: the wanted level falls in a straight line from 1 at `low` to 0 at `high`, µm from
+    `centre` along "x", "y" or "radius", and stays so beyond.
 
     With low > high it rises. centre, floor: as of `Bands`.
     """
@@ -228,7 +279,9 @@ class Gradient(Mask):
         checks.number("Gradient.low", self.low, least=least)
         checks.number("Gradient.high", self.high, least=least)
         if self.low == self.high:
-            raise checks.refuse("Gradient.low, Gradient.high", (self.low, self.high), "two different places")
+            raise checks.refuse(
+                "Gradient.low, Gradient.high", (self.low, self.high), "two different places"
+            )
         object.__setattr__(self, "centre", centre_of("Gradient.centre", self.centre))
         common("Gradient", self.floor)
 
@@ -242,13 +295,17 @@ class Gradient(Mask):
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """Those of every mask, and `correlation`, between what is there and what is wanted, −1 … 1."""
+        """Those of every mask, and `correlation`, between what is there and what is wanted, −1 …
+        1."""
         y, m, w = seen(state, self.names)[0][:, 0], self.wanted(state)[:, 0], weights(state)
         means = total(state, torch.stack([w, w * y, w * m], 1))
         mean = (means[:, 1:] / means[:, :1]).index_select(0, state.colony)
         dy, dm = y - mean[:, 0], m - mean[:, 1]
         squares = total(state, torch.stack([w * dy * dm, w * dy * dy, w * dm * dm], 1))
-        return {"correlation": ratio(squares[:, 0], (squares[:, 1] * squares[:, 2]).sqrt(), math.nan), **super().measures(state)}
+        return {
+            "correlation": ratio(squares[:, 0], (squares[:, 1] * squares[:, 2]).sqrt(), math.nan),
+            **super().measures(state),
+        }
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         middle = centre_at(state, self.centre, place)
@@ -256,15 +313,20 @@ class Gradient(Mask):
         lines(ax, self.along, middle, (self.high,), COLOURS[0], ":")
 
     def describe(self) -> str:
-        return f"{self.species} in a gradient along {self.along} from 1 at {self.low:g} µm to 0 at {self.high:g} µm"
+        return (
+            f"{self.species} in a gradient along {self.along} from 1 at {self.low:g} µm to 0 at"
+            f" {self.high:g} µm"
+        )
 
 
 @dataclass(frozen=True)
 class Image(Mask):
-    """An image: the species is wanted as bright as the picture where the cell is, and dark beside it.
+    """An image: the species is wanted as bright as the picture where the cell is, and dark beside
+    it.
 
-    mask: rows of numbers from 0 to 1, the first row at the top, each the level in the middle of its pixel; between the middles it is bilinear. size: width and
-    height of the whole on the plane, µm, with its middle at `centre`, (x, y) µm or "colony" for the colony's own. floor: as of `Bands`.
+    mask: rows of numbers from 0 to 1, the first row at the top, each the level in the middle of its
+    pixel; between the middles it is bilinear. size: width and height of the whole on the plane, µm,
+    with its middle at `centre`, (x, y) µm or "colony" for the colony's own. floor: as of `Bands`.
     """
 
     species: str
@@ -281,8 +343,15 @@ class Image(Mask):
             pixels = np.array(self.mask, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise checks.refuse("Image.mask", self.mask, rule) from error
-        if pixels.ndim != 2 or not pixels.size or not ((pixels >= 0) & (pixels <= 1)).all() or not pixels.any():
-            raise checks.refuse("Image.mask", pixels.tolist(), rule, "Divide a picture of bytes by 255.")
+        if (
+            pixels.ndim != 2
+            or not pixels.size
+            or not ((pixels >= 0) & (pixels <= 1)).all()
+            or not pixels.any()
+        ):
+            raise checks.refuse(
+                "Image.mask", pixels.tolist(), rule, "Divide a picture of bytes by 255."
+            )
         object.__setattr__(self, "mask", tuple(map(tuple, pixels.tolist())))
         size = checks.vector("Image.size", self.size, 2)
         for side, length in zip("01", size, strict=True):
@@ -292,12 +361,25 @@ class Image(Mask):
         common("Image", self.floor)
 
     @staticmethod
-    def load(path: str | Path, species: str, size: tuple[float, float], *, centre: Centre = (0.0, 0.0), floor: float = 0.0) -> Image:
-        """The image in a CSV file: one row of pixels a line, numbers from 0 to 1 with commas between them. Raises `tf.InputError` if it cannot be read."""
+    def load(
+        path: str | Path,
+        species: str,
+        size: tuple[float, float],
+        *,
+        centre: Centre = (0.0, 0.0),
+        floor: float = 0.0,
+    ) -> Image:
+        """The image in a CSV file: one row of pixels a line, numbers from 0 to 1 with commas
+        between them. Raises `tf.InputError` if it cannot be read."""
         try:
             pixels = np.loadtxt(path, delimiter=",", ndmin=2)
         except (OSError, ValueError) as error:
-            raise checks.refuse("Image.load(path)", str(path), "a CSV file with one row of numbers a line", str(error)) from error
+            raise checks.refuse(
+                "Image.load(path)",
+                str(path),
+                "a CSV file with one row of numbers a line",
+                str(error),
+            ) from error
         return Image(species, pixels, size, centre=centre, floor=floor)  # type: ignore[arg-type]
 
     @property
@@ -332,14 +414,19 @@ class Image(Mask):
         padded = np.pad(self.pixels, 1)
         x, y = (
             middle + ((np.arange(count) - 0.5) / (count - 2) - 0.5) * side
-            for middle, count, side in zip(centre_at(state, self.centre, place), padded.shape[::-1], self.size, strict=True)
+            for middle, count, side in zip(
+                centre_at(state, self.centre, place), padded.shape[::-1], self.size, strict=True
+            )
         )
         window = ax.get_xlim(), ax.get_ylim()
         ax.contour(x, y, padded, levels=[0.5 * padded.max()], colors=COLOURS[0], linewidths=1.0)
         ax.set(xlim=window[0], ylim=window[1])
 
     def describe(self) -> str:
-        return f"{self.species} as in an image of {len(self.mask[0])} × {len(self.mask)} pixels, {self.size[0]:g} × {self.size[1]:g} µm"
+        return (
+            f"{self.species} as in an image of {len(self.mask[0])} × {len(self.mask)} pixels,"
+            f" {self.size[0]:g} × {self.size[1]:g} µm"
+        )
 
 
 def common(kind: str, floor: object, soft: object = 1.0) -> None:
@@ -358,8 +445,10 @@ def centre_of(name: str, given: object) -> Centre:
 
 
 def between(x: Tensor, low: float, high: float, soft: float) -> Tensor:
-    """1 between the edges and 0 beyond, each edge a logistic of `soft` µm: σ((x − low)/soft) − σ((x − high)/soft), so that neighbours add up to 1."""
-    # by tanh, whose last bit does not depend on where in a tensor it is taken, as that of torch's sigmoid does
+    """1 between the edges and 0 beyond, each edge a logistic of `soft` µm: σ((x − low)/soft) − σ((x
+    − high)/soft), so that neighbours add up to 1."""
+    # by tanh, whose last bit does not depend on where in a tensor it is taken, as that of torch's
+    # sigmoid does
     return 0.5 * (torch.tanh((x - low) / (2 * soft)) - torch.tanh((x - high) / (2 * soft)))
 
 
@@ -390,14 +479,25 @@ def centre_at(state: tf.State, centre: Centre, place: int) -> tuple[float, float
     return centre  # type: ignore[return-value]
 
 
-def lines(ax: Axes, along: str, centre: tuple[float, float], edges: Sequence[float], colour: str, style: str = "--") -> None:
+def lines(
+    ax: Axes,
+    along: str,
+    centre: tuple[float, float],
+    edges: Sequence[float],
+    colour: str,
+    style: str = "--",
+) -> None:
     """Lines, or circles, at the edges, µm from the centre; what the axes show stays as it is."""
     from matplotlib.patches import Circle
 
     window = ax.get_xlim(), ax.get_ylim()
     for edge in (e for e in edges if math.isfinite(e)):
         if along == "radius":
-            ax.add_patch(Circle(centre, edge, fill=False, color=colour, linestyle=style, linewidth=1.0, zorder=3))
+            ax.add_patch(
+                Circle(
+                    centre, edge, fill=False, color=colour, linestyle=style, linewidth=1.0, zorder=3
+                )
+            )
         elif along == "x":
             ax.axvline(centre[0] + edge, color=colour, linestyle=style, linewidth=1.0, zorder=3)
         else:

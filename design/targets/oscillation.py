@@ -29,13 +29,16 @@ TRIED = 5.0  # periods are looked for between the wanted one over this and times
 class Oscillation(Target):
     """Swings of one period, h, in the mean over the colony and, with synchrony, in all cells alike.
 
-    After every step the mean and the mean square over the cells are noted. Of the samples of the last `cycles` periods (at least one is needed), the share F
-    of the variance that swings with the wanted period is the sum of squares that a least-squares fit of the mean by a constant, cos 2πt/period and sin
-    2πt/period explains, over that of all samples: over time and cells with synchrony, else of the mean over time. Loss: 1 − F. With `floor`, the amplitude
-    from which a swing counts, floor²/2 is added to the variance, so that a swing of that amplitude has 1/2. Loss 1: a colony that is steady to rounding, or
-    has fewer than six samples or one period of them.
+    After every step the mean and the mean square over the cells are noted. Of the samples of the
+    last `cycles` periods (at least one is needed), the share F of the variance that swings with the
+    wanted period is the sum of squares that a least-squares fit of the mean by a constant, cos
+    2πt/period and sin 2πt/period explains, over that of all samples: over time and cells with
+    synchrony, else of the mean over time. Loss: 1 − F. With `floor`, the amplitude from which a
+    swing counts, floor²/2 is added to the variance, so that a swing of that amplitude has 1/2. Loss
+    1: a colony that is steady to rounding, or has fewer than six samples or one period of them.
 
-    Cells that swing out of step keep their own variance while their mean stands still: F of a population whose phases have spread is small with synchrony.
+    Cells that swing out of step keep their own variance while their mean stands still: F of a
+    population whose phases have spread is small with synchrony.
     """
 
     species: str
@@ -60,7 +63,8 @@ class Oscillation(Target):
         require(state, (self.species,))
 
     def note(self, state: tf.State) -> Tensor:
-        """Time, mean and mean square over the cells' volume, (B, 3) float64; NaN for a colony that cannot be scored."""
+        """Time, mean and mean square over the cells' volume, (B, 3) float64; NaN for a colony that
+        cannot be scored."""
         y, sound = seen(state, (self.species,))
         w = weights(state).unsqueeze(1)
         sums = total(state, torch.cat([w, w * y, w * y * y], 1))
@@ -71,16 +75,25 @@ class Oscillation(Target):
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         _, sound = seen(state, (self.species,))
         window = self._window(history)
-        explained = _explained(window, torch.tensor([1.0 / self.period], dtype=torch.float64, device=state.device))[:, 0]
+        explained = _explained(
+            window, torch.tensor([1.0 / self.period], dtype=torch.float64, device=state.device)
+        )[:, 0]
         whole = window.mean_square + (window.spread if self.synchrony else 0.0)
         swings = window.long & (whole > STEADY * window.level)
-        share = torch.where(swings, explained / torch.where(swings, whole + 0.5 * self.floor**2, 1.0), 0.0)
+        share = torch.where(
+            swings, explained / torch.where(swings, whole + 0.5 * self.floor**2, 1.0), 0.0
+        )
         return torch.where(sound, (1.0 - share).clamp(min=0.0), self.failed)
 
     def _window(self, history: Tensor | None) -> _Window:
         if history is None or history.dim() != 3 or history.shape[2] != 3 or not len(history):
             shape = None if history is None else tuple(history.shape)
-            raise checks.refuse("history", shape, "(T, B, 3), the notes after every step", "Keep target.note(state) of every step and stack them.")
+            raise checks.refuse(
+                "history",
+                shape,
+                "(T, B, 3), the notes after every step",
+                "Keep target.note(state) of every step and stack them.",
+            )
         present = torch.isfinite(history).all(2)
         time, mean, square = torch.where(present.unsqueeze(2), history, 0.0).unbind(2)
         last = torch.where(present, time, -math.inf).amax(0)
@@ -96,23 +109,40 @@ class Oscillation(Target):
         average = _sum(used * mean) / n
         swing = used * (mean - average)
         spread = _sum(used * (square - mean * mean).clamp(min=0.0)) / n
-        return _Window(time - torch.where(count > 0, last, 0.0), used, swing, n, length, long, _sum(swing * swing) / n, spread, _sum(used * square) / n)
+        return _Window(
+            time - torch.where(count > 0, last, 0.0),
+            used,
+            swing,
+            n,
+            length,
+            long,
+            _sum(swing * swing) / n,
+            spread,
+            _sum(used * square) / n,
+        )
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """Of the same samples: period_h, where the power of the mean has its peak, among periods from a fifth of the wanted one to five times it and at
-        most twice as long as the window, NaN for a drift; amplitude, √2 standard deviations of the mean; synchrony, the variance of the mean over that of all
-        cells at all times."""
+        """Of the same samples: period_h, where the power of the mean has its peak, among periods
+        from a fifth of the wanted one to five times it and at most twice as long as the window, NaN
+        for a drift; amplitude, √2 standard deviations of the mean; synchrony, the variance of the
+        mean over that of all cells at all times."""
         window = self._window(history)
         count = math.ceil(FINER * self.cycles * (TRIED - 1.0 / TRIED))
-        tried = torch.linspace(1.0 / TRIED, TRIED, count + 1, dtype=torch.float64, device=state.device) / self.period
+        tried = (
+            torch.linspace(1.0 / TRIED, TRIED, count + 1, dtype=torch.float64, device=state.device)
+            / self.period
+        )
         power = torch.cat([_explained(window, some) for some in tried.split(16)], 1)
-        # no faster than half the samples', no slower than half a swing in the window: a drift has its greatest power there, and no peak
+        # no faster than half the samples', no slower than half a swing in the window: a drift has
+        # its greatest power there, and no peak
         fastest = 0.5 * (window.n - 1).clamp(min=1) / window.length
         possible = (tried * window.length.unsqueeze(1) >= 0.5) & (tried < fastest.unsqueeze(1))
         power = torch.where(possible, power, -1.0)
         top = power.argmax(1).clamp(1, count - 1)
-        before, here, after = (power.gather(1, (top + k).unsqueeze(1)).squeeze(1) for k in (-1, 0, 1))
+        before, here, after = (
+            power.gather(1, (top + k).unsqueeze(1)).squeeze(1) for k in (-1, 0, 1)
+        )
         bend = before - 2 * here + after
         peak = (before >= 0) & (after >= 0) & (here >= before) & (here >= after) & (bend < 0)
         # the top of the parabola through the three
@@ -121,13 +151,18 @@ class Oscillation(Target):
         whole = window.mean_square + window.spread
         swings = window.long & (whole > STEADY * window.level)
         return {
-            "period_h": torch.where(swings & (window.mean_square > STEADY * window.level) & peak, 1.0 / frequency, math.nan),
+            "period_h": torch.where(
+                swings & (window.mean_square > STEADY * window.level) & peak,
+                1.0 / frequency,
+                math.nan,
+            ),
             "amplitude": torch.where(window.long, (2 * window.mean_square).sqrt(), math.nan),
             "synchrony": torch.where(swings, ratio(window.mean_square, whole, math.nan), math.nan),
         }
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """The mean over time in a corner, and a swing of the wanted period and the same amplitude in step with its last maximum; nothing without history."""
+        """The mean over time in a corner, and a swing of the wanted period and the same amplitude
+        in step with its last maximum; nothing without history."""
         if history is None:
             return
         kept = history[:, place, :2].detach().double().cpu().numpy()
@@ -137,17 +172,28 @@ class Oscillation(Target):
         if not len(time):
             return
         wave = np.cos(2 * math.pi * (time - time[mean.argmax()]) / self.period)
-        inset.plot(time, 0.5 * (mean.max() + mean.min()) + 0.5 * np.ptp(mean) * wave, color=WANTED, linewidth=0.8, linestyle="--")
+        inset.plot(
+            time,
+            0.5 * (mean.max() + mean.min()) + 0.5 * np.ptp(mean) * wave,
+            color=WANTED,
+            linewidth=0.8,
+            linestyle="--",
+        )
         inset.plot(time, mean, color=FOUND, linewidth=1.0)
 
     def describe(self) -> str:
-        return f"{self.species} swings with a period of {self.period:g} h" + (", all cells together" if self.synchrony else "")
+        return f"{self.species} swings with a period of {self.period:g} h" + (
+            ", all cells together" if self.synchrony else ""
+        )
 
 
 @dataclass(frozen=True)
 class _Window:
-    """The samples used: time from the last one and `used`, 1 or 0, and swing of the mean about its average, (T, B) each; for each colony, (B,): `n` samples
-    over `length` h, whether that is `long` enough, the mean square of the swing, that of the cells about their mean, and that of their levels."""
+    """The samples used: time from the last one and `used`, 1 or 0, and swing of the mean about its
+    average, (T, B) each; for each colony, (B,): `n` samples over `length` h, whether that is `long`
+    enough, the mean square of the swing, that of the cells about their mean, and that of their
+    levels.
+    """
 
     time: Tensor
     used: Tensor
@@ -161,7 +207,8 @@ class _Window:
 
 
 def _explained(window: _Window, frequency: Tensor) -> Tensor:
-    """The mean square of the swing that a wave of each frequency (F,) 1/h fits, by least squares with a constant, (B, F)."""
+    """The mean square of the swing that a wave of each frequency (F,) 1/h fits, by least squares
+    with a constant, (B, F)."""
     used, n = window.used.unsqueeze(2), window.n.unsqueeze(1)
     phase = 2 * math.pi * window.time.unsqueeze(2) * frequency
     cos, sin = used * torch.cos(phase), used * torch.sin(phase)
@@ -171,9 +218,12 @@ def _explained(window: _Window, frequency: Tensor) -> Tensor:
     # samples at the nodes of one of the waves, or of both, do not tell it
     det = cc * ss - cs * cs
     told = det > 1e-6
-    return torch.where(told, (ss * cy * cy - 2 * cs * cy * sy + cc * sy * sy) / torch.where(told, det, 1.0), 0.0)
+    return torch.where(
+        told, (ss * cy * cy - 2 * cs * cy * sy + cc * sy * sy) / torch.where(told, det, 1.0), 0.0
+    )
 
 
 def _sum(value: Tensor) -> Tensor:
-    """The sum over time, (T, …) -> (…): one sample after the other, so that it does not depend on how many colonies stand beside each other."""
+    """The sum over time, (T, …) -> (…): one sample after the other, so that it does not depend on
+    how many colonies stand beside each other."""
     return value.cumsum(0)[-1]

@@ -10,7 +10,16 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target, ratio, require, seen, species_name, species_names, total, weights
+from design.targets.base import (
+    Target,
+    ratio,
+    require,
+    seen,
+    species_name,
+    species_names,
+    total,
+    weights,
+)
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -24,16 +33,19 @@ WANTED, FOUND = "#c2185b", "#757575"
 
 @dataclass(frozen=True)
 class DomainSize(Target):
-    """Domains of cells in one of two states, as wide as `size`, µm: the mean length that a straight line runs in one domain.
+    """Domains of cells in one of two states, as wide as `size`, µm: the mean length that a straight
+    line runs in one domain.
 
-    The state of a cell is z = (a − b)/(a + b), from −1 to 1, of the levels of two species (0 where it has neither). Of the n pairs of neighbours, cells with
-    a gap under 0.5 µm, the share p = Σ (1 − zᵢzⱼ)/2 / n is unlike, and with their mean centre distance d the domains are d/p wide. Loss: 1 − exp(−ln²(d/p /
-    size)); 1 where no pair is unlike, or no cell has a neighbour.
+    The state of a cell is z = (a − b)/(a + b), from −1 to 1, of the levels of two species (0 where
+    it has neither). Of the n pairs of neighbours, cells with a gap under 0.5 µm, the share p = Σ (1
+    − zᵢzⱼ)/2 / n is unlike, and with their mean centre distance d the domains are d/p wide. Loss: 1
+    − exp(−ln²(d/p / size)); 1 where no pair is unlike, or no cell has a neighbour.
 
-    Why: let domains have borders of length A per area. A short segment of length d, thrown anyhow, crosses them 2dA/π times on average (Buffon); so does each
-    length d of a straight line, whose mean run in one domain is therefore ℓ = π/(2A) (Crofton), and p = d/ℓ; in space, with A per volume, dA/2 and ℓ = 2/A do
-    the same. A segment that crosses twice looks like one that does not: the estimate holds for ℓ well above d, and is 2d for cells whose states are drawn at
-    random.
+    Why: let domains have borders of length A per area. A short segment of length d, thrown anyhow,
+    crosses them 2dA/π times on average (Buffon); so does each length d of a straight line, whose
+    mean run in one domain is therefore ℓ = π/(2A) (Crofton), and p = d/ℓ; in space, with A per
+    volume, dA/2 and ℓ = 2/A do the same. A segment that crosses twice looks like one that does not:
+    the estimate holds for ℓ well above d, and is 2d for cells whose states are drawn at random.
     """
 
     species: tuple[str, str]
@@ -54,17 +66,22 @@ class DomainSize(Target):
         _, sound = seen(state, self.species)
         unlike, distance, _ = self._pairs(state)
         # clamped, the logarithm stays finite and its loss is 1 to the last bit, with zero gradient
-        log = torch.log(torch.where(distance > 0, distance, 1.0) / (unlike.clamp(min=FEWEST) * self.size))
+        log = torch.log(
+            torch.where(distance > 0, distance, 1.0) / (unlike.clamp(min=FEWEST) * self.size)
+        )
         loss = torch.where(distance > 0, -torch.expm1(-log * log), 1.0)
         return torch.where(sound, loss, self.failed)
 
     def _pairs(self, state: tf.State) -> tuple[Tensor, Tensor, Tensor]:
-        """Share of unlike neighbours, mean centre distance (0 without neighbours, µm) and number of pairs, of each colony: (B,) float64 each."""
+        """Share of unlike neighbours, mean centre distance (0 without neighbours, µm) and number of
+        pairs, of each colony: (B,) float64 each."""
         a, b = seen(state, self.species)[0].unbind(1)
         z = ratio(a - b, a + b, 0.0)
         i, j, apart = tf.measure.neighbours(state, GAP)
         colony = state.colony.index_select(0, i)
-        add = lambda v: torch.zeros(state.colonies, dtype=torch.float64, device=v.device).index_add(0, colony, v)  # noqa: E731
+        add = lambda v: torch.zeros(state.colonies, dtype=torch.float64, device=v.device).index_add(
+            0, colony, v
+        )
         count = add(torch.ones_like(apart))
         unlike = add(0.5 * (1.0 - z.index_select(0, i) * z.index_select(0, j)))
         return ratio(unlike, count, 0.0), ratio(add(apart), count, 0.0), count
@@ -73,15 +90,34 @@ class DomainSize(Target):
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """domain_size_um; unlike_share of the neighbours; pairs, how many neighbours there are."""
         unlike, distance, count = self._pairs(state)
-        return {"domain_size_um": ratio(distance, unlike, math.nan), "unlike_share": torch.where(count > 0, unlike, math.nan), "pairs": count}
+        return {
+            "domain_size_um": ratio(distance, unlike, math.nan),
+            "unlike_share": torch.where(count > 0, unlike, math.nan),
+            "pairs": count,
+        }
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """A bar as long as the domains should be wide."""
         window = ax.get_xlim(), ax.get_ylim()
         (left, right), (bottom, top) = window
         x, y = left + 0.05 * (right - left), bottom + 0.05 * (top - bottom)
-        ax.plot([x, x + math.copysign(self.size, right - left)], [y, y], color=WANTED, linewidth=3.0, solid_capstyle="butt", zorder=3)
-        ax.annotate(f"wanted {self.size:g} µm", (x, y), xytext=(0, 3), textcoords="offset points", color=WANTED, fontsize=7.0, zorder=3)
+        ax.plot(
+            [x, x + math.copysign(self.size, right - left)],
+            [y, y],
+            color=WANTED,
+            linewidth=3.0,
+            solid_capstyle="butt",
+            zorder=3,
+        )
+        ax.annotate(
+            f"wanted {self.size:g} µm",
+            (x, y),
+            xytext=(0, 3),
+            textcoords="offset points",
+            color=WANTED,
+            fontsize=7.0,
+            zorder=3,
+        )
         ax.set(xlim=window[0], ylim=window[1])
 
     def describe(self) -> str:
@@ -92,9 +128,11 @@ class DomainSize(Target):
 class OnFraction(Target):
     """A share of the cells on, the rest off, wherever they are.
 
-    fraction: wanted share of the volume, above 0 and below 1. A cell is on above `level`; smoothly, for the loss, s = y⁴/(y⁴ + level⁴). Loss:
-    1 − (1 − d²)(1 − g), with d = (mean s − fraction)/max(fraction, 1 − fraction), which is 1 where the share is as wrong as it can be, and g the mean of
-    4 s (1 − s): 1 where all cells are at the level itself, neither on nor off, 0 where all have decided.
+    fraction: wanted share of the volume, above 0 and below 1. A cell is on above `level`; smoothly,
+    for the loss, s = y⁴/(y⁴ + level⁴). Loss: 1 − (1 − d²)(1 − g), with d = (mean s −
+    fraction)/max(fraction, 1 − fraction), which is 1 where the share is as wrong as it can be, and
+    g the mean of 4 s (1 − s): 1 where all cells are at the level itself, neither on nor off, 0
+    where all have decided.
     """
 
     species: str
@@ -105,7 +143,12 @@ class OnFraction(Target):
         species_name("OnFraction.species", self.species)
         checks.number("OnFraction.fraction", self.fraction, above=0.0)
         if self.fraction >= 1:
-            raise checks.refuse("OnFraction.fraction", self.fraction, "above 0 and below 1", "For all cells on, want one wide band of Bands.")
+            raise checks.refuse(
+                "OnFraction.fraction",
+                self.fraction,
+                "above 0 and below 1",
+                "For all cells on, want one wide band of Bands.",
+            )
         checks.number("OnFraction.level", self.level, above=0.0)
 
     @property
@@ -120,18 +163,27 @@ class OnFraction(Target):
         square = (y[:, 0] / self.level).clamp(max=BRIGHTEST) ** 2
         on = square * square / (1.0 + square * square)
         w = weights(state)
-        share, grey = (ratio(total(state, w * part), total(state, w), 0.0) for part in (on, 4.0 * on * (1.0 - on)))
+        share, grey = (
+            ratio(total(state, w * part), total(state, w), 0.0)
+            for part in (on, 4.0 * on * (1.0 - on))
+        )
         wrong = ((share - self.fraction) / max(self.fraction, 1 - self.fraction)) ** 2
         return torch.where(sound, 1.0 - (1.0 - wrong) * (1.0 - grey), self.failed)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """on_share: share of the volume above the level; on_level and off_level: mean level of the cells above and of the others."""
+        """on_share: share of the volume above the level; on_level and off_level: mean level of the
+        cells above and of the others."""
         y, w = seen(state, (self.species,))[0][:, 0], weights(state)
         on = (y > self.level).double()
-        parts = total(state, torch.stack([w, w * on, w * on * y, w * (1 - on), w * (1 - on) * y], 1)).unbind(1)
+        parts = total(
+            state, torch.stack([w, w * on, w * on * y, w * (1 - on), w * (1 - on) * y], 1)
+        ).unbind(1)
         shares = ((parts[1], parts[0]), (parts[2], parts[1]), (parts[4], parts[3]))
-        return {name: ratio(a, b, math.nan) for name, (a, b) in zip(("on_share", "on_level", "off_level"), shares, strict=True)}
+        return {
+            name: ratio(a, b, math.nan)
+            for name, (a, b) in zip(("on_share", "on_level", "off_level"), shares, strict=True)
+        }
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """Two bars in a corner: the share wanted and the share found."""

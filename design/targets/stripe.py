@@ -1,4 +1,5 @@
-"""A stripe at the border of two populations, or at a given place, and what the one that is there is like."""
+"""A stripe at the border of two populations, or at a given place, and what the one that is there is
+like."""
 
 from __future__ import annotations
 
@@ -28,12 +29,15 @@ FEWEST = 3  # cells, for a mean over a strip to count
 class Stripe(Mask):
     """A stripe across the colony: the species is wanted within `width` µm, and dark beyond.
 
-    at: "border", the border between the two populations (cell types) of the colony, or a number, µm. straight: False, the stripe follows the border
-    wherever it winds: a cell's distance from it is that to the nearest cell of the other type, from centre to centre, less a cell's diameter; True, the
-    border is one straight line, at the place along the axis with the fewest cells on the wrong side. along: "x" or "y", the axis that the stripe lies across.
-    cell_type: only cells of this type count. place: of the stripe's middle from `at`, µm towards the type that lies higher on the axis. By default 0;
-    with "border" and a cell_type, the stripe adjoins the border on the side of that type. floor: level from which a cell counts as lit. soft: µm, how soft
-    the edges are. A colony that has lost one of its two types has no border, and loss 1.
+    at: "border", the border between the two populations (cell types) of the colony, or a number,
+    µm. straight: False, the stripe follows the border wherever it winds: a cell's distance from it
+    is that to the nearest cell of the other type, from centre to centre, less a cell's diameter;
+    True, the border is one straight line, at the place along the axis with the fewest cells on the
+    wrong side. along: "x" or "y", the axis that the stripe lies across. cell_type: only cells of
+    this type count. place: of the stripe's middle from `at`, µm towards the type that lies higher
+    on the axis. By default 0; with "border" and a cell_type, the stripe adjoins the border on the
+    side of that type. floor: level from which a cell counts as lit. soft: µm, how soft the edges
+    are. A colony that has lost one of its two types has no border, and loss 1.
     """
 
     species: str
@@ -57,8 +61,14 @@ class Stripe(Mask):
         if self.place is not None:
             checks.number("Stripe.place", self.place)
         checks.choice("Stripe.along", self.along, ("x", "y"))
-        if self.cell_type is not None and (isinstance(self.cell_type, bool) or not isinstance(self.cell_type, int) or self.cell_type < 0):
-            raise checks.refuse("Stripe.cell_type", self.cell_type, "a whole number from 0, or None for all cells")
+        if self.cell_type is not None and (
+            isinstance(self.cell_type, bool)
+            or not isinstance(self.cell_type, int)
+            or self.cell_type < 0
+        ):
+            raise checks.refuse(
+                "Stripe.cell_type", self.cell_type, "a whole number from 0, or None for all cells"
+            )
         checks.choice("Stripe.straight", self.straight, (True, False))
         common("Stripe", self.floor, self.soft)
 
@@ -71,17 +81,29 @@ class Stripe(Mask):
         if self.at != "border" and self.cell_type is None:
             return
         if "cell_type" not in state.fields:
-            raise tf.InputError("Stripe: the cells have no types. Found the colonies with them: founders=tf.Cells(…, cell_type=[0, 1]).")
+            raise tf.InputError(
+                "Stripe: the cells have no types. Found the colonies with them:"
+                " founders=tf.Cells(…, cell_type=[0, 1])."
+            )
         for k in range(state.colonies):
             there = torch.unique(state.cell_type[state.colony == k]).tolist()
             if self.at == "border" and len(there) != 2:
                 mend = "Found the colonies with two, or give at= a place in µm."
-                raise tf.InputError(f'Stripe(at="border"): a border needs exactly two types of cells, and colony {k} has {there}. {mend}')
+                raise tf.InputError(
+                    'Stripe(at="border"): a border needs exactly two types of cells, and colony'
+                    f" {k} has {there}. {mend}"
+                )
             if self.cell_type is not None and self.cell_type not in there:
-                raise checks.refuse("Stripe.cell_type", self.cell_type, f"a type in every colony; colony {k} has {there}")
+                raise checks.refuse(
+                    "Stripe.cell_type",
+                    self.cell_type,
+                    f"a type in every colony; colony {k} has {there}",
+                )
 
     def counted(self, state: tf.State) -> Tensor:
-        return super().counted(state) if self.cell_type is None else state.cell_type == self.cell_type
+        return (
+            super().counted(state) if self.cell_type is None else state.cell_type == self.cell_type
+        )
 
     @property
     def least(self) -> float:
@@ -93,17 +115,30 @@ class Stripe(Mask):
         return self.at == "border" and not self.straight
 
     def reference(self, state: tf.State) -> tuple[Tensor, Tensor, Tensor]:
-        """The place of `at` along the axis and of the stripe's middle from there, (B,) float64 µm, and the distance of each cell from `at`, (N,) µm, above 0
-        towards where the axis points; NaN where a colony has no border."""
+        """The place of `at` along the axis and of the stripe's middle from there, (B,) float64 µm,
+        and the distance of each cell from `at`, (N,) µm, above 0 towards where the axis points; NaN
+        where a colony has no border."""
         place = 0.0 if self.place is None else self.place
         if not isinstance(self.at, str):
-            at = torch.full((state.colonies,), float(self.at), dtype=torch.float64, device=state.device)
+            at = torch.full(
+                (state.colonies,), float(self.at), dtype=torch.float64, device=state.device
+            )
             return at, torch.full_like(at, place), _axis(state, self.along) - self.at
         at, low_type = border(state, self.along)
         middle = torch.full_like(at, place)
         if self.place is None and self.cell_type is not None:
-            middle = torch.where(low_type == self.cell_type, -0.5 * self.width, 0.5 * self.width).double()
-        return at, middle, _from_border(state, low_type) if self.winds else _axis(state, self.along) - at.index_select(0, state.colony)
+            middle = torch.where(
+                low_type == self.cell_type, -0.5 * self.width, 0.5 * self.width
+            ).double()
+        return (
+            at,
+            middle,
+            (
+                _from_border(state, low_type)
+                if self.winds
+                else _axis(state, self.along) - at.index_select(0, state.colony)
+            ),
+        )
 
     def wanted(self, state: tf.State) -> Tensor:
         _, middle, distance = self.reference(state)
@@ -118,42 +153,68 @@ class Stripe(Mask):
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """Of the cells that count, each (B,):
 
-        place_um: mean distance from `at` of what is brighter than the cells farther than 2·width from the wanted middle; width_um: full
-        width at half maximum of the profile in strips of 2 µm; peak: the greatest mean of a strip; contrast: mean level inside the wanted stripe over that of
-        the cells farther than 2·width; straightness_um: how far, root mean square over strips of 4 µm across, the middle of the cells at least half as bright
-        as the peak is from a straight line.
+        place_um: mean distance from `at` of what is brighter than the cells farther than 2·width
+        from the wanted middle; width_um: full width at half maximum of the profile in strips of 2
+        µm; peak: the greatest mean of a strip; contrast: mean level inside the wanted stripe over
+        that of the cells farther than 2·width; straightness_um: how far, root mean square over
+        strips of 4 µm across, the middle of the cells at least half as bright as the peak is from a
+        straight line.
         """
         y, (_, middle, x) = seen(state, self.names)[0][:, 0], self.reference(state)
-        # without a border there is no place: such colonies' cells are left out, and their measures are NaN
+        # without a border there is no place: such colonies' cells are left out, and their measures
+        # are NaN
         w = torch.where(self.counted(state) & torch.isfinite(x), weights(state), 0.0)
         x = torch.nan_to_num(x)
         away = (x - middle.index_select(0, state.colony)).abs()
         inside, far = w * (away <= 0.5 * self.width), w * (away > 2 * self.width)
-        bright, dark = (ratio(total(state, part * y), total(state, part), math.nan) for part in (inside, far))
+        bright, dark = (
+            ratio(total(state, part * y), total(state, part), math.nan) for part in (inside, far)
+        )
         light = w * (y - torch.nan_to_num(dark).index_select(0, state.colony)).clamp(min=0.0)
         found = {"place_um": ratio(total(state, light * x), total(state, light), math.nan)}
         kept = (w > 0).cpu().numpy()
-        columns = (state.colony, x, _axis(state, self.along), _axis(state, "y" if self.along == "x" else "x"), y, w)
+        columns = (
+            state.colony,
+            x,
+            _axis(state, self.along),
+            _axis(state, "y" if self.along == "x" else "x"),
+            y,
+            w,
+        )
         owner, away_from, along, across, level, weight = (v.cpu().numpy()[kept] for v in columns)
         peak, width = profile(owner, away_from, level, weight, state.colonies)
         straight = straightness(owner, along, across, level, weight, peak)
-        found |= {name: torch.as_tensor(v, device=state.device) for name, v in (("width_um", width), ("peak", peak), ("straightness_um", straight))}
+        found |= {
+            name: torch.as_tensor(v, device=state.device)
+            for name, v in (("width_um", width), ("peak", peak), ("straightness_um", straight))
+        }
         return found | {"contrast": ratio(bright, dark, math.nan)}
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """The edges of the stripe and the border as lines or, where it winds, a dot on each cell that is wanted lit."""
+        """The edges of the stripe and the border as lines or, where it winds, a dot on each cell
+        that is wanted lit."""
         if self.winds:
             mine = (state.colony == place) & self.counted(state) & (self.wanted(state)[:, 0] > 0.5)
             x, y = state.position[mine, :2].cpu().numpy().T
             ax.plot(x, y, ".", color=COLOURS[0], ms=3)
             return
         at, middle = (float(v[place]) for v in self.reference(state)[:2])
-        lines(ax, self.along, (0.0, 0.0), (at + middle - 0.5 * self.width, at + middle + 0.5 * self.width), COLOURS[0])
+        lines(
+            ax,
+            self.along,
+            (0.0, 0.0),
+            (at + middle - 0.5 * self.width, at + middle + 0.5 * self.width),
+            COLOURS[0],
+        )
         if self.at == "border":
             lines(ax, self.along, (0.0, 0.0), (at,), "black", ":")
 
     def describe(self) -> str:
-        at = f"the {'straight ' if self.straight else ''}border" if self.at == "border" else f"{self.along} = {self.at:g} µm"
+        at = (
+            f"the {'straight ' if self.straight else ''}border"
+            if self.at == "border"
+            else f"{self.along} = {self.at:g} µm"
+        )
         place = "" if self.place is None else f", {self.place:+g} µm from it"
         whose = "" if self.cell_type is None else f", cells of type {self.cell_type}"
         return f"{self.species} in a stripe {self.width:g} µm wide at {at}{place}{whose}"
@@ -166,8 +227,9 @@ def _axis(state: tf.State, along: str) -> Tensor:
 
 @torch.no_grad()
 def _from_border(state: tf.State, low_type: Tensor) -> Tensor:
-    """How far each cell is from the nearest cell of the other type, seen from above, centre to centre less a diameter, (N,) float64 µm, below 0 for
-    `low_type` (B,), the type that lies lower on the axis; NaN where there is no other type."""
+    """How far each cell is from the nearest cell of the other type, seen from above, centre to
+    centre less a diameter, (N,) float64 µm, below 0 for `low_type` (B,), the type that lies lower
+    on the axis; NaN where there is no other type."""
     position, kind = state.position.detach()[:, :2], state.cell_type
     found = torch.full((state.cells,), math.nan, dtype=torch.float64, device=state.device)
     start = 0
@@ -180,27 +242,34 @@ def _from_border(state: tf.State, low_type: Tensor) -> Tensor:
             continue
         for these, those in ((one, other), (other, one)):
             for some in these.split(BLOCK):
-                found[some] = torch.cdist(position[some], position[those], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+                found[some] = torch.cdist(
+                    position[some], position[those], compute_mode="donot_use_mm_for_euclid_dist"
+                ).amin(1)
     found = found - 2.0 * state.radius.detach().double()
     return torch.where(kind == low_type.index_select(0, state.colony), -found, found)
 
 
 @torch.no_grad()
 def border(state: tf.State, along: str = "x") -> tuple[Tensor, Tensor]:
-    """The border of the two types of cells of each colony, (B,) float64 µm, and the type that lies before it, (B,) int64.
+    """The border of the two types of cells of each colony, (B,) float64 µm, and the type that lies
+    before it, (B,) int64.
 
-    It is the place along x or y with the fewest cells on the wrong side, half-way between two cells (of several such places the first); the type whose mean
-    place is the lower belongs before it. NaN where a colony has one type only; of more than two the lowest and the highest number count.
+    It is the place along x or y with the fewest cells on the wrong side, half-way between two cells
+    (of several such places the first); the type whose mean place is the lower belongs before it.
+    NaN where a colony has one type only; of more than two the lowest and the highest number count.
     """
     groups, colony, x = state.groups, state.colony, _axis(state, along)
     if not state.cells:
         return x.new_full((state.colonies,), math.nan), colony.new_zeros(state.colonies)
     one, other = -groups.max(-state.cell_type), groups.max(state.cell_type)
     is_one, is_other = (state.cell_type == t.index_select(0, colony) for t in (one, other))
-    sums = groups.sum(torch.stack([is_one * x, is_one.double(), is_other * x, is_other.double()], 1))
+    sums = groups.sum(
+        torch.stack([is_one * x, is_one.double(), is_other * x, is_other.double()], 1)
+    )
     straight = sums[:, 0] * sums[:, 3] <= sums[:, 2] * sums[:, 1]
     before = torch.where(straight, one, other)
-    # from place to place along the axis, how many more cells are on the wrong side than with all of them after it
+    # from place to place along the axis, how many more cells are on the wrong side than with all of
+    # them after it
     order = torch.argsort(x, stable=True)
     order = order.index_select(0, torch.argsort(colony.index_select(0, order), stable=True))
     step = (is_other.long() - is_one.long()) * torch.where(straight, 1, -1).index_select(0, colony)
@@ -210,14 +279,21 @@ def border(state: tf.State, along: str = "x") -> tuple[Tensor, Tensor]:
     first = -groups.max(torch.where(wrong == least, -row, -state.cells))
     last = groups.max(row)
     x = x.index_select(0, order)
-    place = 0.5 * (x.index_select(0, first.clamp(max=state.cells - 1)) + x.index_select(0, torch.minimum(first + 1, last)))
+    place = 0.5 * (
+        x.index_select(0, first.clamp(max=state.cells - 1))
+        + x.index_select(0, torch.minimum(first + 1, last))
+    )
     return torch.where((state.counts > 0) & (one < other), place, math.nan), before
 
 
-def profile(owner: np.ndarray, x: np.ndarray, level: np.ndarray, weight: np.ndarray, colonies: int) -> tuple[np.ndarray, np.ndarray]:
-    """The greatest mean level of a strip and the full width at half of it, µm, of each colony, (B,) each; NaN where nothing is lit.
+def profile(
+    owner: np.ndarray, x: np.ndarray, level: np.ndarray, weight: np.ndarray, colonies: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The greatest mean level of a strip and the full width at half of it, µm, of each colony, (B,)
+    each; NaN where nothing is lit.
 
-    owner, x, level, weight: (N,), colony by colony. Strips with fewer than three cells are passed over.
+    owner, x, level, weight: (N,), colony by colony. Strips with fewer than three cells are passed
+    over.
     """
     colony, centre, strip = strips(owner, x, STRIP)
     mean = np.bincount(strip, weights=weight * level) / np.bincount(strip, weights=weight)
@@ -241,16 +317,25 @@ def profile(owner: np.ndarray, x: np.ndarray, level: np.ndarray, weight: np.ndar
     return peak, width
 
 
-def straightness(owner: np.ndarray, x: np.ndarray, across: np.ndarray, level: np.ndarray, weight: np.ndarray, peak: np.ndarray) -> np.ndarray:
-    """Root mean square distance, µm, (B,), along x of the middles of a stripe from the straight line that fits them best; NaN for fewer than three middles.
+def straightness(
+    owner: np.ndarray,
+    x: np.ndarray,
+    across: np.ndarray,
+    level: np.ndarray,
+    weight: np.ndarray,
+    peak: np.ndarray,
+) -> np.ndarray:
+    """Root mean square distance, µm, (B,), along x of the middles of a stripe from the straight
+    line that fits them best; NaN for fewer than three middles.
 
-    A middle is the mean x of the cells with at least half the colony's peak (B,), in a strip across.
+    A middle is the mean x of the cells with at least half the colony's peak (B,), in a strip
+    across.
     """
     lit = level >= 0.5 * peak[owner]
     owner, x, light = owner[lit], x[lit], (weight * level)[lit]
     colony, at, strip = strips(owner, across[lit], ACROSS)
     middle = np.bincount(strip, weights=light * x) / np.bincount(strip, weights=light)
-    add = lambda v: np.bincount(colony, weights=v, minlength=len(peak))  # noqa: E731
+    add = lambda v: np.bincount(colony, weights=v, minlength=len(peak))
     count = add(np.ones(len(colony)))
     enough = count >= 3
     some = np.where(enough, count, 1)
@@ -259,8 +344,11 @@ def straightness(owner: np.ndarray, x: np.ndarray, across: np.ndarray, level: np
     return np.where(enough, np.sqrt(add((c - slope[colony] * t) ** 2) / some), np.nan)
 
 
-def strips(owner: np.ndarray, x: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The strips, `size` µm wide, that hold cells: colony and centre of each, colony by colony and in order, and the strip of each cell."""
+def strips(
+    owner: np.ndarray, x: np.ndarray, size: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The strips, `size` µm wide, that hold cells: colony and centre of each, colony by colony and
+    in order, and the strip of each cell."""
     number = np.floor(x / size).astype(np.int64)
     low, span = (int(number.min()), int(np.ptp(number)) + 1) if len(number) else (0, 1)
     key, strip = np.unique(owner * span + number - low, return_inverse=True)

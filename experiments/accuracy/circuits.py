@@ -1,7 +1,9 @@
-"""Work and precision of the circuits: cells that neither meet nor exchange, each against its own equation solved by SciPy to twelve digits.
+"""Work and precision of the circuits: cells that neither meet nor exchange, each against its own
+equation solved by SciPy to twelve digits.
 
-The equations are written once, in arithmetic that torch and NumPy share: the library integrates the one, SciPy's Radau or DOP853 the other, where the
-cell's volume is known in closed form. Work is what a rate function was asked for, rows over cells: a Jacobian of S species counts S.
+The equations are written once, in arithmetic that torch and NumPy share: the library integrates the
+one, SciPy's Radau or DOP853 the other, where the cell's volume is known in closed form. Work is
+what a rate function was asked for, rows over cells: a Jacobian of S species counts S.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ LONG = 0.1  # s; what takes longer is run once
 
 @dataclass(frozen=True)
 class Problem:
-    """Cells to be followed for `until` h. rates: (u, s, p, cell) → dict; starts: (CELLS,) by species; solver: SciPy's, for the reference."""
+    """Cells to be followed for `until` h. rates: (u, s, p, cell) → dict; starts: (CELLS,) by
+    species; solver: SciPy's, for the reference."""
 
     name: str
     title: str
@@ -58,11 +61,15 @@ class Counted:
 
 def ring_of_three(u, s, p, cell):
     """The equations of tf.scenes.repressilator, an mRNA and a protein a gene."""
-    made = lambda by: p.speed * (p.alpha / (1 + by**2) + p.basal)  # noqa: E731
+    made = lambda by: p.speed * (p.alpha / (1 + by**2) + p.basal)
     return {
-        "m_laci": made(u.ci) - p.speed * u.m_laci, "m_tetr": made(u.laci) - p.speed * u.m_tetr, "m_ci": made(u.tetr) - p.speed * u.m_ci,
-        "laci": p.turnover * (u.m_laci - u.laci), "tetr": p.turnover * (u.m_tetr - u.tetr), "ci": p.turnover * (u.m_ci - u.ci),
-    }  # fmt: skip
+        "m_laci": made(u.ci) - p.speed * u.m_laci,
+        "m_tetr": made(u.laci) - p.speed * u.m_tetr,
+        "m_ci": made(u.tetr) - p.speed * u.m_ci,
+        "laci": p.turnover * (u.m_laci - u.laci),
+        "tetr": p.turnover * (u.m_tetr - u.tetr),
+        "ci": p.turnover * (u.m_ci - u.ci),
+    }
 
 
 def toggle(u, s, p, cell):
@@ -80,39 +87,61 @@ def lux(u, s, p, cell):
     """The paper's Lux circuit, AHL outside held where it is."""
     into = p.D1 * (p.outside - u.ahl) * cell.area
     induced = u.ahl * u.ahl
-    return {"luxi": 1e-3 + induced / (1e-4 + induced) - 0.1 * u.luxi, "ahl": 100.0 * u.luxi / (1 + u.luxi) + into / cell.volume}
+    return {
+        "luxi": 1e-3 + induced / (1e-4 + induced) - 0.1 * u.luxi,
+        "ahl": 100.0 * u.luxi / (1 + u.luxi) + into / cell.volume,
+    }
 
 
 def problems() -> list[Problem]:
     draw = np.random.default_rng(1)
-    some = lambda low, high: draw.uniform(low, high, CELLS)  # noqa: E731
+    some = lambda low, high: draw.uniform(low, high, CELLS)
     genes = ("laci", "tetr", "ci")
     speed = 2.0
     return [
         Problem(
-            "circuits_repressilator", "Circuits: the repressilator",
-            "Eight cells follow the repressilator for 4 h, nearly a period, each from a start of its own.",
-            ring_of_three, {n: some(0.0, 40.0) for n in (*genes, *("m_" + n for n in genes))}, 4.0,
+            "circuits_repressilator",
+            "Circuits: the repressilator",
+            "Eight cells follow the repressilator for 4 h, nearly a period, each from a start of"
+            " its own.",
+            ring_of_three,
+            {n: some(0.0, 40.0) for n in (*genes, *("m_" + n for n in genes))},
+            4.0,
             {"alpha": 216.0, "basal": 0.216, "speed": speed, "turnover": 5.0 * speed},
         ),
         Problem(
-            "circuits_toggle", "Circuits: the toggle switch", "Eight cells on both sides of the watershed of a toggle switch, for 6 h.",
-            toggle, {"red": some(0.5, 4.0), "green": some(0.5, 4.0)}, 6.0,
+            "circuits_toggle",
+            "Circuits: the toggle switch",
+            "Eight cells on both sides of the watershed of a toggle switch, for 6 h.",
+            toggle,
+            {"red": some(0.5, 4.0), "green": some(0.5, 4.0)},
+            6.0,
         ),
         Problem(
-            "circuits_stiff", "Circuits: a stiff, bistable loop",
-            "Eight cells in the loop of the hard case 24, rates of 1e8/h beside rates of 1/h, for 3 h, while they move.",
-            fast_loop, {"slow": np.linspace(0.85, 1.2, CELLS), "fast": np.zeros(CELLS)}, 3.0, solver="Radau",
+            "circuits_stiff",
+            "Circuits: a stiff, bistable loop",
+            "Eight cells in the loop of the hard case 24, rates of 1e8/h beside rates of 1/h, for 3"
+            " h, while they move.",
+            fast_loop,
+            {"slow": np.linspace(0.85, 1.2, CELLS), "fast": np.zeros(CELLS)},
+            3.0,
+            solver="Radau",
         ),
         Problem(
-            "circuits_lux", "Circuits: Lux quorum sensing", "Eight cells switch on by Lux for 4 h; AHL crosses the membrane at 450/h.",
-            lux, {"luxi": some(0.0, 0.2), "ahl": some(0.0, 0.05)}, 4.0, {"D1": 100.0, "outside": 0.005},
+            "circuits_lux",
+            "Circuits: Lux quorum sensing",
+            "Eight cells switch on by Lux for 4 h; AHL crosses the membrane at 450/h.",
+            lux,
+            {"luxi": some(0.0, 0.2), "ahl": some(0.0, 0.05)},
+            4.0,
+            {"D1": 100.0, "outside": 0.005},
         ),
-    ]  # fmt: skip
+    ]
 
 
 def geometry(growth: float, t: float) -> SimpleNamespace:
-    """Volume and area of a capsule whose volume has grown by the law V' = g V for t hours, exactly."""
+    """Volume and area of a capsule whose volume has grown by the law V' = g V for t hours,
+    exactly."""
     volume = math.pi * RADIUS**2 * (LENGTH + 4 * RADIUS / 3) * math.exp(growth * t)
     length = volume / (math.pi * RADIUS**2) - 4 * RADIUS / 3
     return SimpleNamespace(volume=volume, area=2 * math.pi * RADIUS * (length + 2 * RADIUS))
@@ -123,12 +152,16 @@ def reference(problem: Problem) -> np.ndarray:
     names, p, growth = tuple(problem.starts), SimpleNamespace(**problem.parameters), problem.growth
 
     def slope(t: float, y: np.ndarray) -> np.ndarray:
-        found = problem.rates(SimpleNamespace(**dict(zip(names, y, strict=True))), None, p, geometry(growth, t))
+        found = problem.rates(
+            SimpleNamespace(**dict(zip(names, y, strict=True))), None, p, geometry(growth, t)
+        )
         return np.array([found[n] for n in names]) - growth * y
 
     ends = []
     for start in np.stack([problem.starts[n] for n in names], 1):
-        done = solve_ivp(slope, (0.0, problem.until), start, method=problem.solver, rtol=1e-12, atol=1e-14)
+        done = solve_ivp(
+            slope, (0.0, problem.until), start, method=problem.solver, rtol=1e-12, atol=1e-14
+        )
         assert done.success, done.message
         ends.append(done.y[:, -1])
     return np.stack(ends, 1)
@@ -147,7 +180,11 @@ class Setting:
     @property
     def words(self) -> str:
         kind = "float64" if self.dtype == torch.float64 else "float32"
-        how = f"{self.method}, rtol {self.rtol:g}" if self.method == "rosenbrock" else f"{self.method}, {self.steps} step{'s' * (self.steps > 1)}"
+        how = (
+            f"{self.method}, rtol {self.rtol:g}"
+            if self.method == "rosenbrock"
+            else f"{self.method}, {self.steps} step{'s' * (self.steps > 1)}"
+        )
         return f"{how}, Δt {self.dt:g} h, {kind}"
 
     @property
@@ -164,29 +201,51 @@ def advance(scene: tf.Scene, state: tf.State, dt: float, steps: int) -> tf.State
     return state
 
 
-def point(problem: Problem, exact: np.ndarray, series: str, setting: Setting, step: float | None = None) -> Point:
+def point(
+    problem: Problem, exact: np.ndarray, series: str, setting: Setting, step: float | None = None
+) -> Point:
     """One setting of a problem, run, timed and compared."""
     names = tuple(problem.starts)
     counted = Counted(problem.rates, names[0])
-    circuit = tf.Circuit(counted, species=names, method=setting.method, steps=setting.steps, rtol=setting.rtol, **problem.parameters)
+    circuit = tf.Circuit(
+        counted,
+        species=names,
+        method=setting.method,
+        steps=setting.steps,
+        rtol=setting.rtol,
+        **problem.parameters,
+    )
     # far apart, and without mechanics: nothing but the circuit and the growth
-    cells = tf.Cells([[0.0, 5.0 * k] for k in range(CELLS)], [[1.0, 0.0]] * CELLS, length=LENGTH, radius=RADIUS, extra=problem.starts)
-    scene = tf.Scene(*([tf.Growth(rate=problem.growth)] if problem.growth else []), circuit, founders=cells)
+    cells = tf.Cells(
+        [[0.0, 5.0 * k] for k in range(CELLS)],
+        [[1.0, 0.0]] * CELLS,
+        length=LENGTH,
+        radius=RADIUS,
+        extra=problem.starts,
+    )
+    scene = tf.Scene(
+        *([tf.Growth(rate=problem.growth)] if problem.growth else []), circuit, founders=cells
+    )
     first = scene.seed(dtype=setting.dtype)
     steps = round(problem.until / setting.dt)
     counted.rows = 0
-    run = lambda: advance(scene, first, problem.until / steps, steps)  # noqa: E731
+    run = lambda: advance(scene, first, problem.until / steps, steps)
     last, seconds = timed(run, 1)
     work = counted.rows / CELLS
     if seconds < LONG:
         last, seconds = timed(run)
     words = setting.words + (" (fails)" if last is None else "")
-    error = math.nan if last is None else off(np.stack([last.fields[n].double().numpy() for n in names]), exact)
+    error = (
+        math.nan
+        if last is None
+        else off(np.stack([last.fields[n].double().numpy() for n in names]), exact)
+    )
     return Point(series, words, {ERROR: error}, seconds, work, setting.is_default, step=step)
 
 
 def off(found: np.ndarray, exact: np.ndarray) -> float:
-    """Relative error of (species, cells): of each species its root mean square over cells, relative to that of the species; of these the same over species."""
+    """Relative error of (species, cells): of each species its root mean square over cells, relative
+    to that of the species; of these the same over species."""
     return float(np.sqrt((((found - exact) ** 2).mean(1) / (exact**2).mean(1)).mean()))
 
 
@@ -195,49 +254,117 @@ def sweep(problem: Problem, quick: bool) -> Study:
     exact = reference(problem)
     tolerances = (1e-2, 1e-4, 1e-6) if quick else tuple(10.0**-k for k in range(1, 9))
     wide, whole = torch.float64, problem.until
-    points = [point(problem, exact, "Δt", Setting(dt=dt)) for dt in ((0.2, DT) if quick else (1.0, 0.5, 0.2, 0.1, 0.05, DT, 0.0125))]
-    points += [point(problem, exact, "rtol at Δt 0.025 h", Setting(rtol=r, dtype=wide)) for r in tolerances if r >= 1e-6]
-    points += [point(problem, exact, "rtol, all in one step", Setting(rtol=r, dt=whole, dtype=wide)) for r in tolerances]
-    points += [point(problem, exact, "rtol, all in one step, float32", Setting(rtol=r, dt=whole)) for r in tolerances if not quick]
+    points = [
+        point(problem, exact, "Δt", Setting(dt=dt))
+        for dt in ((0.2, DT) if quick else (1.0, 0.5, 0.2, 0.1, 0.05, DT, 0.0125))
+    ]
+    points += [
+        point(problem, exact, "rtol at Δt 0.025 h", Setting(rtol=r, dtype=wide))
+        for r in tolerances
+        if r >= 1e-6
+    ]
+    points += [
+        point(problem, exact, "rtol, all in one step", Setting(rtol=r, dt=whole, dtype=wide))
+        for r in tolerances
+    ]
+    points += [
+        point(problem, exact, "rtol, all in one step, float32", Setting(rtol=r, dt=whole))
+        for r in tolerances
+        if not quick
+    ]
     stiff = problem.name == "circuits_stiff"
     for method in ("euler", "rk4") if stiff or quick else EXPLICIT:
         for steps in (64,) if stiff else (16, 32, 64) if quick else (1, 2, 4, 8, 16, 32, 64):
             setting = Setting(method, steps, dt=COARSE, dtype=wide)
-            points.append(point(problem, exact, f"steps of {method}", setting, COARSE / steps if steps >= SETTLED else None))
+            points.append(
+                point(
+                    problem,
+                    exact,
+                    f"steps of {method}",
+                    setting,
+                    COARSE / steps if steps >= SETTLED else None,
+                )
+            )
     more = (
-        " Explicit methods divide a step of 0.2 h into 1 to 64; where rates push a concentration below zero or past all numbers they fail, and say so. "
-        f"Orders are of {SETTLED} and more."
-    )  # fmt: skip
+        " Explicit methods divide a step of 0.2 h into 1 to 64; where rates push a concentration"
+        f" below zero or past all numbers they fail, and say so. Orders are of {SETTLED} and more."
+    )
     return Study(
-        problem.name, problem.title, problem.words + more, f"relative, root mean square over species and cells, against SciPy's {problem.solver} to 1e-12",
-        WORK, (ERROR,), points,
-    )  # fmt: skip
+        problem.name,
+        problem.title,
+        problem.words + more,
+        f"relative, root mean square over species and cells, against SciPy's {problem.solver} to"
+        " 1e-12",
+        WORK,
+        (ERROR,),
+        points,
+    )
 
 
 def growing(quick: bool) -> Study:
     """Dilution and rates taken in turns, in cells that grow."""
     lux_like = Problem(
-        "circuits_growth", "Circuits in cells that grow", "", lux, {"luxi": np.linspace(0.0, 0.2, CELLS), "ahl": np.linspace(0.0, 0.05, CELLS)}, 1.0,
-        {"D1": 2.0, "outside": 0.005}, growth=1.0,
-    )  # fmt: skip
+        "circuits_growth",
+        "Circuits in cells that grow",
+        "",
+        lux,
+        {"luxi": np.linspace(0.0, 0.2, CELLS), "ahl": np.linspace(0.0, 0.05, CELLS)},
+        1.0,
+        {"D1": 2.0, "outside": 0.005},
+        growth=1.0,
+    )
     exact, wide = reference(lux_like), torch.float64
     steps = (0.2, 0.1, DT) if quick else (0.5, 0.25, 0.125, 0.1, 0.05, DT, 0.0125, 0.00625)
     tight = 1e-5 if quick else 1e-7
-    points = [point(lux_like, exact, f"Δt at rtol {tight:g}, float64", Setting(rtol=tight, dt=dt, dtype=wide), dt) for dt in steps]
+    points = [
+        point(
+            lux_like,
+            exact,
+            f"Δt at rtol {tight:g}, float64",
+            Setting(rtol=tight, dt=dt, dtype=wide),
+            dt,
+        )
+        for dt in steps
+    ]
     points += [point(lux_like, exact, "Δt", Setting(dt=dt), dt) for dt in steps]
-    points += [point(lux_like, exact, "rtol", Setting(rtol=r)) for r in ((1e-2,) if quick else (1e-1, 1e-2, 1e-3, 1e-5, 1e-6, 1e-7))]
+    points += [
+        point(lux_like, exact, "rtol", Setting(rtol=r))
+        for r in ((1e-2,) if quick else (1e-1, 1e-2, 1e-3, 1e-5, 1e-6, 1e-7))
+    ]
     if not quick:
-        points += [point(lux_like, exact, "several", Setting(rtol=r, dt=dt)) for r in (1e-1, 1e-2) for dt in (0.25, 0.1, 0.05)]
-        points += [point(lux_like, exact, "several", Setting("rk4", n, dt=dt), None) for n in (1, 4) for dt in (0.1, DT)]
+        points += [
+            point(lux_like, exact, "several", Setting(rtol=r, dt=dt))
+            for r in (1e-1, 1e-2)
+            for dt in (0.25, 0.1, 0.05)
+        ]
+        points += [
+            point(lux_like, exact, "several", Setting("rk4", n, dt=dt), None)
+            for n in (1, 4)
+            for dt in (0.1, DT)
+        ]
     return Study(
-        lux_like.name, lux_like.title,
-        "Eight isolated cells grow by e in 1 h while Lux switches on in them; what passes the membrane depends on volume and surface, which change.",
-        "relative, root mean square over species and cells, against SciPy's DOP853 to 1e-12 of c' = f(c, V(t), A(t)) − g c", WORK, (ERROR,), points,
-    )  # fmt: skip
+        lux_like.name,
+        lux_like.title,
+        "Eight isolated cells grow by e in 1 h while Lux switches on in them; what passes the"
+        " membrane depends on volume and surface, which change.",
+        "relative, root mean square over species and cells, against SciPy's DOP853 to 1e-12 of c' ="
+        " f(c, V(t), A(t)) − g c",
+        WORK,
+        (ERROR,),
+        points,
+    )
 
 
 def studies(quick: bool) -> list[Study]:
-    """Work–precision of the integrators in cells that stand still, a problem each, and of Δt in cells that grow."""
+    """Work–precision of the integrators in cells that stand still, a problem each, and of Δt in
+    cells that grow."""
     if quick:
-        return [*(sweep(replace(p, until=2.0), quick) for p in problems() if p.name in ("circuits_toggle", "circuits_lux")), growing(quick)]
+        return [
+            *(
+                sweep(replace(p, until=2.0), quick)
+                for p in problems()
+                if p.name in ("circuits_toggle", "circuits_lux")
+            ),
+            growing(quick),
+        ]
     return [*(sweep(p, quick) for p in problems()), growing(quick)]

@@ -1,8 +1,10 @@
-"""What it costs that cells and medium take turns: Lie and Strang splitting, Δt and the circuits' tolerance, against the whole coupled system; and what
-the same settings do to the statistics of a colony that grows for hours.
+"""What it costs that cells and medium take turns: Lie and Strang splitting, Δt and the circuits'
+tolerance, against the whole coupled system; and what the same settings do to the statistics of a
+colony that grows for hours.
 
-The coupled system is every cell and every voxel as one ordinary differential equation, solved by SciPy to 1e-10: transport as `signals` assembles it, reading
-and giving by the weights of the stencil that defines them, nothing taken in turns and no pools.
+The coupled system is every cell and every voxel as one ordinary differential equation, solved by
+SciPy to 1e-10: transport as `signals` assembles it, reading and giving by the weights of the
+stencil that defines them, nothing taken in turns and no pools.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ def lux(u, s, p, cell):
     return {
         "luxi": 0.05 + 2.0 * induced / (0.01 + induced) - 1.0 * u.luxi,
         "ahl": 5.0 * u.luxi / (1 + u.luxi) - 0.3 * u.ahl + into / cell.volume,
-    }, {"ahl": -into}  # fmt: skip
+    }, {"ahl": -into}
 
 
 @dataclass(frozen=True)
@@ -56,14 +58,31 @@ def cases() -> list[Case]:
     middle = (np.arange(-2, 3, 2) + 0.5) * SPACING
     apart = np.stack(np.meshgrid(middle, middle, indexing="ij"), -1).reshape(-1, 2)
     return [
-        Case("splitting_fixed", "Splitting: cells anywhere", "24 cells at random places exchange AHL with a layer of 16 × 16 voxels.", anywhere),
-        Case("splitting_alone", "Splitting: each cell in the middle of a voxel of its own", "Nine cells whose pools are their voxels themselves.", apart),
-        Case("splitting_growing", "Splitting: cells that grow", "Nine cells off the middles of their voxels grow by e.", apart + np.array([0.7, -1.1]), 1.0),
-    ]  # fmt: skip
+        Case(
+            "splitting_fixed",
+            "Splitting: cells anywhere",
+            "24 cells at random places exchange AHL with a layer of 16 × 16 voxels.",
+            anywhere,
+        ),
+        Case(
+            "splitting_alone",
+            "Splitting: each cell in the middle of a voxel of its own",
+            "Nine cells whose pools are their voxels themselves.",
+            apart,
+        ),
+        Case(
+            "splitting_growing",
+            "Splitting: cells that grow",
+            "Nine cells off the middles of their voxels grow by e.",
+            apart + np.array([0.7, -1.1]),
+            1.0,
+        ),
+    ]
 
 
 def drop(places: torch.Tensor) -> torch.Tensor:
-    """The signal at the start: an uneven one, or Lie and Strang would differ in the signal alone."""
+    """The signal at the start: an uneven one, or Lie and Strang would differ in the signal
+    alone."""
     return 0.1 * torch.exp(-((places[:, 0] + 8.0) ** 2 + places[:, 1] ** 2) / 128.0)
 
 
@@ -72,10 +91,16 @@ def scene_of(case: Case, splitting: str, rtol: float, rates: Callable = lux) -> 
     count = len(case.places)
     grows = [tf.Growth(rate=case.growth)] if case.growth else []
     return tf.Scene(
-        *grows, tf.Circuit(rates, species=("luxi", "ahl"), rtol=rtol, D1=MEMBRANE.D1),
-        tf.Medium(ahl=tf.Signal(diffusion=DIFFUSION, decay=DECAY, initial=drop), box=((-half, -half), (half, half)), spacing=SPACING, splitting=splitting),
+        *grows,
+        tf.Circuit(rates, species=("luxi", "ahl"), rtol=rtol, D1=MEMBRANE.D1),
+        tf.Medium(
+            ahl=tf.Signal(diffusion=DIFFUSION, decay=DECAY, initial=drop),
+            box=((-half, -half), (half, half)),
+            spacing=SPACING,
+            splitting=splitting,
+        ),
         founders=tf.Cells(case.places, [[1.0, 0.0]] * count, length=LENGTH, radius=RADIUS),
-    )  # fmt: skip
+    )
 
 
 def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
@@ -84,18 +109,27 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
     where = state.layout.stencil(state.position, state.colony, torch.float64)
     count, voxels = len(case.places), where.nodes
     rows = np.repeat(np.arange(count), where.node.shape[1])
-    weights = sparse.csr_matrix((where.weight.numpy().ravel(), (rows, where.node.numpy().ravel())), shape=(count, voxels))
+    weights = sparse.csr_matrix(
+        (where.weight.numpy().ravel(), (rows, where.node.numpy().ravel())), shape=(count, voxels)
+    )
     back, transport = weights.T.tocsr(), assembled(VOXELS, SPACING, DIFFUSION, DECAY)
 
     def slope(t: float, y: np.ndarray) -> np.ndarray:
         luxi, inside, outside = y[:count], y[count : 2 * count], y[2 * count :]
         there, cell = weights @ outside, geometry(case.growth, t)
-        rates, given = lux(SimpleNamespace(luxi=luxi, ahl=inside), SimpleNamespace(ahl=there), MEMBRANE, cell)
+        rates, given = lux(
+            SimpleNamespace(luxi=luxi, ahl=inside), SimpleNamespace(ahl=there), MEMBRANE, cell
+        )
         amount = given["ahl"]
         # given by the weights; taken from each voxel in proportion to what it holds
         taken = np.maximum(-amount, 0.0) / np.where(there > 0, there, 1.0)
-        change = transport @ outside + (back @ np.maximum(amount, 0.0) - outside * (back @ taken)) / SPACING**3
-        return np.concatenate([rates["luxi"] - case.growth * luxi, rates["ahl"] - case.growth * inside, change])
+        change = (
+            transport @ outside
+            + (back @ np.maximum(amount, 0.0) - outside * (back @ taken)) / SPACING**3
+        )
+        return np.concatenate(
+            [rates["luxi"] - case.growth * luxi, rates["ahl"] - case.growth * inside, change]
+        )
 
     start = np.concatenate([np.zeros(2 * count), state.signals["ahl"].numpy()])
     done = solve_ivp(slope, (0.0, UNTIL), start, method="DOP853", rtol=1e-10, atol=1e-13)
@@ -105,9 +139,16 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
 
 
 def point(
-    case: Case, exact: tuple[np.ndarray, np.ndarray], series: str, splitting: str = "strang", dt: float = DT, rtol: float = 1e-4, wide: bool = False,
-) -> Point:  # fmt: skip
-    """One setting; wide: float64. Its work: applications of the rates to all cells and of a transport to all voxels, together."""
+    case: Case,
+    exact: tuple[np.ndarray, np.ndarray],
+    series: str,
+    splitting: str = "strang",
+    dt: float = DT,
+    rtol: float = 1e-4,
+    wide: bool = False,
+) -> Point:
+    """One setting; wide: float64. Its work: applications of the rates to all cells and of a
+    transport to all voxels, together."""
     counted = Counted(lux, "luxi")
     scene = scene_of(case, splitting, rtol, counted)
     first, steps = scene.seed(dtype=torch.float64 if wide else torch.float32), round(UNTIL / dt)
@@ -119,33 +160,65 @@ def point(
     assert last is not None
     species = np.stack([last.fields[n].double().numpy() for n in ("luxi", "ahl")])
     signal = last.signals["ahl"].double().numpy()
-    errors = {SPECIES: off(species, exact[0]), SIGNAL: float(np.linalg.norm(signal - exact[1]) / np.linalg.norm(exact[1]))}
+    errors = {
+        SPECIES: off(species, exact[0]),
+        SIGNAL: float(np.linalg.norm(signal - exact[1]) / np.linalg.norm(exact[1])),
+    }
     words = f"{splitting}, Δt {dt:g} h, rtol {rtol:g}, float{64 if wide else 32}"
     default = (splitting, dt, rtol, wide) == ("strang", DT, 1e-4, False)
-    return Point(series, words, errors, seconds, work, default, step=dt if series != "several" else None)
+    return Point(
+        series, words, errors, seconds, work, default, step=dt if series != "several" else None
+    )
 
 
 def taken_in_turns(case: Case, quick: bool) -> Study:
     """Δt, tolerance and splitting."""
     exact = reference(case)
     steps, tight = ((0.1, 0.05, DT), 1e-5) if quick else ((0.2, 0.1, 0.05, DT, 0.0125), 1e-7)
-    points = [point(case, exact, f"Δt, {s}, rtol {tight:g}, float64", s, dt, tight, True) for s in ("lie", "strang") for dt in steps]
+    points = [
+        point(case, exact, f"Δt, {s}, rtol {tight:g}, float64", s, dt, tight, True)
+        for s in ("lie", "strang")
+        for dt in steps
+    ]
     points += [point(case, exact, "Δt", dt=dt) for dt in ((DT,) if quick else (*steps, 0.00625))]
-    points += [point(case, exact, "rtol", rtol=r) for r in ((1e-2,) if quick else (1e-1, 1e-2, 1e-3, 1e-5, 1e-6))]
+    points += [
+        point(case, exact, "rtol", rtol=r)
+        for r in ((1e-2,) if quick else (1e-1, 1e-2, 1e-3, 1e-5, 1e-6))
+    ]
     if not quick:
-        points += [point(case, exact, "several", s, dt, r) for s in ("lie", "strang") for dt in (0.2, 0.1, 0.05, 0.0125) for r in (1e-1, 1e-2)]
+        points += [
+            point(case, exact, "several", s, dt, r)
+            for s in ("lie", "strang")
+            for dt in (0.2, 0.1, 0.05, 0.0125)
+            for r in (1e-1, 1e-2)
+        ]
     return Study(
-        case.name, case.title, case.words + " 1 h. Species: LuxI and AHL in the cells; signal: AHL in the voxels. "
+        case.name,
+        case.title,
+        case.words + " 1 h. Species: LuxI and AHL in the cells; signal: AHL in the voxels. "
         "Applications: of the rates to all cells, and of a transport to all voxels.",
-        "relative, root mean square over species and cells, and over voxels, against all cells and voxels as one equation", WORK, (SPECIES, SIGNAL), points,
-    )  # fmt: skip
+        "relative, root mean square over species and cells, and over voxels, against all cells and"
+        " voxels as one equation",
+        WORK,
+        (SPECIES, SIGNAL),
+        points,
+    )
 
 
-# --- statistics of a colony ---------------------------------------------------------------------------------------------------
+# --- statistics of a colony -----------------------------------------------------------------------
 
 
 # constants that experiments/boundary_stripe.py found
-STRIPE = {"d1": 0.535, "k1": 66.5, "D1": 30.9, "d3": 2.73, "k5": 5.92, "k3": 87.5, "k4": 1.48e-6, "dr": 4.29}
+STRIPE = {
+    "d1": 0.535,
+    "k1": 66.5,
+    "D1": 30.9,
+    "d3": 2.73,
+    "k5": 5.92,
+    "k3": 87.5,
+    "k4": 1.48e-6,
+    "dr": 4.29,
+}
 TARGET = Stripe("yfp", at="border", width=4.0, cell_type=1, floor=0.2)
 MEASURES = ("band width", "band peak", "cells", "mean yfp", "mean ahl", "peak ahl outside")
 
@@ -157,13 +230,23 @@ def detector(splitting: str, rtol: float) -> tf.Scene:
     for effect in ready.listed:
         if isinstance(effect, tf.Medium):
             box, spacing = effect.box, effect.spacing
-            effect = tf.Medium(**effect.signals, box=box, spacing=spacing, beyond=effect.beyond, grows=effect.grows, splitting=splitting)
+            effect = tf.Medium(
+                **effect.signals,
+                box=box,
+                spacing=spacing,
+                beyond=effect.beyond,
+                grows=effect.grows,
+                splitting=splitting,
+            )
         effects.append(effect)
     return tf.Scene(*effects, founders=ready.founders, dt=ready.dt)
 
 
-def ensemble(splitting: str, rtol: float, dt: float, until: float, streams: range) -> tuple[dict[str, np.ndarray], float, float]:
-    """Each measure of each colony, (streams,); what circuits took, steps over all cells; seconds."""
+def ensemble(
+    splitting: str, rtol: float, dt: float, until: float, streams: range
+) -> tuple[dict[str, np.ndarray], float, float]:
+    """Each measure of each colony, (streams,); what circuits took, steps over all cells;
+    seconds."""
     scene = detector(splitting, rtol)
     first = scene.seed(len(streams), streams=list(streams))
 
@@ -177,19 +260,29 @@ def ensemble(splitting: str, rtol: float, dt: float, until: float, streams: rang
 
     (state, taken), seconds = timed(run, 1)
     found = TARGET.measures(state)
-    mean = lambda x: state.groups.sum(x.double().unsqueeze(1)).squeeze(1) / state.counts  # noqa: E731
+    mean = lambda x: state.groups.sum(x.double().unsqueeze(1)).squeeze(1) / state.counts
     sinks = (state.cell_type == 1).double()
     grid = state.layout.grid
     highest = torch.zeros(grid.colonies).scatter_reduce(0, grid.owner, state.signals["ahl"], "amax")
-    values = (found["width_um"], found["peak"], state.counts, mean(state.yfp * sinks) / mean(sinks), mean(state.ahl), highest)
+    values = (
+        found["width_um"],
+        found["peak"],
+        state.counts,
+        mean(state.yfp * sinks) / mean(sinks),
+        mean(state.ahl),
+        highest,
+    )
     return {n: v.double().numpy() for n, v in zip(MEASURES, values, strict=True)}, taken, seconds
 
 
 def apart(mine: np.ndarray, theirs: np.ndarray) -> tuple[float, float]:
-    """How far two means are apart, and the half-width of Welch's 95 % confidence band, both relative to the second; colonies without the measure left out."""
+    """How far two means are apart, and the half-width of Welch's 95 % confidence band, both
+    relative to the second; colonies without the measure left out."""
     mine, theirs = (x[np.isfinite(x)] for x in (mine, theirs))
     parts = [x.var(ddof=1) / x.size for x in (mine, theirs)]
-    freedom = sum(parts) ** 2 / max(sum(v**2 / (x.size - 1) for v, x in zip(parts, (mine, theirs), strict=True)), 1e-300)
+    freedom = sum(parts) ** 2 / max(
+        sum(v**2 / (x.size - 1) for v, x in zip(parts, (mine, theirs), strict=True)), 1e-300
+    )
     band = stats.t.ppf(0.975, freedom) * math.sqrt(sum(parts)) if sum(parts) > 0 else 0.0
     return float(abs(mine.mean() - theirs.mean()) / theirs.mean()), float(band / theirs.mean())
 
@@ -199,28 +292,48 @@ def boundary(quick: bool) -> Study:
     until, streams, tight = (0.5, range(2), 1) if quick else (4.0, range(12), 8)
     others = range(1000, 1000 + 2 * len(streams))
     theirs, _, _ = ensemble("strang", 1e-4 if quick else 1e-6, DT / tight, until, others)
-    settings = [("Δt", "Δt 0.05 h", "strang", 1e-4, 2 * DT), ("Δt", "default", "strang", 1e-4, DT), ("rtol", "rtol 0.01", "strang", 1e-2, DT)]
+    settings = [
+        ("Δt", "Δt 0.05 h", "strang", 1e-4, 2 * DT),
+        ("Δt", "default", "strang", 1e-4, DT),
+        ("rtol", "rtol 0.01", "strang", 1e-2, DT),
+    ]
     if not quick:
         settings = [
-            ("Δt", "Δt 0.1 h", "strang", 1e-4, 4 * DT), *settings[:2], ("Δt", "Δt 0.0125 h", "strang", 1e-4, DT / 2), *settings[2:],
-            ("splitting", "lie", "lie", 1e-4, DT), ("several", "rtol 0.01, Δt 0.05 h", "strang", 1e-2, 2 * DT),
+            ("Δt", "Δt 0.1 h", "strang", 1e-4, 4 * DT),
+            *settings[:2],
+            ("Δt", "Δt 0.0125 h", "strang", 1e-4, DT / 2),
+            *settings[2:],
+            ("splitting", "lie", "lie", 1e-4, DT),
+            ("several", "rtol 0.01, Δt 0.05 h", "strang", 1e-2, 2 * DT),
             ("several", "rtol 0.1, Δt 0.1 h, lie", "lie", 1e-1, 4 * DT),
-        ]  # fmt: skip
+        ]
     points = []
     for series, words, splitting, rtol, dt in settings:
         found, taken, seconds = ensemble(splitting, rtol, dt, until, streams)
-        distance = {n: apart(found[n], theirs[n]) for n in MEASURES if np.isfinite(theirs[n]).sum() > 1 and np.isfinite(found[n]).sum() > 1}
+        distance = {
+            n: apart(found[n], theirs[n])
+            for n in MEASURES
+            if np.isfinite(theirs[n]).sum() > 1 and np.isfinite(found[n]).sum() > 1
+        }
         errors, band = ({n: d[k] for n, d in distance.items()} for k in (0, 1))
         points.append(Point(series, words, errors, seconds, taken, words == "default", band))
     return Study(
-        "splitting_boundary", "Statistics: the boundary detector",
-        f"{len(streams)} colonies a setting, {until:g} h in a channel 16 µm wide, with constants that draw a stripe: measures of `design.Stripe`, and means "
-        "over cells (of YFP over sinks). Within its band a setting cannot be told from the reference.",
-        f"relative distances of means from {len(others)} colonies of other seeds at Δt/{tight}, rtol {1e-4 if quick else 1e-6:g}; ± Welch's 95 % confidence",
-        "circuit steps, all cells", ("mean yfp", "mean ahl") if quick else ("band width", "mean yfp", "peak ahl outside"), points,
-    )  # fmt: skip
+        "splitting_boundary",
+        "Statistics: the boundary detector",
+        f"{len(streams)} colonies a setting, {until:g} h in a channel 16 µm wide, with constants"
+        " that draw a stripe: measures of `design.Stripe`, and means over cells (of YFP over"
+        " sinks). Within its band a setting cannot be told from the reference.",
+        f"relative distances of means from {len(others)} colonies of other seeds at Δt/{tight},"
+        f" rtol {1e-4 if quick else 1e-6:g}; ± Welch's 95 % confidence",
+        "circuit steps, all cells",
+        ("mean yfp", "mean ahl") if quick else ("band width", "mean yfp", "peak ahl outside"),
+        points,
+    )
 
 
 def studies(quick: bool) -> list[Study]:
     """Splitting on small, still systems, and statistics of growing ones."""
-    return [*(taken_in_turns(c, quick) for c in cases() if not quick or c.name != "splitting_fixed"), boundary(quick)]
+    return [
+        *(taken_in_turns(c, quick) for c in cases() if not quick or c.name != "splitting_fixed"),
+        boundary(quick),
+    ]

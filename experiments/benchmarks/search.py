@@ -5,9 +5,11 @@
     python experiments/benchmarks/search.py rate               # one design at a time, in batches, and on recorded growth
     python experiments/benchmarks/search.py unseen             # the winners that `methods` found, on 32 seeds that no search has seen
 
-The searches of one method differ by the method's own seed and share the colonies' four seeds; those of all seeds are evaluated side by side in one batch, so
-that seconds are a share of a common batch. A search succeeds when a design's mean loss over its four replicates is at most the target's threshold.
-Colonies grown to part of the full size count by that part. Each run is appended to a JSON file with its machine, versions and commit.
+The searches of one method differ by the method's own seed and share the colonies' four seeds; those
+of all seeds are evaluated side by side in one batch, so that seconds are a share of a common batch.
+A search succeeds when a design's mean loss over its four replicates is at most the target's
+threshold. Colonies grown to part of the full size count by that part. Each run is appended to a
+JSON file with its machine, versions and commit.
 """
 
 from __future__ import annotations
@@ -32,17 +34,37 @@ import ring
 
 # scene, parameters, target, colony; the loss that counts as found; searches and colonies each
 TARGETS = {
-    "stripe": ("boundary_detector", boundary_stripe.PARAMETERS, boundary_stripe.TARGET, boundary_stripe.COLONY, 0.07, 10, 2000),
+    "stripe": (
+        "boundary_detector",
+        boundary_stripe.PARAMETERS,
+        boundary_stripe.TARGET,
+        boundary_stripe.COLONY,
+        0.07,
+        10,
+        2000,
+    ),
     "bands": (bands.flag, bands.PARAMETERS, bands.TARGET, bands.COLONY, 0.15, 5, 600),
     "ring": (ring.band_detector, ring.PARAMETERS, ring.TARGET, ring.COLONY, 0.1, 5, 600),
-    "domains": ("toggle_switch", domain_size.PARAMETERS, DomainSize(("red", "green"), 12.0), domain_size.COLONY, 0.02, 5, 100),
+    "domains": (
+        "toggle_switch",
+        domain_size.PARAMETERS,
+        DomainSize(("red", "green"), 12.0),
+        domain_size.COLONY,
+        0.02,
+        5,
+        100,
+    ),
 }
-# batches of 24, since a large one costs less a colony; a wide first cloud, since these landscapes have more than one valley
+# batches of 24, since a large one costs less a colony; a wide first cloud, since these landscapes
+# have more than one valley
 CLOUD = {"population": 24, "sigma": 0.5}
 METHODS = {
-    "sobol": Sobol, "cmaes": lambda: CMAES(**CLOUD), "cmaes by default": CMAES, "racing": lambda: Racing(inner=CMAES(**CLOUD)),
+    "sobol": Sobol,
+    "cmaes": lambda: CMAES(**CLOUD),
+    "cmaes by default": CMAES,
+    "racing": lambda: Racing(inner=CMAES(**CLOUD)),
     "bayesian": Bayesian,
-}  # fmt: skip
+}
 REPLICATES = 4
 
 
@@ -71,13 +93,23 @@ def together(objective: Objective, runs: list[Run], colonies: int) -> None:
         groups: dict[tuple[float, int], list] = {}
         for run in open_runs:
             batch = run.method.ask()
-            groups.setdefault((batch.size, batch.replicates or objective.replicates), []).append((run, batch))
+            groups.setdefault((batch.size, batch.replicates or objective.replicates), []).append(
+                (run, batch)
+            )
         for (size, count), mine in groups.items():
-            found = objective.evaluate(np.concatenate([b.points for _, b in mine]), streams=range(count), size=size)
+            found = objective.evaluate(
+                np.concatenate([b.points for _, b in mine]), streams=range(count), size=size
+            )
             parts = np.split(found.loss, np.cumsum([len(b.points) for _, b in mine])[:-1])
             for (run, batch), loss in zip(mine, parts, strict=True):
                 run.tell(batch, loss, found.seconds * len(loss) / len(found.loss))
-        print(f"\r{min(r.colonies for r in open_runs):6.0f} of {colonies} colonies, best {min(r.loss for r in runs):.4f}", end="", file=sys.stderr, flush=True)
+        print(
+            f"\r{min(r.colonies for r in open_runs):6.0f} of {colonies} colonies, best"
+            f" {min(r.loss for r in runs):.4f}",
+            end="",
+            file=sys.stderr,
+            flush=True,
+        )
     print("\r" + " " * 60 + "\r", end="", file=sys.stderr)
 
 
@@ -89,7 +121,9 @@ def objective_of(target: str, **options) -> Objective:
 def methods(options: argparse.Namespace) -> dict:
     """Success, loss and colonies of every method on every target."""
     out: dict = {}
-    print(f"{'target':<9}{'method':<19}{'found':>7}{'colonies to it':>17}{'loss: median':>14}{'worst':>8}{'seconds a search':>18}")
+    print(
+        f"{'target':<9}{'method':<19}{'found':>7}{'colonies to it':>17}{'loss: median':>14}{'worst':>8}{'seconds a search':>18}"
+    )
     for target in options.targets:
         *_, threshold, seeds, colonies = TARGETS[target]
         seeds, colonies = options.seeds or seeds, options.colonies or colonies
@@ -100,16 +134,22 @@ def methods(options: argparse.Namespace) -> dict:
             needed = [next((c for c, _, loss in r.course if loss <= threshold), None) for r in runs]
             reached = sorted(n for n in needed if n is not None)
             out.setdefault(target, {})[name] = {
-                "threshold": threshold, "colonies": colonies, "needed": needed, "loss": [r.loss for r in runs], "seconds": [r.seconds for r in runs],
-                "best": [objective.space.values(r.point) for r in runs], "course": [r.course for r in runs],
-            }  # fmt: skip
+                "threshold": threshold,
+                "colonies": colonies,
+                "needed": needed,
+                "loss": [r.loss for r in runs],
+                "seconds": [r.seconds for r in runs],
+                "best": [objective.space.values(r.point) for r in runs],
+                "course": [r.course for r in runs],
+            }
             middle = f"{np.median([n if n is not None else np.inf for n in needed]):.0f}"
             losses = [r.loss for r in runs]
             print(
-                f"{target:<9}{name:<19}{len(reached):>4} of {seeds:<2}{middle:>14}{np.median(losses):>14.4f}{max(losses):>8.4f}"
+                f"{target:<9}{name:<19}{len(reached):>4} of"
+                f" {seeds:<2}{middle:>14}{np.median(losses):>14.4f}{max(losses):>8.4f}"
                 f"{np.mean([r.seconds for r in runs]):>18.1f}",
                 flush=True,
-            )  # fmt: skip
+            )
     return out
 
 
@@ -128,7 +168,8 @@ def unseen(options: argparse.Namespace) -> dict:
             out.setdefault(target, {})[name] = losses.mean(1).tolist()
             held = int((losses.mean(1) <= record["threshold"]).sum())
             print(
-                f"{target:<9}{name:<19}searched {np.median(record['loss']):.4f}, unseen {np.median(losses.mean(1)):.4f}, {held} of {len(points)} hold",
+                f"{target:<9}{name:<19}searched {np.median(record['loss']):.4f}, unseen"
+                f" {np.median(losses.mean(1)):.4f}, {held} of {len(points)} hold",
                 flush=True,
             )
     return out
@@ -138,27 +179,48 @@ def rate(options: argparse.Namespace) -> dict:
     """Designs an hour: one at a time, in batches, and in batches on recorded growth."""
     out: dict = {}
     for cells in options.cells:
-        for title, count, replay in (("one at a time", 1, False), ("batch", options.designs, False), ("batch on recorded growth", options.designs, True)):
+        for title, count, replay in (
+            ("one at a time", 1, False),
+            ("batch", options.designs, False),
+            ("batch on recorded growth", options.designs, True),
+        ):
             scene, parameters, wanted, colony, *_ = TARGETS["stripe"]
-            objective = Objective(scene, parameters, wanted, **{**colony, "cells": cells}, replicates=REPLICATES, replay=replay)
+            objective = Objective(
+                scene,
+                parameters,
+                wanted,
+                **{**colony, "cells": cells},
+                replicates=REPLICATES,
+                replay=replay,
+            )
             points = np.random.default_rng(0).random((count, objective.space.size))
             if replay:
                 objective.evaluate(points[:1])  # grow the course: once for a whole search
             begun = time.perf_counter()
             objective.evaluate(points)
             seconds = time.perf_counter() - begun
-            out.setdefault(str(cells), {})[title] = {"designs": count, "seconds": seconds, "designs_an_hour": 3600 * count / seconds}
+            out.setdefault(str(cells), {})[title] = {
+                "designs": count,
+                "seconds": seconds,
+                "designs_an_hour": 3600 * count / seconds,
+            }
             print(
-                f"{cells:>5} cells, {title:<26}{count:>4} designs × {REPLICATES} in {seconds:7.2f} s: {3600 * count / seconds:9.0f} designs an hour", flush=True
+                f"{cells:>5} cells, {title:<26}{count:>4} designs × {REPLICATES} in {seconds:7.2f}"
+                f" s: {3600 * count / seconds:9.0f} designs an hour",
+                flush=True,
             )
     return out
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("part", choices=("methods", "unseen", "rate"))
     parser.add_argument("--targets", nargs="*", choices=list(TARGETS), default=list(TARGETS))
-    parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=["sobol", "cmaes", "racing"])
+    parser.add_argument(
+        "--methods", nargs="*", choices=list(METHODS), default=["sobol", "cmaes", "racing"]
+    )
     parser.add_argument("--seeds", type=int)
     parser.add_argument("--colonies", type=int)
     parser.add_argument("--cells", type=int, nargs="*", default=[100, 500])

@@ -19,16 +19,26 @@ def cells(count: int, device="cpu"):
 
 
 def test_uniforms_are_uniform_and_strangers(device):
-    """Kolmogorov–Smirnov of 100,000 draws (they never change: p below 1e-3 would be a defect), and correlations within 4.5/√n
-    of lanes, events, purposes and cells."""
+    """Kolmogorov–Smirnov of 100,000 draws (they never change: p below 1e-3 would be a defect), and
+    correlations within 4.5/√n of lanes, events, purposes and cells."""
     colony, uid = cells(20_000, device)
     draw = keyed_draws(3, colony, uid, 7)
     rows = torch.arange(20_000, device=device)
     u = array(draw(rows, 0, "leap", 5))
     assert u.shape == (5, 20_000) and u.min() > 0 and u.max() < 1
     assert stats.kstest(u.reshape(-1), "uniform").pvalue > 1e-3
-    others = [u[1], u[2], array(draw(rows, 1, "leap", 1))[0], array(draw(rows, 0, "rare", 1))[0], np.roll(u[0], 1), np.roll(u[0], 1000)]
-    others += [array(keyed_draws(seed, colony, uid, step)(rows, 0, "leap", 1))[0] for seed, step in ((4, 7), (3, 8), (3 + 2**40, 7))]
+    others = [
+        u[1],
+        u[2],
+        array(draw(rows, 1, "leap", 1))[0],
+        array(draw(rows, 0, "rare", 1))[0],
+        np.roll(u[0], 1),
+        np.roll(u[0], 1000),
+    ]
+    others += [
+        array(keyed_draws(seed, colony, uid, step)(rows, 0, "leap", 1))[0]
+        for seed, step in ((4, 7), (3, 8), (3 + 2**40, 7))
+    ]
     for other in others:
         assert abs(np.corrcoef(u[0], other)[0, 1]) < 4.5 / np.sqrt(20_000)
 
@@ -41,22 +51,36 @@ def test_a_draw_is_its_own(device):
     rows = torch.tensor([2999, 0, 1500], device=device)
     assert torch.equal(draw(rows, 5, "x", 4), whole[:, rows])
     assert torch.equal(draw(rows, 5, "x", 1), whole[:1, rows])
-    assert torch.equal(keyed_draws(1, colony[rows], uid[rows], 2)(torch.tensor([0, 1, 2], device=device), 5, "x", 3), whole[:3, rows])
+    assert torch.equal(
+        keyed_draws(1, colony[rows], uid[rows], 2)(
+            torch.tensor([0, 1, 2], device=device), 5, "x", 3
+        ),
+        whole[:3, rows],
+    )
 
 
 @pytest.mark.parametrize("mean", [1e-9, 0.01, 0.5, 3.9, 4.1, 12.0, 80.0, 3e3, 1e6, 1e9])
 def test_poisson_inverts_the_distribution(device, mean):
-    """Against scipy's ppf at 3,000 uniforms and the far ends: the very same numbers, except where a uniform lies within rounding of a step."""
+    """Against scipy's ppf at 3,000 uniforms and the far ends: the very same numbers, except where a
+    uniform lies within rounding of a step."""
     g = torch.Generator().manual_seed(1)
-    u = torch.cat([torch.rand(3000, generator=g, dtype=F64), torch.tensor([2.0**-54, 1e-12, 1e-3, 0.999, 1 - 1e-12], dtype=F64)]).clamp(2.0**-54, 1 - 2.0**-53)
+    u = torch.cat(
+        [
+            torch.rand(3000, generator=g, dtype=F64),
+            torch.tensor([2.0**-54, 1e-12, 1e-3, 0.999, 1 - 1e-12], dtype=F64),
+        ]
+    ).clamp(2.0**-54, 1 - 2.0**-53)
     found = array(poisson(torch.full_like(u, mean).to(device), u.to(device)))
     expected = stats.poisson.ppf(array(u), mean)
     different = found != expected
     assert np.abs(found - expected).max() <= 1 and different.mean() <= 2e-3
-    # where they differ, the uniform is at the step itself: 1e-12 from the sum's rounding, or what the law's next correction, 1e-2 of a step, makes of it
+    # where they differ, the uniform is at the step itself: 1e-12 from the sum's rounding, or what
+    # the law's next correction, 1e-2 of a step, makes of it
     at = np.minimum(found, expected)[different]
     off = np.abs(stats.poisson.cdf(at, mean) - array(u)[different])
-    assert off.max(initial=0.0) <= (1e-12 if mean <= 1e6 else 1e-2 * stats.poisson.pmf(int(mean), mean))
+    assert off.max(initial=0.0) <= (
+        1e-12 if mean <= 1e6 else 1e-2 * stats.poisson.pmf(int(mean), mean)
+    )
 
 
 def test_poisson_at_the_ends(device):
@@ -70,7 +94,8 @@ def test_poisson_at_the_ends(device):
 
 
 def test_poisson_moments():
-    """Mean and variance of 200,000 stratified uniforms: the sums are integrals of the inverse, good to 1e-3 of the standard deviation."""
+    """Mean and variance of 200,000 stratified uniforms: the sums are integrals of the inverse, good
+    to 1e-3 of the standard deviation."""
     u = (torch.arange(200_000, dtype=F64) + 0.5) / 200_000
     for mean in (0.3, 4.0, 37.0, 1e4):
         k = array(poisson(torch.full_like(u, mean), u))
@@ -80,7 +105,12 @@ def test_poisson_moments():
 
 def test_poisson_bits_do_not_depend_on_company():
     g = torch.Generator().manual_seed(5)
-    mean, u = 10 ** (torch.rand(400, generator=g, dtype=F64) * 8 - 2), torch.rand(400, generator=g, dtype=F64)
+    mean, u = (
+        10 ** (torch.rand(400, generator=g, dtype=F64) * 8 - 2),
+        torch.rand(400, generator=g, dtype=F64),
+    )
     whole = poisson(mean, u)
-    assert torch.equal(torch.cat([poisson(mean[k : k + 1], u[k : k + 1]) for k in range(400)]), whole)
+    assert torch.equal(
+        torch.cat([poisson(mean[k : k + 1], u[k : k + 1]) for k in range(400)]), whole
+    )
     assert torch.equal(poisson(mean.reshape(4, 100), u.reshape(4, 100)).reshape(-1), whole)

@@ -28,19 +28,27 @@ def logistic(u, rows):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_order(method):
-    """u' = u (1 − u): halving the step divides the error by 2^order, over two halvings within 10 % of the order."""
+    """u' = u (1 − u): halving the step divides the error by 2^order, over two halvings within 10 %
+    of the order."""
     order, step = METHODS[method]
     exact = 1 / (1 + math.exp(-2) * 9)
-    errors = [abs(float(step(logistic, torch.tensor([[0.1]], dtype=F64), 2.0, steps=n)) - exact) for n in (16, 32, 64)]
+    errors = [
+        abs(float(step(logistic, torch.tensor([[0.1]], dtype=F64), 2.0, steps=n)) - exact)
+        for n in (16, 32, 64)
+    ]
     found = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert (np.abs(found - order) <= 0.1 * order).all(), found
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_row_is_its_own(device, dtype, method):
-    start = torch.rand(37, 3, generator=torch.Generator().manual_seed(1)).to(device=device, dtype=dtype)
+    start = torch.rand(37, 3, generator=torch.Generator().manual_seed(1)).to(
+        device=device, dtype=dtype
+    )
     speed = torch.linspace(0.1, 3, 37, device=device, dtype=dtype)
-    run = lambda k: METHODS[method][1](lambda u, rows: speed[k][rows].unsqueeze(1) * logistic(u, rows), start[k], 0.7, steps=3)  # noqa: E731
+    run = lambda k: METHODS[method][1](
+        lambda u, rows: speed[k][rows].unsqueeze(1) * logistic(u, rows), start[k], 0.7, steps=3
+    )
     whole = run(torch.arange(37, device=device))
     assert whole.dtype == dtype and whole.device.type == device.type
     for k in ([0], [36], list(range(36, -1, -1)), [5, 11, 3, 20, 7]):
@@ -51,12 +59,18 @@ def test_a_row_is_its_own(device, dtype, method):
 @pytest.mark.parametrize("method", METHODS)
 def test_gradient(method):
     step = METHODS[method][1]
-    u, k = torch.tensor([[0.1], [0.6]], dtype=F64, requires_grad=True), torch.tensor(1.3, dtype=F64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda u, k: step(lambda y, rows: k * logistic(y, rows), u, 1.0, steps=3), (u, k))
+    u, k = (
+        torch.tensor([[0.1], [0.6]], dtype=F64, requires_grad=True),
+        torch.tensor(1.3, dtype=F64, requires_grad=True),
+    )
+    assert torch.autograd.gradcheck(
+        lambda u, k: step(lambda y, rows: k * logistic(y, rows), u, 1.0, steps=3), (u, k)
+    )
 
 
 def test_equal_steps_in_float32():
-    """A number of steps whose size float32 does not hold: as many calls as steps, no sliver at the end."""
+    """A number of steps whose size float32 does not hold: as many calls as steps, no sliver at the
+    end."""
     calls = []
 
     def rates(u, rows):

@@ -16,11 +16,15 @@ POWERS = [1.0, 1.5, 2.0, 2.5, 4.0, 8.0]
 @pytest.mark.parametrize("power", POWERS)
 @pytest.mark.parametrize("tensor", [False, True], ids=["number", "tensor"])
 def test_values(device, dtype, power, tensor):
-    """Against NumPy in float64 over nine decades about K = 0.3: a power of n costs n |log x/K| roundings, 8 · 12 at most, and both laws are good relatively."""
+    """Against NumPy in float64 over nine decades about K = 0.3: a power of n costs n |log x/K|
+    roundings, 8 · 12 at most, and both laws are good relatively."""
     x = torch.logspace(-5, 4, 200, dtype=F64).to(device=device, dtype=dtype)
     half, n = (torch.tensor(v, dtype=dtype, device=device) if tensor else v for v in (0.3, power))
     r = array(x) / float(half)
-    for law, expected in ((activation, r**power / (1 + r**power)), (repression, 1 / (1 + r**power))):
+    for law, expected in (
+        (activation, r**power / (1 + r**power)),
+        (repression, 1 / (1 + r**power)),
+    ):
         found = law(x, half, n)
         assert found.dtype == dtype
         # below 1e-37 float32 has no full numbers
@@ -32,8 +36,14 @@ def test_values(device, dtype, power, tensor):
 @pytest.mark.parametrize("law, low, high", [(activation, 0.0, 1.0), (repression, 1.0, 0.0)])
 @pytest.mark.parametrize("tensor", [False, True], ids=["number", "tensor"])
 def test_the_ends(device, dtype, power, law, low, high, tensor):
-    """x/K from −1e30 to 1e30: the limits, no overflow, and two finite derivatives, by half and power as well."""
-    x = torch.tensor([-1e30, -1.0, 0.0, 1e-30, 1e-10, 1.0, 1e10, 1e30], dtype=dtype, device=device, requires_grad=True)
+    """x/K from −1e30 to 1e30: the limits, no overflow, and two finite derivatives, by half and
+    power as well."""
+    x = torch.tensor(
+        [-1e30, -1.0, 0.0, 1e-30, 1e-10, 1.0, 1e10, 1e30],
+        dtype=dtype,
+        device=device,
+        requires_grad=True,
+    )
     half = torch.full_like(x, 1.0, requires_grad=True)
     n = torch.full_like(x, power, requires_grad=True) if tensor else power
     inputs = [x, half, n] if tensor else [x, half]
@@ -47,7 +57,8 @@ def test_the_ends(device, dtype, power, law, low, high, tensor):
 
 
 def test_slope_at_zero(dtype):
-    """1/K for n = 1, also where the power is a tensor; 0 for n > 1; the curvature of n = 2 is 2/K²."""
+    """1/K for n = 1, also where the power is a tensor; 0 for n > 1; the curvature of n = 2 is
+    2/K²."""
     x = torch.zeros(3, dtype=dtype, requires_grad=True)
     for n in ([1.0, 2.0, 1.5], None):
         powers = torch.tensor(n, dtype=dtype) if n else 1.0
@@ -61,7 +72,10 @@ def test_slope_at_zero(dtype):
 @pytest.mark.parametrize("law", [activation, repression])
 def test_derivatives_by_finite_differences(law):
     x = torch.tensor([0.1, 0.4, 0.9, 3.0], dtype=F64, requires_grad=True)
-    half, n = torch.tensor([0.5, 0.3, 1.2, 1.0], dtype=F64, requires_grad=True), torch.tensor([1.0, 1.5, 2.0, 8.0], dtype=F64, requires_grad=True)
+    half, n = (
+        torch.tensor([0.5, 0.3, 1.2, 1.0], dtype=F64, requires_grad=True),
+        torch.tensor([1.0, 1.5, 2.0, 8.0], dtype=F64, requires_grad=True),
+    )
     assert torch.autograd.gradcheck(law, (x, half, n))
     assert torch.autograd.gradgradcheck(law, (x, half, n))
     assert torch.autograd.gradcheck(lambda x, k: law(x, k, 2.5), (x, half))
@@ -72,5 +86,9 @@ def test_bits_do_not_depend_on_company(dtype):
     for n in (1.0, 1.5, 2.0, 8.0, torch.tensor(2.7, dtype=dtype)):
         for law in (activation, repression):
             whole = law(x, 0.7, n)
-            assert torch.equal(torch.cat([law(x[k : k + 1], 0.7, n) for k in range(60)]), whole[:60])
-            assert all(torch.equal(law(x[3 : 3 + k], 0.7, n), whole[3 : 3 + k]) for k in range(2, 60))
+            assert torch.equal(
+                torch.cat([law(x[k : k + 1], 0.7, n) for k in range(60)]), whole[:60]
+            )
+            assert all(
+                torch.equal(law(x[3 : 3 + k], 0.7, n), whole[3 : 3 + k]) for k in range(2, 60)
+            )

@@ -23,7 +23,9 @@ def test_columns_by_name():
 
 def test_unknown_names_say_what_there_is():
     u = Names(("luxi", "ahl"), torch.zeros(1, 2), "u")
-    with pytest.raises(tf.InputError, match=r"u has no 'lux1'; known are luxi, ahl\. Did you mean 'luxi'\?"):
+    with pytest.raises(
+        tf.InputError, match=r"u has no 'lux1'; known are luxi, ahl\. Did you mean 'luxi'\?"
+    ):
         _ = u.lux1
     with pytest.raises(tf.InputError, match=r"known are luxi, ahl\.$"):
         _ = u["zzz"]

@@ -1,4 +1,5 @@
-"""Reactions, parts and networks: what they say, what they refuse, and their rates against the formulas written out."""
+"""Reactions, parts and networks: what they say, what they refuse, and their rates against the
+formulas written out."""
 
 from __future__ import annotations
 
@@ -13,7 +14,14 @@ import torchfilm as tf
 from torchfilm.circuits.draws import keyed_draws
 from torchfilm.circuits.names import Names
 from torchfilm.circuits.network import network
-from torchfilm.circuits.parts import activated, constitutive, conversion, degradation, exchange, repressed
+from torchfilm.circuits.parts import (
+    activated,
+    constitutive,
+    conversion,
+    degradation,
+    exchange,
+    repressed,
+)
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.rosenbrock import rosenbrock
 from torchfilm.circuits.stochastic import DONE, direct
@@ -35,11 +43,15 @@ def parts():
 
 def world(n=7, dtype=torch.float64, device="cpu"):
     g = torch.Generator().manual_seed(3)
-    draw = lambda *shape: (torch.rand(*shape, generator=g, dtype=torch.float64) + 0.1).to(device=device, dtype=dtype)  # noqa: E731
+    draw = lambda *shape: (torch.rand(*shape, generator=g, dtype=torch.float64) + 0.1).to(
+        device=device, dtype=dtype
+    )
     u = Names(SPECIES, draw(n, 3), "u")
     s = Names(SIGNALS, draw(n, 1), "s")
     p = Names(("k3", "K", "D1"), [0.9, draw(n), draw(n)], "p")
-    cell = Names(("volume", "area", "colony"), [draw(n), draw(n), torch.arange(n, device=device) % 2], "cell")
+    cell = Names(
+        ("volume", "area", "colony"), [draw(n), draw(n), torch.arange(n, device=device) % 2], "cell"
+    )
     return u, s, p, cell
 
 
@@ -67,7 +79,9 @@ def test_rates_are_the_formulas(device, dtype):
     change = net.changes(found)
     product = np.stack([array(f) for f in found], 1) @ array(net.stoichiometry)
     for k in range(4):
-        assert array(change[k]) == pytest.approx(product[:, k], rel=1e-5 if dtype == torch.float32 else 1e-12)
+        assert array(change[k]) == pytest.approx(
+            product[:, k], rel=1e-5 if dtype == torch.float32 else 1e-12
+        )
     # what leaves the cell enters the medium: amounts are both times the volume
     assert array(change[3]) == pytest.approx(array(found[5] - found[6]), rel=1e-6)
 
@@ -86,7 +100,8 @@ def test_stoichiometry():
         [-1, -2, 1, 0],
     ]
     assert net.parameters == ("k3", "K", "D1")
-    # luxi: a power of 1.5 in a repression, rounded up; ahl: squared; nothing reads yfp; the membrane reads out.ahl as it is
+    # luxi: a power of 1.5 in a repression, rounded up; ahl: squared; nothing reads yfp; the
+    # membrane reads out.ahl as it is
     assert net.orders.tolist() == [2, 2, 0, 1]
 
 
@@ -95,7 +110,9 @@ def test_equations_are_read():
     assert dict(r.consumes) == {"a": 2, "b": 1} and dict(r.produces) == {"c": 1, "out.x": 1, "a": 1}
     assert r.change() == {"a": -1, "b": -1, "c": 1, "out.x": 1}
     assert str(r) == "2 a + b -> c + out.x + a"
-    assert dict(Reaction.of(" -> a", 1.0).consumes) == {} and dict(Reaction.of("3a -> 0", 1.0).consumes) == {"a": 3}
+    assert dict(Reaction.of(" -> a", 1.0).consumes) == {} and dict(
+        Reaction.of("3a -> 0", 1.0).consumes
+    ) == {"a": 3}
     assert dict(Reaction.of("a + a -> b", 1.0).consumes) == {"a": 2}
     copy = pickle.loads(pickle.dumps(r))
     assert str(copy) == str(r) and copy.rate == "k"
@@ -127,7 +144,10 @@ def test_equations_are_read():
         (lambda: repressed("a", "b", -1.0, 1.0), "at least 0"),
         (lambda: conversion("a", enzyme="e", rate=1.0, half=0.0), "above 0"),
         (lambda: network([], ["a"]), "at least one"),
-        (lambda: network([degradation("lux1", 1.0)], ["luxi"]), "unknown name 'lux1'; known are luxi. Did you mean 'luxi'"),
+        (
+            lambda: network([degradation("lux1", 1.0)], ["luxi"]),
+            "unknown name 'lux1'; known are luxi. Did you mean 'luxi'",
+        ),
         (lambda: network([activated("a", "bee", 1.0, 1.0)], ["a", "be"]), "Did you mean 'be'"),
         (lambda: network([exchange("a", 1.0)], ["a"], ["b"]), "unknown name 'out.a'"),
         (lambda: network([degradation("a", 1.0), degradation("a", 2.0)], ["a"]), "only once"),
@@ -151,21 +171,46 @@ def test_gradient_of_rates():
     net = network(parts(), SPECIES, SIGNALS)
 
     def rates(x, outside, k3):
-        return torch.stack(net.concentration_rates(Names(SPECIES, x), Names(SIGNALS, outside), Names(("k3", "K", "D1"), [k3, p.K, p.D1]), cell))
+        return torch.stack(
+            net.concentration_rates(
+                Names(SPECIES, x),
+                Names(SIGNALS, outside),
+                Names(("k3", "K", "D1"), [k3, p.K, p.D1]),
+                cell,
+            )
+        )
 
     x = torch.stack([u.luxi, u.ahl, u.yfp], 1).requires_grad_()
-    assert torch.autograd.gradcheck(rates, (x, s.ahl.unsqueeze(1).requires_grad_(), torch.tensor(0.9, dtype=torch.float64, requires_grad=True)))
+    assert torch.autograd.gradcheck(
+        rates,
+        (
+            x,
+            s.ahl.unsqueeze(1).requires_grad_(),
+            torch.tensor(0.9, dtype=torch.float64, requires_grad=True),
+        ),
+    )
 
 
 def test_propensities_count_combinations(device, dtype):
-    """k Ω n(n − 1)/Ω² for 2 a; rate times Ω for functions; whole molecules only; a signal by its own pool."""
+    """k Ω n(n − 1)/Ω² for 2 a; rate times Ω for functions; whole molecules only; a signal by its
+    own pool."""
     net = network(
-        [Reaction.of("2 a -> b", 0.5), Reaction.of("-> a", 3.0), Reaction.of("out.x -> a", "k"), conversion("a", enzyme="b", rate=2.0, half=0.7)],
+        [
+            Reaction.of("2 a -> b", 0.5),
+            Reaction.of("-> a", 3.0),
+            Reaction.of("out.x -> a", "k"),
+            conversion("a", enzyme="b", rate=2.0, half=0.7),
+        ],
         ["a", "b"],
         ["x"],
     )
-    counts = torch.tensor([[5.0, 2.0, 3.75], [1.0, 0.0, 0.75], [0.0, 1.0, 0.0]], device=device, dtype=dtype)
-    volume, pool = torch.tensor([2.0, 3.0, 1.0], device=device, dtype=dtype), torch.tensor([10.0, 20.0, 30.0], device=device, dtype=dtype)
+    counts = torch.tensor(
+        [[5.0, 2.0, 3.75], [1.0, 0.0, 0.75], [0.0, 1.0, 0.0]], device=device, dtype=dtype
+    )
+    volume, pool = (
+        torch.tensor([2.0, 3.0, 1.0], device=device, dtype=dtype),
+        torch.tensor([10.0, 20.0, 30.0], device=device, dtype=dtype),
+    )
     cell = Names(("volume",), [volume], "cell")
     p = Names(("k",), [0.4], "p")
     a = array(net.propensities(counts, p, cell, copies=10.0, pool=pool))
@@ -174,21 +219,36 @@ def test_propensities_count_combinations(device, dtype):
     assert a[:, 1] == pytest.approx([60, 90, 30], rel=1e-6)
     assert a[:, 2] == pytest.approx([0.4 * 20 * 3 / 100, 0, 0], rel=1e-6)
     assert a[:, 3] == pytest.approx([2 * 2 * 0.25 / (0.7 + 0.25), 0, 0], rel=1e-6)
-    assert torch.equal(net.propensities(counts, p, cell, copies=10.0, pool=pool.unsqueeze(1)), net.propensities(counts, p, cell, copies=10.0, pool=pool))
+    assert torch.equal(
+        net.propensities(counts, p, cell, copies=10.0, pool=pool.unsqueeze(1)),
+        net.propensities(counts, p, cell, copies=10.0, pool=pool),
+    )
     with pytest.raises(tf.InputError, match="pool"):
         net.propensities(counts, p, cell)
 
 
 def test_both_ways_of_running_agree():
-    """Many molecules: the mean of the stochastic run is the smooth solution. Dimerisation among 1,000 molecules: fluctuations shift the mean
-    by a few molecules, 1 % is 10 of them; the sample's standard error is 1.
+    """Many molecules: the mean of the stochastic run is the smooth solution. Dimerisation among
+    1,000 molecules: fluctuations shift the mean by a few molecules, 1 % is 10 of them; the sample's
+    standard error is 1.
     """
-    net = network([constitutive("a", 5.0), Reaction.of("2 a -> b", 0.3), degradation("a", 1.0), degradation("b", 0.5)], ["a", "b"])
+    net = network(
+        [
+            constitutive("a", 5.0),
+            Reaction.of("2 a -> b", 0.3),
+            degradation("a", 1.0),
+            degradation("b", 0.5),
+        ],
+        ["a", "b"],
+    )
     none, cells, copies = Names((), ()), 300, 300.0
-    cell = lambda n: Names(("volume",), [torch.full((n,), 1.0, dtype=torch.float64)])  # noqa: E731
+    cell = lambda n: Names(("volume",), [torch.full((n,), 1.0, dtype=torch.float64)])
 
     def smooth(u, rows):
-        return torch.stack(net.changes(net.concentration_rates(Names(("a", "b"), u), none, none, cell(len(rows)))), 1)
+        return torch.stack(
+            net.changes(net.concentration_rates(Names(("a", "b"), u), none, none, cell(len(rows)))),
+            1,
+        )
 
     u, _ = rosenbrock(smooth, torch.tensor([[0.0, 0.0]], dtype=torch.float64), 1.0, rtol=1e-6)
     rows = torch.arange(cells)

@@ -1,4 +1,5 @@
-"""The stiff integrator: order, oracle, positivity, what is conserved, failures, gradients, and that a cell's result is its own."""
+"""The stiff integrator: order, oracle, positivity, what is conserved, failures, gradients, and that
+a cell's result is its own."""
 
 from __future__ import annotations
 
@@ -47,10 +48,13 @@ def lux(u, rows):
 
 
 def ring(u, rows):
-    """Six species, each activated by the one before; written as a user would, with a broken power."""
+    """Six species, each activated by the one before; written as a user would, with a broken
+    power."""
     with steady_functions():
         x = u.unbind(1)
-        return torch.stack([0.1 + x[i - 1] ** 1.7 / (0.5 + x[i - 1] ** 1.7) - x[i] for i in range(len(x))], 1)
+        return torch.stack(
+            [0.1 + x[i - 1] ** 1.7 / (0.5 + x[i - 1] ** 1.7) - x[i] for i in range(len(x))], 1
+        )
 
 
 def exact(rates, start, t, **options) -> np.ndarray:
@@ -61,7 +65,8 @@ def exact(rates, start, t, **options) -> np.ndarray:
 
 
 def test_order_three():
-    """Equal steps (every error allowed) on a nonlinear circuit: halving the step divides the error by 2³, measured over three halvings within 10 %."""
+    """Equal steps (every error allowed) on a nonlinear circuit: halving the step divides the error
+    by 2³, measured over three halvings within 10 %."""
     start = [0.3, 1.4]
     reference = exact(toggle, start, 2.0)
     errors = []
@@ -76,16 +81,21 @@ def test_order_three():
 
 
 def test_error_estimate_is_of_order_two_results():
-    """The step that is chosen shrinks with the cube root of rtol: the estimate is that of the embedded result, h³."""
+    """The step that is chosen shrinks with the cube root of rtol: the estimate is that of the
+    embedded result, h³."""
     start, counts = torch.tensor([[0.3, 1.4]], dtype=F64), []
     for rtol in (1e-6, 1e-9):
         counts.append(int(rosenbrock(toggle, start, 2.0, rtol=rtol, atol=0.0)[1].accepted))
     assert counts[1] / counts[0] == pytest.approx(10, rel=0.15)
 
 
-@pytest.mark.parametrize("rates, start, t", [(toggle, [0.3, 1.4], 5.0), (lux, [0.0, 0.0, 0.0], 20.0), (robertson, [1.0, 0.0, 0.0], 40.0)])
+@pytest.mark.parametrize(
+    "rates, start, t",
+    [(toggle, [0.3, 1.4], 5.0), (lux, [0.0, 0.0, 0.0], 20.0), (robertson, [1.0, 0.0, 0.0], 40.0)],
+)
 def test_against_lsoda(device, dtype, rates, start, t):
-    """Stable circuits: the error at the end is a few times what a step is allowed, rtol (1e-4 by default); ten times that is the bound."""
+    """Stable circuits: the error at the end is a few times what a step is allowed, rtol (1e-4 by
+    default); ten times that is the bound."""
     u, report = rosenbrock(rates, torch.tensor([start], dtype=dtype, device=device), t, atol=1e-10)
     assert (report.status == DONE).all()
     assert u.dtype == dtype
@@ -100,7 +110,7 @@ def test_error_follows_the_tolerance(rtol):
 
 def test_one_step_where_one_is_enough(device, dtype):
     """The whole of dt is tried at once: near a fixed point that is all, however fast the decay."""
-    rates = lambda u, rows: 1e8 * (1.0 - u)  # noqa: E731
+    rates = lambda u, rows: 1e8 * (1.0 - u)
     u, report = rosenbrock(rates, torch.ones(4, 2, dtype=dtype, device=device), 1.0)
     assert (report.accepted == 1).all() and (report.rejected == 0).all()
     assert torch.equal(u, torch.ones_like(u))
@@ -109,9 +119,12 @@ def test_one_step_where_one_is_enough(device, dtype):
 @pytest.mark.parametrize("size", [1.0, 1e-3, 1e-6, 1e-12, 1e-25])
 @pytest.mark.parametrize("t", [0.025, 1e-6, 3e-8])
 def test_a_fast_decay_to_zero_does_not_stall(device, dtype, size, t):
-    """Rates of 1e8 and 3e7 in a row beside slow ones: nothing below zero, the slow ones right, and steps as many as the accuracy of a decay over the
-    decades down to atol asks for (some 20 each), not t · 1e8."""
-    u, report = rosenbrock(chain, torch.tensor([[size, 0.0, 1.0, 2.0]], dtype=dtype, device=device), t)
+    """Rates of 1e8 and 3e7 in a row beside slow ones: nothing below zero, the slow ones right, and
+    steps as many as the accuracy of a decay over the decades down to atol asks for (some 20 each),
+    not t · 1e8."""
+    u, report = rosenbrock(
+        chain, torch.tensor([[size, 0.0, 1.0, 2.0]], dtype=dtype, device=device), t
+    )
     assert int(report.status) == DONE
     assert int(report.accepted + report.rejected) <= 250
     assert float(u.min()) >= 0
@@ -119,7 +132,8 @@ def test_a_fast_decay_to_zero_does_not_stall(device, dtype, size, t):
 
 
 def test_rates_are_not_asked_below_zero(device, dtype):
-    """x' = −1e6 x from below atol: stages of a long step lie at −x, where x^1.5 is no number. The rates are continued linearly there, so one step will do."""
+    """x' = −1e6 x from below atol: stages of a long step lie at −x, where x^1.5 is no number. The
+    rates are continued linearly there, so one step will do."""
     seen = []
 
     def rates(u, rows):
@@ -132,45 +146,63 @@ def test_rates_are_not_asked_below_zero(device, dtype):
     assert min(seen) >= 0
     assert float(u[0, 1]) == pytest.approx(1e-3 * np.exp(-0.025), rel=1e-4)
     # where values may be negative they are asked as they are
-    rosenbrock(rates, torch.tensor([[1e-13, 1e-3]], dtype=dtype, device=device), 0.025, nonnegative=False, max_steps=3)
+    rosenbrock(
+        rates,
+        torch.tensor([[1e-13, 1e-3]], dtype=dtype, device=device),
+        0.025,
+        nonnegative=False,
+        max_steps=3,
+    )
     assert min(seen) < 0
 
 
 @pytest.mark.parametrize("t", [0.4, 40.0, 4e9])
 def test_what_the_rates_conserve_is_conserved(device, dtype, t):
-    """Robertson's a + b + c = 1: kept to rounding, a unit of the dtype for each of 150 steps adding up at random and one more for f in it."""
-    u, report = rosenbrock(robertson, torch.tensor([[1.0, 0.0, 0.0]], dtype=dtype, device=device), t, atol=1e-10)
+    """Robertson's a + b + c = 1: kept to rounding, a unit of the dtype for each of 150 steps adding
+    up at random and one more for f in it."""
+    u, report = rosenbrock(
+        robertson, torch.tensor([[1.0, 0.0, 0.0]], dtype=dtype, device=device), t, atol=1e-10
+    )
     assert int(report.status) == DONE
     assert abs(float(u.double().sum()) - 1) <= 20 * torch.finfo(dtype).eps
     assert float(u.min()) >= 0
 
 
 def test_conserved_where_results_are_raised_to_zero():
-    """a + b -> c has two conserved sums; over steps so long that plain results would be below zero still nothing is lost: rounding of W's
-    entries, up to 1e4 · 5, against 2/h in it, is 1e-16 · h · 5e4 of what moves, at most 5."""
+    """a + b -> c has two conserved sums; over steps so long that plain results would be below zero
+    still nothing is lost: rounding of W's entries, up to 1e4 · 5, against 2/h in it, is 1e-16 · h ·
+    5e4 of what moves, at most 5."""
 
     def rates(u, rows):
         a, b, _ = u.unbind(1)
         flow = 1e4 * a * b
         return columns(-flow, -flow, flow)
 
-    start = torch.tensor([[1.0, 1e-3, 0.0], [1.0, 1.0, 0.0], [1e-6, 5.0, 0.0], [1e-12, 1.0, 0.3]], dtype=F64)
+    start = torch.tensor(
+        [[1.0, 1e-3, 0.0], [1.0, 1.0, 0.0], [1e-6, 5.0, 0.0], [1e-12, 1.0, 0.3]], dtype=F64
+    )
     for t in (1e-4, 1e-3, 0.1, 10.0):
         u, report = rosenbrock(rates, start, t)
         assert (report.status == DONE).all() and float(u.min()) >= 0
         for k in (0, 1):
-            assert torch.allclose(u[:, k] + u[:, 2], start[:, k] + start[:, 2], rtol=0, atol=1e-14 + 1e-16 * t * 5e4 * 5)
+            assert torch.allclose(
+                u[:, k] + u[:, 2],
+                start[:, k] + start[:, 2],
+                rtol=0,
+                atol=1e-14 + 1e-16 * t * 5e4 * 5,
+            )
 
 
 @pytest.mark.parametrize("fastest", [4, 8])
 def test_nonnegative_over_random_networks(device, dtype, fastest):
-    """200 cells of random first- and second-order reactions with constants from 1e-3 to 10^fastest, from random starts, some at 0: never below 0, all done.
+    """200 cells of random first- and second-order reactions with constants from 1e-3 to 10^fastest,
+    from random starts, some at 0: never below 0, all done.
 
-    The sum is conserved but for the rates' own rounding, which adds up to eps · rate · time for what moves: 0.025 · 1e4 · 6e-8 = 1.5e-5 in float32,
-    where 1e8 asks for float64.
+    The sum is conserved but for the rates' own rounding, which adds up to eps · rate · time for
+    what moves: 0.025 · 1e4 · 6e-8 = 1.5e-5 in float32, where 1e8 asks for float64.
     """
     g = torch.Generator().manual_seed(7)
-    pick = lambda *shape: 10 ** (torch.rand(*shape, generator=g, dtype=F64) * (fastest + 3) - 3)  # noqa: E731
+    pick = lambda *shape: 10 ** (torch.rand(*shape, generator=g, dtype=F64) * (fastest + 3) - 3)
     first = pick(200, 4, 4) * (torch.rand(200, 4, 4, generator=g) < 0.4)
     pair = pick(200)
     start = torch.rand(200, 4, generator=g, dtype=F64) * (torch.rand(200, 4, generator=g) < 0.6)
@@ -185,16 +217,24 @@ def test_nonnegative_over_random_networks(device, dtype, fastest):
     assert (report.status == DONE).all()
     assert float(u.min()) >= 0
     if dtype == F64 or fastest < 8:
-        assert torch.allclose(u.sum(1), start.sum(1), rtol=0, atol=torch.finfo(dtype).eps * (0.025 * 10**fastest + 10))
+        assert torch.allclose(
+            u.sum(1), start.sum(1), rtol=0, atol=torch.finfo(dtype).eps * (0.025 * 10**fastest + 10)
+        )
 
 
 def test_negative_values_are_free_where_asked_for(device, dtype):
-    u, report = rosenbrock(lambda u, rows: -torch.ones_like(u), torch.ones(1, 1, dtype=dtype, device=device), 3.0, nonnegative=False)
+    u, report = rosenbrock(
+        lambda u, rows: -torch.ones_like(u),
+        torch.ones(1, 1, dtype=dtype, device=device),
+        3.0,
+        nonnegative=False,
+    )
     assert int(report.status) == DONE and float(u) == pytest.approx(-2.0, rel=1e-6)
 
 
 def test_failures_stay_with_their_cell(device, dtype):
-    """A rate that is NaN, one that becomes infinite on the way, one that pushes below zero, and one that needs more steps than it may; the others go on."""
+    """A rate that is NaN, one that becomes infinite on the way, one that pushes below zero, and one
+    that needs more steps than it may; the others go on."""
 
     def rates(u, rows):
         x = u[:, 0]
@@ -221,43 +261,63 @@ def test_nothing_to_do(device, dtype):
     same, report = rosenbrock(toggle, start, 0.0)
     assert torch.equal(same, start) and (report.status == DONE).all()
     # a rate that does not depend on what there is has no Jacobian
-    grown, _ = rosenbrock(lambda u, rows: torch.full_like(u, 2.0).detach(), torch.zeros(2, 1, dtype=dtype, device=device), 0.5)
+    grown, _ = rosenbrock(
+        lambda u, rows: torch.full_like(u, 2.0).detach(),
+        torch.zeros(2, 1, dtype=dtype, device=device),
+        0.5,
+    )
     assert array(grown) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("count", [2, 7, 33, 200])
 def test_a_row_is_its_own(dtype, count):
-    """Bit by bit the same alone, in any batch and at any place: easy and stiff rows, results and step counts. With a gradient, the
-    Jacobian is worked out the other way, so the same but for rounding."""
+    """Bit by bit the same alone, in any batch and at any place: easy and stiff rows, results and
+    step counts. With a gradient, the Jacobian is worked out the other way, so the same but for
+    rounding."""
     g = torch.Generator().manual_seed(count)
     speed = (10 ** (torch.rand(count, generator=g, dtype=F64) * 6 - 1)).to(dtype)
     start = (torch.rand(count, 6, generator=g, dtype=F64) ** 3).to(dtype)
-    of = lambda k: lambda u, rows: speed[k][rows].unsqueeze(1) * ring(u, rows)  # noqa: E731
+    of = lambda k: lambda u, rows: speed[k][rows].unsqueeze(1) * ring(u, rows)
     whole, report = rosenbrock(of(torch.arange(count)), start, 0.5)
-    for k in (torch.arange(1), torch.arange(count).flip(0), torch.randperm(count, generator=g)[: count // 2], torch.arange(count - 1, count)):
+    for k in (
+        torch.arange(1),
+        torch.arange(count).flip(0),
+        torch.randperm(count, generator=g)[: count // 2],
+        torch.arange(count - 1, count),
+    ):
         part, own = rosenbrock(of(k), start[k], 0.5)
         assert torch.equal(part, whole[k])
-        assert torch.equal(own.accepted, report.accepted[k]) and torch.equal(own.rejected, report.rejected[k])
+        assert torch.equal(own.accepted, report.accepted[k]) and torch.equal(
+            own.rejected, report.rejected[k]
+        )
     traced, _ = rosenbrock(of(torch.arange(count)), start.clone().requires_grad_(), 0.5)
-    # of the Jacobian's last bits, which change a result by no more than that share of the error that is allowed
-    assert torch.allclose(traced.detach(), whole, rtol=1e-3 * 1e-4 + 4 * torch.finfo(dtype).eps, atol=1e-12)
+    # of the Jacobian's last bits, which change a result by no more than that share of the error
+    # that is allowed
+    assert torch.allclose(
+        traced.detach(), whole, rtol=1e-3 * 1e-4 + 4 * torch.finfo(dtype).eps, atol=1e-12
+    )
 
 
 def test_gradient_of_one_step():
-    """Exact derivative of what is computed, through the Jacobian and both solves: gradcheck, float64."""
+    """Exact derivative of what is computed, through the Jacobian and both solves: gradcheck,
+    float64."""
     u = torch.tensor([[0.3, 1.4], [2.0, 0.1]], dtype=F64, requires_grad=True)
     k = torch.tensor([4.0, 3.0], dtype=F64, requires_grad=True)
 
     def run(u, k):
-        rates = lambda y, rows: columns(k[0] * kinetics.repression(y[:, 1], 1.0, 2) - y[:, 0], k[1] * kinetics.repression(y[:, 0], 1.0, 2) - y[:, 1])  # noqa: E731
+        rates = lambda y, rows: columns(
+            k[0] * kinetics.repression(y[:, 1], 1.0, 2) - y[:, 0],
+            k[1] * kinetics.repression(y[:, 0], 1.0, 2) - y[:, 1],
+        )
         return rosenbrock(rates, u, 0.4, rtol=1e9)[0]
 
     assert torch.autograd.gradcheck(run, (u, k))
 
 
 def test_gradient_through_many_steps(dtype):
-    """Robertson's rate constants over 4 h, by central differences of runs with rtol 1e-7 (float64), whose own steps then do not matter: 1e-3
-    relative leaves truncation 1e-6 and noise 1e-4. The gradient's own error is that of the steps it goes through, some 10 rtol = 1e-3 of the answer.
+    """Robertson's rate constants over 4 h, by central differences of runs with rtol 1e-7 (float64),
+    whose own steps then do not matter: 1e-3 relative leaves truncation 1e-6 and noise 1e-4. The
+    gradient's own error is that of the steps it goes through, some 10 rtol = 1e-3 of the answer.
     """
 
     def run(k, rtol):
@@ -279,13 +339,16 @@ def test_gradient_through_many_steps(dtype):
 
 
 def test_gradient_where_results_are_raised_and_steps_rejected():
-    """Rejected steps and steps drawn to zero leave no NaN behind, and what is conserved has its exact gradient: ∂(a + b + c + …)/∂start = 1."""
+    """Rejected steps and steps drawn to zero leave no NaN behind, and what is conserved has its
+    exact gradient: ∂(a + b + c + …)/∂start = 1."""
 
     def rates(u, rows):
         a, b, _ = u.unbind(1)
         return columns(-1e8 * a, 1e8 * a - 3e7 * b, 3e7 * b)
 
-    u = torch.tensor([[1.0, 0.0, 0.5], [1e-9, 1e-12, 1.0], [0.0, 0.0, 0.0]], dtype=F64, requires_grad=True)
+    u = torch.tensor(
+        [[1.0, 0.0, 0.5], [1e-9, 1e-12, 1.0], [0.0, 0.0, 0.0]], dtype=F64, requires_grad=True
+    )
     out, report = rosenbrock(rates, u, 1e-6)
     assert int(report.rejected.max()) > 0
     grad = torch.autograd.grad(out.sum(), u)[0]
@@ -293,8 +356,9 @@ def test_gradient_where_results_are_raised_and_steps_rejected():
 
 
 def test_gradient_where_a_rejected_step_is_not_finite():
-    """x' = x − 1e-30 eˣ from 10 over 1.98 h: the first trial overflows (2/h − J is 0.01), the steps taken do not. Against central differences."""
-    rates = lambda u, rows: u - 1e-30 * torch.exp(u)  # noqa: E731
+    """x' = x − 1e-30 eˣ from 10 over 1.98 h: the first trial overflows (2/h − J is 0.01), the steps
+    taken do not. Against central differences."""
+    rates = lambda u, rows: u - 1e-30 * torch.exp(u)
     x = torch.full((3, 1), 10.0, dtype=F64) + torch.tensor([[0.0], [1e-3], [-1e-3]], dtype=F64)
     x.requires_grad_()
     u, report = rosenbrock(rates, x, 1.98, rtol=1e-7)
@@ -314,23 +378,41 @@ def test_no_graph_without_need():
 
 @pytest.mark.parametrize("size", [1, 2, 5, 12])
 def test_linear_systems(device, dtype, size):
-    """Against torch.linalg in float64; the transposed solve and the gradients too. Diagonally dominant: errors of a few units of rounding."""
+    """Against torch.linalg in float64; the transposed solve and the gradients too. Diagonally
+    dominant: errors of a few units of rounding."""
     g = torch.Generator().manual_seed(size)
-    matrix = (torch.rand(size, size, 9, generator=g, dtype=F64) - 0.5 + size * torch.eye(size, dtype=F64).unsqueeze(2)).to(device=device, dtype=dtype)
+    matrix = (
+        torch.rand(size, size, 9, generator=g, dtype=F64)
+        - 0.5
+        + size * torch.eye(size, dtype=F64).unsqueeze(2)
+    ).to(device=device, dtype=dtype)
     b = torch.rand(size, 9, generator=g, dtype=F64).to(device=device, dtype=dtype)
     lu, sound = linear.factor(matrix, torch.full_like(b, float(size)))
     assert sound.all()
     whole = matrix.permute(2, 0, 1).double()
-    for found, dense in ((linear.substitute(lu, b), whole), (linear.substitute_transposed(lu, b), whole.mT)):
-        assert torch.allclose(found.double(), torch.linalg.solve(dense, b.t().double()).t(), rtol=0, atol=10 * torch.finfo(dtype).eps)
-    assert torch.allclose(linear.multiply(matrix, b), torch.einsum("ikm,km->im", matrix, b), rtol=1e-5)
+    for found, dense in (
+        (linear.substitute(lu, b), whole),
+        (linear.substitute_transposed(lu, b), whole.mT),
+    ):
+        assert torch.allclose(
+            found.double(),
+            torch.linalg.solve(dense, b.t().double()).t(),
+            rtol=0,
+            atol=10 * torch.finfo(dtype).eps,
+        )
+    assert torch.allclose(
+        linear.multiply(matrix, b), torch.einsum("ikm,km->im", matrix, b), rtol=1e-5
+    )
     if dtype == F64:
-        run = lambda m, b: linear.solve(m, linear.factor(m.detach(), b.detach())[0], b)  # noqa: E731
-        assert torch.autograd.gradcheck(run, (matrix[..., :2].clone().requires_grad_(), b[:, :2].clone().requires_grad_()))
+        run = lambda m, b: linear.solve(m, linear.factor(m.detach(), b.detach())[0], b)
+        assert torch.autograd.gradcheck(
+            run, (matrix[..., :2].clone().requires_grad_(), b[:, :2].clone().requires_grad_())
+        )
 
 
 def test_pivots_that_vanish_are_noticed():
-    """J = 2/h makes W singular at its first pivot: reported, and the step is taken again at another size."""
+    """J = 2/h makes W singular at its first pivot: reported, and the step is taken again at another
+    size."""
     matrix = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=F64).unsqueeze(2)
     assert not bool(linear.factor(matrix, torch.ones(2, 1, dtype=F64))[1])
     u, report = rosenbrock(lambda u, rows: 2.0 * u, torch.ones(1, 1, dtype=F64), 1.0)

@@ -1,4 +1,5 @@
-"""One circuit over one step, without a scene: its pools, its reservoir, and what it says of what went wrong. Also its named columns."""
+"""One circuit over one step, without a scene: its pools, its reservoir, and what it says of what
+went wrong. Also its named columns."""
 
 from __future__ import annotations
 
@@ -21,17 +22,36 @@ def membrane(u, s, p, cell):
     return {"a": into / cell.volume}, {"a": -into}
 
 
-def circuit(part=membrane, *, pool=(8.0, 16.0, 4.0), signals=(1.0, 0.0, 2.0), beyond=None, given=("a",), rows=(0, 1, 2), dtype=F64, D1=3.0) -> run.Circuit:
+def circuit(
+    part=membrane,
+    *,
+    pool=(8.0, 16.0, 4.0),
+    signals=(1.0, 0.0, 2.0),
+    beyond=None,
+    given=("a",),
+    rows=(0, 1, 2),
+    dtype=F64,
+    D1=3.0,
+) -> run.Circuit:
     """In some of three cells of 2, 4 and 1 µm³."""
     cell = {"volume": torch.tensor([2.0, 4.0, 1.0], dtype=dtype)}
     return run.Circuit(
-        part, ("a", "b"), given, torch.tensor(rows), cell, {"D1": torch.tensor(D1, dtype=dtype)},
-        {"a": torch.tensor(signals, dtype=dtype)}, torch.tensor(pool, dtype=dtype), None if beyond is None else torch.tensor(beyond),
-    )  # fmt: skip
+        part,
+        ("a", "b"),
+        given,
+        torch.tensor(rows),
+        cell,
+        {"D1": torch.tensor(D1, dtype=dtype)},
+        {"a": torch.tensor(signals, dtype=dtype)},
+        torch.tensor(pool, dtype=dtype),
+        None if beyond is None else torch.tensor(beyond),
+    )
 
 
 def settings(method: str = "rosenbrock", **given) -> run.Settings:
-    return run.Settings(**{"method": method, "steps": 200, "rtol": 1e-9, "atol": 1e-12, "copies": 1.0, **given})
+    return run.Settings(
+        **{"method": method, "steps": 200, "rtol": 1e-9, "atol": 1e-12, "copies": 1.0, **given}
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -39,8 +59,17 @@ def test_what_cells_lose_their_pools_gain(method):
     made, start = circuit(), torch.tensor([[5.0, 7.0], [5.0, 7.0], [0.0, 7.0]], dtype=F64)
     found = run.step(made, start, 0.2, settings(method))
     volume, pool = made.cell["volume"], made.pool
-    assert torch.allclose(found.pools["a"], (start[:, 0] - found.concentrations[:, 0]) * volume, rtol=1e-12, atol=1e-14)
-    assert torch.equal(found.concentrations[:, 1], start[:, 1]) and found.beyond == {} and not bool(found.failed.any())
+    assert torch.allclose(
+        found.pools["a"],
+        (start[:, 0] - found.concentrations[:, 0]) * volume,
+        rtol=1e-12,
+        atol=1e-14,
+    )
+    assert (
+        torch.equal(found.concentrations[:, 1], start[:, 1])
+        and found.beyond == {}
+        and not bool(found.failed.any())
+    )
     # d/dt (u − s) = −D1 (1/V + 1/pool)(u − s)
     gap = (start[:, 0] - made.signals["a"]) * torch.exp(-3.0 * (1 / volume + 1 / pool) * 0.2)
     end = found.concentrations[:, 0] - (made.signals["a"] + found.pools["a"] / pool)
@@ -52,7 +81,9 @@ def test_only_the_rows_asked_for_in_their_order():
     whole, start = circuit(), torch.tensor([[5.0, 7.0], [3.0, 1.0], [0.0, 2.0]], dtype=F64)
     part = run.step(circuit(rows=(2, 0)), start[[2, 0]], 0.2, settings())
     full = run.step(whole, start, 0.2, settings())
-    assert torch.equal(part.concentrations, full.concentrations[[2, 0]]) and torch.equal(part.pools["a"], full.pools["a"][[2, 0]])
+    assert torch.equal(part.concentrations, full.concentrations[[2, 0]]) and torch.equal(
+        part.pools["a"], full.pools["a"][[2, 0]]
+    )
     assert torch.equal(part.steps, full.steps[[2, 0]])
 
 
@@ -62,11 +93,23 @@ def test_a_reservoir_does_not_change_and_what_it_got_is_told(method):
     start = torch.tensor([[5.0, 0.0], [5.0, 0.0], [0.0, 0.0]], dtype=F64)
     found = run.step(made, start, 0.2, settings(method))
     lost = (start[:, 0] - found.concentrations[:, 0]) * made.cell["volume"]
-    assert torch.allclose(found.beyond["a"], torch.stack([lost[0], lost.new_zeros(()), lost[2]]), rtol=1e-9, atol=1e-12)
+    assert torch.allclose(
+        found.beyond["a"],
+        torch.stack([lost[0], lost.new_zeros(()), lost[2]]),
+        rtol=1e-9,
+        atol=1e-12,
+    )
     assert found.beyond["a"][2] < 0 < found.beyond["a"][0]
-    assert torch.allclose(found.pools["a"], torch.stack([lost.new_zeros(()), lost[1], lost.new_zeros(())]), rtol=1e-9, atol=1e-12)
+    assert torch.allclose(
+        found.pools["a"],
+        torch.stack([lost.new_zeros(()), lost[1], lost.new_zeros(())]),
+        rtol=1e-9,
+        atol=1e-12,
+    )
     toward = 1.0 + 4.0 * math.exp(-3.0 / 2.0 * 0.2)
-    assert float(found.concentrations[0, 0]) == pytest.approx(toward, abs=2e-3 if method == "euler" else 1e-7)
+    assert float(found.concentrations[0, 0]) == pytest.approx(
+        toward, abs=2e-3 if method == "euler" else 1e-7
+    )
 
 
 def test_steps_are_counted():
@@ -83,7 +126,9 @@ def test_a_cell_that_fails_leaves_the_others_alone(method):
     made, start = circuit(breaks), torch.tensor([[1.0, 1.0], [5.0, 1.0], [2.0, 1.0]], dtype=F64)
     found = run.step(made, start, 0.1, settings(method))
     assert found.failed.tolist() == [False, True, False]
-    assert found.concentrations[[0, 2], 0].tolist() == pytest.approx([math.exp(-0.1), 2 * math.exp(-0.1)], rel=1e-3)
+    assert found.concentrations[[0, 2], 0].tolist() == pytest.approx(
+        [math.exp(-0.1), 2 * math.exp(-0.1)], rel=1e-3
+    )
     said = run.words(made, found, start, 1, method, 0.1)
     assert "the species 'a'" in said and "not a finite number" in said and "a = 5, b = 1" in said
 
@@ -94,7 +139,9 @@ def test_a_signal_whose_amount_breaks_is_told_apart():
     found = run.step(made, start, 0.1, settings("rk4"))
     said = run.words(made, found, start, 1, "rk4", 0.1)
     assert "the signal 'a'" in said and "species" not in said
-    with pytest.raises(InputError, match=r"gives -inf for the signal 'a' at the start \(a = 1, b = 0\)"):
+    with pytest.raises(
+        InputError, match=r"gives -inf for the signal 'a' at the start \(a = 1, b = 0\)"
+    ):
         run.trial(made, start)
 
 
@@ -106,11 +153,18 @@ def test_the_trial_tells_what_is_given():
 
 
 def test_rates_may_be_numbers():
-    found = run.step(circuit(lambda u, s, p, cell: {"a": 2.0, "b": torch.tensor(1, dtype=F64)}, given=()), torch.zeros(3, 2, dtype=F64), 0.5, settings())
-    assert torch.allclose(found.concentrations, torch.tensor([[1.0, 0.5]] * 3, dtype=F64), rtol=1e-12)
+    found = run.step(
+        circuit(lambda u, s, p, cell: {"a": 2.0, "b": torch.tensor(1, dtype=F64)}, given=()),
+        torch.zeros(3, 2, dtype=F64),
+        0.5,
+        settings(),
+    )
+    assert torch.allclose(
+        found.concentrations, torch.tensor([[1.0, 0.5]] * 3, dtype=F64), rtol=1e-12
+    )
 
 
-# --- columns --------------------------------------------------------------------------------------------------------------
+# --- columns --------------------------------------------------------------------------------------
 
 
 def test_columns_are_picked_out_when_asked_for_and_noted():
@@ -120,10 +174,26 @@ def test_columns_are_picked_out_when_asked_for_and_noted():
         made.append(1)
         return torch.tensor([1.0, 2.0, 3.0])
 
-    columns = Columns({"a": torch.tensor([4.0, 5.0, 6.0]), "slow": Lazy(slow), "k": 7.0, "t": torch.tensor(8.0)}, torch.tensor([2, 0]), "cell", seen)
-    assert columns.a.tolist() == [6.0, 4.0] and columns["k"] == 7.0 and float(columns.t) == 8.0 and made == [] and seen == {"a", "k", "t"}
+    columns = Columns(
+        {"a": torch.tensor([4.0, 5.0, 6.0]), "slow": Lazy(slow), "k": 7.0, "t": torch.tensor(8.0)},
+        torch.tensor([2, 0]),
+        "cell",
+        seen,
+    )
+    assert (
+        columns.a.tolist() == [6.0, 4.0]
+        and columns["k"] == 7.0
+        and float(columns.t) == 8.0
+        and made == []
+        and seen == {"a", "k", "t"}
+    )
     assert columns.slow.tolist() == [3.0, 1.0] and columns.slow is columns.slow and made == [1]
-    assert "slow" in columns and "none" not in columns and len(columns) == 4 and list(columns) == ["a", "slow", "k", "t"]
+    assert (
+        "slow" in columns
+        and "none" not in columns
+        and len(columns) == 4
+        and list(columns) == ["a", "slow", "k", "t"]
+    )
     assert repr(columns) == "Columns(a, slow, k, t)"
     with pytest.raises(UnknownName, match=r"cell has no 'slwo'.*Did you mean 'slow'"):
         _ = columns.slwo
@@ -142,10 +212,20 @@ def test_a_lazy_column_is_worked_out_once_for_all_rows():
 @pytest.mark.parametrize(
     ("given", "wanted"),
     [
-        (2, [2.0, 2.0]), (0.5, [0.5, 0.5]), (torch.tensor(3), [3.0, 3.0]), (torch.tensor([1, 2]), [1.0, 2.0]), (torch.ones(2, dtype=F64), [1.0, 1.0]),
-        (True, None), ("1", None), (None, None), (torch.ones(3), None), (torch.ones(2, 1), None),
+        (2, [2.0, 2.0]),
+        (0.5, [0.5, 0.5]),
+        (torch.tensor(3), [3.0, 3.0]),
+        (torch.tensor([1, 2]), [1.0, 2.0]),
+        (torch.ones(2, dtype=F64), [1.0, 1.0]),
+        (True, None),
+        ("1", None),
+        (None, None),
+        (torch.ones(3), None),
+        (torch.ones(2, 1), None),
     ],
-)  # fmt: skip
+)
 def test_a_rate_is_a_column_or_a_number(given, wanted, dtype):
     found = column(given, 2, torch.zeros(5, dtype=dtype))
-    assert (found is None) if wanted is None else (found.tolist() == wanted and found.dtype == dtype)
+    assert (
+        (found is None) if wanted is None else (found.tolist() == wanted and found.dtype == dtype)
+    )

@@ -1,4 +1,5 @@
-"""Reactions molecule by molecule, against what is known exactly; bounds are 5 standard errors of the sample at a fixed seed."""
+"""Reactions molecule by molecule, against what is known exactly; bounds are 5 standard errors of
+the sample at a fixed seed."""
 
 from __future__ import annotations
 
@@ -20,18 +21,35 @@ def columns(*parts):
     return torch.stack(torch.broadcast_tensors(*parts), 1)
 
 
-def run(method, start, propensities, stoichiometry, t, *, cells=4000, seed=1, dtype=torch.float32, device="cpu", **options):
+def run(
+    method,
+    start,
+    propensities,
+    stoichiometry,
+    t,
+    *,
+    cells=4000,
+    seed=1,
+    dtype=torch.float32,
+    device="cpu",
+    **options,
+):
     rows = torch.arange(cells, device=device)
     draw = keyed_draws(seed, torch.zeros_like(rows), rows, 0)
     counts = torch.tensor(start, dtype=dtype, device=device).repeat(cells, 1)
-    out, report = METHODS[method](counts, propensities, torch.tensor(stoichiometry), t, draw, **options)
+    out, report = METHODS[method](
+        counts, propensities, torch.tensor(stoichiometry), t, draw, **options
+    )
     assert (report.status == DONE).all() and (report.reaction == -1).all()
     assert out.dtype == dtype and (out >= 0).all() and torch.equal(out, out.round())
     return array(out), report
 
 
-def check_moments(sample: np.ndarray, mean: float, variance: float, fourth: float | None = None, bias: float = 0.0) -> None:
-    """Mean and variance within 5 standard errors, √(σ²/n) and √((μ₄ − σ⁴)/n) (μ₄ of a normal law unless given), and a relative `bias` allowed."""
+def check_moments(
+    sample: np.ndarray, mean: float, variance: float, fourth: float | None = None, bias: float = 0.0
+) -> None:
+    """Mean and variance within 5 standard errors, √(σ²/n) and √((μ₄ − σ⁴)/n) (μ₄ of a normal law
+    unless given), and a relative `bias` allowed."""
     n = len(sample)
     assert abs(sample.mean() - mean) <= 5 * np.sqrt(variance / n) + bias * mean
     spread = np.sqrt(((3 * variance**2 if fourth is None else fourth) - variance**2) / n)
@@ -45,13 +63,22 @@ def birth_death(rate):
     return lambda n, rows: columns(torch.full_like(n[:, 0], rate), n[:, 0])
 
 
-@pytest.mark.parametrize("method, mean", [("direct", 3.0), ("direct", 20.0), ("tau", 3.0), ("tau", 400.0), ("tau", 1e4)])
+@pytest.mark.parametrize(
+    "method, mean", [("direct", 3.0), ("direct", 20.0), ("tau", 3.0), ("tau", 400.0), ("tau", 1e4)]
+)
 def test_birth_and_death(device, method, mean):
-    """∅ → a at λ, a → ∅ at 1/h from 0: Poisson of mean λ (1 − e⁻ᵗ) at any time. Tau-leaping adds ε/2 of bias at most to the variance."""
+    """∅ → a at λ, a → ∅ at 1/h from 0: Poisson of mean λ (1 − e⁻ᵗ) at any time. Tau-leaping adds
+    ε/2 of bias at most to the variance."""
     t = 2.0
     sample, report = run(method, [0.0], birth_death(mean), BIRTH_DEATH, t, device=device)
     expected = mean * (1 - np.exp(-t))
-    check_moments(sample[:, 0], expected, expected, 3 * expected**2 + expected, 0.0 if method == "direct" else 0.015)
+    check_moments(
+        sample[:, 0],
+        expected,
+        expected,
+        3 * expected**2 + expected,
+        0.0 if method == "direct" else 0.015,
+    )
     if mean >= 400:
         # it leaps: event by event it would take 2 λt of them, less those that are still there
         assert float(report.steps.double().mean()) < 0.4 * (2 * mean * t - expected)
@@ -81,18 +108,21 @@ def master_equation(size, rates, changes, start, t):
 
 @both
 def test_dimerisation(device, method):
-    """Against the master equation of 0 … 120 molecules: moments, and the whole distribution by χ² (p > 1e-3 at the fixed seed)."""
+    """Against the master equation of 0 … 120 molecules: moments, and the whole distribution by χ²
+    (p > 1e-3 at the fixed seed)."""
     p = master_equation(120, lambda n: (8.0, 0.05 * n * (n - 1), 0.1 * n), (1, -2, -1), 30, 1.5)
     n = np.arange(120)
     mean = (p * n).sum()
     variance, fourth = (p * (n - mean) ** 2).sum(), (p * (n - mean) ** 4).sum()
     sample, _ = run(method, [30.0], dimers, DIMERS, 1.5, device=device)
-    # a leap would change x by 2 molecules at most here, which is ε x/g and more: single events almost always, so no bias to speak of
+    # a leap would change x by 2 molecules at most here, which is ε x/g and more: single events
+    # almost always, so no bias to speak of
     check_moments(sample[:, 0], mean, variance, fourth)
 
 
 def gene(n, rows):
-    """A gene, off or on, that goes on at 1 and off at 3, makes protein at 40 when on; protein is lost at 1 (all 1/h)."""
+    """A gene, off or on, that goes on at 1 and off at 3, makes protein at 40 when on; protein is
+    lost at 1 (all 1/h)."""
     off, on, protein = n.unbind(1)
     return columns(1.0 * off, 3.0 * on, 40.0 * on, protein)
 
@@ -102,9 +132,11 @@ GENE = [[-1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
 
 @both
 def test_two_state_gene(device, method):
-    """Stationary mean m = 40 · ¼ and variance m + m² (k_off/k_on) γ/(γ + k_on + k_off) = 10 + 100 · 3/5 = 70; gene on a quarter of the time.
+    """Stationary mean m = 40 · ¼ and variance m + m² (k_off/k_on) γ/(γ + k_on + k_off) = 10 + 100 ·
+    3/5 = 70; gene on a quarter of the time.
 
-    After 8 lifetimes e⁻⁸ = 3e-4 of the start is left. μ₄ is less than 4 σ⁴ for this (beta-mixed) law.
+    After 8 lifetimes e⁻⁸ = 3e-4 of the start is left. μ₄ is less than 4 σ⁴ for this (beta-mixed)
+    law.
     """
     sample, _ = run(method, [1.0, 0.0, 0.0], gene, GENE, 8.0, device=device)
     assert (sample[:, 0] + sample[:, 1] == 1).all()
@@ -113,7 +145,8 @@ def test_two_state_gene(device, method):
 
 
 def test_tau_leap_is_direct_in_law():
-    """a + b ⇌ c, 3,000 each, half way: leaps and single events give the same means and variances within 5 standard errors of their difference, and ε/2."""
+    """a + b ⇌ c, 3,000 each, half way: leaps and single events give the same means and variances
+    within 5 standard errors of their difference, and ε/2."""
 
     def propensities(n, rows):
         a, b, c = n.unbind(1)
@@ -121,48 +154,80 @@ def test_tau_leap_is_direct_in_law():
 
     change, start = [[-1.0, -1.0, 1.0], [1.0, 1.0, -1.0]], [3000.0, 3000.0, 0.0]
     slow, slow_report = run("direct", start, propensities, change, 0.5, cells=2000)
-    fast, fast_report = run("tau", start, propensities, change, 0.5, cells=2000, seed=2, orders=torch.tensor([2.0, 2.0, 1.0]))
+    fast, fast_report = run(
+        "tau",
+        start,
+        propensities,
+        change,
+        0.5,
+        cells=2000,
+        seed=2,
+        orders=torch.tensor([2.0, 2.0, 1.0]),
+    )
     # the first molecules of c come one by one, and a leap may change c by 3 % of it
     assert float(fast_report.steps.double().mean()) < 0.4 * float(slow_report.steps.double().mean())
     assert np.abs(fast[:, 0] + fast[:, 2] - 3000).max() == 0
     variance = slow[:, 2].var()
-    assert abs(slow[:, 2].mean() - fast[:, 2].mean()) <= 5 * np.sqrt(2 * variance / 2000) + 0.015 * slow[:, 2].mean()
+    assert (
+        abs(slow[:, 2].mean() - fast[:, 2].mean())
+        <= 5 * np.sqrt(2 * variance / 2000) + 0.015 * slow[:, 2].mean()
+    )
     assert abs(fast[:, 2].var() / variance - 1) <= 5 * np.sqrt(4 / 2000) + 0.03
 
 
 @both
 def test_no_number_goes_negative(device, method):
-    """Few molecules, fast two-body loss and stoichiometries of 3: hard on leaps. What is conserved stays: a + 3 c."""
+    """Few molecules, fast two-body loss and stoichiometries of 3: hard on leaps. What is conserved
+    stays: a + 3 c."""
 
     def propensities(n, rows):
         a, _ = n.unbind(1)
         return columns(2.0 * a * (a - 1).clamp(min=0) * (a - 2).clamp(min=0) / 6, 50.0 * n[:, 1])
 
-    sample, _ = run(method, [400.0, 0.0], propensities, [[-3.0, 1.0], [3.0, -1.0]], 0.05, cells=500, device=device)
+    sample, _ = run(
+        method,
+        [400.0, 0.0],
+        propensities,
+        [[-3.0, 1.0], [3.0, -1.0]],
+        0.05,
+        cells=500,
+        device=device,
+    )
     assert (sample[:, 0] + 3 * sample[:, 1] == 400).all()
 
 
 def test_what_runs_out_fires_alone():
-    """a → ∅ at a steady 12/h, whatever there is, from 9 and from 12: no leap sees the end coming. From 9 it is critical, hence exact: (9 − Poisson(12))⁺ is
-    left after an hour. From 12 leaps may overshoot; they are taken again, half as long.
+    """a → ∅ at a steady 12/h, whatever there is, from 9 and from 12: no leap sees the end coming.
+    From 9 it is critical, hence exact: (9 − Poisson(12))⁺ is left after an hour. From 12 leaps may
+    overshoot; they are taken again, half as long.
     """
-    steady = lambda n, rows: torch.full_like(n, 12.0)  # noqa: E731
+    steady = lambda n, rows: torch.full_like(n, 12.0)
     left, _ = run("tau", [9.0], steady, [[-1.0]], 1.0, orders=torch.tensor([0.0]))
     n = np.arange(60)
     rest, p = np.maximum(9 - n, 0), stats.poisson.pmf(n, 12)
     mean = (rest * p).sum()
     check_moments(left[:, 0], mean, (p * (rest - mean) ** 2).sum(), (p * (rest - mean) ** 4).sum())
-    _, report = run("tau", [12.0], lambda n, rows: torch.full_like(n, 30.0), [[-1.0]], 1.0, orders=torch.tensor([0.0]))
+    _, report = run(
+        "tau",
+        [12.0],
+        lambda n, rows: torch.full_like(n, 30.0),
+        [[-1.0]],
+        1.0,
+        orders=torch.tensor([0.0]),
+    )
     assert int(report.steps.max()) <= 20
 
 
 @both
 def test_what_is_less_than_a_molecule_stays(device, method):
-    """Remainders given in (0.75 of a molecule of a signal outside) are kept, and are never taken."""
+    """Remainders given in (0.75 of a molecule of a signal outside) are kept, and are never
+    taken."""
     rows = torch.arange(300, device=device)
     draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
     start = torch.tensor([[0.0, 4.75]], device=device).repeat(300, 1)
-    out, report = METHODS[method](start, lambda n, rows: columns(100 * n[:, 1]), torch.tensor([[1.0, -1.0]]), 10.0, draw)
+    out, report = METHODS[method](
+        start, lambda n, rows: columns(100 * n[:, 1]), torch.tensor([[1.0, -1.0]]), 10.0, draw
+    )
     assert (report.status == DONE).all()
     assert out[:, 1].tolist() == [0.75] * 300 and out[:, 0].tolist() == [4.0] * 300
 
@@ -171,15 +236,30 @@ def test_what_is_less_than_a_molecule_stays(device, method):
 def test_failures_stay_with_their_cell(device, dtype, method):
     def propensities(n, rows):
         x = n[:, 0]
-        bad = torch.where(rows == 2, torch.full_like(x, -1.0), torch.where(rows == 3, torch.full_like(x, torch.nan), x))
-        return columns(torch.where(rows == 4, torch.full_like(x, 1e9), torch.full_like(x, 5.0)), bad)
+        bad = torch.where(
+            rows == 2,
+            torch.full_like(x, -1.0),
+            torch.where(rows == 3, torch.full_like(x, torch.nan), x),
+        )
+        return columns(
+            torch.where(rows == 4, torch.full_like(x, 1e9), torch.full_like(x, 5.0)), bad
+        )
 
     rows = torch.arange(6, device=device)
     draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
     start = torch.full((6, 1), 10.0, dtype=dtype, device=device)
-    out, report = METHODS[method](start, propensities, torch.tensor([[1.0], [-1.0]]), 1.0, draw, max_steps=100)
+    out, report = METHODS[method](
+        start, propensities, torch.tensor([[1.0], [-1.0]]), 1.0, draw, max_steps=100
+    )
     leaps = method == "tau"
-    assert report.status.tolist() == [DONE, DONE, BAD_PROPENSITY, BAD_PROPENSITY, report.status.tolist()[4], DONE]
+    assert report.status.tolist() == [
+        DONE,
+        DONE,
+        BAD_PROPENSITY,
+        BAD_PROPENSITY,
+        report.status.tolist()[4],
+        DONE,
+    ]
     assert leaps or int(report.status[4]) == TOO_MANY_EVENTS
     assert report.reaction.tolist() == [-1, -1, 1, 1, -1, -1]
     assert out[2:4, 0].tolist() == [10.0, 10.0]
@@ -195,14 +275,33 @@ def test_a_row_is_its_own(method, name):
 
     def result(k):
         if name == "gene":
-            propensities, change, start = (lambda n, rows: gene(n, rows) * (1 + cell[k][rows] / 60).unsqueeze(1)), GENE, [[1.0, 0.0, 5.0]]
+            propensities, change, start = (
+                (lambda n, rows: gene(n, rows) * (1 + cell[k][rows] / 60).unsqueeze(1)),
+                GENE,
+                [[1.0, 0.0, 5.0]],
+            )
         else:
-            propensities, change, start = (lambda n, rows: columns(rate[k][rows], n[:, 0])), BIRTH_DEATH, [[50.0]]
+            propensities, change, start = (
+                (lambda n, rows: columns(rate[k][rows], n[:, 0])),
+                BIRTH_DEATH,
+                [[50.0]],
+            )
         draw = keyed_draws(9, torch.zeros_like(k), cell[k], 3)
-        return METHODS[method](torch.tensor(start, dtype=torch.float64).repeat(len(k), 1), propensities, torch.tensor(change), 0.2, draw)
+        return METHODS[method](
+            torch.tensor(start, dtype=torch.float64).repeat(len(k), 1),
+            propensities,
+            torch.tensor(change),
+            0.2,
+            draw,
+        )
 
     whole, report = result(cell)
-    for k in (torch.tensor([0]), torch.tensor([59]), cell.flip(0), torch.tensor([40, 3, 17, 58, 22, 9, 31])):
+    for k in (
+        torch.tensor([0]),
+        torch.tensor([59]),
+        cell.flip(0),
+        torch.tensor([40, 3, 17, 58, 22, 9, 31]),
+    ):
         part, own = result(k)
         assert torch.equal(part, whole[k]) and torch.equal(own.steps, report.steps[k])
 
@@ -212,10 +311,12 @@ def test_nothing_to_do(device, dtype, method):
     rows = torch.arange(3, device=device)
     draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
     start = torch.tensor([[0.0], [5.0], [7.0]], dtype=dtype, device=device)
-    nothing = lambda n, rows: torch.zeros_like(n)  # noqa: E731
+    nothing = lambda n, rows: torch.zeros_like(n)
     out, report = METHODS[method](start, nothing, torch.tensor([[-1.0]]), 1.0, draw)
     assert torch.equal(out, start) and (report.status == DONE).all()
-    out, _ = METHODS[method](start[:0], nothing, torch.tensor([[-1.0]]), 1.0, keyed_draws(1, rows[:0], rows[:0], 0))
+    out, _ = METHODS[method](
+        start[:0], nothing, torch.tensor([[-1.0]]), 1.0, keyed_draws(1, rows[:0], rows[:0], 0)
+    )
     assert out.shape == (0, 1)
     # the input is not touched
     moved, _ = METHODS[method](start, lambda n, rows: n, torch.tensor([[-1.0]]), 5.0, draw)

@@ -1,4 +1,5 @@
-"""Small scenes to search, at the top level of a module so that they pickle, and targets whose losses tell what was measured."""
+"""Small scenes to search, at the top level of a module so that they pickle, and targets whose
+losses tell what was measured."""
 
 from __future__ import annotations
 
@@ -18,9 +19,12 @@ def filling(u, s, p, cell):
 
 
 def grown(rate, make=1.0, decay=1.0, *more, low=3.0, high=4.0):
-    """Colonies that fill with one species, more so at their ends. Without mechanics they are quick, and what is tested here does not ask for it."""
+    """Colonies that fill with one species, more so at their ends. Without mechanics they are quick,
+    and what is tested here does not ask for it."""
     circuit = tf.Circuit(filling, species=("gfp",), make=make, decay=decay)
-    return tf.Scene(tf.Growth(rate=rate), tf.Division(length=tf.Uniform(low, high)), circuit, *more, dt=DT)
+    return tf.Scene(
+        tf.Growth(rate=rate), tf.Division(length=tf.Uniform(low, high)), circuit, *more, dt=DT
+    )
 
 
 def lit(make=1.0, decay=1.0):
@@ -34,7 +38,8 @@ def paced(rate=1.0, make=1.0):
 
 
 def uneven(make=1.0):
-    """Cells of very different pace: with seed 2, stream 0 takes more than twice as long as stream 1."""
+    """Cells of very different pace: with seed 2, stream 0 takes more than twice as long as stream
+    1."""
     return grown(tf.Uniform(0.2, 4.0), make)
 
 
@@ -57,7 +62,12 @@ def fragile(make=1.0):
 
 def short(added=2.0):
     """Cells divide while too short for two new caps where less than 0.7 µm is added."""
-    return tf.Scene(tf.Growth(rate=1.0), tf.Division(added=added), founders=tf.Cells.single(2, length=0.3), dt=DT)
+    return tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Division(added=added),
+        founders=tf.Cells.single(2, length=0.3),
+        dt=DT,
+    )
 
 
 def built(genes=1, promoter="weak", make=1.0):
@@ -98,7 +108,10 @@ class Spread(Target):
     """No species at all: how far the cells are from the origin, µm²."""
 
     def loss(self, state, history=None):
-        return state.groups.sum(state.position.double().square().sum(1, keepdim=True)).squeeze(1) / state.counts
+        return (
+            state.groups.sum(state.position.double().square().sum(1, keepdim=True)).squeeze(1)
+            / state.counts
+        )
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""Other processes and machines: the same bits wherever a piece is grown, and nothing is lost with a worker."""
+"""Other processes and machines: the same bits wherever a piece is grown, and nothing is lost with a
+worker."""
 
 from __future__ import annotations
 
@@ -7,7 +8,14 @@ import os
 import pickle
 import signal
 import threading
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +32,14 @@ SPAWN = multiprocessing.get_context("spawn")  # a fork of a process that has run
 
 
 def objective(scene=lit, target: Target | None = None, **options) -> Objective:
-    return Objective(scene, [MAKE, Parameter("decay", 0.5, 2)], target or Level(wanted=1.0), cells=12, replicates=2, **options)
+    return Objective(
+        scene,
+        [MAKE, Parameter("decay", 0.5, 2)],
+        target or Level(wanted=1.0),
+        cells=12,
+        replicates=2,
+        **options,
+    )
 
 
 POINTS = spots(6, 2)
@@ -38,7 +53,8 @@ def here():
 
 @dataclass(frozen=True)
 class Deadly(Level):
-    """Kills the process that looks at it in mid-growth, unless that is the one at home or a flag says that it has been done."""
+    """Kills the process that looks at it in mid-growth, unless that is the one at home or a flag
+    says that it has been done."""
 
     flag: str = ""
     home: int = 0
@@ -69,13 +85,19 @@ class Raising(Level):
 
     def loss(self, state, history=None):
         if os.getpid() != self.home:
-            raise {"value": ValueError("no such level"), "os": FileNotFoundError("no such table"), "own": OwnError("lost", "sea")}[self.kind]
+            raise {
+                "value": ValueError("no such level"),
+                "os": FileNotFoundError("no such table"),
+                "own": OwnError("lost", "sea"),
+            }[self.kind]
         return super().loss(state, history)
 
 
 @pytest.fixture(scope="module")
 def processes():
-    with ProcessPoolExecutor(2, mp_context=SPAWN, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    with ProcessPoolExecutor(
+        2, mp_context=SPAWN, initializer=torch.set_num_threads, initargs=(1,)
+    ) as pool:
         yield pool
 
 
@@ -83,12 +105,18 @@ def processes():
 def dask():
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster, cluster.get_client() as client:
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        ) as cluster,
+        cluster.get_client() as client,
+    ):
         yield client.get_executor()
 
 
 class Careless(Executor):
-    """Loses the first pieces that it is given, as if their workers had died, and does the others."""
+    """Loses the first pieces that it is given, as if their workers had died, and does the
+    others."""
 
     def __init__(self, losses: int, error: Exception):
         self.losses, self.error, self.given = losses, error, 0
@@ -103,20 +131,31 @@ class Careless(Executor):
         return future
 
 
-GONE = [BrokenExecutor("a child ended"), CancelledError(), TimeoutError("no answer"), ConnectionResetError("no line"), RuntimeError("4 workers died")]
+GONE = [
+    BrokenExecutor("a child ended"),
+    CancelledError(),
+    TimeoutError("no answer"),
+    ConnectionResetError("no line"),
+    RuntimeError("4 workers died"),
+]
 
 
 @pytest.mark.parametrize("error", GONE, ids=lambda e: type(e).__name__)
 def test_a_piece_that_is_lost_once_is_given_again(here, error):
     careless = Careless(4, error)
-    assert np.array_equal(objective().evaluate(POINTS, executor=careless, pieces=3 + 1).losses, here)
+    assert np.array_equal(
+        objective().evaluate(POINTS, executor=careless, pieces=3 + 1).losses, here
+    )
     assert careless.given == 4 + 4
 
 
 @pytest.mark.parametrize("error", GONE, ids=lambda e: type(e).__name__)
 def test_a_piece_that_is_lost_again_is_grown_here_and_said_so(here, error):
     careless = Careless(1000, error)
-    with pytest.warns(RuntimeWarning, match=f"lost 3 of 3 pieces, which were grown in this process .{type(error).__name__}"):
+    with pytest.warns(
+        RuntimeWarning,
+        match=f"lost 3 of 3 pieces, which were grown in this process .{type(error).__name__}",
+    ):
         found = objective().evaluate(POINTS, executor=careless, pieces=3)
     assert np.array_equal(found.losses, here)
     assert careless.given == 3 * 2
@@ -142,7 +181,9 @@ def test_every_row_is_answered_once(here):
 @pytest.mark.parametrize("pieces", [1, 3, 6, 20])
 def test_threads_find_the_same(here, pieces):
     with ThreadPoolExecutor(3) as pool:
-        assert np.array_equal(objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here)
+        assert np.array_equal(
+            objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here
+        )
 
 
 def test_an_error_of_the_task_ends_the_rest():
@@ -163,7 +204,10 @@ def test_an_error_of_the_task_ends_the_rest():
     assert any(f.cancelled() for f in futures)
 
 
-@pytest.mark.parametrize("scene, fixed", [("boundary_detector", {"width": 16.0}), (tf.scenes.toggle_switch, {"power": 2.0}), (lit, {})])
+@pytest.mark.parametrize(
+    "scene, fixed",
+    [("boundary_detector", {"width": 16.0}), (tf.scenes.toggle_switch, {"power": 2.0}), (lit, {})],
+)
 def test_an_objective_is_the_same_from_a_pickle(scene, fixed):
     name = {"boundary_detector": "k3", lit: "make"}.get(scene, "strength")
     target = Level({"boundary_detector": "yfp", lit: "gfp"}.get(scene, "red"), 1.0)
@@ -179,13 +223,23 @@ class TestElsewhere:
     def test_the_bits_are_the_same(self, where, request, here):
         pool = request.getfixturevalue(where)
         for pieces in (2, 5):
-            assert np.array_equal(objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here)
+            assert np.array_equal(
+                objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here
+            )
 
-    @pytest.mark.parametrize("kind, error, words", [("os", FileNotFoundError, "no such table"), ("own", RuntimeError, "OwnError: lost at sea")])
+    @pytest.mark.parametrize(
+        "kind, error, words",
+        [
+            ("os", FileNotFoundError, "no such table"),
+            ("own", RuntimeError, "OwnError: lost at sea"),
+        ],
+    )
     def test_an_error_of_the_task_comes_through(self, where, request, kind, error, words):
         pool = request.getfixturevalue(where)
         with pytest.raises(error, match=words) as raised:
-            objective(target=Raising(wanted=1.0, kind=kind, home=os.getpid())).evaluate(POINTS, executor=pool, pieces=2)
+            objective(target=Raising(wanted=1.0, kind=kind, home=os.getpid())).evaluate(
+                POINTS, executor=pool, pieces=2
+            )
         # where it was raised, though that is on another machine
         assert "in loss" in "".join([str(raised.value), *getattr(raised.value, "__notes__", ())])
 
@@ -201,13 +255,21 @@ def test_a_scene_that_cannot_be_carried_is_refused(processes):
 
 @pytest.mark.slow
 def test_dask_carries_functions_by_themselves(dask, here):
-    assert np.array_equal(objective(lambda make=1.0, decay=1.0: lit(make, decay)).evaluate(POINTS, executor=dask, pieces=2).losses, here)
+    assert np.array_equal(
+        objective(lambda make=1.0, decay=1.0: lit(make, decay))
+        .evaluate(POINTS, executor=dask, pieces=2)
+        .losses,
+        here,
+    )
 
 
 @pytest.mark.slow
 def test_a_killed_process_takes_the_pool_along_and_nothing_is_lost(here, tmp_path):
     """A broken pool of the standard library takes nothing any more: what is left is grown here."""
-    with ProcessPoolExecutor(1, mp_context=SPAWN) as pool, pytest.warns(RuntimeWarning, match="BrokenProcessPool"):
+    with (
+        ProcessPoolExecutor(1, mp_context=SPAWN) as pool,
+        pytest.warns(RuntimeWarning, match="BrokenProcessPool"),
+    ):
         found = deadly(tmp_path).evaluate(POINTS, executor=pool, pieces=3)
     assert (tmp_path / "done").exists()
     assert np.array_equal(found.losses, here)

@@ -27,7 +27,9 @@ if find_spec("botorch"):
 made = pytest.mark.parametrize("make", MAKE.values(), ids=MAKE)
 # a batch of Bayesian takes a second, so it sees only two of the spaces
 CASES = [(m, s) for m in MAKE for s in SPACES if m != "bayesian" or s in ("line", "mixed")]
-everywhere = pytest.mark.parametrize(("make", "space"), [(MAKE[m], SPACES[s]) for m, s in CASES], ids=[f"{m} {s}" for m, s in CASES])
+everywhere = pytest.mark.parametrize(
+    ("make", "space"), [(MAKE[m], SPACES[s]) for m, s in CASES], ids=[f"{m} {s}" for m, s in CASES]
+)
 
 
 # What every method promises
@@ -50,7 +52,10 @@ def test_after_a_stop_the_next_batches_have_the_same_bits(make, space):
     for stop in (1, 2, 3, 6):
         again = begun(make(), space, seed=5)
         for batch, loss in whole[:stop]:
-            again.tell(Batch(batch.points.copy(), size=batch.size, replicates=batch.replicates), loss.copy())
+            again.tell(
+                Batch(batch.points.copy(), size=batch.size, replicates=batch.replicates),
+                loss.copy(),
+            )
         for batch, loss in whole[stop : stop + 2]:
             asked = again.ask()
             assert asked.points.tobytes() == batch.points.tobytes()
@@ -70,7 +75,10 @@ def test_started_again_it_begins_anew(make):
     given = begun(make(), SPACES["mixed"], seed=2)
     first = follow(given, ellipsoid, 4)
     second = follow(begun(given, SPACES["mixed"], seed=2), ellipsoid, 4)
-    assert all(a.points.tobytes() == b.points.tobytes() for (a, _), (b, _) in zip(first, second, strict=True))
+    assert all(
+        a.points.tobytes() == b.points.tobytes()
+        for (a, _), (b, _) in zip(first, second, strict=True)
+    )
 
 
 @made
@@ -85,9 +93,20 @@ def test_global_random_numbers_are_neither_read_nor_changed(make):
     def run(seed: int) -> bytes:
         np.random.seed(seed)  # noqa: NPY002
         torch.manual_seed(seed)
-        before = np.random.get_state()[1].tobytes(), np.random.get_state()[2], torch.get_rng_state()  # noqa: NPY002
-        points = b"".join(batch.points.tobytes() for batch, _ in follow(begun(make(), SPACES["mixed"]), ellipsoid, 8))
-        after = np.random.get_state()[1].tobytes(), np.random.get_state()[2], torch.get_rng_state()  # noqa: NPY002
+        before = (
+            np.random.get_state()[1].tobytes(),  # noqa: NPY002
+            np.random.get_state()[2],  # noqa: NPY002
+            torch.get_rng_state(),
+        )
+        points = b"".join(
+            batch.points.tobytes()
+            for batch, _ in follow(begun(make(), SPACES["mixed"]), ellipsoid, 8)
+        )
+        after = (
+            np.random.get_state()[1].tobytes(),  # noqa: NPY002
+            np.random.get_state()[2],  # noqa: NPY002
+            torch.get_rng_state(),
+        )
         assert before[:2] == after[:2] and torch.equal(before[2], after[2])
         return points
 
@@ -121,11 +140,17 @@ def test_what_was_not_asked_is_refused(make):
     with pytest.raises(InputError, match=r"points\[0\].*as asked.*same settings"):
         given.tell(Batch(other, size=batch.size, replicates=batch.replicates), ellipsoid(other))
     with pytest.raises(InputError, match=r"\(points, dimensions, size, replicates\)"):
-        given.tell(Batch(batch.points[1:], size=batch.size, replicates=batch.replicates), ellipsoid(batch.points[1:]))
+        given.tell(
+            Batch(batch.points[1:], size=batch.size, replicates=batch.replicates),
+            ellipsoid(batch.points[1:]),
+        )
     with pytest.raises(InputError, match="loss of shape"):
         given.tell(batch, np.zeros(len(batch.points) + 1))
     # rounding on another machine
-    given.tell(Batch(np.clip(batch.points + 1e-13, 0, 1), size=batch.size, replicates=batch.replicates), ellipsoid(batch.points))
+    given.tell(
+        Batch(np.clip(batch.points + 1e-13, 0, 1), size=batch.size, replicates=batch.replicates),
+        ellipsoid(batch.points),
+    )
 
 
 @made
@@ -155,7 +180,10 @@ def test_a_method_by_its_name(name):
     [
         (Sobol(batch=9), "sobol(batch=9)"),
         (CMAES(), "cmaes(population=None, sigma=0.3, restarts=True, noisy=False)"),
-        (Racing(inner=Sobol(batch=9)), "racing(inner=sobol(batch=9), sizes=(0.25, 1.0), keep=0.33, small=1, agree=0.1)"),
+        (
+            Racing(inner=Sobol(batch=9)),
+            "racing(inner=sobol(batch=9), sizes=(0.25, 1.0), keep=0.33, small=1, agree=0.1)",
+        ),
     ],
 )
 def test_describe_gives_all_settings(given, said):

@@ -25,7 +25,14 @@ def test_sobol_points_are_even_in_every_dimension():
 @pytest.mark.parametrize("batch", [1, 3, 16, 50])
 def test_batches_of_any_size_cut_one_sequence(batch):
     whole = begun(Sobol(batch=100), SPACES["cube"], seed=1).ask().points
-    parts = np.concatenate([b.points for b, _ in follow(begun(Sobol(batch=batch), SPACES["cube"], seed=1), sphere, -(-100 // batch))])
+    parts = np.concatenate(
+        [
+            b.points
+            for b, _ in follow(
+                begun(Sobol(batch=batch), SPACES["cube"], seed=1), sphere, -(-100 // batch)
+            )
+        ]
+    )
     assert (parts[:100] == whole).all()
 
 
@@ -50,19 +57,25 @@ def test_cmaes_finds_the_best_of_levels_among_hills(seed):
     space = Room((11, 9, 2, None))
 
     def hills(points: np.ndarray) -> np.ndarray:
-        """Rastrigin's over the levels 7, 2 and 1, and a bowl: 0 there, 0.02 or more with a wrong level."""
+        """Rastrigin's over the levels 7, 2 and 1, and a bowl: 0 there, 0.02 or more with a wrong
+        level."""
         away = (np.floor(points[:, :3] * (11, 9, 2)) - (7, 2, 1)) / (2, 2, 1)
-        return (0.1 * away**2 + 0.05 * (1 - np.cos(2 * np.pi * away))).sum(1) + (points[:, 3] - 0.8) ** 2
+        return (0.1 * away**2 + 0.05 * (1 - np.cos(2 * np.pi * away))).sum(1) + (
+            points[:, 3] - 0.8
+        ) ** 2
 
     assert evaluate(begun(CMAES(), space, seed), hills, 1200).min() < 1e-3
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_does_not_make_the_cloud_collapse(seed):
-    """Noise of 0.1 on losses of up to 1: were the width to shrink as without noise, it were 1e-3 after 100 batches."""
+    """Noise of 0.1 on losses of up to 1: were the width to shrink as without noise, it were 1e-3
+    after 100 batches."""
     noise = np.random.default_rng(seed)
     given = begun(CMAES(restarts=False, noisy=True), Room((None,) * 5), seed)
-    history = follow(given, lambda points: ellipsoid(points) + 0.1 * noise.standard_normal(len(points)), 100)
+    history = follow(
+        given, lambda points: ellipsoid(points) + 0.1 * noise.standard_normal(len(points)), 100
+    )
     late = np.concatenate([batch.points for batch, _ in history[-10:]])
     assert late.std(0).mean() > 0.02
     assert ellipsoid(late.mean(0, keepdims=True))[0] < 0.05  # half the noise of a single loss
@@ -75,8 +88,11 @@ def test_a_converged_cloud_is_followed_by_one_of_twice_the_population_up_to_sixt
         began.append(given.fresh)
         sizes.append(len(follow(given, sphere, 1)[0][0].points))
     assert list(dict.fromkeys(sizes)) == [4, 8, 16, 32, 64] and sizes == sorted(sizes)
-    assert sum(b and n == 64 for b, n in zip(began, sizes, strict=True)) >= 2  # another cloud, but no larger
-    lone = follow(begun(CMAES(population=4, noisy=False, restarts=False), SPACES["line"]), sphere, 240)
+    # another cloud, but no larger
+    assert sum(b and n == 64 for b, n in zip(began, sizes, strict=True)) >= 2
+    lone = follow(
+        begun(CMAES(population=4, noisy=False, restarts=False), SPACES["line"]), sphere, 240
+    )
     assert {len(batch.points) for batch, _ in lone} == {4}
 
 
@@ -94,16 +110,26 @@ def test_a_cloud_in_which_all_fails_is_given_up_without_doubling():
 def test_the_cloud_begins_about_the_best_of_the_first_points():
     given = begun(CMAES(population=400, sigma=0.01), SPACES["cube"])
     (first, loss), (second, _) = follow(given, ellipsoid, 2)
-    assert np.abs(second.points.mean(0) - first.points[loss.argmin()]).max() < 5 * 0.01 / math.sqrt(400)
+    assert np.abs(second.points.mean(0) - first.points[loss.argmin()]).max() < 5 * 0.01 / math.sqrt(
+        400
+    )
 
 
 # Racing
 
 
 def test_a_race_grows_all_small_and_the_best_in_full():
-    given = begun(Racing(inner=CMAES(population=9), sizes=(0.1, 0.5, 1.0), keep=1 / 3, small=2), SPACES["cube"], replicates=5)
+    given = begun(
+        Racing(inner=CMAES(population=9), sizes=(0.1, 0.5, 1.0), keep=1 / 3, small=2),
+        SPACES["cube"],
+        replicates=5,
+    )
     history = follow(given, sphere, 3)
-    assert [(len(b.points), b.size, b.replicates) for b, _ in history] == [(81, 0.1, 2), (27, 0.5, 2), (9, 1.0, None)]
+    assert [(len(b.points), b.size, b.replicates) for b, _ in history] == [
+        (81, 0.1, 2),
+        (27, 0.5, 2),
+        (9, 1.0, None),
+    ]
     for (before, loss), (after, _) in pairwise(history):
         best = np.sort(loss)[: len(after.points)]
         assert (np.sort(sphere(after.points)) == best).all()
@@ -113,7 +139,9 @@ def test_a_race_grows_all_small_and_the_best_in_full():
 def test_the_inner_method_hears_only_of_full_colonies(monkeypatch):
     inner, heard = CMAES(population=6), []
     take = inner.take
-    monkeypatch.setattr(inner, "take", lambda rows, loss: [heard.append(loss.copy()), take(rows, loss)])
+    monkeypatch.setattr(
+        inner, "take", lambda rows, loss: [heard.append(loss.copy()), take(rows, loss)]
+    )
     given = begun(Racing(inner=inner), SPACES["cube"])
     for _ in range(20):
         batch = given.ask()
@@ -126,14 +154,17 @@ def test_no_more_replicates_than_there_are():
 
 
 def race(given, seed: int, *, shift: float, target: float, budget: float) -> float:
-    """Cost in full designs until a design within `target` is among those grown in full. Small colonies are best `shift` away, replicates differ by 0.02."""
+    """Cost in full designs until a design within `target` is among those grown in full. Small
+    colonies are best `shift` away, replicates differ by 0.02."""
     begun(given, Room((None,) * 8), seed)
     noise, used = np.random.default_rng(seed), 0.0
     while used < budget:
         batch = given.ask()
         copies = batch.replicates or 4
         used += len(batch.points) * batch.size * copies / 4
-        loss = ellipsoid(batch.points, 0.3 if batch.size == 1 else 0.3 + shift) + 0.02 / math.sqrt(copies) * noise.standard_normal(len(batch.points))
+        loss = ellipsoid(batch.points, 0.3 if batch.size == 1 else 0.3 + shift) + 0.02 / math.sqrt(
+            copies
+        ) * noise.standard_normal(len(batch.points))
         given.tell(batch, loss)
         if batch.size == 1 and ellipsoid(batch.points).min() <= target:
             return used
@@ -141,14 +172,20 @@ def race(given, seed: int, *, shift: float, target: float, budget: float) -> flo
 
 
 def test_racing_spends_half_where_small_colonies_tell_something():
-    plain = [race(CMAES(noisy=True), seed, shift=0.05, target=0.04, budget=400) for seed in range(6)]
-    raced = [race(Racing(inner=CMAES(noisy=True)), seed, shift=0.05, target=0.04, budget=400) for seed in range(6)]
+    plain = [
+        race(CMAES(noisy=True), seed, shift=0.05, target=0.04, budget=400) for seed in range(6)
+    ]
+    raced = [
+        race(Racing(inner=CMAES(noisy=True)), seed, shift=0.05, target=0.04, budget=400)
+        for seed in range(6)
+    ]
     assert sum(raced) < 0.5 * sum(plain)
 
 
 @pytest.mark.parametrize(("agree", "races"), [(0.1, False), (-1.0, True)])
 def test_small_colonies_that_mislead_are_given_up(agree, races):
-    """Small colonies say the opposite: Kendall's tau is -1, and 1 · 0.8ⁿ - (1 - 0.8ⁿ) falls below 0.1 after three races."""
+    """Small colonies say the opposite: Kendall's tau is -1, and 1 · 0.8ⁿ - (1 - 0.8ⁿ) falls below
+    0.1 after three races."""
     given = begun(Racing(inner=Sobol(batch=6), agree=agree), SPACES["cube"])
     sizes = []
     for _ in range(12):
@@ -197,7 +234,8 @@ if find_spec("botorch"):
         assert evaluate(begun(Bayesian(), space, seed), ellipsoid, 42).min() < 0.1 * plain
 
     def test_bayesian_tries_no_design_twice_while_others_are_left():
-        """Of 12 designs it tries all before it tries one again, but for what Sobol points repeat."""
+        """Of 12 designs it tries all before it tries one again, but for what Sobol points
+        repeat."""
         given = begun(Bayesian(batch=2, first=4), SPACES["levels"])
         tried = np.concatenate([batch.points for batch, _ in follow(given, ellipsoid, 5)])
         assert len({row.tobytes() for row in tried}) >= 9

@@ -1,4 +1,5 @@
-"""The objective: every colony is scored as if it were alone, however designs are batched; what fails is data."""
+"""The objective: every colony is scored as if it were alone, however designs are batched; what
+fails is data."""
 
 from __future__ import annotations
 
@@ -8,7 +9,22 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from searching import DT, Count, Level, Spread, alone, banned, built, fragile, grown, lit, paced, short, spots, uneven
+from searching import (
+    DT,
+    Count,
+    Level,
+    Spread,
+    alone,
+    banned,
+    built,
+    fragile,
+    grown,
+    lit,
+    paced,
+    short,
+    spots,
+    uneven,
+)
 
 import torchfilm as tf
 from design import Choice, Objective, Parameter, Stripe, Target, colonies, courses
@@ -21,20 +37,28 @@ KINDS = {"on recorded growth": (lit, LIT), "each grown anew": (paced, PACED)}
 
 def objective(kind="on recorded growth", target=None, **options):
     scene, parameters = KINDS[kind]
-    return Objective(scene, parameters, target or Level(), **{"cells": 8, "replicates": 3, **options})
+    return Objective(
+        scene, parameters, target or Level(), **{"cells": 8, "replicates": 3, **options}
+    )
 
 
 def alike(one, other):
-    assert np.array_equal(one.losses, other.losses) and np.array_equal(one.loss, other.loss) and np.array_equal(one.cells, other.cells)
+    assert (
+        np.array_equal(one.losses, other.losses)
+        and np.array_equal(one.loss, other.loss)
+        and np.array_equal(one.cells, other.cells)
+    )
     assert one.reasons == other.reasons
 
 
-# --- every colony is scored by itself -------------------------------------------------------------------------------------
+# --- every colony is scored by itself -------------------------------------------------------------
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("end", [{"cells": 5}, {"cells": None, "until": 1.2}, {"cells": 4, "until": 1.2}], ids=str)
+@pytest.mark.parametrize(
+    "end", [{"cells": 5}, {"cells": None, "until": 1.2}, {"cells": 4, "until": 1.2}], ids=str
+)
 def test_a_loss_is_that_of_the_colony_run_alone(kind, end):
     made = objective(kind, replicates=2, **end)
     points = spots(2, 2)
@@ -57,7 +81,9 @@ def test_losses_do_not_depend_on_how_designs_are_batched(kind):
     with ThreadPoolExecutor(2) as pool:
         alike(objective(kind, **options).evaluate(points, pieces=3, executor=pool), whole)
     turned = objective(kind, **options).evaluate(points[order])
-    assert np.array_equal(turned.losses, whole.losses[order]) and np.array_equal(turned.loss, whole.loss[order])
+    assert np.array_equal(turned.losses, whole.losses[order]) and np.array_equal(
+        turned.loss, whole.loss[order]
+    )
 
 
 def test_recorded_growth_changes_no_bit():
@@ -68,17 +94,27 @@ def test_recorded_growth_changes_no_bit():
 
 
 @pytest.mark.parametrize(
-    "rows, least, most, sizes", [(7, 3, 100, [2, 2, 3]), (4, 3, 100, [1, 1, 2]), (2, 5, 100, [1, 1]), (6, 1, 6, [2, 2, 2]), (5, 1, 1, [1] * 5)]
+    "rows, least, most, sizes",
+    [
+        (7, 3, 100, [2, 2, 3]),
+        (4, 3, 100, [1, 1, 2]),
+        (2, 5, 100, [1, 1]),
+        (6, 1, 6, [2, 2, 2]),
+        (5, 1, 1, [1] * 5),
+    ],
 )
 def test_pieces_are_even_and_as_many_as_asked(rows, least, most, sizes):
     made = objective(most=most, replicates=3)
     pieces = made._pieces([made.space.values(p) for p in spots(rows, 2)], 3, 1.0, least)
-    assert [len(p.rows) for p in pieces] == sizes and [r for p in pieces for r in p.rows] == list(range(rows))
+    assert [len(p.rows) for p in pieces] == sizes and [r for p in pieces for r in p.rows] == list(
+        range(rows)
+    )
 
 
 @pytest.mark.slow
 def test_a_colony_is_measured_at_its_own_first_step_of_that_size():
-    """A design of half the pace beside it changes nothing, and each count is the first that is enough."""
+    """A design of half the pace beside it changes nothing, and each count is the first that is
+    enough."""
     made = objective("each grown anew", Count(), replicates=2, cells=5)
     points = np.array([[0.0, 0.5], [1.0, 0.5]])
     found = made.evaluate(points)
@@ -93,17 +129,21 @@ def test_a_colony_is_measured_at_its_own_first_step_of_that_size():
 @pytest.mark.slow
 def test_the_quick_do_not_grow_on_while_a_slow_replicate_is_waited_for():
     parameter = [Parameter("make", 0.5, 1)]
-    kept, anew = (Objective(uneven, parameter, Level(), cells=10, replicates=2, seed=2, replay=r) for r in (True, False))
+    kept, anew = (
+        Objective(uneven, parameter, Level(), cells=10, replicates=2, seed=2, replay=r)
+        for r in (True, False)
+    )
     courses._kept.clear()
     found, points = kept.evaluate(np.array([[0.0], [0.5]])), np.array([[0.0], [0.5]])
     alike(found, anew.evaluate(points))
     (course,) = courses._kept.values()
-    # one takes more than twice as long as the other, which without an end of its own would have 128 cells by then
+    # one takes more than twice as long as the other, which without an end of its own would have 128
+    # cells by then
     assert len(course.steps) == 24 and int(course.state.counts.max()) < 2 * 10
     alike(kept.evaluate(points), found)
 
 
-# --- random numbers, sizes, structure, reduction --------------------------------------------------------------------------
+# --- random numbers, sizes, structure, reduction --------------------------------------------------
 
 
 def test_replicates_share_random_numbers_and_streams_differ():
@@ -111,14 +151,19 @@ def test_replicates_share_random_numbers_and_streams_differ():
     found = made.evaluate(spots(1, 2).repeat(2, 0))
     assert np.array_equal(found.losses[0], found.losses[1]) and len(set(found.losses[0])) == 3
     other = made.evaluate(spots(1, 2), streams=[2, 40, 0])
-    assert other.losses[0, [0, 2]].tolist() == found.losses[0, [2, 0]].tolist() and other.losses[0, 1] not in found.losses
+    assert (
+        other.losses[0, [0, 2]].tolist() == found.losses[0, [2, 0]].tolist()
+        and other.losses[0, 1] not in found.losses
+    )
     loss, _ = alone(lit(**made.space.values(spots(1, 2)[0])), made.target, 40, cells=8)
     assert other.losses[0, 1] == loss
 
 
 def test_another_seed_is_another_growth():
     point = spots(1, 2)
-    assert not set(objective(seed=1).evaluate(point).losses[0]) & set(objective().evaluate(point).losses[0])
+    assert not set(objective(seed=1).evaluate(point).losses[0]) & set(
+        objective().evaluate(point).losses[0]
+    )
 
 
 def test_a_share_of_the_size_is_fewer_cells_and_less_time():
@@ -128,27 +173,48 @@ def test_a_share_of_the_size_is_fewer_cells_and_less_time():
     assert np.array_equal(found.losses, objective(cells=4).evaluate(spots(2, 2)).losses)
     assert made.end(0.01) == (2, None)
     timed = objective(cells=None, until=1.2)
-    assert np.array_equal(timed.evaluate(spots(2, 2), size=0.5).losses, objective(cells=None, until=0.6).evaluate(spots(2, 2)).losses)
+    assert np.array_equal(
+        timed.evaluate(spots(2, 2), size=0.5).losses,
+        objective(cells=None, until=0.6).evaluate(spots(2, 2)).losses,
+    )
     assert timed.end(0.001) == (None, DT)
 
 
 @pytest.mark.slow
 def test_whole_numbers_and_choices_build_scenes_of_their_own():
-    parameters = [Parameter("genes", 1, 3, whole=True), Choice("promoter", ("weak", "strong")), Parameter("make", 1, 2)]
+    parameters = [
+        Parameter("genes", 1, 3, whole=True),
+        Choice("promoter", ("weak", "strong")),
+        Parameter("make", 1, 2),
+    ]
     made = Objective(built, parameters, Level("g0"), cells=3, replicates=2)
-    points = np.array([made.space.point({"genes": g, "promoter": p, "make": m}) for g in (1, 3) for p in ("strong", "weak") for m in (1.0, 1.75)])
+    points = np.array(
+        [
+            made.space.point({"genes": g, "promoter": p, "make": m})
+            for g in (1, 3)
+            for p in ("strong", "weak")
+            for m in (1.0, 1.75)
+        ]
+    )
     found = made.evaluate(points)
     for row, point in enumerate(points):
         values = made.space.values(point)
         assert found.losses[row, 1] == alone(built(**values), Level("g0"), 1, cells=3)[0]
-    # rates without decay of growth are linear in what makes them; the first species does not know how many there are
+    # rates without decay of growth are linear in what makes them; the first species does not know
+    # how many there are
     strong, weak = found.losses[[0, 1, 4, 5]], found.losses[[2, 3, 6, 7]]
     assert strong == pytest.approx(3 * weak, rel=1e-3)
     assert found.losses[:4] == pytest.approx(found.losses[4:], rel=1e-3)
 
 
 @pytest.mark.parametrize(
-    "reduce, expected", [("mean", lambda x: x.mean(1)), ("worst", lambda x: x.max(1)), (0.5, lambda x: np.median(x, 1)), (1.0, lambda x: x.max(1))]
+    "reduce, expected",
+    [
+        ("mean", lambda x: x.mean(1)),
+        ("worst", lambda x: x.max(1)),
+        (0.5, lambda x: np.median(x, 1)),
+        (1.0, lambda x: x.max(1)),
+    ],
 )
 def test_replicates_become_one_loss(reduce, expected):
     found = objective(reduce=reduce).evaluate(spots(3, 2))
@@ -156,44 +222,75 @@ def test_replicates_become_one_loss(reduce, expected):
 
 
 def test_fixed_arguments_reach_the_scene():
-    made = Objective(lit, [Parameter("decay", 0.5, 2)], Level(), fixed={"make": 3.0}, cells=6, replicates=1)
-    assert made.evaluate(np.array([[0.0]])).losses[0, 0] == alone(lit(3.0, 0.5), Level(), 0, cells=6)[0]
+    made = Objective(
+        lit, [Parameter("decay", 0.5, 2)], Level(), fixed={"make": 3.0}, cells=6, replicates=1
+    )
+    assert (
+        made.evaluate(np.array([[0.0]])).losses[0, 0]
+        == alone(lit(3.0, 0.5), Level(), 0, cells=6)[0]
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_ready_scenes_by_name_are_the_functions(dtype):
-    parameter, options = [Parameter("strength", 2, 8)], {"cells": 2, "dt": 0.1, "replicates": 2, "dtype": dtype}
-    named, given = (Objective(s, parameter, Level("red"), **options) for s in ("toggle_switch", tf.scenes.toggle_switch))
-    assert np.array_equal(named.evaluate(np.array([[0.5]])).losses, given.evaluate(np.array([[0.5]])).losses)
+    parameter, options = (
+        [Parameter("strength", 2, 8)],
+        {"cells": 2, "dt": 0.1, "replicates": 2, "dtype": dtype},
+    )
+    named, given = (
+        Objective(s, parameter, Level("red"), **options)
+        for s in ("toggle_switch", tf.scenes.toggle_switch)
+    )
+    assert np.array_equal(
+        named.evaluate(np.array([[0.5]])).losses, given.evaluate(np.array([[0.5]])).losses
+    )
     assert named.recipe is not None and named.recipe[0] == "toggle_switch"
 
 
-# --- what fails -----------------------------------------------------------------------------------------------------------
+# --- what fails -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("most", [None, 100, 1])
 def test_a_design_that_the_scene_refuses_fails_alone(most):
-    made = Objective(banned, [Parameter("low", 3.0, 4.0), Parameter("make", 1, 2)], Level(), cells=4, replicates=2, most=most)
+    made = Objective(
+        banned,
+        [Parameter("low", 3.0, 4.0), Parameter("make", 1, 2)],
+        Level(),
+        cells=4,
+        replicates=2,
+        most=most,
+    )
     points = np.array([[0.3, 0.5], [0.1, 0.5], [0.25, 0.0], [0.9, 1.0]])
     found = made.evaluate(points)
     assert (found.losses[[0, 2]] == 1.5).all() and (found.cells[[0, 2]] == 0).all()
     assert set(found.reasons) == {(0, 0), (0, 1), (2, 0), (2, 1)}
     assert all("low ≤ high" in words for words in found.reasons.values())
-    assert np.array_equal(found.losses[[1, 3]], made.evaluate(points[[1, 3]]).losses) and (found.losses[[1, 3]] != 1.5).all()
+    assert (
+        np.array_equal(found.losses[[1, 3]], made.evaluate(points[[1, 3]]).losses)
+        and (found.losses[[1, 3]] != 1.5).all()
+    )
     assert made.final(points[0]) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("replay", [True, False])
 def test_rates_that_are_not_finite_fail_with_time_and_cell(replay):
-    made = Objective(fragile, [Parameter("make", 1, 10)], Level(), cells=8, replicates=2, replay=replay)
+    made = Objective(
+        fragile, [Parameter("make", 1, 10)], Level(), cells=8, replicates=2, replay=replay
+    )
     points = np.array([[0.1], [0.9], [0.3]])
     found = made.evaluate(points)
     assert found.losses[1].tolist() == [1.5, 1.5] and set(found.reasons) == {(1, 0), (1, 1)}
     for words in found.reasons.values():
         assert words.startswith("at 0.2 h: circuit of cell 0: ") and "gfp" in words
-    assert np.array_equal(found.losses[[0, 2]], made.evaluate(points[[0, 2]]).losses) and (found.losses[[0, 2]] != 1.5).all()
-    assert len(made.final(points[1])) == 0 and sum(d.state.colonies for d in made.final(points[0])) == 2
+    assert (
+        np.array_equal(found.losses[[0, 2]], made.evaluate(points[[0, 2]]).losses)
+        and (found.losses[[0, 2]] != 1.5).all()
+    )
+    assert (
+        len(made.final(points[1])) == 0
+        and sum(d.state.colonies for d in made.final(points[0])) == 2
+    )
 
 
 def test_a_division_too_short_fails_with_time_and_cell():
@@ -234,14 +331,17 @@ def test_a_colony_that_does_not_grow_is_given_up_and_its_neighbours_are_not(monk
     monkeypatch.setattr(colonies, "PATIENCE", 6.0)
     made = Objective(paced, [Parameter("rate", 0.0, 1.0)], Level(), cells=8, replicates=2)
     found = made.evaluate(np.array([[0.0], [1.0]]))
-    assert found.reasons == {(0, k): "it has 1 of 8 cells at 6.2 h, and has had no more for 6 h" for k in range(2)}
+    assert found.reasons == {
+        (0, k): "it has 1 of 8 cells at 6.2 h, and has had no more for 6 h" for k in range(2)
+    }
     monkeypatch.undo()
     assert np.array_equal(found.losses[1], made.evaluate(np.array([[1.0]])).losses[0])
 
 
 @pytest.mark.parametrize("rate", [0.02, 0.2])
 def test_patience_is_longer_than_slow_cells_need(rate):
-    """From 2 µm to division at 4 µm by the law of volume takes ln(4.67/2.67)/rate, 28 h at 0.02/h; the counts of every step are asked."""
+    """From 2 µm to division at 4 µm by the law of volume takes ln(4.67/2.67)/rate, 28 h at 0.02/h;
+    the counts of every step are asked."""
     steps = np.arange(0, 90, 1.0)
     state = tf.Scene(tf.Growth(rate=rate)).seed(1)
     most, since = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.float64)
@@ -251,28 +351,45 @@ def test_patience_is_longer_than_slow_cells_need(rate):
 
 def test_a_colony_without_cells_fails():
     def dying(rate=1.0):
-        edge = tf.Removal(low=(-0.5, -0.5), high=(0.5, 0.5))  # daughters of the first cell are beyond
-        return tf.Scene(tf.Growth(rate=rate), tf.Division(length=4.0), tf.Mechanics(dim=2), edge, dt=DT)
+        # daughters of the first cell are beyond
+        edge = tf.Removal(low=(-0.5, -0.5), high=(0.5, 0.5))
+        return tf.Scene(
+            tf.Growth(rate=rate), tf.Division(length=4.0), tf.Mechanics(dim=2), edge, dt=DT
+        )
 
-    found = Objective(dying, [Parameter("rate", 0.5, 1)], Spread(), cells=8, replicates=1).evaluate(np.array([[1.0]]))
-    assert found.losses.tolist() == [[1.5]] and found.reasons[0, 0].startswith("no cell was left at ")
+    found = Objective(dying, [Parameter("rate", 0.5, 1)], Spread(), cells=8, replicates=1).evaluate(
+        np.array([[1.0]])
+    )
+    assert found.losses.tolist() == [[1.5]] and found.reasons[0, 0].startswith(
+        "no cell was left at "
+    )
 
 
-# --- history --------------------------------------------------------------------------------------------------------------
+# --- history --------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class Diary(Target):
-    """Notes time and number of cells after every step, and reads them back: the loss is the colony's own age."""
+    """Notes time and number of cells after every step, and reads them back: the loss is the
+    colony's own age."""
 
     def note(self, state):
-        return torch.stack([state.counts.double(), torch.full_like(state.counts, state.time, dtype=torch.float64)], 1)
+        return torch.stack(
+            [state.counts.double(), torch.full_like(state.counts, state.time, dtype=torch.float64)],
+            1,
+        )
 
     def loss(self, state, history=None):
         steps, count, k = history.shape
         assert (steps, count, k) == (state.step, state.colonies, 2)
-        assert torch.equal(history[-1, :, 0], state.counts.double()) and (history[:-1, :, 0] <= history[1:, :, 0]).all()
-        assert torch.allclose(history[:, :, 1], (DT * torch.arange(1, steps + 1, dtype=torch.float64)).unsqueeze(1).expand(-1, count))
+        assert (
+            torch.equal(history[-1, :, 0], state.counts.double())
+            and (history[:-1, :, 0] <= history[1:, :, 0]).all()
+        )
+        assert torch.allclose(
+            history[:, :, 1],
+            (DT * torch.arange(1, steps + 1, dtype=torch.float64)).unsqueeze(1).expand(-1, count),
+        )
         return history[-1, :, 1]
 
 
@@ -288,11 +405,16 @@ def test_notes_belong_to_their_colony_though_others_end_at_other_times(kind):
         assert found.losses[1, stream] == pytest.approx(state.time, abs=1e-9)
 
 
-# --- bad input ------------------------------------------------------------------------------------------------------------
+# --- bad input ------------------------------------------------------------------------------------
 
 
 def plain(rate=1.0, longest=4.0):
-    return tf.Scene(tf.Growth(rate=float(rate)), tf.Division(length=tf.Uniform(3.0, longest)), tf.Mechanics(dim=2), dt=DT)
+    return tf.Scene(
+        tf.Growth(rate=float(rate)),
+        tf.Division(length=tf.Uniform(3.0, longest)),
+        tf.Mechanics(dim=2),
+        dt=DT,
+    )
 
 
 def ungrown(make=1.0):
@@ -302,7 +424,10 @@ def ungrown(make=1.0):
 @pytest.mark.parametrize(
     "given, words",
     [
-        ({"parameters": [Parameter("made", 1, 2)]}, "'made'.*a parameter of lit: make, decay.*Did you mean 'make'"),
+        (
+            {"parameters": [Parameter("made", 1, 2)]},
+            "'made'.*a parameter of lit: make, decay.*Did you mean 'make'",
+        ),
         ({"fixed": {"made": 1}}, "fixed = 'made'.*a parameter of lit"),
         ({"fixed": {"make": 1}}, "fixed = 'make'.*not searched as well"),
         ({"parameters": []}, "at least one"),
@@ -319,20 +444,38 @@ def ungrown(make=1.0):
         ({"replicates": 0}, "replicates = 0.*whole number from 1"),
         ({"most": 0}, "most = 0.*whole number from 1"),
         ({"seed": -1}, "^seed = -1.*whole number from 0"),
-        ({"reduce": "best"}, 'reduce = \'best\'.*"worst" or a quantile'),
+        ({"reduce": "best"}, "reduce = 'best'.*\"worst\" or a quantile"),
         ({"reduce": 0.0}, "reduce = 0.0.*above 0"),
         ({"scene": lit()}, "a function from parameters to a tf.Scene.*def scene"),
         ({"scene": "colony"}, "scene = 'colony'.*one of microcolony"),
         ({"scene": lambda make: 3}, "scene = 3.*a function that returns a tf.Scene"),
         ({"scene": lambda make, other: lit()}, "cannot be built.*'other'"),
-        ({"scene": paced, "parameters": [Parameter("rate", -1, 1)]}, r"cannot be built with \{'rate': -1.0\}.*at least 0.*narrow the bounds"),
-        ({"scene": plain, "parameters": [Parameter("rate", 0.5, 1)], "target": Spread()}, "one plain number or as a name can be searched with whole=True or"),
-        ({"scene": plain, "parameters": [Parameter("longest", 2.0, 4.0)], "target": Spread()}, r"cannot be built with \{'longest': 2.0\}"),
-        ({"scene": ungrown, "parameters": [Parameter("make", 1, 2)], "target": Spread()}, "growth waits for 'growth_rate'.*until="),
+        (
+            {"scene": paced, "parameters": [Parameter("rate", -1, 1)]},
+            r"cannot be built with \{'rate': -1.0\}.*at least 0.*narrow the bounds",
+        ),
+        (
+            {"scene": plain, "parameters": [Parameter("rate", 0.5, 1)], "target": Spread()},
+            "one plain number or as a name can be searched with whole=True or",
+        ),
+        (
+            {"scene": plain, "parameters": [Parameter("longest", 2.0, 4.0)], "target": Spread()},
+            r"cannot be built with \{'longest': 2.0\}",
+        ),
+        (
+            {"scene": ungrown, "parameters": [Parameter("make", 1, 2)], "target": Spread()},
+            "growth waits for 'growth_rate'.*until=",
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_refused_in_words(given, words):
-    options = {"scene": lit, "parameters": [Parameter("make", 1, 2)], "target": Level(), "cells": 8, **given}
+    options = {
+        "scene": lit,
+        "parameters": [Parameter("make", 1, 2)],
+        "target": Level(),
+        "cells": 8,
+        **given,
+    }
     with pytest.raises(tf.InputError, match=words):
         Objective(**options)
 
@@ -355,11 +498,17 @@ def test_bad_points_are_refused_in_words(given, words):
         objective().evaluate(**{"points": spots(1, 2), **given})
 
 
-# --- memory ---------------------------------------------------------------------------------------------------------------
+# --- memory ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    "error", [MemoryError(), RuntimeError("CUDA out of memory. Tried to …"), RuntimeError("DefaultCPUAllocator: not enough memory")], ids=str
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("CUDA out of memory. Tried to …"),
+        RuntimeError("DefaultCPUAllocator: not enough memory"),
+    ],
+    ids=str,
 )
 def test_a_batch_that_does_not_fit_is_halved(monkeypatch, error):
     points = spots(5, 2)
@@ -378,7 +527,9 @@ def test_a_batch_that_does_not_fit_is_halved(monkeypatch, error):
     assert tried == [5, 2, 3, 1, 2]
 
 
-@pytest.mark.parametrize("error", [RuntimeError("shapes differ"), ZeroDivisionError(), MemoryError()], ids=repr)
+@pytest.mark.parametrize(
+    "error", [RuntimeError("shapes differ"), ZeroDivisionError(), MemoryError()], ids=repr
+)
 def test_other_errors_and_one_design_that_does_not_fit_pass_through(monkeypatch, error):
     def broken(self, piece, streams, size):
         raise error
@@ -393,7 +544,11 @@ def test_colonies_at_their_ends_are_those_that_were_scored():
     made = objective()
     done = made.final(spots(1, 2)[0])
     assert all(isinstance(d, Done) for d in done)
-    found = {int(s): float(x) for d in done for s, x in zip(d.state.stream, made.target.loss(d.state), strict=True)}
+    found = {
+        int(s): float(x)
+        for d in done
+        for s, x in zip(d.state.stream, made.target.loss(d.state), strict=True)
+    }
     assert [found[k] for k in range(3)] == made.evaluate(spots(1, 2)).losses[0].tolist()
 
 
@@ -404,12 +559,24 @@ def resting(make=1.0):
 
 def test_where_the_end_is_a_time_it_comes_also_to_cells_that_rest(monkeypatch):
     monkeypatch.setattr("design.colonies.PATIENCE", 1.0)
-    found = Objective(resting, [Parameter("make", 0.5, 2.0)], Level(), until=5.0, replicates=1).evaluate(np.array([[0.5]]))
+    found = Objective(
+        resting, [Parameter("make", 0.5, 2.0)], Level(), until=5.0, replicates=1
+    ).evaluate(np.array([[0.5]]))
     assert not found.reasons and found.loss[0] < 1.5
 
 
 def test_a_colony_must_have_somewhere_to_grow():
-    with pytest.raises(tf.InputError, match="cells = 2 is not allowed: it must be above the 2 that a colony starts from"):
+    with pytest.raises(
+        tf.InputError,
+        match="cells = 2 is not allowed: it must be above the 2 that a colony starts from",
+    ):
         Objective("boundary_detector", [Parameter("k3", 0.1, 10)], Level("yfp"), cells=2)
-    small = Objective("boundary_detector", [Parameter("k3", 0.1, 10)], Level("yfp"), cells=20, dt=0.05, replicates=1)
+    small = Objective(
+        "boundary_detector",
+        [Parameter("k3", 0.1, 10)],
+        Level("yfp"),
+        cells=20,
+        dt=0.05,
+        replicates=1,
+    )
     assert small.end(0.01)[0] == 3 and not small.evaluate(np.array([[0.5]]), size=0.01).reasons

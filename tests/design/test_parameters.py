@@ -1,4 +1,5 @@
-"""Parameters and the space that they span: values and coordinates are inverse, and what cannot be is refused."""
+"""Parameters and the space that they span: values and coordinates are inverse, and what cannot be
+is refused."""
 
 from __future__ import annotations
 
@@ -26,9 +27,12 @@ def test_value_and_coordinate_are_inverse(log, a, b, u):
     p = Parameter("k", low, high, log=log)
     value = p.value(u)
     assert low <= value <= high
-    # a value is rounded to 2⁻⁵² of its size, which is a coordinate of that over the width of the range
+    # a value is rounded to 2⁻⁵² of its size, which is a coordinate of that over the width of the
+    # range
     width = math.log(high / low) if log else (high - low) / high
-    assert p.coordinate(value) == pytest.approx(u, abs=1e-14 * (1 + abs(math.log(low)) + abs(math.log(high))) / width)
+    assert p.coordinate(value) == pytest.approx(
+        u, abs=1e-14 * (1 + abs(math.log(low)) + abs(math.log(high))) / width
+    )
     assert p.coordinate(low) == 0.0 and p.coordinate(high) == 1.0
 
 
@@ -36,13 +40,19 @@ def test_value_and_coordinate_are_inverse(log, a, b, u):
 @pytest.mark.parametrize("log", [False, True])
 def test_the_ends_are_the_bounds_and_come_back(low, high, log):
     p = Parameter("k", low, high, log=log)
-    assert p.value(0.0) == pytest.approx(low, rel=ROUNDING) and p.value(1.0) == pytest.approx(high, rel=ROUNDING)
-    assert p.coordinate(p.value(0.0)) == pytest.approx(0.0, abs=ROUNDING) and p.coordinate(p.value(1.0)) == pytest.approx(1.0, abs=ROUNDING)
+    assert p.value(0.0) == pytest.approx(low, rel=ROUNDING) and p.value(1.0) == pytest.approx(
+        high, rel=ROUNDING
+    )
+    assert p.coordinate(p.value(0.0)) == pytest.approx(0.0, abs=ROUNDING) and p.coordinate(
+        p.value(1.0)
+    ) == pytest.approx(1.0, abs=ROUNDING)
 
 
 def test_a_log_parameter_is_even_in_its_logarithm():
     p = Parameter("k3", 0.1, 10.0, log=True)
-    assert [p.value(u) for u in (0.25, 0.5, 0.75)] == pytest.approx([10**-0.5, 1.0, 10**0.5], rel=ROUNDING)
+    assert [p.value(u) for u in (0.25, 0.5, 0.75)] == pytest.approx(
+        [10**-0.5, 1.0, 10**0.5], rel=ROUNDING
+    )
     assert Parameter("k3", 0.0, 10.0).value(0.25) == 2.5
 
 
@@ -59,7 +69,9 @@ def test_whole_numbers_have_equal_shares_and_come_back(low, high):
     assert [p.value(p.coordinate(v)) for v in range(low, high + 1)] == list(range(low, high + 1))
 
 
-@pytest.mark.parametrize("options", [("weak", "strong"), (1, 2.5, "x"), (True, False), [0.1, 0.2, 0.3]])
+@pytest.mark.parametrize(
+    "options", [("weak", "strong"), (1, 2.5, "x"), (True, False), [0.1, 0.2, 0.3]]
+)
 def test_options_have_equal_shares_and_come_back(options):
     c = Choice("promoter", options)
     assert c.levels == len(options)
@@ -70,13 +82,23 @@ def test_options_have_equal_shares_and_come_back(options):
 
 
 def test_a_space_has_its_parameters_side_by_side():
-    space = Space([Parameter("k3", 0.1, 10, log=True), Parameter("genes", 1, 3, whole=True), Choice("promoter", ("weak", "strong"))])
+    space = Space(
+        [
+            Parameter("k3", 0.1, 10, log=True),
+            Parameter("genes", 1, 3, whole=True),
+            Choice("promoter", ("weak", "strong")),
+        ]
+    )
     assert (space.size, space.names, space.levels) == (3, ("k3", "genes", "promoter"), (None, 3, 2))
     values = space.values(np.array([0.5, 0.9, 0.1]))
     assert values == {"k3": pytest.approx(1.0), "genes": 3, "promoter": "weak"}
     again = space.values(space.point(values))
     assert again == {**values, "k3": pytest.approx(values["k3"], rel=ROUNDING)}
-    assert space.describe() == ["k3: 0.1 to 10.0 log", "genes: 1.0 to 3.0 whole", "promoter: 'weak' or 'strong'"]
+    assert space.describe() == [
+        "k3: 0.1 to 10.0 log",
+        "genes: 1.0 to 3.0 whole",
+        "promoter: 'weak' or 'strong'",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -84,7 +106,10 @@ def test_a_space_has_its_parameters_side_by_side():
     [
         (lambda: Parameter("k", 2, 1), r"Parameter\('k'\) = \(2.0, 1.0\).*low < high.*Swap"),
         (lambda: Parameter("k", 1, 1), "low < high.*fixed=…"),
-        (lambda: Parameter("k", 0, 1, log=True), r"Parameter\('k'\).low = 0.0.*above 0 with log=True.*leave log out"),
+        (
+            lambda: Parameter("k", 0, 1, log=True),
+            r"Parameter\('k'\).low = 0.0.*above 0 with log=True.*leave log out",
+        ),
         (lambda: Parameter("k", -1, 1, log=True), "above 0 with log=True"),
         (lambda: Parameter("k", 1, 2.5, whole=True), r"\(1.0, 2.5\).*whole numbers"),
         (lambda: Parameter("k", 1, 2, log=True, whole=True), "one of the two"),
@@ -103,8 +128,14 @@ def test_a_space_has_its_parameters_side_by_side():
         (lambda: Space([]), r"parameters = \[\].*at least one"),
         (lambda: Space(Parameter("k", 0, 1)), "a list of Parameter"),
         (lambda: Space([("k", 0, 1)]), "a list of Parameter"),
-        (lambda: Space([Parameter("k", 0, 1), Choice("k", ("a", "b"))]), "parameters = 'k'.*named once"),
-        (lambda: Space([Parameter("decai", 0, 1)]).check(["decay", "k3"], "lux"), "'decai'.*a parameter of lux: decay, k3. Did you mean 'decay'"),
+        (
+            lambda: Space([Parameter("k", 0, 1), Choice("k", ("a", "b"))]),
+            "parameters = 'k'.*named once",
+        ),
+        (
+            lambda: Space([Parameter("decai", 0, 1)]).check(["decay", "k3"], "lux"),
+            "'decai'.*a parameter of lux: decay, k3. Did you mean 'decay'",
+        ),
         (lambda: Space([Parameter("zzz", 0, 1)]).check(["k3"], "lux"), "a parameter of lux: k3.$"),
         (lambda: Space([Parameter("k", 0, 1)]).point({"q": 1}), "one for each of k. Look at 'q'"),
         (lambda: Space([Parameter("k", 0, 1)]).point({}), "one for each of k. Look at 'k'"),
@@ -112,7 +143,7 @@ def test_a_space_has_its_parameters_side_by_side():
         (lambda: Parameter("k", 0, 3, whole=True).coordinate(1.5), "k = 1.5.*a whole number"),
         (lambda: Choice("c", ("a", "b")).coordinate("d"), "c = 'd'.*one of 'a', 'b'"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_is_refused_in_words(make, words):
     with pytest.raises(tf.InputError, match=words):
         make()

@@ -1,4 +1,5 @@
-"""What a search shows: the table of its parameters and the picture of first guess, best design and target."""
+"""What a search shows: the table of its parameters and the picture of first guess, best design and
+target."""
 
 from __future__ import annotations
 
@@ -17,7 +18,13 @@ LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
 
 def searched(scene, parameters, target, colonies=6, method=None, **options):
-    made = Search(scene, parameters, target, method=method or Sobol(batch=3), **{"cells": 3, "replicates": 2, **options})
+    made = Search(
+        scene,
+        parameters,
+        target,
+        method=method or Sobol(batch=3),
+        **{"cells": 3, "replicates": 2, **options},
+    )
     return made.run(colonies, progress=False)
 
 
@@ -27,23 +34,60 @@ def rows(best) -> dict[str, list[str]]:
 
 
 def test_the_table_has_every_parameter_with_bounds_first_guess_and_best():
-    parameters = [Parameter("make", 1, 2, log=True), Parameter("genes", 1, 3, whole=True), Choice("promoter", ("weak", "strong"))]
+    parameters = [
+        Parameter("make", 1, 2, log=True),
+        Parameter("genes", 1, 3, whole=True),
+        Choice("promoter", ("weak", "strong")),
+    ]
     best = searched(built, parameters, Level("g0", 3.0), 12)
     found, first = rows(best), best.search.first()
     assert list(found)[:5] == ["parameter", "make", "genes", "promoter", "loss"]
-    assert found["make"] == ["make", "1", "…", "2", f"{first.values['make']:.4g}", f"{best.values['make']:.4g}"]
-    assert found["genes"] == ["genes", "1", "…", "3", str(first.values["genes"]), str(best.values["genes"])]
-    assert found["promoter"] == ["promoter", "weak", "|", "strong", first.values["promoter"], best.values["promoter"]]
+    assert found["make"] == [
+        "make",
+        "1",
+        "…",
+        "2",
+        f"{first.values['make']:.4g}",
+        f"{best.values['make']:.4g}",
+    ]
+    assert found["genes"] == [
+        "genes",
+        "1",
+        "…",
+        "3",
+        str(first.values["genes"]),
+        str(best.values["genes"]),
+    ]
+    assert found["promoter"] == [
+        "promoter",
+        "weak",
+        "|",
+        "strong",
+        first.values["promoter"],
+        best.values["promoter"],
+    ]
     assert found["loss"] == ["loss", f"{first.loss:.4f}", f"{best.loss:.4f}"]
-    level = np.mean([float(x) for d in best.colonies() for x in best.search.objective.target.measures(d.state)["mean_level"]])
-    assert found["mean_level"][-1] == f"{level:.4g}" and best.losses.mean() == pytest.approx(abs(level - 3.0), rel=1e-9)
-    assert best.table().splitlines()[-1].startswith("12 colonies in ") and best.table().endswith("; circuits ran on one recorded growth")
+    level = np.mean(
+        [
+            float(x)
+            for d in best.colonies()
+            for x in best.search.objective.target.measures(d.state)["mean_level"]
+        ]
+    )
+    assert found["mean_level"][-1] == f"{level:.4g}" and best.losses.mean() == pytest.approx(
+        abs(level - 3.0), rel=1e-9
+    )
+    assert best.table().splitlines()[-1].startswith("12 colonies in ") and best.table().endswith(
+        "; circuits ran on one recorded growth"
+    )
 
 
 def test_the_table_says_why_colonies_were_grown_anew_and_how_many_failed():
     best = searched(fragile, [Parameter("make", 1, 10)], Level(), 16, Sobol(batch=8), replay=False)
     failed = sum(len(e.reasons) for e in best.search.study.entries)
-    assert failed and best.table().endswith(f", {failed} failed; grown anew for each design: replay=False")
+    assert failed and best.table().endswith(
+        f", {failed} failed; grown anew for each design: replay=False"
+    )
 
 
 class Given:
@@ -70,12 +114,19 @@ class Half(Level):
         return torch.where(state.stream == 0, super().loss(state), torch.nan)
 
     def measures(self, state, history=None):
-        return {"some_um": torch.where(state.stream == 0, 2.5, torch.nan), "none_um": torch.full((state.colonies,), torch.nan)}
+        return {
+            "some_um": torch.where(state.stream == 0, 2.5, torch.nan),
+            "none_um": torch.full((state.colonies,), torch.nan),
+        }
 
 
 def test_measures_that_are_not_defined_everywhere_are_means_of_those_that_are():
     found = rows(searched(lit, LIT, Half()))
-    assert found["some_um"] == ["some_um", "2.5", "2.5"] and found["none_um"] == ["none_um", "nan", "nan"]
+    assert found["some_um"] == ["some_um", "2.5", "2.5"] and found["none_um"] == [
+        "none_um",
+        "nan",
+        "nan",
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,10 +153,13 @@ def coloured(image, box=(0.0, 0.55)) -> float:
 BEST = {
     "one species": lambda: searched(lit, LIT, Bands(("gfp",), edges=(-2.0, 2.0))),
     "several species and choices": lambda: searched(
-        built, [Parameter("make", 1, 2), Choice("promoter", ("weak", "strong"))], Two("g0"), fixed={"genes": 2}
+        built,
+        [Parameter("make", 1, 2), Choice("promoter", ("weak", "strong"))],
+        Two("g0"),
+        fixed={"genes": 2},
     ),
     "no species": lambda: searched(lit, LIT, Spread()),
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow
@@ -117,9 +171,16 @@ def test_a_picture_shows_the_colonies(tmp_path, kind):
 @pytest.mark.slow
 def test_what_failed_is_left_out_of_the_picture_and_the_table(tmp_path):
     """The first guess fails in mid-run, or is refused by the scene; the best is drawn beside it."""
-    broken = searched(fragile, [Parameter("make", 1, 10)], Level(), method=Given([0.9], [0.2]), cells=6)
+    broken = searched(
+        fragile, [Parameter("make", 1, 10)], Level(), method=Given([0.9], [0.2]), cells=6
+    )
     assert broken.search.first().loss == 1.5 and broken.losses[0] != 1.5
-    refused = searched(banned, [Parameter("low", 3.0, 4.0), Parameter("make", 1, 2)], Level(), method=Given([0.3, 0.5], [0.1, 0.5]))
+    refused = searched(
+        banned,
+        [Parameter("low", 3.0, 4.0), Parameter("make", 1, 2)],
+        Level(),
+        method=Given([0.3, 0.5], [0.1, 0.5]),
+    )
     assert refused.search.first().loss == 1.5
     for best in (broken, refused):
         assert rows(best)["mean_level"][1] == "nan" and rows(best)["loss"][1] == "1.5000"
@@ -128,7 +189,14 @@ def test_what_failed_is_left_out_of_the_picture_and_the_table(tmp_path):
 
 @pytest.mark.slow
 def test_a_picture_is_drawn_where_every_design_failed(tmp_path):
-    best = searched(fragile, [Parameter("make", 1, 10)], Level(), colonies=4, method=Given([0.9], [0.8]), cells=6)
+    best = searched(
+        fragile,
+        [Parameter("make", 1, 10)],
+        Level(),
+        colonies=4,
+        method=Given([0.9], [0.8]),
+        cells=6,
+    )
     assert best.loss == 1.5 and best.colonies() == []
     assert pictured(best, tmp_path / "best.png").size and "4 colonies" in best.table()
 
@@ -145,7 +213,9 @@ def test_a_target_draws_on_each_colony_that_is_shown(tmp_path):
             return state.counts.double().unsqueeze(1)
 
         def draw(self, ax, state, place, history=None):
-            assert history.shape[1:] == (state.colonies, 1) and float(history[-1, place, 0]) == float(state.counts[place])
+            assert history.shape[1:] == (state.colonies, 1) and float(
+                history[-1, place, 0]
+            ) == float(state.counts[place])
             drawn.append(int(state.colony_id[place]))
 
     searched(lit, LIT, Drawn(), 15, replicates=5).plot(tmp_path / "best.png")

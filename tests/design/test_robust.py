@@ -1,4 +1,5 @@
-"""How a design holds up: fresh seeds, other sizes, changed parameters, and the parameters that matter, where the answer is known."""
+"""How a design holds up: fresh seeds, other sizes, changed parameters, and the parameters that
+matter, where the answer is known."""
 
 from __future__ import annotations
 
@@ -24,12 +25,24 @@ def spared(make=1.0, nothing=0.5):
     return lit(make)
 
 
-def best(scene, parameters, values, *, target=None, cells: int | None = 12, replicates=2, **options) -> Best:
+def best(
+    scene, parameters, values, *, target=None, cells: int | None = 12, replicates=2, **options
+) -> Best:
     """A design given by hand, as if a search had found it."""
-    search = Search(scene, parameters, target or Level(wanted=1.0), cells=cells, replicates=replicates, method="sobol", **options)
+    search = Search(
+        scene,
+        parameters,
+        target or Level(wanted=1.0),
+        cells=cells,
+        replicates=replicates,
+        method="sobol",
+        **options,
+    )
     point = search.objective.space.point(values)
     found = search.objective.evaluate(point[None])
-    return Best(search, search.objective.space.values(point), point, float(found.loss[0]), found.losses[0])
+    return Best(
+        search, search.objective.space.values(point), point, float(found.loss[0]), found.losses[0]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +77,13 @@ def test_what_is_told_of_the_losses(held):
 def test_another_size_is_the_objective_of_that_size(held, place, share, cells):
     found = held.sizes[place]
     assert (found.share, found.cells, found.until) == (share, cells, None)
-    direct = Objective(spared, [MAKE, Parameter("nothing", 0, 1)], Level(wanted=1.0), cells=cells, replicates=2)
+    direct = Objective(
+        spared, [MAKE, Parameter("nothing", 0, 1)], Level(wanted=1.0), cells=cells, replicates=2
+    )
     point = direct.space.point(held.values)
-    assert np.array_equal(found.losses, direct.evaluate(point[None], streams=held.streams).losses[0])
+    assert np.array_equal(
+        found.losses, direct.evaluate(point[None], streams=held.streams).losses[0]
+    )
 
 
 def test_a_change_is_compared_on_the_same_seeds(spare, held):
@@ -74,8 +91,11 @@ def test_a_change_is_compared_on_the_same_seeds(spare, held):
     assert (change.name, change.clipped) == ("make", False)
     assert change.value == pytest.approx(2.4, rel=1e-12)
     objective = spare.search.objective
-    moved = objective.evaluate(objective.space.point({"make": change.value, "nothing": 0.5})[None], streams=held.streams).losses[0]
-    # the value's coordinate is rounded on its way back, and that changes float32 levels by their last bits at most
+    moved = objective.evaluate(
+        objective.space.point({"make": change.value, "nothing": 0.5})[None], streams=held.streams
+    ).losses[0]
+    # the value's coordinate is rounded on its way back, and that changes float32 levels by their
+    # last bits at most
     assert np.allclose(change.losses, moved, rtol=1e-6, atol=1e-6)
     gained = change.losses - held.losses
     assert change.difference == pytest.approx(gained.mean(), rel=1e-12)
@@ -84,7 +104,10 @@ def test_a_change_is_compared_on_the_same_seeds(spare, held):
 
 def test_a_parameter_without_effect_has_none(held):
     idle = [c for c in held.changes if c.name == "nothing"]
-    assert [(c.value, c.difference, c.error) for c in idle] == [(pytest.approx(0.4), 0.0, 0.0), (pytest.approx(0.6), 0.0, 0.0)]
+    assert [(c.value, c.difference, c.error) for c in idle] == [
+        (pytest.approx(0.4), 0.0, 0.0),
+        (pytest.approx(0.6), 0.0, 0.0),
+    ]
     assert held.indices.first[1] == held.indices.total[1] == held.indices.total_error[1] == 0.0
     assert held.indices.total[0] > 0.0
     assert held.indices.colonies == 8 * (2 + 2) * 2
@@ -92,9 +115,24 @@ def test_a_parameter_without_effect_has_none(held):
 
 @pytest.mark.parametrize("most, pieces", [(3, 1), (None, 4)])
 def test_nothing_depends_on_how_it_is_divided(held, spare, most, pieces):
-    search = Search(spared, [MAKE, Parameter("nothing", 0, 1)], Level(wanted=1.0), cells=12, replicates=2, method="sobol", most=most)
+    search = Search(
+        spared,
+        [MAKE, Parameter("nothing", 0, 1)],
+        Level(wanted=1.0),
+        cells=12,
+        replicates=2,
+        method="sobol",
+        most=most,
+    )
     with ThreadPoolExecutor(2) as pool:
-        other = robustness(Best(search, spare.values, spare.point, spare.loss, spare.losses), seeds=6, samples=8, executor=pool, pieces=pieces, progress=False)
+        other = robustness(
+            Best(search, spare.values, spare.point, spare.loss, spare.losses),
+            seeds=6,
+            samples=8,
+            executor=pool,
+            pieces=pieces,
+            progress=False,
+        )
     assert np.array_equal(other.losses, held.losses)
     for one, two in zip(other.sizes + other.changes, held.sizes + held.changes, strict=True):
         assert np.array_equal(one.losses, two.losses)
@@ -115,20 +153,33 @@ def test_nothing_depends_on_how_it_is_divided(held, spare, most, pieces):
     ],
 )
 def test_values_that_are_tried(parameter, value, wanted, used):
-    found = best(built, [parameter], {parameter.name: value}, cells=2, replicates=1, target=Level("g0")).check(seeds=1, sizes=(), progress=False)
-    near = lambda values: [v if isinstance(v, str) else pytest.approx(v, rel=1e-12) for v in values]  # noqa: E731
+    found = best(
+        built, [parameter], {parameter.name: value}, cells=2, replicates=1, target=Level("g0")
+    ).check(seeds=1, sizes=(), progress=False)
+    near = lambda values: [v if isinstance(v, str) else pytest.approx(v, rel=1e-12) for v in values]
     assert [c.wanted for c in found.changes] == near(wanted)
     assert [c.value for c in found.changes] == near(used)
     assert [c.clipped for c in found.changes] == [a != b for a, b in zip(wanted, used, strict=True)]
     assert all(math.isfinite(c.difference) and math.isnan(c.error) for c in found.changes)
 
 
-@pytest.mark.parametrize("low, high, value, told", [(0.1, 2.0, 2.0, [True, False]), (0.0, 2.0, 0.0, [False, False]), (2.0, 9.0, 2.0, [False, True])])
+@pytest.mark.parametrize(
+    "low, high, value, told",
+    [
+        (0.1, 2.0, 2.0, [True, False]),
+        (0.0, 2.0, 0.0, [False, False]),
+        (2.0, 9.0, 2.0, [False, True]),
+    ],
+)
 def test_a_value_that_cannot_be_changed_says_nothing(low, high, value, told):
     """At a bound, or 0: the value used is the design's own, and no difference is made up."""
-    found = best(lit, [Parameter("make", low, high)], {"make": value}, cells=2, replicates=1).check(seeds=2, sizes=(), progress=False)
+    found = best(lit, [Parameter("make", low, high)], {"make": value}, cells=2, replicates=1).check(
+        seeds=2, sizes=(), progress=False
+    )
     assert [math.isfinite(c.difference) for c in found.changes] == told
-    assert [c.value for c, t in zip(found.changes, told, strict=True) if not t] == [value] * told.count(False)
+    assert [c.value for c, t in zip(found.changes, told, strict=True) if not t] == [
+        value
+    ] * told.count(False)
 
 
 def test_failures_count_with_the_loss_of_a_failure():
@@ -137,7 +188,9 @@ def test_failures_count_with_the_loss_of_a_failure():
     held = design.check(seeds=3, sizes=(), progress=False)
     assert held.failed == 0.0
     assert held.changes[1].losses.tolist() == [Target.failed] * 3
-    broken = best(fragile, [Parameter("make", 0.1, 10)], {"make": 6.0}, cells=20).check(seeds=3, sizes=(), progress=False)
+    broken = best(fragile, [Parameter("make", 0.1, 10)], {"make": 6.0}, cells=20).check(
+        seeds=3, sizes=(), progress=False
+    )
     assert broken.failed == 1.0 and broken.mean == Target.failed
 
 
@@ -167,14 +220,22 @@ CUBE = [Parameter(n, 0, 1) for n in ("x", "y", "z", "rest")]
 
 @pytest.mark.slow
 def test_indices_of_ishigami():
-    """Variances by hand: a = 7, b = 0.1 give V = a²/8 + bπ⁴/5 + b²π⁸/18 + 1/2, V₁ = (1 + bπ⁴/5)²/2, V₂ = a²/8, V₁₃ = 8b²π⁸/225."""
+    """Variances by hand: a = 7, b = 0.1 give V = a²/8 + bπ⁴/5 + b²π⁸/18 + 1/2, V₁ = (1 + bπ⁴/5)²/2,
+    V₂ = a²/8, V₁₃ = 8b²π⁸/225."""
     a, b = 7.0, 0.1
     whole = a**2 / 8 + b * math.pi**4 / 5 + b**2 * math.pi**8 / 18 + 0.5
-    one, two, both = 0.5 * (1 + b * math.pi**4 / 5) ** 2 / whole, a**2 / 8 / whole, 8 * b**2 * math.pi**8 / 225 / whole
+    one, two, both = (
+        0.5 * (1 + b * math.pi**4 / 5) ** 2 / whole,
+        a**2 / 8 / whole,
+        8 * b**2 * math.pi**8 / 225 / whole,
+    )
     middle = dict.fromkeys(("x", "y", "z", "rest"), 0.5)
-    design = best(still, CUBE, middle, target=Ishigami(), cells=None, until=1.0, replicates=1, most=4096)
+    design = best(
+        still, CUBE, middle, target=Ishigami(), cells=None, until=1.0, replicates=1, most=4096
+    )
     found = design.check(seeds=1, sizes=(), samples=1024, progress=False).indices
-    # four standard errors: one in 2,000 tests of eight would miss them by chance, and the points are the same each time
+    # four standard errors: one in 2,000 tests of eight would miss them by chance, and the points
+    # are the same each time
     assert np.all(np.abs(found.first - [one, two, 0, 0]) <= 4 * found.first_error + 1e-12)
     assert np.all(np.abs(found.total - [one + both, two, both, 0]) <= 4 * found.total_error + 1e-12)
     assert found.first_error.max() < 0.06 and found.total_error.max() < 0.06
@@ -184,9 +245,20 @@ def test_indices_of_ishigami():
 
 @pytest.mark.parametrize("scale, index", [(1.0, 1.0), (0.0, 0.0)])
 def test_one_parameter_explains_everything_or_there_is_nothing_to_explain(scale, index):
-    design = best(still, [CUBE[0]], {"x": 0.5}, target=Ishigami(scale), cells=None, until=1.0, replicates=1, most=4096, dtype=torch.float64)
+    design = best(
+        still,
+        [CUBE[0]],
+        {"x": 0.5},
+        target=Ishigami(scale),
+        cells=None,
+        until=1.0,
+        replicates=1,
+        most=4096,
+        dtype=torch.float64,
+    )
     found = design.check(seeds=1, sizes=(), samples=64, progress=False).indices
-    # Sobol points are even: the means of f² over 64 points are within a few per cent of their integrals
+    # Sobol points are even: the means of f² over 64 points are within a few per cent of their
+    # integrals
     assert found.total[0] == pytest.approx(index, abs=0.1)
     assert found.first[0] == pytest.approx(index, abs=0.1)
 
@@ -195,27 +267,49 @@ def test_the_file_says_what_was_found(held, tmp_path):
     told = json.loads(held.save(tmp_path / "held.json").read_text())
     assert told["losses"] == held.losses.tolist() and told["streams"] == list(held.streams)
     assert told["values"] == held.values and told["searched"] == held.searched.tolist()
-    assert (told["mean"], told["median"], told["high"], told["reached"]) == (held.mean, held.median, held.high, held.reached)
+    assert (told["mean"], told["median"], told["high"], told["reached"]) == (
+        held.mean,
+        held.median,
+        held.high,
+        held.reached,
+    )
     assert [c["difference"] for c in told["changes"]] == [c.difference for c in held.changes]
     assert [s["cells"] for s in told["sizes"]] == [6, 24]
     assert told["indices"]["total"] == held.indices.total.tolist()
 
 
 def test_what_is_no_number_is_null(tmp_path):
-    found = best(lit, [Parameter("make", 0, 2.0)], {"make": 0.0}, cells=2, replicates=1).check(seeds=1, sizes=(), progress=False)
+    found = best(lit, [Parameter("make", 0, 2.0)], {"make": 0.0}, cells=2, replicates=1).check(
+        seeds=1, sizes=(), progress=False
+    )
     text = found.save(tmp_path / "held.json").read_text()
     assert "NaN" not in text
-    assert json.loads(text)["changes"][0]["difference"] is None and json.loads(text)["indices"] is None
+    assert (
+        json.loads(text)["changes"][0]["difference"] is None and json.loads(text)["indices"] is None
+    )
 
 
 def test_the_table_names_everything(held):
     table = held.table()
-    for words in ("streams 0 … 1", "6 fresh ones, 2 … 7", "loss at most 0.2", "searched", "× 0.5", "× 2", "make", "nothing", f"{held.mean:.4f}", "64 colonies"):
+    for words in (
+        "streams 0 … 1",
+        "6 fresh ones, 2 … 7",
+        "loss at most 0.2",
+        "searched",
+        "× 0.5",
+        "× 2",
+        "make",
+        "nothing",
+        f"{held.mean:.4f}",
+        "64 colonies",
+    ):
         assert words in table
 
 
 def test_the_table_says_where_a_bound_was_in_the_way():
-    found = best(lit, [Parameter("make", 0.1, 2.1)], {"make": 2.0}, cells=2, replicates=1).check(seeds=1, sizes=(), progress=False)
+    found = best(lit, [Parameter("make", 0.1, 2.1)], {"make": 2.0}, cells=2, replicates=1).check(
+        seeds=1, sizes=(), progress=False
+    )
     row = next(line for line in found.table().splitlines() if "2.4" in line)
     assert row.split()[:4] == ["make", "2", "2.1", "2.4"]
 
@@ -226,7 +320,9 @@ def test_a_picture_has_a_panel_for_each_part(tmp_path, samples, panels):
     from matplotlib.image import imread
 
     design = best(lit, [MAKE], {"make": 2.0}, cells=2, replicates=1)
-    path = design.check(seeds=2, sizes=(2.0,), samples=samples, threshold=0.5, progress=False).plot(tmp_path / "held.png")
+    path = design.check(seeds=2, sizes=(2.0,), samples=samples, threshold=0.5, progress=False).plot(
+        tmp_path / "held.png"
+    )
     assert imread(path).shape[:2] == (512, 576 * panels)  # 3.2 × 3.6 inches at 160 dots
 
 

@@ -19,10 +19,16 @@ LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
 
 def search(method=None, scene=lit, parameters=LIT, target=None, **options):
-    return Search(scene, parameters, target or Level(wanted=1.0), method=method or Sobol(batch=3), **{"cells": 3, "replicates": 2, **options})
+    return Search(
+        scene,
+        parameters,
+        target or Level(wanted=1.0),
+        method=method or Sobol(batch=3),
+        **{"cells": 3, "replicates": 2, **options},
+    )
 
 
-# --- the budget -----------------------------------------------------------------------------------------------------------
+# --- the budget -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("colonies, batches", [(1, 1), (6, 1), (7, 2), (12, 2), (13, 3)])
@@ -63,18 +69,33 @@ def test_the_best_is_the_first_of_the_least_over_all_full_designs():
     points = np.concatenate([e.points for e in made.study.entries])
     found = made.objective.evaluate(points)
     row = int(found.loss.argmin())
-    assert best.loss == found.loss[row] and np.array_equal(best.losses, found.losses[row]) and np.array_equal(best.point, points[row])
+    assert (
+        best.loss == found.loss[row]
+        and np.array_equal(best.losses, found.losses[row])
+        and np.array_equal(best.point, points[row])
+    )
     assert best.values == made.objective.space.values(points[row])
     colonies, seconds, least = made.study.convergence()
-    assert colonies.tolist() == [6, 12, 18] and (np.diff(seconds) > 0).all() and least.tolist() == np.minimum.accumulate(found.loss)[2::3].tolist()
-    scored = {int(s): float(x) for d in best.colonies() for s, x in zip(d.state.stream, made.objective.target.loss(d.state), strict=True)}
+    assert (
+        colonies.tolist() == [6, 12, 18]
+        and (np.diff(seconds) > 0).all()
+        and least.tolist() == np.minimum.accumulate(found.loss)[2::3].tolist()
+    )
+    scored = {
+        int(s): float(x)
+        for d in best.colonies()
+        for s, x in zip(d.state.stream, made.objective.target.loss(d.state), strict=True)
+    }
     assert [scored[0], scored[1]] == best.losses.tolist()
 
 
 def test_there_is_no_best_before_a_full_design():
     made = search(METHOD_SMALL())
     for ask in (made.best, made.first, lambda: made.run(1, progress=False)):
-        with pytest.raises(tf.InputError, match="no design has been grown to full size yet: run the search for more colonies"):
+        with pytest.raises(
+            tf.InputError,
+            match="no design has been grown to full size yet: run the search for more colonies",
+        ):
             ask()
     assert np.isnan(made.study.convergence()[2]).all()
 
@@ -86,7 +107,9 @@ class METHOD_SMALL:
         self.turn = 0
 
     def ask(self):
-        return Batch(np.full((2, 2), 0.5), **({"size": 0.5} if self.turn == 0 else {"replicates": 1}))
+        return Batch(
+            np.full((2, 2), 0.5), **({"size": 0.5} if self.turn == 0 else {"replicates": 1})
+        )
 
     def tell(self, batch, loss):
         self.turn += 1
@@ -113,7 +136,10 @@ def test_a_method_of_ones_own_is_asked_and_told():
     made = search(method, seed=3)
     made.run(4, progress=False)
     assert method.about == (2, (None, None), 3, 2)
-    assert method.told == [(e.points.tolist(), e.loss.tolist()) for e in made.study.entries] and len(method.told) == 2
+    assert (
+        method.told == [(e.points.tolist(), e.loss.tolist()) for e in made.study.entries]
+        and len(method.told) == 2
+    )
     assert made.study.entries[0].replicates == 2  # nine were asked, two are what there is
 
 
@@ -132,7 +158,13 @@ def test_a_bad_run_is_refused_in_words(given, words):
         search().run(**given, progress=False)
 
 
-@pytest.mark.parametrize("method, words", [("annealing", "method = 'annealing'.*'sobol'"), (Sobol, "an object with start, ask and tell.*write CMAES")])
+@pytest.mark.parametrize(
+    "method, words",
+    [
+        ("annealing", "method = 'annealing'.*'sobol'"),
+        (Sobol, "an object with start, ask and tell.*write CMAES"),
+    ],
+)
 def test_a_bad_method_is_refused_in_words(method, words):
     with pytest.raises(tf.InputError, match=words):
         search(method)
@@ -155,10 +187,14 @@ def test_the_bar_tells_the_best_loss_and_what_failed(monkeypatch):
     best = made.run(16, progress=True)
     shown = sys.stderr.getvalue().split("\r")[-1]
     failed = sum(len(e.reasons) for e in made.study.entries)
-    assert failed and f"best loss {best.loss:.4f}, {failed} colonies failed" in shown and "16/16 colonies" in shown
+    assert (
+        failed
+        and f"best loss {best.loss:.4f}, {failed} colonies failed" in shown
+        and "16/16 colonies" in shown
+    )
 
 
-# --- saved designs --------------------------------------------------------------------------------------------------------
+# --- saved designs --------------------------------------------------------------------------------
 
 OWN = """
 import torchfilm as tf
@@ -185,22 +221,35 @@ def own_scene(folder):
 
 SAVED = {
     "ready scene": lambda folder: {
-        "scene": tf.scenes.toggle_switch, "parameters": [Parameter("strength", 2, 8), Parameter("power", 1, 3, whole=True)],
-        "target": Level("red", 20.0), "fixed": {"noise": False}, "dt": 0.1, "seed": 5,
+        "scene": tf.scenes.toggle_switch,
+        "parameters": [Parameter("strength", 2, 8), Parameter("power", 1, 3, whole=True)],
+        "target": Level("red", 20.0),
+        "fixed": {"noise": False},
+        "dt": 0.1,
+        "seed": 5,
     },
     "ready scene by name": lambda folder: {
-        "scene": "boundary_detector", "parameters": [Parameter("k3", 0.1, 10, log=True)], "target": Level("yfp", 1.0), "dt": 0.05, "fixed": {"width": 16.0},
+        "scene": "boundary_detector",
+        "parameters": [Parameter("k3", 0.1, 10, log=True)],
+        "target": Level("yfp", 1.0),
+        "dt": 0.05,
+        "fixed": {"width": 16.0},
     },
-    "file": lambda folder: {"scene": own_scene(folder), "fixed": {"shortest": 3.2}, "seed": 7, "cells": 6},
+    "file": lambda folder: {
+        "scene": own_scene(folder),
+        "fixed": {"shortest": 3.2},
+        "seed": 7,
+        "cells": 6,
+    },
     "file, until": lambda folder: {"scene": own_scene(folder), "cells": None, "until": 1.1},
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SAVED)
 def test_a_saved_design_runs_as_it_was_scored(command, tmp_path, kind):
-    """`torchfilm run best.json` grows the very colonies: the last frame of one colony has the loss of replicate 0, and of several each has its own
-    in its first frame of that size."""
+    """`torchfilm run best.json` grows the very colonies: the last frame of one colony has the loss
+    of replicate 0, and of several each has its own in its first frame of that size."""
     made = search(Sobol(batch=2), **SAVED[kind](tmp_path))
     best = made.run(4, progress=False)
     best.save("best.json")
@@ -208,7 +257,10 @@ def test_a_saved_design_runs_as_it_was_scored(command, tmp_path, kind):
     command("run", "best.json", "--out", "one.h5", "--no-picture")
     with tf.Results("one.h5") as results:
         state = results.state(best.scene())
-        assert results.attributes["seed"] == made.objective.seed and results.attributes["dt"] == made.objective.dt
+        assert (
+            results.attributes["seed"] == made.objective.seed
+            and results.attributes["dt"] == made.objective.dt
+        )
         assert state.cells >= cells if cells else state.time == pytest.approx(1.1)
     assert float(target.loss(state)[0]) == best.losses[0]
     command("run", "best.json", "--colonies", 2, "--out", "two.h5", "--every", 1, "--no-picture")
@@ -217,7 +269,9 @@ def test_a_saved_design_runs_as_it_was_scored(command, tmp_path, kind):
         for k in range(2):
             at = int(np.argmax(counts[:, k] >= cells)) if cells else len(results) - 1
             levels, owner = results.frame(at)[target.species], results.frame(at)["colony"]
-            assert abs(levels[owner == k].astype(float).mean() - target.wanted) == pytest.approx(best.losses[k], rel=1e-12)
+            assert abs(levels[owner == k].astype(float).mean() - target.wanted) == pytest.approx(
+                best.losses[k], rel=1e-12
+            )
 
 
 def doubled(strength=1.0):
@@ -226,12 +280,27 @@ def doubled(strength=1.0):
 
 
 def test_a_design_says_all_that_it_needs(tmp_path):
-    made = search(scene=doubled, parameters=[Parameter("strength", 1, 4)], target=Level("red", 20.0), dt=0.1, dtype=torch.float64, seed=2)
+    made = search(
+        scene=doubled,
+        parameters=[Parameter("strength", 1, 4)],
+        target=Level("red", 20.0),
+        dt=0.1,
+        dtype=torch.float64,
+        seed=2,
+    )
     best = made.run(6, progress=False)
     told = json.loads(best.save(tmp_path / "best.json").read_text())
     assert told["scene"] == told["function"] == "doubled" and told["file"] == __file__
-    assert told["parameters"] == best.values and (told["seed"], told["dt"], told["dtype"], told["cells"]) == (2, 0.1, "float64", 3) and "until" not in told
-    assert told["loss"] == best.loss and told["losses"] == best.losses.tolist() and told["colonies"] == 6
+    assert (
+        told["parameters"] == best.values
+        and (told["seed"], told["dt"], told["dtype"], told["cells"]) == (2, 0.1, "float64", 3)
+        and "until" not in told
+    )
+    assert (
+        told["loss"] == best.loss
+        and told["losses"] == best.losses.tolist()
+        and told["colonies"] == 6
+    )
     assert told["target"] == made.objective.target.describe()
     assert made.study.about["scene"] == "doubled"
 
@@ -239,19 +308,46 @@ def test_a_design_says_all_that_it_needs(tmp_path):
 def test_given_settings_come_before_the_saved(command, tmp_path):
     best = search(**SAVED["file"](tmp_path)).run(6, progress=False)
     best.save("best.json")
-    command("run", "best.json", "--set", "make=3.0", "--until", 0.2, "--seed", 1, "--dt", 0.05, "--out", "a.h5", "--no-picture")
+    command(
+        "run",
+        "best.json",
+        "--set",
+        "make=3.0",
+        "--until",
+        0.2,
+        "--seed",
+        1,
+        "--dt",
+        0.05,
+        "--out",
+        "a.h5",
+        "--no-picture",
+    )
     with tf.Results("a.h5") as results:
-        assert results.attributes["seed"] == 1 and results.attributes["dt"] == 0.05 and results.times[-1] == pytest.approx(0.2)
-        assert results.settings["make"] == 3.0 and results.settings["decay"] == best.values["decay"] and results.settings["shortest"] == 3.2
+        assert (
+            results.attributes["seed"] == 1
+            and results.attributes["dt"] == 0.05
+            and results.times[-1] == pytest.approx(0.2)
+        )
+        assert (
+            results.settings["make"] == 3.0
+            and results.settings["decay"] == best.values["decay"]
+            and results.settings["shortest"] == 3.2
+        )
 
 
-# --- recovery -------------------------------------------------------------------------------------------------------------
+# --- recovery -------------------------------------------------------------------------------------
 
 
 def two(feed=1.0, leak=1.0):
     """Two species, of which the second tells of one rate alone."""
     circuit = tf.Circuit(paired, species=("a", "b"), feed=feed, leak=leak)
-    return tf.Scene(tf.Growth(rate=tf.Uniform(1.6, 2.4)), tf.Division(length=tf.Uniform(3.0, 4.0)), circuit, dt=0.1)
+    return tf.Scene(
+        tf.Growth(rate=tf.Uniform(1.6, 2.4)),
+        tf.Division(length=tf.Uniform(3.0, 4.0)),
+        circuit,
+        dt=0.1,
+    )
 
 
 def paired(u, s, p, cell):
@@ -271,18 +367,30 @@ class Levels(Target):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("hidden", [{"feed": 2.0, "leak": 3.0}, {"feed": 0.4, "leak": 1.5}], ids=str)
+@pytest.mark.parametrize(
+    "hidden", [{"feed": 2.0, "leak": 3.0}, {"feed": 0.4, "leak": 1.5}], ids=str
+)
 def test_hidden_parameters_are_found_again(hidden):
-    """A pattern was made by constants that the search does not know, with random numbers of its own. What is found is as near as seeds differ."""
+    """A pattern was made by constants that the search does not know, with random numbers of its
+    own. What is found is as near as seeds differ."""
     scene = two(**hidden)
     *_, state = tf.simulate(scene, scene.seed(8, seed=99), until=1.0)
     measured = {n: float(mean(state, n).mean()) for n in ("a", "b")}
     target = Levels(**measured)
     parameters = [Parameter("feed", 0.1, 10, log=True), Parameter("leak", 0.1, 10, log=True)]
-    made = Search(two, parameters, target, method=CMAES(population=8, noisy=False), until=1.0, replicates=2, seed=1)
+    made = Search(
+        two,
+        parameters,
+        target,
+        method=CMAES(population=8, noisy=False),
+        until=1.0,
+        replicates=2,
+        seed=1,
+    )
     best = made.run(640, progress=False)
     own = made.objective.evaluate(made.objective.space.point(hidden)[None])
-    # the levels of a colony differ by 2 % between seeds, and so does what they are compared with: the mean of 8 by 0.7 %, that of 2 by 1.5 %
+    # the levels of a colony differ by 2 % between seeds, and so does what they are compared with:
+    # the mean of 8 by 0.7 %, that of 2 by 1.5 %
     assert own.loss[0] < 0.04 and best.loss < own.loss[0] + 0.01
     # they are as good as proportional to the rates: b to leak, a to feed · leak^-0.6
     for name, value in hidden.items():

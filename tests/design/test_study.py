@@ -1,4 +1,5 @@
-"""A study keeps every evaluation, in a file of plain data, from which a search goes on as if it had never stopped."""
+"""A study keeps every evaluation, in a file of plain data, from which a search goes on as if it had
+never stopped."""
 
 from __future__ import annotations
 
@@ -20,7 +21,13 @@ LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
 def search(method=None, scene=lit, parameters=LIT, target=None, **options):
     target = target or Level(wanted=1.0)
-    return Search(scene, parameters, target, method=method or Sobol(batch=3), **{"cells": 3, "replicates": 2, **options})
+    return Search(
+        scene,
+        parameters,
+        target,
+        method=method or Sobol(batch=3),
+        **{"cells": 3, "replicates": 2, **options},
+    )
 
 
 METHODS = {
@@ -35,7 +42,12 @@ class Halving:
     """A method of a user's own: three points about the best so far, ever nearer."""
 
     def start(self, space, seed, replicates):
-        self.best, self.loss, self.width, self.size = np.full(space.size, 0.5), np.inf, 0.5, space.size
+        self.best, self.loss, self.width, self.size = (
+            np.full(space.size, 0.5),
+            np.inf,
+            0.5,
+            space.size,
+        )
 
     def ask(self):
         step = self.width * np.ones(self.size)
@@ -55,7 +67,7 @@ def entries_alike(one, other):
                 assert np.array_equal(getattr(a, f.name), getattr(b, f.name)), f.name
 
 
-# --- the file -------------------------------------------------------------------------------------------------------------
+# --- the file -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", ["sobol", "racing"])
@@ -63,14 +75,22 @@ def test_a_file_gives_back_what_was_written(tmp_path, method):
     made = search(METHODS[method]())
     made.run(12, study=tmp_path / "s.h5", progress=False)
     again = Study.read(tmp_path / "s.h5")
-    assert (again.about, again.names, again.streams) == (made.study.about, made.study.names, made.study.streams)
+    assert (again.about, again.names, again.streams) == (
+        made.study.about,
+        made.study.names,
+        made.study.streams,
+    )
     entries_alike(again, made.study)
     assert [e.seconds for e in again.entries] == [e.seconds for e in made.study.entries]
     assert again.colonies == made.study.colonies
     for a, b in zip(again.convergence(), made.study.convergence(), strict=True):
         assert np.array_equal(a, b, equal_nan=True)
     point, loss, losses = again.best()
-    assert np.array_equal(point, made.best().point) and loss == made.best().loss and np.array_equal(losses, made.best().losses)
+    assert (
+        np.array_equal(point, made.best().point)
+        and loss == made.best().loss
+        and np.array_equal(losses, made.best().losses)
+    )
 
 
 def test_reasons_are_kept(tmp_path):
@@ -85,9 +105,13 @@ def test_the_file_holds_numbers_and_text_only(tmp_path):
     search(METHODS["racing"]()).run(12, study=tmp_path / "s.h5", progress=False)
     kinds = {}
     with h5py.File(tmp_path / "s.h5") as file:
-        file.visititems(lambda name, d: kinds.update({name: d.dtype}) if isinstance(d, h5py.Dataset) else None)
+        file.visititems(
+            lambda name, d: kinds.update({name: d.dtype}) if isinstance(d, h5py.Dataset) else None
+        )
         attributes = {n: file.attrs[n] for n in file.attrs}
-    assert {"designs/point", "designs/losses", "values/make", "batches/size", "streams"} <= set(kinds)
+    assert {"designs/point", "designs/losses", "values/make", "batches/size", "streams"} <= set(
+        kinds
+    )
     assert all(d.kind in "iuf" or h5py.check_string_dtype(d) is not None for d in kinds.values())
     assert all(isinstance(v, (str, int, np.integer)) for v in attributes.values())
     assert json.loads(attributes["about"])["names"] == ["make", "decay"]
@@ -97,7 +121,9 @@ def test_the_file_holds_numbers_and_text_only(tmp_path):
 def test_values_of_all_kinds_are_written(tmp_path, options):
     """A user who opens the file finds the parameters themselves, over several batches."""
     chosen = Choice("kind", options)
-    made = search(Sobol(batch=2), of_a_kind, [chosen, Parameter("rate", 1, 2)], Spread(), replicates=1)
+    made = search(
+        Sobol(batch=2), of_a_kind, [chosen, Parameter("rate", 1, 2)], Spread(), replicates=1
+    )
     made.run(6, study=tmp_path / "s.h5", progress=False)
     points = np.concatenate([e.points for e in made.study.entries])
     with h5py.File(tmp_path / "s.h5") as file:
@@ -113,7 +139,7 @@ def of_a_kind(kind="weak", rate=1.0):
     return tf.Scene(tf.Growth(rate=rate), tf.Division(length=4.0), dt=0.1)
 
 
-# --- going on -------------------------------------------------------------------------------------------------------------
+# --- going on -------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +154,9 @@ def whole():
 @pytest.mark.slow
 @pytest.mark.parametrize("stops", [(1,), (9,), (5, 13, 21)], ids=str)
 @pytest.mark.parametrize("method", METHODS)
-def test_stopped_and_gone_on_it_is_the_search_that_was_never_stopped(tmp_path, whole, method, stops):
+def test_stopped_and_gone_on_it_is_the_search_that_was_never_stopped(
+    tmp_path, whole, method, stops
+):
     path = tmp_path / "s.h5"
     for colonies in stops:
         try:
@@ -144,7 +172,8 @@ def test_stopped_and_gone_on_it_is_the_search_that_was_never_stopped(tmp_path, w
 
 @pytest.mark.parametrize("when", ["before the file takes its place", "between batches"])
 def test_a_kill_costs_at_most_one_batch(tmp_path, monkeypatch, whole, when):
-    """The file as a kill leaves it: the batch in work is lost, a half-written file may lie beside."""
+    """The file as a kill leaves it: the batch in work is lost, a half-written file may lie
+    beside."""
     path, made = tmp_path / "s.h5", search()
     made.run(12, study=path, progress=False)
     (tmp_path / "s.h5.new").write_bytes(path.read_bytes()[:500])
@@ -164,11 +193,16 @@ def test_a_kill_costs_at_most_one_batch(tmp_path, monkeypatch, whole, when):
 def test_what_a_study_holds_counts(tmp_path, monkeypatch):
     path = tmp_path / "s.h5"
     search().run(12, study=path, progress=False)
-    monkeypatch.setattr("design.objective.Objective.evaluate", lambda *_, **__: pytest.fail("nothing is left to do"))
+    monkeypatch.setattr(
+        "design.objective.Objective.evaluate", lambda *_, **__: pytest.fail("nothing is left to do")
+    )
     made = search()
     assert made.run(12, study=path, progress=False).loss == Study.read(path).best()[1]
     assert made.run(10**6, study=path, stop_at=1e9, progress=False).loss <= 1e9
-    assert search("sobol", paced, [Parameter("rate", 1, 2)]).regrown.startswith("Growth.rate differs") and made.regrown == ""
+    assert (
+        search("sobol", paced, [Parameter("rate", 1, 2)]).regrown.startswith("Growth.rate differs")
+        and made.regrown == ""
+    )
 
 
 def test_a_full_disk_is_said_and_costs_nothing(tmp_path, monkeypatch):
@@ -185,7 +219,7 @@ def test_a_full_disk_is_said_and_costs_nothing(tmp_path, monkeypatch):
     assert len(Study.read(path).entries) == 1
 
 
-# --- what is refused ------------------------------------------------------------------------------------------------------
+# --- what is refused ------------------------------------------------------------------------------
 
 
 def brighter(make=1.0, decay=1.0):
@@ -206,7 +240,9 @@ def quicker(make=1.0, decay=1.0):
     faster.__name__ = "filling"
     scene = lit(make, decay)
     circuit = tf.Circuit(faster, species=("gfp",), make=make, decay=decay)
-    return tf.Scene(*(circuit if isinstance(e, tf.Circuit) else e for e in scene.listed), dt=scene.dt)
+    return tf.Scene(
+        *(circuit if isinstance(e, tf.Circuit) else e for e in scene.listed), dt=scene.dt
+    )
 
 
 moved.__name__ = quicker.__name__ = "lit"
@@ -216,7 +252,10 @@ OTHERS = {
     "what a function does": ({"scene": quicker}, ["founders and functions: "]),
     "scene": ({"scene": brighter}, ["lit", "brighter", "rate=2.0", "rate=1.9"]),
     "target": ({"target": Level(wanted=2.0)}, ["wanted=1.0", "wanted=2.0"]),
-    "bounds": ({"parameters": [LIT[0], Parameter("decay", 0.5, 3)]}, ["decay: 0.5 to 2", "decay: 0.5 to 3"]),
+    "bounds": (
+        {"parameters": [LIT[0], Parameter("decay", 0.5, 3)]},
+        ["decay: 0.5 to 2", "decay: 0.5 to 3"],
+    ),
     "method": ({"method": Sobol(batch=4)}, [r"sobol(batch=3)", r"sobol(batch=4)"]),
     "another method": ({"method": CMAES(population=4)}, ["sobol(batch=3)", "cmaes(population=4"]),
     "seed": ({"seed": 1}, ["seed: 0 there, 1 here"]),
@@ -225,7 +264,10 @@ OTHERS = {
     "replicates": ({"replicates": 3}, ["replicates: 2 there, 3 here"]),
     "reduce": ({"reduce": "worst"}, ["'mean' there, 'worst' here"]),
     "step": ({"dt": 0.05}, ["dt: 0.1 there, 0.05 here"]),
-    "names": ({"parameters": [LIT[0]], "fixed": {"decay": 1.0}}, ["'decay': '1.0'", "['make', 'decay'] there, ['make'] here"]),
+    "names": (
+        {"parameters": [LIT[0]], "fixed": {"decay": 1.0}},
+        ["'decay': '1.0'", "['make', 'decay'] there, ['make'] here"],
+    ),
 }
 
 
@@ -248,7 +290,10 @@ def test_the_file_of_another_search_is_refused_with_both_values(kept, other):
 
 def test_fixed_functions_are_the_same_in_another_process():
     """What a value's text says of its place in memory is no part of what a study is of."""
-    one, other = (search(scene=chosen, parameters=[LIT[0]], fixed={"how": lambda x: x}).study.about for _ in range(2))
+    one, other = (
+        search(scene=chosen, parameters=[LIT[0]], fixed={"how": lambda x: x}).study.about
+        for _ in range(2)
+    )
     assert one == other
 
 
@@ -287,7 +332,9 @@ def spoiled(path, what):
             del file[what]
 
 
-@pytest.mark.parametrize("what", ["about", "about is a list", "rows", "reasons", "batches", "designs/loss", "streams"])
+@pytest.mark.parametrize(
+    "what", ["about", "about is a list", "rows", "reasons", "batches", "designs/loss", "streams"]
+)
 def test_a_spoiled_file_is_refused(kept, tmp_path, what):
     shutil.copy(kept, tmp_path / "s.h5")
     spoiled(tmp_path / "s.h5", what)
@@ -303,9 +350,12 @@ def test_foreign_files_are_refused(tmp_path, kept):
     with h5py.File(tmp_path / "c.h5", "r+") as file:
         file.attrs["version"] = 99
     for name, words in (
-        ("a.h5", "cannot be read"), ("b.h5", r"is not a torchfilm study \(its format is 'torchfilm results'"), ("c.h5", "format version 99, newer"),
-        ("", r"a study file\. That is a folder"), ("no/such.h5", "in a folder that exists"),
-    ):  # fmt: skip
+        ("a.h5", "cannot be read"),
+        ("b.h5", r"is not a torchfilm study \(its format is 'torchfilm results'"),
+        ("c.h5", "format version 99, newer"),
+        ("", r"a study file\. That is a folder"),
+        ("no/such.h5", "in a folder that exists"),
+    ):
         with pytest.raises(tf.InputError, match=words):
             search().run(12, study=tmp_path / name, progress=False)
     with pytest.raises(tf.InputError, match=r"a study file\. No such file"):

@@ -1,4 +1,5 @@
-"""What targets draw over a colony: where the lines are, and that what the axes show stays as it was."""
+"""What targets draw over a colony: where the lines are, and that what the axes show stays as it
+was."""
 
 from __future__ import annotations
 
@@ -9,7 +10,17 @@ import pytest
 import torch
 from patterned import placed
 
-from design.targets import Bands, DomainSize, Gradient, Image, OnFraction, Oscillation, Ring, Stripe, Target
+from design.targets import (
+    Bands,
+    DomainSize,
+    Gradient,
+    Image,
+    OnFraction,
+    Oscillation,
+    Ring,
+    Stripe,
+    Target,
+)
 
 WINDOW = (-10.0, 10.0), (-8.0, 8.0)
 
@@ -25,7 +36,14 @@ def ax():
 
 def state():
     """Two colonies; the second has its border at x = 5 and its middle at (5, 1)."""
-    return placed([(-1, 0), (1, 0), (4, 1), (6, 1)], cell_type=[0, 1, 0, 1], colony=[0, 0, 1, 1], colonies=2, yfp=[1, 0, 1, 0], cfp=1.0)
+    return placed(
+        [(-1, 0), (1, 0), (4, 1), (6, 1)],
+        cell_type=[0, 1, 0, 1],
+        colony=[0, 0, 1, 1],
+        colonies=2,
+        yfp=[1, 0, 1, 0],
+        cfp=1.0,
+    )
 
 
 def at(ax, axis: int) -> list[float]:
@@ -53,15 +71,23 @@ def test_lines_stand_where_bands_are_wanted(ax, target, axis, places):
 
 @pytest.mark.parametrize(
     "target, centre, radii",
-    [(Ring("yfp", 4.0, 2.0), (5, 1), [3, 5]), (Bands(("yfp", "cfp"), (0, 3, 20), along="radius"), (0, 0), [0, 3, 3, 20])],
+    [
+        (Ring("yfp", 4.0, 2.0), (5, 1), [3, 5]),
+        (Bands(("yfp", "cfp"), (0, 3, 20), along="radius"), (0, 0), [0, 3, 3, 20]),
+    ],
 )
 def test_rings_are_circles(ax, target, centre, radii):
     target.draw(ax, state(), 1)
-    assert sorted(p.radius for p in ax.patches) == radii and {tuple(p.center) for p in ax.patches} == {centre}
+    assert sorted(p.radius for p in ax.patches) == radii and {
+        tuple(p.center) for p in ax.patches
+    } == {centre}
     assert (ax.get_xlim(), ax.get_ylim()) == WINDOW
 
 
-@pytest.mark.parametrize("mask", [((1.0, 1.0), (1.0, 1.0)), ((0.5,),), ((0.0, 0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))])
+@pytest.mark.parametrize(
+    "mask",
+    [((1.0, 1.0), (1.0, 1.0)), ((0.5,),), ((0.0, 0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))],
+)
 def test_an_image_is_outlined_about_its_lit_part(ax, mask):
     """Within the image and half a pixel of its rim; a picture with one grey only too."""
     Image("yfp", mask, (6.0, 4.0), centre="colony").draw(ax, state(), 1)
@@ -109,6 +135,11 @@ def test_a_target_of_ones_own_needs_a_loss_only(ax):
     mine = Long()
     mine.check(state())
     mine.draw(ax, state(), 0)
-    assert mine.note(state()) is None and mine.measures(state()) == {} and mine.describe() == "Long" and mine.loss(state()).tolist() == [0, 0]
+    assert (
+        mine.note(state()) is None
+        and mine.measures(state()) == {}
+        and mine.describe() == "Long"
+        and mine.loss(state()).tolist() == [0, 0]
+    )
     with pytest.raises(NotImplementedError, match=r"Target\.loss"):
         Target().loss(state())

@@ -1,4 +1,5 @@
-"""Targets that say how bright each cell should be: their loss, worked out by hand, and the profiles that they want."""
+"""Targets that say how bright each cell should be: their loss, worked out by hand, and the profiles
+that they want."""
 
 from __future__ import annotations
 
@@ -55,33 +56,42 @@ def test_floor_takes_off_its_share(level):
 
 
 def test_cells_count_by_their_volume():
-    """Evenly lit, the loss is the share of the volume that is wanted dark; a ball and a rod of 4 µm: π/6 and π/6 + π µm³."""
+    """Evenly lit, the loss is the share of the volume that is wanted dark; a ball and a rod of 4
+    µm: π/6 and π/6 + π µm³."""
     state = placed([[-4.0, 0.0], [4.0, 0.0]], length=[0.0, 4.0], yfp=1.0)
     assert float(LEFT.loss(state)) == pytest.approx((1 / 6 + 1) / (1 / 6 + 1 / 6 + 1), rel=1e-14)
 
 
 @pytest.mark.parametrize("name", MASKS)
 def test_perfect_where_levels_are_as_wanted(name):
-    """y = c·m for each species by its own c has no loss but the floor's. LEAST may take m ≤ 1e-3 off up to 47 of 51 cells, 1e-6 each of Σ m²."""
+    """y = c·m for each species by its own c has no loss but the floor's. LEAST may take m ≤ 1e-3
+    off up to 47 of 51 cells, 1e-6 each of Σ m²."""
     target, state = MASKS[name], crowded()
     wanted = target.wanted(state)
-    assert wanted.shape == (state.cells, len(target.names)) and bool(((wanted >= 0) & (wanted <= 1)).all())
+    assert wanted.shape == (state.cells, len(target.names)) and bool(
+        ((wanted >= 0) & (wanted <= 1)).all()
+    )
     scale = {n: 0.7 * 3**k for k, n in enumerate(target.names)}
-    found = target.loss(state.with_fields(**{n: scale[n] * wanted[:, k] for k, n in enumerate(target.names)}))
+    found = target.loss(
+        state.with_fields(**{n: scale[n] * wanted[:, k] for k, n in enumerate(target.names)})
+    )
     left = np.mean([target.floor**2 / (target.floor**2 + c**2) for c in scale.values()])
     assert found.tolist() == pytest.approx([left] * 4, abs=1e-4)
 
 
 @pytest.mark.parametrize("name", MASKS)
 def test_loss_is_a_share_and_free_of_scale(name):
-    """In [0, 1] for 400 random colonies; not changed by a power of two of the levels, if the floor goes with them."""
+    """In [0, 1] for 400 random colonies; not changed by a power of two of the levels, if the floor
+    goes with them."""
     target, state = MASKS[name], crowded(seed=5, colonies=40, count=3)
     noise = torch.rand(state.cells, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     some = {n: (10 * noise) ** (k + 1) for k, n in enumerate(target.names)}
     found = target.loss(state.with_fields(**some))
     assert bool(((found >= 0) & (found <= 1)).all()) and float(found.std()) > 0.01
     if target.floor == 0:
-        assert torch.equal(target.loss(state.with_fields(**{n: v * 2.0**-20 for n, v in some.items()})), found)
+        assert torch.equal(
+            target.loss(state.with_fields(**{n: v * 2.0**-20 for n, v in some.items()})), found
+        )
 
 
 @pytest.mark.parametrize("name", MASKS)
@@ -99,14 +109,21 @@ def test_a_colony_scores_the_same_in_any_batch(name, dtype):
         alone = state.select([k])
         assert torch.equal(target.loss(alone)[0], whole[k])
         for what, value in target.measures(alone).items():
-            assert value.shape == (1,) and torch.equal(value.nan_to_num(-1.0)[0], measured[what].nan_to_num(-1.0)[k]), what
+            assert value.shape == (1,) and torch.equal(
+                value.nan_to_num(-1.0)[0], measured[what].nan_to_num(-1.0)[k]
+            ), what
 
 
 @pytest.mark.parametrize("name", MASKS)
 def test_without_light_or_wish_the_loss_is_1_with_a_gradient(name):
     """All dark; or, far away from all that is wanted, no cell wanted lit."""
     target, state = MASKS[name], crowded(colonies=2)
-    dark = state.with_fields(**{n: torch.zeros(state.cells, dtype=torch.float64, requires_grad=True) for n in target.names})
+    dark = state.with_fields(
+        **{
+            n: torch.zeros(state.cells, dtype=torch.float64, requires_grad=True)
+            for n in target.names
+        }
+    )
     far = state.replace(position=state.position + 1e4)
     loss = target.loss(dark)
     assert loss.tolist() == [1.0, 1.0]
@@ -125,7 +142,8 @@ def test_a_cell_that_is_hardly_wanted_is_wanted_dark():
 
 @pytest.mark.parametrize("name", MASKS)
 def test_colonies_that_failed_score_so_and_harm_no_other(name):
-    """Without cells, or with a level that is not a number; the gradient stays finite, and that of the others is what it is without them."""
+    """Without cells, or with a level that is not a number; the gradient stays finite, and that of
+    the others is what it is without them."""
     target, state = MASKS[name], crowded(colonies=4)
     good = target.loss(state)
     state = state.remove(state.colony == 1, "removed")
@@ -135,7 +153,11 @@ def test_colonies_that_failed_score_so_and_harm_no_other(name):
     loss = target.loss(state.with_fields(**given))
     assert loss[[1, 2]].tolist() == [target.failed] * 2 and torch.equal(loss[[0, 3]], good[[0, 3]])
     for grad in torch.autograd.grad(loss.sum(), list(given.values())):
-        assert bool(torch.isfinite(grad).all()) and bool((grad[state.colony == 2] == 0).all()) and float(grad.abs().max()) > 0
+        assert (
+            bool(torch.isfinite(grad).all())
+            and bool((grad[state.colony == 2] == 0).all())
+            and float(grad.abs().max()) > 0
+        )
     assert all(v.shape == (4,) and bool(v[1].isnan()) for v in target.measures(state).values())
 
 
@@ -146,15 +168,22 @@ def test_levels_below_zero_count_as_none():
 def test_edges_are_logistic_and_bands_add_up():
     """σ at the edge, one and two `soft` beyond; bands side by side are one wide band."""
     x = torch.tensor([-2.0, 0.0, 1.0, 4.0], dtype=torch.float64)
-    assert between(x, 0.0, math.inf, 2.0).tolist() == pytest.approx([1 / (1 + math.exp(-v / 2)) for v in x.tolist()], rel=1e-14)
+    assert between(x, 0.0, math.inf, 2.0).tolist() == pytest.approx(
+        [1 / (1 + math.exp(-v / 2)) for v in x.tolist()], rel=1e-14
+    )
     state = crowded()
     wanted = Bands(("yfp", "cfp"), (-6.0, 1.0, 5.0)).wanted(state)
-    assert torch.allclose(wanted.sum(1, keepdim=True), Bands(("yfp",), (-6.0, 5.0)).wanted(state), atol=1e-15, rtol=0)
+    assert torch.allclose(
+        wanted.sum(1, keepdim=True), Bands(("yfp",), (-6.0, 5.0)).wanted(state), atol=1e-15, rtol=0
+    )
 
 
-@pytest.mark.parametrize("along, place", [("x", (3.0, 9.0)), ("y", (9.0, 3.0)), ("radius", (0.0, 3.0))])
+@pytest.mark.parametrize(
+    "along, place", [("x", (3.0, 9.0)), ("y", (9.0, 3.0)), ("radius", (0.0, 3.0))]
+)
 def test_bands_lie_along_their_axis(along, place):
-    """3 µm is in the second of three bands, 9 in none; at the very centre the first is wanted, for there is nothing on its other side."""
+    """3 µm is in the second of three bands, 9 in none; at the very centre the first is wanted, for
+    there is nothing on its other side."""
     target = Bands(("a", "b", "c"), (0.0, 2.0, 4.0, 6.0), along=along, soft=SHARP)
     state = placed([place, (9.0, 9.0), (0.0, 0.0)], a=1.0, b=1.0, c=1.0)
     wanted = target.wanted(state).tolist()
@@ -165,7 +194,17 @@ def test_bands_lie_along_their_axis(along, place):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_ring_about_the_colony_goes_with_it(dim):
     """Wherever the colony is; in space it is seen from above."""
-    place = np.array([[3.0, 0.0, 0.0], [-3.0, 0.0, 5.0], [0.0, 3.0, 0.0], [0.0, -3.0, -5.0], [0.0, 0.0, 0.0], [6.0, 0.0, 0.0], [-6.0, 0.0, 0.0]])[:, :dim]
+    place = np.array(
+        [
+            [3.0, 0.0, 0.0],
+            [-3.0, 0.0, 5.0],
+            [0.0, 3.0, 0.0],
+            [0.0, -3.0, -5.0],
+            [0.0, 0.0, 0.0],
+            [6.0, 0.0, 0.0],
+            [-6.0, 0.0, 0.0],
+        ]
+    )[:, :dim]
     levels = [2, 2, 2, 2, 0, 0, 0]
     for shift in (0.0, 1000.0):
         state = placed(place + shift, yfp=levels)
@@ -173,10 +212,13 @@ def test_ring_about_the_colony_goes_with_it(dim):
         assert target.wanted(state)[:, 0].tolist() == [1, 1, 1, 1, 0, 0, 0]
         assert float(target.loss(state)) == 0
         assert float(target.measures(state)["radius_um"]) == pytest.approx(3.0, rel=1e-12)
-    assert Ring("yfp", 2.0, 4.0, soft=SHARP).wanted(state)[:, 0].tolist() == [1, 1, 1, 1, 1, 0, 0]  # a disc
+    # a disc
+    assert Ring("yfp", 2.0, 4.0, soft=SHARP).wanted(state)[:, 0].tolist() == [1, 1, 1, 1, 1, 0, 0]
 
 
-@pytest.mark.parametrize("low, high, wanted", [(-4, 4, [1, 1, 0.75, 0.5, 0, 0]), (4, -4, [0, 0, 0.25, 0.5, 1, 1])])
+@pytest.mark.parametrize(
+    "low, high, wanted", [(-4, 4, [1, 1, 0.75, 0.5, 0, 0]), (4, -4, [0, 0, 0.25, 0.5, 1, 1])]
+)
 def test_gradient_is_straight_between_its_ends(low, high, wanted):
     state = row([-9, -4, -2, 0, 4, 9], yfp=wanted)
     target = Gradient("yfp", "x", low, high)
@@ -188,22 +230,37 @@ def test_gradient_is_straight_between_its_ends(low, high, wanted):
 
 
 def test_image_is_bilinear_with_its_first_row_on_top():
-    """Pixels 4 µm wide and high, the picture about (10, 20): their middles, half-way between two, between four, at the rim, and beside it."""
+    """Pixels 4 µm wide and high, the picture about (10, 20): their middles, half-way between two,
+    between four, at the rim, and beside it."""
     target = Image("yfp", PICTURE, (12.0, 8.0), centre=(10.0, 20.0))
-    places = {(6, 22): 0.0, (10, 22): 0.25, (14, 22): 0.5, (6, 18): 1.0, (14, 18): 0.0, (8, 22): 0.125, (6, 20): 0.5, (8, 20): 0.5, (8, 19): 0.6875}
+    places = {
+        (6, 22): 0.0,
+        (10, 22): 0.25,
+        (14, 22): 0.5,
+        (6, 18): 1.0,
+        (14, 18): 0.0,
+        (8, 22): 0.125,
+        (6, 20): 0.5,
+        (8, 20): 0.5,
+        (8, 19): 0.6875,
+    }
     places |= {(4, 16): 1.0, (16, 24): 0.5, (3.99, 18): 0.0, (6, 15.99): 0.0}
     wanted = target.wanted(placed(list(places), yfp=1.0))[:, 0].tolist()
     assert wanted == pytest.approx(list(places.values()), abs=1e-14)
 
 
 def test_image_of_one_pixel_is_a_box():
-    wanted = Image("yfp", [[1]], (4.0, 2.0)).wanted(placed([(0, 0), (1.9, -0.9), (2.1, 0), (0, 1.1)], yfp=1.0))
+    wanted = Image("yfp", [[1]], (4.0, 2.0)).wanted(
+        placed([(0, 0), (1.9, -0.9), (2.1, 0), (0, 1.1)], yfp=1.0)
+    )
     assert wanted[:, 0].tolist() == [1, 1, 0, 0]
 
 
 def test_image_from_a_file(tmp_path):
     (tmp_path / "x.csv").write_text("0,0.25,0.5\n1,0.75,0\n")
-    assert Image.load(tmp_path / "x.csv", "yfp", (12.0, 8.0)) == Image("yfp", np.array(PICTURE), (12.0, 8.0))
+    assert Image.load(tmp_path / "x.csv", "yfp", (12.0, 8.0)) == Image(
+        "yfp", np.array(PICTURE), (12.0, 8.0)
+    )
     (tmp_path / "bad.csv").write_text("0,red\n")
     for name in ("bad.csv", "none.csv"):
         with pytest.raises(tf.InputError, match=name):
@@ -212,17 +269,25 @@ def test_image_from_a_file(tmp_path):
 
 def test_measures_say_how_bright_it_is_inside_and_outside():
     found = LEFT.measures(row([-4, -2, 2, 4], yfp=[3, 1, 0.5, 0.5]))
-    assert {name: float(v) for name, v in found.items()} == {"inside": 2.0, "outside": 0.5, "contrast": 4.0}
-    two = Bands(("yfp", "cfp"), (-9, 0, 9), soft=SHARP).measures(row([-4, 4], yfp=[1, 0], cfp=[1, 2]))
+    assert {name: float(v) for name, v in found.items()} == {
+        "inside": 2.0,
+        "outside": 0.5,
+        "contrast": 4.0,
+    }
+    two = Bands(("yfp", "cfp"), (-9, 0, 9), soft=SHARP).measures(
+        row([-4, 4], yfp=[1, 0], cfp=[1, 2])
+    )
     assert float(two["cfp_contrast"]) == 2 and bool(two["yfp_contrast"].isnan())
 
 
 def test_a_signal_is_seen_where_the_cells_are():
-    """ "out.ahl" is what the medium holds where a cell is, with its gradient; in a flat field all cells find the same."""
+    """ "out.ahl" is what the medium holds where a cell is, with its gradient; in a flat field all
+    cells find the same."""
     scene = tf.Scene(
-        tf.Growth(), tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=0.5), box=((-8, -8), (8, 8)), spacing=4.0),
+        tf.Growth(),
+        tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=0.5), box=((-8, -8), (8, 8)), spacing=4.0),
         founders=tf.Cells([[-3.0, 0.0], [-1.0, 0.0], [3.0, 0.0]], [1.0, 0.0], 0.0),
-    )  # fmt: skip
+    )
     state = scene.seed(dtype=torch.float64)
     target = Bands(("out.ahl",), (-math.inf, 0.0), soft=SHARP)
     target.check(state)
@@ -241,7 +306,9 @@ def test_a_signal_is_seen_where_the_cells_are():
 def test_unknown_species_are_told_with_what_there_is(name):
     state = crowded(names=("yfq", "cfp"))
     for look in (MASKS[name].check, MASKS[name].loss):
-        with pytest.raises(tf.InputError, match=r"'yfp' is not allowed.*'yfq'.*Did you mean 'yfq'\?"):
+        with pytest.raises(
+            tf.InputError, match=r"'yfp' is not allowed.*'yfq'.*Did you mean 'yfq'\?"
+        ):
             look(state)
 
 
@@ -291,7 +358,13 @@ def test_targets_are_values():
         LEFT.floor = 1.0
 
 
-@pytest.mark.parametrize("target, places", [(Ring("yfp", radius=3.0, width=2.0), [(0.0, 0.0)]), (Bands(("yfp",), (20.0, 26.0)), [(0.0, 0.0), (16.0, 0.0)])])
+@pytest.mark.parametrize(
+    "target, places",
+    [
+        (Ring("yfp", radius=3.0, width=2.0), [(0.0, 0.0)]),
+        (Bands(("yfp",), (20.0, 26.0)), [(0.0, 0.0), (16.0, 0.0)]),
+    ],
+)
 def test_the_soft_tail_of_an_edge_that_is_not_reached_is_no_pattern(target, places):
     """Lit in proportion to the tail, the colony has nothing of what is wanted."""
     state = placed(places, yfp=1.0)

@@ -35,35 +35,48 @@ def test_notes_are_time_mean_and_mean_square_by_volume():
 
 @pytest.mark.parametrize("spread", [0.0, 0.3, 4.0])
 def test_loss_is_the_share_of_variance_that_does_not_swing_so(spread):
-    """A pure wave of the period is fitted exactly, whatever its phase: left is the spread over the cells, and that only with synchrony. A fit by least
-    squares in float64: 1e-12."""
+    """A pure wave of the period is fitted exactly, whatever its phase: left is the spread over the
+    cells, and that only with synchrony. A fit by least squares in float64: 1e-12."""
     time = np.arange(241) * 0.05
     history = notes(time, swing(time, 2.0), spread)
     variance = np.var(swing(time, 2.0)[time >= 12 - 6 - 1e-9])
-    assert float(TARGET.loss(STATE, history)) == pytest.approx(spread / (spread + variance), abs=1e-12)
-    assert float(Oscillation("yfp", 2.0, synchrony=False).loss(STATE, history)) == pytest.approx(0, abs=1e-12)
+    assert float(TARGET.loss(STATE, history)) == pytest.approx(
+        spread / (spread + variance), abs=1e-12
+    )
+    assert float(Oscillation("yfp", 2.0, synchrony=False).loss(STATE, history)) == pytest.approx(
+        0, abs=1e-12
+    )
 
 
 def test_floor_is_the_amplitude_that_has_loss_one_half():
     time = np.arange(120) * 0.05  # three periods less a sample: the variance is a²/2
     history = notes(time, swing(time, 2.0, amplitude=0.25))
-    assert float(Oscillation("yfp", 2.0, floor=0.25).loss(STATE, history)) == pytest.approx(0.5, abs=1e-12)
+    assert float(Oscillation("yfp", 2.0, floor=0.25).loss(STATE, history)) == pytest.approx(
+        0.5, abs=1e-12
+    )
 
 
 def test_only_the_last_cycles_count():
     """Before them anything may have been."""
     time = np.arange(241) * 0.05
     mean = np.where(time < 12 - 4 - 1e-9, 100 * time, swing(time, 2.0))
-    assert float(Oscillation("yfp", 2.0, cycles=2).loss(STATE, notes(time, mean))) == pytest.approx(0, abs=1e-12)
+    assert float(Oscillation("yfp", 2.0, cycles=2).loss(STATE, notes(time, mean))) == pytest.approx(
+        0, abs=1e-12
+    )
     assert float(TARGET.loss(STATE, notes(time, mean))) > 0.5
 
 
 @pytest.mark.parametrize("period, loss", [(1.0, 1.0), (2.0 / 3.0, 1.0), (1.9, 0.1), (3.0, 0.9)])
 def test_other_periods_do_not_count(period, loss):
-    """Waves with a whole number of periods in the window are orthogonal to the wanted one; three periods hardly tell 5 %."""
+    """Waves with a whole number of periods in the window are orthogonal to the wanted one; three
+    periods hardly tell 5 %."""
     time = np.arange(120) * 0.05
     found = float(TARGET.loss(STATE, notes(time, swing(time, period))))
-    assert found == pytest.approx(1, abs=1e-12) if loss == 1 else (found < loss if loss < 0.5 else found > 0.5)
+    assert (
+        found == pytest.approx(1, abs=1e-12)
+        if loss == 1
+        else (found < loss if loss < 0.5 else found > 0.5)
+    )
 
 
 @pytest.mark.parametrize(
@@ -98,7 +111,9 @@ def test_cells_out_of_step_do_not_swing_together():
     apart = torch.tensor(np.stack([time, level.mean(1), (level**2).mean(1)], 1)).unsqueeze(1)
     assert float(TARGET.loss(STATE, apart)) == pytest.approx(1, abs=1e-12)
     assert float(TARGET.measures(STATE, apart)["synchrony"]) == pytest.approx(0, abs=1e-12)
-    assert float(TARGET.measures(STATE, notes(time, level[:, 0]))["synchrony"]) == pytest.approx(1, abs=1e-12)
+    assert float(TARGET.measures(STATE, notes(time, level[:, 0]))["synchrony"]) == pytest.approx(
+        1, abs=1e-12
+    )
 
 
 def test_notes_of_a_run_are_a_history():
@@ -107,7 +122,13 @@ def test_notes_of_a_run_are_a_history():
     kept = []
     for step in range(121):
         level = 3 + math.sin(math.pi * 0.05 * step)
-        kept.append(TARGET.note(state.with_fields(yfp=torch.tensor([level, level + 1], dtype=torch.float64)).replace(time=0.05 * step)))
+        kept.append(
+            TARGET.note(
+                state.with_fields(
+                    yfp=torch.tensor([level, level + 1], dtype=torch.float64)
+                ).replace(time=0.05 * step)
+            )
+        )
     found = TARGET.measures(state, torch.stack(kept))
     # swings of variance ½ over time (a sample more than three periods: 1 %), spread of ¼ over cells
     assert float(TARGET.loss(state, torch.stack(kept))) == pytest.approx(0.25 / 0.75, rel=0.01)
@@ -116,14 +137,17 @@ def test_notes_of_a_run_are_a_history():
 
 @pytest.mark.parametrize("period", [0.6, 1.0, 1.7, 2.0, 2.9])
 def test_the_period_is_measured(period):
-    """Six hours of samples tell it, by the parabola through the greatest power, to a hundredth; the amplitude to what a broken number of periods leaves."""
+    """Six hours of samples tell it, by the parabola through the greatest power, to a hundredth; the
+    amplitude to what a broken number of periods leaves."""
     time = np.arange(121) * 0.05
     found = TARGET.measures(STATE, notes(time, swing(time, period, amplitude=0.5)))
     assert float(found["period_h"]) == pytest.approx(period, rel=0.01)
     assert float(found["amplitude"]) == pytest.approx(0.5, rel=0.1)
 
 
-@pytest.mark.parametrize("mean", [np.arange(121) * 0.1, np.exp(-np.arange(121) * 0.02), np.sqrt(np.arange(121.0))])
+@pytest.mark.parametrize(
+    "mean", [np.arange(121) * 0.1, np.exp(-np.arange(121) * 0.02), np.sqrt(np.arange(121.0))]
+)
 def test_a_drift_has_no_period(mean):
     found = TARGET.measures(STATE, notes(np.arange(121) * 0.05, mean))
     assert math.isnan(found["period_h"]) and float(found["synchrony"]) == 1
@@ -138,7 +162,11 @@ def test_one_period_is_enough_to_be_measured():
 
 def test_what_stands_still_has_no_period():
     found = TARGET.measures(STATE, notes(np.arange(200) * 0.05, 5.0))
-    assert math.isnan(found["period_h"]) and math.isnan(found["synchrony"]) and float(found["amplitude"]) == 0
+    assert (
+        math.isnan(found["period_h"])
+        and math.isnan(found["synchrony"])
+        and float(found["amplitude"]) == 0
+    )
     short = TARGET.measures(STATE, notes(np.arange(10) * 0.05, swing(np.arange(10) * 0.05, 2.0)))
     assert all(math.isnan(v) for v in short.values())
 
@@ -147,16 +175,23 @@ def test_gradient_by_the_levels():
     time = np.arange(50) * 0.05
     history = notes(time, swing(time, 1.8), 0.2)
     means = history[:, :, 1:].clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda given: TARGET.loss(STATE, torch.cat([history[:, :, :1], given], 2)), means)
+    assert torch.autograd.gradcheck(
+        lambda given: TARGET.loss(STATE, torch.cat([history[:, :, :1], given], 2)), means
+    )
     given = crowded(colonies=2).yfp.requires_grad_()
-    assert torch.autograd.gradcheck(lambda y: TARGET.note(crowded(colonies=2).with_fields(yfp=y)), given)
+    assert torch.autograd.gradcheck(
+        lambda y: TARGET.note(crowded(colonies=2).with_fields(yfp=y)), given
+    )
 
 
 def test_a_colony_scores_the_same_in_any_batch():
     """To the last bit; also where others were not noted for some time, or failed."""
     rng = np.random.default_rng(0)
     time = np.arange(200) * 0.05
-    each = [notes(time, swing(time, p) + rng.normal(0, 0.3, 200), 0.2) for p in (1.5, 2.0, 2.1, 2.5, 4.0)]
+    each = [
+        notes(time, swing(time, p) + rng.normal(0, 0.3, 200), 0.2)
+        for p in (1.5, 2.0, 2.1, 2.5, 4.0)
+    ]
     history = torch.cat(each, 1)
     history[150:, 3] = math.nan
     state = placed([(0, 0)], yfp=1.0, colonies=5)
@@ -166,7 +201,9 @@ def test_a_colony_scores_the_same_in_any_batch():
         alone = state.select([k])
         mine = history[:150, [k]] if k == 3 else history[:, [k]]
         assert torch.equal(TARGET.loss(alone, mine)[0], whole[k])
-        assert all(torch.equal(v[0], measured[name][k]) for name, v in TARGET.measures(alone, mine).items())
+        assert all(
+            torch.equal(v[0], measured[name][k]) for name, v in TARGET.measures(alone, mine).items()
+        )
 
 
 def test_a_colony_that_failed_scores_so():
@@ -178,7 +215,9 @@ def test_a_colony_that_failed_scores_so():
     assert found.tolist() == [pytest.approx(0, abs=1e-12), TARGET.failed]
 
 
-@pytest.mark.parametrize("history", [None, torch.zeros(0, 1, 3), torch.zeros(4, 1, 2), torch.zeros(4, 3)])
+@pytest.mark.parametrize(
+    "history", [None, torch.zeros(0, 1, 3), torch.zeros(4, 1, 2), torch.zeros(4, 3)]
+)
 def test_without_history_there_is_no_score(history):
     for ask in (TARGET.loss, TARGET.measures):
         with pytest.raises(tf.InputError, match=r"Keep target\.note"):

@@ -16,10 +16,13 @@ DOMAINS = DomainSize(("a", "b"), 5.0)
 
 
 def lattice(kinds) -> tf.State:
-    """Balls 1.2 µm apart, gaps 0.2, on a square lattice whose diagonal neighbours (gap 0.7) do not count: kinds (rows, columns), True makes a, False b."""
+    """Balls 1.2 µm apart, gaps 0.2, on a square lattice whose diagonal neighbours (gap 0.7) do not
+    count: kinds (rows, columns), True makes a, False b."""
     kinds = np.asarray(kinds, dtype=bool)
     x, y = np.meshgrid(1.2 * np.arange(kinds.shape[1]), 1.2 * np.arange(kinds.shape[0]))
-    return placed(np.stack([x.reshape(-1), y.reshape(-1)], 1), a=kinds.reshape(-1), b=~kinds.reshape(-1))
+    return placed(
+        np.stack([x.reshape(-1), y.reshape(-1)], 1), a=kinds.reshape(-1), b=~kinds.reshape(-1)
+    )
 
 
 @pytest.mark.parametrize("width", [1, 2, 5])
@@ -41,8 +44,11 @@ def test_checkers_are_as_small_as_domains_can_be():
 
 @pytest.mark.parametrize("dim, length", [(2, math.pi / 2), (3, 2.0)])
 def test_size_is_the_mean_run_of_a_straight_line(dim, length):
-    """Buffon's law for layers W apart: lines of all directions run π/2·W in the plane and 2·W in space on average in one of them. No two
-    neighbours are as far apart as two borders, so the law is exact but for the rim; over seeds 24,000 random balls vary by 2 %, and 8 % is four times that."""
+    """Buffon's law for layers W apart: lines of all directions run π/2·W in the plane and 2·W in
+    space on average in one of them. No two neighbours are as far apart as two borders, so the law
+    is exact but for the rim; over seeds 24,000 random balls vary by 2 %, and 8 % is four times
+    that.
+    """
     layer, side = 4.0, 240.0 if dim == 2 else 36.0
     rng = np.random.default_rng(0)
     place = rng.uniform(0, side, (24000, dim))
@@ -56,17 +62,18 @@ def test_loss_goes_by_the_ratio_of_sizes():
     """0 at the wanted size, 1 − 1/e a factor e either way."""
     state = lattice(np.broadcast_to(np.arange(20) // 4 % 2, (20, 20)))
     size = float(DOMAINS.measures(state)["domain_size_um"])
-    for wanted, loss in ((size, 0.0), (size * math.e, 1 - 1 / math.e), (size / math.e, 1 - 1 / math.e)):
+    for wanted, loss in (
+        (size, 0.0),
+        (size * math.e, 1 - 1 / math.e),
+        (size / math.e, 1 - 1 / math.e),
+    ):
         found = DomainSize(("a", "b"), wanted).loss(state)
         assert float(found) == pytest.approx(loss, abs=1e-14) and found.dtype == torch.float64
 
 
 @pytest.mark.parametrize(
     "a, b",
-    [
-        ([1, 1, 1], [0, 0, 0]),  # all alike
-        ([0.0, 0.0, 0.0], [2, 2, 2]),
-    ],
+    [([1, 1, 1], [0, 0, 0]), ([0.0, 0.0, 0.0], [2, 2, 2])],  # all alike
 )
 def test_one_domain_has_loss_1_and_a_gradient(a, b):
     state = placed([(0, 0), (1, 0), (2, 0)], a=a, b=b)
@@ -88,8 +95,18 @@ def test_cells_with_neither_species_are_half_like_any():
 
 def test_without_neighbours_there_is_no_domain():
     """Alone, far from all others, or next to a cell of another colony only."""
-    state = placed([(0, 0), (5, 0), (1, 0), (0, 0), (1, 0)], a=[1, 0, 1, 1, 0], b=[0, 1, 0, 0, 1], colony=[0, 0, 1, 2, 2], colonies=4)
-    assert DOMAINS.loss(state).tolist()[:2] == [1.0, 1.0] and DOMAINS.loss(state)[2] < 1 and float(DOMAINS.loss(state)[3]) == DOMAINS.failed
+    state = placed(
+        [(0, 0), (5, 0), (1, 0), (0, 0), (1, 0)],
+        a=[1, 0, 1, 1, 0],
+        b=[0, 1, 0, 0, 1],
+        colony=[0, 0, 1, 2, 2],
+        colonies=4,
+    )
+    assert (
+        DOMAINS.loss(state).tolist()[:2] == [1.0, 1.0]
+        and DOMAINS.loss(state)[2] < 1
+        and float(DOMAINS.loss(state)[3]) == DOMAINS.failed
+    )
     assert DOMAINS.measures(state)["domain_size_um"].isnan().tolist() == [True, True, False, True]
 
 
@@ -109,7 +126,9 @@ def test_a_colony_scores_the_same_in_any_batch(name):
     for k in (0, 3, 6):
         alone = state.select([k])
         assert torch.equal(target.loss(alone)[0], whole[k])
-        assert all(torch.equal(v[0], measured[what][k]) for what, v in target.measures(alone).items())
+        assert all(
+            torch.equal(v[0], measured[what][k]) for what, v in target.measures(alone).items()
+        )
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -136,13 +155,16 @@ def test_colonies_that_failed_score_so_and_harm_no_other(name):
     ],
 )
 def test_share_of_cells_that_are_on(levels, share):
-    """s = y⁴/(y⁴ + level⁴); 1 − s = 1e-20 at 1e5. Cells between on and off cost as much as they are: 4 s (1 − s)."""
+    """s = y⁴/(y⁴ + level⁴); 1 − s = 1e-20 at 1e5. Cells between on and off cost as much as they
+    are: 4 s (1 − s)."""
     fourth = np.minimum(np.array(levels, dtype=float), 1e9) ** 4
     s = fourth / (1 + fourth)
     state = placed([(0, 0), (2, 0), (4, 0), (6, 0)], yfp=3.0 * np.array(levels, dtype=float))
     given = state.yfp.clone().requires_grad_()
     loss = OnFraction("yfp", 0.2, 3.0).loss(state.with_fields(yfp=given))
-    assert float(loss.detach()) == pytest.approx(1 - (1 - ((share - 0.2) / 0.8) ** 2) * (1 - np.mean(4 * s * (1 - s))), abs=1e-15)
+    assert float(loss.detach()) == pytest.approx(
+        1 - (1 - ((share - 0.2) / 0.8) ** 2) * (1 - np.mean(4 * s * (1 - s))), abs=1e-15
+    )
     assert bool(torch.isfinite(torch.autograd.grad(loss.sum(), given)[0]).all())
 
 
@@ -156,7 +178,11 @@ def test_the_worst_share_has_loss_1(fraction):
 def test_share_measured_is_that_of_the_volume_above_the_level():
     state = placed([(0, 0), (8, 0)], length=[0.0, 4.0], yfp=[1.5, 0.5])
     found = {name: float(v) for name, v in OnFraction("yfp", 0.5, 1.0).measures(state).items()}
-    assert found == {"on_share": pytest.approx((1 / 6) / (1 / 6 + 1 / 6 + 1)), "on_level": 1.5, "off_level": 0.5}
+    assert found == {
+        "on_share": pytest.approx((1 / 6) / (1 / 6 + 1 / 6 + 1)),
+        "on_level": 1.5,
+        "off_level": 0.5,
+    }
 
 
 @pytest.mark.parametrize(

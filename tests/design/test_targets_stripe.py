@@ -1,4 +1,5 @@
-"""The stripe at the border of two populations: where the border is, what is wanted, and what is measured, on colonies laid out by hand."""
+"""The stripe at the border of two populations: where the border is, what is wanted, and what is
+measured, on colonies laid out by hand."""
 
 from __future__ import annotations
 
@@ -14,13 +15,29 @@ from design.targets import Stripe
 from design.targets.stripe import STRIP, border
 
 
-def field(shift=0.0, columns=range(-20, 20), rows=16, bend=0.0, turned=False, low=0, edge=0.0) -> tf.State:
-    """Balls 1 µm apart: type `low`, at 100, before x = shift, the other beyond, lit (8) for 6 µm from edge + bend · cos(2π y/16) on, else dim (1/8)."""
-    x, y = (v.reshape(-1) + 0.5 for v in np.meshgrid(np.array(columns, dtype=float), np.arange(rows, dtype=float), indexing="ij"))
+def field(
+    shift=0.0, columns=range(-20, 20), rows=16, bend=0.0, turned=False, low=0, edge=0.0
+) -> tf.State:
+    """Balls 1 µm apart: type `low`, at 100, before x = shift, the other beyond, lit (8) for 6 µm
+    from edge + bend · cos(2π y/16) on, else dim (1/8)."""
+    x, y = (
+        v.reshape(-1) + 0.5
+        for v in np.meshgrid(
+            np.array(columns, dtype=float), np.arange(rows, dtype=float), indexing="ij"
+        )
+    )
     far = x > 0
-    lit = far & (x > edge + bend * np.cos(2 * math.pi * y / 16)) & (x < edge + 6 + bend * np.cos(2 * math.pi * y / 16))
+    lit = (
+        far
+        & (x > edge + bend * np.cos(2 * math.pi * y / 16))
+        & (x < edge + 6 + bend * np.cos(2 * math.pi * y / 16))
+    )
     place = np.stack([y, x + shift] if turned else [x + shift, y], 1)
-    return placed(place, cell_type=np.where(far, 1 - low, low), yfp=np.where(lit, 8.0, np.where(far, 0.125, 100.0)))
+    return placed(
+        place,
+        cell_type=np.where(far, 1 - low, low),
+        yfp=np.where(lit, 8.0, np.where(far, 0.125, 100.0)),
+    )
 
 
 @pytest.mark.parametrize(
@@ -28,7 +45,8 @@ def field(shift=0.0, columns=range(-20, 20), rows=16, bend=0.0, turned=False, lo
     [
         ([-2, -1, 1, 2], [0, 0, 1, 1], 0.0),
         ([-2, -1, 1, 2], [1, 1, 0, 0], 0.0),  # the other way round
-        ([-3, -1, 1, 2, 3, 9], [0, 0, 1, 0, 1, 1], 0.0),  # a stray at 2: before it or after it, one is wrong; the first such place
+        # a stray at 2: before it or after it, one is wrong; the first such place
+        ([-3, -1, 1, 2, 3, 9], [0, 0, 1, 0, 1, 1], 0.0),
         ([9, 3, 7, -1, 1, 2, -3], [1, 0, 1, 0, 1, 0, 0], 5.0),  # in any order of rows; a stray at 1
         ([0, 4], [3, 7], 2.0),  # any two numbers
     ],
@@ -46,7 +64,10 @@ def test_border_against_every_place_tried():
     state = crowded(seed=8, colonies=20, count=8)
     found, before = border(state)
     for k in range(state.colonies):
-        x, kind = state.position[state.colony == k, 0].numpy(), state.cell_type[state.colony == k].numpy()
+        x, kind = (
+            state.position[state.colony == k, 0].numpy(),
+            state.cell_type[state.colony == k].numpy(),
+        )
         first = kind == int(before[k])
         assert len(set(kind)) == 2 and x[first].mean() <= x[~first].mean()
         tried = np.append(np.sort(x) + 1e-9, found[k])
@@ -63,7 +84,13 @@ def test_border_is_where_it_is_in_the_mirror():
 
 def test_there_is_no_border_without_two_types():
     """One type, or no cell: NaN; and a colony that has lost a type along the way has loss 1."""
-    state = placed([(-1, 0), (1, 0), (0, 0), (2, 0)], cell_type=[0, 1, 1, 1], colony=[0, 0, 1, 1], colonies=3, yfp=1.0)
+    state = placed(
+        [(-1, 0), (1, 0), (0, 0), (2, 0)],
+        cell_type=[0, 1, 1, 1],
+        colony=[0, 0, 1, 1],
+        colonies=3,
+        yfp=1.0,
+    )
     assert border(state)[0].isnan().tolist() == [False, True, True]
     target = Stripe("yfp", width=4.0, cell_type=1)
     assert target.loss(state).tolist()[1:] == [1.0, target.failed]
@@ -75,7 +102,8 @@ def test_there_is_no_border_without_two_types():
 @pytest.mark.parametrize("turned", [False, True], ids=["x", "y"])
 @pytest.mark.parametrize("low", [0, 1])
 def test_a_stripe_of_one_type_adjoins_the_border_on_its_side(turned, low):
-    """The cells of the far type are wanted lit within 6 µm, those of the near one on the other side; cells of the other type are left out."""
+    """The cells of the far type are wanted lit within 6 µm, those of the near one on the other
+    side; cells of the other type are left out."""
     state = field(shift=5.0, turned=turned, low=low)
     along = "y" if turned else "x"
     x = state.position[:, int(turned)] - 5.0
@@ -85,7 +113,8 @@ def test_a_stripe_of_one_type_adjoins_the_border_on_its_side(turned, low):
     assert float(far.loss(state)) == pytest.approx(1 - 48**2 / (6 * (6 * 64 + 14 / 64)), rel=1e-9)
     near = Stripe("yfp", straight=True, width=6.0, along=along, cell_type=low, soft=SHARP)
     assert torch.equal(near.wanted(state)[:, 0], ((x > -6) & (x < 0)).double())
-    assert float(near.loss(state)) == pytest.approx(1 - 6 / 20, rel=1e-9)  # all 20 columns evenly lit
+    # all 20 columns evenly lit
+    assert float(near.loss(state)) == pytest.approx(1 - 6 / 20, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -102,27 +131,38 @@ def test_a_stripe_of_one_type_adjoins_the_border_on_its_side(turned, low):
 def test_where_the_stripe_is(options, low, high):
     state = field(shift=5.0)
     x = state.position[:, 0] - 5.0
-    assert torch.equal(Stripe("yfp", straight=True, width=6.0, soft=SHARP, **options).wanted(state)[:, 0], ((x > low) & (x < high)).double())
+    assert torch.equal(
+        Stripe("yfp", straight=True, width=6.0, soft=SHARP, **options).wanted(state)[:, 0],
+        ((x > low) & (x < high)).double(),
+    )
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["x", "y"])
 @pytest.mark.parametrize("mirror", [False, True])
 def test_measures_of_a_stripe_laid_out_by_hand(turned, mirror):
-    """Six columns of 8, fourteen of 1/8, the first at the border: middle 3 µm from it, three strips of 2 µm wide, and straight."""
+    """Six columns of 8, fourteen of 1/8, the first at the border: middle 3 µm from it, three strips
+    of 2 µm wide, and straight."""
     state = field(shift=5.0, turned=turned)
     if mirror:
         state = state.replace(position=-state.position)
-    found = Stripe("yfp", straight=True, width=6.0, cell_type=1, along="y" if turned else "x").measures(state)
+    found = Stripe(
+        "yfp", straight=True, width=6.0, cell_type=1, along="y" if turned else "x"
+    ).measures(state)
     assert list(found) == ["place_um", "width_um", "peak", "straightness_um", "contrast"]
     assert float(found["place_um"]) == pytest.approx(-3 if mirror else 3, abs=1e-12)
-    assert (float(found["width_um"]), float(found["peak"]), float(found["contrast"])) == (6.0, 8.0, 64.0)
+    assert (float(found["width_um"]), float(found["peak"]), float(found["contrast"])) == (
+        6.0,
+        8.0,
+        64.0,
+    )
     assert float(found["straightness_um"]) == pytest.approx(0, abs=1e-12)
     assert all(v.shape == (1,) and v.dtype == torch.float64 for v in found.values())
 
 
 def test_straightness_of_a_bent_stripe():
-    """Bent by a · cos over one period, less the straight line through it: a cosine sampled symmetrically has no slope, RMS a/√2. Columns 1 µm apart and
-    strips 4 µm high, in which the cosine is averaged (by 0.90), leave 0.3 µm."""
+    """Bent by a · cos over one period, less the straight line through it: a cosine sampled
+    symmetrically has no slope, RMS a/√2. Columns 1 µm apart and strips 4 µm high, in which the
+    cosine is averaged (by 0.90), leave 0.3 µm."""
     bend = 4.0
     state = field(bend=bend, edge=6.0)
     found = Stripe("yfp", straight=True, width=6.0, cell_type=1).measures(state)
@@ -135,11 +175,17 @@ def test_a_slanted_stripe_is_straight(slope):
     x, y = state.position.unbind(1)
     state = state.with_fields(yfp=((x - 20 - slope * y).abs() < 2).double() + 0.01)
     # columns 1 µm apart: the middle of a slanted stripe is right to half of that
-    assert float(Stripe("yfp", straight=True, width=4.0, cell_type=1).measures(state)["straightness_um"]) < 0.5
+    assert (
+        float(
+            Stripe("yfp", straight=True, width=4.0, cell_type=1).measures(state)["straightness_um"]
+        )
+        < 0.5
+    )
 
 
 def test_width_is_that_of_the_run_about_the_peak():
-    """Other stripes beside it, less bright than half, or brighter than half but apart, are not counted."""
+    """Other stripes beside it, less bright than half, or brighter than half but apart, are not
+    counted."""
     x = np.repeat(np.arange(0.5, 30.5), 4)
     y = np.tile(np.arange(4.0), 30)
     level = np.select([(x > 4) & (x < 10), (x > 16) & (x < 20)], [4.0, 3.0], 0.5)
@@ -151,12 +197,18 @@ def test_width_is_that_of_the_run_about_the_peak():
 def test_a_dark_colony_has_no_width():
     state = field().with_fields(yfp=torch.zeros(640, dtype=torch.float64))
     found = Stripe("yfp", straight=True, width=6.0, cell_type=1).measures(state)
-    assert all(math.isnan(found[name]) for name in ("place_um", "width_um", "peak", "straightness_um", "contrast"))
+    assert all(
+        math.isnan(found[name])
+        for name in ("place_um", "width_um", "peak", "straightness_um", "contrast")
+    )
 
 
 def test_measures_of_each_colony_are_its_own():
     """Colonies of different places and widths in one batch."""
-    parts = [field(shift=s, columns=range(-20, 20), edge=e) for s, e in ((0.0, 0.0), (100.0, 4.0), (-7.0, 8.0))]
+    parts = [
+        field(shift=s, columns=range(-20, 20), edge=e)
+        for s, e in ((0.0, 0.0), (100.0, 4.0), (-7.0, 8.0))
+    ]
     place = torch.cat([p.position for p in parts]).numpy()
     state = placed(
         place,
@@ -213,12 +265,19 @@ def test_what_is_not_allowed_is_refused_when_made(options, what):
 
 
 def test_describe_says_where():
-    assert Stripe("yfp", width=8.0, cell_type=1).describe() == "yfp in a stripe 8 µm wide at the border, cells of type 1"
-    assert Stripe("yfp", at=3.0, width=8.0, place=-2.0).describe() == "yfp in a stripe 8 µm wide at x = 3 µm, -2 µm from it"
+    assert (
+        Stripe("yfp", width=8.0, cell_type=1).describe()
+        == "yfp in a stripe 8 µm wide at the border, cells of type 1"
+    )
+    assert (
+        Stripe("yfp", at=3.0, width=8.0, place=-2.0).describe()
+        == "yfp in a stripe 8 µm wide at x = 3 µm, -2 µm from it"
+    )
 
 
 def winding():
-    """Two types along a staircase: cells 2 µm apart on a grid, the border at x = 0 below y = 0 and at x = 6 above."""
+    """Two types along a staircase: cells 2 µm apart on a grid, the border at x = 0 below y = 0 and
+    at x = 6 above."""
     places = [(x, y) for y in (-6, -4, -2, 0, 2, 4) for x in range(-9, 16, 2)]
     kinds = [int(x > (6 if y >= 0 else 0)) for x, y in places]
     return placed(places, cell_type=kinds, yfp=1.0), torch.tensor(places), torch.tensor(kinds)
@@ -226,14 +285,17 @@ def winding():
 
 @pytest.mark.parametrize("kind", [0, 1])
 def test_a_stripe_follows_a_border_that_winds(kind):
-    """Wanted are the cells whose nearest cell of the other type is nearer than the width and a diameter, centre to centre."""
+    """Wanted are the cells whose nearest cell of the other type is nearer than the width and a
+    diameter, centre to centre."""
     state, places, kinds = winding()
     apart = (places.unsqueeze(1) - places).double().square().sum(2).sqrt()
     nearest = torch.where(kinds.unsqueeze(1) != kinds, apart, torch.inf).amin(1) - 1.0
     target = Stripe("yfp", width=4.0, cell_type=kind, soft=SHARP)
     mine = kinds == kind
     assert torch.equal(target.wanted(state)[mine, 0], (nearest < 4.0).double()[mine])
-    assert float(target.loss(state)) == pytest.approx(1 - float((nearest < 4.0)[mine].double().mean()), rel=1e-9)
+    assert float(target.loss(state)) == pytest.approx(
+        1 - float((nearest < 4.0)[mine].double().mean()), rel=1e-9
+    )
     both = Stripe("yfp", width=4.0, soft=SHARP)
     assert torch.equal(both.wanted(state)[:, 0], (nearest < 2.0).double())
     straight = Stripe("yfp", width=4.0, cell_type=kind, soft=SHARP, straight=True)

@@ -27,7 +27,9 @@ def run(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.1) -> tf.Sta
 def same(a: tf.State, b: tf.State) -> bool:
     """Bit for bit the same cells and fields."""
     names = ("colony", "uid", "parent", "position", "axis", "length", "radius", "next_uid")
-    return all(torch.equal(getattr(a, n), getattr(b, n)) for n in names) and all(torch.equal(v, b.fields[n]) for n, v in a.fields.items())
+    return all(torch.equal(getattr(a, n), getattr(b, n)) for n in names) and all(
+        torch.equal(v, b.fields[n]) for n, v in a.fields.items()
+    )
 
 
 def short_update(cells):

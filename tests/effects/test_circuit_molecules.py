@@ -1,4 +1,5 @@
-"""Circuit, molecule by molecule: whole numbers through growth and division, binomial partition, dilution, exchange of single molecules, failures."""
+"""Circuit, molecule by molecule: whole numbers through growth and division, binomial partition,
+dilution, exchange of single molecules, failures."""
 
 from __future__ import annotations
 
@@ -23,9 +24,12 @@ def molecules(state: tf.State, name: str = "m", copies: float = 1.0) -> torch.Te
 
 
 def assert_whole(state: tf.State, name: str = "m", copies: float = 1.0) -> None:
-    """A concentration is a number of molecules over a volume, each rounded once: eps of the number."""
+    """A concentration is a number of molecules over a volume, each rounded once: eps of the
+    number."""
     n = molecules(state, name, copies)
-    assert float(((n - n.round()).abs() / n.clamp(min=1.0)).max()) <= 4 * torch.finfo(state.dtype).eps
+    assert (
+        float(((n - n.round()).abs() / n.clamp(min=1.0)).max()) <= 4 * torch.finfo(state.dtype).eps
+    )
 
 
 def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.1) -> tf.State:
@@ -39,15 +43,25 @@ def side_by_side(count: int, **given) -> tf.Cells:
     return tf.Cells([[0.0, 2.0 * k] for k in range(count)], [[1.0, 0.0]] * count, **given)
 
 
-# --- whole numbers --------------------------------------------------------------------------------------------------------
+# --- whole numbers --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_numbers_stay_whole_through_growth_and_division(method, dtype, device):
     scene = tf.Scene(
-        tf.Growth(rate=1.5), tf.Division(length=tf.Uniform(3.0, 3.4)), tf.Mechanics(dim=2),
-        tf.Circuit(BIRTH_DEATH, species=("m",), initial={"m": 3.0}, method=method, copies=2.5, make=8.0, lose=1.0),
-    )  # fmt: skip
+        tf.Growth(rate=1.5),
+        tf.Division(length=tf.Uniform(3.0, 3.4)),
+        tf.Mechanics(dim=2),
+        tf.Circuit(
+            BIRTH_DEATH,
+            species=("m",),
+            initial={"m": 3.0},
+            method=method,
+            copies=2.5,
+            make=8.0,
+            lose=1.0,
+        ),
+    )
     state = scene.seed(2, dtype=dtype, device=device)
     for _ in range(20):
         assert_whole(state, copies=2.5)
@@ -56,10 +70,14 @@ def test_numbers_stay_whole_through_growth_and_division(method, dtype, device):
 
 
 def test_first_numbers_are_whole_and_right_in_the_mean():
-    """2.3 molecules for each cell: 2 or 3 of them, 3 with probability 0.3; 4,000 cells, 5 standard errors."""
+    """2.3 molecules for each cell: 2 or 3 of them, 3 with probability 0.3; 4,000 cells, 5 standard
+    errors."""
     cells = side_by_side(4000)
     volume = math.pi * 0.25 * (2 + 2 / 3)
-    scene = tf.Scene(tf.Circuit(INERT, species=("m", "w"), initial={"m": 2.3 / volume}, method="tau_leap"), founders=cells)
+    scene = tf.Scene(
+        tf.Circuit(INERT, species=("m", "w"), initial={"m": 2.3 / volume}, method="tau_leap"),
+        founders=cells,
+    )
     n = molecules(scene.seed(dtype=F64)).round()
     assert set(n.tolist()) == {2.0, 3.0}
     assert float(n.mean()) == pytest.approx(2.3, abs=5 * math.sqrt(0.21 / 4000))
@@ -67,33 +85,54 @@ def test_first_numbers_are_whole_and_right_in_the_mean():
 
 @pytest.mark.parametrize("copies", [1.0, [0.5, 4.0]])
 def test_copies_make_molecules_of_concentrations(copies):
-    scene = tf.Scene(tf.Circuit(INERT, species=("m", "w"), initial={"m": 10.0}, method="direct", copies=copies), founders=side_by_side(50))
+    scene = tf.Scene(
+        tf.Circuit(INERT, species=("m", "w"), initial={"m": 10.0}, method="direct", copies=copies),
+        founders=side_by_side(50),
+    )
     state = advance(scene, scene.seed(2), 1)
     for k, each in enumerate((1.0, 1.0) if copies == 1.0 else copies):
         one = state.select([k])
         assert_whole(one, copies=each)
-        assert float(molecules(one, copies=each).mean()) == pytest.approx(10 * each * math.pi * 0.25 * (2 + 2 / 3), rel=0.03)
+        assert float(molecules(one, copies=each).mean()) == pytest.approx(
+            10 * each * math.pi * 0.25 * (2 + 2 / 3), rel=0.03
+        )
 
 
-# --- partition ------------------------------------------------------------------------------------------------------------
+# --- partition ------------------------------------------------------------------------------------
 
 
-def divided(fraction: float = 0.5, count: int = 4000, start: float = 20.0, seed: int = 0) -> tuple[tf.State, tf.State]:
+def divided(
+    fraction: float = 0.5, count: int = 4000, start: float = 20.0, seed: int = 0
+) -> tuple[tf.State, tf.State]:
     """Before and after one division of all cells."""
     volume = math.pi * 0.25 * (4 + 2 / 3)
-    circuit = tf.Circuit(INERT, species=("m", "w"), initial={"m": start / volume, "w": 5 / volume}, method="tau_leap")
-    scene = tf.Scene(tf.Division(fraction=fraction), circuit, founders=side_by_side(count, length=4.0))
+    circuit = tf.Circuit(
+        INERT, species=("m", "w"), initial={"m": start / volume, "w": 5 / volume}, method="tau_leap"
+    )
+    scene = tf.Scene(
+        tf.Division(fraction=fraction), circuit, founders=side_by_side(count, length=4.0)
+    )
     state = scene.seed(seed=seed, dtype=F64)
-    return state, scene.step(state.with_fields(divide_flag=torch.ones(count, dtype=torch.bool)), 0.1)
+    return state, scene.step(
+        state.with_fields(divide_flag=torch.ones(count, dtype=torch.bool)), 0.1
+    )
 
 
 @pytest.mark.parametrize("fraction", [0.5, 0.3])
 def test_partition_is_binomial(fraction):
-    """n molecules, each to the first daughter with the share p of the volume: mean n p, variance n p (1 − p). 4,000 divisions of 20; 5 standard errors."""
+    """n molecules, each to the first daughter with the share p of the volume: mean n p, variance n
+    p (1 − p). 4,000 divisions of 20; 5 standard errors."""
     before, after = divided(fraction)
     births = after.births[-1]
-    n, first, second = molecules(before).round(), molecules(after)[births.first], molecules(after)[births.second]
-    assert float((first + second - n).abs().max()) <= 1e-12 * 20 and float((first - first.round()).abs().max()) <= 1e-12 * 20
+    n, first, second = (
+        molecules(before).round(),
+        molecules(after)[births.first],
+        molecules(after)[births.second],
+    )
+    assert (
+        float((first + second - n).abs().max()) <= 1e-12 * 20
+        and float((first - first.round()).abs().max()) <= 1e-12 * 20
+    )
     volume = after.volume[births.first] / (after.volume[births.first] + after.volume[births.second])
     p = float(volume[0])
     assert n.tolist() == [20.0] * 4000 and (p == 0.5) == (fraction == 0.5)
@@ -117,46 +156,66 @@ def test_partition_depends_on_the_seed_and_on_nothing_else():
 
 
 def test_the_binomial_draw_at_its_edges():
-    count, share = torch.tensor([0.0, 7.0, 7.0, 7.0, 1e6]), torch.tensor([0.5, 1e-12, 1 - 1e-12, 0.5, 0.5])
+    count, share = (
+        torch.tensor([0.0, 7.0, 7.0, 7.0, 1e6]),
+        torch.tensor([0.5, 1e-12, 1 - 1e-12, 0.5, 0.5]),
+    )
     for u in (2.0**-24, 0.5, 1 - 2.0**-24):
         k = binomial(count, share, torch.full((5,), u))
         assert bool((k == k.round()).all()) and bool((k >= 0).all()) and bool((k <= count).all())
         assert k[:3].tolist() == [0.0, 0.0, 7.0]
 
 
-# --- laws -----------------------------------------------------------------------------------------------------------------
+# --- laws -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_birth_and_death_under_dilution(method):
-    """Made at 40 a µm³ and hour, lost at 1/h and by growth at 1/h: mean concentration 40/(1 + 1) = 20, and Poisson-like numbers.
+    """Made at 40 a µm³ and hour, lost at 1/h and by growth at 1/h: mean concentration 40/(1 + 1) =
+    20, and Poisson-like numbers.
 
-    Cells grow from V to 1.27 V in 6 steps of 0.04 h from near equilibrium. Splitting growth from reactions is first order: at most 0.04 × 1 of the mean, 4 %.
+    Cells grow from V to 1.27 V in 6 steps of 0.04 h from near equilibrium. Splitting growth from
+    reactions is first order: at most 0.04 × 1 of the mean, 4 %.
     """
     scene = tf.Scene(
-        tf.Growth(rate=1.0), tf.Circuit(BIRTH_DEATH, species=("m",), initial={"m": 20.0}, method=method, make=40.0, lose=1.0),
+        tf.Growth(rate=1.0),
+        tf.Circuit(
+            BIRTH_DEATH, species=("m",), initial={"m": 20.0}, method=method, make=40.0, lose=1.0
+        ),
         founders=side_by_side(400),
-    )  # fmt: skip
+    )
     state = scene.seed(dtype=F64)
     last = advance(scene, state, 25, 0.04)
-    # 400 cells, sd of a concentration √(20/V) ≈ 2: a standard error of 0.1, of which 4, beside the 4 % of splitting
+    # 400 cells, sd of a concentration √(20/V) ≈ 2: a standard error of 0.1, of which 4, beside the
+    # 4 % of splitting
     assert float(last.m.mean()) == pytest.approx(20.0, abs=0.4 + 0.8)
     assert float(state.m.var()) < 0.2  # at first all alike
-    # noise of reactions, of mean 20 in a volume V ≈ 5.7: 20/V = 3.5 in the long run; after an hour at a relaxation of 2/h, 98 % of it
+    # noise of reactions, of mean 20 in a volume V ≈ 5.7: 20/V = 3.5 in the long run; after an hour
+    # at a relaxation of 2/h, 98 % of it
     assert float(last.m.var()) == pytest.approx(20.0 / float(last.volume.mean()), rel=0.5)
 
 
 def test_noise_and_no_noise_agree_where_molecules_are_many():
-    """10⁵ copies: the smooth circuit to within 5 standard deviations of √n in n, and the leap's 0.03²."""
+    """10⁵ copies: the smooth circuit to within 5 standard deviations of √n in n, and the leap's
+    0.03²."""
     ends = []
     for method, copies in (("tau_leap", 1e5), ("rosenbrock", 1.0)):
-        circuit = tf.Circuit(BIRTH_DEATH, species=("m",), initial={"m": 1.0}, method=method, copies=copies, make=3.0, lose=1.0, rtol=1e-6)
+        circuit = tf.Circuit(
+            BIRTH_DEATH,
+            species=("m",),
+            initial={"m": 1.0},
+            method=method,
+            copies=copies,
+            make=3.0,
+            lose=1.0,
+            rtol=1e-6,
+        )
         scene = tf.Scene(tf.Growth(rate=0.5), circuit)
         ends.append(float(advance(scene, scene.seed(dtype=F64), 10).m))
     assert ends[0] == pytest.approx(ends[1], rel=5 / math.sqrt(1.7 * 2e5) + 2e-3)
 
 
-# --- single molecules through the membrane --------------------------------------------------------------------------------
+# --- single molecules through the membrane --------------------------------------------------------
 
 BOX = {"box": ((-8.0, -8.0), (8.0, 8.0)), "spacing": 4.0}
 
@@ -165,8 +224,19 @@ BOX = {"box": ((-8.0, -8.0), (8.0, 8.0)), "spacing": 4.0}
 @pytest.mark.parametrize("beyond", ["error", "open"])
 def test_molecules_through_the_membrane_are_conserved(method, beyond, dtype):
     """What leaves a cell is in the medium or beyond: 10 steps, each rounding some ten sums."""
-    circuit = tf.Circuit([tf.parts.exchange("a", "D1")], species=("a",), initial={"a": 8.0}, method=method, copies=2.0, D1=1.0)
-    scene = tf.Scene(circuit, tf.Medium(a=tf.Signal(diffusion=5.0, initial=0.5, beyond=1.0), beyond=beyond, **BOX), founders=side_by_side(3))
+    circuit = tf.Circuit(
+        [tf.parts.exchange("a", "D1")],
+        species=("a",),
+        initial={"a": 8.0},
+        method=method,
+        copies=2.0,
+        D1=1.0,
+    )
+    scene = tf.Scene(
+        circuit,
+        tf.Medium(a=tf.Signal(diffusion=5.0, initial=0.5, beyond=1.0), beyond=beyond, **BOX),
+        founders=side_by_side(3),
+    )
     state = scene.seed(2, dtype=dtype)
     if beyond == "open":
         position = state.position.clone()
@@ -187,17 +257,24 @@ def test_molecules_through_the_membrane_are_conserved(method, beyond, dtype):
 
 
 def test_uptake_of_the_last_molecules_leaves_nothing_negative():
-    """Hard case 39 molecule by molecule: at k·dt = 1e3, cells in one voxel take what there is, and less than a molecule stays."""
+    """Hard case 39 molecule by molecule: at k·dt = 1e3, cells in one voxel take what there is, and
+    less than a molecule stays."""
     takes = [tf.Reaction({"out.a": 1}, {"a": 1}, 1e4)]
-    scene = tf.Scene(tf.Circuit(takes, species=("a",), method="direct"), tf.Medium(a=tf.Signal(diffusion=0.0, initial=0.05), **BOX), founders=side_by_side(3))
+    scene = tf.Scene(
+        tf.Circuit(takes, species=("a",), method="direct"),
+        tf.Medium(a=tf.Signal(diffusion=0.0, initial=0.05), **BOX),
+        founders=side_by_side(3),
+    )
     state = scene.seed(dtype=F64)
     first = float(state.signals["a"].sum() * 64)
     last = advance(scene, state, 3)
     assert float(last.signals["a"].min()) >= 0 and float(molecules(last, "a").sum()) >= 1
-    assert float(last.signals["a"].sum() * 64) + float(molecules(last, "a").sum()) == pytest.approx(first, rel=1e-13)
+    assert float(last.signals["a"].sum() * 64) + float(molecules(last, "a").sum()) == pytest.approx(
+        first, rel=1e-13
+    )
 
 
-# --- failures -------------------------------------------------------------------------------------------------------------
+# --- failures -------------------------------------------------------------------------------------
 
 
 def sinking(u, s, p, cell):
@@ -208,12 +285,23 @@ def sinking(u, s, p, cell):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_negative_propensity_names_reaction_step_and_colonies(method):
     reaction = tf.Reaction({}, {"m": 1}, sinking, "m made less and less")
-    circuit = tf.Circuit([reaction], species=("m",), initial={"m": torch.tensor([0.0, 8.0, 0.0])}, method=method, k=torch.tensor([0.0, 1.0, 0.0]))
+    circuit = tf.Circuit(
+        [reaction],
+        species=("m",),
+        initial={"m": torch.tensor([0.0, 8.0, 0.0])},
+        method=method,
+        k=torch.tensor([0.0, 1.0, 0.0]),
+    )
     scene = tf.Scene(circuit)
-    with pytest.raises((SimulationError, InputError), match=r"(?s)colony 1.*cell 0.*'m made less and less' has a propensity .*negative") as failed:
+    with pytest.raises(
+        (SimulationError, InputError),
+        match=r"(?s)colony 1.*cell 0.*'m made less and less' has a propensity .*negative",
+    ) as failed:
         list(tf.simulate(scene, scene.seed(3, dtype=F64), until=0.3, dt=0.1))
     assert failed.value.colonies == (1,) and "step 1" in str(failed.value)
-    last = list(tf.simulate(scene, scene.seed(3, dtype=F64), until=0.3, dt=0.1, on_failure="drop"))[-1]
+    last = list(tf.simulate(scene, scene.seed(3, dtype=F64), until=0.3, dt=0.1, on_failure="drop"))[
+        -1
+    ]
     assert last.counts.tolist() == [1, 0, 1]
 
 
@@ -223,19 +311,27 @@ def test_a_propensity_that_is_not_a_number_at_the_start_is_refused():
         tf.Scene(tf.Circuit([reaction], species=("m",), method="tau_leap")).seed()
 
 
-# --- one colony, whatever the batch ---------------------------------------------------------------------------------------
+# --- one colony, whatever the batch ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_colony_is_the_same_in_any_batch(method, dtype, device):
     circuit = tf.Circuit(
-        [*BIRTH_DEATH, tf.parts.exchange("m", 1.0)], species=("m",), initial={"m": tf.Uniform(1.0, 5.0)}, method=method,
-        make=torch.tensor([5.0, 10.0, 20.0]), lose=1.0, copies=torch.tensor([1.0, 2.0, 3.0]),
-    )  # fmt: skip
+        [*BIRTH_DEATH, tf.parts.exchange("m", 1.0)],
+        species=("m",),
+        initial={"m": tf.Uniform(1.0, 5.0)},
+        method=method,
+        make=torch.tensor([5.0, 10.0, 20.0]),
+        lose=1.0,
+        copies=torch.tensor([1.0, 2.0, 3.0]),
+    )
     scene = tf.Scene(
-        tf.Growth(rate=1.5), tf.Division(length=tf.Uniform(3.0, 3.4)), tf.Mechanics(dim=2), circuit,
+        tf.Growth(rate=1.5),
+        tf.Division(length=tf.Uniform(3.0, 3.4)),
+        tf.Mechanics(dim=2),
+        circuit,
         tf.Medium(m=tf.Signal(diffusion=5.0), box=((-8, -8), (8, 8)), spacing=4.0, beyond="grow"),
-    )  # fmt: skip
+    )
     first = scene.seed(3, seed=4, dtype=dtype, device=device)
     last = advance(scene, first, 16)
     assert int(last.counts.min()) >= 4

@@ -1,4 +1,5 @@
-"""Division: who divides and when, what becomes of geometry, ids and fields, and gradients' copying."""
+"""Division: who divides and when, what becomes of geometry, ids and fields, and gradients'
+copying."""
 
 from __future__ import annotations
 
@@ -14,7 +15,9 @@ from torchfilm.effect import Effect
 from torchfilm.physics import capsule
 
 
-def row_of_cells(count: int, length: float | list[float] = 2.0, dim: int = 2, radius: float = 0.5) -> tf.Cells:
+def row_of_cells(
+    count: int, length: float | list[float] = 2.0, dim: int = 2, radius: float = 0.5
+) -> tf.Cells:
     """Cells far apart, at varied angles."""
     position = torch.zeros(count, dim, dtype=torch.float64)
     position[:, 0] = 10.0 * torch.arange(count)
@@ -34,9 +37,14 @@ def flagged(scene: tf.Scene, colonies: int = 1, which=None, **options) -> tf.Sta
     return state.with_fields(divide_flag=flag)
 
 
-def division_times(division: tf.Division, steps: int, founder_length: float = 2.0, **growth) -> list[int]:
-    """Steps in which the number of cells changed; growth is linear, ¼ µm a step, so that every length is exact in binary."""
-    scene = tf.Scene(tf.Growth(rate=1.0, law="linear"), division, founders=row_of_cells(1, founder_length))
+def division_times(
+    division: tf.Division, steps: int, founder_length: float = 2.0, **growth
+) -> list[int]:
+    """Steps in which the number of cells changed; growth is linear, ¼ µm a step, so that every
+    length is exact in binary."""
+    scene = tf.Scene(
+        tf.Growth(rate=1.0, law="linear"), division, founders=row_of_cells(1, founder_length)
+    )
     state, found = scene.seed(), []
     for _ in range(steps):
         new = scene.step(state, 0.25)
@@ -46,16 +54,18 @@ def division_times(division: tf.Division, steps: int, founder_length: float = 2.
     return found
 
 
-# --- criteria -------------------------------------------------------------------------------------------------------------
+# --- criteria -------------------------------------------------------------------------------------
 
 
 def test_by_length():
-    """2 + ¼k reaches 3 at the end of step 4; division comes first in step 5. Daughters start at (3 − 1)/2 = 1: eight steps more."""
+    """2 + ¼k reaches 3 at the end of step 4; division comes first in step 5. Daughters start at (3
+    − 1)/2 = 1: eight steps more."""
     assert division_times(tf.Division(length=3.0), 14) == [5, 13]
 
 
 def test_by_volume():
-    """The volume of l = 3, less a billionth so that rounding cannot put it off by a step: the same times."""
+    """The volume of l = 3, less a billionth so that rounding cannot put it off by a step: the same
+    times."""
     at = math.pi * 0.25 * (3.0 + 2 / 3) * (1 - 1e-6)
     assert division_times(tf.Division(volume=at), 14) == [5, 13]
 
@@ -90,7 +100,11 @@ def test_a_flagged_rule_divides_what_it_names():
 
 
 def test_one_threshold_for_each_colony():
-    scene = tf.Scene(tf.Growth(rate=1.0, law="linear"), tf.Division(length=[2.5, 3.0, 9.0]), founders=row_of_cells(1))
+    scene = tf.Scene(
+        tf.Growth(rate=1.0, law="linear"),
+        tf.Division(length=[2.5, 3.0, 9.0]),
+        founders=row_of_cells(1),
+    )
     state = scene.seed(3)
     for _ in range(3):
         state = scene.step(state, 0.25)
@@ -125,11 +139,12 @@ def test_birth_length_of_the_adder_is_the_daughters_own():
     assert state.birth_length.tolist() == [0.5, 1.5]
 
 
-# --- geometry -------------------------------------------------------------------------------------------------------------
+# --- geometry -------------------------------------------------------------------------------------
 
 
 def outer_ends(state: tf.State) -> torch.Tensor:
-    """The −axis tip of each first daughter and the +axis tip of each second, caps included, (2, M, d)."""
+    """The −axis tip of each first daughter and the +axis tip of each second, caps included, (2, M,
+    d)."""
     low, high = (torch.as_tensor(e) for e in ends(state))
     radius = state.radius.double().cpu()[:, None]
     axis = state.axis.double().cpu()
@@ -151,19 +166,27 @@ def test_daughters_lengths_and_outer_ends(dim, fraction, device, dtype):
     out = before.radius.double().cpu()[:, None] * before.axis.double().cpu()
     # lengths of a few µm are rounded a few times each, and places up to 40 µm away in float64
     rounding = 16 * eps + 4 * 40 * torch.finfo(torch.float64).eps
-    assert torch.allclose(outer_ends(after), torch.stack([low - out, high + out]), rtol=0, atol=rounding)
+    assert torch.allclose(
+        outer_ends(after), torch.stack([low - out, high + out]), rtol=0, atol=rounding
+    )
     # the two new caps touch, they neither overlap nor leave a gap
     inner = torch.as_tensor(ends(after)[1][0::2] - ends(after)[0][1::2])
-    assert torch.allclose(inner.norm(dim=1), torch.ones(5, dtype=torch.float64), rtol=0, atol=rounding)
+    assert torch.allclose(
+        inner.norm(dim=1), torch.ones(5, dtype=torch.float64), rtol=0, atol=rounding
+    )
 
 
 def test_fraction_for_each_colony():
     scene = tf.Scene(tf.Division(fraction=[0.2, 0.5]), founders=row_of_cells(1, 3.0))
-    assert scene.step(flagged(scene, 2), 0.1).length.tolist() == pytest.approx([0.4, 1.6, 1.0, 1.0], rel=1e-12)
+    assert scene.step(flagged(scene, 2), 0.1).length.tolist() == pytest.approx(
+        [0.4, 1.6, 1.0, 1.0], rel=1e-12
+    )
 
 
 def test_drawn_fractions():
-    scene = tf.Scene(tf.Division(fraction=tf.Uniform(0.3, 0.7), axis_noise=0.0), founders=row_of_cells(1, 3.0))
+    scene = tf.Scene(
+        tf.Division(fraction=tf.Uniform(0.3, 0.7), axis_noise=0.0), founders=row_of_cells(1, 3.0)
+    )
     first, second = scene.step(flagged(scene, 500), 0.1).length.reshape(500, 2).T
     assert torch.allclose(first + second, torch.full_like(first, 2.0), rtol=1e-14, atol=0)
     share = first / 2
@@ -176,9 +199,12 @@ def test_drawn_fractions():
 def test_axis_noise_is_a_thousandth_on_each_component(dim):
     scene = tf.Scene(tf.Division(), founders=row_of_cells(1, dim=dim))
     after = scene.step(flagged(scene, 4096), 0.1)
-    assert torch.allclose(after.axis.norm(dim=1), torch.ones(8192, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert torch.allclose(
+        after.axis.norm(dim=1), torch.ones(8192, dtype=torch.float64), rtol=0, atol=1e-12
+    )
     across = after.axis[:, 1:]  # the founder lies along x
-    # after normalising, the components across the axis keep their noise; four standard errors of sd and mean
+    # after normalising, the components across the axis keep their noise; four standard errors of sd
+    # and mean
     for part in across.T:
         assert float(part.std()) == pytest.approx(0.001, rel=4 / math.sqrt(2 * 8192))
         assert float(part.mean()) == pytest.approx(0.0, abs=4 * 0.001 / math.sqrt(8192))
@@ -193,18 +219,25 @@ def test_axis_noise_zero_means_none():
 
 
 def test_volume_of_two_daughters_is_the_parents(dtype):
-    """With flat cuts refilled by caps of the same radius: π r² (l − 2r) + 2·(4/3)π r³ = V − (2π − 4π/3) r³."""
+    """With flat cuts refilled by caps of the same radius: π r² (l − 2r) + 2·(4/3)π r³ = V − (2π −
+    4π/3) r³."""
     scene = tf.Scene(tf.Division(), founders=row_of_cells(1, 3.0))
     before = flagged(scene, dtype=dtype)
     lost = (2 - 4 / 3) * math.pi * 0.125
-    assert float(scene.step(before, 0.1).volume.sum()) == pytest.approx(float(before.volume.sum()) - lost, rel=1e-6)
+    assert float(scene.step(before, 0.1).volume.sum()) == pytest.approx(
+        float(before.volume.sum()) - lost, rel=1e-6
+    )
 
 
-# --- ids and order --------------------------------------------------------------------------------------------------------
+# --- ids and order --------------------------------------------------------------------------------
 
 
 def test_ids_parents_and_order_through_a_growing_batch():
-    scene = tf.Scene(tf.Growth(rate=tf.Uniform(0.7, 1.3)), tf.Division(length=tf.Uniform(3.0, 4.0)), founders=row_of_cells(3))
+    scene = tf.Scene(
+        tf.Growth(rate=tf.Uniform(0.7, 1.3)),
+        tf.Division(length=tf.Uniform(3.0, 4.0)),
+        founders=row_of_cells(3),
+    )
     state = scene.seed(5, seed=3)
     ever = {(c, u) for c, u in zip(state.colony.tolist(), state.uid.tolist(), strict=True)}
     for _ in range(60):
@@ -213,8 +246,19 @@ def test_ids_parents_and_order_through_a_growing_batch():
         ids = list(zip(state.colony.tolist(), state.uid.tolist(), strict=True))
         assert len(set(ids)) == len(ids), "an id twice in one colony"
         for birth in state.births:
-            born = zip(state.colony[birth.first].tolist(), birth.uid[: len(birth.first)].tolist(), strict=True)
-            born = [*born, *zip(state.colony[birth.second].tolist(), birth.uid[len(birth.first) :].tolist(), strict=True)]
+            born = zip(
+                state.colony[birth.first].tolist(),
+                birth.uid[: len(birth.first)].tolist(),
+                strict=True,
+            )
+            born = [
+                *born,
+                *zip(
+                    state.colony[birth.second].tolist(),
+                    birth.uid[len(birth.first) :].tolist(),
+                    strict=True,
+                ),
+            ]
             assert not ever & set(born), "an id was given out twice"
             ever |= set(born)
             assert torch.equal(state.uid[birth.first], birth.uid[: len(birth.first)])
@@ -223,12 +267,19 @@ def test_ids_parents_and_order_through_a_growing_batch():
             assert torch.equal(state.colony[birth.first], birth.parents.colony)
             assert torch.equal(birth.second, birth.first + 1)
             alive = set(zip(before.colony.tolist(), before.uid.tolist(), strict=True))
-            assert set(zip(birth.parents.colony.tolist(), birth.parents.uid.tolist(), strict=True)) <= alive
-            assert not set(zip(birth.parents.colony.tolist(), birth.parents.uid.tolist(), strict=True)) & set(ids)
+            assert (
+                set(zip(birth.parents.colony.tolist(), birth.parents.uid.tolist(), strict=True))
+                <= alive
+            )
+            assert not set(
+                zip(birth.parents.colony.tolist(), birth.parents.uid.tolist(), strict=True)
+            ) & set(ids)
         most = torch.zeros(5, dtype=torch.int64).scatter_reduce(0, state.colony, state.uid, "amax")
         assert (state.next_uid > most).all()
     assert state.cells > 60
-    assert [(c, u) for c, u in sorted(ever) if c == 0] == [(0, u) for u in range(int(state.next_uid[0]))], "ids with holes"
+    assert [(c, u) for c, u in sorted(ever) if c == 0] == [
+        (0, u) for u in range(int(state.next_uid[0]))
+    ], "ids with holes"
 
 
 def test_the_note_of_the_end_names_the_parents():
@@ -240,7 +291,7 @@ def test_the_note_of_the_end_names_the_parents():
     assert not scene.step(state, 0.1).ended, "the note must not be told again"
 
 
-# --- fields ---------------------------------------------------------------------------------------------------------------
+# --- fields ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -252,9 +303,19 @@ class Marks(Effect):
 
     def declares(self, dim):
         return (
-            tf.Field("carried", "copied", initial=lambda s, rows: 1.0 + s.uid.index_select(0, rows).double()),
+            tf.Field(
+                "carried",
+                "copied",
+                initial=lambda s, rows: 1.0 + s.uid.index_select(0, rows).double(),
+            ),
             tf.Field("clock", "starts anew", initial=7.0, at_division="reset"),
-            tf.Field("own", "a function of the newborn", dtype=torch.int64, initial=lambda s, rows: s.uid.index_select(0, rows), at_division="reset"),
+            tf.Field(
+                "own",
+                "a function of the newborn",
+                dtype=torch.int64,
+                initial=lambda s, rows: s.uid.index_select(0, rows),
+                at_division="reset",
+            ),
             tf.Field("pair", "two numbers", shape=(2,)),
             tf.Field("plate", "of the colony", scope="colony", initial=3.0),
         )
@@ -267,7 +328,11 @@ def test_fields_are_copied_or_start_anew():
     scene = tf.Scene(tf.Division(), Marks(), founders=row_of_cells(2))
     before = flagged(scene, 2, which=[1, 2])
     pair = torch.arange(8, dtype=torch.float64).reshape(4, 2)
-    before = before.with_fields(clock=torch.full((4,), 99.0, dtype=torch.float64), pair=pair, plate=torch.tensor([5.0, 6.0], dtype=torch.float64))
+    before = before.with_fields(
+        clock=torch.full((4,), 99.0, dtype=torch.float64),
+        pair=pair,
+        plate=torch.tensor([5.0, 6.0], dtype=torch.float64),
+    )
     after = scene.step(before, 0.1)
     assert after.carried.tolist() == [1.0, 2.0, 2.0, 1.0, 1.0, 2.0]
     assert after.clock.tolist() == [99.0, 7.0, 7.0, 7.0, 7.0, 99.0]
@@ -287,15 +352,21 @@ def test_4096_divisions_at_once(device, dtype):
 
     count, colonies = 1024, 4
     cells = row_of_cells(count)
-    scene = tf.Scene(tf.Rules(divide=divide, variables={"amount": 0.0}), tf.Division(), founders=cells)
+    scene = tf.Scene(
+        tf.Rules(divide=divide, variables={"amount": 0.0}), tf.Division(), founders=cells
+    )
     before = seeded(scene, cells, device, dtype, colonies=colonies)
     amount = 10.0 ** torch.linspace(-3, 3, before.cells, dtype=dtype, device=device)
-    before = before.with_fields(divide_flag=torch.ones(before.cells, dtype=torch.bool, device=device), amount=amount)
+    before = before.with_fields(
+        divide_flag=torch.ones(before.cells, dtype=torch.bool, device=device), amount=amount
+    )
     after = scene.step(before, 0.1)
     assert after.counts.tolist() == [2 * count] * colonies
     first, second = after.amount.reshape(-1, 2).T
     assert torch.allclose(first + second, amount, rtol=1e-6, atol=0)
-    assert float(after.amount.double().sum()) == pytest.approx(float(amount.double().sum()), rel=1e-6)
+    assert float(after.amount.double().sum()) == pytest.approx(
+        float(amount.double().sum()), rel=1e-6
+    )
     share = (first / amount).double()
     # uniform: Kolmogorov–Smirnov distance of 4,096 draws, exceeded by chance once in 10⁴
     empirical = torch.arange(1, 4097, dtype=torch.float64, device=device) / 4096
@@ -307,35 +378,45 @@ def test_4096_divisions_at_once(device, dtype):
 
 
 def test_gradient_passes_through_the_copying():
-    """Daughters' lengths are (l − 1)f and (l − 1)(1 − f); the sum of l² then has slope 2 l₁ f + 2 l₂ (1 − f)."""
+    """Daughters' lengths are (l − 1)f and (l − 1)(1 − f); the sum of l² then has slope 2 l₁ f + 2
+    l₂ (1 − f)."""
     scene = tf.Scene(tf.Division(fraction=0.3, axis_noise=0.0), founders=row_of_cells(1, 3.0))
     state = flagged(scene)
     length = state.length.clone().requires_grad_()
     after = scene.step(state.replace(length=length), 0.1)
     (slope,) = torch.autograd.grad((after.length**2).sum(), length)
     assert float(slope) == pytest.approx(2 * 0.6 * 0.3 + 2 * 1.4 * 0.7, rel=1e-12)
-    (shift,) = torch.autograd.grad(scene.step(state.replace(length=length), 0.1).position[0, 0], length)
+    (shift,) = torch.autograd.grad(
+        scene.step(state.replace(length=length), 0.1).position[0, 0], length
+    )
     # centre of the first daughter: ½(l₁ − l)·a, so its x moves by ½(f − 1)
     assert float(shift) == pytest.approx(0.5 * (0.3 - 1), rel=1e-12)
 
 
-# --- bad input ------------------------------------------------------------------------------------------------------------
+# --- bad input ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("given", [{"length": 3.0, "volume": 3.0}, {"length": 3.0, "added": 1.0}, {"volume": 3.0, "added": 1.0}])
+@pytest.mark.parametrize(
+    "given",
+    [{"length": 3.0, "volume": 3.0}, {"length": 3.0, "added": 1.0}, {"volume": 3.0, "added": 1.0}],
+)
 def test_two_criteria_are_refused(given):
     with pytest.raises(tf.InputError, match="one criterion"):
         tf.Division(**given)
 
 
 @pytest.mark.parametrize("criterion", ["length", "volume", "added"])
-@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf, "long", [3.0, -3.0], tf.Uniform(-1.0, 2.0)])
+@pytest.mark.parametrize(
+    "bad", [0.0, -1.0, math.nan, math.inf, "long", [3.0, -3.0], tf.Uniform(-1.0, 2.0)]
+)
 def test_bad_thresholds_are_refused(criterion, bad):
     with pytest.raises(tf.InputError, match=rf"Division\.{criterion}"):
         tf.Division(**{criterion: bad})
 
 
-@pytest.mark.parametrize("bad", [0.0, 1.0, -0.1, 1.5, math.nan, tf.Uniform(0.5, 1.0), tf.Uniform(0.0, 0.5), [0.5, 1.0]])
+@pytest.mark.parametrize(
+    "bad", [0.0, 1.0, -0.1, 1.5, math.nan, tf.Uniform(0.5, 1.0), tf.Uniform(0.0, 0.5), [0.5, 1.0]]
+)
 def test_bad_fractions_are_refused(bad):
     with pytest.raises(tf.InputError, match=r"Division\.fraction"):
         tf.Division(fraction=bad)
@@ -384,12 +465,18 @@ def test_flagged_cell_too_short_to_divide_stops_the_run_and_names_it():
 
 
 def test_a_cell_too_short_to_divide_keeps_its_whole_colony_from_dividing():
-    """By the step itself a failure is no exception but a report for each colony, as a failed solve is."""
+    """By the step itself a failure is no exception but a report for each colony, as a failed solve
+    is."""
     scene = tf.Scene(tf.Division(), founders=row_of_cells(2, [3.0, 0.6]))
     after = scene.step(flagged(scene, 3, which=[0, 2, 3, 4]), 0.1)
-    assert after.counts.tolist() == [3, 2, 3] and after.divide_flag.tolist() == [False] * 3 + [True] * 2 + [False] * 3
+    assert (
+        after.counts.tolist() == [3, 2, 3]
+        and after.divide_flag.tolist() == [False] * 3 + [True] * 2 + [False] * 3
+    )
     assert after.reports["division"].status.tolist() == [0, 1, 0]
-    assert not scene.step(flagged(scene, 3, which=[3]), 0.1).births, "no division of no cell for a rule to see"
+    assert not scene.step(flagged(scene, 3, which=[3]), 0.1).births, (
+        "no division of no cell for a rule to see"
+    )
     assert "division" not in scene.step(flagged(scene, 3, which=[0]), 0.1).reports
 
 

@@ -23,15 +23,20 @@ def grown(scene: tf.Scene, state: tf.State, steps: int, dt: float) -> tf.State:
 
 
 def rounding(dtype: torch.dtype, steps: int) -> float:
-    """Relative error of `steps` steps: each rounds rate·dt, its exponential, a product and a sum, half an ulp each."""
+    """Relative error of `steps` steps: each rounds rate·dt, its exponential, a product and a sum,
+    half an ulp each."""
     return 2 * steps * torch.finfo(dtype).eps
 
 
 def scene_of(rate, law: str, founder: tf.Cells | None = None, *more: tf.Effect) -> tf.Scene:
-    return tf.Scene(tf.Growth(rate=rate, law=law), *more, founders=founder if founder is not None else one_cell())
+    return tf.Scene(
+        tf.Growth(rate=rate, law=law),
+        *more,
+        founders=founder if founder is not None else one_cell(),
+    )
 
 
-# --- closed forms ---------------------------------------------------------------------------------------------------------
+# --- closed forms ---------------------------------------------------------------------------------
 
 
 def test_length_law_is_exponential(device, dtype):
@@ -41,11 +46,18 @@ def test_length_law_is_exponential(device, dtype):
 
 
 def test_volume_doubles_in_ln2_over_rate_whatever_the_shape(device, dtype):
-    cells = tf.Cells([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]], [[1.0, 0.0]] * 3, [0.0, 1.0, 4.0], [0.5, 0.25, 1.0])
+    cells = tf.Cells(
+        [[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]], [[1.0, 0.0]] * 3, [0.0, 1.0, 4.0], [0.5, 0.25, 1.0]
+    )
     scene = scene_of(0.7, "volume", cells)
     first = seeded(scene, cells, device, dtype)
     last = grown(scene, first, 50, math.log(2) / 0.7 / 50)
-    assert torch.allclose(last.volume / first.volume, torch.full_like(first.volume, 2.0), rtol=rounding(dtype, 50), atol=0)
+    assert torch.allclose(
+        last.volume / first.volume,
+        torch.full_like(first.volume, 2.0),
+        rtol=rounding(dtype, 50),
+        atol=0,
+    )
 
 
 def test_linear_law_adds_rate_times_time(device, dtype):
@@ -73,8 +85,12 @@ def test_volume_law_and_length_law_differ_by_the_caps():
 @pytest.mark.parametrize("law", ["volume", "length", "linear"])
 @pytest.mark.parametrize("unilateral", [False, True])
 def test_an_isolated_cell_grows_the_same_with_mechanics(law, unilateral, dtype):
-    """Nothing touches it, so the solve must leave it alone; base + elongation may round once more a step."""
-    free, held = scene_of(1.0, law), scene_of(1.0, law, one_cell(), tf.Mechanics(dim=2, unilateral=unilateral))
+    """Nothing touches it, so the solve must leave it alone; base + elongation may round once more a
+    step."""
+    free, held = (
+        scene_of(1.0, law),
+        scene_of(1.0, law, one_cell(), tf.Mechanics(dim=2, unilateral=unilateral)),
+    )
     a, b = (grown(s, s.seed(dtype=dtype), 40, 0.025) for s in (free, held))
     assert float(b.length) == pytest.approx(float(a.length), rel=rounding(dtype, 40))
     assert torch.equal(a.position, b.position) and torch.equal(a.axis, b.axis)
@@ -88,7 +104,7 @@ def test_elongation_is_what_was_added():
     assert float(second.elongation) > 0
 
 
-# --- rates ----------------------------------------------------------------------------------------------------------------
+# --- rates ----------------------------------------------------------------------------------------
 
 
 def test_a_rate_for_each_colony(device, dtype):
@@ -116,7 +132,9 @@ def test_without_a_rate_cells_rest_until_told():
 
 
 def test_rates_of_single_cells_may_come_with_the_cells():
-    cells = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, 2.0, extra={"growth_rate": [0.0, 1.0]})
+    cells = tf.Cells(
+        [[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, 2.0, extra={"growth_rate": [0.0, 1.0]}
+    )
     scene = tf.Scene(tf.Growth(law="length"), founders=cells)
     state = scene.step(scene.seed(dtype=torch.float64), 1.0)
     assert state.length.tolist() == pytest.approx([2.0, 2 * math.e], rel=1e-14)
@@ -129,8 +147,12 @@ def test_drawn_rates_cover_their_range_and_belong_to_cells():
     # mean 1, sd 1/√12: four standard errors of 2000 draws
     assert float(rate.mean()) == pytest.approx(1.0, abs=4 / math.sqrt(12 * 2000))
     assert float(rate.std()) == pytest.approx(1 / math.sqrt(12), rel=0.06)
-    assert torch.equal(scene.seed(3, dtype=torch.float64).growth_rate, rate[:3]), "a draw depends on the batch"
-    assert not torch.equal(scene.seed(3, seed=1, dtype=torch.float64).growth_rate, rate[:3]), "a draw ignores the seed"
+    assert torch.equal(scene.seed(3, dtype=torch.float64).growth_rate, rate[:3]), (
+        "a draw depends on the batch"
+    )
+    assert not torch.equal(scene.seed(3, seed=1, dtype=torch.float64).growth_rate, rate[:3]), (
+        "a draw ignores the seed"
+    )
 
 
 def flagged(scene: tf.Scene, colonies: int) -> tf.State:
@@ -160,10 +182,12 @@ def test_other_distributions(distribution):
     rate = scene_of(distribution, "volume").seed(2000, dtype=torch.float64).growth_rate
     assert float(rate.mean()) == pytest.approx(1.0025, abs=0.0025 + 4 * 0.1 / math.sqrt(2000))
     assert float(rate.std()) == pytest.approx(0.1, rel=4 / math.sqrt(2 * 2000) + 0.01)
-    assert float(rate.min()) >= distribution.least() and float(rate.max()) <= distribution.greatest()
+    assert (
+        float(rate.min()) >= distribution.least() and float(rate.max()) <= distribution.greatest()
+    )
 
 
-# --- gradients ------------------------------------------------------------------------------------------------------------
+# --- gradients ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("law", ["volume", "length", "linear"])
@@ -186,10 +210,23 @@ def test_gradient_of_each_colony_is_its_own():
     assert slope.tolist() == pytest.approx([0.0, float(state.length[1].detach()), 0.0], rel=1e-12)
 
 
-# --- bad input ------------------------------------------------------------------------------------------------------------
+# --- bad input ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rate", [-1.0, math.nan, math.inf, "fast", True, [[1.0]], [1.0, math.nan], [1.0, -1.0], tf.Uniform(-0.5, 1.0)])
+@pytest.mark.parametrize(
+    "rate",
+    [
+        -1.0,
+        math.nan,
+        math.inf,
+        "fast",
+        True,
+        [[1.0]],
+        [1.0, math.nan],
+        [1.0, -1.0],
+        tf.Uniform(-0.5, 1.0),
+    ],
+)
 def test_bad_rates_are_refused(rate):
     with pytest.raises(tf.InputError, match=r"Growth\.rate"):
         tf.Growth(rate=rate)
@@ -202,4 +239,6 @@ def test_unknown_law_is_refused():
 
 def test_volume_helper_agrees_with_the_model():
     """V = π r² (l + 4r/3) for l = 2, r = ½."""
-    assert float(capsule.volume(torch.tensor(2.0), torch.tensor(0.5))) == pytest.approx(math.pi * 0.25 * (2 + 2 / 3), rel=1e-6)
+    assert float(capsule.volume(torch.tensor(2.0), torch.tensor(0.5))) == pytest.approx(
+        math.pi * 0.25 * (2 + 2 / 3), rel=1e-6
+    )

@@ -1,4 +1,5 @@
-"""How many passes a step takes, how finely each is solved, and that neither depends on the batch."""
+"""How many passes a step takes, how finely each is solved, and that neither depends on the
+batch."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from torchfilm.effects.mechanics import _Run
 from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.physics.solve import CONVERGED
 
-# Sixty short rods thrown into a box of 5 µm: the first moves would turn some of them by far more than MAX_TURN, as in the middle of a large colony.
+# Sixty short rods thrown into a box of 5 µm: the first moves would turn some of them by far more
+# than MAX_TURN, as in the middle of a large colony.
 RODS, SIDE = 60, 5.0
 
 
@@ -22,9 +24,16 @@ def thrown(*colonies: float) -> tf.Cells:
     for number, stretch in enumerate(colonies):
         rng = np.random.default_rng(number)
         axis = rng.normal(size=(RODS, 3))
-        parts.append((stretch * SIDE * rng.random((RODS, 3)), axis / np.linalg.norm(axis, axis=1, keepdims=True)))
+        parts.append(
+            (
+                stretch * SIDE * rng.random((RODS, 3)),
+                axis / np.linalg.norm(axis, axis=1, keepdims=True),
+            )
+        )
     position, axis = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return tf.Cells(position, axis, length=1.5, radius=0.5, colony=np.repeat(np.arange(len(colonies)), RODS))
+    return tf.Cells(
+        position, axis, length=1.5, radius=0.5, colony=np.repeat(np.arange(len(colonies)), RODS)
+    )
 
 
 def first_step(device, dtype, **options) -> tf.State:
@@ -38,7 +47,8 @@ def deepest(state: tf.State) -> float:
 
 
 def test_later_passes_part_what_the_first_left_deep(device, dtype):
-    """Further passes leave the crowd's mean overlap less, until none is deeper than 0.02 µm, which is asked where passes are."""
+    """Further passes leave the crowd's mean overlap less, until none is deeper than 0.02 µm, which
+    is asked where passes are."""
     more = [first_step(device, dtype, passes=passes) for passes in (1, 2, 4, 8)]
     mean = [float(tf.measure.overlaps(s).mean[0]) for s in more]
     assert mean[0] > mean[1] > mean[2] > mean[3]
@@ -59,11 +69,17 @@ def test_the_overlap_that_is_left_can_be_named(device, dtype):
 
 
 def test_a_later_pass_moves_only_what_is_too_deep(device, dtype):
-    """Beside the crowd, in one colony with it, a pair that the first pass parts to within the limit: the second moves the crowd's cells that are
-    deeper than the limit, or were cut short, and no other."""
+    """Beside the crowd, in one colony with it, a pair that the first pass parts to within the
+    limit: the second moves the crowd's cells that are deeper than the limit, or were cut short, and
+    no other."""
     crowd = thrown(1.0)
     far = np.array([[40, 0, 0], [40, 0.8, 0]]), np.array([[1.0, 0, 0], [1, 0, 0]])
-    cells = tf.Cells(np.concatenate([crowd.position, far[0]]), np.concatenate([crowd.axis, far[1]]), length=1.5, radius=0.5)
+    cells = tf.Cells(
+        np.concatenate([crowd.position, far[0]]),
+        np.concatenate([crowd.axis, far[1]]),
+        length=1.5,
+        radius=0.5,
+    )
     scenes = [tf.Scene(tf.Mechanics(dim=3, passes=n, overlap=0.1)) for n in (1, 2)]
     one, two = (run(scene, seeded(scene, cells, device, dtype), 1, dt=0.025) for scene in scenes)
     moved = (two.position != one.position).any(1) | (two.axis != one.axis).any(1)
@@ -76,7 +92,8 @@ def test_a_later_pass_moves_only_what_is_too_deep(device, dtype):
 
 
 def every_pair(run_of: _Run, active: torch.Tensor) -> tuple[list, torch.Tensor]:
-    """What a later pass should find, by looking at every pair: those that hold a cell which takes part, and which cells take part, (N,) bool."""
+    """What a later pass should find, by looking at every pair: those that hold a cell which takes
+    part, and which cells take part, (N,) bool."""
     pairs, walls = run_of._all_that_touches(active, run_of.sees_near[1])
     of_active = active[run_of.state.colony]
     left = run_of.cut & of_active
@@ -93,15 +110,23 @@ def as_list(first: torch.Tensor, second: torch.Tensor) -> list:
     return sorted((min(p), max(p)) for p in zip(first.tolist(), second.tolist(), strict=True))
 
 
-# By overlap: cells that hardly move are left deep where the limit is small beside what the box leaves, and it goes by the radius where none is given.
-LIMITS = {"small": {"passes": 6, "overlap": 0.01}, "by radius": {}, "large": {"passes": 4, "overlap": 0.3}, "soft cells": {"stiffness": 40.0, "passes": 4}}
+# By overlap: cells that hardly move are left deep where the limit is small beside what the box
+# leaves, and it goes by the radius where none is given.
+LIMITS = {
+    "small": {"passes": 6, "overlap": 0.01},
+    "by radius": {},
+    "large": {"passes": 4, "overlap": 0.3},
+    "soft cells": {"stiffness": 40.0, "passes": 4},
+}
 
 
 @pytest.mark.parametrize("limit", LIMITS)
 @pytest.mark.parametrize("unilateral", [False, True])
 def test_what_is_left_deep_is_found_wherever_it_is(dtype, limit, unilateral, monkeypatch):
-    """In each later pass, by the search near what has moved, the same cells and the same contacts, each once, as by looking at every pair: for cells of many
-    sizes, in colonies from loose to jammed, in a hard box with a soft plane in it; some colonies are done before others."""
+    """In each later pass, by the search near what has moved, the same cells and the same contacts,
+    each once, as by looking at every pair: for cells of many sizes, in colonies from loose to
+    jammed, in a hard box with a soft plane in it; some colonies are done before others.
+    """
     found_of, seen = _Run._left_deep, []
 
     def compared(run_of, active, before):
@@ -109,7 +134,13 @@ def test_what_is_left_deep_is_found_wherever_it_is(dtype, limit, unilateral, mon
         wanted, taking = every_pair(run_of, active)
         assert torch.equal(left, taking)
         assert as_list(pairs.first, pairs.second) == wanted
-        seen.append((int(left.sum()), bool(active.all()), int((left & (2 * run_of.moved <= run_of.overlap) & ~run_of.cut).sum())))
+        seen.append(
+            (
+                int(left.sum()),
+                bool(active.all()),
+                int((left & (2 * run_of.moved <= run_of.overlap) & ~run_of.cut).sum()),
+            )
+        )
         return pairs, walls, left
 
     monkeypatch.setattr(_Run, "_left_deep", compared)
@@ -118,15 +149,30 @@ def test_what_is_left_deep_is_found_wherever_it_is(dtype, limit, unilateral, mon
     rng = np.random.default_rng(3)
     count = len(stretches) * RODS
     position = np.clip(cells.position, 0.0, 30.0)
-    cells = tf.Cells(position, cells.axis, length=rng.choice([0.0, 0.5, 2.0, 6.0], count), radius=rng.uniform(0.2, 0.6, count), colony=cells.colony)
-    walls = [tf.Box((-1.0, -1.0, -1.0), (30.5, 30.5, 30.5)), tf.Plane(z=-0.5, facing="+z", stiffness=16.0)]
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=3, walls=walls, unilateral=unilateral, **LIMITS[limit]))
+    cells = tf.Cells(
+        position,
+        cells.axis,
+        length=rng.choice([0.0, 0.5, 2.0, 6.0], count),
+        radius=rng.uniform(0.2, 0.6, count),
+        colony=cells.colony,
+    )
+    walls = [
+        tf.Box((-1.0, -1.0, -1.0), (30.5, 30.5, 30.5)),
+        tf.Plane(z=-0.5, facing="+z", stiffness=16.0),
+    ]
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Mechanics(dim=3, walls=walls, unilateral=unilateral, **LIMITS[limit]),
+    )
     state = seeded(scene, cells, "cpu", dtype)
     for _ in range(4):
         state = scene.step(state, 0.025)
     assert len(seen) >= 4 and max(n for n, _, _ in seen) > 0
     if limit == "small":  # all that there is to go wrong went by
-        assert any(not all_active for _, all_active, _ in seen) and max(still for _, _, still in seen) > 0
+        assert (
+            any(not all_active for _, all_active, _ in seen)
+            and max(still for _, _, still in seen) > 0
+        )
 
 
 @pytest.fixture(scope="module")
@@ -139,23 +185,40 @@ def full_channel() -> tf.State:
 
 @pytest.mark.parametrize("unilateral", [False, True])
 def test_more_passes_over_hard_contacts_keep_a_full_channel_apart(full_channel, unilateral):
-    """F6: blind to what the pass before had left a hair apart, each pushed it together again, until cells lay on one another, 0.45 µm deep on average, and grew
-    as if nothing held them. More passes of tighter solves must leave less than the start's overlap, which is of usual settings."""
-    mechanics = tf.Mechanics(dim=2, walls=[tf.Channel(10.0, low_end=0.0)], alpha=1e-3, passes=4, tolerance=1e-3, unilateral=unilateral)
+    """F6: blind to what the pass before had left a hair apart, each pushed it together again, until
+    cells lay on one another, 0.45 µm deep on average, and grew as if nothing held them. More passes
+    of tighter solves must leave less than the start's overlap, which is of usual settings.
+    """
+    mechanics = tf.Mechanics(
+        dim=2,
+        walls=[tf.Channel(10.0, low_end=0.0)],
+        alpha=1e-3,
+        passes=4,
+        tolerance=1e-3,
+        unilateral=unilateral,
+    )
     removal = tf.Removal(low=(-1.0, -10.0), high=(60.0, 10.0))
-    scene = tf.Scene(tf.Growth(), tf.Division(length=tf.Uniform(3.5, 4.5)), mechanics, removal, founders=tf.Cells([[15.0, 0.0]], [[1.0, 0.0]]))
+    scene = tf.Scene(
+        tf.Growth(),
+        tf.Division(length=tf.Uniform(3.5, 4.5)),
+        mechanics,
+        removal,
+        founders=tf.Cells([[15.0, 0.0]], [[1.0, 0.0]]),
+    )
     usual = float(tf.measure.overlaps(full_channel).mean.max())
     state, deepest_of_each = full_channel, []
     for _ in range(20):
         state = scene.step(state, 0.025)
         deepest_of_each.append(float(tf.measure.overlaps(state, mechanics.walls).worst.max()))
     assert float(tf.measure.overlaps(state).mean.max()) < 0.5 * usual
-    assert float(np.median(deepest_of_each)) < 0.25  # half a radius; cells on one another are 1 µm deep
+    # half a radius; cells on one another are 1 µm deep
+    assert float(np.median(deepest_of_each)) < 0.25
     assert int((state.counts - full_channel.counts).max()) < 30
 
 
 def test_a_colony_whose_cells_stay_in_one_another_is_told():
-    """A heap whose contacts are so soft by their alpha that they part nothing; the colony beside it is loose. No solve fails."""
+    """A heap whose contacts are so soft by their alpha that they part nothing; the colony beside it
+    is loose. No solve fails."""
     scene = tf.Scene(tf.Mechanics(dim=3, alpha=1e4), founders=thrown(0.3, 6.0))
     with pytest.warns(RuntimeWarning, match=r"for 20 steps in colony 0 \(\d+ cells\).*alpha"):
         states = list(tf.simulate(scene, scene.seed(2), until=25 * 0.025, dt=0.025))
@@ -172,8 +235,9 @@ def test_a_heap_that_parts_is_no_collapse():
 @pytest.mark.parametrize("unilateral", [False, True])
 @pytest.mark.parametrize("alpha", [1e-6, 1e-7])
 def test_nearly_hard_contacts_converge_in_32_bits(alpha, unilateral):
-    """Rods thrown together, whose blocks are nearly singular: their inverses must stay symmetric, or CG comes to a stand. Four in five seeds, of 20 rods
-    each; at αγ = 1e-6 float32 has no digit to spare."""
+    """Rods thrown together, whose blocks are nearly singular: their inverses must stay symmetric,
+    or CG comes to a stand. Four in five seeds, of 20 rods each; at αγ = 1e-6 float32 has no digit
+    to spare."""
     parts = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -181,7 +245,10 @@ def test_nearly_hard_contacts_converge_in_32_bits(alpha, unilateral):
         parts.append((axis / np.linalg.norm(axis, axis=1, keepdims=True), 5 * rng.random((20, 3))))
     axis, position = (np.concatenate(part) for part in zip(*parts, strict=True))
     cells = tf.Cells(position, axis, length=2.0, radius=0.5, colony=np.repeat(np.arange(20), 20))
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=3, unilateral=unilateral, alpha=alpha, passes=1, max_iterations=500))
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Mechanics(dim=3, unilateral=unilateral, alpha=alpha, passes=1, max_iterations=500),
+    )
     report = scene.step(seeded(scene, cells, "cpu", torch.float32), 0.005).reports["mechanics"]
     assert int((report.status == CONVERGED).sum()) >= 16
     assert float(report.iterations.double().median()) < 60
@@ -196,13 +263,24 @@ def test_no_more_passes_than_asked(device, dtype, passes):
 
 
 def test_a_pass_is_as_fine_as_asked(device, dtype):
-    """The worst residual is at most the tolerance of that at rest, 0.05 unless another is given, whichever pass it is."""
-    assert 1e-3 < float(first_step(device, dtype, passes=1).reports["mechanics"].residual.max()) <= 0.05
-    assert float(first_step(device, dtype, passes=2, tolerance=1e-3).reports["mechanics"].residual.max()) <= 1e-3
+    """The worst residual is at most the tolerance of that at rest, 0.05 unless another is given,
+    whichever pass it is."""
+    assert (
+        1e-3
+        < float(first_step(device, dtype, passes=1).reports["mechanics"].residual.max())
+        <= 0.05
+    )
+    assert (
+        float(
+            first_step(device, dtype, passes=2, tolerance=1e-3).reports["mechanics"].residual.max()
+        )
+        <= 1e-3
+    )
 
 
 def test_passes_do_not_depend_on_the_batch(device, dtype):
-    """Colonies that take many passes and few beside each other: each has the bits that it has by itself."""
+    """Colonies that take many passes and few beside each other: each has the bits that it has by
+    itself."""
     scene = tf.Scene(tf.Mechanics(dim=3, passes=5))
     start = seeded(scene, thrown(1.0, 1.6, 6.0, 0.9), device, dtype)
     state = run(scene, start, 3, dt=0.025)

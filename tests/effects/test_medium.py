@@ -1,4 +1,5 @@
-"""Medium: what cells and grid hold together, cells beyond the box, and what a scene refuses. The transport itself is tested with its kernels."""
+"""Medium: what cells and grid hold together, cells beyond the box, and what a scene refuses. The
+transport itself is tested with its kernels."""
 
 from __future__ import annotations
 
@@ -25,18 +26,29 @@ def exchanging(start: float = 3.0, *, D1: float = 1.0, **options) -> tf.Circuit:
     return tf.Circuit(membrane, species=("ahl",), initial={"ahl": start}, D1=D1, **options)
 
 
-def resting(medium: tf.Medium, circuit: tf.Circuit | None = None, founders: tf.Cells | None = None, **options) -> tf.Scene:
+def resting(
+    medium: tf.Medium,
+    circuit: tf.Circuit | None = None,
+    founders: tf.Cells | None = None,
+    **options,
+) -> tf.Scene:
     """Cells that neither grow nor move."""
-    return tf.Scene(circuit or exchanging(), medium, founders=founders or tf.Cells.single(2), **options)
+    return tf.Scene(
+        circuit or exchanging(), medium, founders=founders or tf.Cells.single(2), **options
+    )
 
 
 def totals(state: tf.State, name: str = "ahl", inside: bool = True) -> Tensor:
     """Amount of a substance in cells, medium and beyond, conc·µm³, per colony (B,) float64."""
     grid = state.layout.grid
-    out = torch.zeros(state.colonies, dtype=F64, device=state.device).index_add(0, grid.owner, state.signals[name].double() * grid.voxel_volume)
+    out = torch.zeros(state.colonies, dtype=F64, device=state.device).index_add(
+        0, grid.owner, state.signals[name].double() * grid.voxel_volume
+    )
     if inside:
         out = out.index_add(0, state.colony, state.fields[name].double() * state.volume.double())
-    return out + state.fields[f"{name}_beyond"].double() if f"{name}_beyond" in state.fields else out
+    return (
+        out + state.fields[f"{name}_beyond"].double() if f"{name}_beyond" in state.fields else out
+    )
 
 
 def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float) -> tf.State:
@@ -46,17 +58,26 @@ def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float) -> tf.State
     return state
 
 
-# --- what there is, stays ------------------------------------------------------------------------------------------------
+# --- what there is, stays -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("beyond", ["error", "grow", "open"])
 def test_amounts_are_conserved_through_growth_division_and_exchange(beyond, dtype, device):
-    """Cells, medium and reservoir together. Every step rounds each of some ten sums once: relative, 40 steps × 10 × eps / 2."""
+    """Cells, medium and reservoir together. Every step rounds each of some ten sums once: relative,
+    40 steps × 10 × eps / 2."""
     half = 16.0 if beyond == "error" else 4.0  # where the box may be left, it is
     scene = tf.Scene(
-        tf.Growth(rate=1.5), tf.Division(length=tf.Uniform(3.0, 3.4)), tf.Mechanics(dim=2), exchanging(daughters="amount"),
-        tf.Medium(ahl=tf.Signal(diffusion=20.0, initial=0.5, beyond=0.7), box=((-half, -half), (half, half)), spacing=2.0, beyond=beyond),
-    )  # fmt: skip
+        tf.Growth(rate=1.5),
+        tf.Division(length=tf.Uniform(3.0, 3.4)),
+        tf.Mechanics(dim=2),
+        exchanging(daughters="amount"),
+        tf.Medium(
+            ahl=tf.Signal(diffusion=20.0, initial=0.5, beyond=0.7),
+            box=((-half, -half), (half, half)),
+            spacing=2.0,
+            beyond=beyond,
+        ),
+    )
     state = scene.seed(2, seed=3, dtype=dtype, device=device)
     first, nodes = totals(state), state.layout.grid.nodes
     if beyond == "grow":  # new room comes with what it holds at first
@@ -77,19 +98,30 @@ def test_amounts_are_conserved_through_growth_division_and_exchange(beyond, dtyp
 
 @pytest.mark.parametrize("method", ["rosenbrock", "rk4", "euler"])
 def test_exchange_conserves_whatever_integrates_it(method):
-    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=20.0), box=BOX, spacing=4.0), exchanging(method=method, steps=4))
+    scene = resting(
+        tf.Medium(ahl=tf.Signal(diffusion=20.0), box=BOX, spacing=4.0),
+        exchanging(method=method, steps=4),
+    )
     state = scene.seed(dtype=F64)
-    assert float(totals(advance(scene, state, 20, 0.01))) == pytest.approx(float(totals(state)), rel=1e-13)
+    assert float(totals(advance(scene, state, 20, 0.01))) == pytest.approx(
+        float(totals(state)), rel=1e-13
+    )
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_one_voxel_relaxes_at_the_rate_of_its_membranes(count):
-    """d/dt (ci − ce) = −D1 A (1/V + 1/Vg) (ci − ce) for one cell in one voxel. With three alike, each has a third of it: 1/V + 3/Vg.
+    """d/dt (ci − ce) = −D1 A (1/V + 1/Vg) (ci − ce) for one cell in one voxel. With three alike,
+    each has a third of it: 1/V + 3/Vg.
 
     The integrator is asked for 1e-8 of 3 a step, 20 steps: 6e-7 in all where errors add up.
     """
     cells = tf.Cells([[0.0, 2.0 * k - 2.0] for k in range(count)], [[1.0, 0.0]] * count)
-    medium = tf.Medium(ahl=tf.Signal(diffusion=10.0, initial=0.5), box=((-4.0, -4.0), (4.0, 4.0)), spacing=8.0, depth=1.0)
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=10.0, initial=0.5),
+        box=((-4.0, -4.0), (4.0, 4.0)),
+        spacing=8.0,
+        depth=1.0,
+    )
     scene = resting(medium, exchanging(D1=2.0, rtol=1e-8, atol=1e-12), cells)
     state = scene.seed(dtype=F64)
     volume, area, room = float(state.volume[0]), float(state.area[0]), 64.0 / count
@@ -108,17 +140,24 @@ def test_one_voxel_relaxes_at_the_rate_of_its_membranes(count):
 def test_a_stiff_membrane_leaves_nothing_negative(start, dtype, device):
     """D1 = 1e6 µm/h: a step is 4e5 relaxation times, either way through the membrane.
 
-    The solve magnifies the rounding of rates by rate × step, so what is lost is at most eps × 4e5 of what is exchanged, 0.0075 of the whole; of float32
-    rates that alone could be all, and the integrator's error control must keep it to its tolerance of 1e-4 a step, five times.
+    The solve magnifies the rounding of rates by rate × step, so what is lost is at most eps × 4e5
+    of what is exchanged, 0.0075 of the whole; of float32 rates that alone could be all, and the
+    integrator's error control must keep it to its tolerance of 1e-4 a step, five times.
     """
     cells = tf.Cells([[0.3 * k, 1.1 * k - 3.0] for k in range(6)], [[1.0, 0.2]] * 6)
-    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0, initial=2.0), box=BOX, spacing=4.0), exchanging(start, D1=1e6), cells)
+    scene = resting(
+        tf.Medium(ahl=tf.Signal(diffusion=5.0, initial=2.0), box=BOX, spacing=4.0),
+        exchanging(start, D1=1e6),
+        cells,
+    )
     state = scene.seed(dtype=dtype, device=device)
     first = float(totals(state))
     for _ in range(5):
         state = advance(scene, state, 1, 0.1)
         assert float(state.fields["ahl"].min()) >= 0 and float(state.signals["ahl"].min()) >= 0
-    assert float(totals(state)) == pytest.approx(first, rel=1e-12 if dtype == F64 else 5e-4 * 0.0075 * 5)
+    assert float(totals(state)) == pytest.approx(
+        first, rel=1e-12 if dtype == F64 else 5e-4 * 0.0075 * 5
+    )
 
 
 def uptake(u, s, p, cell):
@@ -128,10 +167,17 @@ def uptake(u, s, p, cell):
 
 
 def test_uptake_a_thousand_times_faster_than_the_step(dtype, device):
-    """Hard case 39 through a circuit: k·dt = 1e3, u ≥ 0, gain = loss to 1e-6 relative, crowded voxels and lonely ones."""
-    cells = tf.Cells([[1.3 * (k % 4) - 2.0, 1.2 * (k // 4) - 2.0] for k in range(16)], [[0.0, 1.0]] * 16, length=0.1)
+    """Hard case 39 through a circuit: k·dt = 1e3, u ≥ 0, gain = loss to 1e-6 relative, crowded
+    voxels and lonely ones."""
+    cells = tf.Cells(
+        [[1.3 * (k % 4) - 2.0, 1.2 * (k // 4) - 2.0] for k in range(16)],
+        [[0.0, 1.0]] * 16,
+        length=0.1,
+    )
     circuit = tf.Circuit(uptake, species=("ahl",), k=1e4)
-    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=1.0), box=BOX, spacing=4.0), circuit, cells)
+    scene = resting(
+        tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=1.0), box=BOX, spacing=4.0), circuit, cells
+    )
     state = scene.seed(dtype=dtype, device=device)
     first = float(totals(state))
     for _ in range(3):
@@ -140,10 +186,11 @@ def test_uptake_a_thousand_times_faster_than_the_step(dtype, device):
         gain = float((state.fields["ahl"].double() * state.volume.double()).sum())
         loss = first - float(totals(state, inside=False))
         assert gain > 200
-        assert abs(gain - loss) <= (1e-12 * gain if dtype == F64 else 1e-6 * first)  # in float32 the grid itself is rounded by 6e-8 of all that it holds
+        # in float32 the grid itself is rounded by 6e-8 of all that it holds
+        assert abs(gain - loss) <= (1e-12 * gain if dtype == F64 else 1e-6 * first)
 
 
-# --- cells beyond the box: hard case 38 -----------------------------------------------------------------------------------
+# --- cells beyond the box: hard case 38 -----------------------------------------------------------
 
 FAR = [pytest.param(4e-3, id="a thousandth of a voxel"), pytest.param(40.0, id="ten voxels")]
 
@@ -160,7 +207,11 @@ def strayed(scene: tf.Scene, away: float) -> tf.State:
 @pytest.mark.parametrize("away", FAR)
 def test_a_cell_beyond_the_box_is_an_error_that_names_it(away):
     scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0))
-    with pytest.raises(SimulationError, match=r"(?s)1 of 3 colonies.*colony 1 \(2 cells\): 1 cell.*beyond the box.*\(" + f"{16 + away:.4g}") as failed:
+    with pytest.raises(
+        SimulationError,
+        match=r"(?s)1 of 3 colonies.*colony 1 \(2 cells\): 1 cell.*beyond the box.*\("
+        + f"{16 + away:.4g}",
+    ) as failed:
         list(tf.simulate(scene, strayed(scene, away), until=0.1, dt=0.1))
     assert failed.value.colonies == (1,)
     assert "grow" in str(failed.value)
@@ -170,7 +221,10 @@ def test_a_cell_beyond_the_box_is_an_error_that_names_it(away):
 def test_drop_goes_on_without_the_colony_that_strayed(away):
     scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0))
     good = strayed(scene, -1.0)
-    states = [list(tf.simulate(scene, s, until=0.5, dt=0.1, on_failure="drop"))[-1] for s in (strayed(scene, away), good)]
+    states = [
+        list(tf.simulate(scene, s, until=0.5, dt=0.1, on_failure="drop"))[-1]
+        for s in (strayed(scene, away), good)
+    ]
     assert states[0].counts.tolist() == [2, 0, 2]
     for name in ("ahl", "out.ahl"):
         found, wanted = (s.select([0, 2]).fields[name] for s in states)
@@ -183,35 +237,58 @@ def test_the_grid_grows_to_the_cell_that_strays(away):
     state = strayed(scene, away)
     first, grown = totals(state), scene.step(state, 0.1)
     grid = grown.layout.grid
-    assert float(grid.high[1, 0]) >= 16 + away + 4.0 and grid.shapes[0] == grid.shapes[2] == (8, 8, 1)
+    assert float(grid.high[1, 0]) >= 16 + away + 4.0 and grid.shapes[0] == grid.shapes[2] == (
+        8,
+        8,
+        1,
+    )
     assert torch.equal(grid.origin[1], state.layout.grid.origin[1])
     assert torch.allclose(totals(grown), first, rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("away", FAR)
 def test_an_open_box_keeps_count(away):
-    """Outside, the cell meets the reservoir's 0.25 and nothing else: its exchange over one step is known exactly."""
-    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0, beyond=0.25), box=BOX, spacing=4.0, beyond="open"), exchanging(3.0, rtol=1e-8))
+    """Outside, the cell meets the reservoir's 0.25 and nothing else: its exchange over one step is
+    known exactly."""
+    scene = resting(
+        tf.Medium(ahl=tf.Signal(diffusion=5.0, beyond=0.25), box=BOX, spacing=4.0, beyond="open"),
+        exchanging(3.0, rtol=1e-8),
+    )
     state = strayed(scene, away)
     after = scene.step(state, 0.1)
     left = 0.25 + 2.75 * math.exp(-float(state.area[3] / state.volume[3]) * 0.1)
     assert float(after.fields["ahl"][3]) == pytest.approx(left, rel=1e-6)
     beyond = after.fields["ahl_beyond"]
-    assert beyond[0] == beyond[2] == 0 and float(beyond[1]) == pytest.approx(float(state.volume[3]) * (3.0 - left), rel=1e-6)
+    assert beyond[0] == beyond[2] == 0 and float(beyond[1]) == pytest.approx(
+        float(state.volume[3]) * (3.0 - left), rel=1e-6
+    )
     assert torch.allclose(totals(after), totals(state), rtol=1e-14, atol=0)
 
 
 def test_an_open_box_gives_too():
     """A cell with less than the reservoir takes from it: the count goes below 0."""
-    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0, beyond=[1.0, 2.0, 4.0]), box=BOX, spacing=4.0, beyond="open"), exchanging(0.0))
+    scene = resting(
+        tf.Medium(
+            ahl=tf.Signal(diffusion=5.0, beyond=[1.0, 2.0, 4.0]),
+            box=BOX,
+            spacing=4.0,
+            beyond="open",
+        ),
+        exchanging(0.0),
+    )
     state = advance(scene, strayed(scene, 4.0), 50, 0.1)
-    assert float(state.fields["ahl"][3]) == pytest.approx(2.0, rel=1e-3)  # colony 1's own reservoir; rtol is 1e-4
-    assert float(state.fields["ahl_beyond"][1]) == pytest.approx(-2.0 * float(state.volume[3]), rel=1e-3)
+    # colony 1's own reservoir; rtol is 1e-4
+    assert float(state.fields["ahl"][3]) == pytest.approx(2.0, rel=1e-3)
+    assert float(state.fields["ahl_beyond"][1]) == pytest.approx(
+        -2.0 * float(state.volume[3]), rel=1e-3
+    )
     assert torch.allclose(totals(state), torch.zeros(3, dtype=F64), atol=1e-12)
 
 
 def test_a_box_that_grows_along_x_only_says_where_else_it_ends():
-    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, beyond="grow", grows="x"))
+    scene = resting(
+        tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, beyond="grow", grows="x")
+    )
     state = strayed(scene, 40.0)
     assert scene.step(state, 0.1).layout.grid.shapes[1] == (24, 8, 1)
     up = state.replace(position=state.position.flip(1))
@@ -220,82 +297,159 @@ def test_a_box_that_grows_along_x_only_says_where_else_it_ends():
 
 
 def test_a_cell_inside_an_obstacle_is_beyond_the_medium():
-    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, obstacles=lambda at: at[:, 0] > 8.0))
+    scene = resting(
+        tf.Medium(
+            ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, obstacles=lambda at: at[:, 0] > 8.0
+        )
+    )
     state = strayed(scene, -2.0)
     with pytest.raises(SimulationError, match=r"colony 1.*obstacle") as failed:
         list(tf.simulate(scene, state, until=0.1, dt=0.1))
     assert failed.value.colonies == (1,)
 
 
-# --- values on the grid ---------------------------------------------------------------------------------------------------
+# --- values on the grid ---------------------------------------------------------------------------
 
 
 def test_first_values_and_constants_may_be_numbers_per_colony_or_functions(dtype):
     medium = tf.Medium(
-        a=tf.Signal(diffusion=[1.0, 2.0], initial=[3.0, 4.0], decay=[0.0, 1.0]), b=tf.Signal(diffusion=0.0, initial=lambda at: (at[:, 0] > 0).double()),
-        c=tf.Signal(diffusion=0.0, source=lambda at: (at[:, 1] > 0).double() * 2.0), box=BOX, spacing=4.0,
-    )  # fmt: skip
+        a=tf.Signal(diffusion=[1.0, 2.0], initial=[3.0, 4.0], decay=[0.0, 1.0]),
+        b=tf.Signal(diffusion=0.0, initial=lambda at: (at[:, 0] > 0).double()),
+        c=tf.Signal(diffusion=0.0, source=lambda at: (at[:, 1] > 0).double() * 2.0),
+        box=BOX,
+        spacing=4.0,
+    )
     scene = tf.Scene(medium, founders=tf.Cells.single(2))
     state = scene.seed(2, dtype=dtype)
-    assert state.signals["a"].dtype == dtype and state.signals["a"].reshape(2, -1).mean(1).tolist() == [3.0, 4.0]
+    assert state.signals["a"].dtype == dtype and state.signals["a"].reshape(2, -1).mean(
+        1
+    ).tolist() == [3.0, 4.0]
     after = scene.step(state, 0.5)
     close = {"rel": 20 * torch.finfo(dtype).eps}  # eight voxels an axis, two products
-    assert after.signals["a"].reshape(2, -1).amax(1).tolist() == pytest.approx([3.0, 4.0 * math.exp(-0.5)], **close)
-    assert torch.equal(after.signals["b"], state.signals["b"]) and float(after.signals["b"].sum()) == 64
+    assert after.signals["a"].reshape(2, -1).amax(1).tolist() == pytest.approx(
+        [3.0, 4.0 * math.exp(-0.5)], **close
+    )
+    assert (
+        torch.equal(after.signals["b"], state.signals["b"])
+        and float(after.signals["b"].sum()) == 64
+    )
     assert float(after.signals["c"].sum()) == pytest.approx(2 * 32 * 2.0 * 0.5, **close)
 
 
 def test_obstacles_hold_nothing_at_first():
     scene = tf.Scene(
-        tf.Medium(a=tf.Signal(diffusion=1.0, initial=1.0), box=BOX, spacing=4.0, obstacles=lambda at: at[:, 0] > 0), founders=tf.Cells([[-5.0, 0]], [1.0, 0])
+        tf.Medium(
+            a=tf.Signal(diffusion=1.0, initial=1.0),
+            box=BOX,
+            spacing=4.0,
+            obstacles=lambda at: at[:, 0] > 0,
+        ),
+        founders=tf.Cells([[-5.0, 0]], [1.0, 0]),
     )
     state = scene.seed(dtype=F64)
     after = advance(scene, state, 3, 0.5)
-    assert float(state.signals["a"].sum()) == 32 and float(after.signals["a"].reshape(8, 8)[4:].abs().max()) == 0
-    assert float(after.signals["a"].sum()) == pytest.approx(32, rel=1e-9)  # the implicit solve stops at a relative 1e-10 or so
+    assert (
+        float(state.signals["a"].sum()) == 32
+        and float(after.signals["a"].reshape(8, 8)[4:].abs().max()) == 0
+    )
+    # the implicit solve stops at a relative 1e-10 or so
+    assert float(after.signals["a"].sum()) == pytest.approx(32, rel=1e-9)
 
 
 def test_flat_cells_may_lie_in_a_box_with_three_dimensions():
-    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0), box=((-8, -8, -8), (8, 8, 8)), spacing=4.0, height=2.0), exchanging(1.0))
+    scene = resting(
+        tf.Medium(
+            ahl=tf.Signal(diffusion=5.0), box=((-8, -8, -8), (8, 8, 8)), spacing=4.0, height=2.0
+        ),
+        exchanging(1.0),
+    )
     after = scene.step(scene.seed(dtype=F64), 1e-6)
     layers = after.signals["ahl"].reshape(4, 4, 4).sum((0, 1))
     assert int(layers.argmax()) == 2  # the layer from 0 to 4 µm, with the plane z = 2 in its middle
     assert float(totals(after)) == pytest.approx(float(totals(scene.seed(dtype=F64))), rel=1e-14)
 
 
-# --- what is refused ------------------------------------------------------------------------------------------------------
+# --- what is refused ------------------------------------------------------------------------------
 
 GOOD = {"box": BOX, "spacing": 4.0}
 AHL = tf.Signal(diffusion=1.0)
 BAD = {
-    "negative diffusion": (lambda: tf.Signal(diffusion=-1.0), r"Signal\.diffusion = -1.*at least 0"),
-    "negative diffusion of one colony": (lambda: tf.Signal(diffusion=[1.0, -2.0]), r"Signal\.diffusion\[1\] = -2"),
+    "negative diffusion": (
+        lambda: tf.Signal(diffusion=-1.0),
+        r"Signal\.diffusion = -1.*at least 0",
+    ),
+    "negative diffusion of one colony": (
+        lambda: tf.Signal(diffusion=[1.0, -2.0]),
+        r"Signal\.diffusion\[1\] = -2",
+    ),
     "NaN": (lambda: tf.Signal(diffusion=math.nan), r"Signal\.diffusion = nan"),
     "negative decay": (lambda: tf.Signal(diffusion=1.0, decay=-0.1), r"Signal\.decay"),
     "negative start": (lambda: tf.Signal(diffusion=1.0, initial=-0.1), r"Signal\.initial"),
-    "periodic without its partner": (lambda: tf.Faces(x=(tf.Periodic(), tf.NoFlux())), r"Faces\.x.*periodic at both ends"),
+    "periodic without its partner": (
+        lambda: tf.Faces(x=(tf.Periodic(), tf.NoFlux())),
+        r"Faces\.x.*periodic at both ends",
+    ),
     "periodic for one signal only": (
-        lambda: tf.Medium(a=AHL, b=tf.Signal(diffusion=1.0, faces=tf.Faces(x=tf.Periodic())), **GOOD), "periodic for one signal and not for another",
+        lambda: tf.Medium(
+            a=AHL, b=tf.Signal(diffusion=1.0, faces=tf.Faces(x=tf.Periodic())), **GOOD
+        ),
+        "periodic for one signal and not for another",
     ),
     "no signal": (lambda: tf.Medium(**GOOD), "has no signal"),
-    "misspelt option": (lambda: tf.Medium(ahl=AHL, hight=2.0, **GOOD), r"Medium\.hight.*a Signal.*spelling"),
-    "a number for a signal": (lambda: tf.Medium(ahl=10.0, **GOOD), r"Medium\.ahl.*a Signal.*ahl=tf\.Signal"),
+    "misspelt option": (
+        lambda: tf.Medium(ahl=AHL, hight=2.0, **GOOD),
+        r"Medium\.hight.*a Signal.*spelling",
+    ),
+    "a number for a signal": (
+        lambda: tf.Medium(ahl=10.0, **GOOD),
+        r"Medium\.ahl.*a Signal.*ahl=tf\.Signal",
+    ),
     "no box": (lambda: tf.Medium(ahl=AHL, box=3.0, spacing=1.0), r"Medium\.box.*two corners"),
-    "box inside out": (lambda: tf.Medium(ahl=AHL, box=((1.0, 0.0), (0.0, 1.0)), spacing=1.0), r"Medium\.box.*first below the second"),
-    "not a whole number of voxels": (lambda: tf.Medium(ahl=AHL, box=((0, 0), (10, 8)), spacing=4.0), r"along x.*whole number of voxels.*2\.5.*make it 8"),
-    "too many voxels": (lambda: tf.Medium(ahl=AHL, box=((-16e3, -16e3), (16e3, 16e3)), spacing=0.5), r"Medium\.box.*at most 67,108,864.*4,096,000,000"),
+    "box inside out": (
+        lambda: tf.Medium(ahl=AHL, box=((1.0, 0.0), (0.0, 1.0)), spacing=1.0),
+        r"Medium\.box.*first below the second",
+    ),
+    "not a whole number of voxels": (
+        lambda: tf.Medium(ahl=AHL, box=((0, 0), (10, 8)), spacing=4.0),
+        r"along x.*whole number of voxels.*2\.5.*make it 8",
+    ),
+    "too many voxels": (
+        lambda: tf.Medium(ahl=AHL, box=((-16e3, -16e3), (16e3, 16e3)), spacing=0.5),
+        r"Medium\.box.*at most 67,108,864.*4,096,000,000",
+    ),
     "spacing": (lambda: tf.Medium(ahl=AHL, box=BOX, spacing=0.0), r"Medium\.spacing"),
-    "spacing of three for two": (lambda: tf.Medium(ahl=AHL, box=BOX, spacing=(1.0, 1.0, 1.0)), r"Medium\.spacing.*2 numbers"),
-    "depth of a box with three": (lambda: tf.Medium(ahl=AHL, box=((0, 0, 0), (4, 4, 4)), spacing=4.0, depth=1.0), r"Medium\.depth"),
-    "height outside": (lambda: tf.Medium(ahl=AHL, box=((0, 0, 0), (4, 4, 4)), spacing=4.0, height=5.0), r"Medium\.height.*within the box"),
+    "spacing of three for two": (
+        lambda: tf.Medium(ahl=AHL, box=BOX, spacing=(1.0, 1.0, 1.0)),
+        r"Medium\.spacing.*2 numbers",
+    ),
+    "depth of a box with three": (
+        lambda: tf.Medium(ahl=AHL, box=((0, 0, 0), (4, 4, 4)), spacing=4.0, depth=1.0),
+        r"Medium\.depth",
+    ),
+    "height outside": (
+        lambda: tf.Medium(ahl=AHL, box=((0, 0, 0), (4, 4, 4)), spacing=4.0, height=5.0),
+        r"Medium\.height.*within the box",
+    ),
     "policy": (lambda: tf.Medium(ahl=AHL, beyond="ignore", **GOOD), r"Medium\.beyond.*'grow'"),
-    "growing where space closes": (lambda: tf.Medium(ahl=AHL, faces=tf.Faces(x=tf.Periodic()), beyond="grow", **GOOD), "closes on itself cannot grow"),
+    "growing where space closes": (
+        lambda: tf.Medium(ahl=AHL, faces=tf.Faces(x=tf.Periodic()), beyond="grow", **GOOD),
+        "closes on itself cannot grow",
+    ),
     "growing along nothing": (lambda: tf.Medium(ahl=AHL, grows="", **GOOD), r"Medium\.grows"),
-    "method": (lambda: tf.Medium(ahl=AHL, method="exact", **GOOD), r"Medium\.method.*'exponential'"),
+    "method": (
+        lambda: tf.Medium(ahl=AHL, method="exact", **GOOD),
+        r"Medium\.method.*'exponential'",
+    ),
     "flow": (lambda: tf.Medium(ahl=AHL, flow=3.0, **GOOD), r"Medium\.flow"),
-    "flow of four": (lambda: tf.Medium(ahl=AHL, flow=(1, 2, 3, 4), **GOOD), r"Medium\.flow.*two or three"),
-    "obstacles": (lambda: tf.Medium(ahl=AHL, obstacles=True, **GOOD), r"Medium\.obstacles.*function of places"),
-}  # fmt: skip
+    "flow of four": (
+        lambda: tf.Medium(ahl=AHL, flow=(1, 2, 3, 4), **GOOD),
+        r"Medium\.flow.*two or three",
+    ),
+    "obstacles": (
+        lambda: tf.Medium(ahl=AHL, obstacles=True, **GOOD),
+        r"Medium\.obstacles.*function of places",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -307,13 +461,20 @@ def test_bad_input_is_refused_at_construction(case):
 
 AT_SEED = {
     "too small for its cells": (
-        {"box": ((4.0, 4.0), (8.0, 8.0)), "spacing": 4.0}, r"Medium\.box.*too small for colony 0: 1 cell.*\(0, 0, 0\).*beyond='grow'",
+        {"box": ((4.0, 4.0), (8.0, 8.0)), "spacing": 4.0},
+        r"Medium\.box.*too small for colony 0: 1 cell.*\(0, 0, 0\).*beyond='grow'",
     ),
-    "obstacles of a wrong shape": ({"obstacles": lambda at: at > 0}, r"obstacles\(places\).*bool tensor of shape \(64,\)"),
+    "obstacles of a wrong shape": (
+        {"obstacles": lambda at: at > 0},
+        r"obstacles\(places\).*bool tensor of shape \(64,\)",
+    ),
     "obstacles everywhere": ({"obstacles": lambda at: at[:, 0] < 99}, "true everywhere"),
     "flow of a wrong shape": ({"flow": lambda at: at[:, 0]}, r"flow\(places\)"),
-    "exponential with obstacles": ({"method": "exponential", "obstacles": lambda at: at[:, 0] > 8}, "(?i)exponential|separable"),
-}  # fmt: skip
+    "exponential with obstacles": (
+        {"method": "exponential", "obstacles": lambda at: at[:, 0] > 8},
+        "(?i)exponential|separable",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", AT_SEED)
@@ -327,24 +488,32 @@ def test_bad_input_that_shows_with_the_cells_is_refused_by_seed(case):
 @pytest.mark.parametrize(
     "signal",
     [
-        tf.Signal(diffusion=1.0, initial=lambda at: at[:, 0]), tf.Signal(diffusion=1.0, initial=lambda at: at), tf.Signal(diffusion=1.0, decay=lambda at: at),
-        tf.Signal(diffusion=1.0, source=lambda at: at[:, 0] * torch.nan), tf.Signal(diffusion=1.0, initial=lambda at: 3.0),
+        tf.Signal(diffusion=1.0, initial=lambda at: at[:, 0]),
+        tf.Signal(diffusion=1.0, initial=lambda at: at),
+        tf.Signal(diffusion=1.0, decay=lambda at: at),
+        tf.Signal(diffusion=1.0, source=lambda at: at[:, 0] * torch.nan),
+        tf.Signal(diffusion=1.0, initial=lambda at: 3.0),
     ],
     ids=["negative", "shape", "decay's shape", "NaN source", "no tensor"],
-)  # fmt: skip
+)
 def test_a_function_of_places_must_give_one_good_number_for_each(signal):
-    with pytest.raises(InputError, match=r"\(places\) of the signal 'ahl'.*(one number for each place|at least 0 everywhere)"):
+    with pytest.raises(
+        InputError,
+        match=r"\(places\) of the signal 'ahl'.*(one number for each place|at least 0 everywhere)",
+    ):
         tf.Scene(tf.Medium(ahl=signal, **GOOD), founders=tf.Cells.single(2)).seed()
 
 
 @pytest.mark.parametrize(
     ("medium", "path"),
     [
-        ({"ahl": tf.Signal(diffusion=[1.0, 2.0])}, "diffusion"), ({"ahl": tf.Signal(diffusion=1.0, decay=[1.0, 2.0])}, "decay"),
-        ({"ahl": AHL, "flow": ([1.0, 2.0], 0.0)}, "flow"), ({"ahl": AHL, "faces": tf.Faces(x=tf.Fixed([1.0, 2.0]))}, "faces.*value"),
+        ({"ahl": tf.Signal(diffusion=[1.0, 2.0])}, "diffusion"),
+        ({"ahl": tf.Signal(diffusion=1.0, decay=[1.0, 2.0])}, "decay"),
+        ({"ahl": AHL, "flow": ([1.0, 2.0], 0.0)}, "flow"),
+        ({"ahl": AHL, "faces": tf.Faces(x=tf.Fixed([1.0, 2.0]))}, "faces.*value"),
     ],
     ids=["diffusion", "decay", "flow", "face"],
-)  # fmt: skip
+)
 def test_a_value_per_colony_must_have_one_for_each(medium, path):
     scene = tf.Scene(tf.Medium(**medium, **GOOD), founders=tf.Cells.single(2))
     with pytest.raises(InputError, match=f"{path}.* has 2 values, but the batch has 3 colonies"):
@@ -359,8 +528,14 @@ def test_two_media_are_one_too_many():
 
 def test_a_flat_box_in_space_is_refused_unless_it_is_meant():
     growth, flat = tf.Growth(rate=1.0), ((-8.0, -8.0), (8.0, 8.0))
-    scene = lambda **given: tf.Scene(growth, tf.Mechanics(), tf.Medium(ahl=tf.Signal(diffusion=1.0), box=flat, spacing=4.0, **given))  # noqa: E731
-    with pytest.raises(tf.InputError, match=r"Medium\.box.*of three dimensions in a 3-D scene.*depth"):
+    scene = lambda **given: tf.Scene(
+        growth,
+        tf.Mechanics(),
+        tf.Medium(ahl=tf.Signal(diffusion=1.0), box=flat, spacing=4.0, **given),
+    )
+    with pytest.raises(
+        tf.InputError, match=r"Medium\.box.*of three dimensions in a 3-D scene.*depth"
+    ):
         scene().seed()
     for given in ({"depth": 2.0}, {"beyond": "grow"}, {"beyond": "open"}):
         scene(**given).seed()

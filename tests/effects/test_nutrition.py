@@ -1,4 +1,5 @@
-"""Monod growth: what cells gain is what the medium loses, the law where food is plenty and where it is short, and what a scene refuses."""
+"""Monod growth: what cells gain is what the medium loses, the law where food is plenty and where it
+is short, and what a scene refuses."""
 
 from __future__ import annotations
 
@@ -15,19 +16,40 @@ F64 = torch.float64
 BOX = {"box": ((-8.0, -8.0), (8.0, 8.0)), "spacing": 2.0, "depth": 1.0}
 
 
-def eating(monod: tf.Monod, *, initial: object = 1.0, diffusion: float = 10.0, cells: tf.Cells | None = None, more: tuple = (), **medium) -> tf.Scene:
+def eating(
+    monod: tf.Monod,
+    *,
+    initial: object = 1.0,
+    diffusion: float = 10.0,
+    cells: tf.Cells | None = None,
+    more: tuple = (),
+    **medium,
+) -> tf.Scene:
     food = tf.Signal(diffusion=diffusion, initial=initial)
-    return tf.Scene(monod, tf.Growth(), *more, tf.Medium(food=food, **{**BOX, **medium}), founders=cells or tf.Cells.single(2))
+    return tf.Scene(
+        monod,
+        tf.Growth(),
+        *more,
+        tf.Medium(food=food, **{**BOX, **medium}),
+        founders=cells or tf.Cells.single(2),
+    )
 
 
 def food(state: tf.State) -> torch.Tensor:
     """Amount in the medium of each colony, (B,) float64."""
     grid = state.layout.grid
-    return torch.zeros(state.colonies, dtype=F64, device=state.device).index_add(0, grid.owner, state.signals["food"].double()) * grid.voxel_volume
+    return (
+        torch.zeros(state.colonies, dtype=F64, device=state.device).index_add(
+            0, grid.owner, state.signals["food"].double()
+        )
+        * grid.voxel_volume
+    )
 
 
 def volumes(state: tf.State) -> torch.Tensor:
-    return torch.zeros(state.colonies, dtype=F64, device=state.device).index_add(0, state.colony, state.volume.double())
+    return torch.zeros(state.colonies, dtype=F64, device=state.device).index_add(
+        0, state.colony, state.volume.double()
+    )
 
 
 def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.05) -> tf.State:
@@ -38,12 +60,17 @@ def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.05) -> t
 
 
 def pack(count: int = 12) -> tf.Cells:
-    return tf.Cells([[2.4 * (k % 3) - 2.0, 1.1 * (k // 3) - 2.0] for k in range(count)], [[1.0, 0.0]] * count, length=1.0)
+    return tf.Cells(
+        [[2.4 * (k % 3) - 2.0, 1.1 * (k // 3) - 2.0] for k in range(count)],
+        [[1.0, 0.0]] * count,
+        length=1.0,
+    )
 
 
 @pytest.mark.parametrize("growth_yield", [0.5, 2.0])
 def test_what_cells_gain_is_what_the_medium_loses(growth_yield, dtype, device):
-    """Volume made / yield = amount gone; each step rounds some five sums, of which food is the greater by five."""
+    """Volume made / yield = amount gone; each step rounds some five sums, of which food is the
+    greater by five."""
     scene = eating(tf.Monod("food", rate=1.0, half=0.2, growth_yield=growth_yield), cells=pack())
     state = scene.seed(2, dtype=dtype, device=device)
     last = advance(scene, state, 20)
@@ -51,13 +78,18 @@ def test_what_cells_gain_is_what_the_medium_loses(growth_yield, dtype, device):
     assert float(gain.min()) > 1.0
     bound = 20 * 5 * torch.finfo(dtype).eps * float(food(state).max())
     assert float((gain / growth_yield - loss).abs().max()) <= bound
-    eaten = torch.zeros(2, dtype=F64, device=device).index_add(0, last.colony, last.food_eaten.double())
+    eaten = torch.zeros(2, dtype=F64, device=device).index_add(
+        0, last.colony, last.food_eaten.double()
+    )
     assert float((eaten - loss).abs().max()) <= bound
-    assert torch.equal(last.reports["nutrition"].uptake > 0, torch.ones(2, dtype=torch.bool, device=device))
+    assert torch.equal(
+        last.reports["nutrition"].uptake > 0, torch.ones(2, dtype=torch.bool, device=device)
+    )
 
 
 def test_with_food_in_plenty_growth_is_exponential():
-    """s stays at 1 to a part 1e-6 and half = 1: dV/dt = V·rate/2, to the tolerance of the solver."""
+    """s stays at 1 to a part 1e-6 and half = 1: dV/dt = V·rate/2, to the tolerance of the
+    solver."""
     scene = eating(tf.Monod("food", rate=1.0, half=1.0, growth_yield=1e7))
     state = scene.seed(dtype=F64)
     last = advance(scene, state, 20)
@@ -67,7 +99,8 @@ def test_with_food_in_plenty_growth_is_exponential():
 
 @pytest.mark.parametrize("supply", [1e2, 1e4, 1e6])
 def test_abundance_does_not_drown_what_is_eaten(dtype, supply):
-    """In float32 a cell's meal is less than the last bit of a rich medium: growth must not be read off the difference."""
+    """In float32 a cell's meal is less than the last bit of a rich medium: growth must not be read
+    off the difference."""
     scene = eating(tf.Monod("food", rate=1.0, half=0.1), initial=supply)
     last = scene.step(scene.seed(dtype=dtype), 0.025)
     assert float(last.growth_rate) == pytest.approx(supply / (0.1 + supply), rel=1e-4)
@@ -75,15 +108,23 @@ def test_abundance_does_not_drown_what_is_eaten(dtype, supply):
 
 @pytest.mark.parametrize("half", [0.1, 1.0, 10.0])
 def test_growth_follows_monod(half):
-    scene = eating(tf.Monod("food", rate=[1.0, 1.0, 2.0], half=half, growth_yield=1e7), initial=[1.0, 0.2, 0.2])
+    scene = eating(
+        tf.Monod("food", rate=[1.0, 1.0, 2.0], half=half, growth_yield=1e7), initial=[1.0, 0.2, 0.2]
+    )
     last = scene.step(scene.seed(3, dtype=F64), 1e-4)
     wanted = [r * s / (half + s) for r, s in ((1.0, 1.0), (1.0, 0.2), (2.0, 0.2))]
-    assert last.growth_rate.tolist() == pytest.approx(wanted, rel=2e-4)  # over a step of 1e-4 h the volume grows by that much
+    # over a step of 1e-4 h the volume grows by that much
+    assert last.growth_rate.tolist() == pytest.approx(wanted, rel=2e-4)
 
 
 def test_in_a_closed_voxel_food_runs_out(dtype):
     """All of it becomes cell, and no more: V ends at V₀ + yield × what there was."""
-    scene = eating(tf.Monod("food", rate=5.0, half=0.01, growth_yield=0.5), initial=0.1, box=((-4.0, -4.0), (4.0, 4.0)), spacing=8.0)
+    scene = eating(
+        tf.Monod("food", rate=5.0, half=0.01, growth_yield=0.5),
+        initial=0.1,
+        box=((-4.0, -4.0), (4.0, 4.0)),
+        spacing=8.0,
+    )
     state = scene.seed(dtype=dtype)
     last = advance(scene, state, 60, 0.1)
     assert 0 <= float(food(last)) < 1e-6
@@ -92,21 +133,31 @@ def test_in_a_closed_voxel_food_runs_out(dtype):
 
 
 def test_hunger_a_thousand_times_faster_than_the_step(dtype, device):
-    """Hard case 39: uptake at k·dt = 1e3 of what is there, by a crowd; nothing negative, gain = loss to 1e-6 of what there was."""
-    scene = eating(tf.Monod("food", rate=1e4, half=1.0, growth_yield=0.05), initial=0.02, cells=pack())
+    """Hard case 39: uptake at k·dt = 1e3 of what is there, by a crowd; nothing negative, gain =
+    loss to 1e-6 of what there was."""
+    scene = eating(
+        tf.Monod("food", rate=1e4, half=1.0, growth_yield=0.05), initial=0.02, cells=pack()
+    )
     state = scene.seed(dtype=dtype, device=device)
     first, start = float(food(state)), float(volumes(state))
     for _ in range(3):
         state = advance(scene, state, 1, 0.1)
         assert float(state.signals["food"].min()) >= 0
         gain, loss = (float(volumes(state)) - start) / 0.05, first - float(food(state))
-        # the volumes that the gain is the difference of are rounded by 6e-8 of 30, and divided by the yield
-        assert gain == pytest.approx(loss, abs=1e-12 * first + (0 if dtype == F64 else 1e-6 * first + 6e-8 * start / 0.05 * 3))
+        # the volumes that the gain is the difference of are rounded by 6e-8 of 30, and divided by
+        # the yield
+        assert gain == pytest.approx(
+            loss,
+            abs=1e-12 * first + (0 if dtype == F64 else 1e-6 * first + 6e-8 * start / 0.05 * 3),
+        )
     assert loss > 0.2 * first
 
 
 def test_daughters_begin_to_eat_anew():
-    scene = eating(tf.Monod("food", rate=1.5, half=0.1, growth_yield=2.0), more=(tf.Division(length=2.5), tf.Mechanics(dim=2)))
+    scene = eating(
+        tf.Monod("food", rate=1.5, half=0.1, growth_yield=2.0),
+        more=(tf.Division(length=2.5), tf.Mechanics(dim=2)),
+    )
     state = scene.seed(dtype=F64)
     while state.cells == 1:
         before, state = state, scene.step(state, 0.05)
@@ -118,33 +169,42 @@ def test_without_food_nothing_happens(dtype):
     scene = eating(tf.Monod("food", rate=1.0, half=0.1), initial=0.0)
     state = scene.seed(dtype=dtype)
     last = advance(scene, state, 3)
-    assert torch.equal(last.length, state.length) and float(last.growth_rate) == 0 and float(last.signals["food"].abs().max()) == 0
+    assert (
+        torch.equal(last.length, state.length)
+        and float(last.growth_rate) == 0
+        and float(last.signals["food"].abs().max()) == 0
+    )
 
 
 @pytest.mark.parametrize("away", [2e-3, 40.0])
 def test_a_cell_beyond_an_open_box_eats_from_the_reservoir(away):
     """Hard case 38: what it eats is kept count of, and the box does not lose it."""
     scene = tf.Scene(
-        tf.Monod("food", rate=1.0, half=1.0, growth_yield=2.0), tf.Growth(),
+        tf.Monod("food", rate=1.0, half=1.0, growth_yield=2.0),
+        tf.Growth(),
         tf.Medium(food=tf.Signal(diffusion=0.0, initial=1.0, beyond=3.0), beyond="open", **BOX),
         founders=tf.Cells([[0.0, 0.0], [0.0, 3.0]], [1.0, 0.0]),
-    )  # fmt: skip
+    )
     state = scene.seed(dtype=F64)
     position = state.position.clone()
     position[1, 0] = 8.0 + away
     state = state.replace(position=position)
     after = scene.step(state, 0.1)
     gained = after.volume - state.volume
-    assert float(gained[1]) == pytest.approx(float(state.volume[1]) * math.expm1(0.75 * 0.1), rel=1e-12)
+    assert float(gained[1]) == pytest.approx(
+        float(state.volume[1]) * math.expm1(0.75 * 0.1), rel=1e-12
+    )
     assert float(after.fields["food_beyond"]) == pytest.approx(-float(gained[1]) / 2.0, rel=1e-12)
     assert float(food(state) - food(after)) == pytest.approx(float(gained[0]) / 2.0, rel=1e-9)
 
 
 def test_a_colony_is_the_same_in_any_batch(dtype, device):
     scene = eating(
-        tf.Monod("food", rate=[1.0, 1.4, 1.7], half=[0.1, 0.2, 0.4], growth_yield=2.0), initial=[1.0, 2.0, 0.7],
-        more=(tf.Division(length=tf.Uniform(3.0, 3.4)), tf.Mechanics(dim=2)), beyond="grow",
-    )  # fmt: skip
+        tf.Monod("food", rate=[1.0, 1.4, 1.7], half=[0.1, 0.2, 0.4], growth_yield=2.0),
+        initial=[1.0, 2.0, 0.7],
+        more=(tf.Division(length=tf.Uniform(3.0, 3.4)), tf.Mechanics(dim=2)),
+        beyond="grow",
+    )
     first = scene.seed(3, seed=4, dtype=dtype, device=device)
     last = advance(scene, first, 30)
     assert int(last.counts.max()) >= 4
@@ -152,7 +212,9 @@ def test_a_colony_is_the_same_in_any_batch(dtype, device):
         assert same(last.select(places), advance(scene, first.select(places), 30)), places
 
 
-@pytest.mark.parametrize("option", [{"rate": -1.0}, {"half": 0.0}, {"growth_yield": 0.0}, {"half": [0.1, -0.1]}])
+@pytest.mark.parametrize(
+    "option", [{"rate": -1.0}, {"half": 0.0}, {"growth_yield": 0.0}, {"half": [0.1, -0.1]}]
+)
 def test_bad_input_is_refused_at_construction(option):
     with pytest.raises(InputError, match=rf"Monod\.{next(iter(option))}"):
         tf.Monod("food", **option)
@@ -160,13 +222,27 @@ def test_bad_input_is_refused_at_construction(option):
 
 def test_what_is_missing_is_told():
     medium = tf.Medium(food=tf.Signal(diffusion=1.0), **BOX)
-    with pytest.raises(InputError, match=r"needs the field 'out.sugar'.*out.food.*signal 'sugar'; the Medium has food: .*give the Medium sugar=tf\.Signal"):
+    with pytest.raises(
+        InputError,
+        match=(
+            r"needs the field 'out.sugar'.*out.food.*signal 'sugar'; the Medium has food: .*give"
+            r" the Medium sugar=tf\.Signal"
+        ),
+    ):
         tf.Scene(tf.Monod("sugar"), tf.Growth(), medium)
-    with pytest.raises(InputError, match=r"needs the field 'out.food'.*signal 'food', and the scene has no Medium: list tf\.Medium\(food=tf\.Signal"):
+    with pytest.raises(
+        InputError,
+        match=(
+            r"needs the field 'out.food'.*signal 'food', and the scene has no Medium: list"
+            r" tf\.Medium\(food=tf\.Signal"
+        ),
+    ):
         tf.Scene(tf.Monod("food"), tf.Growth())
     with pytest.raises(InputError, match="needs the field 'growth_rate'"):
         tf.Scene(tf.Monod("food"), medium)
-    scene = tf.Scene(tf.Monod("food", rate=[1.0, 2.0]), tf.Growth(), medium, founders=tf.Cells.single(2))
+    scene = tf.Scene(
+        tf.Monod("food", rate=[1.0, 2.0]), tf.Growth(), medium, founders=tf.Cells.single(2)
+    )
     with pytest.raises(InputError, match=r"Monod\.rate has 2 values, but the batch has 3"):
         scene.seed(3)
 

@@ -63,7 +63,14 @@ def test_an_open_side_loses_none(dim):
 
 def test_a_colony_may_lose_all_its_cells_and_the_others_go_on():
     cells = tf.Cells([[9.5, 0.0], [0.0, 0.0]], [[0.0, 1.0]] * 2, colony=[0, 1])
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Mechanics(dim=2), Drift(), tf.Removal((-10, -10), (10, 10)), founders=cells)
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Division(length=3.0),
+        tf.Mechanics(dim=2),
+        Drift(),
+        tf.Removal((-10, -10), (10, 10)),
+        founders=cells,
+    )
     state = scene.seed()
     for _ in range(16):
         state = scene.step(state, 0.0625)
@@ -73,7 +80,12 @@ def test_a_colony_may_lose_all_its_cells_and_the_others_go_on():
 
 def test_a_region_of_several_pieces_is_all_of_them():
     """Two removals: a cell must be inside both."""
-    scene = tf.Scene(tf.Removal((-10, -10), (10, 10)), Drift(), tf.Removal((-5, -5), (5, 5)), founders=at(0.0, 4.5))
+    scene = tf.Scene(
+        tf.Removal((-10, -10), (10, 10)),
+        Drift(),
+        tf.Removal((-5, -5), (5, 5)),
+        founders=at(0.0, 4.5),
+    )
     assert scene.step(scene.seed(), 1.0).uid.tolist() == [0]
 
 
@@ -81,7 +93,12 @@ def test_the_results_file_remembers_who_left_and_who_was_removed(tmp_path):
     def update(cells):
         cells.remove_flag = (cells.uid == 1) & (cells.time >= 2.0)
 
-    scene = tf.Scene(tf.Rules(update), Drift(), tf.Removal((-10.0, -10.0), (10.0, 10.0)), founders=at(0.0, 1.0, 8.5))
+    scene = tf.Scene(
+        tf.Rules(update),
+        Drift(),
+        tf.Removal((-10.0, -10.0), (10.0, 10.0)),
+        founders=at(0.0, 1.0, 8.5),
+    )
     for _ in tf.simulate(scene, scene.seed(2), until=4.0, dt=1.0, record=tmp_path / "run.h5"):
         pass
     with tf.Results(tmp_path / "run.h5") as results:
@@ -107,7 +124,14 @@ def test_removed_and_divided_in_one_step_are_both_noted(tmp_path):
 
 @pytest.mark.parametrize(
     ("low", "high"),
-    [((1.0, 0.0), (0.0, 1.0)), ((0.0, 0.0), (0.0, 1.0)), ((0.0,), (1.0, 1.0)), ((math.nan, 0.0), (1.0, 1.0)), (0.0, 1.0), ("ab", "cd")],
+    [
+        ((1.0, 0.0), (0.0, 1.0)),
+        ((0.0, 0.0), (0.0, 1.0)),
+        ((0.0,), (1.0, 1.0)),
+        ((math.nan, 0.0), (1.0, 1.0)),
+        (0.0, 1.0),
+        ("ab", "cd"),
+    ],
     ids=["inside out", "flat", "unequal", "nan", "no corner", "text"],
 )
 def test_bad_regions_are_refused(low, high):

@@ -10,7 +10,7 @@ from ruled import pair_of_cells, run, same, short_update
 
 import torchfilm as tf
 
-# --- the paper's listings -------------------------------------------------------------------------------------------------
+# --- the paper's listings -------------------------------------------------------------------------
 
 
 def paper_update(cells):
@@ -31,7 +31,8 @@ def minutes_scene(update) -> tf.Scene:
 
 
 def test_the_papers_update_doubles_every_twenty_minutes():
-    """Volume grows by e^0.035 a minute; the founder, V = 2.094, passes 3 after ln(3/2.094)/0.035 = 10.3 minutes."""
+    """Volume grows by e^0.035 a minute; the founder, V = 2.094, passes 3 after ln(3/2.094)/0.035 =
+    10.3 minutes."""
     scene = minutes_scene(paper_update)
     first = scene.seed()
     state = run(scene, first, 11, 1.0)
@@ -41,12 +42,15 @@ def test_the_papers_update_doubles_every_twenty_minutes():
 
 
 def test_loop_and_whole_tensors_do_the_same():
-    states = [run(scene := minutes_scene(u), scene.seed(2, seed=4), 60, 1.0) for u in (paper_update, tensor_update, short_update)]
+    states = [
+        run(scene := minutes_scene(u), scene.seed(2, seed=4), 60, 1.0)
+        for u in (paper_update, tensor_update, short_update)
+    ]
     assert states[0].cells >= 8
     assert same(states[0], states[1]) and same(states[1], states[2])
 
 
-# --- variables ------------------------------------------------------------------------------------------------------------
+# --- variables ------------------------------------------------------------------------------------
 
 
 def test_a_variable_of_the_users_own_keeps_its_value_and_is_inherited():
@@ -54,14 +58,21 @@ def test_a_variable_of_the_users_own_keeps_its_value_and_is_inherited():
         cells.age = cells.age + cells.dt
         cells.divide_flag = (cells.age > 0.35) & (cells.uid < 2)
 
-    scene = tf.Scene(tf.Rules(update, variables={"age": 0.0}), tf.Division(), founders=pair_of_cells())
+    scene = tf.Scene(
+        tf.Rules(update, variables={"age": 0.0}), tf.Division(), founders=pair_of_cells()
+    )
     state = run(scene, scene.seed(dtype=torch.float64), 4)
     assert state.cells == 4
     assert state.age.tolist() == pytest.approx([0.4] * 4, rel=1e-12)
 
 
 def test_a_first_value_is_the_first_value():
-    scene = tf.Scene(tf.Rules(lambda cells: setattr(cells, "energy", cells.energy * 2), variables={"energy": 3.0}), founders=pair_of_cells())
+    scene = tf.Scene(
+        tf.Rules(
+            lambda cells: setattr(cells, "energy", cells.energy * 2), variables={"energy": 3.0}
+        ),
+        founders=pair_of_cells(),
+    )
     first = scene.seed()
     assert first.energy.tolist() == [3.0, 3.0], "trying the rule must not run it"
     assert run(scene, first, 2).energy.tolist() == [12.0, 12.0]
@@ -106,30 +117,55 @@ def test_table_1_names():
     seen = {}
 
     def update(cells):
-        seen.update({n: getattr(cells, n).clone() for n in ("pos", "dir", "length", "radius", "volume", "area", "cellType", "growthRate", "divideFlag")})
+        seen.update(
+            {
+                n: getattr(cells, n).clone()
+                for n in (
+                    "pos",
+                    "dir",
+                    "length",
+                    "radius",
+                    "volume",
+                    "area",
+                    "cellType",
+                    "growthRate",
+                    "divideFlag",
+                )
+            }
+        )
 
     cells = tf.Cells([[1.0, 2.0]], [[0.0, 3.0]], 2.0, 0.5, cell_type=[7])
-    scene = tf.Scene(tf.Rules(update), tf.Growth(rate=0.25), tf.Division(length=4.0), founders=cells)
+    scene = tf.Scene(
+        tf.Rules(update), tf.Growth(rate=0.25), tf.Division(length=4.0), founders=cells
+    )
     scene.step(scene.seed(dtype=torch.float64), 0.1)
     pi = 3.141592653589793
     assert seen["pos"].tolist() == [[1.0, 2.0]] and seen["dir"].tolist() == [[0.0, 1.0]]
     assert float(seen["volume"]) == pytest.approx(pi * 0.25 * (2 + 2 / 3), rel=1e-14)
     assert float(seen["area"]) == pytest.approx(2 * pi * 0.5 * 3, rel=1e-14)
-    assert seen["cellType"].tolist() == [7] and seen["growthRate"].tolist() == [0.25] and seen["divideFlag"].tolist() == [False]
+    assert (
+        seen["cellType"].tolist() == [7]
+        and seen["growthRate"].tolist() == [0.25]
+        and seen["divideFlag"].tolist() == [False]
+    )
 
 
 def test_time_step_and_count_are_readable():
     seen = []
-    scene = tf.Scene(tf.Rules(lambda cells: seen.append((cells.time, cells.dt, cells.count, len(cells)))), founders=pair_of_cells())
+    scene = tf.Scene(
+        tf.Rules(lambda cells: seen.append((cells.time, cells.dt, cells.count, len(cells)))),
+        founders=pair_of_cells(),
+    )
     run(scene, scene.seed(3), 2, 0.25)
     assert seen[-2:] == [(0.0, 0.25, 6, 6), (0.25, 0.25, 6, 6)]
 
 
-# --- neighbours and colonies ----------------------------------------------------------------------------------------------
+# --- neighbours and colonies ----------------------------------------------------------------------
 
 
 def test_contacts_and_their_count():
-    """Three upright rods 1.02 µm apart touch in a row; the fourth is far off. The same in each colony, never across."""
+    """Three upright rods 1.02 µm apart touch in a row; the fourth is far off. The same in each
+    colony, never across."""
     seen = {}
 
     def update(cells):
@@ -151,7 +187,11 @@ def test_greatest_smallest_and_sum_of_the_colony():
 
     def update(cells):
         x = cells.position[:, 0]
-        seen.update(max=cells.colony_max(x).tolist(), min=cells.colony_min(x).tolist(), sum=cells.colony_sum(x).tolist())
+        seen.update(
+            max=cells.colony_max(x).tolist(),
+            min=cells.colony_min(x).tolist(),
+            sum=cells.colony_sum(x).tolist(),
+        )
 
     cells = tf.Cells([[1.0, 0.0], [5.0, 0.0], [-3.0, 0.0]], [[1.0, 0.0]] * 3, colony=[0, 0, 1])
     scene = tf.Scene(tf.Rules(update), founders=cells)
@@ -167,7 +207,9 @@ def test_rules_remove_cells():
     state = scene.step(scene.seed(2), 0.1)
     assert state.uid.tolist() == [0, 0]
     (note,) = state.ended
-    assert note.fate == "removed" and note.uid.tolist() == [1, 1] and note.colony_id.tolist() == [0, 1]
+    assert (
+        note.fate == "removed" and note.uid.tolist() == [1, 1] and note.colony_id.tolist() == [0, 1]
+    )
 
 
 def test_rules_remove_cells_one_by_one():
@@ -184,12 +226,14 @@ def test_removing_everyone_is_no_accident():
     def update(cells):
         cells.remove_flag = cells.time >= 0.2
 
-    scene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2))
+    scene = tf.Scene(
+        tf.Rules(update), tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2)
+    )
     state = run(scene, scene.seed(2), 6)
     assert state.cells == 0 and state.colonies == 2
 
 
-# --- random draws ---------------------------------------------------------------------------------------------------------
+# --- random draws ---------------------------------------------------------------------------------
 
 
 def test_draws_belong_to_cell_and_step_and_not_to_the_batch():
@@ -215,7 +259,9 @@ def test_random_growth_in_a_batch_is_random_growth_alone():
     def update(cells):
         cells.growth_rate = 0.5 + cells.random()
 
-    scene = tf.Scene(tf.Rules(update), tf.Growth(), tf.Division(length=tf.Uniform(3.0, 4.0)), tf.Mechanics(dim=2))
+    scene = tf.Scene(
+        tf.Rules(update), tf.Growth(), tf.Division(length=tf.Uniform(3.0, 4.0)), tf.Mechanics(dim=2)
+    )
     whole = scene.seed(3, seed=9)
     alone = [run(scene, whole.select([k]), 40, 0.05) for k in range(3)]
     whole = run(scene, whole, 40, 0.05)
@@ -224,7 +270,7 @@ def test_random_growth_in_a_batch_is_random_growth_alone():
         assert same(whole.select([k]), alone[k].select([0]))
 
 
-# --- frozen states --------------------------------------------------------------------------------------------------------
+# --- frozen states --------------------------------------------------------------------------------
 
 
 def test_writing_in_place_leaves_the_old_state_alone():
@@ -234,14 +280,18 @@ def test_writing_in_place_leaves_the_old_state_alone():
         rate = cells.growth_rate
         rate *= 2
 
-    scene = tf.Scene(tf.Rules(update, variables={"age": 0.0}), tf.Growth(rate=1.0), founders=pair_of_cells())
+    scene = tf.Scene(
+        tf.Rules(update, variables={"age": 0.0}), tf.Growth(rate=1.0), founders=pair_of_cells()
+    )
     old = scene.seed()
     new = scene.step(old, 0.0)
     assert old.age.tolist() == [0.0, 0.0] and old.growth_rate.tolist() == [1.0, 1.0]
     assert new.age.tolist() == [1.0, 1.0] and new.growth_rate.tolist() == [10.0, 2.0]
 
 
-@pytest.mark.parametrize("name", ["position", "axis", "length", "radius", "uid", "parent", "colony"])
+@pytest.mark.parametrize(
+    "name", ["position", "axis", "length", "radius", "uid", "parent", "colony"]
+)
 def test_writing_into_what_is_read_only_never_reaches_the_state(name):
     """Whether it is refused or has no effect: the frozen state must not change behind its back."""
 
@@ -251,22 +301,43 @@ def test_writing_into_what_is_read_only_never_reaches_the_state(name):
     scene = tf.Scene(tf.Growth(rate=1.0), founders=pair_of_cells(gap=3.0))
     state = scene.seed()
     state = state.replace(**{name: getattr(state, name) + 3})
-    before = {n: getattr(state, n).clone() for n in ("position", "axis", "length", "radius", "uid", "parent", "colony")}
+    before = {
+        n: getattr(state, n).clone()
+        for n in ("position", "axis", "length", "radius", "uid", "parent", "colony")
+    }
     ruled = tf.Rules(update)
-    with contextlib.suppress(AttributeError, RuntimeError, TypeError, IndexError):  # a colony that the batch has not is refused too
+    # a colony that the batch has not is refused too
+    with contextlib.suppress(AttributeError, RuntimeError, TypeError, IndexError):
         ruled.step(state, 0.1)
     for n, value in before.items():
         assert torch.equal(getattr(state, n), value), f"the rule changed {n} of the frozen state"
 
 
-# --- clear errors ---------------------------------------------------------------------------------------------------------
+# --- clear errors ---------------------------------------------------------------------------------
 
 
 def write(name, value):
     return lambda cells: setattr(cells, name, value)
 
 
-@pytest.mark.parametrize("name", ["position", "pos", "dir", "length", "radius", "volume", "area", "uid", "parent", "colony", "time", "dt", "count"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "position",
+        "pos",
+        "dir",
+        "length",
+        "radius",
+        "volume",
+        "area",
+        "uid",
+        "parent",
+        "colony",
+        "time",
+        "dt",
+        "count",
+    ],
+)
 def test_what_table_1_only_reads_cannot_be_written(name):
     with pytest.raises(AttributeError, match="can only be read"):
         tf.Scene(tf.Rules(write(name, 1.0))).seed()
@@ -280,7 +351,9 @@ def test_a_misspelt_name_is_told_with_those_that_exist():
 @pytest.mark.parametrize("shape", [(3,), (2, 2), (1, 2, 1)])
 def test_a_wrong_shape_is_told_before_anything_runs(shape):
     with pytest.raises(ValueError, match=r"cells\.growth_rate.*shape"):
-        tf.Scene(tf.Rules(write("growth_rate", torch.ones(shape))), tf.Growth(), founders=pair_of_cells()).seed()
+        tf.Scene(
+            tf.Rules(write("growth_rate", torch.ones(shape))), tf.Growth(), founders=pair_of_cells()
+        ).seed()
 
 
 def test_a_new_variable_of_wrong_length_is_told():
@@ -303,7 +376,10 @@ def test_a_variable_that_first_comes_up_in_mid_run_is_told():
         run(scene, scene.seed(), 3)
 
 
-@pytest.mark.parametrize(("given", "message"), [((), "neither"), ((3,), r"Rules\.update"), (("no_such_file.py",), "No such file")])
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [((), "neither"), ((3,), r"Rules\.update"), (("no_such_file.py",), "No such file")],
+)
 def test_bad_rules_are_refused(given, message):
     with pytest.raises(tf.InputError, match=message):
         tf.Rules(*given)
@@ -317,8 +393,11 @@ def test_bad_first_values_are_refused(value):
 
 @pytest.mark.parametrize("law", ["volume", "length", "linear"])
 def test_a_negative_rate_from_a_rule_never_makes_a_negative_length(law):
-    """Length stays at least 0 always: a rule that shrinks cells is either refused or stops at nothing."""
-    scene = tf.Scene(tf.Rules(write("growth_rate", -1.0)), tf.Growth(law=law), founders=pair_of_cells())
+    """Length stays at least 0 always: a rule that shrinks cells is either refused or stops at
+    nothing."""
+    scene = tf.Scene(
+        tf.Rules(write("growth_rate", -1.0)), tf.Growth(law=law), founders=pair_of_cells()
+    )
     try:
         state = run(scene, scene.seed(), 4, 1.0)
     except (tf.InputError, tf.SimulationError):
@@ -326,7 +405,7 @@ def test_a_negative_rate_from_a_rule_never_makes_a_negative_length(law):
     assert (state.length >= 0).all()
 
 
-# --- couplings ------------------------------------------------------------------------------------------------------------
+# --- couplings ------------------------------------------------------------------------------------
 
 
 def test_what_a_rule_reads_and_writes_is_declared():
@@ -353,7 +432,9 @@ def test_looking_for_contacts_is_reading_the_geometry():
     def update(cells):
         cells.touching = cells.contact_count()
 
-    scene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=pair_of_cells())
+    scene = tf.Scene(
+        tf.Rules(update), tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=pair_of_cells()
+    )
     scene.seed()
     assert {"growth", "mechanics"} <= {w for w, _, r in scene.couplings() if r == "rules"}
 
@@ -364,7 +445,9 @@ def test_a_rule_that_would_fail_with_two_cells_is_told_at_once_with_one():
             cells.growth_rate = 1.0
 
     scene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division())
-    with pytest.raises(tf.InputError, match=r"test_rules\.py, line \d+ \(if cells\.length > 3:\).*torch\.where"):
+    with pytest.raises(
+        tf.InputError, match=r"test_rules\.py, line \d+ \(if cells\.length > 3:\).*torch\.where"
+    ):
         scene.seed()
 
 

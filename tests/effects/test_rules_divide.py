@@ -14,7 +14,8 @@ from torchfilm.effect import Effect
 
 
 def test_the_papers_divide_partitions_at_random():
-    """As printed, but for the index of the species, which on whole tensors comes after the cells'."""
+    """As printed, but for the index of the species, which on whole tensors comes after the
+    cells'."""
 
     def divide(parent, daughter1, daughter2):
         r1 = random.uniform(0.0, 1.0)
@@ -65,7 +66,9 @@ def test_divide_may_set_flags_types_and_read_geometry():
 
 def test_division_views_refuse_what_makes_no_sense():
     def divided(divide):
-        scene = tf.Scene(tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells())
+        scene = tf.Scene(
+            tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells()
+        )
         state = scene.seed()
         scene.step(state.with_fields(divide_flag=torch.ones(2, dtype=torch.bool)), 0.1)
 
@@ -95,7 +98,10 @@ IN_PLACE = {
     "one coordinate": ("daughter1.position", lambda parent, d1, d2: d1.position[:, 0].fill_(7.0)),
     "by another name": ("daughter2.position", lambda parent, d1, d2: d2.pos.mul_(2.0)),
     "length": ("daughter1.length", lambda parent, d1, d2: d1.length.mul_(2.0)),
-    "length, and set": ("daughter1.length", lambda parent, d1, d2: setattr(d1, "length", d1.length.mul_(2.0))),
+    "length, and set": (
+        "daughter1.length",
+        lambda parent, d1, d2: setattr(d1, "length", d1.length.mul_(2.0)),
+    ),
     "axis": ("daughter2.axis", lambda parent, d1, d2: d2.axis.neg_()),
     "radius": ("daughter1.radius", lambda parent, d1, d2: d1.radius.__setitem__(0, 0.25)),
     "volume": ("daughter1.volume", lambda parent, d1, d2: d1.volume.mul_(0.5)),
@@ -107,7 +113,8 @@ IN_PLACE = {
 
 @pytest.mark.parametrize("kind", list(IN_PLACE))
 def test_what_divide_can_only_read_cannot_be_changed_in_place(kind):
-    """It would have no effect, and nobody would notice: told when the rule is tried, or else at the first division, by name."""
+    """It would have no effect, and nobody would notice: told when the rule is tried, or else at the
+    first division, by name."""
     name, divide = IN_PLACE[kind]
     scene = tf.Scene(tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells())
     with pytest.raises(AttributeError, match=rf"{name}.*can only be read"):
@@ -131,7 +138,8 @@ def test_fields_of_daughters_may_be_changed_in_place_and_geometry_worked_with():
 
 
 def test_a_colony_that_is_not_finite_is_no_fault_of_the_rules():
-    """NaN is not equal to itself, and a rule that read it has not changed it: such a colony is the driver's matter."""
+    """NaN is not equal to itself, and a rule that read it has not changed it: such a colony is the
+    driver's matter."""
 
     def update(cells):
         cells.growth_rate = 0.0 * cells.position[:, 0]
@@ -154,7 +162,14 @@ class Plate(Effect):
     title = "plate"
 
     def declares(self, dim):
-        return (tf.Field("plate", "per colony", scope="colony", initial=lambda s, rows: 1.0 + rows.to(s.dtype)),)
+        return (
+            tf.Field(
+                "plate",
+                "per colony",
+                scope="colony",
+                initial=lambda s, rows: 1.0 + rows.to(s.dtype),
+            ),
+        )
 
     def step(self, state, dt):
         return state
@@ -164,10 +179,28 @@ def test_divide_reads_the_colonys_own_quantities_and_cannot_write_them():
     def divide(parent, daughter1, daughter2):
         daughter1.growth_rate = daughter1.plate + parent.plate
 
-    scene = tf.Scene(tf.Rules(divide=divide), tf.Growth(rate=0.0), tf.Division(), Plate(), founders=pair_of_cells())
+    scene = tf.Scene(
+        tf.Rules(divide=divide),
+        tf.Growth(rate=0.0),
+        tf.Division(),
+        Plate(),
+        founders=pair_of_cells(),
+    )
     after = scene.step(flagged_to_divide(scene.seed(3)), 0.1)
-    assert after.growth_rate[::2].tolist() == [2.0, 2.0, 4.0, 4.0, 6.0, 6.0] and after.plate.tolist() == [1.0, 2.0, 3.0]
-    wrong = tf.Scene(tf.Rules(divide=lambda p, d1, d2: setattr(d1, "plate", 3.0)), tf.Division(), Plate(), founders=pair_of_cells())
+    assert after.growth_rate[::2].tolist() == [
+        2.0,
+        2.0,
+        4.0,
+        4.0,
+        6.0,
+        6.0,
+    ] and after.plate.tolist() == [1.0, 2.0, 3.0]
+    wrong = tf.Scene(
+        tf.Rules(divide=lambda p, d1, d2: setattr(d1, "plate", 3.0)),
+        tf.Division(),
+        Plate(),
+        founders=pair_of_cells(),
+    )
     with pytest.raises(tf.InputError, match=r"'plate'.*a colony's can only be read"):
         wrong.seed()
 
@@ -176,6 +209,8 @@ def test_what_a_divide_rule_writes_is_declared():
     def divide(parent, daughter1, daughter2):
         daughter1.growth_rate = parent.growth_rate * 2
 
-    scene = tf.Scene(tf.Rules(divide=divide), tf.Growth(rate=1.0), tf.Division(), founders=pair_of_cells())
+    scene = tf.Scene(
+        tf.Rules(divide=divide), tf.Growth(rate=1.0), tf.Division(), founders=pair_of_cells()
+    )
     scene.seed()
     assert "growth" in {r for w, _, r in scene.couplings() if w.startswith("rules")}

@@ -30,7 +30,8 @@ def test_rules_from_a_file(rules_file):
 
 def test_a_rules_file_may_define_dataclasses(rules_file):
     rules_file.write_text(
-        "from dataclasses import dataclass\n\n@dataclass\nclass P:\n    rate: float = 0.5\n\ndef update(cells):\n    cells.growth_rate = P().rate\n"
+        "from dataclasses import dataclass\n\n@dataclass\nclass P:\n    rate: float = 0.5\n\ndef"
+        " update(cells):\n    cells.growth_rate = P().rate\n"
     )
     scene = tf.Scene(tf.Rules(rules_file), tf.Growth(), founders=pair_of_cells())
     assert run(scene, scene.seed(), 1).growth_rate.tolist() == [0.5, 0.5]
@@ -44,7 +45,9 @@ def test_an_edit_takes_effect_at_the_next_step(rules_file):
         if state.step == 3:
             rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
     assert rates == [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]
-    assert rules.source.messages == ["t = 0.3 h: my_rules.py taken up"], "it was the step from 0.3 to 0.4 h that first ran the new rules"
+    assert rules.source.messages == ["t = 0.3 h: my_rules.py taken up"], (
+        "it was the step from 0.3 to 0.4 h that first ran the new rules"
+    )
 
 
 def test_without_watching_an_edit_waits(rules_file):
@@ -59,7 +62,10 @@ BROKEN = {
     "syntax": ("def update(cells)\n    pass\n", "SyntaxError"),
     "unknown name": ("def update(cells):\n    cells.growth_rate = speed\n", "NameError"),
     "unknown field": ("def update(cells):\n    cells.growth_rate = cells.groth\n", "groth"),
-    "wrong shape": ("import torch\ndef update(cells):\n    cells.growth_rate = torch.ones(99)\n", "growth_rate"),
+    "wrong shape": (
+        "import torch\ndef update(cells):\n    cells.growth_rate = torch.ones(99)\n",
+        "growth_rate",
+    ),
     "read only": ("def update(cells):\n    cells.length = 3.0\n", "can only be read"),
     "new variable": ("def update(cells):\n    cells.fresh = 3.0\n", "fresh"),
     "empty": ("", "neither"),
@@ -92,10 +98,13 @@ def test_a_file_that_is_gone_for_a_moment_is_no_error(rules_file):
 
 
 def test_an_edit_that_breaks_only_later_does_not_end_the_run(rules_file):
-    """It passes when it is taken up and fails two steps after: the last good rules must carry on."""
+    """It passes when it is taken up and fails two steps after: the last good rules must carry
+    on."""
     rules, scene = watched(rules_file)
     state = run(scene, scene.seed(), 1)
-    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0 if cells.time < 0.25 else speed\n")
+    rules_file.write_text(
+        "def update(cells):\n    cells.growth_rate = 2.0 if cells.time < 0.25 else speed\n"
+    )
     state = run(scene, state, 5)
     assert state.step == 6
     assert any("t = 0.3 h" in m and "broken" in m and "speed" in m for m in rules.source.messages)
@@ -110,7 +119,10 @@ def grow_and_divide(path) -> tuple[tf.Rules, tf.Scene, tf.State]:
 
 
 def flagged(state: tf.State) -> tf.State:
-    return state.with_fields(divide_flag=torch.ones_like(state.divide_flag), growth_rate=torch.ones_like(state.growth_rate))
+    return state.with_fields(
+        divide_flag=torch.ones_like(state.divide_flag),
+        growth_rate=torch.ones_like(state.growth_rate),
+    )
 
 
 def test_divide_in_a_file_and_its_edit(rules_file):

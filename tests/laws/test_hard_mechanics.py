@@ -1,7 +1,8 @@
 """Hard cases 1 to 7, 9, 10, 14 and 18 of the mechanics: few cells, answers known beforehand.
 
-Radius 0.5 µm, μ = 1, γ = 10, α = 1/γ, growth 1/h by the length law, Δt = 0.01 h, weights 1, unless a case says otherwise.
-`check_always` (finite, |axis| = 1, length ≥ 0, converged by the true residual) is applied to every state on the way.
+Radius 0.5 µm, μ = 1, γ = 10, α = 1/γ, growth 1/h by the length law, Δt = 0.01 h, weights 1, unless
+a case says otherwise. `check_always` (finite, |axis| = 1, length ≥ 0, converged by the true
+residual) is applied to every state on the way.
 """
 
 from __future__ import annotations
@@ -38,13 +39,15 @@ X, Y, Z = np.eye(3)
 
 
 def parted(scene: tf.Scene, cells: tf.Cells, device, dtype, measured) -> None:
-    """Two cells on top of each other are parted in one step of at most six passes, and their forces balance."""
+    """Two cells on top of each other are parted in one step of at most six passes, and their forces
+    balance."""
     start = seeded(scene, cells, device, dtype)
     state = scene.step(start, DT)
     check_always(state, scene)
     # criterion of the cases: no gap below −1e-3 µm
     assert measured("overlap, µm", worst_overlap(state), "≤ 1e-3") <= 1e-3
-    # action = reaction row by row, so Σ μL Δc = 0; the two cells are alike, so their L is one number and 1e-6 leaves only rounding
+    # action = reaction row by row, so Σ μL Δc = 0; the two cells are alike, so their L is one
+    # number and 1e-6 leaves only rounding
     drag = array(state.length + 2 * state.radius)[:, None]
     moved = np.abs((drag * array(state.position - start.position)).sum(0)).max()
     assert measured("Σ drag·displacement", moved, "≤ 1e-6") <= 1e-6
@@ -55,8 +58,11 @@ def parted(scene: tf.Scene, cells: tf.Cells, device, dtype, measured) -> None:
 @pytest.mark.parametrize("sign", [1, -1], ids=["parallel", "antiparallel"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_case_01_same_centre_parallel(device, dtype, measured, unilateral, rate, sign, dim):
-    """Two cells, same centre, parallel, l = 2: after 6 passes no gap below −1e-3; Σ drag·displacement = 0 ± 1e-6."""
-    scene = tf.Scene(growth(rate), mechanics(passes=6, overlap=1e-3, unilateral=unilateral, dim=dim))
+    """Two cells, same centre, parallel, l = 2: after 6 passes no gap below −1e-3; Σ
+    drag·displacement = 0 ± 1e-6."""
+    scene = tf.Scene(
+        growth(rate), mechanics(passes=6, overlap=1e-3, unilateral=unilateral, dim=dim)
+    )
     axis = rotation(np.random.default_rng(1), dim)[0]
     parted(scene, tf.Cells(np.zeros((2, dim)), [axis, sign * axis], 2.0), device, dtype, measured)
 
@@ -64,13 +70,22 @@ def test_case_01_same_centre_parallel(device, dtype, measured, unilateral, rate,
 @MODES
 @pytest.mark.parametrize("rate", [0.0, 1.0])
 def test_case_02_same_centre_crossing(device, dtype, measured, unilateral, rate):
-    """Same centre, crossing at 90°: the normal is the cross product of the axes; same bounds as case 1."""
+    """Same centre, crossing at 90°: the normal is the cross product of the axes; same bounds as
+    case 1."""
     a, b, c = rotation(np.random.default_rng(2), 3)
     cells = tf.Cells(np.zeros((2, 3)), [a, b], 2.0)
     pair = bodies(np.zeros((2, 3)), [a, b], [2.0, 2.0], dtype=dtype, device=device)
     found = rows_of(pair, torch.tensor([0], device=device), torch.tensor([1], device=device))
-    # unit vectors that are the same but for rounding and sign: their product is ±1 to a few units of float32's 1.2e-7
-    assert measured("normal against the cross product", abs(abs(float(array(found.normal)[:, 0] @ c)) - 1), "≤ 1e-6") <= 1e-6
+    # unit vectors that are the same but for rounding and sign: their product is ±1 to a few units
+    # of float32's 1.2e-7
+    assert (
+        measured(
+            "normal against the cross product",
+            abs(abs(float(array(found.normal)[:, 0] @ c)) - 1),
+            "≤ 1e-6",
+        )
+        <= 1e-6
+    )
     scene = tf.Scene(growth(rate), mechanics(passes=6, overlap=1e-3, unilateral=unilateral))
     parted(scene, cells, device, dtype, measured)
 
@@ -79,14 +94,18 @@ SWITCH = math.asin(LINE_CONTACT_SINE)
 
 
 def tilted(angle: float, sign: int, about: np.ndarray, dtype, device) -> Bodies:
-    """Two cells 0.9 apart along y, the second turned by `angle` about `about` out of parallel (or antiparallel)."""
+    """Two cells 0.9 apart along y, the second turned by `angle` about `about` out of parallel (or
+    antiparallel)."""
     axis = math.cos(angle) * X + math.sin(angle) * np.cross(about, X)
-    return bodies([[0, 0, 0], [0.3, 0.9, 0]], [X, sign * axis], [2.0, 2.0], dtype=dtype, device=device)
+    return bodies(
+        [[0, 0, 0], [0.3, 0.9, 0]], [X, sign * axis], [2.0, 2.0], dtype=dtype, device=device
+    )
 
 
 def forces(pair: Bodies, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Generalised forces JᵀD²g (force, torque, elongation), (7,), on cells 0 and 1; the pair given in the order (first, other)."""
-    t = lambda k: torch.tensor([k], device=pair.half.device)  # noqa: E731
+    """Generalised forces JᵀD²g (force, torque, elongation), (7,), on cells 0 and 1; the pair given
+    in the order (first, other)."""
+    t = lambda k: torch.tensor([k], device=pair.half.device)
     found = rows_of(pair, t(first), t(1 - first))
     push = (found.weight * found.gap.clamp(max=0)).unsqueeze(1)
     on = array((push * found.row_first).sum(0)), array((push * found.row_second).sum(0))
@@ -97,7 +116,8 @@ def forces(pair: Bodies, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("sign", [1, -1], ids=["parallel", "antiparallel"])
 @pytest.mark.parametrize("about", [Y, Z], ids=["scissors", "wedge"])
 def test_case_03_near_parallel(device, dtype, measured, angle, sign, about):
-    """Parallel and antiparallel, offset 0.9: distance error ≤ 1e-6, swapping the pair changes ≤ 1e-6 (both given)."""
+    """Parallel and antiparallel, offset 0.9: distance error ≤ 1e-6, swapping the pair changes ≤
+    1e-6 (both given)."""
     pair = tilted(angle, sign, about, dtype, device)
     zero, one = torch.tensor([0], device=device), torch.tensor([1], device=device)
     c, a, h = array(pair.centre.T), array(pair.axis.T), array(pair.half)
@@ -113,7 +133,8 @@ def test_case_03_near_parallel(device, dtype, measured, angle, sign, about):
 @pytest.mark.parametrize("sign", [1, -1], ids=["parallel", "antiparallel"])
 @pytest.mark.parametrize("about", [Y, Z, (Y + Z) / math.sqrt(2)], ids=["scissors", "wedge", "both"])
 def test_case_03_no_jump_at_the_switch(device, dtype, measured, sign, about, shift):
-    """The total force jumps ≤ 1e-3 from two rows to one. Force, torque and elongation are all held to it, on both cells.
+    """The total force jumps ≤ 1e-3 from two rows to one. Force, torque and elongation are all held
+    to it, on both cells.
 
     The two sides are 2e-6 rad apart, over which a force that does not jump moves by less than 1e-5.
     """
@@ -144,10 +165,13 @@ def judged(cells: Bodies) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_case_04_random_pairs(device, dtype, measured, dim):
-    """1e5 random pairs, l from {0} ∪ U(0, 4): distance against a float64 reference ≤ 1e-5 (given)."""
+    """1e5 random pairs, l from {0} ∪ U(0, 4): distance against a float64 reference ≤ 1e-5
+    (given)."""
     rng, count = np.random.default_rng(4), 200_000
     length = rng.uniform(0, 4, count) * (rng.uniform(size=count) > 0.2)
-    cells = bodies(rng.uniform(-2, 2, (count, dim)), unit(rng, count, dim), length, dtype=dtype, device=device)
+    cells = bodies(
+        rng.uniform(-2, 2, (count, dim)), unit(rng, count, dim), length, dtype=dtype, device=device
+    )
     assert measured("error of the distance, µm", judged(cells)[0].max(), "≤ 1e-5") <= 1e-5
 
 
@@ -155,16 +179,27 @@ def test_case_04_random_pairs(device, dtype, measured, dim):
 def test_case_04_random_pairs_near_parallel(device, dtype, measured, dim):
     """The same for pairs 1e-8 to 0.1 rad out of parallel or antiparallel, bound as given.
 
-    Left out are centrelines that cross: where two lines meet at a sine s is known to ε/s², the distance there to ε/s, and nobody
-    asks how deep cells overlap that are through each other.
+    Left out are centrelines that cross: where two lines meet at a sine s is known to ε/s², the
+    distance there to ε/s, and nobody asks how deep cells overlap that are through each other.
     """
     rng, count = np.random.default_rng(40), 30_000
     axis = unit(rng, count, dim)
-    other = axis * rng.choice([-1, 1], (count, 1)) + 10.0 ** rng.uniform(-8, -1, (count, 1)) * unit(rng, count, dim)
+    other = axis * rng.choice([-1, 1], (count, 1)) + 10.0 ** rng.uniform(-8, -1, (count, 1)) * unit(
+        rng, count, dim
+    )
     axis = np.concatenate([axis, other / np.linalg.norm(other, axis=1, keepdims=True)])
-    cells = bodies(rng.uniform(-2, 2, (2 * count, dim)), axis, rng.uniform(0, 4, 2 * count), dtype=dtype, device=device)
+    cells = bodies(
+        rng.uniform(-2, 2, (2 * count, dim)),
+        axis,
+        rng.uniform(0, 4, 2 * count),
+        dtype=dtype,
+        device=device,
+    )
     error, distance = judged(cells)
-    assert measured("error of the distance near parallel, µm", error[distance > 1e-3].max(), "≤ 1e-5") <= 1e-5
+    assert (
+        measured("error of the distance near parallel, µm", error[distance > 1e-3].max(), "≤ 1e-5")
+        <= 1e-5
+    )
     assert (distance > 1e-3).mean() > 0.8
 
 
@@ -175,9 +210,11 @@ def along_length(f, h: float):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_case_05_spheres(device, dtype, measured, dim):
-    """Spheres (l = 0), on each other and on a plane: the Jacobian row against finite differences of the gap ≤ 1e-4 (given).
+    """Spheres (l = 0), on each other and on a plane: the Jacobian row against finite differences of
+    the gap ≤ 1e-4 (given).
 
-    Central differences with h = 5e-3 in float32: rounding 1e-7/h = 2e-5, truncation h²/6 · |f‴| < 2e-5; with 1e-4 in float64: 1e-8.
+    Central differences with h = 5e-3 in float32: rounding 1e-7/h = 2e-5, truncation h²/6 · |f‴| <
+    2e-5; with 1e-4 in float64: 1e-8.
     """
     h = 5e-3 if dtype == torch.float32 else 1e-4
     rng = np.random.default_rng(5)
@@ -192,20 +229,28 @@ def test_case_05_spheres(device, dtype, measured, dim):
                 c, lengths = centre.copy(), np.zeros(2)
                 c[cell] += shift
                 lengths[cell] = length
-                return float(contact_gaps(bodies(c, axis, lengths, dtype=dtype, device=device), one, other))
+                return float(
+                    contact_gaps(bodies(c, axis, lengths, dtype=dtype, device=device), one, other)
+                )
 
             slope = [(gap(h * e) - gap(-h * e)) / (2 * h) for e in np.eye(dim)]
             # the row is minus the slope: the gap after a move x is gap − row · x
-            assert measured("row against finite differences", np.abs(found[:dim] + slope).max(), "≤ 1e-4") <= 1e-4
+            assert (
+                measured(
+                    "row against finite differences", np.abs(found[:dim] + slope).max(), "≤ 1e-4"
+                )
+                <= 1e-4
+            )
             assert np.abs(found[dim:-1]).max() <= 1e-4  # no lever arm
             assert abs(found[-1] + along_length(lambda x, gap=gap: gap(length=x), h)) <= 1e-4
 
 
 def test_case_05_sphere_on_a_plane(device, dtype, measured):
-    """As above for a sphere and a tilted plane: each of its two (coinciding) ends has a row of its own."""
+    """As above for a sphere and a tilted plane: each of its two (coinciding) ends has a row of its
+    own."""
     h = 5e-3 if dtype == torch.float32 else 1e-4
     rng = np.random.default_rng(6)
-    t = lambda x, kind: torch.as_tensor(np.asarray(x), dtype=kind, device=device)  # noqa: E731
+    t = lambda x, kind: torch.as_tensor(np.asarray(x), dtype=kind, device=device)
     for _ in range(5):
         normal, axis = unit(rng, 2, 3)
         surfaces = tf.Plane(point=(0.1, 0.2, 0.3), normal=tuple(normal)).surfaces(3)
@@ -213,13 +258,25 @@ def test_case_05_sphere_on_a_plane(device, dtype, measured):
         def found(shift=0.0, length=0.0, normal=normal, axis=axis, surfaces=surfaces):
             place = np.array([0.1, 0.2, 0.3]) + 0.45 * normal + shift
             return find_wall_contacts(
-                surfaces, t([place], torch.float64), t([axis], dtype), t([length], dtype), t([0.5], dtype), torch.zeros(1, dtype=torch.int64, device=device)
+                surfaces,
+                t([place], torch.float64),
+                t([axis], dtype),
+                t([length], dtype),
+                t([0.5], dtype),
+                torch.zeros(1, dtype=torch.int64, device=device),
             )
 
         rows, gap = array(found().row), lambda found=found, **at: array(found(**at).gap)
         assert rows.shape == (2, 7)
         slope = np.stack([(gap(shift=h * e) - gap(shift=-h * e)) / (2 * h) for e in np.eye(3)], 1)
-        assert measured("row at a plane against finite differences", np.abs(rows[:, :3] + slope).max(), "≤ 1e-4") <= 1e-4
+        assert (
+            measured(
+                "row at a plane against finite differences",
+                np.abs(rows[:, :3] + slope).max(),
+                "≤ 1e-4",
+            )
+            <= 1e-4
+        )
         assert np.abs(rows[:, 3:6]).max() <= 1e-4
         assert np.abs(rows[:, 6] + along_length(lambda x, gap=gap: gap(length=x), h)).max() <= 1e-4
 
@@ -228,42 +285,74 @@ TRAP = [((1, 0, 0), -1.5), ((-1, 0, 0), -1.5)]
 
 
 def trap(weight=None) -> list[tf.Plane]:
-    return [tf.Plane(x=-1.5, facing="+x", weight=weight), tf.Plane(x=1.5, facing="-x", weight=weight)]
+    return [
+        tf.Plane(x=-1.5, facing="+x", weight=weight),
+        tf.Plane(x=1.5, facing="-x", weight=weight),
+    ]
 
 
 @MODES
 @pytest.mark.parametrize("law", ["linear", "length"])
 def test_case_06_trapped_cell(device, dtype, measured, unilateral, law):
-    """One cell, l = 2, between walls at ±1.5, 200 steps: the wall overlap settles (0.0200), growth goes to 0.
+    """One cell, l = 2, between walls at ±1.5, 200 steps: the wall overlap settles (0.0200), growth
+    goes to 0.
 
-    At rest growth e a step is just held back: αγ e = D² o with αγ = 1 and D = 1, so the overlap o is e. Where e is the same in every
-    step, 2 µm/h · 0.01 h, that is the guide's 0.0200. By the length law e = (e^0.01 − 1) l with l = 2 + 2o, and the same balance
-    gives o = 2ε/(1 − 2ε) = 0.020513, ε = e^0.01 − 1. The approach is by 2/3 a step: nothing is left of it after 200. The solve's
-    tolerance, 1e-4 of e, leaves 2e-6, and float32 lengths of 2 µm are 2.4e-7 apart: 1e-5 covers both.
+    At rest growth e a step is just held back: αγ e = D² o with αγ = 1 and D = 1, so the overlap o
+    is e. Where e is the same in every step, 2 µm/h · 0.01 h, that is the guide's 0.0200. By the
+    length law e = (e^0.01 − 1) l with l = 2 + 2o, and the same balance gives o = 2ε/(1 − 2ε) =
+    0.020513, ε = e^0.01 − 1. The approach is by 2/3 a step: nothing is left of it after 200. The
+    solve's tolerance, 1e-4 of e, leaves 2e-6, and float32 lengths of 2 µm are 2.4e-7 apart: 1e-5
+    covers both.
     """
-    scene = tf.Scene(growth(2.0 if law == "linear" else 1.0, law), mechanics(walls=trap(), unilateral=unilateral))
+    scene = tf.Scene(
+        growth(2.0 if law == "linear" else 1.0, law), mechanics(walls=trap(), unilateral=unilateral)
+    )
     state = run(scene, seeded(scene, tf.Cells(np.zeros((1, 3)), [X], 2.0), device, dtype), 200, DT)
     gain = math.expm1(0.01)
     expected = 0.02 if law == "linear" else 2 * gain / (1 - 2 * gain)
-    assert measured("overlap against theory, µm", np.abs(wall_overlap(state, TRAP) - expected).max(), "≤ 1e-5") <= 1e-5
+    assert (
+        measured(
+            "overlap against theory, µm",
+            np.abs(wall_overlap(state, TRAP) - expected).max(),
+            "≤ 1e-5",
+        )
+        <= 1e-5
+    )
     assert measured("growth left, µm a step", abs(float(state.elongation)), "≤ 1e-6") <= 1e-6
 
 
 @MODES
 def test_case_07_row_between_walls(device, dtype, measured, unilateral):
-    """100 cells tip to tip between two hard walls, 60 steps: all 101 overlaps equal g·l·Δt within 1 % (given).
+    """100 cells tip to tip between two hard walls, 60 steps: all 101 overlaps equal g·l·Δt within 1
+    % (given).
 
     Of that 1 %, 0.5 % is e^0.01 − 1 against 0.01.
     """
-    scene = tf.Scene(growth(), mechanics(walls=[tf.Plane(x=0.0, facing="+x"), tf.Plane(x=300.0, facing="-x")], unilateral=unilateral))
+    scene = tf.Scene(
+        growth(),
+        mechanics(
+            walls=[tf.Plane(x=0.0, facing="+x"), tf.Plane(x=300.0, facing="-x")],
+            unilateral=unilateral,
+        ),
+    )
     cells = tf.Cells(3.0 * np.arange(100)[:, None] * X + 1.5 * X, X, 2.0)
     state = run(scene, seeded(scene, cells, device, dtype), 60, DT)
     between = -pair_gaps(state, np.stack([np.arange(99), np.arange(1, 100)], 1))
     walls = wall_overlap(state, [((1, 0, 0), 0.0), ((-1, 0, 0), -300.0)])
     overlap = np.concatenate([walls[0, :1], between, walls[1, -1:]])
     expected = DT * array(state.length)
-    assert measured("overlap against g·l·Δt, relative", np.abs(overlap[:-1] / expected - 1).max(), "≤ 0.01") <= 0.01
-    assert measured("overlap against g·l·Δt, relative", np.abs(overlap[1:] / expected - 1).max(), "≤ 0.01") <= 0.01
+    assert (
+        measured(
+            "overlap against g·l·Δt, relative", np.abs(overlap[:-1] / expected - 1).max(), "≤ 0.01"
+        )
+        <= 0.01
+    )
+    assert (
+        measured(
+            "overlap against g·l·Δt, relative", np.abs(overlap[1:] / expected - 1).max(), "≤ 0.01"
+        )
+        <= 0.01
+    )
 
 
 @pytest.mark.slow
@@ -271,30 +360,47 @@ def test_case_07_row_between_walls(device, dtype, measured, unilateral):
 def test_case_09_soft_wall(device, dtype, measured, unilateral):
     """The trapped cell of 6 with wall weight D = 1 and D = 0.1: overlap ratio 100 ± 1 % (given).
 
-    The balance αγ e = D² o gives o = e/D² with the same wanted e in both: growth is linear, since by the length law the
-    longer cell in the softer trap wants more and o = 2ε/(D² − 2ε) has no solution at D² = 0.01 < 2ε. The approach is by 1/(1 + D²/2) a step,
-    so the cell in the soft trap starts at l = 5.8, 5 % short of its rest: 600 steps leave e^−3 of that, 0.25 %. A cell never shortens, so the
-    ratio cannot come out right from above. Both traps run side by side, as two colonies.
+    The balance αγ e = D² o gives o = e/D² with the same wanted e in both: growth is linear, since
+    by the length law the longer cell in the softer trap wants more and o = 2ε/(D² − 2ε) has no
+    solution at D² = 0.01 < 2ε. The approach is by 1/(1 + D²/2) a step, so the cell in the soft trap
+    starts at l = 5.8, 5 % short of its rest: 600 steps leave e^−3 of that, 0.25 %. A cell never
+    shortens, so the ratio cannot come out right from above. Both traps run side by side, as two
+    colonies.
     """
-    scene = tf.Scene(growth(2.0, "linear"), mechanics(walls=trap(torch.tensor([1.0, 0.1])), unilateral=unilateral))
-    state = seeded(scene, tf.Cells(np.zeros((2, 3)), [X, X], [2.0, 5.8], colony=[0, 1]), device, dtype)
+    scene = tf.Scene(
+        growth(2.0, "linear"),
+        mechanics(walls=trap(torch.tensor([1.0, 0.1])), unilateral=unilateral),
+    )
+    state = seeded(
+        scene, tf.Cells(np.zeros((2, 3)), [X, X], [2.0, 5.8], colony=[0, 1]), device, dtype
+    )
     for _ in range(60):
         state = run(scene, state, 9, DT, check=False)
         state = run(scene, state, 1, DT)
     overlap = wall_overlap(state, TRAP)
-    assert measured("ratio less 100", np.abs(overlap[:, 1] / overlap[:, 0] - 100).max(), "≤ 1") <= 1.0
+    assert (
+        measured("ratio less 100", np.abs(overlap[:, 1] / overlap[:, 0] - 100).max(), "≤ 1") <= 1.0
+    )
 
 
 @MODES
 @pytest.mark.parametrize("height", [0.0, 0.05])
 @pytest.mark.parametrize("tilt", [0.0, 0.03])
 def test_case_10_planes_too_near(device, dtype, measured, unilateral, height, tilt):
-    """Two planes 0.8 µm apart, a cell of diameter 1 between them: 0.1 ± 1e-3 overlap each (given), no oscillation.
+    """Two planes 0.8 µm apart, a cell of diameter 1 between them: 0.1 ± 1e-3 overlap each (given),
+    no oscillation.
 
-    No oscillation: started off the middle, the cell comes nearer to it in every step and never goes over to the other side, to
-    within 1e-6 µm: float32 rounding of a gap of 0.1 is 1e-8, of a lever arm of 2 µm 2e-7.
+    No oscillation: started off the middle, the cell comes nearer to it in every step and never goes
+    over to the other side, to within 1e-6 µm: float32 rounding of a gap of 0.1 is 1e-8, of a lever
+    arm of 2 µm 2e-7.
     """
-    scene = tf.Scene(growth(), mechanics(walls=[tf.Plane(z=-0.4, facing="+z"), tf.Plane(z=0.4, facing="-z")], unilateral=unilateral))
+    scene = tf.Scene(
+        growth(),
+        mechanics(
+            walls=[tf.Plane(z=-0.4, facing="+z"), tf.Plane(z=0.4, facing="-z")],
+            unilateral=unilateral,
+        ),
+    )
     state = seeded(scene, tf.Cells([[0, 0, height]], [X + tilt * Z], 2.0), device, dtype)
     z = [height]
     for _ in range(60):
@@ -307,12 +413,15 @@ def test_case_10_planes_too_near(device, dtype, measured, unilateral, height, ti
 
 
 @MODES
-@pytest.mark.parametrize("other", [([0, 0.9, 0], X), ([0.3, 0.8, 0.1], X + 0.4 * Y)], ids=["side by side", "at an angle"])
+@pytest.mark.parametrize(
+    "other", [([0, 0.9, 0], X), ([0.3, 0.8, 0.1], X + 0.4 * Y)], ids=["side by side", "at an angle"]
+)
 def test_case_14_heavy_and_light(device, dtype, measured, unilateral, other):
     """Drag ratio 1e4 between two overlapping cells: heavy/light displacement ≤ 1.01e-4 (given).
 
-    Forces balance, so the ratio is 1e-4 exactly, and below 0.99e-4 would be as wrong. The solve must see the heavy cell: in scaled
-    unknowns it moves 1e-2 of what the light one does, so a tolerance of 1e-6 of the light one's move is 1e-4 of the heavy one's.
+    Forces balance, so the ratio is 1e-4 exactly, and below 0.99e-4 would be as wrong. The solve
+    must see the heavy cell: in scaled unknowns it moves 1e-2 of what the light one does, so a
+    tolerance of 1e-6 of the light one's move is 1e-4 of the heavy one's.
     """
     scene = tf.Scene(mechanics(unilateral=unilateral, tolerance=1e-6))
     cells = tf.Cells([[0, 0, 0], other[0]], [X, other[1]], 2.0, extra={"drag": [1e4, 1.0]})
@@ -326,9 +435,12 @@ def test_case_14_heavy_and_light(device, dtype, measured, unilateral, other):
 
 @MODES
 def test_case_18_near_but_not_touching(device, dtype, measured, unilateral):
-    """Gap +0.005, no growth: displacement exactly 0, in every unknown. Beside it a pair that does overlap, and so must move."""
+    """Gap +0.005, no growth: displacement exactly 0, in every unknown. Beside it a pair that does
+    overlap, and so must move."""
     scene = tf.Scene(mechanics(unilateral=unilateral))
-    cells = tf.Cells([[0, 0, 0], [0.3, 1.005, 0], [0, 0, 0], [0.3, 0.995, 0]], [X] * 4, 2.0, colony=[0, 0, 1, 1])
+    cells = tf.Cells(
+        [[0, 0, 0], [0.3, 1.005, 0], [0, 0, 0], [0.3, 0.995, 0]], [X] * 4, 2.0, colony=[0, 0, 1, 1]
+    )
     start = seeded(scene, cells, device, dtype)
     state = scene.step(start, DT)
     check_always(state, scene)

@@ -25,15 +25,25 @@ def halves(cells: Bodies) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def side_by_side(rng: np.random.Generator, count: int, dim: int, tilt: float, **options) -> Bodies:
-    """Pairs of rods beside one another that overlap all along, up to `tilt` out of parallel, either way round."""
+    """Pairs of rods beside one another that overlap all along, up to `tilt` out of parallel, either
+    way round."""
     axis = unit(rng, count, dim)
-    across = np.stack([-axis[:, 1], axis[:, 0]], 1) if dim == 2 else np.cross(axis, unit(rng, count, dim))
+    across = (
+        np.stack([-axis[:, 1], axis[:, 0]], 1)
+        if dim == 2
+        else np.cross(axis, unit(rng, count, dim))
+    )
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     other = axis + tilt * rng.uniform(-1, 1, (count, 1)) * unit(rng, count, dim)
     other *= rng.choice([-1, 1], (count, 1)) / np.linalg.norm(other, axis=1, keepdims=True)
     centre = 0.75 * across + rng.uniform(-1, 1, (count, 1)) * axis
     place = rng.uniform(-3, 3, (count, dim))
-    return bodies(np.concatenate([place, place + centre]), np.concatenate([axis, other]), rng.uniform(2, 3, 2 * count), **options)
+    return bodies(
+        np.concatenate([place, place + centre]),
+        np.concatenate([axis, other]),
+        rng.uniform(2, 3, 2 * count),
+        **options,
+    )
 
 
 @settings(deadline=None, derandomize=True, max_examples=100)
@@ -45,20 +55,27 @@ def side_by_side(rng: np.random.Generator, count: int, dim: int, tilt: float, **
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
 def test_distance_is_the_least_and_the_same_when_swapped(seed, dim, lengths, tilt, dtype):
-    """Against the search of the helpers, for any mixture of lengths and angles, parallel and coincident cells included.
+    """Against the search of the helpers, for any mixture of lengths and angles, parallel and
+    coincident cells included.
 
-    float32 keeps 1.2e-7 of places up to 20 µm out; where centrelines cross at a sine s it knows the crossing to ε/s, at worst
-    √(ε·20) = 1.5e-3. Such pairs are through each other, and only held to that.
+    float32 keeps 1.2e-7 of places up to 20 µm out; where centrelines cross at a sine s it knows the
+    crossing to ε/s, at worst √(ε·20) = 1.5e-3. Such pairs are through each other, and only held to
+    that.
     """
     rng, count = np.random.default_rng(seed), 40
     axis = unit(rng, 2 * count, dim)
     other = axis[:count] + tilt * unit(rng, count, dim)
-    axis[count:] = other / np.linalg.norm(other, axis=1, keepdims=True) * rng.choice([-1, 1], (count, 1))
+    axis[count:] = (
+        other / np.linalg.norm(other, axis=1, keepdims=True) * rng.choice([-1, 1], (count, 1))
+    )
     centre = rng.uniform(-2, 2, (2 * count, dim))
     centre[count : count + 5] = centre[:5]
     cells = bodies(centre, axis, rng.choice(lengths, 2 * count), dtype=dtype)
     first, second = halves(cells)
-    gap, swapped = array(contact_gaps(cells, first, second)), array(contact_gaps(cells, second, first))
+    gap, swapped = (
+        array(contact_gaps(cells, first, second)),
+        array(contact_gaps(cells, second, first)),
+    )
     c, a, h = array(cells.centre.T), array(cells.axis.T), array(cells.half)
     distance = segment_distance(c[:count], a[:count], h[:count], c[count:], a[count:], h[count:])
     usual, crossing = {torch.float32: (2e-5, 1.5e-3), torch.float64: (1e-8, 1e-6)}[dtype]
@@ -87,13 +104,19 @@ def moved(cells: Bodies, which: torch.Tensor, dof: int, by: float) -> Bodies:
 
 @DIMS
 def test_rows_are_the_derivative_of_the_gap(dim):
-    """The gap after a small move x is gap − row · x, for every degree of freedom of both cells, where contact is in a point.
+    """The gap after a small move x is gap − row · x, for every degree of freedom of both cells,
+    where contact is in a point.
 
-    Central differences in float64, h = 1e-6: rounding leaves 1e-10, curvature h² = 1e-12. At a kink (the closest point arriving at an end) a
-    derivative does not exist: the few pairs where the two one-sided differences disagree are left out, and counted.
+    Central differences in float64, h = 1e-6: rounding leaves 1e-10, curvature h² = 1e-12. At a kink
+    (the closest point arriving at an end) a derivative does not exist: the few pairs where the two
+    one-sided differences disagree are left out, and counted.
     """
     rng, count, h = np.random.default_rng(1), 2000, 1e-6
-    cells = bodies(rng.uniform(-1, 1, (2 * count, dim)), unit(rng, 2 * count, dim), rng.uniform(0.5, 4, 2 * count))
+    cells = bodies(
+        rng.uniform(-1, 1, (2 * count, dim)),
+        unit(rng, 2 * count, dim),
+        rng.uniform(0.5, 4, 2 * count),
+    )
     first, second = halves(cells)
     gap = contact_gaps(cells, first, second)
     line = contact_points(cells.take(first), cells.take(second))[-1]
@@ -111,8 +134,11 @@ def test_rows_are_the_derivative_of_the_gap(dim):
             assert float((row[:, dof] + 0.5 * (up + down))[smooth].abs().max()) <= 1e-6
 
 
-def gap_at(cells: Bodies, first, second, s, t, end_a, end_b, from_half: torch.Tensor) -> torch.Tensor:
-    """Gap between two marked points of the cells, which ride along as cells turn, and with the ends as they grow."""
+def gap_at(
+    cells: Bodies, first, second, s, t, end_a, end_b, from_half: torch.Tensor
+) -> torch.Tensor:
+    """Gap between two marked points of the cells, which ride along as cells turn, and with the ends
+    as they grow."""
     grown = cells.half - from_half
     a = cells.centre[:, first] + (s + end_a * grown[first]) * cells.axis[:, first]
     b = cells.centre[:, second] + (t + end_b * grown[second]) * cells.axis[:, second]
@@ -122,40 +148,63 @@ def gap_at(cells: Bodies, first, second, s, t, end_a, end_b, from_half: torch.Te
 @DIMS
 @pytest.mark.parametrize("tilt", [1e-3, 0.09])
 def test_rows_of_a_line_of_contact(dim, tilt):
-    """Two rows for each pair, D² = ½, each the exact derivative of the gap between two marked points. Differences as above."""
+    """Two rows for each pair, D² = ½, each the exact derivative of the gap between two marked
+    points. Differences as above."""
     cells, h = side_by_side(np.random.default_rng(2), 300, dim, tilt), 1e-6
     first, second = halves(cells)
     s, t, end_a, end_b, line = contact_points(cells.take(first), cells.take(second))
     points = [(s[k], t[k], end_a[k], end_b[k]) for k in range(2)]
-    both = line & (gap_at(cells, first, second, *points[0], cells.half) < 0) & (gap_at(cells, first, second, *points[1], cells.half) < 0)
+    both = (
+        line
+        & (gap_at(cells, first, second, *points[0], cells.half) < 0)
+        & (gap_at(cells, first, second, *points[1], cells.half) < 0)
+    )
     first, second, points = first[both], second[both], [tuple(x[both] for x in p) for p in points]
     found = rows_of(cells, first, second)
-    assert len(first) > 250 and found.gap.numel() == 2 * len(first) and bool((found.weight == 0.5).all())
+    assert (
+        len(first) > 250
+        and found.gap.numel() == 2 * len(first)
+        and bool((found.weight == 0.5).all())
+    )
     for k, point in enumerate(points):
         part = slice(k * len(first), (k + 1) * len(first))
         for which, row in ((first, found.row_first[part]), (second, found.row_second[part])):
             for dof in range(row.shape[1]):
-                up, down = (gap_at(moved(cells, which, dof, x), first, second, *point, cells.half) for x in (h, -h))
+                up, down = (
+                    gap_at(moved(cells, which, dof, x), first, second, *point, cells.half)
+                    for x in (h, -h)
+                )
                 assert float((row[:, dof] + (up - down) / (2 * h)).abs().max()) <= 1e-6
 
 
 @DIMS
 @pytest.mark.parametrize("push", [False, True])
 def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, push):
-    """All rows that `contact_points` has for every pair, wherever it overlaps or is held, and no other: gaps and weights to rounding, order exactly."""
+    """All rows that `contact_points` has for every pair, wherever it overlaps or is held, and no
+    other: gaps and weights to rounding, order exactly."""
     rng, count = np.random.default_rng(4), 8000
     axis = unit(rng, 2 * count, dim)
     tilt = rng.choice([1e-8, 1e-3, 0.08, 0.12], (count // 2, 1))
     axis[count : count + count // 2] = axis[: count // 2] + tilt * unit(rng, count // 2, dim)
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    cells = bodies(rng.uniform(-0.9, 0.9, (2 * count, dim)), axis, rng.choice([0.0, 0.5, 2.0, 3.0], 2 * count), dtype=dtype)
+    cells = bodies(
+        rng.uniform(-0.9, 0.9, (2 * count, dim)),
+        axis,
+        rng.choice([0.0, 0.5, 2.0, 3.0], 2 * count),
+        dtype=dtype,
+    )
     first, second = halves(cells)
     s, t, end_a, end_b, line = contact_points(cells.take(first), cells.take(second))
-    gap = torch.stack([gap_at(cells, first, second, s[k], t[k], end_a[k], end_b[k], cells.half) for k in range(2)])
-    clear = (gap.abs() > 1e-5).all(0) & (gap.sum(0).abs() > 1e-5)  # of the others rounding may say whether they overlap, or are held
+    gap = torch.stack(
+        [gap_at(cells, first, second, s[k], t[k], end_a[k], end_b[k], cells.half) for k in range(2)]
+    )
+    # of the others rounding may say whether they overlap, or are held
+    clear = (gap.abs() > 1e-5).all(0) & (gap.sum(0).abs() > 1e-5)
     first, second, gap, line = first[clear], second[clear], gap[:, clear], line[clear]
     deep = (gap < 0) & torch.stack([torch.ones_like(line), line])
-    assert deep[1].sum() > 500 and (~deep[0]).sum() > 500 and (line & (deep[0] != deep[1])).sum() > 3
+    assert (
+        deep[1].sum() > 500 and (~deep[0]).sum() > 500 and (line & (deep[0] != deep[1])).sum() > 3
+    )
     weight = torch.where(line, 0.5, 1.0).expand(2, -1).clone()
     if push:
         deep = deep | (line & deep.any(0))
@@ -166,25 +215,48 @@ def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, push):
         assert held.sum() > 3
         gap = gap.clamp(max=0.0)
     found = rows_of(cells, first, second, push)
-    assert torch.equal(found.first, torch.cat([first[d] for d in deep])) and torch.equal(found.second, torch.cat([second[d] for d in deep]))
-    assert float((found.weight - torch.cat([w[d] for w, d in zip(weight, deep, strict=True)])).abs().max()) <= 1e-3
-    assert float((found.gap - torch.cat([g[d] for g, d in zip(gap, deep, strict=True)])).abs().max()) <= 1e-5
+    assert torch.equal(found.first, torch.cat([first[d] for d in deep])) and torch.equal(
+        found.second, torch.cat([second[d] for d in deep])
+    )
+    assert (
+        float(
+            (found.weight - torch.cat([w[d] for w, d in zip(weight, deep, strict=True)]))
+            .abs()
+            .max()
+        )
+        <= 1e-3
+    )
+    assert (
+        float((found.gap - torch.cat([g[d] for g, d in zip(gap, deep, strict=True)])).abs().max())
+        <= 1e-5
+    )
 
 
-@pytest.mark.parametrize("apart, tilt", [(1.9, 0.02), (1.9, 0.05), (1.9, 0.2), (1.7, 0.02), (1.7, 0.2), (1.5, 0.02), (1.5, 0.05)])
+@pytest.mark.parametrize(
+    "apart, tilt",
+    [(1.9, 0.02), (1.9, 0.05), (1.9, 0.2), (1.7, 0.02), (1.7, 0.2), (1.5, 0.02), (1.5, 0.05)],
+)
 def test_a_cell_squeezed_between_two_comes_to_rest(apart, tilt):
-    """Between two cells as good as fixed, too near for it at any angle, it overlaps them at opposite ends: a solve that saw these ends alone would
-    turn it as far the other way, step after step. It lies down between them instead, to what is left of a tilt by a tolerance of 0.01 a step."""
+    """Between two cells as good as fixed, too near for it at any angle, it overlaps them at
+    opposite ends: a solve that saw these ends alone would turn it as far the other way, step after
+    step. It lies down between them instead, to what is left of a tilt by a tolerance of 0.01 a
+    step.
+    """
     cells = tf.Cells(
-        [[0.0, -apart / 2], [0.1, 0.0], [0.0, apart / 2]], [[1.0, 0.0], [math.cos(tilt), math.sin(tilt)], [1.0, 0.0]], [4.0, 1.4, 4.0], [0.5] * 3,
+        [[0.0, -apart / 2], [0.1, 0.0], [0.0, apart / 2]],
+        [[1.0, 0.0], [math.cos(tilt), math.sin(tilt)], [1.0, 0.0]],
+        [4.0, 1.4, 4.0],
+        [0.5] * 3,
         extra={"drag": [1e3, 1.0, 1e3]},
-    )  # fmt: skip
+    )
     scene = tf.Scene(tf.Mechanics(dim=2, tolerance=0.01), founders=cells)
     state, angles = scene.seed(dtype=torch.float64), []
     for _ in range(30):
         state = scene.step(state, 0.025)
         angles.append(float(torch.atan2(state.axis[1, 1], state.axis[1, 0])))
-    assert max(map(abs, angles)) < max(tilt, 0.1) + 0.02 and max(map(abs, angles[-5:])) < 1e-3, angles
+    assert max(map(abs, angles)) < max(tilt, 0.1) + 0.02 and max(map(abs, angles[-5:])) < 1e-3, (
+        angles
+    )
 
 
 def forces(cells: Bodies) -> np.ndarray:
@@ -192,20 +264,30 @@ def forces(cells: Bodies) -> np.ndarray:
     first, second = halves(cells)
     found = rows_of(cells, first, second)
     out = np.zeros((len(first), found.row_first.shape[1]))
-    np.add.at(out, array(found.first), array((found.weight * found.gap).unsqueeze(1) * found.row_first))
+    np.add.at(
+        out, array(found.first), array((found.weight * found.gap).unsqueeze(1) * found.row_first)
+    )
     return out
 
 
 def sweep(dim: int, angle, shift, apart) -> Bodies:
-    """Pairs that differ by a little from one to the next: an angle, a shift along the axis, a distance; one of them an array."""
+    """Pairs that differ by a little from one to the next: an angle, a shift along the axis, a
+    distance; one of them an array."""
     angle, shift, apart = np.broadcast_arrays(*map(np.asarray, (angle, shift, apart)))
     zero, one = np.zeros(angle.shape), np.ones(angle.shape)
     if dim == 2:
         axis, centre = np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([shift, apart], 1)
     else:  # out of the common plane and in it
-        axis, centre = np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], 1), np.stack([shift, apart, zero], 1)
+        axis, centre = (
+            np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], 1),
+            np.stack([shift, apart, zero], 1),
+        )
     lie = np.stack([one] + [zero] * (dim - 1), 1)
-    return bodies(np.concatenate([0 * centre, centre]), np.concatenate([lie, axis]), np.repeat([2.0, 2.4], len(angle)))
+    return bodies(
+        np.concatenate([0 * centre, centre]),
+        np.concatenate([lie, axis]),
+        np.repeat([2.0, 2.4], len(angle)),
+    )
 
 
 FINE = 5e-5
@@ -215,17 +297,40 @@ FINE = 5e-5
 @pytest.mark.parametrize(
     "name, path",
     [
-        *[(f"angle at shift {x}", {"angle": np.arange(-0.3, 0.3, FINE), "shift": x, "apart": 0.85}) for x in (0.0, 0.4, 1.5)],
-        *[(f"antiparallel at shift {x}", {"angle": math.pi + np.arange(-0.3, 0.3, FINE), "shift": x, "apart": 0.85}) for x in (0.0, 0.7)],
-        *[(f"shift at angle {x}", {"angle": x, "shift": np.arange(-4, 4, FINE), "apart": 0.8}) for x in (0.0, 0.03, 0.0999, 0.2)],
-        *[(f"distance at angle {x}", {"angle": x, "shift": 0.3, "apart": np.arange(0.3, 1.2, FINE)}) for x in (0.0, 0.05, 0.15)],
+        *[
+            (
+                f"angle at shift {x}",
+                {"angle": np.arange(-0.3, 0.3, FINE), "shift": x, "apart": 0.85},
+            )
+            for x in (0.0, 0.4, 1.5)
+        ],
+        *[
+            (
+                f"antiparallel at shift {x}",
+                {"angle": math.pi + np.arange(-0.3, 0.3, FINE), "shift": x, "apart": 0.85},
+            )
+            for x in (0.0, 0.7)
+        ],
+        *[
+            (f"shift at angle {x}", {"angle": x, "shift": np.arange(-4, 4, FINE), "apart": 0.8})
+            for x in (0.0, 0.03, 0.0999, 0.2)
+        ],
+        *[
+            (
+                f"distance at angle {x}",
+                {"angle": x, "shift": 0.3, "apart": np.arange(0.3, 1.2, FINE)},
+            )
+            for x in (0.0, 0.05, 0.15)
+        ],
     ],
 )
 def test_forces_never_jump(dim, name, path):
-    """Force, torque and elongation go on without a jump as a cell turns, slides or comes near: from two rows to one, from end to middle.
+    """Force, torque and elongation go on without a jump as a cell turns, slides or comes near: from
+    two rows to one, from end to middle.
 
-    Jumps ≤ 1e-3, as the guide has it for one row against two. Steps are 5e-5 rad or µm: what changes fastest without a jump is the sliding of
-    a line's ends with the angle, at most 15 a rad for an overlap of 1 and levers of 1 µm, which is 8e-4 a step.
+    Jumps ≤ 1e-3, as the guide has it for one row against two. Steps are 5e-5 rad or µm: what
+    changes fastest without a jump is the sliding of a line's ends with the angle, at most 15 a rad
+    for an overlap of 1 and levers of 1 µm, which is 8e-4 a step.
     """
     found = forces(sweep(dim, **path))
     jump = np.abs(np.diff(found, axis=0)).max(0)
@@ -235,8 +340,9 @@ def test_forces_never_jump(dim, name, path):
 
 @DIMS
 def test_swapping_a_pair_swaps_its_rows(dtype, device, dim):
-    """The same gaps, weights and rows, with first and second exchanged, but for rounding: where two axes at a sine s are nearest is known to
-    ε/s² times the size of the cells, and s is at least 0.1 wherever that place matters. In float32 1e-7 · 100 · 2 µm.
+    """The same gaps, weights and rows, with first and second exchanged, but for rounding: where two
+    axes at a sine s are nearest is known to ε/s² times the size of the cells, and s is at least 0.1
+    wherever that place matters. In float32 1e-7 · 100 · 2 µm.
     """
     rng = np.random.default_rng(3)
     cells = side_by_side(rng, 200, dim, 0.3, dtype=dtype, device=device)
@@ -244,9 +350,14 @@ def test_swapping_a_pair_swaps_its_rows(dtype, device, dim):
     one, other = rows_of(cells, first, second), rows_of(cells, second, first)
 
     def rows(found, cell, row):
-        """Gap, weight and row, (P, 2, …), of each pair's one or two rows; zeros where there is one."""
+        """Gap, weight and row, (P, 2, …), of each pair's one or two rows; zeros where there is
+        one."""
         out, seen = np.zeros((len(first), 2, 2 + row.shape[1])), np.zeros(len(first), dtype=int)
-        for k, values in zip(array(cell) % len(first), array(torch.cat([found.gap.unsqueeze(1), found.weight.unsqueeze(1), row], 1)), strict=True):
+        for k, values in zip(
+            array(cell) % len(first),
+            array(torch.cat([found.gap.unsqueeze(1), found.weight.unsqueeze(1), row], 1)),
+            strict=True,
+        ):
             out[k, seen[k]] = values
             seen[k] += 1
         return out
@@ -262,14 +373,19 @@ def test_swapping_a_pair_swaps_its_rows(dtype, device, dim):
 
 @DIMS
 def test_action_is_reaction(dtype, device, dim):
-    """The two rows of a contact balance: forces exactly, torques about one common point to rounding."""
+    """The two rows of a contact balance: forces exactly, torques about one common point to
+    rounding."""
     cells = side_by_side(np.random.default_rng(4), 200, dim, 0.5, dtype=dtype, device=device)
     found = rows_of(cells, *halves(cells))
     a, b = found.row_first, found.row_second
     assert torch.equal(a[:, :dim], -b[:, :dim])
     between = array((cells.centre[:, found.second] - cells.centre[:, found.first]).T)
     n, turning = array(a[:, :dim]), array(a[:, dim:-1] + b[:, dim:-1])
-    arm = (between[:, :1] * n[:, 1:] - between[:, 1:] * n[:, :1]) if dim == 2 else np.cross(between, n)
+    arm = (
+        (between[:, :1] * n[:, 1:] - between[:, 1:] * n[:, :1])
+        if dim == 2
+        else np.cross(between, n)
+    )
     # b's centre stands `between` from a's, so its force has that arm about a's centre
     assert np.abs(turning - arm).max() <= {torch.float32: 2e-6, torch.float64: 1e-14}[dtype]
     assert np.abs(np.linalg.norm(n, axis=1) - 1).max() <= 1e-6
@@ -278,8 +394,8 @@ def test_action_is_reaction(dtype, device, dim):
 @pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
 @DIMS
 def test_a_colony_does_not_push_or_turn_itself(device, dim, unilateral):
-    """Without walls Σ μL Δc = 0 and Σ (μL c × Δc + μL³/12 Δθ) = 0 after one solve, in float64 to what a tolerance of 1e-11 leaves of
-    sixty moves of 0.1 µm, drags of 3 and arms of 20 µm.
+    """Without walls Σ μL Δc = 0 and Σ (μL c × Δc + μL³/12 Δθ) = 0 after one solve, in float64 to
+    what a tolerance of 1e-11 leaves of sixty moves of 0.1 µm, drags of 3 and arms of 20 µm.
     """
     scene = tf.Scene(growth(), mechanics(dim=dim, unilateral=unilateral, passes=1, tolerance=1e-11))
     start = seeded(scene, crowd(np.random.default_rng(5), 60, dim), device, torch.float64)
@@ -298,7 +414,8 @@ def test_a_colony_does_not_push_or_turn_itself(device, dim, unilateral):
 @DIMS
 @pytest.mark.parametrize("length", [0.0, 2.0])
 def test_cells_in_one_place_still_have_a_normal(dtype, device, dim, length):
-    """Same centre, any angle, spheres too: finite rows and a unit normal across the first axis, or across both."""
+    """Same centre, any angle, spheres too: finite rows and a unit normal across the first axis, or
+    across both."""
     rng = np.random.default_rng(6)
     axis = unit(rng, 20, dim)
     axis[15:] = axis[5:10]  # five pairs parallel
@@ -315,6 +432,8 @@ def test_cells_in_one_place_still_have_a_normal(dtype, device, dim, length):
 def test_gradient_of_gaps_is_finite_where_cells_coincide(dtype):
     cells = bodies(np.zeros((2, 3)), np.eye(3)[:2], [2.0, 2.0], dtype=dtype)
     centre = cells.centre.clone().requires_grad_()
-    gap = contact_gaps(Bodies(centre, cells.axis, cells.half, cells.radius), torch.tensor([0]), torch.tensor([1]))
+    gap = contact_gaps(
+        Bodies(centre, cells.axis, cells.half, cells.radius), torch.tensor([0]), torch.tensor([1])
+    )
     gap.sum().backward()
     assert bool(torch.isfinite(centre.grad).all())

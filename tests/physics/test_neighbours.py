@@ -1,4 +1,5 @@
-"""The broad phase: no pair that could touch is missing, none stands twice, whatever else is in the batch."""
+"""The broad phase: no pair that could touch is missing, none stands twice, whatever else is in the
+batch."""
 
 from __future__ import annotations
 
@@ -24,9 +25,17 @@ DIMS = pytest.mark.parametrize("dim", [2, 3])
 
 
 class Scatter:
-    """Cells at random in several colonies: position, axis (N, d), length, radius, colony (N,), as arrays."""
+    """Cells at random in several colonies: position, axis (N, d), length, radius, colony (N,), as
+    arrays."""
 
-    def __init__(self, rng: np.random.Generator, counts: list[int], dim: int, side: float, lengths: list[float]):
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        counts: list[int],
+        dim: int,
+        side: float,
+        lengths: list[float],
+    ):
         count = sum(counts)
         self.colony, self.colonies = np.repeat(np.arange(len(counts)), counts), len(counts)
         self.position = rng.uniform(-side, side, (count, dim))
@@ -39,9 +48,17 @@ class Scatter:
         return i.cpu().numpy(), j.cpu().numpy()
 
     def asked(self, dtype, margin: float = 0.0, device="cpu") -> Neighbourhood:
-        t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)  # noqa: E731
+        t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)
         colony = torch.as_tensor(self.colony, device=device)
-        return Neighbourhood(t(self.position), t(self.axis), t(self.length), t(self.radius), colony, self.colonies, margin)
+        return Neighbourhood(
+            t(self.position),
+            t(self.axis),
+            t(self.length),
+            t(self.radius),
+            colony,
+            self.colonies,
+            margin,
+        )
 
     def near(self, margin: float) -> set[tuple[int, int]]:
         """Brute force: every pair of one colony whose surfaces are within `margin`."""
@@ -51,7 +68,13 @@ class Scatter:
         if not len(i):
             return set()
         half = 0.5 * self.length
-        gap = segment_distance(self.position[i], self.axis[i], half[i], self.position[j], self.axis[j], half[j]) - self.radius[i] - self.radius[j]
+        gap = (
+            segment_distance(
+                self.position[i], self.axis[i], half[i], self.position[j], self.axis[j], half[j]
+            )
+            - self.radius[i]
+            - self.radius[j]
+        )
         return set(zip(i[gap < margin].tolist(), j[gap < margin].tolist(), strict=True))
 
 
@@ -71,28 +94,32 @@ def check(cells: Scatter, dtype, margin: float, device="cpu") -> int:
 @DIMS
 @pytest.mark.parametrize("margin", [0.0, 0.1, 1.0])
 def test_pairs_against_brute_force(device, dtype, dim, margin):
-    """Spheres, rods and filaments of 40 µm in six colonies, of which two are empty and one has a single cell."""
-    cells = Scatter(np.random.default_rng(1), [60, 0, 1, 150, 0, 90], dim, 12.0 if dim == 2 else 6.0, [0.0, 2.0, 2.0, 2.0, 40.0])
+    """Spheres, rods and filaments of 40 µm in six colonies, of which two are empty and one has a
+    single cell."""
+    cells = Scatter(
+        np.random.default_rng(1),
+        [60, 0, 1, 150, 0, 90],
+        dim,
+        12.0 if dim == 2 else 6.0,
+        [0.0, 2.0, 2.0, 2.0, 40.0],
+    )
     assert check(cells, dtype, margin, device) > 100
 
 
 @settings(deadline=None, derandomize=True, max_examples=60)
-@given(
-    **SCATTERS,
-    margin=st.sampled_from([0.0, 0.2]),
-)
+@given(**SCATTERS, margin=st.sampled_from([0.0, 0.2]))
 def test_pairs_of_any_scatter(seed, counts, dim, side, lengths, dtype, margin):
     """The same for whatever sizes and densities: all cells in one place, or none near another."""
     check(Scatter(np.random.default_rng(seed), counts, dim, side, lengths), dtype, margin)
 
 
 @settings(deadline=None, derandomize=True, max_examples=60)
-@given(
-    **SCATTERS,
-    share=st.sampled_from([0.0, 0.1, 0.5, 1.0]),
-)
-def test_pairs_of_some_cells_are_those_of_all_that_hold_one(seed, counts, dim, side, lengths, share, dtype):
-    """Each once, the cell that was asked for first, whatever its class and its partner's; nothing where nobody is asked for."""
+@given(**SCATTERS, share=st.sampled_from([0.0, 0.1, 0.5, 1.0]))
+def test_pairs_of_some_cells_are_those_of_all_that_hold_one(
+    seed, counts, dim, side, lengths, share, dtype
+):
+    """Each once, the cell that was asked for first, whatever its class and its partner's; nothing
+    where nobody is asked for."""
     rng = np.random.default_rng(seed)
     cells = Scatter(rng, counts, dim, side, lengths)
     asked = np.flatnonzero(rng.random(len(cells.colony)) < share)
@@ -106,7 +133,8 @@ def test_pairs_of_some_cells_are_those_of_all_that_hold_one(seed, counts, dim, s
 
 @DIMS
 def test_list_is_not_much_longer_than_it_must_be(device, dtype, dim):
-    """What the bounding spheres and boxes let through is a small multiple of what is near, for rods as dense as in a colony."""
+    """What the bounding spheres and boxes let through is a small multiple of what is near, for rods
+    as dense as in a colony."""
     rng = np.random.default_rng(2)
     cells = Scatter(rng, [400], dim, 14.0 if dim == 2 else 6.6, [2.5])
     i, _ = cells.pairs(dtype, 0.0, device)
@@ -115,7 +143,8 @@ def test_list_is_not_much_longer_than_it_must_be(device, dtype, dim):
 
 @DIMS
 def test_one_filament_costs_the_rods_nothing(dtype, dim):
-    """A cell of 200 µm among rods adds at most one pair for each rod: it does not make the rods look at each other."""
+    """A cell of 200 µm among rods adds at most one pair for each rod: it does not make the rods
+    look at each other."""
     rng = np.random.default_rng(3)
     cells = Scatter(rng, [800], dim, 40.0, [2.0])
     without, _ = cells.pairs(dtype)

@@ -1,4 +1,5 @@
-"""The contact solve against dense and general-purpose solvers, and what it reports of each colony."""
+"""The contact solve against dense and general-purpose solvers, and what it reports of each
+colony."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ X, Y, Z = np.eye(3)
 
 @dataclass(frozen=True)
 class Problem:
-    """A random contact problem, with J written out: cells of the colonies side by side, pairs and walls within each."""
+    """A random contact problem, with J written out: cells of the colonies side by side, pairs and
+    walls within each."""
 
     first: np.ndarray
     second: np.ndarray
@@ -52,9 +54,18 @@ class Problem:
         gap = -rng.uniform(0.0, 0.3, len(first) + len(at_wall))
         bounds = np.full(cells, WIDE) if lower == WIDE else -rng.uniform(0, -lower, cells)
         return Problem(
-            first, second, at_wall, rng.normal(size=(len(first), 2, degrees)), rng.normal(size=(len(at_wall), degrees)), gap,
-            rng.uniform(0.05, 0.2, cells), bounds, rng.uniform(0.3, 1.5, (cells, degrees)), np.repeat(np.arange(len(counts)), counts), len(counts),
-        )  # fmt: skip
+            first,
+            second,
+            at_wall,
+            rng.normal(size=(len(first), 2, degrees)),
+            rng.normal(size=(len(at_wall), degrees)),
+            gap,
+            rng.uniform(0.05, 0.2, cells),
+            bounds,
+            rng.uniform(0.3, 1.5, (cells, degrees)),
+            np.repeat(np.arange(len(counts)), counts),
+            len(counts),
+        )
 
     @property
     def dense(self) -> np.ndarray:
@@ -67,18 +78,35 @@ class Problem:
         np.add.at(out, (len(pairs) + np.arange(len(self.at_wall)), self.at_wall), self.wall_rows)
         return out.reshape(len(self.gap), -1)
 
-    def problem(self, unilateral: bool, dtype=torch.float64, device="cpu", held=None, **other) -> ContactProblem:
-        t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)  # noqa: E731
-        i = lambda x: torch.as_tensor(x, dtype=torch.int64, device=device)  # noqa: E731
+    def problem(
+        self, unilateral: bool, dtype=torch.float64, device="cpu", held=None, **other
+    ) -> ContactProblem:
+        t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)
+        i = lambda x: torch.as_tensor(x, dtype=torch.int64, device=device)
         rows = ContactRows(
-            i(self.first), i(self.second), t(self.half_rows[:, 0]).contiguous(), t(self.half_rows[:, 1]).contiguous(),
-            i(self.at_wall), t(self.wall_rows), len(self.scale),
-        )  # fmt: skip
+            i(self.first),
+            i(self.second),
+            t(self.half_rows[:, 0]).contiguous(),
+            t(self.half_rows[:, 1]).contiguous(),
+            i(self.at_wall),
+            t(self.wall_rows),
+            len(self.scale),
+        )
         gap = t(other.get("gap", self.gap))
         held = torch.zeros_like(gap) if held is None else t(held)
         colonies = Groups(i(self.colony), self.colonies)
         rigid = torch.as_tensor(other.get("rigid", np.zeros(len(self.scale), bool)), device=device)
-        return ContactProblem(rows, gap, held, t(self.weight).reshape(self.scale.shape), t(self.lower), t(self.scale), rigid, colonies, unilateral)
+        return ContactProblem(
+            rows,
+            gap,
+            held,
+            t(self.weight).reshape(self.scale.shape),
+            t(self.lower),
+            t(self.scale),
+            rigid,
+            colonies,
+            unilateral,
+        )
 
     def solved(self, unilateral: bool, tolerance: float | torch.Tensor = 1e-12, **options):
         """The solve's y = x / M^(−½), (N, D), and its report."""
@@ -93,7 +121,8 @@ class Problem:
 @pytest.mark.parametrize("degrees", [4, 7])
 @pytest.mark.parametrize("seed", range(3))
 def test_bilateral_solve_against_dense(seed, degrees):
-    """(JᵀJ + α) y = Jᵀ g by a dense factorisation. At a tolerance of 1e-12 the two agree to the condition of the system, under 1e3, times that."""
+    """(JᵀJ + α) y = Jᵀ g by a dense factorisation. At a tolerance of 1e-12 the two agree to the
+    condition of the system, under 1e3, times that."""
     p = Problem.random(seed, [12, 1, 7, 0, 20], degrees)
     y, report = p.solved(False)
     j = p.dense
@@ -105,7 +134,8 @@ def test_bilateral_solve_against_dense(seed, degrees):
 
 @MODES
 def test_a_tolerance_for_each_colony(unilateral):
-    """Each colony is solved to its own tolerance, with the bits of a solve in which all have that tolerance."""
+    """Each colony is solved to its own tolerance, with the bits of a solve in which all have that
+    tolerance."""
     p, wanted = Problem.random(4, [12, 7, 20], 7), [0.2, 1e-10, 1e-3]
     found, report = p.solved(unilateral, torch.tensor(wanted, dtype=torch.float64))
     assert (report.residual <= torch.tensor(wanted, dtype=torch.float64)).all()
@@ -117,8 +147,9 @@ def test_a_tolerance_for_each_colony(unilateral):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_bilateral_solve_within_bounds(seed):
-    """Some lengths at their bound. The problem is convex, so y is the minimum if and only if the slope is 0 where y is free and not negative
-    where it is bound (Karush, Kuhn and Tucker): to 1e-9, with a tolerance of 1e-12 and forces of about 1.
+    """Some lengths at their bound. The problem is convex, so y is the minimum if and only if the
+    slope is 0 where y is free and not negative where it is bound (Karush, Kuhn and Tucker): to
+    1e-9, with a tolerance of 1e-12 and forces of about 1.
     """
     p = Problem.random(seed, [12, 20], 7, lower=-0.05)
     y, report = p.solved(False)
@@ -134,12 +165,15 @@ def test_bilateral_solve_within_bounds(seed):
 
 
 def pushing_energy(p: Problem, held: np.ndarray | None = None):
-    """½ ‖min(0, g − Jy)‖² + ½ α ‖y‖² + held · Jy, and its gradient: what a unilateral solve minimises, written out."""
+    """½ ‖min(0, g − Jy)‖² + ½ α ‖y‖² + held · Jy, and its gradient: what a unilateral solve
+    minimises, written out."""
     j, spent = p.dense, np.zeros(len(p.gap)) if held is None else held
 
     def energy(y):
         left = np.minimum(0.0, p.gap - j @ y)
-        return 0.5 * left @ left + 0.5 * p.weight @ y**2 + spent @ (j @ y), p.weight * y - j.T @ (left - spent)
+        return 0.5 * left @ left + 0.5 * p.weight @ y**2 + spent @ (j @ y), p.weight * y - j.T @ (
+            left - spent
+        )
 
     return energy
 
@@ -147,14 +181,23 @@ def pushing_energy(p: Problem, held: np.ndarray | None = None):
 @pytest.mark.parametrize("lower", [WIDE, -0.05])
 @pytest.mark.parametrize("seed", range(3))
 def test_unilateral_solve_against_a_general_minimiser(seed, lower):
-    """Against L-BFGS-B on the exact convex function. It stops at a gradient of 1e-10; curvature is at least α = 0.05, so y is within 2e-9 · √N."""
+    """Against L-BFGS-B on the exact convex function. It stops at a gradient of 1e-10; curvature is
+    at least α = 0.05, so y is within 2e-9 · √N."""
     p = Problem.random(seed, [12, 1, 20], 7, lower=lower)
-    gap = p.gap + 0.15 * (np.random.default_rng(seed).uniform(size=len(p.gap)) < 0.5)  # some rows apart at first
+    # some rows apart at first
+    gap = p.gap + 0.15 * (np.random.default_rng(seed).uniform(size=len(p.gap)) < 0.5)
     p = Problem(**{**vars(p), "gap": gap})
     y, report = p.solved(True)
     bounds = [(p.lower[k // 7] if k % 7 == 6 else None, None) for k in range(y.size)]
     options = {"maxiter": 20_000, "maxfun": 40_000, "ftol": 1e-30, "gtol": 1e-10, "maxcor": 50}
-    found = minimize(pushing_energy(p), np.zeros(y.size), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    found = minimize(
+        pushing_energy(p),
+        np.zeros(y.size),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options=options,
+    )
     assert (report.status == CONVERGED).all()
     left = p.gap - p.dense @ y.ravel()
     assert 0 < (left < 0).sum() < len(left), "some rows must push and some not"
@@ -166,11 +209,13 @@ def test_unilateral_solve_against_a_general_minimiser(seed, lower):
 @pytest.mark.parametrize("degrees", [4, 7])
 @pytest.mark.parametrize("seed", range(4))
 def test_contacts_that_just_touch_do_not_take_turns(seed, degrees, lower, dtype, device):
-    """Nearly hard contacts of which many just touch: the overlapping ones, once solved for, drive the others in, and those, once solved for, drive
-    the first ones back. The solve to 0.3 % gets there all the same, within the iterations that any solve has.
+    """Nearly hard contacts of which many just touch: the overlapping ones, once solved for, drive
+    the others in, and those, once solved for, drive the first ones back. The solve to 0.3 % gets
+    there all the same, within the iterations that any solve has.
 
-    What is minimised is then within 1e-3 of what it was at rest from its least: (0.3 %)², a hundred times over, since residuals are what cells would
-    move by alone, and contacts a thousand times as stiff as drag make them lean on one another.
+    What is minimised is then within 1e-3 of what it was at rest from its least: (0.3 %)², a hundred
+    times over, since residuals are what cells would move by alone, and contacts a thousand times as
+    stiff as drag make them lean on one another.
     """
     p = Problem.random(seed, [30, 12], degrees, lower=lower)
     touching = np.random.default_rng(seed).uniform(size=len(p.gap)) < 0.6
@@ -186,7 +231,8 @@ def test_contacts_that_just_touch_do_not_take_turns(seed, degrees, lower, dtype,
 
 @MODES
 def test_force_already_spent_is_not_spent_again(unilateral):
-    """Rows whose force `held` has acted in an earlier pass: the minimum is that of the function with their work added."""
+    """Rows whose force `held` has acted in an earlier pass: the minimum is that of the function
+    with their work added."""
     p = Problem.random(5, [15], 7)
     held = np.where(np.arange(len(p.gap)) % 3 == 0, 0.5 * p.gap, 0.0)
     y, report = p.solved(unilateral, held=held)
@@ -201,8 +247,9 @@ def test_force_already_spent_is_not_spent_again(unilateral):
 
 @MODES
 def test_reported_residual_is_the_true_one(unilateral, dtype, device):
-    """Recomputed here: the worst residual of each colony, preconditioned by the rows that act, relative to the worst at rest, over the free
-    degrees of freedom. float32 sums of twenty terms: 1e-5 of the start.
+    """Recomputed here: the worst residual of each colony, preconditioned by the rows that act,
+    relative to the worst at rest, over the free degrees of freedom. float32 sums of twenty terms:
+    1e-5 of the start.
     """
     p = Problem.random(6, [15, 10], 7)
     y, report = p.solved(unilateral, tolerance=1e-3, dtype=dtype, device=device)
@@ -213,20 +260,30 @@ def test_reported_residual_is_the_true_one(unilateral, dtype, device):
 
     def preconditioned(slope, acting):
         blocks = (j * acting[:, None]).reshape(len(j), len(p.scale), 7)
-        return np.stack([np.linalg.solve(b.T @ b + a * np.eye(7), s) for b, a, s in zip(blocks.transpose(1, 0, 2), p.alpha, slope, strict=True)])
+        return np.stack(
+            [
+                np.linalg.solve(b.T @ b + a * np.eye(7), s)
+                for b, a, s in zip(blocks.transpose(1, 0, 2), p.alpha, slope, strict=True)
+            ]
+        )
 
-    worst = np.abs(preconditioned((p.weight * y.ravel() - j.T @ (left * active)).reshape(y.shape), active)).max(1)
+    worst = np.abs(
+        preconditioned((p.weight * y.ravel() - j.T @ (left * active)).reshape(y.shape), active)
+    ).max(1)
     rest = np.abs(preconditioned((-j.T @ np.minimum(p.gap, 0)).reshape(y.shape), start)).max(1)
     for colony in range(2):
         expected = worst[p.colony == colony].max() / rest[p.colony == colony].max()
-        assert float(report.residual[colony]) == pytest.approx(expected, rel=1e-3, abs={torch.float32: 1e-5, torch.float64: 1e-12}[dtype])
+        assert float(report.residual[colony]) == pytest.approx(
+            expected, rel=1e-3, abs={torch.float32: 1e-5, torch.float64: 1e-12}[dtype]
+        )
         assert expected <= 1e-3 * 1.01
     assert (report.status == CONVERGED).all()
 
 
 @MODES
 def test_each_colony_converges_by_itself(unilateral, dtype, device):
-    """Colonies of very different stiffness: each has, in the batch, the solution and the iterations that it has alone, bitwise."""
+    """Colonies of very different stiffness: each has, in the batch, the solution and the iterations
+    that it has alone, bitwise."""
     p = Problem.random(7, [10, 25, 4], 7)
     alpha = p.alpha * np.array([1.0, 1e-3, 10.0])[p.colony]
     p = Problem(**{**vars(p), "alpha": alpha})
@@ -236,9 +293,18 @@ def test_each_colony_converges_by_itself(unilateral, dtype, device):
         mine, own = p.colony == colony, np.flatnonzero(p.colony == colony)
         pairs, walls = mine[p.first], mine[p.at_wall]
         alone = Problem(
-            p.first[pairs] - own[0], p.second[pairs] - own[0], p.at_wall[walls] - own[0], p.half_rows[pairs], p.wall_rows[walls],
-            p.gap[np.concatenate([pairs, walls])], p.alpha[mine], p.lower[mine], p.scale[mine], np.zeros(len(own), dtype=int), 1,
-        )  # fmt: skip
+            p.first[pairs] - own[0],
+            p.second[pairs] - own[0],
+            p.at_wall[walls] - own[0],
+            p.half_rows[pairs],
+            p.wall_rows[walls],
+            p.gap[np.concatenate([pairs, walls])],
+            p.alpha[mine],
+            p.lower[mine],
+            p.scale[mine],
+            np.zeros(len(own), dtype=int),
+            1,
+        )
         found, its = alone.solved(unilateral, tolerance=1e-5, dtype=dtype, device=device)
         assert (found == y[mine]).all()
         assert int(its.iterations[0]) == int(report.iterations[colony])
@@ -266,7 +332,8 @@ def test_a_start_from_the_answer_costs_nothing(unilateral):
 @MODES
 @pytest.mark.parametrize("alpha", [0.1, 0.01])
 def test_two_capsules_side_by_side(unilateral, dtype, device, alpha):
-    """Two side-by-side capsules, one solve: residual overlap fraction m/(2 + m), m = α μ L. 1e-4 is the solve's tolerance."""
+    """Two side-by-side capsules, one solve: residual overlap fraction m/(2 + m), m = α μ L. 1e-4 is
+    the solve's tolerance."""
     scene = tf.Scene(mechanics(alpha=alpha, passes=1, unilateral=unilateral))
     start = seeded(scene, tf.Cells([[0, 0, 0], [0, 0.9, 0]], [X, X], 2.0), device, dtype)
     pair = np.array([[0, 1]])
@@ -278,46 +345,72 @@ def test_two_capsules_side_by_side(unilateral, dtype, device, alpha):
 @MODES
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_cell_ends_shorter_than_before_it_grew(unilateral, dtype, device, dim):
-    """Mechanics may hold growth back, all of it, but never shorten a cell. Ten steps in a closed box, so that most is held back.
+    """Mechanics may hold growth back, all of it, but never shorten a cell. Ten steps in a closed
+    box, so that most is held back.
 
-    What is held back is length + e − e, which in float32 comes back to within one unit of the last place, 2.4e-7 at 2 to 4 µm.
+    What is held back is length + e − e, which in float32 comes back to within one unit of the last
+    place, 2.4e-7 at 2 to 4 µm.
     """
     walls = [tf.Box(low=(-0.6, -0.6, -0.6)[:dim], high=(17.0, 5.5, 5.5)[:dim])]
-    scene = tf.Scene(growth(), mechanics(dim=dim, unilateral=unilateral, walls=walls, tolerance=1e-3))
-    state = seeded(scene, crowd(np.random.default_rng(2), 36 if dim == 2 else 125, dim), device, dtype)
+    scene = tf.Scene(
+        growth(), mechanics(dim=dim, unilateral=unilateral, walls=walls, tolerance=1e-3)
+    )
+    state = seeded(
+        scene, crowd(np.random.default_rng(2), 36 if dim == 2 else 125, dim), device, dtype
+    )
     held = 0
     for _ in range(10):
         before = state.length
         state = scene.step(state, 0.02)
-        assert float((before - state.length).max()) <= {torch.float32: 2.4e-7, torch.float64: 4.5e-16}[dtype]
+        assert (
+            float((before - state.length).max())
+            <= {torch.float32: 2.4e-7, torch.float64: 4.5e-16}[dtype]
+        )
         held += int((state.length - before < 1e-3 * before).sum())
-        assert float((state.length - before - state.elongation).abs().max()) <= {torch.float32: 5e-7, torch.float64: 1e-15}[dtype]
+        assert (
+            float((state.length - before - state.elongation).abs().max())
+            <= {torch.float32: 5e-7, torch.float64: 1e-15}[dtype]
+        )
     assert held > 0
 
 
 @MODES
-@pytest.mark.parametrize("name, bad", [("position", "nan"), ("position", "inf"), ("axis", "nan"), ("axis", "inf"), ("length", "nan")])
+@pytest.mark.parametrize(
+    "name, bad",
+    [("position", "nan"), ("position", "inf"), ("axis", "nan"), ("axis", "inf"), ("length", "nan")],
+)
 def test_a_broken_colony_is_reported_and_harms_no_other(unilateral, dtype, device, name, bad):
-    """Coordinates that are not finite: that colony's status is NOT_FINITE, the others converge and are, bitwise, as without it."""
+    """Coordinates that are not finite: that colony's status is NOT_FINITE, the others converge and
+    are, bitwise, as without it."""
     rng = np.random.default_rng(3)
     parts = [crowd(rng, n, 3) for n in (12, 9, 15)]
-    join = lambda what: np.concatenate([getattr(p, what) for p in parts])  # noqa: E731
+    join = lambda what: np.concatenate([getattr(p, what) for p in parts])
     scene = tf.Scene(growth(), mechanics(unilateral=unilateral))
-    cells = tf.Cells(join("position"), join("axis"), join("length"), 0.5, colony=np.repeat([0, 1, 2], [12, 9, 15]))
+    cells = tf.Cells(
+        join("position"),
+        join("axis"),
+        join("length"),
+        0.5,
+        colony=np.repeat([0, 1, 2], [12, 9, 15]),
+    )
     start = seeded(scene, cells, device, dtype)
     broken = getattr(start, name).clone()
     broken[15] = float(bad)
     state = scene.step(start.replace(**{name: broken}), 0.01)
     assert state.reports["mechanics"].status.tolist() == [CONVERGED, NOT_FINITE, CONVERGED]
     sound = scene.step(start.select([0, 2]), 0.01)
-    assert torch.equal(sound.reports["mechanics"].iterations, state.reports["mechanics"].iterations[[0, 2]])
+    assert torch.equal(
+        sound.reports["mechanics"].iterations, state.reports["mechanics"].iterations[[0, 2]]
+    )
     for what in ("position", "axis", "length", "displacement"):
         assert torch.equal(getattr(sound, what), getattr(state.select([0, 2]), what)), what
 
 
 def test_the_driver_names_the_broken_colony(dtype, device):
     scene = tf.Scene(growth(), mechanics())
-    start = seeded(scene, tf.Cells(np.zeros((3, 3)), [X, Y, Z], 2.0, colony=[0, 1, 2]), device, dtype)
+    start = seeded(
+        scene, tf.Cells(np.zeros((3, 3)), [X, Y, Z], 2.0, colony=[0, 1, 2]), device, dtype
+    )
     broken = start.position.clone()
     broken[1] = torch.nan
     start = start.replace(position=broken)
@@ -331,16 +424,28 @@ def test_the_driver_names_the_broken_colony(dtype, device):
 
 @MODES
 def test_gradient_through_the_solve(unilateral):
-    """Two overlapping cells and a wall: the gradient of where they end, by the adjoint, against differences of the whole step.
+    """Two overlapping cells and a wall: the gradient of where they end, by the adjoint, against
+    differences of the whole step.
 
     float64, solved to 1e-12; differences with h = 1e-5 are good to 1e-9.
     """
-    scene = tf.Scene(mechanics(unilateral=unilateral, passes=1, tolerance=1e-12, walls=[tf.Plane(y=-0.45, facing="+y")]))
-    start = seeded(scene, tf.Cells([[0, 0, 0], [0.4, 0.8, 0.1]], [X, X + 0.3 * Y + 0.1 * Z], [2.0, 2.2]), torch.device("cpu"), torch.float64)
+    scene = tf.Scene(
+        mechanics(
+            unilateral=unilateral, passes=1, tolerance=1e-12, walls=[tf.Plane(y=-0.45, facing="+y")]
+        )
+    )
+    start = seeded(
+        scene,
+        tf.Cells([[0, 0, 0], [0.4, 0.8, 0.1]], [X, X + 0.3 * Y + 0.1 * Z], [2.0, 2.2]),
+        torch.device("cpu"),
+        torch.float64,
+    )
     goal = torch.tensor(np.random.default_rng(4).normal(size=(2, 3)))
 
     def outcome(position, length):
-        return (scene.step(start.replace(position=position, length=length), 0.01).position * goal).sum()
+        return (
+            scene.step(start.replace(position=position, length=length), 0.01).position * goal
+        ).sum()
 
     place, length = start.position.clone().requires_grad_(), start.length.clone().requires_grad_()
     by_place, by_length = torch.autograd.grad(outcome(place, length), (place, length))
@@ -352,4 +457,6 @@ def test_gradient_through_the_solve(unilateral):
                     given = {"position": start.position.clone(), "length": start.length.clone()}
                     given[name].view(-1)[k] += h
                     ends.append(float(outcome(**given)))
-                assert float(found.view(-1)[k]) == pytest.approx((ends[0] - ends[1]) / 2e-5, abs=1e-7), (name, k)
+                assert float(found.view(-1)[k]) == pytest.approx(
+                    (ends[0] - ends[1]) / 2e-5, abs=1e-7
+                ), (name, k)

@@ -29,11 +29,14 @@ WALLS_2D = {
     "outside a circle": tf.Sphere(center=(0.2, 0.0), radius=1.5, inside=False),
     "channel": tf.Channel(width=2.0, high_end=2.0),
 }
-ALL = [pytest.param(3, w, id=f"3-D {n}") for n, w in WALLS_3D.items()] + [pytest.param(2, w, id=f"2-D {n}") for n, w in WALLS_2D.items()]
+ALL = [pytest.param(3, w, id=f"3-D {n}") for n, w in WALLS_3D.items()] + [
+    pytest.param(2, w, id=f"2-D {n}") for n, w in WALLS_2D.items()
+]
 
 
 def distance(wall: tf.Plane, p: np.ndarray) -> np.ndarray:
-    """Signed distance (..., surfaces) of points (..., d) to each surface of the wall, written out from what the wall says of itself."""
+    """Signed distance (..., surfaces) of points (..., d) to each surface of the wall, written out
+    from what the wall says of itself."""
     if isinstance(wall, tf.Sphere):
         away = np.linalg.norm(p - np.array(wall.center), axis=-1)
         return (wall.radius - away if wall.inside else away - wall.radius)[..., None]
@@ -42,7 +45,9 @@ def distance(wall: tf.Plane, p: np.ndarray) -> np.ndarray:
             n = np.array(wall.normal) / np.linalg.norm(wall.normal)
             return ((p - np.array(wall.point)) @ n)[..., None]
         k = "xyz".index(wall.facing[1])
-        return ((p[..., k] - getattr(wall, wall.facing[1])) * (1 if wall.facing[0] == "+" else -1))[..., None]
+        return ((p[..., k] - getattr(wall, wall.facing[1])) * (1 if wall.facing[0] == "+" else -1))[
+            ..., None
+        ]
     if isinstance(wall, tf.Box):
         low, high = np.array(wall.low), np.array(wall.high)
     else:
@@ -56,45 +61,74 @@ def distance(wall: tf.Plane, p: np.ndarray) -> np.ndarray:
 class Rods:
     """Rods at random about the origin, and the rows that a wall gives them."""
 
-    def __init__(self, dim: int, count: int = 300, dtype=torch.float64, device="cpu", seed: int = 1):
+    def __init__(
+        self, dim: int, count: int = 300, dtype=torch.float64, device="cpu", seed: int = 1
+    ):
         rng = np.random.default_rng(seed)
-        t = lambda x, kind: torch.as_tensor(x, dtype=kind, device=device)  # noqa: E731
+        t = lambda x, kind: torch.as_tensor(x, dtype=kind, device=device)
         self.position = t(rng.uniform(-2, 2, (count, dim)), torch.float64)
-        self.axis, self.length = t(unit(rng, count, dim), dtype), t(rng.uniform(0.5, 3, count), dtype)
+        self.axis, self.length = (
+            t(unit(rng, count, dim), dtype),
+            t(rng.uniform(0.5, 3, count), dtype),
+        )
         self.radius = torch.full_like(self.length, 0.5)
         self.colony = torch.zeros(count, dtype=torch.int64, device=device)
 
     def rows(self, wall):
-        return find_wall_contacts(wall.surfaces(self.position.shape[1]), self.position, self.axis, self.length, self.radius, self.colony)
+        return find_wall_contacts(
+            wall.surfaces(self.position.shape[1]),
+            self.position,
+            self.axis,
+            self.length,
+            self.radius,
+            self.colony,
+        )
 
 
 def foot(wall: tf.Sphere, rods: Rods) -> np.ndarray:
-    """Where along each rod, −1 at one end and +1 at the other, it comes nearest to the ball's centre."""
+    """Where along each rod, −1 at one end and +1 at the other, it comes nearest to the ball's
+    centre."""
     along = ((np.array(wall.center) - array(rods.position)) * array(rods.axis)).sum(1)
     return np.clip(along / (0.5 * array(rods.length)), -1, 1)
 
 
 def roots(wall, rods: Rods) -> np.ndarray:
-    """The root of the share that the row of either end has, (2, N): 1, but at a ball, whose nearest point has a row of its own, a half of what the
-    end is away from it; and 1 where the end is the nearest point itself.
+    """The root of the share that the row of either end has, (2, N): 1, but at a ball, whose nearest
+    point has a row of its own, a half of what the end is away from it; and 1 where the end is the
+    nearest point itself.
     """
     if not isinstance(wall, tf.Sphere) or wall.inside:
         return np.ones((2, len(rods.length)))
     at = foot(wall, rods)
-    return np.stack([np.where(at == 1, 1, np.sqrt((1 - at) / 2)), np.where(at == -1, 1, np.sqrt((1 + at) / 2))])
+    return np.stack(
+        [np.where(at == 1, 1, np.sqrt((1 - at) / 2)), np.where(at == -1, 1, np.sqrt((1 + at) / 2))]
+    )
 
 
 @pytest.mark.parametrize("dim, wall", ALL)
 def test_every_overlapping_end_has_a_row(dtype, device, dim, wall):
-    """Gaps of both ends with every surface against the plain formula; rows exactly for those under zero. float32: places of 4 µm to 1e-6."""
+    """Gaps of both ends with every surface against the plain formula; rows exactly for those under
+    zero. float32: places of 4 µm to 1e-6."""
     rods = Rods(dim, dtype=dtype, device=device)
     found = rods.rows(wall)
     half = (0.5 * array(rods.length))[:, None] * array(rods.axis)
     tips = np.stack([array(rods.position) + half, array(rods.position) - half])
     gap = (distance(wall, tips) - 0.5) * roots(wall, rods)[..., None]
-    expected = {(i, k, round(g, 4)) for e in range(2) for i, k in zip(*np.nonzero(gap[e] < 0), strict=True) for g in [gap[e, i, k]]}
+    expected = {
+        (i, k, round(g, 4))
+        for e in range(2)
+        for i, k in zip(*np.nonzero(gap[e] < 0), strict=True)
+        for g in [gap[e, i, k]]
+    }
     ends = array(found.row[:, -1]) != 0
-    got = list(zip(array(found.cell)[ends].tolist(), array(found.surface)[ends].tolist(), array(found.gap)[ends].tolist(), strict=True))
+    got = list(
+        zip(
+            array(found.cell)[ends].tolist(),
+            array(found.surface)[ends].tolist(),
+            array(found.gap)[ends].tolist(),
+            strict=True,
+        )
+    )
     assert len(got) == len(expected) and len(got) > 20
     assert bool((found.gap < 0).all())
     for i, k, g in got:
@@ -102,7 +136,8 @@ def test_every_overlapping_end_has_a_row(dtype, device, dim, wall):
 
 
 def marked_gaps(rods: Rods, wall, dof: int, by: float, cell, surface, s, end) -> np.ndarray:
-    """Gap of one marked point of each row's cell (at s from the centre, riding along with an end as the cell grows), after a small move."""
+    """Gap of one marked point of each row's cell (at s from the centre, riding along with an end as
+    the cell grows), after a small move."""
     dim, turns = rods.position.shape[1], 1 if rods.position.shape[1] == 2 else 3
     c, a = rods.position[cell].clone(), rods.axis[cell].clone()
     if dof < dim:
@@ -117,7 +152,8 @@ def marked_gaps(rods: Rods, wall, dof: int, by: float, cell, surface, s, end) ->
 
 @pytest.mark.parametrize("dim, wall", ALL)
 def test_rows_are_the_derivative_of_the_gap(dim, wall):
-    """Gap after a small move x: gap − row · x. Central differences in float64, h = 1e-6: rounding 1e-10, curvature 1e-12."""
+    """Gap after a small move x: gap − row · x. Central differences in float64, h = 1e-6: rounding
+    1e-10, curvature 1e-12."""
     rods, h = Rods(dim), 1e-6
     found = rods.rows(wall)
     cell, surface, row = array(found.cell), array(found.surface), array(found.row)
@@ -130,9 +166,21 @@ def test_rows_are_the_derivative_of_the_gap(dim, wall):
         nearest = foot(wall, rods)[cell] * half
         places, ends = np.concatenate([places, nearest[None]]), np.array([1.0, -1.0, 0.0])
         shares = np.concatenate([shares, np.ones((1, len(cell)))])
-    gaps = np.stack([distance(wall, c + s[:, None] * a)[np.arange(len(cell)), surface] - 0.5 for s in places]) * shares
+    gaps = (
+        np.stack(
+            [
+                distance(wall, c + s[:, None] * a)[np.arange(len(cell)), surface] - 0.5
+                for s in places
+            ]
+        )
+        * shares
+    )
     pick = np.abs(gaps - array(found.gap)).argmin(0)
-    s, end, root = places[pick, np.arange(len(cell))], ends[pick], shares[pick, np.arange(len(cell))]
+    s, end, root = (
+        places[pick, np.arange(len(cell))],
+        ends[pick],
+        shares[pick, np.arange(len(cell))],
+    )
     assert np.abs(gaps[pick, np.arange(len(cell))] - array(found.gap)).max() <= 1e-12
     for dof in range(row.shape[1]):
         up, down = (marked_gaps(rods, wall, dof, x, cell, surface, s, end) for x in (h, -h))
@@ -141,7 +189,8 @@ def test_rows_are_the_derivative_of_the_gap(dim, wall):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_ball_in_the_way_is_met_between_the_ends(dtype, device, dim):
-    """A rod lying on a small ball: neither end touches, the middle does, and is pushed straight away without a torque to speak of."""
+    """A rod lying on a small ball: neither end touches, the middle does, and is pushed straight
+    away without a torque to speak of."""
     center = (0.1, -0.9, 0.0)[:dim]
     rods = Rods(dim, 1, dtype, device)
     rods.position[:] = 0.0
@@ -160,7 +209,9 @@ def test_a_ball_in_the_way_is_met_between_the_ends(dtype, device, dim):
 def force(rods: Rods, wall) -> torch.Tensor:
     """What the wall's rows push each rod with at rest, gap times row summed, (N, D)."""
     found = rods.rows(wall)
-    total = torch.zeros(len(rods.length), found.row.shape[1], dtype=found.row.dtype, device=found.row.device)
+    total = torch.zeros(
+        len(rods.length), found.row.shape[1], dtype=found.row.dtype, device=found.row.device
+    )
     return total.index_add(0, found.cell, found.gap.unsqueeze(1) * found.row)
 
 
@@ -168,9 +219,11 @@ def force(rods: Rods, wall) -> torch.Tensor:
 @pytest.mark.parametrize("radius", [0.5, 3.0, 20.0])
 @pytest.mark.parametrize("way", ["shift", "turn"])
 def test_the_force_of_a_ball_never_jumps(dtype, device, dim, radius, way):
-    """A rod of 2 µm, 0.3 µm deep, shifted past a ball end to end and over, or turned, its end near the ball, until the end is nearest: force, torque
-    and push on the length change by at most 1e-3 from one of 8,001 places to the next (as in hard case 3). The path itself changes them by half of
-    that: 7.5e-4 µm at slopes up to 0.5 (0.3 µm over the ball's radius), or 1e-4 rad at slopes up to 5 µm² (two ends, levers and depths of 1 µm).
+    """A rod of 2 µm, 0.3 µm deep, shifted past a ball end to end and over, or turned, its end near
+    the ball, until the end is nearest: force, torque and push on the length change by at most 1e-3
+    from one of 8,001 places to the next (as in hard case 3). The path itself changes them by half
+    of that: 7.5e-4 µm at slopes up to 0.5 (0.3 µm over the ball's radius), or 1e-4 rad at slopes up
+    to 5 µm² (two ends, levers and depths of 1 µm).
     """
     count, t = 8001, torch.linspace(-1, 1, 8001, dtype=torch.float64, device=device)
     rods = Rods(dim, count, dtype, device)
@@ -180,18 +233,26 @@ def test_the_force_of_a_ball_never_jumps(dtype, device, dim, radius, way):
         rods.position[:, 0] = 3.0 * t
     else:
         rods.position[:, 0] = 0.8
-        rods.axis[:, 0], rods.axis[:, 1] = torch.cos(0.4 * t).to(dtype), torch.sin(0.4 * t).to(dtype)
+        rods.axis[:, 0], rods.axis[:, 1] = (
+            torch.cos(0.4 * t).to(dtype),
+            torch.sin(0.4 * t).to(dtype),
+        )
     ball = tf.Sphere(center=(0.0, -0.2 - radius, 0.0)[:dim], radius=radius, inside=False)
     found = force(rods, ball)
     at = foot(ball, rods)
-    assert at.min() == -1 and np.abs(at).min() < 0.9, "the nearest point should come from between the ends to an end"
-    assert float(found[count // 2, :dim].norm()) >= 0.3 - 1e-6, "the nearest point alone pushes with its overlap"
+    assert at.min() == -1 and np.abs(at).min() < 0.9, (
+        "the nearest point should come from between the ends to an end"
+    )
+    assert float(found[count // 2, :dim].norm()) >= 0.3 - 1e-6, (
+        "the nearest point alone pushes with its overlap"
+    )
     assert float((found[1:] - found[:-1]).abs().max()) <= 1e-3
 
 
 @pytest.mark.parametrize("length", [0.0, 2.0])
 def test_a_very_large_ball_is_a_plane_to_a_rod_that_stands_askew(dtype, device, length):
-    """Both ends overlap, one is nearest: rows as at a plane. A ball of 1e5 µm differs from one by 1e-5 over 1 µm, and its distances by float64's 1e-11."""
+    """Both ends overlap, one is nearest: rows as at a plane. A ball of 1e5 µm differs from one by
+    1e-5 over 1 µm, and its distances by float64's 1e-11."""
     rods = Rods(3, 1, dtype, device)
     rods.position[:], rods.length[:] = 0.0, length
     rods.axis[:] = torch.tensor([math.cos(0.1), 0.0, math.sin(0.1)])
@@ -204,7 +265,14 @@ def test_a_very_large_ball_is_a_plane_to_a_rod_that_stands_askew(dtype, device, 
 def test_a_box_is_its_planes(dtype, device):
     rods = Rods(3, dtype=dtype, device=device)
     box = rods.rows(tf.Box(low=(-1, -2, -INF), high=(1, INF, INF)))
-    planes = [rods.rows(p) for p in (tf.Plane(x=-1.0, facing="+x"), tf.Plane(x=1.0, facing="-x"), tf.Plane(y=-2.0, facing="+y"))]
+    planes = [
+        rods.rows(p)
+        for p in (
+            tf.Plane(x=-1.0, facing="+x"),
+            tf.Plane(x=1.0, facing="-x"),
+            tf.Plane(y=-2.0, facing="+y"),
+        )
+    ]
     assert torch.equal(box.cell, torch.cat([p.cell for p in planes]))
     assert torch.equal(box.gap, torch.cat([p.gap for p in planes]))
     assert torch.equal(box.row, torch.cat([p.row for p in planes]))
@@ -238,24 +306,35 @@ def vectors(kind: str, dim: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("kind", list(MOVED))
-@pytest.mark.parametrize("give", [lambda v: v, lambda v: v.numpy(), lambda v: v.tolist()], ids=["tensor", "array", "list"])
+@pytest.mark.parametrize(
+    "give",
+    [lambda v: v, lambda v: v.numpy(), lambda v: v.tolist()],
+    ids=["tensor", "array", "list"],
+)
 def test_a_vector_for_each_colony_is_each_colonys_own(dtype, device, dim, kind, give):
-    """Each colony's rows are, bit for bit, those at a wall made from its own vector alone, however that is given."""
+    """Each colony's rows are, bit for bit, those at a wall made from its own vector alone, however
+    that is given."""
     rods, given = Rods(dim, 90, dtype, device), vectors(kind, dim)
     rods.colony = torch.arange(90, device=device) // 30
     together = rods.rows(MOVED[kind](give(given)))
     for k in range(3):
         alone = rods.rows(MOVED[kind](give(given)[k]))
-        mine, own = (torch.nonzero(rods.colony.index_select(0, x.cell) == k).squeeze(1) for x in (together, alone))
+        mine, own = (
+            torch.nonzero(rods.colony.index_select(0, x.cell) == k).squeeze(1)
+            for x in (together, alone)
+        )
         assert own.numel() > 5
         for name in ("cell", "gap", "row", "surface"):
-            assert torch.equal(getattr(together.take(mine), name), getattr(alone.take(own), name)), name
+            assert torch.equal(
+                getattr(together.take(mine), name), getattr(alone.take(own), name)
+            ), name
 
 
 @pytest.mark.parametrize("kind", list(MOVED))
 @pytest.mark.parametrize("each", [True, False], ids=["per colony", "one"])
 def test_gradients_to_a_walls_vector(kind, each):
-    """Of gaps and rows, by central differences in float64: h = 1e-6 leaves 1e-9 of rounding and curvature; no rod crosses a switch within h."""
+    """Of gaps and rows, by central differences in float64: h = 1e-6 leaves 1e-9 of rounding and
+    curvature; no rod crosses a switch within h."""
     rods = Rods(3, 90)
     rods.colony = torch.arange(90) // 30 if each else torch.zeros(90, dtype=torch.int64)
     mix = torch.linspace(0.5, 1.5, 7, dtype=torch.float64)
@@ -297,7 +376,8 @@ def test_a_vector_changed_in_place_moves_the_wall(kind):
 
 
 def test_a_scene_counts_a_walls_vectors():
-    """Vectors for two colonies in a batch of three, or of one: refused by name before anything runs."""
+    """Vectors for two colonies in a batch of three, or of one: refused by name before anything
+    runs."""
     scene = tf.Scene(tf.Mechanics(walls=[tf.Sphere(center=[[0.0, 0, 0], [0.1, 0, 0]], radius=5.0)]))
     assert scene.seed(2).colonies == 2
     for count in (1, 3):
@@ -309,10 +389,13 @@ def test_a_scene_counts_a_walls_vectors():
 
 @pytest.mark.parametrize("dim, wall", ALL)
 def test_deepest_is_the_least_distance_along_the_cell(dim, wall):
-    """Against 2,001 points along each rod of up to 3 µm: a sample lies within 7.5e-4 µm, and a distance changes no faster than its point moves."""
+    """Against 2,001 points along each rod of up to 3 µm: a sample lies within 7.5e-4 µm, and a
+    distance changes no faster than its point moves."""
     rods = Rods(dim)
     half = 0.5 * rods.length
-    samples = array(rods.position) + np.linspace(-1, 1, 2001)[:, None, None] * array(half)[:, None] * array(rods.axis)
+    samples = array(rods.position) + np.linspace(-1, 1, 2001)[:, None, None] * array(half)[
+        :, None
+    ] * array(rods.axis)
     for number, surface in enumerate(wall.surfaces(dim)):
         s = surface.deepest(rods.position, rods.axis, half, rods.colony)
         assert bool((s.abs() <= half).all())
@@ -345,9 +428,12 @@ def test_no_row_where_there_is_room(dim, wall):
 )
 @pytest.mark.slow
 def test_a_growing_cell_stays_inside(dtype, device, wall, start):
-    """One cell of 2 µm grows to fill 6 µm of room and stops; hard walls give way by αγ e, which is e = 0.05 µm at l = 5, over a cosine."""
+    """One cell of 2 µm grows to fill 6 µm of room and stops; hard walls give way by αγ e, which is
+    e = 0.05 µm at l = 5, over a cosine."""
     scene = tf.Scene(growth(), mechanics(walls=[wall]))
-    state = run(scene, seeded(scene, tf.Cells([start], [[1.0, 0.05, 0.0]], 2.0), device, dtype), 150)
+    state = run(
+        scene, seeded(scene, tf.Cells([start], [[1.0, 0.05, 0.0]], 2.0), device, dtype), 150
+    )
     assert 4.5 < float(state.length) < 5.3
     half = 0.5 * array(state.length)[:, None] * array(state.axis)
     room = distance(wall, array(state.position) + np.array([-1, 1])[:, None, None] * half) - 0.5

@@ -1,4 +1,5 @@
-"""Reading and writing: interpolation, its adjoint, what may be taken, and what must never be lost."""
+"""Reading and writing: interpolation, its adjoint, what may be taken, and what must never be
+lost."""
 
 from __future__ import annotations
 
@@ -23,18 +24,25 @@ def grid(shapes, device="cpu") -> Grid:
 
 
 def scattered(g: Grid, each: int, seed: int = 0, beyond: float = 0.0):
-    """`each` cells in every colony, at random in its box (or `beyond` it by that part of its size), in no order of place."""
+    """`each` cells in every colony, at random in its box (or `beyond` it by that part of its size),
+    in no order of place."""
     rng = np.random.default_rng(seed)
     colony = torch.arange(g.colonies, device=g.origin.device).repeat_interleave(each)
-    part = torch.as_tensor(rng.uniform(-beyond, 1 + beyond, (len(colony), 3)), device=g.origin.device)
+    part = torch.as_tensor(
+        rng.uniform(-beyond, 1 + beyond, (len(colony), 3)), device=g.origin.device
+    )
     return g.origin[colony] + part * (g.high - g.origin)[colony], colony
 
 
 def random_values(g: Grid, dtype, seed: int = 1):
-    return torch.as_tensor(np.random.default_rng(seed).uniform(0, 2, g.nodes), dtype=dtype, device=g.origin.device)
+    return torch.as_tensor(
+        np.random.default_rng(seed).uniform(0, 2, g.nodes), dtype=dtype, device=g.origin.device
+    )
 
 
-def interpolated(g: Grid, values: np.ndarray, position: np.ndarray, periodic=(False,) * 3) -> np.ndarray:
+def interpolated(
+    g: Grid, values: np.ndarray, position: np.ndarray, periodic=(False,) * 3
+) -> np.ndarray:
     """Trilinear interpolation of one colony's values, cell by cell and corner by corner."""
     n, out = np.array(g.shapes[0]), []
     values = values.reshape(n)
@@ -47,7 +55,9 @@ def interpolated(g: Grid, values: np.ndarray, position: np.ndarray, periodic=(Fa
                 a = at[k] if periodic[k] else min(max(at[k], 0.0), n[k] - 1.0)
                 base = int(np.floor(a))
                 weight *= (a - base) if corner[k] else 1 - (a - base)
-                place.append((base + corner[k]) % n[k] if periodic[k] else min(base + corner[k], n[k] - 1))
+                place.append(
+                    (base + corner[k]) % n[k] if periodic[k] else min(base + corner[k], n[k] - 1)
+                )
             total += weight * values[tuple(place)]
         out.append(total)
     return np.array(out)
@@ -63,7 +73,10 @@ def test_reading_is_trilinear_interpolation(device, dtype, shape, periodic):
     assert found.node.shape == (200, 2 ** sum(n > 1 for n in shape))
     expected = interpolated(g, values.cpu().double().numpy(), position.cpu().numpy(), periodic)
     # values up to 2, eight weights: a dozen roundings
-    assert np.abs(read(values, found).cpu().double().numpy() - expected).max() <= 24 * torch.finfo(dtype).eps
+    assert (
+        np.abs(read(values, found).cpu().double().numpy() - expected).max()
+        <= 24 * torch.finfo(dtype).eps
+    )
 
 
 @ALL
@@ -81,7 +94,10 @@ def test_writing_is_the_adjoint_of_reading(device, shape):
     """⟨write(a), v⟩ · voxel volume = ⟨a, read(v)⟩ for what is secreted; float64."""
     g = grid([shape, shape], device)
     found = stencil(g, *scattered(g, 100))
-    values, amount = random_values(g, torch.float64), torch.rand(200, dtype=torch.float64, device=device)
+    values, amount = (
+        random_values(g, torch.float64),
+        torch.rand(200, dtype=torch.float64, device=device),
+    )
     zero = torch.zeros_like(values)
     left = (write(zero, amount, found) * values).sum() * g.voxel_volume
     right = (amount * read(values, found)).sum()
@@ -90,50 +106,86 @@ def test_writing_is_the_adjoint_of_reading(device, shape):
     # and in a flat field for what is taken up, too
     flat = torch.full_like(values, 3.0)
     small = -1e-3 * amount
-    assert torch.allclose(write(flat, small, found) - flat, write(zero, -small, found).neg(), rtol=1e-9, atol=1e-14)
+    assert torch.allclose(
+        write(flat, small, found) - flat, write(zero, -small, found).neg(), rtol=1e-9, atol=1e-14
+    )
 
 
 def test_a_cell_alone_may_empty_its_voxel_and_a_crowd_shares(device, dtype):
-    """W cells at one centre each have 1/W of the voxel; a cell alone all of its voxel, and between centres, where it reads
-    and shares more than one, as much as leaves the nearest voxel what it has."""
+    """W cells at one centre each have 1/W of the voxel; a cell alone all of its voxel, and between
+    centres, where it reads and shares more than one, as much as leaves the nearest voxel what it
+    has."""
     g = grid([(5, 4, 6)], device)
     centre = g.centres()[37].expand(7, 3)
     found = stencil(g, centre, torch.zeros(7, dtype=torch.int64, device=device), dtype=dtype)
-    assert torch.allclose(pool_volume(found), torch.full((7,), g.voxel_volume / 7, dtype=dtype, device=device), rtol=1e-6)
-    alone = stencil(g, centre[:1] + 0.1, torch.zeros(1, dtype=torch.int64, device=device), dtype=dtype)
-    assert float(pool_volume(alone)) == pytest.approx(g.voxel_volume / float(alone.weight.max()), rel=1e-6)
+    assert torch.allclose(
+        pool_volume(found),
+        torch.full((7,), g.voxel_volume / 7, dtype=dtype, device=device),
+        rtol=1e-6,
+    )
+    alone = stencil(
+        g, centre[:1] + 0.1, torch.zeros(1, dtype=torch.int64, device=device), dtype=dtype
+    )
+    assert float(pool_volume(alone)) == pytest.approx(
+        g.voxel_volume / float(alone.weight.max()), rel=1e-6
+    )
     emptied = write(torch.ones(g.nodes, dtype=dtype, device=device), -pool_volume(alone), alone)
     assert float(emptied.min()) == pytest.approx(0.0, abs=1e-6) and float(emptied.min()) >= 0.0
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 2**31), cells=st.integers(1, 60), shape=st.sampled_from(list(SHAPES.values())), single=st.booleans(), spots=st.integers(1, 5))
-def test_however_crowded_nothing_goes_below_zero_and_nothing_is_lost(seed, cells, shape, single, spots):
-    """Every cell takes up as much as it may, or secretes: values ≥ 0 exactly; what the grid gains is what the cells give.
+@given(
+    seed=st.integers(0, 2**31),
+    cells=st.integers(1, 60),
+    shape=st.sampled_from(list(SHAPES.values())),
+    single=st.booleans(),
+    spots=st.integers(1, 5),
+)
+def test_however_crowded_nothing_goes_below_zero_and_nothing_is_lost(
+    seed, cells, shape, single, spots
+):
+    """Every cell takes up as much as it may, or secretes: values ≥ 0 exactly; what the grid gains
+    is what the cells give.
 
-    Tolerance: each of at most cells × 8 entries is rounded a few times; against all that is moved or there.
+    Tolerance: each of at most cells × 8 entries is rounded a few times; against all that is moved
+    or there.
     """
     dtype = torch.float32 if single else torch.float64
     rng, g = np.random.default_rng(seed), grid([shape])
     places, _ = scattered(g, spots, seed)
     position = places[torch.as_tensor(rng.integers(0, spots, cells))]
-    values = random_values(g, dtype, seed) * torch.as_tensor(rng.uniform(size=g.nodes) < 0.6, dtype=dtype)
+    values = random_values(g, dtype, seed) * torch.as_tensor(
+        rng.uniform(size=g.nodes) < 0.6, dtype=dtype
+    )
     found = stencil(g, position, torch.zeros(cells, dtype=torch.int64), dtype=dtype)
     most = read(values, found) * pool_volume(found)
-    amount = torch.where(torch.as_tensor(rng.uniform(size=cells) < 0.8), -most, torch.as_tensor(rng.uniform(size=cells), dtype=dtype))
+    amount = torch.where(
+        torch.as_tensor(rng.uniform(size=cells) < 0.8),
+        -most,
+        torch.as_tensor(rng.uniform(size=cells), dtype=dtype),
+    )
     after = write(values, amount, found)
     assert bool((after >= 0).all())
     moved = float(amount.abs().double().sum() + values.double().sum() * g.voxel_volume)
     gained = float((after.double() - values.double()).sum() * g.voxel_volume)
-    assert gained == pytest.approx(float(amount.double().sum()), abs=16 * torch.finfo(dtype).eps * moved)
+    assert gained == pytest.approx(
+        float(amount.double().sum()), abs=16 * torch.finfo(dtype).eps * moved
+    )
 
 
 def test_taking_more_than_is_there_shows(device, dtype):
     """Not a silent loss: a value below zero, or NaN where there was nothing."""
     g = grid([(3, 3, 1)], device)
-    found = stencil(g, g.centres()[4:5], torch.zeros(1, dtype=torch.int64, device=device), dtype=dtype)
+    found = stencil(
+        g, g.centres()[4:5], torch.zeros(1, dtype=torch.int64, device=device), dtype=dtype
+    )
     full = torch.ones(9, dtype=dtype, device=device)
-    assert write(full, torch.full((1,), -1.5 * g.voxel_volume, dtype=dtype, device=device), found).min() < 0
+    assert (
+        write(
+            full, torch.full((1,), -1.5 * g.voxel_volume, dtype=dtype, device=device), found
+        ).min()
+        < 0
+    )
     assert write(0 * full, torch.full((1,), -1.0, dtype=dtype, device=device), found).isnan().any()
     assert torch.equal(write(0 * full, torch.zeros(1, dtype=dtype, device=device), found), 0 * full)
 
@@ -159,13 +211,14 @@ def test_obstacles_take_no_part(device, dtype):
 
 
 def test_the_slope_of_a_reading(device):
-    """d read / d position and d read / d values against central differences in float64: h = 1e-6 of values of order 1, so 1e-9."""
+    """d read / d position and d read / d values against central differences in float64: h = 1e-6 of
+    values of order 1, so 1e-9."""
     g = grid([(5, 4, 6)], device)
     position, colony = scattered(g, 40, seed=3)
     position = position.requires_grad_()
     values = random_values(g, torch.float64).requires_grad_()
     weight = torch.linspace(0.5, 1.5, 40, dtype=torch.float64, device=device)
-    of = lambda p, v: (read(v, stencil(g, p, colony)) * weight).sum()  # noqa: E731
+    of = lambda p, v: (read(v, stencil(g, p, colony)) * weight).sum()
     of(position, values).backward()
     h = 1e-6
     with torch.no_grad():
@@ -173,21 +226,33 @@ def test_the_slope_of_a_reading(device):
             up, down = position.clone(), position.clone()
             up[cell, axis] += h
             down[cell, axis] -= h
-            assert float(position.grad[cell, axis]) == pytest.approx(float(of(up, values) - of(down, values)) / (2 * h), abs=1e-8)
+            assert float(position.grad[cell, axis]) == pytest.approx(
+                float(of(up, values) - of(down, values)) / (2 * h), abs=1e-8
+            )
         node = int(stencil(g, position, colony).node[0, 0])
         up = values.clone()
         up[node] += 1.0
-        assert float(values.grad[node]) == pytest.approx(float(of(position, up) - of(position, values)), abs=1e-12)
+        assert float(values.grad[node]) == pytest.approx(
+            float(of(position, up) - of(position, values)), abs=1e-12
+        )
 
 
 def test_the_slope_of_writing():
-    """Secretion and uptake together, by amount, values and position: finite differences of 1e-6 (gradcheck, float64)."""
+    """Secretion and uptake together, by amount, values and position: finite differences of 1e-6
+    (gradcheck, float64)."""
     g = grid([(3, 2, 2)])
     position, colony = scattered(g, 6, seed=4)
     values = (random_values(g, torch.float64) + 0.5).requires_grad_()
-    amount = (0.05 * torch.tensor([1.0, -1.0, 2.0, -2.0, -1.0, 1.0], dtype=torch.float64)).requires_grad_()
+    amount = (
+        0.05 * torch.tensor([1.0, -1.0, 2.0, -2.0, -1.0, 1.0], dtype=torch.float64)
+    ).requires_grad_()
     position = position.requires_grad_()
-    assert torch.autograd.gradcheck(lambda v, a, p: write(v, a, stencil(g, p, colony)), (values, amount, position), eps=1e-6, atol=1e-6)
+    assert torch.autograd.gradcheck(
+        lambda v, a, p: write(v, a, stencil(g, p, colony)),
+        (values, amount, position),
+        eps=1e-6,
+        atol=1e-6,
+    )
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -197,7 +262,11 @@ def test_a_colony_does_not_see_the_others(device, dtype, masked, deterministic):
     g = grid(shapes, device)
     position, colony = scattered(g, 40, seed=6)
     values = random_values(g, dtype)
-    mask = torch.as_tensor(np.random.default_rng(7).uniform(size=g.nodes) < 0.8, device=device) if masked else None
+    mask = (
+        torch.as_tensor(np.random.default_rng(7).uniform(size=g.nodes) < 0.8, device=device)
+        if masked
+        else None
+    )
 
     def run(grid, position, colony, values, mask):
         found = stencil(grid, position, colony, mask=mask, dtype=dtype)
@@ -208,7 +277,13 @@ def test_a_colony_does_not_see_the_others(device, dtype, masked, deterministic):
     together = run(g, position, colony, values, mask)
     for k in range(len(shapes)):
         own, here = slice(40 * k, 40 * k + 40), slice(int(g.offsets[k]), int(g.offsets[k + 1]))
-        alone = run(Grid(g.origin[k : k + 1], g.shape[k : k + 1], SPACING), position[own], colony[own] - k, values[here], None if mask is None else mask[here])
+        alone = run(
+            Grid(g.origin[k : k + 1], g.shape[k : k + 1], SPACING),
+            position[own],
+            colony[own] - k,
+            values[here],
+            None if mask is None else mask[here],
+        )
         for a, b, part in zip(alone, together, (own, own, here, own), strict=True):
             assert torch.equal(a, b[part])
 
@@ -219,12 +294,23 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(InputError, match="position"):
         stencil(g, torch.zeros(2, 2, dtype=torch.float64), colony)
     with pytest.raises(InputError, match="mask"):
-        stencil(g, torch.zeros(2, 3, dtype=torch.float64), colony, mask=torch.ones(4, dtype=torch.bool))
+        stencil(
+            g, torch.zeros(2, 3, dtype=torch.float64), colony, mask=torch.ones(4, dtype=torch.bool)
+        )
 
 
 def test_no_cells_at_all(device, dtype):
     g = grid([(3, 3, 1)], device)
-    found = stencil(g, torch.zeros(0, 3, dtype=torch.float64, device=device), torch.zeros(0, dtype=torch.int64, device=device), dtype=dtype)
+    found = stencil(
+        g,
+        torch.zeros(0, 3, dtype=torch.float64, device=device),
+        torch.zeros(0, dtype=torch.int64, device=device),
+        dtype=dtype,
+    )
     values = random_values(g, dtype)
-    assert isinstance(found, Stencil) and read(values, found).shape == (0,) and pool_volume(found).shape == (0,)
+    assert (
+        isinstance(found, Stencil)
+        and read(values, found).shape == (0,)
+        and pool_volume(found).shape == (0,)
+    )
     assert torch.equal(write(values, values[:0], found), values)

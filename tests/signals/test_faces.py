@@ -36,7 +36,10 @@ def test_a_concentration_is_a_number_that_is_not_negative(make, name, value):
 
 def test_taking_colonies():
     places = torch.tensor([2, 0])
-    faces = Faces(x=(Fixed(torch.tensor([1.0, 2.0, 3.0])), Open(torch.tensor([4.0, 5.0, 6.0]))), y=(Fixed(7.0), NoFlux())).take(places)
+    faces = Faces(
+        x=(Fixed(torch.tensor([1.0, 2.0, 3.0])), Open(torch.tensor([4.0, 5.0, 6.0]))),
+        y=(Fixed(7.0), NoFlux()),
+    ).take(places)
     (low, high), (still, _), _ = faces.pairs
     assert low.outside_value().tolist() == [3.0, 1.0]
     assert high.outside_value().tolist() == [6.0, 4.0]

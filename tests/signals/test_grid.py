@@ -16,7 +16,9 @@ SPACING = (2.0, 1.0, 0.5)
 
 def grid(shapes, device="cpu", spacing=SPACING) -> Grid:
     shape = torch.tensor(shapes, device=device)
-    origin = torch.arange(3.0 * len(shapes), dtype=torch.float64, device=device).reshape(-1, 3) - 4.0
+    origin = (
+        torch.arange(3.0 * len(shapes), dtype=torch.float64, device=device).reshape(-1, 3) - 4.0
+    )
     return Grid(origin, shape, spacing)
 
 
@@ -77,12 +79,26 @@ def test_growing_keeps_every_value_in_its_place(device, dtype):
     low, high = g.origin.clone(), g.high.clone()
     low[0, 0] -= 0.1  # one block of 4 voxels of 2 µm
     high[0, 2] += 2.1  # two blocks of 4 voxels of 0.5 µm
-    larger, (new, other) = g.extended([values, values], low, high, block=4, fill=[-1.0, torch.tensor([5.0, 6.0], device=device)])
+    larger, (new, other) = g.extended(
+        [values, values], low, high, block=4, fill=[-1.0, torch.tensor([5.0, 6.0], device=device)]
+    )
     assert larger.shapes == ((7, 2, 12), (2, 2, 1))
     assert larger.origin.tolist() == [[-12.0, -3.0, -2.0], [-1.0, 0.0, 1.0]]
     # every centre that was there has its value, every other is filled
-    old = {(int(c), *p): float(v) for c, p, v in zip(g.owner, np.round(g.centres().cpu().numpy(), 6).tolist(), values, strict=True) for p in [tuple(p)]}
-    for c, p, v, w in zip(larger.owner.tolist(), np.round(larger.centres().cpu().numpy(), 6).tolist(), new.tolist(), other.tolist(), strict=True):
+    old = {
+        (int(c), *p): float(v)
+        for c, p, v in zip(
+            g.owner, np.round(g.centres().cpu().numpy(), 6).tolist(), values, strict=True
+        )
+        for p in [tuple(p)]
+    }
+    for c, p, v, w in zip(
+        larger.owner.tolist(),
+        np.round(larger.centres().cpu().numpy(), 6).tolist(),
+        new.tolist(),
+        other.tolist(),
+        strict=True,
+    ):
         assert v == old.get((c, *p), -1.0)
         assert w == old.get((c, *p), 5.0 + c)
     assert new.dtype == dtype
@@ -101,9 +117,14 @@ reach = st.floats(-12, 12)
 
 
 @settings(max_examples=40, deadline=None)
-@given(low=st.tuples(reach, reach, reach), size=st.tuples(*[st.floats(0, 8)] * 3), block=st.integers(1, 9))
+@given(
+    low=st.tuples(reach, reach, reach),
+    size=st.tuples(*[st.floats(0, 8)] * 3),
+    block=st.integers(1, 9),
+)
 def test_growing_covers_what_is_asked_and_is_a_colonys_own(low, size, block):
-    """Covered to the rounding of places of 100 µm, 1e-13; in whole blocks, none of them idle; the same bits alone and in a batch."""
+    """Covered to the rounding of places of 100 µm, 1e-13; in whole blocks, none of them idle; the
+    same bits alone and in a batch."""
     g = grid([(3, 2, 4)])
     lows = torch.tensor([low], dtype=torch.float64)
     highs = lows + torch.tensor([size], dtype=torch.float64)
@@ -113,14 +134,19 @@ def test_growing_covers_what_is_asked_and_is_a_colonys_own(low, size, block):
     added = larger.shape - g.shape
     assert bool((added % block == 0).all())
     step = g.step * block
-    assert bool((larger.origin + step > torch.minimum(lows, g.origin) - 1e-13).all() and (larger.high - step < torch.maximum(highs, g.high) + 1e-13).all())
+    assert bool(
+        (larger.origin + step > torch.minimum(lows, g.origin) - 1e-13).all()
+        and (larger.high - step < torch.maximum(highs, g.high) + 1e-13).all()
+    )
     assert float(new.sum()) == pytest.approx(float(values.sum()), abs=1e-9)
     # beside another colony with wishes of its own
     both = Grid(torch.cat([g.origin + 50, g.origin]), torch.cat([g.shape + 1, g.shape]), SPACING)
     more, (beside,) = both.extended(
         [torch.cat([torch.ones(int((g.shape + 1).prod()), dtype=torch.float64), values])],
-        torch.cat([lows + 40, lows]), torch.cat([highs + 55, highs]), block=block,
-    )  # fmt: skip
+        torch.cat([lows + 40, lows]),
+        torch.cat([highs + 55, highs]),
+        block=block,
+    )
     assert torch.equal(more.origin[1], larger.origin[0]) and more.shapes[1] == larger.shapes[0]
     assert torch.equal(beside[more.offsets[1] :], new)
 
@@ -139,6 +165,10 @@ def test_what_makes_no_grid_is_refused():
         with pytest.raises(InputError, match=name):
             Grid(o, s, h)
     g = Grid(origin, shape, SPACING)
-    for low, high in ((origin[:1], origin), (origin * torch.nan, origin), (origin - torch.inf, origin)):
+    for low, high in (
+        (origin[:1], origin),
+        (origin * torch.nan, origin),
+        (origin - torch.inf, origin),
+    ):
         with pytest.raises(InputError, match="low, high"):
             g.extended([], low, high, block=4)

@@ -1,4 +1,5 @@
-"""The layout: what a state carries of its medium, taken apart by colonies, moved, and put on another grid."""
+"""The layout: what a state carries of its medium, taken apart by colonies, moved, and put on
+another grid."""
 
 from __future__ import annotations
 
@@ -14,8 +15,12 @@ F64 = torch.float64
 
 def grid(device: str | torch.device = "cpu") -> Grid:
     """Three colonies with grids of different size and place."""
-    origin = torch.tensor([[0.0, 0.0, 0.0], [-8.0, 4.0, 0.0], [10.0, 0.0, 0.0]], dtype=F64, device=device)
-    return Grid(origin, torch.tensor([[2, 3, 1], [4, 2, 1], [1, 1, 1]], device=device), (2.0, 2.0, 1.0))
+    origin = torch.tensor(
+        [[0.0, 0.0, 0.0], [-8.0, 4.0, 0.0], [10.0, 0.0, 0.0]], dtype=F64, device=device
+    )
+    return Grid(
+        origin, torch.tensor([[2, 3, 1], [4, 2, 1], [1, 1, 1]], device=device), (2.0, 2.0, 1.0)
+    )
 
 
 def test_what_is_made_ready_belongs_to_one_grid():
@@ -30,7 +35,11 @@ def test_a_layout_of_other_colonies_finds_their_voxels(device):
     layout = Layout(grid(device), height=0.5, reservoir={"a": 1.0})
     values = torch.arange(layout.grid.nodes, device=device)
     part, rows = layout.take(torch.tensor([2, 0], device=device))
-    assert part.grid.shapes == ((1, 1, 1), (2, 3, 1)) and part.height == 0.5 and part.reservoir == {"a": 1.0}
+    assert (
+        part.grid.shapes == ((1, 1, 1), (2, 3, 1))
+        and part.height == 0.5
+        and part.reservoir == {"a": 1.0}
+    )
     assert values[rows].tolist() == [14, 0, 1, 2, 3, 4, 5]
     assert torch.equal(part.grid.centres(), layout.grid.centres()[rows])
     every, rows = layout.take(torch.tensor([0, 1, 2], device=device))
@@ -39,7 +48,9 @@ def test_a_layout_of_other_colonies_finds_their_voxels(device):
 
 def test_a_layout_moves_to_a_device(device):
     moved = Layout(grid()).to(device)
-    assert moved.grid.origin.device.type == device.type and torch.equal(moved.grid.shape.cpu(), grid().shape)
+    assert moved.grid.origin.device.type == device.type and torch.equal(
+        moved.grid.shape.cpu(), grid().shape
+    )
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -59,28 +70,44 @@ def test_the_mask_is_asked_for_once_and_without_obstacles_not_at_all():
     assert Layout(grid()).mask is None
     layout = Layout(grid(), obstacle=solid)
     assert layout.mask is layout.mask and asked == [(15, 3)]
-    assert layout.mask.tolist() == (layout.grid.centres()[:, 0] <= 0).tolist() and 0 < int(layout.mask.sum()) < 15
+    assert (
+        layout.mask.tolist() == (layout.grid.centres()[:, 0] <= 0).tolist()
+        and 0 < int(layout.mask.sum()) < 15
+    )
 
 
 @pytest.mark.parametrize(
     ("solid", "said"),
     [
-        (lambda at: at > 0, r"bool tensor of shape \(15,\)"), (lambda at: (at[:, 0] > 0).float(), r"float32.*bool"), (lambda at: True, "bool tensor"),
+        (lambda at: at > 0, r"bool tensor of shape \(15,\)"),
+        (lambda at: (at[:, 0] > 0).float(), r"float32.*bool"),
+        (lambda at: True, "bool tensor"),
         (lambda at: at[:, 0] < 1e9, "nothing is left of the medium"),
     ],
     ids=["shape", "dtype", "no tensor", "everywhere"],
-)  # fmt: skip
+)
 def test_a_mask_must_be_one(solid, said):
     with pytest.raises(InputError, match="(?s)obstacles.*" + said):
         _ = Layout(grid(), obstacle=solid).mask
 
 
 def test_the_stencil_knows_height_mask_and_period(dtype):
-    position, colony = torch.tensor([[1.0, 1.0], [-7.0, 5.0], [13.0, 1.0]], dtype=F64), torch.tensor([0, 1, 2])
+    position, colony = (
+        torch.tensor([[1.0, 1.0], [-7.0, 5.0], [13.0, 1.0]], dtype=F64),
+        torch.tensor([0, 1, 2]),
+    )
     inside = Layout(grid(), height=0.5).stencil(position, colony, dtype)
     assert inside.weight.dtype == dtype and inside.outside.tolist() == [False, False, True]
     assert inside.node[:2, 0].tolist() == [0, 6]
-    assert Layout(grid(), height=1.5).stencil(position, colony, dtype).outside.tolist() == [True, True, True]
-    assert Layout(grid(), periodic=(True, False, True), height=1.5).stencil(position, colony, dtype).outside.tolist() == [False, False, False]
-    held = Layout(grid(), height=0.5, obstacle=lambda at: at[:, 0] < -4).stencil(position, colony, dtype)
+    assert Layout(grid(), height=1.5).stencil(position, colony, dtype).outside.tolist() == [
+        True,
+        True,
+        True,
+    ]
+    assert Layout(grid(), periodic=(True, False, True), height=1.5).stencil(
+        position, colony, dtype
+    ).outside.tolist() == [False, False, False]
+    held = Layout(grid(), height=0.5, obstacle=lambda at: at[:, 0] < -4).stencil(
+        position, colony, dtype
+    )
     assert held.outside.tolist() == [False, True, True]

@@ -34,14 +34,18 @@ def bernoulli(x: float) -> float:
 
 
 def flux_parts(k: float, v: float, h: float) -> tuple[float, float]:
-    """What a face passes up and down for each unit of concentration: Scharfetter and Gummel, or upwind where nothing diffuses."""
+    """What a face passes up and down for each unit of concentration: Scharfetter and Gummel, or
+    upwind where nothing diffuses."""
     if k == 0:
         return max(v, 0.0), max(-v, 0.0)
     return k / h * bernoulli(-v * h / k), k / h * bernoulli(v * h / k)
 
 
-def assembled(shape, spacing, diffusion, decay, velocity, faces, mask, source) -> tuple[np.ndarray, np.ndarray]:
-    """T and q of du/dt = T u + q, (V, V) and (V,), voxel by voxel and face by face. velocity: three arrays on faces."""
+def assembled(
+    shape, spacing, diffusion, decay, velocity, faces, mask, source
+) -> tuple[np.ndarray, np.ndarray]:
+    """T and q of du/dt = T u + q, (V, V) and (V,), voxel by voxel and face by face. velocity: three
+    arrays on faces."""
     number = np.arange(math.prod(shape)).reshape(shape)
     matrix, gain = np.zeros((number.size,) * 2), np.zeros(number.size)
     for place in np.ndindex(*shape):
@@ -54,7 +58,9 @@ def assembled(shape, spacing, diffusion, decay, velocity, faces, mask, source) -
             h = spacing[axis]
             for side in (0, 1):
                 face = faces.pairs[axis][side]
-                v = velocity[axis][tuple(p + (side if k == axis else 0) for k, p in enumerate(place))]
+                v = velocity[axis][
+                    tuple(p + (side if k == axis else 0) for k, p in enumerate(place))
+                ]
                 other = list(place)
                 other[axis] += 1 if side else -1
                 edge = not 0 <= other[axis] < shape[axis]
@@ -91,10 +97,23 @@ def flow(kind: str, shape, rng) -> tuple[object, list[np.ndarray]]:
             np.moveaxis(a, axis, 0)[-1] = np.moveaxis(a, axis, 0)[0]
         return tuple(torch.as_tensor(a) for a in arrays), arrays
     v = (3.0, -1.0, 0.5) if kind == "uniform" else (0.0, 0.0, 0.0)
-    return (v if kind == "uniform" else None), [np.full(s, x) for s, x in zip(faces, v, strict=True)]
+    return (v if kind == "uniform" else None), [
+        np.full(s, x) for s, x in zip(faces, v, strict=True)
+    ]
 
 
-def make(shape, faces="mixed", kind="uniform", masked=False, diffusion=1.3, decay=0.2, source=0.3, dtype=torch.float64, device="cpu", seed=0):
+def make(
+    shape,
+    faces="mixed",
+    kind="uniform",
+    masked=False,
+    diffusion=1.3,
+    decay=0.2,
+    source=0.3,
+    dtype=torch.float64,
+    device="cpu",
+    seed=0,
+):
     """An operator, and its matrix and gain assembled by `assembled`."""
     rng = np.random.default_rng(seed)
     velocity, arrays = flow(kind, shape, rng)
@@ -103,9 +122,17 @@ def make(shape, faces="mixed", kind="uniform", masked=False, diffusion=1.3, deca
     if isinstance(velocity, tuple) and isinstance(velocity[0], torch.Tensor):
         velocity = tuple(v.to(device) for v in velocity)
     made = operator(
-        shape, SPACING, diffusion=diffusion, decay=decay, velocity=velocity, faces=chosen, source=source, dtype=dtype, device=device,
+        shape,
+        SPACING,
+        diffusion=diffusion,
+        decay=decay,
+        velocity=velocity,
+        faces=chosen,
+        source=source,
+        dtype=dtype,
+        device=device,
         mask=torch.as_tensor(mask, device=device) if masked else None,
-    )  # fmt: skip
+    )
     return made, *assembled(shape, SPACING, diffusion, decay, arrays, chosen, mask, source), mask
 
 
@@ -116,7 +143,11 @@ def dense(op: Operator) -> np.ndarray:
     return np.stack([apply(op, e, gain=False).cpu().numpy().reshape(-1) for e in units], 1)
 
 
-EVERY = [pytest.mark.parametrize("shape", SHAPES, ids=str), pytest.mark.parametrize("faces", FACES), pytest.mark.parametrize("kind", FLOWS)]
+EVERY = [
+    pytest.mark.parametrize("shape", SHAPES, ids=str),
+    pytest.mark.parametrize("faces", FACES),
+    pytest.mark.parametrize("kind", FLOWS),
+]
 
 
 def every(test):
@@ -134,10 +165,18 @@ def test_the_operator_is_the_assembled_matrix(device, dtype, shape, faces, kind,
     found = apply(op, torch.as_tensor(u, dtype=dtype, device=device)[None])
     assert found.dtype == dtype
     expected = (matrix @ u.reshape(-1) + gain).reshape(shape)
-    assert np.abs(found[0].cpu().double().numpy() - expected).max() <= (1e-13 if dtype == torch.float64 else 1e-5)
+    assert np.abs(found[0].cpu().double().numpy() - expected).max() <= (
+        1e-13 if dtype == torch.float64 else 1e-5
+    )
     assert np.abs(dense(op) - matrix).max() <= 1e-13
-    assert np.abs(op.loss.expand(1, *shape).cpu().numpy().reshape(-1) + np.diag(matrix)).max() <= 1e-13
-    given = np.zeros_like(gain) if op.gain is None else op.gain.expand(1, *shape).cpu().numpy().reshape(-1)
+    assert (
+        np.abs(op.loss.expand(1, *shape).cpu().numpy().reshape(-1) + np.diag(matrix)).max() <= 1e-13
+    )
+    given = (
+        np.zeros_like(gain)
+        if op.gain is None
+        else op.gain.expand(1, *shape).cpu().numpy().reshape(-1)
+    )
     assert np.abs(given - gain).max() <= 1e-13
 
 
@@ -148,8 +187,12 @@ def test_the_operator_is_the_assembled_matrix(device, dtype, shape, faces, kind,
 def test_the_papers_convolution_gives_the_same(device, dtype, shape, faces, kind, masked):
     """Equation 7 as a 3 × 3 × 3 stencil: to rounding, as above."""
     op, _, _, mask = make(shape, faces, kind, masked, dtype=dtype, device=device)
-    u = torch.as_tensor(np.random.default_rng(1).uniform(size=shape) * mask, dtype=dtype, device=device)[None]
-    assert float((convolve(op, u) - apply(op, u)).abs().max()) <= (1e-13 if dtype == torch.float64 else 2e-5)
+    u = torch.as_tensor(
+        np.random.default_rng(1).uniform(size=shape) * mask, dtype=dtype, device=device
+    )[None]
+    assert float((convolve(op, u) - apply(op, u)).abs().max()) <= (
+        1e-13 if dtype == torch.float64 else 2e-5
+    )
 
 
 def test_a_convolution_needs_one_velocity():
@@ -181,43 +224,78 @@ def test_symmetric_is_said_only_of_what_is():
 @pytest.mark.parametrize("diffusion", [0.0, 1e-12, 1e-3, 1.0, 1e6])
 @pytest.mark.parametrize("speed", [0.0, 1e-12, 1e-5, 0.05, 0.0999, 0.1001, 3.0, 79.0, 81.0, 1e4])
 def test_fitted_rates(diffusion, speed):
-    """Against the plain formula, worked another way; relative 1e-13 of the larger rate, which is all that rounding leaves of the smaller."""
+    """Against the plain formula, worked another way; relative 1e-13 of the larger rate, which is
+    all that rounding leaves of the smaller."""
     for sign in (1, -1):
-        up, down = (float(x) for x in fitted(torch.tensor(diffusion, dtype=torch.float64), torch.tensor(sign * speed, dtype=torch.float64)))
+        up, down = (
+            float(x)
+            for x in fitted(
+                torch.tensor(diffusion, dtype=torch.float64),
+                torch.tensor(sign * speed, dtype=torch.float64),
+            )
+        )
         expected = flux_parts(diffusion, sign * speed, 1.0)
-        assert up == pytest.approx(expected[0], abs=1e-13 * max(expected)) and down == pytest.approx(expected[1], abs=1e-13 * max(expected))
+        assert up == pytest.approx(
+            expected[0], abs=1e-13 * max(expected)
+        ) and down == pytest.approx(expected[1], abs=1e-13 * max(expected))
         assert min(up, down) >= 0
         assert up - down == pytest.approx(sign * speed, abs=1e-13 * max(expected))
 
 
 @pytest.mark.parametrize("speed", [0.0, 1e-4, -0.0999, 0.1001, 2.0, -30.0])
 def test_the_slope_of_fitted_rates(speed):
-    """By diffusion and flow, at rest too, where the parts of the formula have corners but the rates do not: central differences, float64."""
-    d, v = torch.tensor(1.3, dtype=torch.float64, requires_grad=True), torch.tensor(1.3 * speed, dtype=torch.float64, requires_grad=True)
+    """By diffusion and flow, at rest too, where the parts of the formula have corners but the rates
+    do not: central differences, float64."""
+    d, v = (
+        torch.tensor(1.3, dtype=torch.float64, requires_grad=True),
+        torch.tensor(1.3 * speed, dtype=torch.float64, requires_grad=True),
+    )
     assert torch.autograd.gradcheck(fitted, (d, v), eps=1e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize("diffusion, speed", [(0.0, 0.0), (0.0, 1.0), (1e-30, 1.0), (1e-30, 0.0), (1.0, 1e30)])
+@pytest.mark.parametrize(
+    "diffusion, speed", [(0.0, 0.0), (0.0, 1.0), (1e-30, 1.0), (1e-30, 0.0), (1.0, 1e30)]
+)
 def test_no_slope_is_nan(diffusion, speed):
-    d, v = torch.tensor(diffusion, dtype=torch.float64, requires_grad=True), torch.tensor(speed, dtype=torch.float64, requires_grad=True)
+    d, v = (
+        torch.tensor(diffusion, dtype=torch.float64, requires_grad=True),
+        torch.tensor(speed, dtype=torch.float64, requires_grad=True),
+    )
     up, down = fitted(d, v)
     grads = torch.autograd.grad(up + 2 * down, (d, v))
     assert all(bool(torch.isfinite(g)) for g in grads)
 
 
 def test_each_colony_has_its_own_numbers(device, dtype):
-    """Diffusion, decay, velocity, faces, obstacles and source, one for each colony: as each alone, bit for bit."""
+    """Diffusion, decay, velocity, faces, obstacles and source, one for each colony: as each alone,
+    bit for bit."""
     rng, shape = np.random.default_rng(3), (5, 4, 3)
-    t = lambda *s: torch.as_tensor(rng.uniform(0.1, 2, s), device=device)  # noqa: E731
-    diffusion, decay, velocity, fixed, outside, source = t(3), t(3), t(3, 3), t(3), t(3), t(3, *shape)
+    t = lambda *s: torch.as_tensor(rng.uniform(0.1, 2, s), device=device)
+    diffusion, decay, velocity, fixed, outside, source = (
+        t(3),
+        t(3),
+        t(3, 3),
+        t(3),
+        t(3),
+        t(3, *shape),
+    )
     mask = torch.as_tensor(rng.uniform(size=(3, *shape)) < 0.8, device=device)
     u = t(3, *shape).to(dtype)
 
     def of(k):
         return operator(
-            shape, SPACING, diffusion=diffusion[k], decay=decay[k], velocity=velocity[k], mask=mask[k], source=source[k],
-            faces=Faces(x=(Fixed(fixed[k]), NoFlux()), y=(Open(outside[k]), Open())), colonies=len(u[k]), dtype=dtype, device=device,
-        )  # fmt: skip
+            shape,
+            SPACING,
+            diffusion=diffusion[k],
+            decay=decay[k],
+            velocity=velocity[k],
+            mask=mask[k],
+            source=source[k],
+            faces=Faces(x=(Fixed(fixed[k]), NoFlux()), y=(Open(outside[k]), Open())),
+            colonies=len(u[k]),
+            dtype=dtype,
+            device=device,
+        )
 
     together = apply(of(slice(0, 3)), u)
     for k in range(3):
@@ -236,12 +314,18 @@ def test_each_colony_has_its_own_numbers(device, dtype):
         ({"velocity": (1.0, 2.0)}, "velocity"),
         ({"velocity": (1.0, 2.0, float("inf"))}, "velocity"),
         ({"velocity": torch.zeros(3, 3)}, "velocity"),
-        ({"velocity": (torch.zeros(5, 4, 3), torch.zeros(4, 5, 3), torch.zeros(4, 4, 3))}, "velocity along z"),
+        (
+            {"velocity": (torch.zeros(5, 4, 3), torch.zeros(4, 5, 3), torch.zeros(4, 4, 3))},
+            "velocity along z",
+        ),
         ({"mask": torch.ones(4, 4, 3)}, "mask"),
         ({"mask": torch.ones(4, 4, 2, dtype=torch.bool)}, "mask"),
         ({"source": torch.ones(4, 4, 2)}, "source"),
         ({"source": torch.full((4, 4, 3), torch.inf)}, "source"),
-        ({"faces": Faces(x=(Fixed(torch.tensor([1.0, 2.0, 3.0])), NoFlux()))}, "beyond a face along x"),
+        (
+            {"faces": Faces(x=(Fixed(torch.tensor([1.0, 2.0, 3.0])), NoFlux()))},
+            "beyond a face along x",
+        ),
         ({"shape": (4, 4)}, "shape"),
         ({"shape": (4, 0, 4)}, "shape"),
         ({"spacing": (1.0, -1.0, 1.0)}, "spacing"),
@@ -254,6 +338,10 @@ def test_what_is_not_allowed_is_refused(change, name):
 
 
 def test_one_periodic_face_has_one_velocity():
-    velocity = (torch.arange(5.0).reshape(5, 1, 1).expand(5, 4, 3), torch.zeros(4, 5, 3), torch.zeros(4, 4, 4))
+    velocity = (
+        torch.arange(5.0).reshape(5, 1, 1).expand(5, 4, 3),
+        torch.zeros(4, 5, 3),
+        torch.zeros(4, 4, 4),
+    )
     with pytest.raises(InputError, match="velocity along x"):
         operator((4, 4, 3), SPACING, diffusion=1.0, velocity=velocity, faces=Faces(x=Periodic()))

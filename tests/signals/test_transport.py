@@ -1,4 +1,5 @@
-"""Steps of transport: each method against dense linear algebra, its order, its bounds, its slopes and its bits."""
+"""Steps of transport: each method against dense linear algebra, its order, its bounds, its slopes
+and its bits."""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ def exact(matrix: np.ndarray, gain: np.ndarray, dt: float, u: np.ndarray) -> np.
 @pytest.mark.parametrize("faces", FACES)
 @pytest.mark.parametrize("kind", FLOWS[:2])
 def test_exponential_is_exact(device, dtype, shape, faces, kind, dt):
-    """Against scipy's expm, good to some 1e-12 of the values, which reach 10 as source and faces fill the box; float32: 100 roundings."""
+    """Against scipy's expm, good to some 1e-12 of the values, which reach 10 as source and faces
+    fill the box; float32: 100 roundings."""
     op, matrix, gain, _ = make(shape, faces, kind, dtype=dtype, device=device)
     u = start(shape)
     expected = exact(matrix, gain, dt, u)
@@ -60,7 +62,8 @@ def test_exponential_is_exact(device, dtype, shape, faces, kind, dt):
 @every
 @MASKED
 def test_implicit_is_one_solve_an_axis(dtype, shape, faces, kind, masked, dt):
-    """Against three dense solves, each axis's matrix assembled with the others' rates at zero. Rounding: dense solves lose digits as Δt·T grows."""
+    """Against three dense solves, each axis's matrix assembled with the others' rates at zero.
+    Rounding: dense solves lose digits as Δt·T grows."""
     op, _, _, mask = make(shape, faces, kind, masked, dtype=dtype)
     u = start(shape, mask)
     expected = u.reshape(-1) + dt * 0.3 * mask.reshape(-1)
@@ -82,9 +85,16 @@ def one_axis(op, axis: int, decay: float, mask: np.ndarray) -> tuple[np.ndarray,
     low, high = (0.0 if x is None else float(x) for x in (e.low, e.high))
     matrix, gain = np.zeros((number.size,) * 2), np.zeros(number.size)
     for place in np.ndindex(*shape):
-        i, n, above = number[place], shape[axis], tuple(p + (k == axis) for k, p in enumerate(place))
+        i, n, above = (
+            number[place],
+            shape[axis],
+            tuple(p + (k == axis) for k, p in enumerate(place)),
+        )
         matrix[i, i] -= decay * mask[place] + down[place] + up[above]
-        for rate, other, outside in ((up[place], place[axis] - 1, low), (down[above], place[axis] + 1, high)):
+        for rate, other, outside in (
+            (up[place], place[axis] - 1, low),
+            (down[above], place[axis] + 1, high),
+        ):
             if 0 <= other < n or e.periodic:
                 neighbour = tuple(other % n if k == axis else p for k, p in enumerate(place))
                 matrix[i, number[neighbour]] += rate
@@ -96,12 +106,17 @@ def one_axis(op, axis: int, decay: float, mask: np.ndarray) -> tuple[np.ndarray,
 @every
 @MASKED
 def test_crank_nicolson_solves_its_equation(dtype, shape, faces, kind, masked):
-    """Against a dense solve; the iteration leaves 1e-10 of the right-hand side, which is of order 10."""
+    """Against a dense solve; the iteration leaves 1e-10 of the right-hand side, which is of order
+    10."""
     op, matrix, gain, mask = make(shape, faces, kind, masked, dtype=dtype)
     u, dt = start(shape, mask), 0.7
     one = np.eye(u.size)
-    expected = np.linalg.solve(one - dt / 2 * matrix, (one + dt / 2 * matrix) @ u.reshape(-1) + dt * gain).reshape(shape)
-    assert np.abs(stepped(op, dt, "crank_nicolson", u) - expected).max() <= (1e-8 if dtype == torch.float64 else 1e-6)
+    expected = np.linalg.solve(
+        one - dt / 2 * matrix, (one + dt / 2 * matrix) @ u.reshape(-1) + dt * gain
+    ).reshape(shape)
+    assert np.abs(stepped(op, dt, "crank_nicolson", u) - expected).max() <= (
+        1e-8 if dtype == torch.float64 else 1e-6
+    )
 
 
 @every
@@ -115,13 +130,16 @@ def test_euler_is_its_power(dtype, shape, faces, kind, masked):
     for _ in range(count):
         expected = expected + dt / count * (matrix @ expected + gain)
     assert int(prepare(op, dt, "euler").substeps) == count
-    assert np.abs(stepped(op, dt, "euler", u).reshape(-1) - expected).max() <= (1e-12 if dtype == torch.float64 else 2e-5) * max(1.0, expected.max())
+    assert np.abs(stepped(op, dt, "euler", u).reshape(-1) - expected).max() <= (
+        1e-12 if dtype == torch.float64 else 2e-5
+    ) * max(1.0, expected.max())
 
 
 @pytest.mark.parametrize("method, order", [("implicit", 1), ("crank_nicolson", 2), ("euler", 1)])
 @MASKED
 def test_order_in_time(method, order, masked):
-    """Half the step, and the error is 2^−order: measured within 0.15 between Δt = 1/64 and 1/128 of a time over which much happens, float64."""
+    """Half the step, and the error is 2^−order: measured within 0.15 between Δt = 1/64 and 1/128 of
+    a time over which much happens, float64."""
     op, matrix, gain, mask = make((5, 4, 3), "mixed", "varying", masked)
     u = start((5, 4, 3), mask)
     expected = exact(matrix, gain, 1.0, u)
@@ -130,25 +148,40 @@ def test_order_in_time(method, order, masked):
 
 
 def test_implicit_at_rest_is_at_rest():
-    """A flat field between faces fixed at its value, whatever the step: each axis takes its own faces in. Some roundings of 5."""
-    op = operator((6, 5, 4), SPACING, diffusion=1.0, faces=Faces(*[(Fixed(5.0), Fixed(5.0))] * 3), dtype=torch.float64)
+    """A flat field between faces fixed at its value, whatever the step: each axis takes its own
+    faces in. Some roundings of 5."""
+    op = operator(
+        (6, 5, 4),
+        SPACING,
+        diffusion=1.0,
+        faces=Faces(*[(Fixed(5.0), Fixed(5.0))] * 3),
+        dtype=torch.float64,
+    )
     for dt in (1e-3, 1.0, 1e6):
         assert np.abs(stepped(op, dt, "implicit", np.full((6, 5, 4), 5.0), 3) - 5.0).max() <= 1e-13
 
 
-face = st.one_of(st.just(NoFlux()), st.builds(Fixed, st.floats(0, 1)), st.builds(Open, st.floats(0, 1)))
+face = st.one_of(
+    st.just(NoFlux()), st.builds(Fixed, st.floats(0, 1)), st.builds(Open, st.floats(0, 1))
+)
 pair = st.one_of(st.just(Periodic()), st.tuples(face, face))
 closed = st.sampled_from([NoFlux(), Periodic()])
 shapes = st.tuples(*[st.integers(1, 7)] * 3)
 powers = st.floats(-3, 6)
 common = {
-    "seed": st.integers(0, 2**31), "shape": shapes, "power": powers, "masked": st.booleans(), "kind": st.sampled_from(FLOWS),
-    "single": st.booleans(), "method": st.sampled_from(["exponential", "implicit"]),
-}  # fmt: skip
+    "seed": st.integers(0, 2**31),
+    "shape": shapes,
+    "power": powers,
+    "masked": st.booleans(),
+    "kind": st.sampled_from(FLOWS),
+    "single": st.booleans(),
+    "method": st.sampled_from(["exponential", "implicit"]),
+}
 
 
 def random_operator(seed, shape, power, masked, kind, single, method, faces, decay=0.0):
-    """An operator of which the most that diffuses in a step of 1 h is r = KΔt/h² = 10^power, its velocity of a Péclet number up to 100."""
+    """An operator of which the most that diffuses in a step of 1 h is r = KΔt/h² = 10^power, its
+    velocity of a Péclet number up to 100."""
     rng = np.random.default_rng(seed)
     h = rng.uniform(0.5, 3.0, 3)
     k = 10.0**power * h.min() ** 2
@@ -159,19 +192,34 @@ def random_operator(seed, shape, power, masked, kind, single, method, faces, dec
         scale = k / h.min() * 10 ** rng.uniform(-2, 2)
         velocity = torch.as_tensor(scale * rng.normal(size=3))
         if kind == "varying":
-            arrays = [scale * rng.normal(size=tuple(n + (a == b) for b, n in enumerate(shape))) for a in range(3)]
+            arrays = [
+                scale * rng.normal(size=tuple(n + (a == b) for b, n in enumerate(shape)))
+                for a in range(3)
+            ]
             for a, values in enumerate(arrays):
                 np.moveaxis(values, a, 0)[-1] = np.moveaxis(values, a, 0)[0]
             velocity = tuple(torch.as_tensor(a) for a in arrays)
     mask = rng.uniform(size=shape) < 0.7 if masked else np.ones(shape, dtype=bool)
     dtype = torch.float32 if single else torch.float64
-    op = operator(shape, tuple(h), diffusion=k, decay=decay, velocity=velocity, faces=faces, dtype=dtype, mask=torch.as_tensor(mask) if masked else None)
-    u = torch.as_tensor(rng.uniform(size=shape) * mask * (rng.uniform(size=shape) < 0.5), dtype=dtype)[None]
+    op = operator(
+        shape,
+        tuple(h),
+        diffusion=k,
+        decay=decay,
+        velocity=velocity,
+        faces=faces,
+        dtype=dtype,
+        mask=torch.as_tensor(mask) if masked else None,
+    )
+    u = torch.as_tensor(
+        rng.uniform(size=shape) * mask * (rng.uniform(size=shape) < 0.5), dtype=dtype
+    )[None]
     return op, u, torch.as_tensor(mask)
 
 
 def roundings(op) -> float:
-    """The most that a sum of non-negative parts may be off, relative: a few roundings for each voxel along each axis."""
+    """The most that a sum of non-negative parts may be off, relative: a few roundings for each
+    voxel along each axis."""
     return 8 * sum(op.shape) * torch.finfo(op.dtype).eps
 
 
@@ -189,7 +237,10 @@ def test_nothing_goes_below_zero(x, y, z, decay, **drawn):
 @given(**common, x=closed, y=closed, z=closed)
 def test_nothing_is_lost_in_a_closed_box(x, y, z, **drawn):
     op, u, _ = random_operator(faces=Faces(x, y, z), **drawn)
-    before, after = float(u.double().sum()), float(prepare(op, 1.0, drawn["method"]).step(u).double().sum())
+    before, after = (
+        float(u.double().sum()),
+        float(prepare(op, 1.0, drawn["method"]).step(u).double().sum()),
+    )
     assert after == pytest.approx(before, rel=roundings(op), abs=1e-300)
 
 
@@ -203,58 +254,113 @@ def test_nothing_rises_above_what_is_there_or_beyond_the_faces(x, y, z, **drawn)
 
 
 def params(dtype=torch.float64):
-    t = lambda *x: torch.tensor(x, dtype=dtype, requires_grad=True)  # noqa: E731
-    return {"diffusion": t(0.7, 1.1), "decay": t(0.3, 0.1), "velocity": torch.tensor([[0.5, -1.0, 0.0], [0.0, 0.2, 2.0]], dtype=dtype, requires_grad=True),
-            "value": t(1.0, 2.0), "source": t(0.2, 0.4)}  # fmt: skip
+    t = lambda *x: torch.tensor(x, dtype=dtype, requires_grad=True)
+    return {
+        "diffusion": t(0.7, 1.1),
+        "decay": t(0.3, 0.1),
+        "velocity": torch.tensor(
+            [[0.5, -1.0, 0.0], [0.0, 0.2, 2.0]], dtype=dtype, requires_grad=True
+        ),
+        "value": t(1.0, 2.0),
+        "source": t(0.2, 0.4),
+    }
 
 
 # the exponential takes no obstacles
-@pytest.mark.parametrize("method, masked", [*((m, False) for m in METHODS), *((m, True) for m in METHODS if m != "exponential")])
+@pytest.mark.parametrize(
+    "method, masked",
+    [*((m, False) for m in METHODS), *((m, True) for m in METHODS if m != "exponential")],
+)
 @pytest.mark.parametrize("periodic", [False, True])
 def test_slopes(method, periodic, masked):
-    """By u, diffusion, velocity, decay, source and a face's value against central differences, over two steps. float64; the differences of an
-    iterative solve that leaves 1e-10 are good to 1e-10/1e-4."""
+    """By u, diffusion, velocity, decay, source and a face's value against central differences, over
+    two steps. float64; the differences of an iterative solve that leaves 1e-10 are good to
+    1e-10/1e-4."""
     shape, dt = (3, 2, 2), 0.4
     mask = torch.as_tensor(np.random.default_rng(2).uniform(size=shape) < 0.8) if masked else None
     rough = method == "crank_nicolson"
     u = torch.as_tensor(np.random.default_rng(3).uniform(0.5, 1.0, (2, *shape))).requires_grad_()
 
     def run(u, diffusion, decay, velocity, value, source):
-        faces = Faces(x=Periodic() if periodic else (Fixed(value), NoFlux()), y=(Open(value), Fixed(0.5)))
+        faces = Faces(
+            x=Periodic() if periodic else (Fixed(value), NoFlux()), y=(Open(value), Fixed(0.5))
+        )
         op = operator(
-            shape, SPACING, diffusion=diffusion, decay=decay, velocity=velocity, faces=faces, mask=mask, source=source, colonies=2, dtype=torch.float64
+            shape,
+            SPACING,
+            diffusion=diffusion,
+            decay=decay,
+            velocity=velocity,
+            faces=faces,
+            mask=mask,
+            source=source,
+            colonies=2,
+            dtype=torch.float64,
         )
         stepper = prepare(op, dt, method)
         return stepper.step(stepper.step(u))
 
     given = (u, *params().values())
-    assert torch.autograd.gradcheck(run, given, eps=1e-4 if rough else 1e-6, atol=1e-5 if rough else 1e-7)
+    assert torch.autograd.gradcheck(
+        run, given, eps=1e-4 if rough else 1e-6, atol=1e-5 if rough else 1e-7
+    )
 
 
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "exponential"])
 def test_slopes_by_a_velocity_on_faces(method):
     shape = (3, 2, 2)
     rng = np.random.default_rng(4)
-    velocity = tuple(torch.as_tensor(rng.normal(size=tuple(n + (a == b) for b, n in enumerate(shape)))).requires_grad_() for a in range(3))
+    velocity = tuple(
+        torch.as_tensor(
+            rng.normal(size=tuple(n + (a == b) for b, n in enumerate(shape)))
+        ).requires_grad_()
+        for a in range(3)
+    )
     u = torch.as_tensor(rng.uniform(0.5, 1.0, (1, *shape)))
     rough = method == "crank_nicolson"
 
     def run(*v):
-        return prepare(operator(shape, SPACING, diffusion=1.0, velocity=v, faces=Faces(x=(Fixed(1.0), Open())), dtype=torch.float64), 0.4, method).step(u)
+        return prepare(
+            operator(
+                shape,
+                SPACING,
+                diffusion=1.0,
+                velocity=v,
+                faces=Faces(x=(Fixed(1.0), Open())),
+                dtype=torch.float64,
+            ),
+            0.4,
+            method,
+        ).step(u)
 
-    assert torch.autograd.gradcheck(run, velocity, eps=1e-4 if rough else 1e-6, atol=1e-5 if rough else 1e-7)
+    assert torch.autograd.gradcheck(
+        run, velocity, eps=1e-4 if rough else 1e-6, atol=1e-5 if rough else 1e-7
+    )
 
 
 # Crank-Nicolson works in float64 whatever the dtype
-@pytest.mark.parametrize("method, dtype", [*((m, torch.float64) for m in METHODS), *((m, torch.float32) for m in METHODS if m != "crank_nicolson")], ids=str)
+@pytest.mark.parametrize(
+    "method, dtype",
+    [
+        *((m, torch.float64) for m in METHODS),
+        *((m, torch.float32) for m in METHODS if m != "crank_nicolson"),
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("shape", [(9, 8, 7), (33, 1, 1), (12, 11, 1), (1, 1, 1)], ids=str)
 @pytest.mark.parametrize("own", [False, True], ids=["shared", "each its own"])
 def test_a_colony_does_not_see_the_others(device, dtype, method, shape, own, deterministic):
-    """The same bits after three steps alone and in batches of 2 and 17, beside colonies in which all goes a thousand times faster."""
+    """The same bits after three steps alone and in batches of 2 and 17, beside colonies in which
+    all goes a thousand times faster."""
     rng, count = np.random.default_rng(5), 17
-    t = lambda *s: torch.as_tensor(rng.uniform(0.1, 1, s), device=device)  # noqa: E731
+    t = lambda *s: torch.as_tensor(rng.uniform(0.1, 1, s), device=device)
     fast = 10.0 ** torch.as_tensor(rng.uniform(-2, 1, count), device=device)
-    diffusion, decay, velocity, value = t(count) * fast, t(count) * fast, t(count, 3) * fast[:, None], t(count)
+    diffusion, decay, velocity, value = (
+        t(count) * fast,
+        t(count) * fast,
+        t(count, 3) * fast[:, None],
+        t(count),
+    )
     masks = torch.as_tensor(rng.uniform(size=(count, *shape)) < 0.8, device=device)
     u = t(count, *shape).to(dtype)
 
@@ -262,9 +368,18 @@ def test_a_colony_does_not_see_the_others(device, dtype, method, shape, own, det
         size = len(range(*k.indices(count)))
         part = k if own else slice(0, 1)
         op = operator(
-            shape, SPACING, diffusion=diffusion[part], decay=decay[part], velocity=velocity[part] if own else velocity[0], source=0.3, colonies=size,
-            faces=Faces(x=(Fixed(value[part]), Open()), y=Periodic()), mask=None if method == "exponential" else masks[k], dtype=dtype, device=device,
-        )  # fmt: skip
+            shape,
+            SPACING,
+            diffusion=diffusion[part],
+            decay=decay[part],
+            velocity=velocity[part] if own else velocity[0],
+            source=0.3,
+            colonies=size,
+            faces=Faces(x=(Fixed(value[part]), Open()), y=Periodic()),
+            mask=None if method == "exponential" else masks[k],
+            dtype=dtype,
+            device=device,
+        )
         stepper, v = prepare(op, 0.5, method), u[k]
         for _ in range(3):
             v = stepper.step(v)
@@ -293,11 +408,17 @@ def test_the_method_that_suits():
 
 def test_a_failed_solve_is_its_own_colonys():
     """A colony with a NaN is reported, and is NaN; the other goes on as if alone."""
-    op = operator((4, 3, 2), SPACING, diffusion=1.0, velocity=(1.0, 0.0, 0.0), colonies=2, dtype=torch.float64)
+    op = operator(
+        (4, 3, 2), SPACING, diffusion=1.0, velocity=(1.0, 0.0, 0.0), colonies=2, dtype=torch.float64
+    )
     u = torch.as_tensor(start((2, 4, 3, 2)))
     well = CrankNicolson(op, 0.5).step(u)
     u[1, 0, 0, 0] = torch.nan
     out, report = CrankNicolson(op, 0.5).solve(u)
-    assert report.converged.tolist() == [True, False] and int(report.iterations[0]) > 0 and float(report.residual[0]) <= 1e-9
+    assert (
+        report.converged.tolist() == [True, False]
+        and int(report.iterations[0]) > 0
+        and float(report.residual[0]) <= 1e-9
+    )
     assert torch.equal(out[0], well[0])
     assert bool(CrankNicolson(op, 0.5).step(u)[1].isnan().all())

@@ -16,7 +16,8 @@ from torchfilm.tools.powers import power, steady_functions
 
 EXPONENTS = [0, 1, 2, 3, 4, 7, 8, 13, -1, -2, -3, 0.5, 1.5, 2.7, 0.3, -0.5, -1.5]
 
-# what users may write, each seen unsteady on some build of torch; powers of 0, 1, 2, 3 belong to the family
+# what users may write, each seen unsteady on some build of torch; powers of 0, 1, 2, 3 belong to
+# the family
 WRITTEN = {
     **{f"x ** {n}": lambda x, n=n: x**n for n in EXPONENTS},
     "x ** tensor": lambda x: x ** torch.full_like(x, 1.5),
@@ -52,7 +53,8 @@ WRITTEN = {
 
 @pytest.fixture(scope="module", autouse=True)
 def forward_mode():
-    """Torch compiles its forward derivatives on their first use, by a function that it calls deprecated itself."""
+    """Torch compiles its forward derivatives on their first use, by a function that it calls
+    deprecated itself."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.func.jvp(torch.exp, (torch.ones(1),), (torch.ones(1),))
@@ -71,8 +73,11 @@ def backward(f, x):
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_bits_do_not_depend_on_place_or_company(dtype, name):
-    """An element alone, at any offset of a slice of any length up to 70, in a strided column, in a long tensor: value and both derivatives."""
-    x = (torch.rand(3000, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 4 + 1e-3).to(dtype)
+    """An element alone, at any offset of a slice of any length up to 70, in a strided column, in a
+    long tensor: value and both derivatives."""
+    x = (
+        torch.rand(3000, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 4 + 1e-3
+    ).to(dtype)
     f = WRITTEN[name]
     with steady_functions():
         for kind in (lambda y: f(y), lambda y: tangent(f, y), lambda y: backward(f, y)):
@@ -82,13 +87,17 @@ def test_bits_do_not_depend_on_place_or_company(dtype, name):
             assert torch.equal(torch.cat([kind(x[i : i + 1]) for i in range(200)]), whole[:200])
             for length in range(2, 71):
                 start = length % 17
-                assert torch.equal(kind(x[start : start + length]), whole[start : start + length]), length
+                assert torch.equal(
+                    kind(x[start : start + length]), whole[start : start + length]
+                ), length
             assert torch.equal(kind(x.reshape(-1, 6)[:, 1]), whole.reshape(-1, 6)[:, 1])
 
 
 @pytest.mark.parametrize("name", ["x ** 1.5", "x ** 4", "sigmoid", "1.7 ** x"])
 def test_bits_do_not_depend_on_threads(dtype, name):
-    x = torch.rand(60_001, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(dtype)
+    x = torch.rand(60_001, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(
+        dtype
+    )
     with steady_functions():
         alone = WRITTEN[name](x)
         torch.set_num_threads(2)
@@ -101,10 +110,12 @@ def test_bits_do_not_depend_on_threads(dtype, name):
 @pytest.mark.parametrize("n", EXPONENTS)
 @pytest.mark.parametrize("tensor", [False, True], ids=["number", "tensor"])
 def test_power_is_exact_to_a_few_units(dtype, device, n, tensor):
-    """Against NumPy's in float64: squaring costs up to n roundings, exp(n log x) up to n |log x| and a few of exp and log themselves."""
+    """Against NumPy's in float64: squaring costs up to n roundings, exp(n log x) up to n |log x|
+    and a few of exp and log themselves."""
     x = torch.logspace(-2.5, 2.5, 400, dtype=torch.float64).to(device=device, dtype=dtype)
     found = power(x, torch.full_like(x, n) if tensor else n)
-    exponent = float(torch.tensor(n, dtype=dtype)) if tensor else n  # 2.7 is another number in float32
+    # 2.7 is another number in float32
+    exponent = float(torch.tensor(n, dtype=dtype)) if tensor else n
     expected = array(x) ** exponent
     bound = torch.finfo(dtype).eps * (4 + abs(n) * (1 + np.abs(np.log(array(x)))))
     assert found.dtype == dtype
@@ -113,8 +124,18 @@ def test_power_is_exact_to_a_few_units(dtype, device, n, tensor):
 
 @pytest.mark.parametrize("tensor", [False, True], ids=["number", "tensor"])
 def test_power_at_zero_and_below(dtype, device, tensor):
-    """0ⁿ and its two derivatives by n; whole exponents of negative numbers; NaN for broken ones, as torch says."""
-    cases = [(1.0, 0, 1, 0), (2.0, 0, 0, 2), (3.0, 0, 0, 0), (8.0, 0, 0, 0), (1.5, 0, 0, 0), (2.5, 0, 0, 0), (0.5, 0, 0, 0), (0.0, 1, 0, 0)]
+    """0ⁿ and its two derivatives by n; whole exponents of negative numbers; NaN for broken ones, as
+    torch says."""
+    cases = [
+        (1.0, 0, 1, 0),
+        (2.0, 0, 0, 2),
+        (3.0, 0, 0, 0),
+        (8.0, 0, 0, 0),
+        (1.5, 0, 0, 0),
+        (2.5, 0, 0, 0),
+        (0.5, 0, 0, 0),
+        (0.0, 1, 0, 0),
+    ]
     for n, *expected in cases:
         x = torch.zeros(1, dtype=dtype, device=device, requires_grad=True)
         y = power(x, torch.tensor([n], dtype=dtype, device=device) if tensor else n) + 0 * x * x
@@ -122,7 +143,7 @@ def test_power_at_zero_and_below(dtype, device, tensor):
         second = torch.autograd.grad(first.sum(), x)[0]
         assert [float(z.detach()) for z in (y, first, second)] == expected, n
     x = torch.tensor([-1.5], dtype=dtype, device=device)
-    as_given = lambda n: torch.tensor([n], dtype=dtype, device=device) if tensor else n  # noqa: E731
+    as_given = lambda n: torch.tensor([n], dtype=dtype, device=device) if tensor else n
     for n in (0, 1, 2, 3, 4, 5, -1, -2):
         assert float(power(x, as_given(float(n)))) == pytest.approx((-1.5) ** n, rel=1e-5)
     assert math.isnan(float(power(x, as_given(1.5))))
@@ -131,10 +152,14 @@ def test_power_at_zero_and_below(dtype, device, tensor):
 @pytest.mark.parametrize("x", [1e-30, 1e-10, 1.0, 3.0, -2.0])
 @pytest.mark.parametrize("n", [1.0, 1.5, 2.0, 2.5, 8.0])
 def test_no_derivative_is_poisoned_by_a_branch_not_taken(dtype, x, n):
-    """Two derivatives by x and the one by n of a tensor power are numbers wherever the value is one."""
+    """Two derivatives by x and the one by n of a tensor power are numbers wherever the value is
+    one."""
     if x < 0 and n % 1:
         return
-    base, exponent = torch.tensor([x], dtype=dtype, requires_grad=True), torch.tensor([n], dtype=dtype, requires_grad=True)
+    base, exponent = (
+        torch.tensor([x], dtype=dtype, requires_grad=True),
+        torch.tensor([n], dtype=dtype, requires_grad=True),
+    )
     y = power(base, exponent)
     first = torch.autograd.grad(y.sum(), [base, exponent], create_graph=True)
     second = torch.autograd.grad(first[0].sum(), base)[0]
@@ -150,7 +175,11 @@ def test_derivatives_by_finite_differences():
     for k in (1.5, 2, 5, -1, -2.5, 0.5):
         assert torch.autograd.gradcheck(lambda x, k=k: power(x, k), (x,), check_forward_ad=True)
     for f in (powers.sigmoid, powers.softplus, powers.elu, powers.sinh, powers.cosh, powers.silu):
-        assert torch.autograd.gradcheck(f, (torch.cat([x, -x, torch.zeros(1)]) if f is not powers.elu else torch.cat([x, -x]),), check_forward_ad=True)
+        assert torch.autograd.gradcheck(
+            f,
+            (torch.cat([x, -x, torch.zeros(1)]) if f is not powers.elu else torch.cat([x, -x]),),
+            check_forward_ad=True,
+        )
 
 
 OTHERS = {
@@ -165,20 +194,29 @@ OTHERS = {
 
 @pytest.mark.parametrize("mine", OTHERS)
 def test_other_functions_are_torchs(dtype, mine):
-    """Against torch in float64 over ±50, a few units in the last place (softplus: torch gives the straight line beyond 20, wrong by 2e-9)."""
+    """Against torch in float64 over ±50, a few units in the last place (softplus: torch gives the
+    straight line beyond 20, wrong by 2e-9)."""
     x = torch.linspace(-50, 50, 2001, dtype=torch.float64).to(dtype)
     expected = OTHERS[mine](x.double())
-    assert torch.allclose(mine(x).double(), expected, rtol=8 * torch.finfo(dtype).eps, atol=2.2e-9 if mine is powers.softplus else 1e-30)
+    assert torch.allclose(
+        mine(x).double(),
+        expected,
+        rtol=8 * torch.finfo(dtype).eps,
+        atol=2.2e-9 if mine is powers.softplus else 1e-30,
+    )
 
 
 def test_two_arguments_are_torchs(dtype):
     x, y = torch.tensor([[-3.0, 0.0, 2.0, 2.0, -80.0], [1.0, 0.0, 2.0, -2.0, 80.0]], dtype=dtype)
-    assert torch.allclose(powers.logaddexp(x, y), torch.logaddexp(x, y), rtol=4 * torch.finfo(dtype).eps)
+    assert torch.allclose(
+        powers.logaddexp(x, y), torch.logaddexp(x, y), rtol=4 * torch.finfo(dtype).eps
+    )
     assert torch.allclose(powers.hypot(x, y), torch.hypot(x, y), rtol=4 * torch.finfo(dtype).eps)
 
 
 def test_what_is_not_replaced_is_left_to_torch():
-    """Whole-number tensors, complex ones and negative bases of a number's power come out as torch has them; nothing is replaced outside."""
+    """Whole-number tensors, complex ones and negative bases of a number's power come out as torch
+    has them; nothing is replaced outside."""
     whole, complexes = torch.tensor([2, 3]), torch.tensor([1 + 1j])
     with steady_functions():
         assert (whole**2).dtype == torch.int64 and (2**whole).dtype == torch.int64

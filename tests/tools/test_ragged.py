@@ -29,7 +29,8 @@ def loop(owner: np.ndarray, size: int, value: np.ndarray, what, empty: float = 0
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
 def test_sums_and_maxima_against_loops(owner, more, width, in_order, dtype):
-    """Groups without a row included, at the front, between and at the end. float32: forty terms of 1e-7."""
+    """Groups without a row included, at the front, between and at the end. float32: forty terms of
+    1e-7."""
     owner = np.array(sorted(owner) if in_order else owner, dtype=np.int64)
     value = np.random.default_rng(len(owner)).normal(size=(len(owner), *width))
     groups = Groups(torch.as_tensor(owner), 7 + more)
@@ -42,8 +43,14 @@ def test_sums_and_maxima_against_loops(owner, more, width, in_order, dtype):
     if width == ():
         rounded = array(given_value)
         assert (array(groups.max(given_value)) == loop(owner, 7 + more, rounded, np.max)).all()
-        assert (array(groups.max(given_value, empty=-5.0)) == loop(owner, 7 + more, rounded, np.max, -5.0)).all()
-        assert (groups.any(given_value > 1).numpy() == loop(owner, 7 + more, rounded > 1, np.max).astype(bool)).all()
+        assert (
+            array(groups.max(given_value, empty=-5.0))
+            == loop(owner, 7 + more, rounded, np.max, -5.0)
+        ).all()
+        assert (
+            groups.any(given_value > 1).numpy()
+            == loop(owner, 7 + more, rounded > 1, np.max).astype(bool)
+        ).all()
 
 
 def test_no_rows_and_no_groups(device, dtype):
@@ -51,14 +58,19 @@ def test_no_rows_and_no_groups(device, dtype):
     empty = torch.zeros(0, 3, dtype=dtype, device=device)
     assert torch.equal(Groups(none, 4).sum(empty), torch.zeros(4, 3, dtype=dtype, device=device))
     assert Groups(none, 0).sum(empty).shape == (0, 3)
-    assert torch.equal(Groups(none, 2).max(empty[:, 0], empty=7.0), torch.full((2,), 7.0, dtype=dtype, device=device))
+    assert torch.equal(
+        Groups(none, 2).max(empty[:, 0], empty=7.0),
+        torch.full((2,), 7.0, dtype=dtype, device=device),
+    )
     assert not Groups(none, 3).any(none > 0).any()
 
 
 def test_maxima_of_negative_numbers_and_infinities(device, dtype):
     """Zero has no part in it unless it is there; NaN comes out as NaN."""
     groups = Groups(torch.tensor([0, 0, 1, 2, 2], device=device), 4)
-    found = groups.max(torch.tensor([-3.0, -1.0, -torch.inf, 1.0, torch.nan], dtype=dtype, device=device))
+    found = groups.max(
+        torch.tensor([-3.0, -1.0, -torch.inf, 1.0, torch.nan], dtype=dtype, device=device)
+    )
     assert found[:2].tolist() == [-1.0, -torch.inf]
     assert bool(found[2].isnan()) and float(found[3]) == 0.0
 
@@ -80,14 +92,17 @@ def test_weighted_sums_against_loops(owner, width, in_order, dtype):
         found = rows.sum(rows.sorted(torch.as_tensor(weight, dtype=dtype)))
         assert found.shape == (8, width) and found.dtype == dtype
         wanted = loop(owner, 8, weight[:, None] * value, np.sum)
-        assert np.abs(array(found) - wanted).max() <= {torch.float32: 1e-5, torch.float64: 1e-13}[dtype]
+        assert (
+            np.abs(array(found) - wanted).max()
+            <= {torch.float32: 1e-5, torch.float64: 1e-13}[dtype]
+        )
 
 
 @pytest.mark.parametrize("width", [1, 4, 7])
 def test_a_group_has_the_same_weighted_sum_in_any_company(device, dtype, width, deterministic):
     """To the last bit: alone, and first, last or in the midst of many."""
     rng = np.random.default_rng(1)
-    t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)  # noqa: E731
+    t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)
     value, weight = rng.normal(size=(90, width)), rng.normal(size=90)
     alone = WeightedRows(t(value), Groups(torch.zeros(90, dtype=torch.int64, device=device), 1))
     wanted = alone.sum(alone.sorted(t(weight)))[0]
@@ -95,28 +110,44 @@ def test_a_group_has_the_same_weighted_sum_in_any_company(device, dtype, width, 
         for own in (0, others // 2, others - 1):
             owner = np.concatenate([rng.integers(0, others, 2 * others), np.full(90, own)])
             owner[:-90][owner[:-90] == own] = (own + 1) % others
-            order = np.sort(rng.permutation(len(owner))[:90])  # where the group's rows stand among the rest
+            # where the group's rows stand among the rest
+            order = np.sort(rng.permutation(len(owner))[:90])
             place = np.concatenate([np.setdiff1d(np.arange(len(owner)), order), order])
-            every = {k: np.empty((len(owner), *v.shape[1:])) for k, v in (("value", value), ("weight", weight))}
+            every = {
+                k: np.empty((len(owner), *v.shape[1:]))
+                for k, v in (("value", value), ("weight", weight))
+            }
             every["value"][place] = np.concatenate([rng.normal(size=(2 * others, width)), value])
             every["weight"][place] = np.concatenate([rng.normal(size=2 * others), weight])
             owners = np.empty(len(owner), dtype=np.int64)
             owners[place] = owner
-            among = WeightedRows(t(every["value"]), Groups(torch.as_tensor(owners, device=device), others))
-            assert torch.equal(among.sum(among.sorted(t(every["weight"])))[own], wanted), (others, own)
+            among = WeightedRows(
+                t(every["value"]), Groups(torch.as_tensor(owners, device=device), others)
+            )
+            assert torch.equal(among.sum(among.sorted(t(every["weight"])))[own], wanted), (
+                others,
+                own,
+            )
 
 
 @pytest.mark.parametrize("width", [(), (1,), (3,)])
 def test_gradient_of_a_sum(width):
     owner = torch.tensor([2, 0, 2, 1, 2, 4])
-    value = torch.randn(6, *width, dtype=torch.float64, generator=torch.Generator().manual_seed(1), requires_grad=True)
+    value = torch.randn(
+        6,
+        *width,
+        dtype=torch.float64,
+        generator=torch.Generator().manual_seed(1),
+        requires_grad=True,
+    )
     assert torch.autograd.gradcheck(lambda v: Groups(owner, 5).sum(v), (value,))
 
 
 @pytest.mark.parametrize("width", [1, 3, 7, 28])
 @pytest.mark.parametrize("count", [1, 5, 63, 1000])
 def test_a_group_has_the_same_sum_in_any_company(device, dtype, width, count, deterministic):
-    """Bitwise: alone, behind others, in front of others, with its rows scattered among theirs; numbers of all sizes, so order shows."""
+    """Bitwise: alone, behind others, in front of others, with its rows scattered among theirs;
+    numbers of all sizes, so order shows."""
     rng = np.random.default_rng(count + width)
 
     def rows(n):
@@ -130,36 +161,60 @@ def test_a_group_has_the_same_sum_in_any_company(device, dtype, width, count, de
     alone = summed(np.zeros(count, dtype=np.int64), mine, 1, 0)
     for others in (1, 40, 5000):
         strange = rows(others)
-        before = summed(np.r_[np.zeros(others, np.int64), np.ones(count, np.int64)], torch.cat([strange, mine]), 2, 1)
-        after = summed(np.r_[np.zeros(count, np.int64), 3 * np.ones(others, np.int64)], torch.cat([mine, strange]), 9, 0)
+        before = summed(
+            np.r_[np.zeros(others, np.int64), np.ones(count, np.int64)],
+            torch.cat([strange, mine]),
+            2,
+            1,
+        )
+        after = summed(
+            np.r_[np.zeros(count, np.int64), 3 * np.ones(others, np.int64)],
+            torch.cat([mine, strange]),
+            9,
+            0,
+        )
         assert torch.equal(before, alone) and torch.equal(after, alone)
         place = np.sort(rng.permutation(count + others)[:count])
-        owner, mixed = np.ones(count + others, np.int64), torch.empty(count + others, width, dtype=dtype, device=device)
+        owner, mixed = (
+            np.ones(count + others, np.int64),
+            torch.empty(count + others, width, dtype=dtype, device=device),
+        )
         owner[place] = 0
-        mixed[torch.as_tensor(owner == 0, device=device)], mixed[torch.as_tensor(owner == 1, device=device)] = mine, strange
+        (
+            mixed[torch.as_tensor(owner == 0, device=device)],
+            mixed[torch.as_tensor(owner == 1, device=device)],
+        ) = (mine, strange)
         assert torch.equal(summed(owner, mixed, 2, 0), alone)
 
 
 @pytest.mark.parametrize("width", [1, 4, 7])
 @pytest.mark.parametrize("count", [1, 5, 1000])
 def test_blocks_against_products_and_in_any_company(device, dtype, width, count):
-    """Each block times its row, and bitwise the same whatever stands before it; what is not a number stays in its own."""
+    """Each block times its row, and bitwise the same whatever stands before it; what is not a
+    number stays in its own."""
     rng = np.random.default_rng(count + width)
     value = rng.normal(size=(count, width, width))
     value, r = value + value.swapaxes(1, 2), rng.normal(size=(count, width))
-    t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)  # noqa: E731
+    t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)
     found = Blocks(t(value)).times(t(r))
     close = {torch.float32: 1e-5, torch.float64: 1e-13}[dtype]
     assert np.abs(array(found) - np.einsum("nij,nj->ni", value, r)).max() <= close
     strange = np.full((37, width, width), np.nan)
-    among = Blocks(t(np.concatenate([strange, value]))).times(t(np.concatenate([rng.normal(size=(37, width)), r])))
+    among = Blocks(t(np.concatenate([strange, value]))).times(
+        t(np.concatenate([rng.normal(size=(37, width)), r]))
+    )
     assert torch.equal(among[37:], found) and bool(among[:37].isnan().all())
 
 
 def test_not_a_number_stays_in_its_group(device, dtype):
     value = torch.tensor([[1.0], [torch.nan], [2.0], [torch.inf]], dtype=dtype, device=device)
     found = Groups(torch.tensor([0, 1, 0, 2], device=device), 4).sum(value).squeeze(1)
-    assert float(found[0]) == 3.0 and bool(found[1].isnan()) and bool(found[2].isinf()) and float(found[3]) == 0.0
+    assert (
+        float(found[0]) == 3.0
+        and bool(found[1].isnan())
+        and bool(found[2].isinf())
+        and float(found[3]) == 0.0
+    )
 
 
 def test_offsets(device):

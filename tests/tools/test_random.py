@@ -1,4 +1,5 @@
-"""Draws that belong to a cell: the generator itself, how evenly it draws, and that nothing but the key matters."""
+"""Draws that belong to a cell: the generator itself, how evenly it draws, and that nothing but the
+key matters."""
 
 from __future__ import annotations
 
@@ -14,11 +15,24 @@ from scipy import stats
 
 from torchfilm.tools import random
 
-# Known answers of the generator's authors (Random123, kat_vectors, philox4x32 10): counter, key, what comes out.
+# Known answers of the generator's authors (Random123, kat_vectors, philox4x32 10): counter, key,
+# what comes out.
 KNOWN = [
-    ("00000000 00000000 00000000 00000000", "00000000 00000000", "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),
-    ("ffffffff ffffffff ffffffff ffffffff", "ffffffff ffffffff", "408f276d 41c83b0e a20bc7c6 6d5451fd"),
-    ("243f6a88 85a308d3 13198a2e 03707344", "a4093822 299f31d0", "d16cfe09 94fdcceb 5001e420 24126ea1"),
+    (
+        "00000000 00000000 00000000 00000000",
+        "00000000 00000000",
+        "6627e8d5 e169c58d bc57ac4c 9b00dbd8",
+    ),
+    (
+        "ffffffff ffffffff ffffffff ffffffff",
+        "ffffffff ffffffff",
+        "408f276d 41c83b0e a20bc7c6 6d5451fd",
+    ),
+    (
+        "243f6a88 85a308d3 13198a2e 03707344",
+        "a4093822 299f31d0",
+        "d16cfe09 94fdcceb 5001e420 24126ea1",
+    ),
 ]
 
 
@@ -52,7 +66,8 @@ WORD = st.integers(0, 2**32 - 1)
 @settings(deadline=None, derandomize=True, max_examples=200)
 @given(counter=st.lists(WORD, min_size=4, max_size=4), key=st.lists(WORD, min_size=2, max_size=2))
 def test_products_that_overflow_do_no_harm(counter, key):
-    """int64 products of two 32-bit words wrap; the 64 bits that are used must be those of the true product."""
+    """int64 products of two 32-bit words wrap; the 64 bits that are used must be those of the true
+    product."""
     found = random.philox(tuple(torch.tensor([c]) for c in counter), tuple(key))
     assert [int(w) for w in found] == philox_by_hand(counter, key)
 
@@ -64,8 +79,8 @@ def keys(count: int, device="cpu") -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_uniform_is_uniform(device, dtype):
-    """200,000 draws of successive cells: Kolmogorov–Smirnov and χ² over 1,000 bins. The draws never change, so neither do the p-values: below
-    1e-3 would be a defect, not luck.
+    """200,000 draws of successive cells: Kolmogorov–Smirnov and χ² over 1,000 bins. The draws never
+    change, so neither do the p-values: below 1e-3 would be a defect, not luck.
     """
     colony, uid = keys(200_000, device)
     u = random.uniform(1, colony, uid, 3, "test", dtype)
@@ -74,7 +89,8 @@ def test_uniform_is_uniform(device, dtype):
     u = array(u)
     assert stats.kstest(u, "uniform").pvalue > 1e-3
     assert stats.chisquare(np.histogram(u, 1000, (0, 1))[0]).pvalue > 1e-3
-    # neighbours in uid, colony and step are strangers: correlations within 4 of their standard deviation 1/√n
+    # neighbours in uid, colony and step are strangers: correlations within 4 of their standard
+    # deviation 1/√n
     later = array(random.uniform(1, colony, uid, 4, "test", dtype))
     other = array(random.uniform(1, colony, uid, 3, "tests", dtype))
     reseeded = array(random.uniform(2, colony, uid, 3, "test", dtype))
@@ -84,7 +100,8 @@ def test_uniform_is_uniform(device, dtype):
 
 @pytest.mark.parametrize("word", [0, 2**32 - 1])
 def test_no_draw_is_zero_or_one(dtype, word, monkeypatch):
-    """The docstring promises the open interval (0, 1): also for the least and the greatest word, in either precision."""
+    """The docstring promises the open interval (0, 1): also for the least and the greatest word, in
+    either precision."""
     monkeypatch.setattr(random, "words", lambda *key: (torch.tensor([word]),) * 4)
     none = torch.tensor([0])
     assert 0 < float(random.uniform(0, none, none, 0, "test", dtype)) < 1
@@ -92,7 +109,8 @@ def test_no_draw_is_zero_or_one(dtype, word, monkeypatch):
 
 
 def test_normal_is_normal(device, dtype):
-    """Four draws a cell, each standard normal by Kolmogorov–Smirnov, the four uncorrelated, also in size."""
+    """Four draws a cell, each standard normal by Kolmogorov–Smirnov, the four uncorrelated, also in
+    size."""
     colony, uid = keys(50_000, device)
     z = random.normal(5, colony, uid, 0, "test", dtype)
     assert z.shape == (50_000, 4) and z.dtype == dtype
@@ -106,29 +124,55 @@ def test_normal_is_normal(device, dtype):
 
 
 @settings(deadline=None, derandomize=True, max_examples=50)
-@given(seed=st.integers(0, 2**63 - 1), order=st.permutations(range(8)), step=st.integers(0, 2**31), shift=st.integers(0, 2**40))
+@given(
+    seed=st.integers(0, 2**63 - 1),
+    order=st.permutations(range(8)),
+    step=st.integers(0, 2**31),
+    shift=st.integers(0, 2**40),
+)
 def test_draws_do_not_depend_on_company(seed, order, step, shift):
     """In any order, alone or together, a cell's draw is its own; bitwise."""
     colony, uid = torch.tensor([0, 0, 1, 1, 2, 5, 5, 7]), torch.arange(8) * 3 + shift
     place = torch.tensor(order)
     for draw in (random.uniform, random.normal):
         whole = draw(seed, colony, uid, step, "test", torch.float32)
-        assert torch.equal(draw(seed, colony[place], uid[place], step, "test", torch.float32), whole[place])
-        assert torch.equal(draw(seed, colony[3:4], uid[3:4], step, "test", torch.float32), whole[3:4])
+        assert torch.equal(
+            draw(seed, colony[place], uid[place], step, "test", torch.float32), whole[place]
+        )
+        assert torch.equal(
+            draw(seed, colony[3:4], uid[3:4], step, "test", torch.float32), whole[3:4]
+        )
 
 
 def test_every_part_of_the_key_counts():
-    """Change one of seed, colony, uid, step, purpose and the words change; seeds and uids beyond 32 bits too."""
+    """Change one of seed, colony, uid, step, purpose and the words change; seeds and uids beyond 32
+    bits too."""
     base = {"seed": 1, "colony": 2, "uid": 3, "step": 4, "purpose": "a"}
-    others = [{}, {"seed": 2}, {"seed": 1 + 2**40}, {"colony": 3}, {"uid": 4}, {"uid": 3 + 2**33}, {"step": 5}, {"purpose": "b"}]
+    others = [
+        {},
+        {"seed": 2},
+        {"seed": 1 + 2**40},
+        {"colony": 3},
+        {"uid": 4},
+        {"uid": 3 + 2**33},
+        {"step": 5},
+        {"purpose": "b"},
+    ]
     seen = set()
     for change in others:
         key = {**base, **change}
-        words = random.words(key["seed"], torch.tensor([key["colony"]]), torch.tensor([key["uid"]]), key["step"], key["purpose"])
+        words = random.words(
+            key["seed"],
+            torch.tensor([key["colony"]]),
+            torch.tensor([key["uid"]]),
+            key["step"],
+            key["purpose"],
+        )
         seen.add(tuple(int(w) for w in words))
     assert len(seen) == len(others)
 
 
 def test_purposes_have_stable_codes():
-    """A saved run goes on with the same draws in another session: codes are a checksum of the name, not Python's hash."""
+    """A saved run goes on with the same draws in another session: codes are a checksum of the name,
+    not Python's hash."""
     assert random.purpose_code("abc") == 0x352441C2

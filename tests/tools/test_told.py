@@ -50,12 +50,21 @@ class Adding:
         (made("def f(x): return x + 1"), made("def f(x): return x + 2")),
         (made("def f(x): return x + 1"), made("def f(x): return x - 1")),
         (made("def f(x, k=1): return x + k"), made("def f(x, k=2): return x + k")),
-        (made("def f(x):\n  def g(y): return y\n  return g(x)"), made("def f(x):\n  def g(y): return -y\n  return g(x)")),
-        (made("import math\ndef f(x): return math.sin(x)"), made("import math\ndef f(x): return math.cos(x)")),
+        (
+            made("def f(x):\n  def g(y): return y\n  return g(x)"),
+            made("def f(x):\n  def g(y): return -y\n  return g(x)"),
+        ),
+        (
+            made("import math\ndef f(x): return math.sin(x)"),
+            made("import math\ndef f(x): return math.cos(x)"),
+        ),
         (holding(1), holding(2)),
         (Thing(1.0), Thing(2.0)),
         (Adding(1.0).to, Adding(2.0).to),
-        (partial(made("def f(x, k): return x + k"), k=1), partial(made("def f(x, k): return x - k"), k=1)),
+        (
+            partial(made("def f(x, k): return x + k"), k=1),
+            partial(made("def f(x, k): return x - k"), k=1),
+        ),
         (partial(holding, 1), partial(holding, 2)),
     ],
 )
@@ -72,7 +81,10 @@ def test_what_differs_is_told_apart(one, other):
         (torch.tensor([1.0, 2.0]), np.array([1.0, 2.0], np.float32)),
         ([object()], [object()]),
         ((2.0, (1, "a")), [2.0, [1, "a"]]),
-        (made('def f(x):\n  "Adds one."\n  return x + 1'), made('def f(x):\n  "Adds 1 to x."\n  return x + 1')),
+        (
+            made('def f(x):\n  "Adds one."\n  return x + 1'),
+            made('def f(x):\n  "Adds 1 to x."\n  return x + 1'),
+        ),
         (made("size = 3\ndef f(x): return x.size"), made("size = 4\ndef f(x): return x.size")),
         (Adding(1.0).to, Adding(1.0).to),
         (partial(holding, 1), partial(holding, 1)),

@@ -1,1 +1,2 @@
-"""Circuits: reactions inside cells and the integrators that carry them forward. Tensors in and out, never a State."""
+"""Circuits: reactions inside cells and the integrators that carry them forward. Tensors in and out,
+never a State."""

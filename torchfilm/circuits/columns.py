@@ -13,8 +13,8 @@ from torchfilm.circuits.names import Names, UnknownName, unknown
 class Columns(Names):
     """Named columns over some of the cells.
 
-    source: per name a tensor over all cells, a number, or a function that gives the tensor. rows: (M,) int64 the cells. seen: collects the names
-    that were asked for, where given.
+    source: per name a tensor over all cells, a number, or a function that gives the tensor. rows:
+    (M,) int64 the cells. seen: collects the names that were asked for, where given.
     """
 
     __slots__ = ("_rows", "_seen", "_source")
@@ -22,7 +22,9 @@ class Columns(Names):
     _rows: Tensor
     _seen: set[str] | None
 
-    def __init__(self, source: Mapping[str, Any], rows: Tensor, label: str, seen: set[str] | None = None):
+    def __init__(
+        self, source: Mapping[str, Any], rows: Tensor, label: str, seen: set[str] | None = None
+    ):
         super().__init__((), (), label)
         object.__setattr__(self, "_source", source)
         object.__setattr__(self, "_rows", rows)

@@ -1,4 +1,5 @@
-"""Explicit integrators with equal steps, for circuits that are not stiff: Euler, and Runge–Kutta by torchdiffeq."""
+"""Explicit integrators with equal steps, for circuits that are not stiff: Euler, and Runge–Kutta by
+torchdiffeq."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ METHODS = ("midpoint", "heun2", "heun3", "rk4")
 
 
 def euler(rates: Rates, u: Tensor, dt: float, steps: int = 1) -> Tensor:
-    """Concentrations (N, S) after dt hours in equal steps of Euler's method; order 1. rates: as in `rosenbrock`."""
+    """Concentrations (N, S) after dt hours in equal steps of Euler's method; order 1. rates: as in
+    `rosenbrock`."""
     _check_steps(steps)
     rows = torch.arange(u.shape[0], device=u.device)
     for _ in range(steps):
@@ -22,9 +24,11 @@ def euler(rates: Rates, u: Tensor, dt: float, steps: int = 1) -> Tensor:
 
 
 def runge_kutta(rates: Rates, u: Tensor, dt: float, steps: int = 1, method: str = "rk4") -> Tensor:
-    """Concentrations (N, S) after dt hours in equal steps; method: "midpoint", "heun2" (order 2), "heun3" (3) or "rk4" (4, the ⅜ rule).
+    """Concentrations (N, S) after dt hours in equal steps; method: "midpoint", "heun2" (order 2),
+    "heun3" (3) or "rk4" (4, the ⅜ rule).
 
-    Only torchdiffeq's methods with fixed steps: its adaptive ones share one step over the batch, so that a stiff cell would change the others' results.
+    Only torchdiffeq's methods with fixed steps: its adaptive ones share one step over the batch, so
+    that a stiff cell would change the others' results.
     """
     _check_steps(steps)
     checks.choice("method", method, METHODS)
@@ -33,7 +37,13 @@ def runge_kutta(rates: Rates, u: Tensor, dt: float, steps: int = 1, method: str 
     rows = torch.arange(u.shape[0], device=u.device)
     # times in float64 on the host: in float32 the last step could come out as a sliver
     grid = torch.linspace(0.0, dt, steps + 1, dtype=torch.float64)
-    found = torchdiffeq.odeint(lambda t, y: rates(y, rows), u, grid[[0, -1]], method=method, options={"grid_constructor": lambda *_: grid})
+    found = torchdiffeq.odeint(
+        lambda t, y: rates(y, rows),
+        u,
+        grid[[0, -1]],
+        method=method,
+        options={"grid_constructor": lambda *_: grid},
+    )
     return found[-1]
 
 

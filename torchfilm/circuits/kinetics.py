@@ -1,4 +1,5 @@
-"""Rate laws that hold everywhere: below zero they are as at zero, far above they do not overflow, and at zero their derivatives are finite.
+"""Rate laws that hold everywhere: below zero they are as at zero, far above they do not overflow,
+and at zero their derivatives are finite.
 
 x, half and power are tensors that broadcast, or numbers; half > 0, power ≥ 1.
 """
@@ -29,7 +30,8 @@ def michaelis_menten(x: Tensor, half: float | Tensor) -> Tensor:
 
 
 def _ratio(x: Tensor, half: float | Tensor, power: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Whether x > K, and (x/K)ⁿ, or (K/x)ⁿ where it is: a number from 0 to 1 that neither overflows nor divides by 0."""
+    """Whether x > K, and (x/K)ⁿ, or (K/x)ⁿ where it is: a number from 0 to 1 that neither overflows
+    nor divides by 0."""
     r = (x / half).clamp(min=0.0)
     big = r.detach() > 1.0
     inner = torch.where(big, torch.where(big, r, 1.0).reciprocal(), r)

@@ -18,7 +18,8 @@ class UnknownName(checks.InputError, AttributeError):
 class Names:
     """Read-only names for columns: `u.ahl`, or `u["ahl"]` for a name that is made up at run time.
 
-    order: the names. columns: one for each of them, in a tensor (M, K) or a sequence of tensors or numbers. label: what to call this in a message.
+    order: the names. columns: one for each of them, in a tensor (M, K) or a sequence of tensors or
+    numbers. label: what to call this in a message.
     """
 
     __slots__ = ("__dict__", "_label")
@@ -26,8 +27,11 @@ class Names:
 
     def __init__(self, order: Sequence[str], columns: Tensor | Sequence[Any], label: str = "this"):
         object.__setattr__(self, "_label", label)
-        # the columns are the instance's own attributes, so that finding one costs what any attribute costs
-        self.__dict__.update(zip(order, columns.unbind(1) if isinstance(columns, Tensor) else columns, strict=True))
+        # the columns are the instance's own attributes, so that finding one costs what any
+        # attribute costs
+        self.__dict__.update(
+            zip(order, columns.unbind(1) if isinstance(columns, Tensor) else columns, strict=True)
+        )
 
     def __getattr__(self, name: str) -> Any:
         # only called for what is not there
@@ -39,7 +43,10 @@ class Names:
         return getattr(self, name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        raise UnknownName(f"{self._label}.{name} can only be read: a rate function returns rates and changes nothing.")
+        raise UnknownName(
+            f"{self._label}.{name} can only be read: a rate function returns rates and changes"
+            " nothing."
+        )
 
     def __delattr__(self, name: str) -> None:
         raise UnknownName(f"{self._label}.{name} can only be read.")
@@ -63,4 +70,6 @@ class Names:
 def unknown(what: str, name: str, known: Sequence[str]) -> str:
     """The message for a name that is not there: what is, and what may have been meant."""
     near = difflib.get_close_matches(name, known, 1, cutoff=0.6)
-    return f"{what}; known are {', '.join(known) or 'none'}." + (f" Did you mean {near[0]!r}?" if near else "")
+    return f"{what}; known are {', '.join(known) or 'none'}." + (
+        f" Did you mean {near[0]!r}?" if near else ""
+    )

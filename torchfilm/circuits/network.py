@@ -1,4 +1,5 @@
-"""A list of reactions made ready to run: checked against the species and signals that there are, with its stoichiometry as a tensor."""
+"""A list of reactions made ready to run: checked against the species and signals that there are,
+with its stoichiometry as a tensor."""
 
 from __future__ import annotations
 
@@ -18,8 +19,9 @@ from torchfilm.tools import checks
 class Network:
     """R reactions over S species and M signals.
 
-    stoichiometry (R, S + M) float64: molecules gained by each event, species before signals. orders (S + M,) float64: the highest order in which
-    a rate depends on each. parameters: the names that constants refer to.
+    stoichiometry (R, S + M) float64: molecules gained by each event, species before signals. orders
+    (S + M,) float64: the highest order in which a rate depends on each. parameters: the names that
+    constants refer to.
     """
 
     reactions: tuple[Reaction, ...]
@@ -35,13 +37,18 @@ class Network:
         return (*self.species, *(OUTSIDE + s for s in self.signals))
 
     def concentration_rates(self, u: Names, s: Names, p: Names, cell: Names) -> list[Tensor]:
-        """R rates, each (n,) conc/h in the cell's volume; differentiable. `cell` holds volume, area and colony (the id that constants per colony go by)."""
+        """R rates, each (n,) conc/h in the cell's volume; differentiable. `cell` holds volume, area
+        and colony (the id that constants per colony go by)."""
         out = []
         for reaction in self.reactions:
             if callable(reaction.rate):
                 out.append(reaction.rate(u, s, p, cell))
                 continue
-            rate = torch.as_tensor(per_cell(reaction.rate, p, cell, cell.volume), dtype=cell.volume.dtype, device=cell.volume.device).expand_as(cell.volume)
+            rate = torch.as_tensor(
+                per_cell(reaction.rate, p, cell, cell.volume),
+                dtype=cell.volume.dtype,
+                device=cell.volume.device,
+            ).expand_as(cell.volume)
             for name, order in reaction.consumes.items():
                 x = concentration(name, u, s)
                 for _ in range(order):
@@ -50,7 +57,8 @@ class Network:
         return out
 
     def changes(self, rates: Sequence[Tensor]) -> list[Tensor]:
-        """What R rates (n,) change: S + M tensors (n,), conc/h referred to the cell's volume; a signal's, times the volume, is an amount per hour."""
+        """What R rates (n,) change: S + M tensors (n,), conc/h referred to the cell's volume; a
+        signal's, times the volume, is an amount per hour."""
         out = [torch.zeros_like(rates[0]) for _ in self.names]
         place = {n: k for k, n in enumerate(self.names)}
         for reaction, rate in zip(self.reactions, rates, strict=True):
@@ -59,17 +67,33 @@ class Network:
                 out[k] = out[k] + (rate if count == 1 else -rate if count == -1 else count * rate)
         return out
 
-    def propensities(self, counts: Tensor, p: Names, cell: Names, *, copies: float | Tensor = 1.0, pool: Tensor | None = None) -> Tensor:
-        """Events per hour, (n, R), at molecule numbers `counts` (n, S + M); copies: molecules in a unit of concentration × µm³.
+    def propensities(
+        self,
+        counts: Tensor,
+        p: Names,
+        cell: Names,
+        *,
+        copies: float | Tensor = 1.0,
+        pool: Tensor | None = None,
+    ) -> Tensor:
+        """Events per hour, (n, R), at molecule numbers `counts` (n, S + M); copies: molecules in a
+        unit of concentration × µm³.
 
-        pool: µm³ outside that each cell may draw signals from, (n,) or (n, M), where there are signals. Mass action counts combinations, k Ω n (n − 1)/Ω²
-        for 2 a with Ω = volume × copies; a function's rate is used as it is, times Ω.
+        pool: µm³ outside that each cell may draw signals from, (n,) or (n, M), where there are
+        signals. Mass action counts combinations, k Ω n (n − 1)/Ω² for 2 a with Ω = volume × copies;
+        a function's rate is used as it is, times Ω.
         """
         volumes = [cell.volume * copies] * len(self.species)
         if self.signals:
             if pool is None:
-                raise checks.refuse("pool", pool, "the volume outside of each cell, for the signals " + ", ".join(self.signals))
-            volumes += [(pool if pool.dim() == 1 else pool[:, k]) * copies for k in range(len(self.signals))]
+                raise checks.refuse(
+                    "pool",
+                    pool,
+                    "the volume outside of each cell, for the signals " + ", ".join(self.signals),
+                )
+            volumes += [
+                (pool if pool.dim() == 1 else pool[:, k]) * copies for k in range(len(self.signals))
+            ]
         columns = counts.unbind(1)
         density = [n / v for n, v in zip(columns, volumes, strict=True)]
         u = Names(self.species, density[: len(self.species)], "u")
@@ -93,11 +117,20 @@ class Network:
 
 def network_parts(entry: Sequence[Any]) -> list[Reaction]:
     """Reactions in a part, or in parts within parts, in order."""
-    return [r for inner in entry for r in ([inner] if isinstance(inner, Reaction) else network_parts(inner))]
+    return [
+        r
+        for inner in entry
+        for r in ([inner] if isinstance(inner, Reaction) else network_parts(inner))
+    ]
 
 
-def network(reactions: Sequence[Reaction | Sequence[Reaction]], species: Sequence[str], signals: Sequence[str] = ()) -> Network:
-    """Reactions, or parts (lists of reactions), checked and put together over the given species and signals."""
+def network(
+    reactions: Sequence[Reaction | Sequence[Reaction]],
+    species: Sequence[str],
+    signals: Sequence[str] = (),
+) -> Network:
+    """Reactions, or parts (lists of reactions), checked and put together over the given species and
+    signals."""
     flat: list[Reaction] = []
     for entry in reactions:
         flat += [entry] if isinstance(entry, Reaction) else network_parts(entry)
@@ -106,23 +139,43 @@ def network(reactions: Sequence[Reaction | Sequence[Reaction]], species: Sequenc
     names = [*species, *(OUTSIDE + s for s in signals)]
     _check_names(species, signals)
     seen: set[str] = set()
-    stoichiometry, orders = torch.zeros(len(flat), len(names), dtype=torch.float64), torch.zeros(len(names), dtype=torch.float64)
+    stoichiometry, orders = (
+        torch.zeros(len(flat), len(names), dtype=torch.float64),
+        torch.zeros(len(names), dtype=torch.float64),
+    )
     for row, reaction in enumerate(flat):
         if reaction.name and reaction.name in seen:
-            raise checks.refuse("reaction", reaction.name, "there only once", "Give each reaction a name of its own, or none.")
+            raise checks.refuse(
+                "reaction",
+                reaction.name,
+                "there only once",
+                "Give each reaction a name of its own, or none.",
+            )
         seen.add(reaction.name)
         for name in (*reaction.consumes, *reaction.produces, *getattr(reaction.rate, "reads", ())):
             if name not in names:
                 if name.startswith(OUTSIDE) and not signals:
                     signal = name.removeprefix(OUTSIDE)
                     raise checks.InputError(
-                        f"the reaction {reaction.name or str(reaction)!r} needs the signal {signal!r}: list tf.Medium({signal}=tf.Signal(…))."
+                        f"the reaction {reaction.name or str(reaction)!r} needs the signal"
+                        f" {signal!r}: list tf.Medium({signal}=tf.Signal(…))."
                     )
-                raise checks.InputError(unknown(f"the reaction {reaction.name or str(reaction)!r} has the unknown name {name!r}", name, names))
+                raise checks.InputError(
+                    unknown(
+                        f"the reaction {reaction.name or str(reaction)!r} has the unknown name"
+                        f" {name!r}",
+                        name,
+                        names,
+                    )
+                )
         for name, count in reaction.change().items():
             stoichiometry[row, names.index(name)] = count
         # what a user's own function reads is not known, so it may be anything
-        steep = dict.fromkeys(getattr(reaction.rate, "reads", names), reaction.order) if callable(reaction.rate) else reaction.consumes
+        steep = (
+            dict.fromkeys(getattr(reaction.rate, "reads", names), reaction.order)
+            if callable(reaction.rate)
+            else reaction.consumes
+        )
         for name, order in steep.items():
             k = names.index(name)
             orders[k] = max(float(orders[k]), order)
@@ -132,16 +185,23 @@ def network(reactions: Sequence[Reaction | Sequence[Reaction]], species: Sequenc
 
 def _check_names(species: Sequence[str], signals: Sequence[str]) -> None:
     for what, given in (("species", species), ("signals", signals)):
-        if isinstance(given, str) or not all(isinstance(n, str) and n.isidentifier() for n in given):
+        if isinstance(given, str) or not all(
+            isinstance(n, str) and n.isidentifier() for n in given
+        ):
             raise checks.refuse(what, given, "a sequence of names")
         if len(set(given)) != len(given):
             raise checks.refuse(what, list(given), "different names", "One stands there twice.")
 
 
 def _parameters(reactions: Sequence[Reaction]) -> tuple[str, ...]:
-    """Names of parameters that constants refer to, in order; what a user's own function reads is not known."""
+    """Names of parameters that constants refer to, in order; what a user's own function reads is
+    not known."""
     found: list[str] = []
     for reaction in reactions:
-        given = [getattr(reaction.rate, c, None) for c in ("rate", "half", "power")] if callable(reaction.rate) else [reaction.rate]
+        given = (
+            [getattr(reaction.rate, c, None) for c in ("rate", "half", "power")]
+            if callable(reaction.rate)
+            else [reaction.rate]
+        )
         found += [c for c in given if isinstance(c, str) and c not in found]
     return tuple(found)

@@ -9,6 +9,9 @@ from torch import Tensor
 
 @torch.no_grad()
 def binomial(count: Tensor, share: Tensor, uniform: Tensor) -> Tensor:
-    """How many of `count` (M,) go to the first daughter if each goes there with probability `share` (M,): the least k with P(X ≤ k) ≥ uniform (M,)."""
-    found = scipy.stats.binom.ppf(uniform.double().cpu().numpy(), count.double().cpu().numpy(), share.double().cpu().numpy())
+    """How many of `count` (M,) go to the first daughter if each goes there with probability `share`
+    (M,): the least k with P(X ≤ k) ≥ uniform (M,)."""
+    found = scipy.stats.binom.ppf(
+        uniform.double().cpu().numpy(), count.double().cpu().numpy(), share.double().cpu().numpy()
+    )
     return torch.from_numpy(found).to(count).clamp(min=0.0)

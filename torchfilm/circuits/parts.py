@@ -1,4 +1,5 @@
-"""Parts: the usual reactions of genetic circuits by name, each a list of reactions. Every constant is a number, one per colony, or a parameter's name."""
+"""Parts: the usual reactions of genetic circuits by name, each a list of reactions. Every constant
+is a number, one per colony, or a parameter's name."""
 
 from __future__ import annotations
 
@@ -8,7 +9,14 @@ from torch import Tensor
 
 from torchfilm.circuits import kinetics
 from torchfilm.circuits.names import Names
-from torchfilm.circuits.reactions import OUTSIDE, Constant, Reaction, concentration, constant, per_cell
+from torchfilm.circuits.reactions import (
+    OUTSIDE,
+    Constant,
+    Reaction,
+    concentration,
+    constant,
+    per_cell,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +80,17 @@ def _steepness(power: Constant) -> int:
     return max(1, -int(-power // 1)) if isinstance(power, (int, float)) else 4
 
 
-def _regulated(species: str, by: str, rate: Constant, half: Constant, power: Constant, repressed: bool) -> list[Reaction]:
+def _regulated(
+    species: str, by: str, rate: Constant, half: Constant, power: Constant, repressed: bool
+) -> list[Reaction]:
     what = "repressed" if repressed else "activated"
-    law = _Regulated(by, constant(f"{what}.rate", rate), constant(f"{what}.half", half, positive=True), constant(f"{what}.power", power), repressed)
+    law = _Regulated(
+        by,
+        constant(f"{what}.rate", rate),
+        constant(f"{what}.half", half, positive=True),
+        constant(f"{what}.power", power),
+        repressed,
+    )
     return [Reaction({}, {species: 1}, law, f"{species} {what} by {by}", order=_steepness(power))]
 
 
@@ -83,12 +99,16 @@ def constitutive(species: str, rate: Constant) -> list[Reaction]:
     return [Reaction({}, {species: 1}, rate, f"{species} made")]
 
 
-def activated(species: str, by: str, rate: Constant, half: Constant, power: Constant = 1.0) -> list[Reaction]:
+def activated(
+    species: str, by: str, rate: Constant, half: Constant, power: Constant = 1.0
+) -> list[Reaction]:
     """∅ → species at rate × xⁿ/(Kⁿ + xⁿ), x the concentration of `by`, K = half, n = power."""
     return _regulated(species, by, rate, half, power, False)
 
 
-def repressed(species: str, by: str, rate: Constant, half: Constant, power: Constant = 1.0) -> list[Reaction]:
+def repressed(
+    species: str, by: str, rate: Constant, half: Constant, power: Constant = 1.0
+) -> list[Reaction]:
     """∅ → species at rate × Kⁿ/(Kⁿ + xⁿ), x the concentration of `by`, K = half, n = power."""
     return _regulated(species, by, rate, half, power, True)
 
@@ -98,16 +118,32 @@ def degradation(species: str, rate: Constant) -> list[Reaction]:
     return [Reaction({species: 1}, {}, rate, f"{species} lost")]
 
 
-def conversion(substrate: str, product: str | None = None, *, enzyme: str, rate: Constant, half: Constant) -> list[Reaction]:
+def conversion(
+    substrate: str, product: str | None = None, *, enzyme: str, rate: Constant, half: Constant
+) -> list[Reaction]:
     """substrate → product (or nothing) by an enzyme E at rate × E × S/(half + S); rate 1/h."""
-    law = _Enzyme(substrate, enzyme, constant("conversion.rate", rate), constant("conversion.half", half, positive=True))
-    return [Reaction({substrate: 1}, {product: 1} if product else {}, law, f"{substrate} converted by {enzyme}")]
+    law = _Enzyme(
+        substrate,
+        enzyme,
+        constant("conversion.rate", rate),
+        constant("conversion.half", half, positive=True),
+    )
+    return [
+        Reaction(
+            {substrate: 1},
+            {product: 1} if product else {},
+            law,
+            f"{substrate} converted by {enzyme}",
+        )
+    ]
 
 
 def exchange(species: str, rate: Constant, signal: str | None = None) -> list[Reaction]:
-    """Through the membrane, both ways: D₁ A/V × concentration, rate = D₁ in µm/h; signal: its name outside, default as inside.
+    """Through the membrane, both ways: D₁ A/V × concentration, rate = D₁ in µm/h; signal: its name
+    outside, default as inside.
 
-    What leaves the cell enters the medium and the other way round: one reaction each, so that single molecules can make the way too.
+    What leaves the cell enters the medium and the other way round: one reaction each, so that
+    single molecules can make the way too.
     """
     outside = OUTSIDE + (signal or species)
     rate = constant("exchange.rate", rate)

@@ -1,6 +1,8 @@
-"""Reactions: what turns into what, and how fast. A list of them is a circuit that can run smoothly or molecule by molecule.
+"""Reactions: what turns into what, and how fast. A list of them is a circuit that can run smoothly
+or molecule by molecule.
 
-Names are the cell's species; "out.ahl" is the signal ahl just outside the cell. Rates are concentration per hour, referred to the cell's volume.
+Names are the cell's species; "out.ahl" is the signal ahl just outside the cell. Rates are
+concentration per hour, referred to the cell's volume.
 """
 
 from __future__ import annotations
@@ -28,8 +30,9 @@ PLACE = re.compile(r"(?:(\d+)\s*\*?\s*)?((?:out\.)?[A-Za-z_]\w*)")
 class Reaction:
     """Molecules `consumes` turn into `produces`, name -> how many, at `rate`.
 
-    rate: a constant (a number, one per colony, or a parameter's name) for mass action, rate × Π concentration^order over what is consumed; or a
-    function (u, s, p, cell) -> (n,) conc/h. Its arguments are names for columns over cells: species, signals outside, parameters, geometry.
+    rate: a constant (a number, one per colony, or a parameter's name) for mass action, rate × Π
+    concentration^order over what is consumed; or a function (u, s, p, cell) -> (n,) conc/h. Its
+    arguments are names for columns over cells: species, signals outside, parameters, geometry.
     """
 
     consumes: Mapping[str, int]
@@ -42,48 +45,77 @@ class Reaction:
     def __post_init__(self) -> None:
         label = f"Reaction({self.name!r})" if self.name else "Reaction"
         for side in ("consumes", "produces"):
-            object.__setattr__(self, side, MappingProxyType(_side(f"{label}.{side}", getattr(self, side))))
+            object.__setattr__(
+                self, side, MappingProxyType(_side(f"{label}.{side}", getattr(self, side)))
+            )
         if not callable(self.rate):
             object.__setattr__(self, "rate", constant(f"{label}.rate", self.rate))
         if isinstance(self.order, bool) or not isinstance(self.order, int) or self.order < 1:
             raise checks.refuse(f"{label}.order", self.order, "a whole number from 1")
         if not self.change():
-            raise checks.refuse(label, str(self), "a reaction that changes something", "Both sides are the same.")
+            raise checks.refuse(
+                label, str(self), "a reaction that changes something", "Both sides are the same."
+            )
 
     @staticmethod
-    def of(equation: str, rate: Constant | RateFunction, name: str = "", *, order: int = 2) -> Reaction:
-        """From an equation: `Reaction.of("2 a + b -> c", rate=0.1)`; an empty side or 0 stands for nothing."""
+    def of(
+        equation: str, rate: Constant | RateFunction, name: str = "", *, order: int = 2
+    ) -> Reaction:
+        """From an equation: `Reaction.of("2 a + b -> c", rate=0.1)`; an empty side or 0 stands for
+        nothing."""
         sides = equation.split("->")
         if len(sides) != 2:
-            raise checks.refuse("equation", equation, 'two sides with an arrow, such as "2 a + b -> c"')
-        return Reaction(_parse(sides[0], equation), _parse(sides[1], equation), rate, name, order=order)
+            raise checks.refuse(
+                "equation", equation, 'two sides with an arrow, such as "2 a + b -> c"'
+            )
+        return Reaction(
+            _parse(sides[0], equation), _parse(sides[1], equation), rate, name, order=order
+        )
 
     def change(self) -> dict[str, int]:
-        """Net change of each species and signal that one event makes; what does not change is left out."""
+        """Net change of each species and signal that one event makes; what does not change is left
+        out."""
         names = [*self.consumes, *(n for n in self.produces if n not in self.consumes)]
         net = {n: self.produces.get(n, 0) - self.consumes.get(n, 0) for n in names}
         return {n: k for n, k in net.items() if k}
 
     def __str__(self) -> str:
-        sides = (" + ".join(n if k == 1 else f"{k} {n}" for n, k in side.items()) or "0" for side in (self.consumes, self.produces))
+        sides = (
+            " + ".join(n if k == 1 else f"{k} {n}" for n, k in side.items()) or "0"
+            for side in (self.consumes, self.produces)
+        )
         return " -> ".join(sides)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # read-only mappings do not pickle by themselves
-        return (_restore, (dict(self.consumes), dict(self.produces), self.rate, self.name, self.order))
+        return (
+            _restore,
+            (dict(self.consumes), dict(self.produces), self.rate, self.name, self.order),
+        )
 
 
-def _restore(consumes: dict[str, int], produces: dict[str, int], rate: Constant | RateFunction, name: str, order: int) -> Reaction:
+def _restore(
+    consumes: dict[str, int],
+    produces: dict[str, int],
+    rate: Constant | RateFunction,
+    name: str,
+    order: int,
+) -> Reaction:
     return Reaction(consumes, produces, rate, name, order=order)
 
 
 def constant(name: str, given: object, *, positive: bool = False) -> Constant:
-    """A constant as given, checked: at least 0 (above 0 where `positive`), or a parameter's name."""
+    """A constant as given, checked: at least 0 (above 0 where `positive`), or a parameter's
+    name."""
     if isinstance(given, str):
         if not given.isidentifier():
-            raise checks.refuse(name, given, "a number, one number per colony, or a parameter's name")
+            raise checks.refuse(
+                name, given, "a number, one number per colony, or a parameter's name"
+            )
         return given
-    return checks.value(name, given, above=0.0) if positive else checks.value(name, given, least=0.0)
+    return (
+        checks.value(name, given, above=0.0) if positive else checks.value(name, given, least=0.0)
+    )
 
 
 def _side(name: str, given: object) -> dict[str, int]:
@@ -104,13 +136,19 @@ def _parse(side: str, equation: str) -> dict[str, int]:
     for term in side.split("+"):
         found = PLACE.fullmatch(term.strip())
         if not found:
-            raise checks.refuse("equation", equation, 'terms such as "2 a" or "out.ahl", joined by +', f"This is not one: {term.strip()!r}.")
+            raise checks.refuse(
+                "equation",
+                equation,
+                'terms such as "2 a" or "out.ahl", joined by +',
+                f"This is not one: {term.strip()!r}.",
+            )
         out[found[2]] = out.get(found[2], 0) + int(found[1] or 1)
     return out
 
 
 def per_cell(given: Constant, p: Names, cell: Names, like: Tensor) -> Tensor | float:
-    """A constant for each cell, (n,), or a single value: parameters by name, one per colony by the colony's id, `cell.colony`."""
+    """A constant for each cell, (n,), or a single value: parameters by name, one per colony by the
+    colony's id, `cell.colony`."""
     if isinstance(given, str):
         return p[given]
     if not isinstance(given, Tensor):
@@ -125,7 +163,8 @@ def concentration(name: str, u: Names, s: Names) -> Tensor:
 
 
 def falling(count: Tensor, order: int) -> Tensor:
-    """n (n − 1) … (n − order + 1) for whole n ≥ 0 and an order from 1: 0 where there are too few."""
+    """n (n − 1) … (n − order + 1) for whole n ≥ 0 and an order from 1: 0 where there are too
+    few."""
     out = count
     for k in range(1, order):
         out = out * (count - k).clamp(min=0.0)

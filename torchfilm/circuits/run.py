@@ -1,8 +1,10 @@
-"""One circuit in the cells of one type, over one step: rates by a user's function or by reactions, with the medium about each cell as its pool.
+"""One circuit in the cells of one type, over one step: rates by a user's function or by reactions,
+with the medium about each cell as its pool.
 
-What a cell exchanges with the medium is solved together with what happens inside it: the circuit's variables are the species and, for each
-signal that it gives or takes, the concentration in the cell's own pool, the part of the medium from which it may draw in this step. So however
-fast the exchange, neither side falls below zero, and what one gives the other has.
+What a cell exchanges with the medium is solved together with what happens inside it: the circuit's
+variables are the species and, for each signal that it gives or takes, the concentration in the
+cell's own pool, the part of the medium from which it may draw in this step. So however fast the
+exchange, neither side falls below zero, and what one gives the other has.
 """
 
 from __future__ import annotations
@@ -23,13 +25,15 @@ from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.powers import steady_functions
 
-# rates of change of species by name, conc/h, and amounts per hour given to signals by name, conc·µm³/h
+# rates of change of species by name, conc/h, and amounts per hour given to signals by name,
+# conc·µm³/h
 RateFunction = Callable[[Names, Names, Names, Names], Any]
 
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """How circuits are stepped: method, its `steps` or tolerances, and molecules per unit of concentration × µm³, (N,) or one number."""
+    """How circuits are stepped: method, its `steps` or tolerances, and molecules per unit of
+    concentration × µm³, (N,) or one number."""
 
     method: str
     steps: int
@@ -40,10 +44,13 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Circuit:
-    """A circuit in M of N cells. part: a rate function, or reactions made ready. species: its variables. given: the signals it exchanges.
+    """A circuit in M of N cells. part: a rate function, or reactions made ready. species: its
+    variables. given: the signals it exchanges.
 
-    rows: (M,) int64. cell, p: columns over the N cells by name. signals: what each cell finds outside, (N,) by name. pool: (N,) µm³, the part of the
-    medium that is each cell's own, if anything is exchanged. beyond: (N,) bool, cells whose pool is a reservoir that nothing changes, or None.
+    rows: (M,) int64. cell, p: columns over the N cells by name. signals: what each cell finds
+    outside, (N,) by name. pool: (N,) µm³, the part of the medium that is each cell's own, if
+    anything is exchanged. beyond: (N,) bool, cells whose pool is a reservoir that nothing changes,
+    or None.
     """
 
     part: RateFunction | Network
@@ -59,47 +66,78 @@ class Circuit:
     seen: dict[str, set[str]] = field(default_factory=dict)
 
     def names(self, u: Tensor, rows: Tensor) -> tuple[Names, Names, Names, Names]:
-        """What a rate function is called with, at the variables u (m, ≥ S + E) of the cells `rows` (m,) among the N."""
+        """What a rate function is called with, at the variables u (m, ≥ S + E) of the cells `rows`
+        (m,) among the N."""
         size = len(self.species)
         columns = u.unbind(1)
         outside: dict[str, Any] = dict(self.signals)
-        s = Columns(outside, rows, "s" if outside else "without a Medium in the scene, s", self.seen.get("s"))
+        s = Columns(
+            outside,
+            rows,
+            "s" if outside else "without a Medium in the scene, s",
+            self.seen.get("s"),
+        )
         for name, value in zip(self.given, columns[size:], strict=False):
             s.__dict__[name] = value
         return (
-            Names(self.species, columns[:size], "u"), s,
-            Columns(self.p, rows, "p", self.seen.get("p")), Columns(self.cell, rows, "cell", self.seen.get("cell")),
-        )  # fmt: skip
+            Names(self.species, columns[:size], "u"),
+            s,
+            Columns(self.p, rows, "p", self.seen.get("p")),
+            Columns(self.cell, rows, "cell", self.seen.get("cell")),
+        )
 
     def changes(self, u: Tensor, rows: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Rates of species (m,), conc/h, and amounts given to signals (m,), conc·µm³/h, by name; u (m, …), rows (m,) among the N cells."""
+        """Rates of species (m,), conc/h, and amounts given to signals (m,), conc·µm³/h, by name; u
+        (m, …), rows (m,) among the N cells."""
         u_, s, p, cell = self.names(u, rows)
         with steady_functions():
             if isinstance(self.part, Network):
                 found = self.part.changes(self.part.concentration_rates(u_, s, p, cell))
                 split = len(self.species)
                 inside = dict(zip(self.species, found[:split], strict=True))
-                return inside, {n: x * cell.volume for n, x in zip(self.part.signals, found[split:], strict=True)}
+                return inside, {
+                    n: x * cell.volume
+                    for n, x in zip(self.part.signals, found[split:], strict=True)
+                }
             returned = self.part(u_, s, p, cell)
-        inside, outside = returned if isinstance(returned, tuple) and len(returned) == 2 else (returned, {})
-        return self._checked(inside, self.species, "species", u, rows), self._checked(outside, tuple(self.signals), "signal", u, rows)
+        inside, outside = (
+            returned if isinstance(returned, tuple) and len(returned) == 2 else (returned, {})
+        )
+        return self._checked(inside, self.species, "species", u, rows), self._checked(
+            outside, tuple(self.signals), "signal", u, rows
+        )
 
-    def _checked(self, found: object, known: Sequence[str], what: str, u: Tensor, rows: Tensor) -> dict[str, Tensor]:
+    def _checked(
+        self, found: object, known: Sequence[str], what: str, u: Tensor, rows: Tensor
+    ) -> dict[str, Tensor]:
         if not isinstance(found, Mapping):
-            raise InputError(f"{self.label} returned {type(found).__name__}: it must return a dict of rates by species, and, for signals, a second one.")
+            raise InputError(
+                f"{self.label} returned {type(found).__name__}: it must return a dict of rates by"
+                " species, and, for signals, a second one."
+            )
         out = {}
         for name, value in found.items():
             if name not in known:
-                raise InputError(unknown(f"{self.label} returned a rate for {name!r}, which is no {what}", str(name), list(known)))
+                raise InputError(
+                    unknown(
+                        f"{self.label} returned a rate for {name!r}, which is no {what}",
+                        str(name),
+                        list(known),
+                    )
+                )
             made = column(value, rows.numel(), u)
             if made is None:
                 shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-                raise InputError(f"{self.label} returned a rate of shape {shape} for the {what} {name!r}: it must be one number a cell, ({rows.numel()},).")
+                raise InputError(
+                    f"{self.label} returned a rate of shape {shape} for the {what} {name!r}: it"
+                    f" must be one number a cell, ({rows.numel()},)."
+                )
             out[name] = made
         return out
 
     def rates(self, u: Tensor, rows: Tensor) -> Tensor:
-        """du/dt of all variables, (m, S + E), or (m, S + 3E) where there is a reservoir; rows (m,) among the M."""
+        """du/dt of all variables, (m, S + E), or (m, S + 3E) where there is a reservoir; rows (m,)
+        among the M."""
         rows = self.rows.index_select(0, rows)
         inside, outside = self.changes(u, rows)
         none = torch.zeros_like(u[:, 0])
@@ -109,7 +147,10 @@ class Circuit:
             pool = self.pool.index_select(0, rows)
             new = [n for n in outside if n not in self.given]
             if new:
-                raise InputError(f"{self.label} gave {new[0]!r} to the medium, and had not when it was tried: always return it, 0 where nothing passes.")
+                raise InputError(
+                    f"{self.label} gave {new[0]!r} to the medium, and had not when it was tried:"
+                    " always return it, 0 where nothing passes."
+                )
             flux = [outside.get(n, none) for n in self.given]
             if self.beyond is None:
                 columns += [x / pool for x in flux]
@@ -121,17 +162,23 @@ class Circuit:
         return torch.stack(columns, 1)
 
     def start(self, concentrations: Tensor) -> Tensor:
-        """The variables at the start: concentrations (M, S), then pools, then what went to a reservoir and what came from it."""
+        """The variables at the start: concentrations (M, S), then pools, then what went to a
+        reservoir and what came from it."""
         columns = [self.signals[n].index_select(0, self.rows) for n in self.given]
         if self.beyond is not None:
             columns += [torch.zeros_like(c) for c in columns] * 2
-        return torch.cat([concentrations, *(c.unsqueeze(1) for c in columns)], 1) if columns else concentrations
+        return (
+            torch.cat([concentrations, *(c.unsqueeze(1) for c in columns)], 1)
+            if columns
+            else concentrations
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """After a step: concentrations (M, S); amounts given to the pools and beyond, conc·µm³, (M,) by signal; whether a cell failed (M,) bool and
-    why, (M,) codes for `words`; steps taken (M,) int64."""
+    """After a step: concentrations (M, S); amounts given to the pools and beyond, conc·µm³, (M,) by
+    signal; whether a cell failed (M,) bool and why, (M,) codes for `words`; steps taken (M,) int64.
+    """
 
     concentrations: Tensor
     pools: dict[str, Tensor]
@@ -141,8 +188,15 @@ class Outcome:
     steps: Tensor
 
 
-def step(circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings, draw: Draw | None = None) -> Outcome:
-    """The circuit `dt` hours later, from concentrations (M, S). Raises nothing for a cell that fails; it is marked."""
+def step(
+    circuit: Circuit,
+    concentrations: Tensor,
+    dt: float,
+    settings: Settings,
+    draw: Draw | None = None,
+) -> Outcome:
+    """The circuit `dt` hours later, from concentrations (M, S). Raises nothing for a cell that
+    fails; it is marked."""
     if settings.method in ("tau_leap", "direct"):
         assert draw is not None
         return _molecules(circuit, concentrations, dt, settings, draw)
@@ -150,7 +204,9 @@ def step(circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings
     count = start.shape[0]
     steps = torch.full((count,), settings.steps, dtype=torch.int64, device=start.device)
     if settings.method == "rosenbrock":
-        end, report = rosenbrock.rosenbrock(circuit.rates, start, dt, rtol=settings.rtol, atol=settings.atol)
+        end, report = rosenbrock.rosenbrock(
+            circuit.rates, start, dt, rtol=settings.rtol, atol=settings.atol
+        )
         code, steps = report.status, report.accepted + report.rejected
     else:
         if settings.method == "euler":
@@ -162,23 +218,33 @@ def step(circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings
         below = (end < -(settings.atol + settings.rtol * scale.nan_to_num())) & (start >= 0)
         code = torch.where(below.any(1), rosenbrock.BELOW_ZERO, rosenbrock.DONE)
         code = torch.where(torch.isfinite(end).all(1), code, rosenbrock.NOT_FINITE)
-        end = torch.where((end < 0) & (start >= 0), 0.0, end)  # by no more than the tolerance, or the cell has failed
+        # by no more than the tolerance, or the cell has failed
+        end = torch.where((end < 0) & (start >= 0), 0.0, end)
     size, more = len(circuit.species), len(circuit.given)
     pools, beyond = {}, {}
     for k, name in enumerate(circuit.given):
         assert circuit.pool is not None
-        pools[name] = (end[:, size + k] - start[:, size + k]) * circuit.pool.index_select(0, circuit.rows)
+        pools[name] = (end[:, size + k] - start[:, size + k]) * circuit.pool.index_select(
+            0, circuit.rows
+        )
         if circuit.beyond is not None:
             beyond[name] = end[:, size + more + k] - end[:, size + 2 * more + k]
     return Outcome(end[:, :size], pools, beyond, code != 0, code, steps)
 
 
-def _molecules(circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings, draw: Draw) -> Outcome:
-    """The same molecule by molecule. A reservoir is a pool so large that what is given to it or taken does not show."""
+def _molecules(
+    circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings, draw: Draw
+) -> Outcome:
+    """The same molecule by molecule. A reservoir is a pool so large that what is given to it or
+    taken does not show."""
     assert isinstance(circuit.part, Network)
     network, rows = circuit.part, circuit.rows
     volume = circuit.names(concentrations, rows)[3].volume.double()
-    copies = settings.copies.index_select(0, rows).double() if isinstance(settings.copies, Tensor) and settings.copies.dim() else settings.copies
+    copies = (
+        settings.copies.index_select(0, rows).double()
+        if isinstance(settings.copies, Tensor) and settings.copies.dim()
+        else settings.copies
+    )
     parts = [torch.round(concentrations.double() * (volume * copies).unsqueeze(1))]
     pool = None
     if network.signals:
@@ -186,41 +252,72 @@ def _molecules(circuit: Circuit, concentrations: Tensor, dt: float, settings: Se
         pool = circuit.pool.index_select(0, rows).double()
         if circuit.beyond is not None:
             pool = torch.where(circuit.beyond.index_select(0, rows), 1e9 * volume, pool)
-        parts += [(circuit.signals[n].index_select(0, rows).double() * pool * copies).unsqueeze(1) for n in network.signals]
+        parts += [
+            (circuit.signals[n].index_select(0, rows).double() * pool * copies).unsqueeze(1)
+            for n in network.signals
+        ]
     start = torch.cat(parts, 1)
 
     def propensities(counts: Tensor, mine: Tensor) -> Tensor:
         _, _, p, cell = circuit.names(counts, rows.index_select(0, mine))
-        scale = copies.index_select(0, mine) if isinstance(copies, Tensor) and copies.dim() else copies
+        scale = (
+            copies.index_select(0, mine) if isinstance(copies, Tensor) and copies.dim() else copies
+        )
         with steady_functions():
-            return network.propensities(counts, p, cell, copies=scale, pool=None if pool is None else pool.index_select(0, mine))
+            return network.propensities(
+                counts,
+                p,
+                cell,
+                copies=scale,
+                pool=None if pool is None else pool.index_select(0, mine),
+            )
 
     if settings.method == "direct":
         end, report = stochastic.direct(start, propensities, network.stoichiometry, dt, draw)
     else:
-        end, report = stochastic.tau_leap(start, propensities, network.stoichiometry, dt, draw, orders=network.orders)
+        end, report = stochastic.tau_leap(
+            start, propensities, network.stoichiometry, dt, draw, orders=network.orders
+        )
     size = len(circuit.species)
-    amount = {n: (end[:, size + k] - start[:, size + k]) / copies for k, n in enumerate(network.signals)}
+    amount = {
+        n: (end[:, size + k] - start[:, size + k]) / copies for k, n in enumerate(network.signals)
+    }
     away = None if circuit.beyond is None else circuit.beyond.index_select(0, rows)
-    pools = {n: (x if away is None else torch.where(away, 0.0, x)).to(concentrations.dtype) for n, x in amount.items()}
-    beyond = {} if away is None else {n: torch.where(away, x, 0.0).to(concentrations.dtype) for n, x in amount.items()}
+    pools = {
+        n: (x if away is None else torch.where(away, 0.0, x)).to(concentrations.dtype)
+        for n, x in amount.items()
+    }
+    beyond = (
+        {}
+        if away is None
+        else {n: torch.where(away, x, 0.0).to(concentrations.dtype) for n, x in amount.items()}
+    )
     found = (end[:, :size] / (volume * copies).unsqueeze(1)).to(concentrations.dtype)
     # a code of its own for each reaction that went wrong, apart from those of the smooth methods
-    code = torch.where(report.status == 0, 0, torch.where(report.reaction >= 0, MOLECULES + report.reaction, report.status))
+    code = torch.where(
+        report.status == 0,
+        0,
+        torch.where(report.reaction >= 0, MOLECULES + report.reaction, report.status),
+    )
     return Outcome(found, pools, beyond, report.status != 0, code, report.steps)
 
 
 MOLECULES = 100
 
 
-def words(circuit: Circuit, outcome: Outcome, concentrations: Tensor, k: int, method: str, dt: float) -> str:
+def words(
+    circuit: Circuit, outcome: Outcome, concentrations: Tensor, k: int, method: str, dt: float
+) -> str:
     """What went wrong in the k-th of the M cells, from concentrations (M, S) on."""
     code = int(outcome.code[k])
     if method in ("tau_leap", "direct"):
         assert isinstance(circuit.part, Network)
         if code >= MOLECULES:
             reaction = circuit.part.reactions[code - MOLECULES]
-            return f"the reaction {reaction.name or str(reaction)!r} has a {stochastic.STATUS[stochastic.BAD_PROPENSITY].removeprefix('a ')}"
+            return (
+                f"the reaction {reaction.name or str(reaction)!r} has a"
+                f" {stochastic.STATUS[stochastic.BAD_PROPENSITY].removeprefix('a ')}"
+            )
         return stochastic.STATUS[code]
     if code == rosenbrock.BELOW_ZERO:
         start, one = circuit.start(concentrations), torch.tensor([k], device=concentrations.device)
@@ -228,36 +325,58 @@ def words(circuit: Circuit, outcome: Outcome, concentrations: Tensor, k: int, me
         names = (*circuit.species, *(f"out.{n}" for n in circuit.given))
         first = int(torch.where(slope < 0, start[k] / -slope, torch.inf)[: len(names)].argmin())
         hint = ". Take more steps, or method='rosenbrock'" if method != "rosenbrock" else ""
-        return f"{rosenbrock.STATUS[code]}, {names[first]!r} first, from {float(start[k, first]):g} at a rate of {float(slope[first]):g}/h{hint}"
+        return (
+            f"{rosenbrock.STATUS[code]}, {names[first]!r} first, from {float(start[k, first]):g} at"
+            f" a rate of {float(slope[first]):g}/h{hint}"
+        )
     bad = _not_finite(circuit, concentrations, k, dt)
     if code != rosenbrock.NOT_FINITE and not bad:
         return rosenbrock.STATUS[code]
-    at = ", ".join(f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True))
-    return f"the rate of {' and '.join(bad) or 'a species, on the way,'} is not a finite number, at {at}" + (" or soon after" if bad else "")
+    at = ", ".join(
+        f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True)
+    )
+    return (
+        f"the rate of {' and '.join(bad) or 'a species, on the way,'} is not a finite number, at"
+        f" {at}" + (" or soon after" if bad else "")
+    )
 
 
 @torch.no_grad()
 def _not_finite(circuit: Circuit, concentrations: Tensor, k: int, dt: float) -> list[str]:
-    """The species and signals whose rates in the k-th cell are not finite, at the start of the step or ahead of it: a careful method stops short of there."""
+    """The species and signals whose rates in the k-th cell are not finite, at the start of the step
+    or ahead of it: a careful method stops short of there."""
     one = torch.tensor([k], device=concentrations.device)
-    start, rows = circuit.start(concentrations).index_select(0, one), circuit.rows.index_select(0, one)
+    start, rows = (
+        circuit.start(concentrations).index_select(0, one),
+        circuit.rows.index_select(0, one),
+    )
     slope = torch.nan_to_num(circuit.rates(start, one))
     for share in (0.0, 0.01, 0.1, 0.5, 1.0):
         inside, outside = circuit.changes((start + share * dt * slope).clamp(min=0.0), rows)
-        bad = [f"the {what} {n!r}" for what, found in (("species", inside), ("signal", outside)) for n, x in found.items() if not bool(torch.isfinite(x).all())]
+        bad = [
+            f"the {what} {n!r}"
+            for what, found in (("species", inside), ("signal", outside))
+            for n, x in found.items()
+            if not bool(torch.isfinite(x).all())
+        ]
         if bad:
             return bad
     return []
 
 
 def trial(circuit: Circuit, concentrations: Tensor, derivatives: bool = False) -> tuple[str, ...]:
-    """Try the circuit once at concentrations (M, S), with derivatives where its method asks for them: raise InputError for what it returns wrongly; the
-    signals that it exchanges."""
+    """Try the circuit once at concentrations (M, S), with derivatives where its method asks for
+    them: raise InputError for what it returns wrongly; the signals that it exchanges."""
     try:
         inside, outside = circuit.changes(concentrations, circuit.rows)
         # a little of everything, another little in every cell: at 0 a sum over cells would not show
-        some = concentrations + 0.1 * torch.arange(1, len(concentrations) + 1, device=concentrations.device).unsqueeze(1)
-        crowd, alone = circuit.changes(some, circuit.rows), circuit.changes(some[:1], circuit.rows[:1])
+        some = concentrations + 0.1 * torch.arange(
+            1, len(concentrations) + 1, device=concentrations.device
+        ).unsqueeze(1)
+        crowd, alone = (
+            circuit.changes(some, circuit.rows),
+            circuit.changes(some[:1], circuit.rows[:1]),
+        )
         if derivatives:
             with torch.enable_grad():
                 circuit.changes(some.detach().clone().requires_grad_(), circuit.rows)
@@ -267,25 +386,39 @@ def trial(circuit: Circuit, concentrations: Tensor, derivatives: bool = False) -
         raise
     except (TypeError, ValueError, RuntimeError, IndexError) as error:
         raise InputError(
-            f"{circuit.label} failed on the columns of {len(concentrations)} cells: {error}. It is called with (u, s, p, cell), each name a column with "
-            "one value a cell: use torch.exp and the like rather than math or numpy, torch.where rather than if, and change nothing in place."
+            f"{circuit.label} failed on the columns of {len(concentrations)} cells: {error}. It is"
+            " called with (u, s, p, cell), each name a column with one value a cell: use torch.exp"
+            " and the like rather than math or numpy, torch.where rather than if, and change"
+            " nothing in place."
         ) from error
     for whole, one in zip(crowd, alone, strict=True):
         for name, value in one.items():
-            if not torch.allclose(whole[name].detach()[:1], value.detach(), rtol=1e-4, atol=1e-30, equal_nan=True):
+            if not torch.allclose(
+                whole[name].detach()[:1], value.detach(), rtol=1e-4, atol=1e-30, equal_nan=True
+            ):
                 raise InputError(
-                    f"{circuit.label}: the rate of {name!r} in one cell depends on what other cells there are (a sum or a mean over them, or a draw?). "
-                    "A rate function may go by its own cell and what it finds outside only."
+                    f"{circuit.label}: the rate of {name!r} in one cell depends on what other cells"
+                    " there are (a sum or a mean over them, or a draw?). A rate function may go by"
+                    " its own cell and what it finds outside only."
                 )
     for what, found in (("species", inside), ("signal", outside)):
         for name, value in found.items():
             if not bool(torch.isfinite(value.detach()).all()):
                 k = int(torch.nonzero(~torch.isfinite(value.detach()))[0])
-                at = ", ".join(f"{n} = {float(x):g}" for n, x in zip(circuit.species, concentrations[k], strict=True))
+                at = ", ".join(
+                    f"{n} = {float(x):g}"
+                    for n, x in zip(circuit.species, concentrations[k], strict=True)
+                )
                 raise checks.InputError(
-                    f"{circuit.label} gives {float(value[k])} for the {what} {name!r} at the start ({at}): every rate must be a finite number."
+                    f"{circuit.label} gives {float(value[k])} for the {what} {name!r} at the start"
+                    f" ({at}): every rate must be a finite number."
                 )
     if isinstance(circuit.part, Network):
-        exchanged = {n.removeprefix("out.") for r in circuit.part.reactions for n in r.change() if n.startswith("out.")}
+        exchanged = {
+            n.removeprefix("out.")
+            for r in circuit.part.reactions
+            for n in r.change()
+            if n.startswith("out.")
+        }
         return tuple(n for n in circuit.part.signals if n in exchanged)
     return tuple(n for n in circuit.signals if n in outside)

@@ -1,8 +1,10 @@
-"""Reactions molecule by molecule: Gillespie's direct method, and tau-leaping with a safe step for every cell by itself.
+"""Reactions molecule by molecule: Gillespie's direct method, and tau-leaping with a safe step for
+every cell by itself.
 
-Tau-leaping after Cao, Gillespie and Petzold, J. Chem. Phys. 124, 044109 (2006): a step that changes no propensity by more than about ε of it;
-reactions that are few events from using up what they consume are critical, and fire at most once a step; where steps would hold
-few events, the exact method is used. Cells that have reached the end leave the batch.
+Tau-leaping after Cao, Gillespie and Petzold, J. Chem. Phys. 124, 044109 (2006): a step that changes
+no propensity by more than about ε of it; reactions that are few events from using up what they
+consume are critical, and fire at most once a step; where steps would hold few events, the exact
+method is used. Cells that have reached the end leave the batch.
 """
 
 from __future__ import annotations
@@ -19,14 +21,19 @@ from torchfilm.circuits.draws import Draw, poisson
 Propensities = Callable[[Tensor, Tensor], Tensor]
 
 DONE, TOO_MANY_EVENTS, BAD_PROPENSITY = 0, 1, 2
-STATUS = {DONE: "done", TOO_MANY_EVENTS: "too many events", BAD_PROPENSITY: "a propensity is negative or not a finite number"}
+STATUS = {
+    DONE: "done",
+    TOO_MANY_EVENTS: "too many events",
+    BAD_PROPENSITY: "a propensity is negative or not a finite number",
+}
 FEW_EVENTS = 10.0  # a leap that would hold fewer is not worth it
 MOST_HALVINGS = 60
 
 
 @dataclass(frozen=True)
 class Report:
-    """For each cell, (N,) int64: `steps` (leaps and single events), `status`, one of STATUS, and the `reaction` that went wrong, −1 for none."""
+    """For each cell, (N,) int64: `steps` (leaps and single events), `status`, one of STATUS, and
+    the `reaction` that went wrong, −1 for none."""
 
     steps: Tensor
     status: Tensor
@@ -47,19 +54,31 @@ def tau_leap(
 ) -> tuple[Tensor, Report]:
     """Molecule numbers (N, S) after dt hours by tau-leaping, single events where leaps do not pay.
 
-    What limits a reaction must be a species that it takes: a gene that goes on from "off" is two species, on and off, or a leap could turn it on twice.
+    What limits a reaction must be a species that it takes: a gene that goes on from "off" is two
+    species, on and off, or a leap could turn it on twice.
 
-    stoichiometry (R, S): molecules gained by each event. draw: see `draws.keyed_draws`. epsilon: relative change of a propensity that a leap may bring.
-    critical: a reaction that could fire fewer times than this fires alone. orders (S,): highest order in which a propensity depends on each
-    species, 0 for none; default 2. Numbers stay whole (a remainder given in stays) and never negative. Not differentiable; raises nothing.
+    stoichiometry (R, S): molecules gained by each event. draw: see `draws.keyed_draws`. epsilon:
+    relative change of a propensity that a leap may bring. critical: a reaction that could fire
+    fewer times than this fires alone. orders (S,): highest order in which a propensity depends on
+    each species, 0 for none; default 2. Numbers stay whole (a remainder given in stays) and never
+    negative. Not differentiable; raises nothing.
     """
     run = _Run(propensities, stoichiometry, draw, counts)
     leap = _Leap(run, epsilon, critical, orders)
     return run.advance(counts, dt, leap.step, max_steps)
 
 
-def direct(counts: Tensor, propensities: Propensities, stoichiometry: Tensor, dt: float, draw: Draw, *, max_steps: int = 1_000_000) -> tuple[Tensor, Report]:
-    """Molecule numbers (N, S) after dt hours, event by event: exact, all cells side by side. Arguments as in `tau_leap`."""
+def direct(
+    counts: Tensor,
+    propensities: Propensities,
+    stoichiometry: Tensor,
+    dt: float,
+    draw: Draw,
+    *,
+    max_steps: int = 1_000_000,
+) -> tuple[Tensor, Report]:
+    """Molecule numbers (N, S) after dt hours, event by event: exact, all cells side by side.
+    Arguments as in `tau_leap`."""
     run = _Run(propensities, stoichiometry, draw, counts)
     return run.advance(counts, dt, run.single, max_steps)
 
@@ -73,7 +92,8 @@ def _total(parts: Tensor) -> Tensor:
 
 
 def _choose(parts: Tensor, u: Tensor) -> Tensor:
-    """Which of R, in proportion to parts (R, M) ≥ 0: (M,) int64; one with parts = 0 is never chosen where another is not."""
+    """Which of R, in proportion to parts (R, M) ≥ 0: (M,) int64; one with parts = 0 is never chosen
+    where another is not."""
     bounds = parts.clone()
     for k in range(1, parts.shape[0]):
         bounds[k] += bounds[k - 1]
@@ -85,16 +105,20 @@ def _choose(parts: Tensor, u: Tensor) -> Tensor:
 
 
 class _Run:
-    """What both methods share. Within, arrays are float64 with cells last: counts (S, M), propensities (R, M)."""
+    """What both methods share. Within, arrays are float64 with cells last: counts (S, M),
+    propensities (R, M)."""
 
-    def __init__(self, propensities: Propensities, stoichiometry: Tensor, draw: Draw, counts: Tensor):
+    def __init__(
+        self, propensities: Propensities, stoichiometry: Tensor, draw: Draw, counts: Tensor
+    ):
         self.propensities, self.draw, self.dtype = propensities, draw, counts.dtype
         self.gain = stoichiometry.to(device=counts.device, dtype=torch.float64)
         self.taken = (-self.gain).clamp(min=0.0)
         self.takers = torch.nonzero((self.taken > 0).any(1)).squeeze(1).tolist()
 
     def rates(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Propensities (R, M), 0 where an event would take more than there is, and for each cell the first that is not allowed or −1."""
+        """Propensities (R, M), 0 where an event would take more than there is, and for each cell
+        the first that is not allowed or −1."""
         a = self.propensities(x.to(self.dtype).t(), rows).t().to(torch.float64).contiguous()
         good = (a >= 0) & (a < torch.inf)
         bad = torch.where(good.all(0), -1, good.to(torch.uint8).argmin(0))
@@ -115,20 +139,35 @@ class _Run:
         """Molecule numbers after one event of the reaction `which` (M,)."""
         return x + self.gain.index_select(0, which).t()
 
-    def single(self, x: Tensor, a: Tensor, left: Tensor, rows: Tensor, event: int) -> tuple[Tensor, Tensor]:
-        """One event, or the end if it would come after it: molecule numbers, and the time that passed."""
+    def single(
+        self, x: Tensor, a: Tensor, left: Tensor, rows: Tensor, event: int
+    ) -> tuple[Tensor, Tensor]:
+        """One event, or the end if it would come after it: molecule numbers, and the time that
+        passed."""
         u = self.draw(rows, event, "single", 2)
         wait = -torch.log(u[0]) / _total(a)  # infinite where nothing can happen
         happens = wait < left
-        return torch.where(happens, self.after_one(x, _choose(a, u[1])), x), torch.where(happens, wait, left)
+        return torch.where(happens, self.after_one(x, _choose(a, u[1])), x), torch.where(
+            happens, wait, left
+        )
 
     @torch.no_grad()
-    def advance(self, counts: Tensor, dt: float, step: Callable[..., tuple[Tensor, Tensor]], most: int) -> tuple[Tensor, Report]:
-        """All cells to the end, each at its own pace: `step` gives a cell's numbers and how much time passed."""
+    def advance(
+        self, counts: Tensor, dt: float, step: Callable[..., tuple[Tensor, Tensor]], most: int
+    ) -> tuple[Tensor, Report]:
+        """All cells to the end, each at its own pace: `step` gives a cell's numbers and how much
+        time passed."""
         cells = counts.shape[0]
         rows = torch.arange(cells, device=counts.device)
-        steps, status, wrong = torch.zeros_like(rows), torch.full_like(rows, TOO_MANY_EVENTS), torch.full_like(rows, -1)
-        x, left = counts.t().to(torch.float64).contiguous(), torch.full((cells,), float(dt), dtype=torch.float64, device=counts.device)
+        steps, status, wrong = (
+            torch.zeros_like(rows),
+            torch.full_like(rows, TOO_MANY_EVENTS),
+            torch.full_like(rows, -1),
+        )
+        x, left = (
+            counts.t().to(torch.float64).contiguous(),
+            torch.full((cells,), float(dt), dtype=torch.float64, device=counts.device),
+        )
         out = counts.clone()
         for event in range(most):
             if rows.numel() == 0:
@@ -145,9 +184,15 @@ class _Run:
             gone, stay = torch.nonzero(ends).squeeze(1), torch.nonzero(~ends).squeeze(1)
             who = rows.index_select(0, gone)
             out.index_copy_(0, who, x.index_select(1, gone).t().to(self.dtype))
-            status.index_copy_(0, who, torch.where(faulty, BAD_PROPENSITY, DONE).index_select(0, gone))
+            status.index_copy_(
+                0, who, torch.where(faulty, BAD_PROPENSITY, DONE).index_select(0, gone)
+            )
             wrong.index_copy_(0, who, bad.index_select(0, gone))
-            rows, x, left = rows.index_select(0, stay), x.index_select(1, stay), left.index_select(0, stay)
+            rows, x, left = (
+                rows.index_select(0, stay),
+                x.index_select(1, stay),
+                left.index_select(0, stay),
+            )
         out.index_copy_(0, rows, x.t().to(self.dtype))
         return out, Report(steps, status, wrong)
 
@@ -161,7 +206,8 @@ class _Leap:
         self.read, self.order = (order > 0).unsqueeze(1), order.clamp(min=1.0).unsqueeze(1)
 
     def rare(self, x: Tensor, a: Tensor) -> Tensor:
-        """(R, M): reactions that can happen, and fewer than `critical` times before something that they take is used up."""
+        """(R, M): reactions that can happen, and fewer than `critical` times before something that
+        they take is used up."""
         out = torch.zeros_like(a, dtype=torch.bool)
         whole = x.floor()
         for j in self.run.takers:
@@ -170,19 +216,25 @@ class _Leap:
         return out & (a > 0)
 
     def longest(self, x: Tensor, a: Tensor) -> Tensor:
-        """(M,): the time in which no propensity is expected to change by more than ε of it, for the propensities a (R, M) of what may leap."""
+        """(M,): the time in which no propensity is expected to change by more than ε of it, for the
+        propensities a (R, M) of what may leap."""
         mean, spread = torch.zeros_like(x), torch.zeros_like(x)
         for j in range(a.shape[0]):
             gain = self.run.gain[j].unsqueeze(1)
             mean = torch.addcmul(mean, gain, a[j].unsqueeze(0))
             spread = torch.addcmul(spread, gain * gain, a[j].unsqueeze(0))
-        # g of the paper is the order, and more where few molecules of one kind meet one another: 2 + 1/(x − 1) for a pair
-        steep = self.order + torch.where(self.order > 1, (self.order - 1) / (x - 1).clamp(min=1.0), 0.0)
+        # g of the paper is the order, and more where few molecules of one kind meet one another: 2
+        # + 1/(x − 1) for a pair
+        steep = self.order + torch.where(
+            self.order > 1, (self.order - 1) / (x - 1).clamp(min=1.0), 0.0
+        )
         change = (self.epsilon * x / steep).clamp(min=1.0)
         time = torch.minimum(change / mean.abs(), change * change / spread)
         return torch.where(self.read & (spread > 0), time, torch.inf).amin(0)
 
-    def step(self, x: Tensor, a: Tensor, left: Tensor, rows: Tensor, event: int) -> tuple[Tensor, Tensor]:
+    def step(
+        self, x: Tensor, a: Tensor, left: Tensor, rows: Tensor, event: int
+    ) -> tuple[Tensor, Tensor]:
         """One leap, or one event: molecule numbers, and the time that passed."""
         rare = self.rare(x, a)
         often, seldom = torch.where(rare, 0.0, a), torch.where(rare, a, 0.0)
@@ -195,12 +247,30 @@ class _Leap:
         at = torch.nonzero(leaps).squeeze(1)
         if at.numel() == 0:
             return after, passed
-        pick = lambda v: v.index_select(-1, at)  # noqa: E731
-        jumped, took = self.leap(pick(x), pick(often), pick(seldom), pick(longest), pick(left), rows.index_select(0, at), event)
+        pick = lambda v: v.index_select(-1, at)
+        jumped, took = self.leap(
+            pick(x),
+            pick(often),
+            pick(seldom),
+            pick(longest),
+            pick(left),
+            rows.index_select(0, at),
+            event,
+        )
         return after.index_copy(1, at, jumped), passed.index_copy(0, at, took)
 
-    def leap(self, x: Tensor, often: Tensor, seldom: Tensor, longest: Tensor, left: Tensor, rows: Tensor, event: int) -> tuple[Tensor, Tensor]:
-        """Poisson numbers of what is frequent, and at most one event of what is rare; half as far again where that would leave less than nothing."""
+    def leap(
+        self,
+        x: Tensor,
+        often: Tensor,
+        seldom: Tensor,
+        longest: Tensor,
+        left: Tensor,
+        rows: Tensor,
+        event: int,
+    ) -> tuple[Tensor, Tensor]:
+        """Poisson numbers of what is frequent, and at most one event of what is rare; half as far
+        again where that would leave less than nothing."""
         size = often.shape[0]
         u = self.run.draw(rows, event, "rare", 2)
         until_rare = -torch.log(u[0]) / _total(seldom)
@@ -208,7 +278,7 @@ class _Leap:
         after, took = x, left
         open_ = torch.arange(rows.numel(), device=rows.device)
         for trial in range(MOST_HALVINGS):
-            pick = lambda v: v.index_select(-1, open_)  # noqa: B023, E731
+            pick = lambda v: v.index_select(-1, open_)  # noqa: B023
             far = torch.minimum(pick(longest), pick(left)) * 0.5**trial
             wait = pick(until_rare)
             fires = wait < far

@@ -1,1 +1,2 @@
-"""The effects that a scene may list. They never import each other; they meet only through named fields."""
+"""The effects that a scene may list. They never import each other; they meet only through named
+fields."""

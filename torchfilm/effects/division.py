@@ -21,8 +21,10 @@ TOO_SHORT = 1
 
 @dataclass(frozen=True)
 class DivisionReport:
-    """Why colonies could not divide, per colony (B,): `status`, 0 or TOO_SHORT; `uid` and `length` (µm) of the first cell that was due and too short,
-    and the length that it `needs`. Made only where there is such a cell; nobody divided in its colony."""
+    """Why colonies could not divide, per colony (B,): `status`, 0 or TOO_SHORT; `uid` and `length`
+    (µm) of the first cell that was due and too short, and the length that it `needs`. Made only
+    where there is such a cell; nobody divided in its colony.
+    """
 
     status: Tensor
     uid: Tensor
@@ -34,8 +36,8 @@ class DivisionReport:
     def reason(self, place: int) -> str:
         """What went wrong in the colony at this place of the batch."""
         return (
-            f"cell {int(self.uid[place])} is due to divide at length {float(self.length[place]):g} µm, but needs at least "
-            f"{float(self.needs[place]):g} µm for two new caps"
+            f"cell {int(self.uid[place])} is due to divide at length {float(self.length[place]):g}"
+            f" µm, but needs at least {float(self.needs[place]):g} µm for two new caps"
         )
 
 
@@ -43,11 +45,11 @@ class DivisionReport:
 class Division(Effect):
     """Cells divide, by one criterion or by flag.
 
-    length: centreline length, µm, at which a cell divides; volume: µm³; added: µm of centreline grown since birth (the adder).
-    Each one number, one per colony, or a distribution drawn for each cell at birth. None of them: only cells whose `divide_flag` a
-    rule sets divide; the flag works beside a criterion too.
-    fraction: share of the length that the first daughter (at the −axis end) gets. axis_noise: standard deviation of the noise on each
-    component of a daughter's axis.
+    length: centreline length, µm, at which a cell divides; volume: µm³; added: µm of centreline
+    grown since birth (the adder). Each one number, one per colony, or a distribution drawn for each
+    cell at birth. None of them: only cells whose `divide_flag` a rule sets divide; the flag works
+    beside a criterion too. fraction: share of the length that the first daughter (at the −axis end)
+    gets. axis_noise: standard deviation of the noise on each component of a daughter's axis.
     """
 
     length: float | Tensor | Distribution | None = None
@@ -62,39 +64,82 @@ class Division(Effect):
     def __post_init__(self) -> None:
         given = [name for name in CRITERIA if getattr(self, name) is not None]
         if len(given) > 1:
-            raise checks.InputError(f"Division got {' and '.join(given)}: give one criterion (length, volume or added), or none and a rule.")
+            raise checks.InputError(
+                f"Division got {' and '.join(given)}: give one criterion (length, volume or added),"
+                " or none and a rule."
+            )
         for name in given:
-            object.__setattr__(self, name, parameter(f"Division.{name}", getattr(self, name), above=0.0))
+            object.__setattr__(
+                self, name, parameter(f"Division.{name}", getattr(self, name), above=0.0)
+            )
         fraction = parameter("Division.fraction", self.fraction, above=0.0, most=1.0)
         object.__setattr__(self, "fraction", fraction)
-        greatest = fraction.greatest() if isinstance(fraction, Distribution) else float(torch.as_tensor(fraction).max())
+        greatest = (
+            fraction.greatest()
+            if isinstance(fraction, Distribution)
+            else float(torch.as_tensor(fraction).max())
+        )
         if greatest >= 1.0:
-            raise checks.refuse("Division.fraction", self.fraction, "between 0 and 1, both excluded")
-        object.__setattr__(self, "axis_noise", checks.value("Division.axis_noise", self.axis_noise, least=0.0, most=0.5))
+            raise checks.refuse(
+                "Division.fraction", self.fraction, "between 0 and 1, both excluded"
+            )
+        object.__setattr__(
+            self,
+            "axis_noise",
+            checks.value("Division.axis_noise", self.axis_noise, least=0.0, most=0.5),
+        )
 
     @property
     def criterion(self) -> str | None:
         return next((name for name in CRITERIA if getattr(self, name) is not None), None)
 
     def declares(self, dim: int) -> tuple[Field, ...]:
-        fields = [Field("divide_flag", "divides at the next opportunity", dtype=torch.bool, at_division="reset")]
+        fields = [
+            Field(
+                "divide_flag",
+                "divides at the next opportunity",
+                dtype=torch.bool,
+                at_division="reset",
+            )
+        ]
         name = self.criterion
         if name is not None:
             threshold = getattr(self, name)
             fields.append(
                 Field(
-                    "division_threshold", f"{name} at which the cell divides", "µm³" if name == "volume" else "µm",
+                    "division_threshold",
+                    f"{name} at which the cell divides",
+                    "µm³" if name == "volume" else "µm",
                     initial=lambda state, rows: draw(f"Division.{name}", threshold, state, rows),
                     at_division="reset" if isinstance(threshold, Distribution) else "copy",
                 )
-            )  # fmt: skip
+            )
         if name == "added":
-            fields.append(Field("birth_length", "centreline length at birth", "µm", initial=_length_of_rows, at_division="reset"))
+            fields.append(
+                Field(
+                    "birth_length",
+                    "centreline length at birth",
+                    "µm",
+                    initial=_length_of_rows,
+                    at_division="reset",
+                )
+            )
         return tuple(fields)
 
     def reads(self) -> tuple[str, ...]:
-        more = {"length": ("division_threshold",), "volume": ("division_threshold",), "added": ("division_threshold", "birth_length")}
-        return ("divide_flag", "length", "radius", "position", "axis", *more.get(self.criterion or "", ()))
+        more = {
+            "length": ("division_threshold",),
+            "volume": ("division_threshold",),
+            "added": ("division_threshold", "birth_length"),
+        }
+        return (
+            "divide_flag",
+            "length",
+            "radius",
+            "position",
+            "axis",
+            *more.get(self.criterion or "", ()),
+        )
 
     def writes(self) -> tuple[str, ...]:
         return ("cells", "position", "axis", "length", "divide_flag")
@@ -103,26 +148,37 @@ class Division(Effect):
         if self.criterion is None or state.cells == 0:
             return
         given = getattr(self, self.criterion)
-        # cells from a micrograph may be past the threshold drawn for them, and then divide at once; none may be past all that can be drawn
+        # cells from a micrograph may be past the threshold drawn for them, and then divide at once;
+        # none may be past all that can be drawn
         most = given.greatest() if isinstance(given, Distribution) else state.division_threshold
-        start = {"length": state.length, "volume": state.volume, "added": torch.zeros_like(state.length)}[self.criterion]
+        start = {
+            "length": state.length,
+            "volume": state.volume,
+            "added": torch.zeros_like(state.length),
+        }[self.criterion]
         below = torch.nonzero(start >= most).squeeze(1)
         if below.numel():
             k = int(below[0])
             raise checks.InputError(
-                f"Division.{self.criterion}: threshold {float(state.division_threshold[k]):g} of cell {int(state.uid[k])} in colony "
-                f"{int(state.own_colony_id[k])} is not above its {self.criterion} at birth, {float(start[k]):g}. "
-                "Raise the threshold or start from smaller cells."
+                f"Division.{self.criterion}: threshold {float(state.division_threshold[k]):g} of"
+                f" cell {int(state.uid[k])} in colony {int(state.own_colony_id[k])} is not above"
+                f" its {self.criterion} at birth, {float(start[k]):g}. Raise the threshold or start"
+                " from smaller cells."
             )
-        least = given.least() if isinstance(given, Distribution) else float(torch.as_tensor(given).min())
+        least = (
+            given.least()
+            if isinstance(given, Distribution)
+            else float(torch.as_tensor(given).min())
+        )
         radius = float(state.radius.max())
         needed = 2 * radius
         if self.criterion == "volume":
             needed = float(capsule.volume(torch.tensor(needed), torch.tensor(radius)))
         if self.criterion != "added" and least < needed:
             raise checks.InputError(
-                f"Division.{self.criterion} can be {least:g}: it must be at least {needed:g} for radius {radius:g} µm, or the daughters would be "
-                "shorter than nothing (each loses a new cap). Raise the threshold."
+                f"Division.{self.criterion} can be {least:g}: it must be at least {needed:g} for"
+                f" radius {radius:g} µm, or the daughters would be shorter than nothing (each loses"
+                " a new cap). Raise the threshold."
             )
 
     def due(self, state: State) -> Tensor:
@@ -158,13 +214,22 @@ def _too_short(state: State, short: Tensor) -> DivisionReport:
     status = torch.where(first < state.cells, TOO_SHORT, 0)
     row = first.clamp(max=state.cells - 1)
     length, radius = state.length.detach(), state.radius.detach()
-    return DivisionReport(status, state.uid.index_select(0, row), length.index_select(0, row), 2 * radius.index_select(0, row))
+    return DivisionReport(
+        status,
+        state.uid.index_select(0, row),
+        length.index_select(0, row),
+        2 * radius.index_select(0, row),
+    )
 
 
-def divide(state: State, due: Tensor, fraction: float | Tensor | Distribution, axis_noise: float | Tensor) -> State:
-    """The state in which each cell that is due (N,) bool has become two neighbours in the batch, first daughter at its −axis end.
+def divide(
+    state: State, due: Tensor, fraction: float | Tensor | Distribution, axis_noise: float | Tensor
+) -> State:
+    """The state in which each cell that is due (N,) bool has become two neighbours in the batch,
+    first daughter at its −axis end.
 
-    Lengths (l − 2r)f and (l − 2r)(1 − f), outer ends where the parent's were; gradients pass through.
+    Lengths (l − 2r)f and (l − 2r)(1 − f), outer ends where the parent's were; gradients pass
+    through.
     """
     copies = due.long() + 1
     source = torch.repeat_interleave(torch.arange(state.cells, device=state.device), copies)
@@ -188,7 +253,10 @@ def divide(state: State, due: Tensor, fraction: float | Tensor | Distribution, a
     new = new.replace(length=length, position=position, uid=uid, parent=parent, next_uid=next_uid)
     new = new.replace(axis=_with_noise(new, daughters, axis_noise))
     note = Ended(parents.own_colony_id, parents.uid, "divided")
-    new = new.replace(births=(*new.births, Births(first, second, new.uid.index_select(0, daughters), parents)), ended=(*new.ended, note))
+    new = new.replace(
+        births=(*new.births, Births(first, second, new.uid.index_select(0, daughters), parents)),
+        ended=(*new.ended, note),
+    )
     return new.reset_at_division(daughters, new.declared)
 
 

@@ -1,4 +1,5 @@
-"""Growth: how much each cell wants to lengthen in a step. Contacts, where there are any, may then hold it back."""
+"""Growth: how much each cell wants to lengthen in a step. Contacts, where there are any, may then
+hold it back."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}
 
 @dataclass(frozen=True)
 class GrowthReport:
-    """Made only where a cell of some colony would grow past all numbers: `status` (B,), 1 for its colony, of which no cell grew, and the `rate` (B,) and
-    `uid` (B,) of the first such cell."""
+    """Made only where a cell of some colony would grow past all numbers: `status` (B,), 1 for its
+    colony, of which no cell grew, and the `rate` (B,) and `uid` (B,) of the first such cell."""
 
     status: Tensor
     uid: Tensor
@@ -28,17 +29,21 @@ class GrowthReport:
 
     def reason(self, place: int) -> str:
         """What went wrong in the colony at this place of the batch."""
-        return f"cell {int(self.uid[place])} at a growth rate of {float(self.rate[place]):g} would be of no finite length"
+        return (
+            f"cell {int(self.uid[place])} at a growth rate of {float(self.rate[place]):g} would be"
+            " of no finite length"
+        )
 
 
 @dataclass(frozen=True)
 class Growth(Effect):
     """Cells lengthen.
 
-    rate: 1/h (µm/h with law "linear"); one number, one per colony, or a distribution drawn at birth. None: cells grow at whatever
-    rules write to `growth_rate`, at first 0.
-    law: "volume", dV/dt = rate·V, so that ln 2/rate is the doubling time whatever the shape (the paper's wording); "length",
-    dl/dt = rate·l of the centreline (the authors' program); "linear", dl/dt = rate. Exponentials are exact over a step.
+    rate: 1/h (µm/h with law "linear"); one number, one per colony, or a distribution drawn at
+    birth. None: cells grow at whatever rules write to `growth_rate`, at first 0. law: "volume",
+    dV/dt = rate·V, so that ln 2/rate is the doubling time whatever the shape (the paper's wording);
+    "length", dl/dt = rate·l of the centreline (the authors' program); "linear", dl/dt = rate.
+    Exponentials are exact over a step.
     """
 
     rate: float | Tensor | Distribution | None = None
@@ -56,13 +61,14 @@ class Growth(Effect):
         rate = 0.0 if self.rate is None else self.rate
         return (
             Field(
-                "growth_rate", "relative growth rate" if self.law != "linear" else "growth of the centreline",
+                "growth_rate",
+                "relative growth rate" if self.law != "linear" else "growth of the centreline",
                 UNITS[self.law],
                 initial=lambda state, rows: draw("Growth.rate", rate, state, rows),
                 at_division="reset" if isinstance(rate, Distribution) else "copy",
             ),
             Field("elongation", "growth wanted in this step, contained in length", "µm"),
-        )  # fmt: skip
+        )
 
     def reads(self) -> tuple[str, ...]:
         return ("growth_rate", "length", "radius")
@@ -86,8 +92,13 @@ class Growth(Effect):
         # one look at the longest: NaN is the greatest of all
         if state.cells and not length.max().item() < math.inf:
             report = _too_long(state, torch.isfinite(length))
-            elongation = torch.where((report.status == 0).index_select(0, state.colony), elongation, 0.0)
-            state, length = state.replace(reports={**state.reports, "growth": report}), state.length + elongation
+            elongation = torch.where(
+                (report.status == 0).index_select(0, state.colony), elongation, 0.0
+            )
+            state, length = (
+                state.replace(reports={**state.reports, "growth": report}),
+                state.length + elongation,
+            )
         return state.replace(length=length).with_fields(elongation=elongation)
 
 
@@ -96,4 +107,8 @@ def _too_long(state: State, good: Tensor) -> GrowthReport:
     number = torch.arange(state.cells, device=state.device)
     first = state.cells - state.groups.max(torch.where(good, 0, state.cells - number))
     row = first.clamp(max=state.cells - 1)
-    return GrowthReport((first < state.cells).long(), state.uid.index_select(0, row), state.growth_rate.detach().index_select(0, row))
+    return GrowthReport(
+        (first < state.cells).long(),
+        state.uid.index_select(0, row),
+        state.growth_rate.detach().index_select(0, row),
+    )

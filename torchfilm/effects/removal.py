@@ -15,7 +15,8 @@ from torchfilm.tools import checks
 
 @dataclass(frozen=True)
 class Removal(Effect):
-    """Cells whose centre leaves the box from `low` to `high` are removed, as at a channel's open end.
+    """Cells whose centre leaves the box from `low` to `high` are removed, as at a channel's open
+    end.
 
     low, high: µm, each entry one number or one per colony; ±inf leaves a side out.
     """
@@ -27,7 +28,9 @@ class Removal(Effect):
     title = "removal"
 
     def __post_init__(self) -> None:
-        for name, corner in zip(("low", "high"), checks.corners("Removal", self.low, self.high), strict=True):
+        for name, corner in zip(
+            ("low", "high"), checks.corners("Removal", self.low, self.high), strict=True
+        ):
             object.__setattr__(self, name, corner)
 
     def reads(self) -> tuple[str, ...]:
@@ -38,13 +41,17 @@ class Removal(Effect):
 
     def check(self, state: State) -> None:
         if len(self.low) != state.dim:
-            raise checks.refuse("Removal.low", self.low, f"of {state.dim} numbers in a {state.dim}-D scene")
+            raise checks.refuse(
+                "Removal.low", self.low, f"of {state.dim} numbers in a {state.dim}-D scene"
+            )
         outside = self._outside(state)
         if bool(outside.any()):
             k = int(torch.nonzero(outside)[0])
             raise checks.InputError(
-                f"Removal would take cell {int(state.uid[k])} of colony {int(state.own_colony_id[k])} before the first step: it starts at "
-                f"{state.position[k].tolist()}, outside {self.low} to {self.high}. Move the cell or the region."
+                f"Removal would take cell {int(state.uid[k])} of colony"
+                f" {int(state.own_colony_id[k])} before the first step: it starts at"
+                f" {state.position[k].tolist()}, outside {self.low} to {self.high}. Move the cell"
+                " or the region."
             )
 
     def _outside(self, state: State) -> torch.Tensor:

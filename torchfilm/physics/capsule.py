@@ -1,4 +1,5 @@
-"""The capsule: a cylinder of centreline length l with hemispherical caps of radius r. Lengths in µm."""
+"""The capsule: a cylinder of centreline length l with hemispherical caps of radius r. Lengths in
+µm."""
 
 from __future__ import annotations
 
@@ -23,11 +24,14 @@ def area(length: Tensor, radius: Tensor) -> Tensor:
     return 2.0 * math.pi * radius * total_length(length, radius)
 
 
-def drag(length: Tensor, radius: Tensor, viscosity: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
-    """Overdamped drag of one cell: translation μL, rotation across the axis μL³/12, rotation about it μLr²/2.
+def drag(
+    length: Tensor, radius: Tensor, viscosity: Tensor | float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Overdamped drag of one cell: translation μL, rotation across the axis μL³/12, rotation about
+    it μLr²/2.
 
-    The slender rod has no resistance about its own axis; the last term, of a rod of finite radius, makes the tensor
-    positive definite. Each (N,), in units of μ times µm, µm³ and µm³.
+    The slender rod has no resistance about its own axis; the last term, of a rod of finite radius,
+    makes the tensor positive definite. Each (N,), in units of μ times µm, µm³ and µm³.
     """
     whole = total_length(length, radius)
     along = viscosity * whole
@@ -35,14 +39,35 @@ def drag(length: Tensor, radius: Tensor, viscosity: Tensor | float) -> tuple[Ten
 
 
 def rotate(axis: Tensor, turn: Tensor) -> Tensor:
-    """Turn unit axes by a rotation vector, exactly: axis (N, d), turn (N, 3) or, in 2-D, (N, 1) rad -> (N, d), unit.
+    """Turn unit axes by a rotation vector, exactly: axis (N, d), turn (N, 3) or, in 2-D, (N, 1) rad
+    -> (N, d), unit.
 
-    sin θ/θ and (1 − cos θ)/θ² are summed as series in θ² (good to 1e-16 for θ ≤ 1): no singular gradient at zero, and
-    no library sine whose last bit may depend on where an element stands.
+    sin θ/θ and (1 − cos θ)/θ² are summed as series in θ² (good to 1e-16 for θ ≤ 1): no singular
+    gradient at zero, and no library sine whose last bit may depend on where an element stands.
     """
     t2 = (turn * turn).sum(1, keepdim=True)
-    sinc = 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42 * (1 - t2 / 72 * (1 - t2 / 110 * (1 - t2 / 156 * (1 - t2 / 210 * (1 - t2 / 272)))))))
-    versine = 0.5 * (1 - t2 / 12 * (1 - t2 / 30 * (1 - t2 / 56 * (1 - t2 / 90 * (1 - t2 / 132 * (1 - t2 / 182 * (1 - t2 / 240)))))))
+    sinc = 1 - t2 / 6 * (
+        1
+        - t2
+        / 20
+        * (
+            1
+            - t2
+            / 42
+            * (1 - t2 / 72 * (1 - t2 / 110 * (1 - t2 / 156 * (1 - t2 / 210 * (1 - t2 / 272)))))
+        )
+    )
+    versine = 0.5 * (
+        1
+        - t2
+        / 12
+        * (
+            1
+            - t2
+            / 30
+            * (1 - t2 / 56 * (1 - t2 / 90 * (1 - t2 / 132 * (1 - t2 / 182 * (1 - t2 / 240)))))
+        )
+    )
     if axis.shape[1] == 2:
         first = turn * torch.stack([-axis[:, 1], axis[:, 0]], 1)
         second = -t2 * axis

@@ -1,11 +1,12 @@
 """Broad phase: pairs of cells near enough to touch, found on the tensors' own device.
 
-Every cell has a reach: half its length plus its radius plus half the margin asked for. Cells are sorted into rows (of the
-plane) or columns of rows (of space), each row about as high as cells reach, and by place along the row; the partners
-that a cell has in one row are then one contiguous run, found by bisection. Cells of very different reach go into classes,
-each with a grid of its own, so that one filament among a thousand rods costs the rods nothing. There is no capacity
-to overflow: the list is as long as it must be. All sizes are taken colony by colony, so that a colony's pairs, and their
-order, do not depend on what else is in the batch.
+Every cell has a reach: half its length plus its radius plus half the margin asked for. Cells are
+sorted into rows (of the plane) or columns of rows (of space), each row about as high as cells
+reach, and by place along the row; the partners that a cell has in one row are then one contiguous
+run, found by bisection. Cells of very different reach go into classes, each with a grid of its own,
+so that one filament among a thousand rods costs the rods nothing. There is no capacity to overflow:
+the list is as long as it must be. All sizes are taken colony by colony, so that a colony's pairs,
+and their order, do not depend on what else is in the batch.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from torch import Tensor
 
 from torchfilm.tools.ragged import Groups, expand_ranges, offsets
 
-# Slices of a row, to each reach of a cell: finer ones leave fewer strangers to look at, coarser ones make the table of their starts shorter.
+# Slices of a row, to each reach of a cell: finer ones leave fewer strangers to look at, coarser
+# ones make the table of their starts shorter.
 SLICES = 8
 # A table may have this many entries a cell; cells strewn more thinly are found by bisection.
 TABLE_SHARE = 64
@@ -31,21 +33,34 @@ CLASS_RATIO = 4.0
 class Neighbourhood:
     """Cells of many colonies where they stand, to be asked who is near whom as often as need be.
 
-    position, axis (N, d) µm and unit; length, radius (N,) µm; colony (N,) int64. A pair (i, j), i ≠ j, is of one colony, and its bounding spheres and
-    bounding boxes come within `margin` µm of each other, one number or the mean of the two cells' own (N,). No pair whose surfaces are within it is missing.
-    Pairs are two (P,) int64 tensors.
+    position, axis (N, d) µm and unit; length, radius (N,) µm; colony (N,) int64. A pair (i, j), i ≠
+    j, is of one colony, and its bounding spheres and bounding boxes come within `margin` µm of each
+    other, one number or the mean of the two cells' own (N,). No pair whose surfaces are within it
+    is missing. Pairs are two (P,) int64 tensors.
     """
 
     @torch.no_grad()
-    def __init__(self, position: Tensor, axis: Tensor, length: Tensor, radius: Tensor, colony: Tensor, colonies: int, margin: float | Tensor = 0.0):
+    def __init__(
+        self,
+        position: Tensor,
+        axis: Tensor,
+        length: Tensor,
+        radius: Tensor,
+        colony: Tensor,
+        colonies: int,
+        margin: float | Tensor = 0.0,
+    ):
         self.place, self.reach = position.T.contiguous(), 0.5 * length + radius + 0.5 * margin
         # a hair more, so that rounding loses no pair that touches exactly
         self.box = (0.5 * length * axis.abs().T + radius + 0.5 * margin) * (1 + 1e-5)
-        self.grids: list[tuple[_Grid, Tensor]] = []  # of each class, with the cells of larger classes
+        # of each class, with the cells of larger classes
+        self.grids: list[tuple[_Grid, Tensor]] = []
         if colony.numel() < 2:
             return
         smallest = -Groups(colony, colonies).max(-self.reach)
-        level = torch.floor(torch.log(self.reach / smallest.index_select(0, colony)) / math.log(CLASS_RATIO) + 1e-3).long()
+        level = torch.floor(
+            torch.log(self.reach / smallest.index_select(0, colony)) / math.log(CLASS_RATIO) + 1e-3
+        ).long()
         for k in range(int(level.max()) + 1):
             members = torch.nonzero(level == k).squeeze(1)
             if members.numel():
@@ -65,7 +80,9 @@ class Neighbourhood:
     @torch.no_grad()
     def pairs_of(self, cells: Tensor) -> tuple[Tensor, Tensor]:
         """Every pair of which at least one is among `cells` (M,), once; that one stands first."""
-        asked = torch.zeros(self.reach.numel(), dtype=torch.bool, device=self.reach.device).index_fill(0, cells, True)
+        asked = torch.zeros(
+            self.reach.numel(), dtype=torch.bool, device=self.reach.device
+        ).index_fill(0, cells, True)
         found = []
         for grid, _ in self.grids if cells.numel() else ():
             i, j = _meeting(self.place, self.reach, *grid.pairs_with(cells))
@@ -77,9 +94,13 @@ class Neighbourhood:
     def _near(self, found: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
         """Those of the pairs whose bounding boxes, each grown by half the margin, meet."""
         none = self.reach.new_empty(0, dtype=torch.int64)
-        i, j = (torch.cat([none, *side]) for side in (zip(*found, strict=True) if found else ((), ())))
+        i, j = (
+            torch.cat([none, *side]) for side in (zip(*found, strict=True) if found else ((), ()))
+        )
         for x, size in zip(self.place, self.box, strict=True):
-            apart = (x.index_select(0, j) - x.index_select(0, i)).abs() > size.index_select(0, i) + size.index_select(0, j)
+            apart = (x.index_select(0, j) - x.index_select(0, i)).abs() > size.index_select(
+                0, i
+            ) + size.index_select(0, j)
             keep = torch.nonzero(~apart).squeeze(1)
             i, j = i.index_select(0, keep), j.index_select(0, keep)
         return i, j
@@ -92,7 +113,8 @@ class _Grid:
     at: Tensor  # (d, N) where each cell is: along the row, then across rows
     shape: Tensor  # (d, B) int64: slices along a row, then numbers of rows
     base: Tensor  # (B,) int64: first key of each colony
-    window: Tensor  # (N,) how far a partner of each cell may be: its own reach and the greatest of the members
+    # (N,) how far a partner of each cell may be: its own reach and the greatest of the members
+    window: Tensor
     colony: Tensor
     members: Tensor  # sorted by key
     keys: Tensor
@@ -100,8 +122,12 @@ class _Grid:
     table: Tensor | None = None  # how many members stand before each key
 
     @staticmethod
-    def build(position: Tensor, reach: Tensor, colony: Tensor, colonies: int, members: Tensor) -> _Grid:
-        greatest = Groups(colony.index_select(0, members), colonies).max(reach.index_select(0, members), empty=1.0)
+    def build(
+        position: Tensor, reach: Tensor, colony: Tensor, colonies: int, members: Tensor
+    ) -> _Grid:
+        greatest = Groups(colony.index_select(0, members), colonies).max(
+            reach.index_select(0, members), empty=1.0
+        )
         # narrow rows leave fewer strangers to look at, but in space there are many more of them
         wide = 1 if position.shape[1] == 2 else 2
         groups = Groups(colony, colonies)
@@ -119,9 +145,22 @@ class _Grid:
         for k in range(1, len(shape)):
             numbers = numbers * shape[k]
         window = (reach + greatest.index_select(0, colony)) / height * (1 + 1e-5)
-        grid = _Grid(torch.stack(at), torch.stack(shape), offsets(numbers)[:-1], window, colony, members, members, slices)
+        grid = _Grid(
+            torch.stack(at),
+            torch.stack(shape),
+            offsets(numbers)[:-1],
+            window,
+            colony,
+            members,
+            members,
+            slices,
+        )
         mine = grid.at.index_select(1, members)
-        key = grid._key(colony.index_select(0, members), torch.floor(mine[1:]).long(), torch.floor(mine[0] * slices).long())
+        key = grid._key(
+            colony.index_select(0, members),
+            torch.floor(mine[1:]).long(),
+            torch.floor(mine[0] * slices).long(),
+        )
         keys, order = torch.sort(key, stable=True)
         table, size = None, int(numbers.sum())
         if size <= TABLE_SHARE * colony.numel():
@@ -132,10 +171,13 @@ class _Grid:
         row = rows[-1]
         for k in range(rows.shape[0] - 1, 0, -1):
             row = row * self.shape[k].index_select(0, colony) + rows[k - 1]
-        return self.base.index_select(0, colony) + row * self.shape[0].index_select(0, colony) + along
+        return (
+            self.base.index_select(0, colony) + row * self.shape[0].index_select(0, colony) + along
+        )
 
     def _run(self, cells: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the possible partners of each of `cells` (Q,) in the row numbered `rows` (d − 1, Q) stand in the sorted list: start and count."""
+        """Where the possible partners of each of `cells` (Q,) in the row numbered `rows` (d − 1, Q)
+        stand in the sorted list: start and count."""
         colony, at = self.colony.index_select(0, cells), self.at.index_select(1, cells)
         window = self.window.index_select(0, cells)
         # of a row some way off only a part is within the window
@@ -146,7 +188,8 @@ class _Grid:
         inside = ((rows >= 0) & (rows <= last[1:])).all(0) & (left >= 0)
         low = torch.floor((at[0] - width) * self.slices).long().clamp(min=0)
         high = torch.minimum(torch.floor((at[0] + width) * self.slices).long(), last[0])
-        # a row outside has no key of its own; any that exists will do, since nothing is taken from it
+        # a row outside has no key of its own; any that exists will do, since nothing is taken from
+        # it
         rows = torch.minimum(rows.clamp(min=0), last[1:])
         start = self._before(self._key(colony, rows, torch.minimum(low, last[0])))
         stop = self._before(self._key(colony, rows, high.clamp(min=0)) + 1)
@@ -154,21 +197,32 @@ class _Grid:
 
     def _before(self, key: Tensor) -> Tensor:
         """How many members stand before each key."""
-        return torch.searchsorted(self.keys, key) if self.table is None else self.table.index_select(0, key)
+        return (
+            torch.searchsorted(self.keys, key)
+            if self.table is None
+            else self.table.index_select(0, key)
+        )
 
     def pairs_within(self, place: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """Every pair of members whose bounding spheres meet, once: in the rest of a member's own row, and in the rows after it. place (d, N), reach (N,)."""
-        members = self.members  # asked in their own order, so that neighbours in space are neighbours in memory
+        """Every pair of members whose bounding spheres meet, once: in the rest of a member's own
+        row, and in the rows after it. place (d, N), reach (N,)."""
+        # asked in their own order, so that neighbours in space are neighbours in memory
+        members = self.members
         own = torch.floor(self.at[1:].index_select(1, members)).long()
-        # strangers are told apart row by row, from copies in the members' own order: what is read stands side by side, and fits a cache
+        # strangers are told apart row by row, from copies in the members' own order: what is read
+        # stands side by side, and fits a cache
         place, reach = place.index_select(1, members), reach.index_select(0, members)
         reaches = 2 if own.shape[0] == 1 else 1
         most = self.shape[1:].amax(1).tolist()  # a film a row thick has no rows above or below
         first, second = [], []
         for step in itertools.product(range(-reaches, reaches + 1), repeat=own.shape[0]):
-            if step[::-1] < (0,) * len(step) or any(abs(k) >= rows for k, rows in zip(step, most, strict=True)):
+            if step[::-1] < (0,) * len(step) or any(
+                abs(k) >= rows for k, rows in zip(step, most, strict=True)
+            ):
                 continue
-            start, count = self._run(members, own + torch.tensor(step, device=own.device).unsqueeze(1))
+            start, count = self._run(
+                members, own + torch.tensor(step, device=own.device).unsqueeze(1)
+            )
             if not any(step):
                 stop = start + count
                 start = torch.arange(1, members.numel() + 1, device=members.device)
@@ -179,7 +233,8 @@ class _Grid:
         return torch.cat(first), torch.cat(second)
 
     def pairs_with(self, asked: Tensor) -> tuple[Tensor, Tensor]:
-        """Every pair of one of the cells `asked` (M,), of this class or another, and a member: those of this class meet themselves too."""
+        """Every pair of one of the cells `asked` (M,), of this class or another, and a member:
+        those of this class meet themselves too."""
         # the hair that windows have been given for rounding is no reason for another row
         rows_each_way = torch.ceil(self.window.index_select(0, asked) * (1 - 2e-5)).long()
         found: list[Tensor] = []

@@ -1,7 +1,9 @@
-"""Pictures: cells drawn as the capsules that they are, coloured by what they hold, over the signal about them. Needs matplotlib (the `app` extra).
+"""Pictures: cells drawn as the capsules that they are, coloured by what they hold, over the signal
+about them. Needs matplotlib (the `app` extra).
 
-`show` draws a frame of a results file, `strip` several times of it, `movie` films it, and `sheet` draws a state. For figures of your own, `draw_cells` and
-`draw_signal` draw on matplotlib axes, and `colour_bar` and `scale_bar` say what was drawn.
+`show` draws a frame of a results file, `strip` several times of it, `movie` films it, and `sheet`
+draws a state. For figures of your own, `draw_cells` and `draw_signal` draw on matplotlib axes, and
+`colour_bar` and `scale_bar` say what was drawn.
 """
 
 from torchfilm.pictures.colours import Scale
@@ -12,5 +14,17 @@ from torchfilm.pictures.shapes import VIEWS, outlines
 from torchfilm.pictures.sheets import sheet, show, strip
 
 __all__ = [
-    "VIEWS", "Frame", "Scale", "colour_bar", "draw_cells", "draw_signal", "frame_of", "movie", "outlines", "scale_bar", "sheet", "show", "strip",
-]  # fmt: skip
+    "VIEWS",
+    "Frame",
+    "Scale",
+    "colour_bar",
+    "draw_cells",
+    "draw_signal",
+    "frame_of",
+    "movie",
+    "outlines",
+    "scale_bar",
+    "sheet",
+    "show",
+    "strip",
+]

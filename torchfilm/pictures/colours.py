@@ -1,4 +1,5 @@
-"""Colours: what a picture shows of its cells and of the signal behind them, over which ranges, in which colours."""
+"""Colours: what a picture shows of its cells and of the signal behind them, over which ranges, in
+which colours."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ ANGLE = "angle"
 CELLS, MEAN = "cells", "mean"
 # A dark cell is not quite black, so that it is seen on black; what has no number is grey.
 FLOOR, NOTHING = 0.14, (0.55, 0.55, 0.55, 1.0)
-# Whole numbers with at most this many values are kinds, each with a colour of its own (of Okabe and Ito, distinct to the colour-blind).
+# Whole numbers with at most this many values are kinds, each with a colour of its own (of Okabe and
+# Ito, distinct to the colour-blind).
 KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C6BB1")
 
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -45,24 +47,47 @@ class Look:
         checks.choice("view", self.view, tuple(VIEWS))
         if self.channels is not None:
             if self.colour is not None:
-                raise checks.InputError("colour and channels both say what colours the cells: give one of them.")
+                raise checks.InputError(
+                    "colour and channels both say what colours the cells: give one of them."
+                )
             if not isinstance(self.channels, Mapping) or not self.channels:
-                raise checks.refuse("channels", self.channels, 'colours by name of quantity, such as {"cfp": "cyan", "yfp": "yellow"}')
+                raise checks.refuse(
+                    "channels",
+                    self.channels,
+                    'colours by name of quantity, such as {"cfp": "cyan", "yfp": "yellow"}',
+                )
             for name, colour in self.channels.items():
                 if not is_color_like(colour):
-                    raise checks.refuse(f"channels[{name!r}]", colour, 'a colour, such as "cyan" or "#00ffff"')
+                    raise checks.refuse(
+                        f"channels[{name!r}]", colour, 'a colour, such as "cyan" or "#00ffff"'
+                    )
         if self.section not in (CELLS, MEAN):
             if isinstance(self.section, str):
-                raise checks.refuse("section", self.section, '"cells", "mean", or a coordinate in µm')
+                raise checks.refuse(
+                    "section", self.section, '"cells", "mean", or a coordinate in µm'
+                )
             checks.number("section", self.section)
         if self.section != CELLS and self.background is None:
-            raise checks.refuse("section", self.section, "left out without a background: it says where to cut the signal")
+            raise checks.refuse(
+                "section",
+                self.section,
+                "left out without a background: it says where to cut the signal",
+            )
         for name, pair in (self.limits or {}).items():
             low, high = checks.vector(f"limits[{name!r}]", pair, 2)
             if low >= high:
-                raise checks.refuse(f"limits[{name!r}]", (low, high), "two numbers, the first below the second")
+                raise checks.refuse(
+                    f"limits[{name!r}]", (low, high), "two numbers, the first below the second"
+                )
             if name not in (*self.quantities, self.background, self.signal):
-                drawn = ", ".join(repr(n) for n in (*self.quantities, self.background) if n not in (None, ANGLE)) or "nothing that has a range"
+                drawn = (
+                    ", ".join(
+                        repr(n)
+                        for n in (*self.quantities, self.background)
+                        if n not in (None, ANGLE)
+                    )
+                    or "nothing that has a range"
+                )
                 raise checks.refuse("limits", name, f"of what is drawn: {drawn}")
 
     @property
@@ -76,7 +101,8 @@ class Look:
         return None if self.background is None else OUTSIDE + self.background
 
     def given(self, name: str) -> tuple[float, float] | None:
-        """The limits that were asked for. A bare name that is both a signal's and drawn in the cells means the cells'."""
+        """The limits that were asked for. A bare name that is both a signal's and drawn in the
+        cells means the cells'."""
         limits = self.limits or {}
         found = limits.get(name)
         if found is None and name == self.signal and self.background not in self.quantities:
@@ -88,14 +114,24 @@ class Look:
         if max(VIEWS[self.view]) >= frame.dim:
             raise checks.refuse("view", self.view, '"xy" for 2-D cells')
         if self.whole and frame.origin is None:
-            raise checks.refuse("whole", True, "left out where the scene has no medium, and so no box")
+            raise checks.refuse(
+                "whole", True, "left out where the scene has no medium, and so no box"
+            )
         if self.background is not None and self.background not in frame.signals:
-            raise checks.refuse("background", self.background, "a signal of the medium: " + (", ".join(frame.signals) or "there is none"))
+            raise checks.refuse(
+                "background",
+                self.background,
+                "a signal of the medium: " + (", ".join(frame.signals) or "there is none"),
+            )
         known = [n for n, v in frame.cells.items() if v.ndim == 1]
         for name in self.quantities:
             if name not in known and not (name == ANGLE and self.channels is None):
                 what = "colour" if self.channels is None else "channels"
-                raise checks.refuse(what, name, ("'angle' or " if self.channels is None else "") + "one of " + ", ".join(known))
+                raise checks.refuse(
+                    what,
+                    name,
+                    ("'angle' or " if self.channels is None else "") + "one of " + ", ".join(known),
+                )
 
 
 def values_of(cells: Mapping[str, np.ndarray], name: str, view: str) -> np.ndarray:
@@ -103,12 +139,15 @@ def values_of(cells: Mapping[str, np.ndarray], name: str, view: str) -> np.ndarr
     if name != ANGLE:
         return cells[name].astype(float)
     u, v = VIEWS[view]
-    return np.degrees(np.mod(np.arctan2(cells["axis"][:, v], cells["axis"][:, u]).astype(float), math.pi))
+    return np.degrees(
+        np.mod(np.arctan2(cells["axis"][:, v], cells["axis"][:, u]).astype(float), math.pi)
+    )
 
 
 @dataclass
 class Seen:
-    """The values of one quantity met so far: lowest, highest, and each of them while they are few whole numbers."""
+    """The values of one quantity met so far: lowest, highest, and each of them while they are few
+    whole numbers."""
 
     low: float = math.inf
     high: float = -math.inf
@@ -117,18 +156,25 @@ class Seen:
     def note(self, values: np.ndarray) -> None:
         if self.kinds is not None:
             whole = values.dtype == bool or np.issubdtype(values.dtype, np.integer)
-            self.kinds = self.kinds | {int(x) for x in np.unique(values)[: len(KINDS) + 1]} if whole else None
+            self.kinds = (
+                self.kinds | {int(x) for x in np.unique(values)[: len(KINDS) + 1]}
+                if whole
+                else None
+            )
             if self.kinds is not None and len(self.kinds) > len(KINDS):
                 self.kinds = None
         finite = values[np.isfinite(values)]
         if finite.size:
-            self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
+            self.low, self.high = (
+                min(self.low, float(finite.min())),
+                max(self.high, float(finite.max())),
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """A quantity's colours: its name, what a legend calls it and its unit, its colour map, the range that this spans, and whether some values lie
-    beyond ("min", "max", "both"; "neither").
+    """A quantity's colours: its name, what a legend calls it and its unit, its colour map, the
+    range that this spans, and whether some values lie beyond ("min", "max", "both"; "neither").
 
     kinds: instead of a range, the values of a quantity that tells kinds of cells apart.
     """
@@ -175,7 +221,14 @@ def scale_of(name: str, seen: Seen, look: Look, units: Mapping[str, str], note: 
     if name == ANGLE:
         return Scale(name, "angle of the axis", "°", _wheel(), (0.0, 180.0))
     if given is None and look.channels is None and seen.kinds and name != look.signal:
-        return Scale(name, label, unit, ListedColormap(KINDS[: len(seen.kinds)]), (0.0, 1.0), kinds=tuple(sorted(seen.kinds)))
+        return Scale(
+            name,
+            label,
+            unit,
+            ListedColormap(KINDS[: len(seen.kinds)]),
+            (0.0, 1.0),
+            kinds=tuple(sorted(seen.kinds)),
+        )
     low, high = (seen.low, seen.high) if seen.low <= seen.high else (0.0, 1.0)
     if look.channels is not None and name != look.signal:
         low = min(0.0, low)  # no light means none of it
@@ -192,14 +245,17 @@ def _colours(name: str, look: Look) -> Any:
     if name == look.signal:
         made: Any = LinearSegmentedColormap.from_list("signal", ["white", "black"])
     elif look.channels is not None:
-        made = LinearSegmentedColormap.from_list(name, [lit(np.zeros(3)), lit(light(look.channels[name]))])
+        made = LinearSegmentedColormap.from_list(
+            name, [lit(np.zeros(3)), lit(light(look.channels[name]))]
+        )
     else:
         made = colormaps["viridis"]
     return made.with_extremes(bad=NOTHING)
 
 
 def _wheel() -> Any:
-    """A cyclic colour map of even, muted colours: one that passes through white or black would hide cells of one direction."""
+    """A cyclic colour map of even, muted colours: one that passes through white or black would hide
+    cells of one direction."""
     from matplotlib.colors import ListedColormap, hsv_to_rgb
 
     hue = np.linspace(0, 1, 256, endpoint=False)
@@ -219,7 +275,8 @@ def lit(rgb: np.ndarray) -> np.ndarray:
 
 
 def paint_cells(cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: Look) -> np.ndarray:
-    """The colour of each cell, (N, 4): of its one quantity, or the lights of its channels added up as in a fluorescence picture."""
+    """The colour of each cell, (N, 4): of its one quantity, or the lights of its channels added up
+    as in a fluorescence picture."""
     if look.channels is None:
         (scale,) = scales
         return scale.paint(values_of(cells, scale.name, look.view))

@@ -1,4 +1,5 @@
-"""Drawing on matplotlib axes: cells as the capsules that they are, a signal behind them, a scale bar, legends. Lengths in µm."""
+"""Drawing on matplotlib axes: cells as the capsules that they are, a signal behind them, a scale
+bar, legends. Lengths in µm."""
 
 from __future__ import annotations
 
@@ -8,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchfilm.pictures.colours import CELLS, MEAN, Look, Scale, Seen, paint_cells, scale_of, values_of
+from torchfilm.pictures.colours import (
+    CELLS,
+    MEAN,
+    Look,
+    Scale,
+    Seen,
+    paint_cells,
+    scale_of,
+    values_of,
+)
 from torchfilm.pictures.shapes import CAP_POINTS, VIEWS, Window, along, box, outlines, section, span
 from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
@@ -17,7 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WALL = "#a0522d"  # no grey either
-BEYOND = "#efe4d2"  # what is outside the box of a signal: no grey, so that it is not read as a concentration
+# what is outside the box of a signal: no grey, so that it is not read as a concentration
+BEYOND = "#efe4d2"
 SMALL, TINY = 7.0, 6.0  # points
 ROUND = 0.1  # inches of a µm from which on an outline of few points has corners to be seen
 
@@ -32,22 +43,33 @@ def draw_cells(
     view: str = "xy",
     window: Window | None = None,
 ) -> list[Scale]:
-    """Draw cells, as `Results.frame` gives them, and return the scales of their colours, for `colour_bar`.
+    """Draw cells, as `Results.frame` gives them, and return the scales of their colours, for
+    `colour_bar`.
 
-    colour, channels, limits, view: as for `show`; ranges that are not given are those of these cells. window: what the axes show; by default all cells.
+    colour, channels, limits, view: as for `show`; ranges that are not given are those of these
+    cells. window: what the axes show; by default all cells.
     """
     look = Look(colour=colour, channels=channels, limits=limits, view=view)
     scales = []
     for name in look.quantities:
         if (name in cells and cells[name].ndim != 1) or name not in (*cells, "angle"):
-            raise checks.refuse("colour", name, "'angle' or one of " + ", ".join(n for n in cells if cells[n].ndim == 1))
+            raise checks.refuse(
+                "colour",
+                name,
+                "'angle' or one of " + ", ".join(n for n in cells if cells[n].ndim == 1),
+            )
         seen = Seen()
         seen.note(cells[name] if name in cells else values_of(cells, name, view))
         scales.append(scale_of(name, seen, look, {}))
     covered = span(cells, view)
     if window is None and covered is not None:
         pad = 0.04 * float((covered[1] - covered[0]).max())
-        window = (covered[0, 0] - pad, covered[1, 0] + pad, covered[0, 1] - pad, covered[1, 1] + pad)
+        window = (
+            covered[0, 0] - pad,
+            covered[1, 0] + pad,
+            covered[0, 1] - pad,
+            covered[1, 1] + pad,
+        )
     if window is not None:
         set_window(ax, window)
     add_cells(ax, cells, scales, look)
@@ -65,12 +87,19 @@ def draw_signal(
     section: float | str = MEAN,
     limits: tuple[float, float] | None = None,
 ) -> Scale:
-    """Draw a signal (nx, ny, nz) of one colony, as `Results.signal` and `Results.grid` give it, and return its scale, for `colour_bar`.
+    """Draw a signal (nx, ny, nz) of one colony, as `Results.signal` and `Results.grid` give it, and
+    return its scale, for `colour_bar`.
 
-    White is lowest and black highest. section: where it is cut, the coordinate along the line of sight, µm, or "mean", its mean along it. limits: the range
-    from white to black; by default that of what is drawn.
+    White is lowest and black highest. section: where it is cut, the coordinate along the line of
+    sight, µm, or "mean", its mean along it. limits: the range from white to black; by default that
+    of what is drawn.
     """
-    look = Look(background=name, view=view, section=section, limits=None if limits is None else {name: limits})
+    look = Look(
+        background=name,
+        view=view,
+        section=section,
+        limits=None if limits is None else {name: limits},
+    )
     if section == CELLS:
         raise checks.refuse("section", section, 'a coordinate in µm, or "mean"')
     flat = cut(values, np.asarray(origin), np.asarray(spacing), look, None)
@@ -83,8 +112,11 @@ def draw_signal(
     return scale
 
 
-def cut(values: np.ndarray, origin: np.ndarray, spacing: np.ndarray, look: Look, height: float | None) -> np.ndarray:
-    """What is seen of a signal, (nu, nv); `height` is where the cells are along the line of sight, for a section there."""
+def cut(
+    values: np.ndarray, origin: np.ndarray, spacing: np.ndarray, look: Look, height: float | None
+) -> np.ndarray:
+    """What is seen of a signal, (nu, nv); `height` is where the cells are along the line of sight,
+    for a section there."""
     at = None if look.section == MEAN else height if look.section == CELLS else float(look.section)
     if look.section == CELLS and at is not None:
         # cells beyond the box read what is at its face
@@ -102,44 +134,80 @@ def add_signal(ax: Axes, flat: np.ndarray, extent: Window, scale: Scale) -> None
     """Put a signal as it is seen (nu, nv) behind the cells."""
     window = (*ax.get_xlim(), *ax.get_ylim())
     ax.set_facecolor(BEYOND)
-    ax.imshow(scale.paint(flat).transpose(1, 0, 2), origin="lower", extent=extent, interpolation="bilinear", zorder=0)
+    ax.imshow(
+        scale.paint(flat).transpose(1, 0, 2),
+        origin="lower",
+        extent=extent,
+        interpolation="bilinear",
+        zorder=0,
+    )
     set_window(ax, window)
 
 
-def add_cells(ax: Axes, cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: Look) -> Any:
+def add_cells(
+    ax: Axes, cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: Look
+) -> Any:
     """Put cells into the window of the axes, the nearest to the eye last."""
     from matplotlib.collections import PolyCollection
 
     u, v = VIEWS[look.view]
     if cells["position"].shape[1] == 3:
         # seen against y in "xz", since x, z and what comes towards the eye turn like x, y and z
-        order = np.argsort(cells["position"][:, along(look.view)] * (-1 if look.view == "xz" else 1), kind="stable")
+        order = np.argsort(
+            cells["position"][:, along(look.view)] * (-1 if look.view == "xz" else 1), kind="stable"
+        )
         cells = {name: value[order] for name, value in cells.items()}
     left, right = ax.get_xlim()
     inch = ax.get_window_extent().width / ax.figure.dpi / abs(right - left)  # of a µm
     points = CAP_POINTS if inch < ROUND else 4 * CAP_POINTS
-    shapes = outlines(cells["position"][:, [u, v]], cells["axis"][:, [u, v]], cells["length"], cells["radius"], points=points)
+    shapes = outlines(
+        cells["position"][:, [u, v]],
+        cells["axis"][:, [u, v]],
+        cells["length"],
+        cells["radius"],
+        points=points,
+    )
     # an outline helps where a cell is large on paper and drowns the colour where it is small
     width = min(0.4, 1.2 * inch)
     edge = "black" if look.channels is None else "#d0d0d0"
-    made = PolyCollection(list(shapes), facecolors=paint_cells(cells, scales, look), edgecolors=edge, linewidths=width, zorder=1)
+    made = PolyCollection(
+        list(shapes),
+        facecolors=paint_cells(cells, scales, look),
+        edgecolors=edge,
+        linewidths=width,
+        zorder=1,
+    )
     ax.add_collection(made, autolim=False)
     return made
 
 
 def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: str) -> None:
-    """Draw what the cells of the colony with this id cannot pass, as `Results.walls` tells it, behind them: hard walls as lines, soft ones dashed. A flat wall
-    that is not seen edge-on is left out."""
+    """Draw what the cells of the colony with this id cannot pass, as `Results.walls` tells it,
+    behind them: hard walls as lines, soft ones dashed. A flat wall that is not seen edge-on is left
+    out."""
     from matplotlib.patches import Circle
 
     for artist in [a for a in (*ax.lines, *ax.patches) if a.get_gid() == WALL]:
         artist.remove()
-    own = lambda x: x[colony] if isinstance(x, list) else x  # noqa: E731
+    own = lambda x: x[colony] if isinstance(x, list) else x
     seen = VIEWS[view]
     for wall in walls:
-        style: Any = {"color": WALL, "linewidth": 0.8, "linestyle": "--" if wall["soft"] else "-", "zorder": 0.5, "gid": WALL}
+        style: Any = {
+            "color": WALL,
+            "linewidth": 0.8,
+            "linestyle": "--" if wall["soft"] else "-",
+            "zorder": 0.5,
+            "gid": WALL,
+        }
         if "radius" in wall:
-            ax.add_patch(Circle(tuple(own(wall["center"][k]) for k in seen), own(wall["radius"]), fill=False, **style))
+            ax.add_patch(
+                Circle(
+                    tuple(own(wall["center"][k]) for k in seen),
+                    own(wall["radius"]),
+                    fill=False,
+                    **style,
+                )
+            )
             continue
         u, v = (own(wall["normal"][k]) for k in seen)
         if math.hypot(u, v) > 1.0 - 1e-6:
@@ -148,7 +216,8 @@ def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: s
 
 
 def scale_bar(ax: Axes) -> float:
-    """A bar of a round length just below the axes, at the left, so that it hides nothing. Returns its length, µm."""
+    """A bar of a round length just below the axes, at the left, so that it hides nothing. Returns
+    its length, µm."""
     from matplotlib.transforms import ScaledTranslation
 
     low, high = sorted(ax.get_xlim())
@@ -158,18 +227,36 @@ def scale_bar(ax: Axes) -> float:
     below = ax.transAxes + ScaledTranslation(0, -5 / 72, ax.figure.dpi_scale_trans)
     share = size / (high - low)
     ax.add_line(_line([0, share], below))
-    ax.annotate(f"{size:g} µm", (0, 0), xycoords="axes fraction", xytext=(0, -8), textcoords="offset points", va="top", fontsize=SMALL, annotation_clip=False)
+    ax.annotate(
+        f"{size:g} µm",
+        (0, 0),
+        xycoords="axes fraction",
+        xytext=(0, -8),
+        textcoords="offset points",
+        va="top",
+        fontsize=SMALL,
+        annotation_clip=False,
+    )
     return size
 
 
 def _line(x: list[float], transform: Any) -> Any:
     from matplotlib.lines import Line2D
 
-    return Line2D(x, [0, 0], transform=transform, color="black", linewidth=2.0, solid_capstyle="butt", clip_on=False)
+    return Line2D(
+        x,
+        [0, 0],
+        transform=transform,
+        color="black",
+        linewidth=2.0,
+        solid_capstyle="butt",
+        clip_on=False,
+    )
 
 
 def colour_bar(ax: Axes, scale: Scale) -> None:
-    """Fill axes with the legend of a scale: its colours from left to right, its name above, its range below. Points show where values lie beyond."""
+    """Fill axes with the legend of a scale: its colours from left to right, its name above, its
+    range below. Points show where values lie beyond."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colorbar import Colorbar
     from matplotlib.colors import BoundaryNorm, Normalize
@@ -182,7 +269,13 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
         low, high = scale.limits
         norm, ticks = Normalize(low, high), np.array([low, 0.5 * (low + high), high])
         words = numbers(ticks / 10.0**scale.power)
-    bar = Colorbar(ax, ScalarMappable(norm, scale.cmap), orientation="horizontal", extend=scale.beyond, extendfrac=0.06)
+    bar = Colorbar(
+        ax,
+        ScalarMappable(norm, scale.cmap),
+        orientation="horizontal",
+        extend=scale.beyond,
+        extendfrac=0.06,
+    )
     bar.set_ticks(list(ticks), labels=words)
     bar.minorticks_off()
     bar.outline.set_linewidth(0.4)  # type: ignore[operator]
@@ -191,7 +284,8 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
 
 
 def numbers(values: np.ndarray) -> list[str]:
-    """Numbers with the decimals that matter in the range that they span, about three digits of it."""
+    """Numbers with the decimals that matter in the range that they span, about three digits of
+    it."""
     decimals = min(17, max(0, 2 - math.floor(math.log10(values.max() - values.min()))))
     words = (f"{x:.{decimals}f}" for x in values)
     words = (w.rstrip("0").rstrip(".") if "." in w else w for w in words)

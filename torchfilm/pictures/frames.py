@@ -1,4 +1,5 @@
-"""What pictures are made from: cells and signals at one time as arrays, taken from a state or read from a results file."""
+"""What pictures are made from: cells and signals at one time as arrays, taken from a state or read
+from a results file."""
 
 from __future__ import annotations
 
@@ -21,9 +22,10 @@ UNITS = {"length": "µm", "radius": "µm"}
 class Frame:
     """Cells and signals of B colonies at one time.
 
-    cells: arrays by name as `Results.frame` gives them, the cells of one colony side by side. time: h. colony_id: (B,). units: by name, signals under
-    "out.NAME". signals: by name, one array (nx, ny, nz) a colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm.
-    height: z of the plane of 2-D cells, µm, where it is known. walls: as `Results.walls` tells them.
+    cells: arrays by name as `Results.frame` gives them, the cells of one colony side by side. time:
+    h. colony_id: (B,). units: by name, signals under "out.NAME". signals: by name, one array (nx,
+    ny, nz) a colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm. height: z
+    of the plane of 2-D cells, µm, where it is known. walls: as `Results.walls` tells them.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -58,7 +60,9 @@ class Frame:
 
 def frame_of(state: State) -> Frame:
     """A state as a frame, its cells as `Results.frame` would give them."""
-    columns = {n: getattr(state, n) for n in PER_CELL} | {n: v for n, v in state.fields.items() if state.declared[n].scope == CELL}
+    columns = {n: getattr(state, n) for n in PER_CELL} | {
+        n: v for n, v in state.fields.items() if state.declared[n].scope == CELL
+    }
     cells = {n: v.detach().cpu().numpy() for n, v in columns.items()}
     units = {f.name: f.unit for f in state.declared.values()}
     ids = state.colony_id.cpu().numpy()
@@ -66,21 +70,44 @@ def frame_of(state: State) -> Frame:
         return Frame(cells, state.time, ids, units)
     grid = state.layout.grid
     cuts = grid.offsets.cpu().numpy()[1:-1]
-    signals = {n: [x.reshape(s) for x, s in zip(np.split(v.detach().cpu().numpy(), cuts), grid.shapes, strict=True)] for n, v in state.signals.items()}
+    signals = {
+        n: [
+            x.reshape(s)
+            for x, s in zip(np.split(v.detach().cpu().numpy(), cuts), grid.shapes, strict=True)
+        ]
+        for n, v in state.signals.items()
+    }
     return Frame(
-        cells, state.time, ids, units, signals, grid.origin.cpu().numpy(), grid.shape.cpu().numpy(), np.asarray(grid.spacing), state.layout.height
-    )  # fmt: skip
+        cells,
+        state.time,
+        ids,
+        units,
+        signals,
+        grid.origin.cpu().numpy(),
+        grid.shape.cpu().numpy(),
+        np.asarray(grid.spacing),
+        state.layout.height,
+    )
 
 
 class Recorded(Sequence[Frame]):
     """Some frames of a results file, each read when it is asked for, with one signal or none."""
 
     def __init__(self, results: Results, places: Sequence[int], signal: str | None = None):
-        self.results, self.places, self.signal = results, [results._index(k) for k in places], signal
+        self.results, self.places, self.signal = (
+            results,
+            [results._index(k) for k in places],
+            signal,
+        )
         declared = json.loads(results.attributes["declared"])
         self.units, self.walls = {name: entry[1] for name, entry in declared.items()}, results.walls
         if signal is not None and signal not in results.signal_names:
-            raise checks.refuse("background", signal, "a signal of the medium: " + (", ".join(results.signal_names) or "this run has none"))
+            raise checks.refuse(
+                "background",
+                signal,
+                "a signal of the medium: "
+                + (", ".join(results.signal_names) or "this run has none"),
+            )
 
     def __len__(self) -> int:
         return len(self.places)
@@ -95,7 +122,18 @@ class Recorded(Sequence[Frame]):
         origin, shape, spacing = results.grid(place)
         signals = {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
         height = results.attributes.get("height")
-        return Frame(cells, time, ids, self.units, signals, origin, shape, spacing, None if height is None else float(height), self.walls)
+        return Frame(
+            cells,
+            time,
+            ids,
+            self.units,
+            signals,
+            origin,
+            shape,
+            spacing,
+            None if height is None else float(height),
+            self.walls,
+        )
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))

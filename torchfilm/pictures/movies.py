@@ -1,4 +1,5 @@
-"""Films of a run: MP4 through imageio-ffmpeg, or animated GIF through pillow, which matplotlib brings along."""
+"""Films of a run: MP4 through imageio-ffmpeg, or animated GIF through pillow, which matplotlib
+brings along."""
 
 from __future__ import annotations
 
@@ -36,10 +37,12 @@ def movie(
     colonies: Sequence[int] | None = None,
     dpi: float = 150,
 ) -> Path:
-    """Film a results file, a panel a colony, with one window, one scale and one range of colours from beginning to end. Returns the film's path.
+    """Film a results file, a panel a colony, with one window, one scale and one range of colours
+    from beginning to end. Returns the film's path.
 
-    out: its name, which ends in .mp4 (needs imageio-ffmpeg) or .gif. every: draw every so many of the recorded frames, and the last. fps: drawn frames a
-    second; a GIF counts hundredths of a second. colonies: their ids; by default the first 9. The other options are those of `show`.
+    out: its name, which ends in .mp4 (needs imageio-ffmpeg) or .gif. every: draw every so many of
+    the recorded frames, and the last. fps: drawn frames a second; a GIF counts hundredths of a
+    second. colonies: their ids; by default the first 9. The other options are those of `show`.
     """
     figure_class()
     target = beside(path, out, "")
@@ -57,7 +60,10 @@ def movie(
             write(part, Film(frames, made, f"{seen_along(look)}{more}", dpi), fps)
             part.replace(target)
         except OSError as error:
-            raise checks.InputError(f"{target} cannot be written as a film: {error}. Choose a folder that exists and has room.") from error
+            raise checks.InputError(
+                f"{target} cannot be written as a film: {error}. Choose a folder that exists and"
+                " has room."
+            ) from error
         finally:
             part.unlink(missing_ok=True)
     return target
@@ -102,13 +108,22 @@ def _writer(target: Path, fps: float) -> Callable[[Path, Film, float], None]:
     if not target.parent.is_dir():
         raise checks.refuse("out", str(target), "in a folder that exists")
     if kind == ".gif":
-        checks.number("fps", fps, above=0.0, most=FASTEST_GIF, mend="Write an .mp4 for more, or draw fewer frames with every=.")
+        checks.number(
+            "fps",
+            fps,
+            above=0.0,
+            most=FASTEST_GIF,
+            mend="Write an .mp4 for more, or draw fewer frames with every=.",
+        )
         return _gif
     checks.number("fps", fps, above=0.0)
     try:
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
-        raise checks.InputError('MP4 needs imageio-ffmpeg: pip install "torchfilm[movie]" or imageio-ffmpeg, or give a name that ends in .gif.') from error
+        raise checks.InputError(
+            'MP4 needs imageio-ffmpeg: pip install "torchfilm[movie]" or imageio-ffmpeg, or give a'
+            " name that ends in .gif."
+        ) from error
     return _mp4
 
 
@@ -116,7 +131,15 @@ def _mp4(path: Path, film: Film, fps: float) -> None:
     import imageio_ffmpeg
 
     size = film.canvas.get_width_height()
-    stream = imageio_ffmpeg.write_frames(str(path), size, fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error")
+    stream = imageio_ffmpeg.write_frames(
+        str(path),
+        size,
+        fps=fps,
+        codec="libx264",
+        quality=8,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+    )
     stream.send(None)
     try:
         for k in range(len(film)):
@@ -140,13 +163,22 @@ def _gif(path: Path, film: Film, fps: float) -> None:
         return made
 
     frames = (image(k) for k in range(len(film)))
-    next(frames).save(path, format="GIF", save_all=True, append_images=frames, duration=round(100 / fps) * 10, loop=0)
+    next(frames).save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=frames,
+        duration=round(100 / fps) * 10,
+        loop=0,
+    )
 
 
 def _palette(film: Film) -> np.ndarray:
-    """The 256 colours (256, 3) uint8 of a GIF: greys for the signal, lines and letters; the others for those of the legends and of some frames' cells.
+    """The 256 colours (256, 3) uint8 of a GIF: greys for the signal, lines and letters; the others
+    for those of the legends and of some frames' cells.
 
-    A palette from whole pictures would spend itself on the differences that cover most of the paper.
+    A palette from whole pictures would spend itself on the differences that cover most of the
+    paper.
     """
     from matplotlib.colors import to_rgb
 
@@ -154,16 +186,25 @@ def _palette(film: Film) -> np.ndarray:
     colours = [scale.cmap(np.linspace(0, 1, 256))[:, :3] for scale in made.scales]
     for k in np.unique(np.linspace(0, len(film) - 1, 5).astype(int)):
         frame = film.frames[int(k)]
-        colours += [paint_cells(frame.colony(place), made.scales, made.look)[:, :3] for place in made.places]
+        colours += [
+            paint_cells(frame.colony(place), made.scales, made.look)[:, :3] for place in made.places
+        ]
     wanted = np.unique(np.round(255 * np.concatenate(colours)).astype(np.uint8), axis=0)
     wanted = _spread(wanted, 256 - GREYS - 1)
     greys = np.round(np.linspace(0, 255, GREYS)).astype(np.uint8)
-    made_up = np.concatenate([np.repeat(greys[:, None], 3, 1), np.round(255 * np.array([to_rgb(BEYOND)])).astype(np.uint8), wanted])
+    made_up = np.concatenate(
+        [
+            np.repeat(greys[:, None], 3, 1),
+            np.round(255 * np.array([to_rgb(BEYOND)])).astype(np.uint8),
+            wanted,
+        ]
+    )
     return np.concatenate([made_up, np.zeros((256 - len(made_up), 3), dtype=np.uint8)])
 
 
 def _spread(colours: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of some colours (n, 3), such that none is far from one of them: each next is the one farthest from those before."""
+    """At most so many of some colours (n, 3), such that none is far from one of them: each next is
+    the one farthest from those before."""
     if len(colours) <= most:
         return colours
     points, chosen = colours.astype(np.float32), [0]
@@ -175,9 +216,13 @@ def _spread(colours: np.ndarray, most: int) -> np.ndarray:
 
 
 def _nearest(picture: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """The place in the palette of the colour nearest to each pixel, (height, width) uint8; pillow's own search is coarser than the palette."""
+    """The place in the palette of the colour nearest to each pixel, (height, width) uint8; pillow's
+    own search is coarser than the palette."""
     shift = np.array([1 << 16, 1 << 8, 1])
     found, where = np.unique(picture @ shift, return_inverse=True)
-    colours, there = np.stack([found >> 16, found >> 8 & 255, found & 255], 1).astype(np.float32), palette.astype(np.float32)
+    colours, there = (
+        np.stack([found >> 16, found >> 8 & 255, found & 255], 1).astype(np.float32),
+        palette.astype(np.float32),
+    )
     distance = (there * there).sum(1) - 2.0 * colours @ there.T
     return distance.argmin(1).astype(np.uint8)[where].reshape(picture.shape[:2])

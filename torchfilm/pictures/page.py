@@ -1,4 +1,5 @@
-"""The page: panels of one size and one scale, their titles, a scale bar and legends below, each with a place of its own in inches."""
+"""The page: panels of one size and one scale, their titles, a scale bar and legends below, each
+with a place of its own in inches."""
 
 from __future__ import annotations
 
@@ -12,7 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchfilm.pictures.colours import CELLS, MEAN, Look, Scale, Seen, scale_of
-from torchfilm.pictures.draw import add_cells, add_signal, add_walls, colour_bar, cut, scale_bar, set_window
+from torchfilm.pictures.draw import (
+    add_cells,
+    add_signal,
+    add_walls,
+    colour_bar,
+    cut,
+    scale_bar,
+    set_window,
+)
 from torchfilm.pictures.frames import Frame
 from torchfilm.pictures.shapes import Window, along, box, span, window
 from torchfilm.tools import checks
@@ -23,7 +32,9 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT, NARROWEST = 7.2, 8.4, 3.2  # inches of the page, at most and at least
 EDGE, GAP, HEAD = 0.12, 0.07, 0.19  # margin, between panels, title of a panel
-BAR, BELOW, ROOM = 0.36, 0.24, 0.45  # height of a legend with its ticks; of the scale bar; between two legends, for numbers at their ends
+# height of a legend with its ticks; of the scale bar; between two legends, for numbers at their
+# ends
+BAR, BELOW, ROOM = 0.36, 0.24, 0.45
 LETTER = 0.056  # width of a letter of 7 points, about
 
 
@@ -31,13 +42,16 @@ def figure_class() -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise checks.InputError('Pictures need matplotlib: pip install "torchfilm[app]".') from error
+        raise checks.InputError(
+            'Pictures need matplotlib: pip install "torchfilm[app]".'
+        ) from error
     return Figure
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What all panels of a picture have in common: the colonies (places in the batch), the window of each, and the scales of cells and signal."""
+    """What all panels of a picture have in common: the colonies (places in the batch), the window
+    of each, and the scales of cells and signal."""
 
     look: Look
     places: Sequence[int]
@@ -53,7 +67,8 @@ class Survey:
 
 
 def survey(frames: Sequence[Frame], places: Sequence[int], look: Look) -> Survey:
-    """Go through the frames once, for one window a colony and one range a quantity over all of them."""
+    """Go through the frames once, for one window a colony and one range a quantity over all of
+    them."""
     seen = {name: Seen() for name in (*look.quantities, *([look.signal] if look.signal else []))}
     covered: dict[int, np.ndarray] = {}
     boxes: dict[int, np.ndarray] = {}
@@ -66,12 +81,24 @@ def survey(frames: Sequence[Frame], places: Sequence[int], look: Look) -> Survey
             for name in look.quantities:
                 if name in cells:
                     seen[name].note(cells[name])
-            if (look.background or look.whole) and frame.origin is not None and frame.spacing is not None and frame.shape is not None:
-                boxes[place] = _union(boxes.get(place), box(frame.origin[place], frame.spacing, tuple(frame.shape[place]), look.view))
+            if (
+                (look.background or look.whole)
+                and frame.origin is not None
+                and frame.spacing is not None
+                and frame.shape is not None
+            ):
+                boxes[place] = _union(
+                    boxes.get(place),
+                    box(frame.origin[place], frame.spacing, tuple(frame.shape[place]), look.view),
+                )
             if look.signal is not None:
                 seen[look.signal].note(signal_seen(frame, place, look, cells))
     scales = tuple(scale_of(name, seen[name], look, frame.units) for name in look.quantities)
-    behind = None if look.signal is None else scale_of(look.signal, seen[look.signal], look, frame.units, _where(frame, look))
+    behind = (
+        None
+        if look.signal is None
+        else scale_of(look.signal, seen[look.signal], look, frame.units, _where(frame, look))
+    )
     return Survey(look, places, _windows(places, covered, boxes, look), scales, behind)
 
 
@@ -79,9 +106,19 @@ def _union(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:
     return b if a is None else np.stack([np.minimum(a[0], b[0]), np.maximum(a[1], b[1])])
 
 
-def _windows(places: Sequence[int], covered: Mapping[int, np.ndarray], boxes: Mapping[int, np.ndarray], look: Look) -> dict[int, Window]:
-    """Windows of one size: about the cells with some room, within the box of the signal where the cells are; or the whole box."""
-    shown = {place: _union(covered.get(place), boxes[place]) for place in places} if look.whole else covered
+def _windows(
+    places: Sequence[int],
+    covered: Mapping[int, np.ndarray],
+    boxes: Mapping[int, np.ndarray],
+    look: Look,
+) -> dict[int, Window]:
+    """Windows of one size: about the cells with some room, within the box of the signal where the
+    cells are; or the whole box."""
+    shown = (
+        {place: _union(covered.get(place), boxes[place]) for place in places}
+        if look.whole
+        else covered
+    )
     sizes = []
     for place in places:
         extent = shown[place][1] - shown[place][0]
@@ -96,15 +133,20 @@ def _windows(places: Sequence[int], covered: Mapping[int, np.ndarray], boxes: Ma
     return {place: window(shown[place], size, boxes.get(place)) for place in places}
 
 
-def signal_seen(frame: Frame, place: int, look: Look, cells: Mapping[str, np.ndarray]) -> np.ndarray:
+def signal_seen(
+    frame: Frame, place: int, look: Look, cells: Mapping[str, np.ndarray]
+) -> np.ndarray:
     """The background of one colony, (nu, nv)."""
     assert look.background is not None and frame.origin is not None and frame.spacing is not None
     height = _height(frame, place, look, cells) if look.section == CELLS else None
-    return cut(frame.signals[look.background][place], frame.origin[place], frame.spacing, look, height)
+    return cut(
+        frame.signals[look.background][place], frame.origin[place], frame.spacing, look, height
+    )
 
 
 def _height(frame: Frame, place: int, look: Look, cells: Mapping[str, np.ndarray]) -> float:
-    """Where cells are along the line of sight: their mean, or the plane of 2-D ones; the middle of the box where there are none."""
+    """Where cells are along the line of sight: their mean, or the plane of 2-D ones; the middle of
+    the box where there are none."""
     assert frame.origin is not None and frame.spacing is not None and frame.shape is not None
     k = along(look.view)
     low = float(frame.origin[place, k])
@@ -112,7 +154,9 @@ def _height(frame: Frame, place: int, look: Look, cells: Mapping[str, np.ndarray
     if frame.dim == 3:
         return float(cells["position"][:, k].mean()) if len(cells["length"]) else 0.5 * (low + high)
     if frame.height is None and frame.shape[place, k] > 1 and not low <= 0.0 <= high:
-        told = f"the height of the cells, from {low:g} to {high:g} µm, which this file does not tell"
+        told = (
+            f"the height of the cells, from {low:g} to {high:g} µm, which this file does not tell"
+        )
         raise checks.refuse("section", look.section, told, 'Give it, or "mean".')
     return frame.height or 0.0
 
@@ -127,19 +171,32 @@ def _where(frame: Frame, look: Look) -> str:
         return f", mean over {letter}"
     if look.section == CELLS and frame.dim == 3:
         return f", {letter} of the cells"
-    return f", {letter} = {frame.height or 0.0 if look.section == CELLS else float(look.section):g} µm"
+    return (
+        f", {letter} = {frame.height or 0.0 if look.section == CELLS else float(look.section):g} µm"
+    )
 
 
 def fill(ax: Axes, frame: Frame, place: int, made: Survey, titles: Sequence[str]) -> None:
-    """Draw one colony of one frame in a panel, in place of what was there. titles: from long to short; the longest that fits is written."""
+    """Draw one colony of one frame in a panel, in place of what was there. titles: from long to
+    short; the longest that fits is written."""
     for artist in (*ax.collections, *ax.images):
         artist.remove()
     set_window(ax, made.windows[place])
     cells = frame.colony(place)
     if made.behind is not None:
         assert frame.origin is not None and frame.spacing is not None
-        low, high = box(frame.origin[place], frame.spacing, frame.signals[str(made.look.background)][place].shape, made.look.view)
-        add_signal(ax, signal_seen(frame, place, made.look, cells), (low[0], high[0], low[1], high[1]), made.behind)
+        low, high = box(
+            frame.origin[place],
+            frame.spacing,
+            frame.signals[str(made.look.background)][place].shape,
+            made.look.view,
+        )
+        add_signal(
+            ax,
+            signal_seen(frame, place, made.look, cells),
+            (low[0], high[0], low[1], high[1]),
+            made.behind,
+        )
     elif made.look.channels is not None:
         ax.set_facecolor("black")
     add_walls(ax, frame.walls, int(frame.colony_id[place]), made.look.view)
@@ -148,8 +205,11 @@ def fill(ax: Axes, frame: Frame, place: int, made: Survey, titles: Sequence[str]
     ax.set_title(next((t for t in titles if LETTER * len(t) <= inches), ""), fontsize=7, pad=2.5)
 
 
-def page(rows: int, columns: int, made: Survey, title: str, *, dpi: float) -> tuple[Figure, list[Axes]]:
-    """A figure with a panel for each place of a grid (row by row), its title, a scale bar and legends; panels are empty but have their windows."""
+def page(
+    rows: int, columns: int, made: Survey, title: str, *, dpi: float
+) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel for each place of a grid (row by row), its title, a scale bar and
+    legends; panels are empty but have their windows."""
     width, height = made.size
     room = WIDTH - 2 * EDGE - (columns - 1) * GAP
     panel = min(room / columns, ((HEIGHT - 1.2) / rows - HEAD) * width / height)
@@ -162,17 +222,22 @@ def page(rows: int, columns: int, made: Survey, title: str, *, dpi: float) -> tu
     bars, depth = _legend(legends, inches, left + 0.3 * panel + 0.15)
     total = top + rows * (HEAD + tall) + (rows - 1) * GAP + BELOW + depth + EDGE
     # whole and even numbers of pixels, as films need them
-    figure = figure_class()(figsize=tuple(2 * math.ceil(x * dpi / 2) / dpi for x in (inches, total)), dpi=dpi)
+    figure = figure_class()(
+        figsize=tuple(2 * math.ceil(x * dpi / 2) / dpi for x in (inches, total)), dpi=dpi
+    )
     wide, high = figure.get_size_inches()
 
     def place(x: float, y: float, w: float, h: float) -> Axes:
-        """Axes whose upper left corner is x to the right and y down from that of the page, inches."""
+        """Axes whose upper left corner is x to the right and y down from that of the page,
+        inches."""
         return figure.add_axes((x / wide, 1 - (y + h) / high, w / wide, h / high))
 
     axes = []
     for k in range(rows * columns):
         row, column = divmod(k, columns)
-        ax = place(left + column * (panel + GAP), top + row * (HEAD + tall + GAP) + HEAD, panel, tall)
+        ax = place(
+            left + column * (panel + GAP), top + row * (HEAD + tall + GAP) + HEAD, panel, tall
+        )
         set_window(ax, (0.0, width, 0.0, height))
         for spine in ax.spines.values():
             spine.set(linewidth=0.4, edgecolor="#808080")
@@ -188,7 +253,13 @@ def page(rows: int, columns: int, made: Survey, title: str, *, dpi: float) -> tu
 def entitle(figure: Figure, title: str) -> None:
     """Write a page's title, in place of the one before."""
     wide, high = figure.get_size_inches()
-    figure.suptitle("\n".join(_lines(title, wide)), fontsize=9, y=1 - 0.6 * EDGE / high, va="top", linespacing=1.1)
+    figure.suptitle(
+        "\n".join(_lines(title, wide)),
+        fontsize=9,
+        y=1 - 0.6 * EDGE / high,
+        va="top",
+        linespacing=1.1,
+    )
 
 
 def _lines(title: str, width: float) -> list[str]:
@@ -201,10 +272,14 @@ def _slot(scale: Scale) -> float:
     return max(1.0, LETTER * len(scale.title) - 0.1, 0.2 * len(scale.kinds)) + ROOM
 
 
-def _legend(scales: Sequence[Scale], width: float, taken: float) -> tuple[list[tuple[float, float, float]], float]:
-    """Where each colour bar goes: (from the left, down from the panels, width), inches, and how far down they reach below the scale bar.
+def _legend(
+    scales: Sequence[Scale], width: float, taken: float
+) -> tuple[list[tuple[float, float, float]], float]:
+    """Where each colour bar goes: (from the left, down from the panels, width), inches, and how far
+    down they reach below the scale bar.
 
-    They stand at the right, beside the scale bar if all fit there, which has `taken` of the width; in rows of their own otherwise.
+    They stand at the right, beside the scale bar if all fit there, which has `taken` of the width;
+    in rows of their own otherwise.
     """
     slots = [_slot(s) for s in scales]
     beside = sum(slots) + EDGE <= width - max(taken, 0.9)
@@ -232,6 +307,7 @@ def save(figure: Figure, path: str | Path) -> Path:
         figure.savefig(path, dpi=figure.dpi)
     except (OSError, ValueError) as error:  # no such folder; no such kind of picture
         raise checks.InputError(
-            f"{path} cannot be written as a picture: {error}. Choose a folder that exists and a name that ends in .png, .pdf or .svg."
+            f"{path} cannot be written as a picture: {error}. Choose a folder that exists and a"
+            " name that ends in .png, .pdf or .svg."
         ) from error
     return Path(path)

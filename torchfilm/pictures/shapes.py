@@ -1,4 +1,5 @@
-"""Geometry of pictures: outlines of capsules, what a view spans, and sections through signals. Arrays in and out, µm."""
+"""Geometry of pictures: outlines of capsules, what a view spans, and sections through signals.
+Arrays in and out, µm."""
 
 from __future__ import annotations
 
@@ -22,10 +23,19 @@ def along(view: str) -> int:
     return 3 - u - v
 
 
-def outlines(position: np.ndarray, axis: np.ndarray, length: np.ndarray, radius: np.ndarray, *, points: int = CAP_POINTS) -> np.ndarray:
-    """Outline polygons (N, 2·points, 2) of capsules seen along the line of sight: position, axis (N, 2) of the projection, µm.
+def outlines(
+    position: np.ndarray,
+    axis: np.ndarray,
+    length: np.ndarray,
+    radius: np.ndarray,
+    *,
+    points: int = CAP_POINTS,
+) -> np.ndarray:
+    """Outline polygons (N, 2·points, 2) of capsules seen along the line of sight: position, axis
+    (N, 2) of the projection, µm.
 
-    The projection of a capsule is a capsule whose centreline is shortened, so an upright cell is a circle.
+    The projection of a capsule is a capsule whose centreline is shortened, so an upright cell is a
+    circle.
     """
     size = np.hypot(axis[:, 0], axis[:, 1])
     way = np.where(size[:, None] > 1e-9, axis / np.maximum(size, 1e-9)[:, None], (1.0, 0.0))
@@ -35,7 +45,9 @@ def outlines(position: np.ndarray, axis: np.ndarray, length: np.ndarray, radius:
     parts = []
     for sign in (1.0, -1.0):
         end = position + sign * half[:, None] * way
-        around = sign * (np.cos(turn)[None, :, None] * way[:, None] + np.sin(turn)[None, :, None] * side[:, None])
+        around = sign * (
+            np.cos(turn)[None, :, None] * way[:, None] + np.sin(turn)[None, :, None] * side[:, None]
+        )
         parts.append(end[:, None] + radius[:, None, None] * around)
     return np.concatenate(parts, 1)
 
@@ -45,8 +57,12 @@ def span(cells: Mapping[str, np.ndarray], view: str) -> np.ndarray | None:
     if len(cells["length"]) == 0:
         return None
     seen = list(VIEWS[view])
-    reach = 0.5 * cells["length"][:, None] * np.abs(cells["axis"][:, seen]) + cells["radius"][:, None]
-    return np.stack([(cells["position"][:, seen] - reach).min(0), (cells["position"][:, seen] + reach).max(0)])
+    reach = (
+        0.5 * cells["length"][:, None] * np.abs(cells["axis"][:, seen]) + cells["radius"][:, None]
+    )
+    return np.stack(
+        [(cells["position"][:, seen] - reach).min(0), (cells["position"][:, seen] + reach).max(0)]
+    )
 
 
 def box(origin: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], view: str) -> np.ndarray:
@@ -57,17 +73,25 @@ def box(origin: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], view: s
 
 
 def window(shown: np.ndarray, size: np.ndarray, within: np.ndarray | None) -> Window:
-    """A window of the given size (2,) about what is to be shown, a box (2, 2) that fits into it; moved to lie within another as far as that allows."""
+    """A window of the given size (2,) about what is to be shown, a box (2, 2) that fits into it;
+    moved to lie within another as far as that allows."""
     low = shown.mean(0) - 0.5 * size
     if within is not None:
         room = within[1] - within[0] - size
-        low = np.where(room >= 0, np.clip(low, within[0], within[0] + np.maximum(room, 0)), within[0] + 0.5 * room)
+        low = np.where(
+            room >= 0,
+            np.clip(low, within[0], within[0] + np.maximum(room, 0)),
+            within[0] + 0.5 * room,
+        )
         low = np.clip(low, shown[1] - size, shown[0])
     return float(low[0]), float(low[0] + size[0]), float(low[1]), float(low[1] + size[1])
 
 
-def section(values: np.ndarray, origin: np.ndarray, spacing: np.ndarray, *, view: str, at: float | None) -> np.ndarray:
-    """A signal (nx, ny, nz) as a view shows it, (nu, nv): cut at the coordinate `at`, µm, along the line of sight, or its mean along it (None).
+def section(
+    values: np.ndarray, origin: np.ndarray, spacing: np.ndarray, *, view: str, at: float | None
+) -> np.ndarray:
+    """A signal (nx, ny, nz) as a view shows it, (nu, nv): cut at the coordinate `at`, µm, along the
+    line of sight, or its mean along it (None).
 
     Between the centres of voxels it is interpolated linearly, as cells read it.
     """
@@ -77,7 +101,12 @@ def section(values: np.ndarray, origin: np.ndarray, spacing: np.ndarray, *, view
         return values.mean(k)
     low, high = float(origin[k]), float(origin[k] + spacing[k] * count)
     if not low <= at <= high:
-        raise checks.refuse("section", at, f'within the box of the signal, from {low:g} to {high:g} µm along {"xyz"[k]}, or "mean"')
+        raise checks.refuse(
+            "section",
+            at,
+            f"within the box of the signal, from {low:g} to {high:g} µm along {'xyz'[k]}, or"
+            ' "mean"',
+        )
     place = min(max((at - low) / float(spacing[k]) - 0.5, 0.0), count - 1.0)
     first = min(int(place), count - 2)
     part = place - first

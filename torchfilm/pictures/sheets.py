@@ -37,16 +37,21 @@ def show(
     out: str | Path | None = None,
     dpi: float = 200,
 ) -> Path:
-    """Draw one frame of a results file, a panel a colony; by default to the file's own name with .png. Returns the picture's path.
+    """Draw one frame of a results file, a panel a colony; by default to the file's own name with
+    .png. Returns the picture's path.
 
-    colour: what colours the cells: "angle", the direction of their axes (the default), or any quantity per cell by name.
-    channels: instead of colour, several quantities at once as in a fluorescence picture, each with the colour of its light, which add up:
-    {"cfp": "cyan", "yfp": "yellow"}. background: a signal of the medium, white lowest and black highest.
-    limits: the range of colours of what is drawn, by name, such as {"yfp": (0, 2)}; a signal that shares its name with a quantity of the cells is "out.NAME".
-    Without, it is that of all that is drawn in the picture (from 0 for a channel; of a signal, in all of its box). view: "xy", "xz" or "yz".
-    section: where a signal in three dimensions is seen: at the height of the "cells" (the mean of each colony's; what they read), its "mean" along the line
-    of sight, or at a coordinate, µm. whole: the whole box of the medium, not just the colony and some room. colonies: their ids; by default the first 36.
-    out: the picture; its kind is that of its name (.png, .pdf, .svg). dpi: pixels an inch; a page is 7.2 inches wide.
+    colour: what colours the cells: "angle", the direction of their axes (the default), or any
+    quantity per cell by name. channels: instead of colour, several quantities at once as in a
+    fluorescence picture, each with the colour of its light, which add up: {"cfp": "cyan", "yfp":
+    "yellow"}. background: a signal of the medium, white lowest and black highest. limits: the range
+    of colours of what is drawn, by name, such as {"yfp": (0, 2)}; a signal that shares its name
+    with a quantity of the cells is "out.NAME". Without, it is that of all that is drawn in the
+    picture (from 0 for a channel; of a signal, in all of its box). view: "xy", "xz" or "yz".
+    section: where a signal in three dimensions is seen: at the height of the "cells" (the mean of
+    each colony's; what they read), its "mean" along the line of sight, or at a coordinate, µm.
+    whole: the whole box of the medium, not just the colony and some room. colonies: their ids; by
+    default the first 36. out: the picture; its kind is that of its name (.png, .pdf, .svg). dpi:
+    pixels an inch; a page is 7.2 inches wide.
     """
     figure_class()
     look = Look(colour, channels, background, limits, view, section, whole)
@@ -74,7 +79,8 @@ def sheet(
     most: int = 36,
     dpi: float = 200,
 ) -> Path:
-    """A sheet of the colonies of a state, one panel each, all to one scale; written to `path`. The options are those of `show`.
+    """A sheet of the colonies of a state, one panel each, all to one scale; written to `path`. The
+    options are those of `show`.
 
     More than `most` colonies: the first ones, and the title says so.
     """
@@ -101,11 +107,14 @@ def strip(
     out: str | Path | None = None,
     dpi: float = 200,
 ) -> Path:
-    """Draw one or more colonies at several times, all panels to one scale and one range of colours; by default to NAME_strip.png beside NAME.h5.
+    """Draw one or more colonies at several times, all panels to one scale and one range of colours;
+    by default to NAME_strip.png beside NAME.h5.
 
-    times: h; the recorded frame nearest to each is drawn, and its own time is written. frames: instead, this many of them (at most), evenly spaced from first
-    to last; 4 without either. A colony is a row; panels that are more than twice as wide as high stand one below the other, and a colony is a column.
-    colonies: their ids; by default the first 4. The other options are those of `show`.
+    times: h; the recorded frame nearest to each is drawn, and its own time is written. frames:
+    instead, this many of them (at most), evenly spaced from first to last; 4 without either. A
+    colony is a row; panels that are more than twice as wide as high stand one below the other, and
+    a colony is a column. colonies: their ids; by default the first 4. The other options are those
+    of `show`.
     """
     figure_class()
     look = Look(colour, channels, background, limits, view, section, whole)
@@ -114,8 +123,15 @@ def strip(
         target = beside(path, out, "_strip.png")
         places, more = chosen(recorded.present, results.colony_id, colonies, 4)
         made = survey(recorded, places, look)
-        one = f", colony {results.colony_id[places[0]]}" if len(places) == 1 and len(results.colony_id) > 1 else ""
-        return save(strip_figure(recorded, made, f"{recorded.title}{one}{seen_along(look)}{more}", dpi), target)
+        one = (
+            f", colony {results.colony_id[places[0]]}"
+            if len(places) == 1 and len(results.colony_id) > 1
+            else ""
+        )
+        return save(
+            strip_figure(recorded, made, f"{recorded.title}{one}{seen_along(look)}{more}", dpi),
+            target,
+        )
 
 
 def sheet_figure(frame: Frame, places: Sequence[int], look: Look, title: str, dpi: float) -> Figure:
@@ -137,7 +153,13 @@ def fill_sheet(axes: Sequence, frame: Frame, made: Survey) -> None:
     """A panel a colony; those left over are hidden."""
     for ax, place in zip(axes, made.places, strict=False):
         name, count = f"colony {frame.colony_id[place]}", int(frame.counts[place])
-        fill(ax, frame, place, made, [f"{name}: {count} cell{'' if count == 1 else 's'}", name, str(frame.colony_id[place])])
+        fill(
+            ax,
+            frame,
+            place,
+            made,
+            [f"{name}: {count} cell{'' if count == 1 else 's'}", name, str(frame.colony_id[place])],
+        )
     for ax in axes[len(made.places) :]:
         ax.set_visible(False)
 
@@ -155,23 +177,36 @@ def strip_figure(frames: Recorded, made: Survey, title: str, dpi: float) -> Figu
             titles = [words, f"{clocks[k]} h"]
             if len(made.places) > 1:
                 name = f"colony {frame.colony_id[place]}"
-                titles = [f"{name}, {words}", f"{name}, {clocks[k]} h", f"{frame.colony_id[place]}: {clocks[k]} h"]
-            fill(axes[k * shape[1] + row if down else row * shape[1] + k], frame, place, made, titles)
+                titles = [
+                    f"{name}, {words}",
+                    f"{name}, {clocks[k]} h",
+                    f"{frame.colony_id[place]}: {clocks[k]} h",
+                ]
+            fill(
+                axes[k * shape[1] + row if down else row * shape[1] + k], frame, place, made, titles
+            )
     return figure
 
 
-def chosen(present: np.ndarray, ids: np.ndarray, colonies: Sequence[int] | None, most: int) -> tuple[list[int], str]:
-    """The places of the colonies to draw, and what the title says if these are not all that have cells."""
+def chosen(
+    present: np.ndarray, ids: np.ndarray, colonies: Sequence[int] | None, most: int
+) -> tuple[list[int], str]:
+    """The places of the colonies to draw, and what the title says if these are not all that have
+    cells."""
     alive = [int(p) for p in np.flatnonzero(present)]
     if not alive:
         raise checks.InputError("there is no cell to draw in this frame.")
     if colonies is None:
-        return alive[:most], f" (first {most} of {len(alive)} colonies)" if len(alive) > most else ""
+        return alive[:most], (
+            f" (first {most} of {len(alive)} colonies)" if len(alive) > most else ""
+        )
     places = {int(ids[p]): p for p in alive}
     wrong = [c for c in colonies if c not in places]
     if wrong or not colonies:
         shown = ", ".join(map(str, list(places)[:12])) + (", …" if len(places) > 12 else "")
-        raise checks.refuse("colonies", list(colonies), f"ids of colonies that have cells here: {shown}")
+        raise checks.refuse(
+            "colonies", list(colonies), f"ids of colonies that have cells here: {shown}"
+        )
     return [places[c] for c in dict.fromkeys(colonies)], ""
 
 
@@ -190,7 +225,9 @@ def picked(recorded: np.ndarray, times: Sequence[float] | None, frames: int | No
     places = []
     for t in checks.vector("times", times):
         if not recorded[0] - slack <= t <= recorded[-1] + slack:
-            raise checks.refuse("times", t, f"within what was recorded, {recorded[0]:g} to {recorded[-1]:g} h")
+            raise checks.refuse(
+                "times", t, f"within what was recorded, {recorded[0]:g} to {recorded[-1]:g} h"
+            )
         places.append(int(np.abs(recorded - t).argmin()))
     if not places:
         raise checks.refuse("times", times, "at least one time")
@@ -204,7 +241,12 @@ def seen_along(look: Look) -> str:
 def beside(path: str | Path, out: str | Path | None, ending: str) -> Path:
     """Where a picture goes; never onto the results themselves."""
     if not isinstance(path, (str, Path)):
-        raise checks.refuse("results", path, "the path of a results file", "A state is drawn by tf.pictures.sheet(state, out).")
+        raise checks.refuse(
+            "results",
+            path,
+            "the path of a results file",
+            "A state is drawn by tf.pictures.sheet(state, out).",
+        )
     own = Path(path)
     target = Path(out) if out is not None else own.with_name(own.stem + ending)
     if target.absolute() == own.absolute():

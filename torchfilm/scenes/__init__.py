@@ -1,4 +1,5 @@
-"""Ready-made scenes: each a function from parameters to a Scene. `torchfilm info NAME` prints what one simulates."""
+"""Ready-made scenes: each a function from parameters to a Scene. `torchfilm info NAME` prints what
+one simulates."""
 
 from __future__ import annotations
 
@@ -19,23 +20,34 @@ from torchfilm.tools import checks
 
 def _numbers(given: Any) -> bool:
     """Whether it is a list with one number per colony."""
-    return isinstance(given, (list, tuple)) and bool(given) and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in given)
+    return (
+        isinstance(given, (list, tuple))
+        and bool(given)
+        and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in given)
+    )
 
 
 def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
-    """Note the name and the parameters in the scene, so that a results file can say how to build it again."""
+    """Note the name and the parameters in the scene, so that a results file can say how to build it
+    again."""
 
     @functools.wraps(make)
     def build(*args: Any, **parameters: Any) -> Scene:
         bound = inspect.signature(make).bind(*args, **parameters)
         bound.apply_defaults()
         # a recipe holds lists, and a list times a number is no list of products
-        scene = make(**{n: torch.tensor(v, dtype=torch.float64) if _numbers(v) else v for n, v in bound.arguments.items()})
+        scene = make(
+            **{
+                n: torch.tensor(v, dtype=torch.float64) if _numbers(v) else v
+                for n, v in bound.arguments.items()
+            }
+        )
         plain = {n: v.tolist() if hasattr(v, "tolist") else v for n, v in bound.arguments.items()}
         scene.name, scene.recipe = make.__name__, (make.__name__, plain)
         return scene
 
-    build.__module__ = __name__  # where it is found by its name, as pickling for another process does
+    # where it is found by its name, as pickling for another process does
+    build.__module__ = __name__
     return build
 
 
@@ -52,9 +64,17 @@ nutrient_limited = _ready(nutrients.nutrient_limited)
 READY: dict[str, Callable[..., Scene]] = {
     f.__name__: f
     for f in (
-        microcolony, programmed_growth, channel, quorum_sensing, boundary_detector, random_partition, repressilator, toggle_switch, nutrient_limited,
+        microcolony,
+        programmed_growth,
+        channel,
+        quorum_sensing,
+        boundary_detector,
+        random_partition,
+        repressilator,
+        toggle_switch,
+        nutrient_limited,
     )
-}  # fmt: skip
+}
 
 
 def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
@@ -62,10 +82,19 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
     if name not in READY:
         near = difflib.get_close_matches(name, READY, n=1)
         mend = f"Did you mean {near[0]}?" if near else ""
-        raise checks.refuse("scene", name, "one of " + ", ".join(READY) + ", or the path of a Python file that defines `scene`", mend)
+        raise checks.refuse(
+            "scene",
+            name,
+            "one of " + ", ".join(READY) + ", or the path of a Python file that defines `scene`",
+            mend,
+        )
     allowed = inspect.signature(READY[name]).parameters
     for given in parameters or {}:
         if given not in allowed:
-            knob = "It is a knob of accuracy: --settings FILE, or tf.Settings(…)." if given in {f.name for f in dataclasses.fields(Settings)} else ""
+            knob = (
+                "It is a knob of accuracy: --settings FILE, or tf.Settings(…)."
+                if given in {f.name for f in dataclasses.fields(Settings)}
+                else ""
+            )
             raise checks.refuse(f"parameter of {name}", given, "one of " + ", ".join(allowed), knob)
     return READY[name](**(parameters or {}))

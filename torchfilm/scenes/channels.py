@@ -12,12 +12,22 @@ from torchfilm.physics.walls import Channel
 from torchfilm.scene import Scene
 
 
-def channel(width: float = 10.0, length: float = 60.0, open_ended: bool = True, rate: float = 1.0, shortest: float = 3.5, longest: float = 4.5) -> Scene:
-    """Cells in a channel from x = 0 to `length` µm, `width` µm wide. open_ended: cells that pass the end at x = length are gone; else it is closed
-    and pressure brings growth to a stop."""
+def channel(
+    width: float = 10.0,
+    length: float = 60.0,
+    open_ended: bool = True,
+    rate: float = 1.0,
+    shortest: float = 3.5,
+    longest: float = 4.5,
+) -> Scene:
+    """Cells in a channel from x = 0 to `length` µm, `width` µm wide. open_ended: cells that pass
+    the end at x = length are gone; else it is closed and pressure brings growth to a stop."""
     walls = Channel(width, low_end=0.0, high_end=None if open_ended else length)
     leave = [Removal(low=(-1.0, -width), high=(length, width))] if open_ended else []
     return Scene(
-        Growth(rate=rate), Division(length=Uniform(shortest, longest)), Mechanics(dim=2, walls=[walls]), *leave,
+        Growth(rate=rate),
+        Division(length=Uniform(shortest, longest)),
+        Mechanics(dim=2, walls=[walls]),
+        *leave,
         founders=Cells([[length / 4, 0.0]], [[1.0, 0.0]]),
-    )  # fmt: skip
+    )

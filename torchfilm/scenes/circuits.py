@@ -1,4 +1,5 @@
-"""Cells that compute on their own: random partition, an oscillator and a switch, molecule by molecule."""
+"""Cells that compute on their own: random partition, an oscillator and a switch, molecule by
+molecule."""
 
 from __future__ import annotations
 
@@ -30,59 +31,99 @@ def _share_out(parent: DivisionView, daughter1: DivisionView, daughter2: Divisio
 
 
 def random_partition(rate: float = 1.0, start: float = 1.0) -> Scene:
-    """A species that nothing makes or destroys, shared between daughters in random parts (the paper's `divide` example).
+    """A species that nothing makes or destroys, shared between daughters in random parts (the
+    paper's `divide` example).
 
     Its amount stays, and cells differ ever more.
     """
     return Scene(
-        Rules(divide=_share_out), Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2),
+        Rules(divide=_share_out),
+        Growth(rate=rate),
+        Division(length=Uniform(3.5, 4.5)),
+        Mechanics(dim=2),
         Circuit(_nothing, species=("plasmid",), initial={"plasmid": start}),
-    )  # fmt: skip
+    )
 
 
 def repressilator(
-    alpha: Value = 216.0, basal: Value = 0.216, beta: Value = 5.0, power: float = 2.0, speed: Value = 2.0, copies: float = 0.5, noise: bool = True,
+    alpha: Value = 216.0,
+    basal: Value = 0.216,
+    beta: Value = 5.0,
+    power: float = 2.0,
+    speed: Value = 2.0,
+    copies: float = 0.5,
+    noise: bool = True,
     rate: float = 0.7,
-) -> Scene:  # fmt: skip
-    """Three genes that repress each other in a ring (Elowitz and Leibler 2000), in a growing colony: cells of one descent drift out of step.
+) -> Scene:
+    """Three genes that repress each other in a ring (Elowitz and Leibler 2000), in a growing
+    colony: cells of one descent drift out of step.
 
-    alpha, basal, beta, power: the dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ − pᵢ); speed: its unit of time is 1/speed h, the mRNA's
-    lifetime. noise: molecule by molecule (tau-leaping), with `copies` of them in a unit of concentration × µm³; else smoothly.
+    alpha, basal, beta, power: the dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ −
+    pᵢ); speed: its unit of time is 1/speed h, the mRNA's lifetime. noise: molecule by molecule
+    (tau-leaping), with `copies` of them in a unit of concentration × µm³; else smoothly.
     """
     names = ("laci", "tetr", "ci")
     reactions = []
     for name, by in zip(names, ("ci", "laci", "tetr"), strict=True):
         message = f"m_{name}"
         reactions += [
-            parts.repressed(message, by, rate="production", half=1.0, power=power), parts.constitutive(message, rate="leak"),
+            parts.repressed(message, by, rate="production", half=1.0, power=power),
+            parts.constitutive(message, rate="leak"),
             parts.degradation(message, rate="speed"),
-            [Reaction({message: 1}, {message: 1, name: 1}, "turnover", f"{name} translated")], parts.degradation(name, rate="turnover"),
-        ]  # fmt: skip
+            [Reaction({message: 1}, {message: 1, name: 1}, "turnover", f"{name} translated")],
+            parts.degradation(name, rate="turnover"),
+        ]
     return Scene(
-        Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2),
+        Growth(rate=rate),
+        Division(length=Uniform(3.5, 4.5)),
+        Mechanics(dim=2),
         Circuit(
-            reactions, species=(*names, *(f"m_{n}" for n in names)), method="tau_leap" if noise else "rosenbrock", copies=copies,
-            initial={"laci": 20.0, "m_laci": 20.0}, production=alpha * speed, leak=basal * speed, speed=speed, turnover=beta * speed,
+            reactions,
+            species=(*names, *(f"m_{n}" for n in names)),
+            method="tau_leap" if noise else "rosenbrock",
+            copies=copies,
+            initial={"laci": 20.0, "m_laci": 20.0},
+            production=alpha * speed,
+            leak=basal * speed,
+            speed=speed,
+            turnover=beta * speed,
         ),
-    )  # fmt: skip
+    )
 
 
 def toggle_switch(
-    strength: Value = 10.0, power: float = 2.0, speed: Value = 1.0, start: float = 1.65, copies: float = 50.0, noise: bool = True, rate: float = 0.7,
-) -> Scene:  # fmt: skip
-    """Two genes that repress each other (Gardner et al. 2000): cells near the tipping point fall to one side or the other, and their descendants stay there,
-    so that the colony forms sectors.
+    strength: Value = 10.0,
+    power: float = 2.0,
+    speed: Value = 1.0,
+    start: float = 1.65,
+    copies: float = 50.0,
+    noise: bool = True,
+    rate: float = 0.7,
+) -> Scene:
+    """Two genes that repress each other (Gardner et al. 2000): cells near the tipping point fall to
+    one side or the other, and their descendants stay there, so that the colony forms sectors.
 
-    x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y = `start`, by default where decay,
-    dilution and repression balance. noise: molecule by molecule, with `copies` of them in a unit of concentration × µm³. Growth dilutes beside the decay.
+    x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y =
+    `start`, by default where decay, dilution and repression balance. noise: molecule by molecule,
+    with `copies` of them in a unit of concentration × µm³. Growth dilutes beside the decay.
     """
     reactions = []
     for name, by in (("red", "green"), ("green", "red")):
-        reactions += [parts.repressed(name, by, rate="production", half=1.0, power=power), parts.degradation(name, rate="speed")]
+        reactions += [
+            parts.repressed(name, by, rate="production", half=1.0, power=power),
+            parts.degradation(name, rate="speed"),
+        ]
     return Scene(
-        Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2),
+        Growth(rate=rate),
+        Division(length=Uniform(3.5, 4.5)),
+        Mechanics(dim=2),
         Circuit(
-            reactions, species=("red", "green"), method="tau_leap" if noise else "rosenbrock", copies=copies,
-            initial={"red": start, "green": start}, production=strength * speed, speed=speed,
+            reactions,
+            species=("red", "green"),
+            method="tau_leap" if noise else "rosenbrock",
+            copies=copies,
+            initial={"red": start, "green": start},
+            production=strength * speed,
+            speed=speed,
         ),
-    )  # fmt: skip
+    )

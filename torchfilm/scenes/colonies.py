@@ -1,4 +1,5 @@
-"""Microcolonies: free in the plane, between agarose and coverslip, and with growth at one edge only (the paper's figures 1, 2 and 4)."""
+"""Microcolonies: free in the plane, between agarose and coverslip, and with growth at one edge only
+(the paper's figures 1, 2 and 4)."""
 
 from __future__ import annotations
 
@@ -23,11 +24,17 @@ def microcolony(
     agarose: float = 16.0,
     length_drag: float = 10.0,
 ) -> Scene:
-    """A colony from one cell (Fig. 1, 2): growth `rate` (1/h), division at a centreline length between `shortest` and `longest` µm.
+    """A colony from one cell (Fig. 1, 2): growth `rate` (1/h), division at a centreline length
+    between `shortest` and `longest` µm.
 
-    dim 2: strictly in the plane. dim 3: between a soft agarose below (stiffness `agarose`, μ·µm/h) and a hard coverslip above.
+    dim 2: strictly in the plane. dim 3: between a soft agarose below (stiffness `agarose`, μ·µm/h)
+    and a hard coverslip above.
     """
-    walls = () if dim == 2 else (Plane(z=-0.5, facing="+z", stiffness=agarose), Plane(z=0.5, facing="-z"))
+    walls = (
+        ()
+        if dim == 2
+        else (Plane(z=-0.5, facing="+z", stiffness=agarose), Plane(z=0.5, facing="-z"))
+    )
     return Scene(
         Growth(rate=rate, law=law),
         Division(length=Uniform(shortest, longest)),
@@ -35,11 +42,23 @@ def microcolony(
     )
 
 
-def programmed_growth(rate: float = 1.0, edge: float = 10.0, shortest: float = 3.5, longest: float = 4.5, length_drag: float = 10.0) -> Scene:
-    """Only cells within `edge` µm of the colony's rightmost point grow (Fig. 4): a tip that is pushed to the right, like a meristem."""
+def programmed_growth(
+    rate: float = 1.0,
+    edge: float = 10.0,
+    shortest: float = 3.5,
+    longest: float = 4.5,
+    length_drag: float = 10.0,
+) -> Scene:
+    """Only cells within `edge` µm of the colony's rightmost point grow (Fig. 4): a tip that is
+    pushed to the right, like a meristem."""
 
     def update(cells: CellsView) -> None:
         x = cells.position[:, 0]
         cells.growth_rate = torch.where(cells.colony_max(x) - x <= edge, rate, 0.0)
 
-    return Scene(Rules(update), Growth(), Division(length=Uniform(shortest, longest)), Mechanics(dim=2, length_drag=length_drag))
+    return Scene(
+        Rules(update),
+        Growth(),
+        Division(length=Uniform(shortest, longest)),
+        Mechanics(dim=2, length_drag=length_drag),
+    )

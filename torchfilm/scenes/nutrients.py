@@ -15,20 +15,33 @@ from torchfilm.signals.faces import Faces, Fixed
 
 
 def nutrient_limited(
-    supply: float | Tensor = 1.0, half: float | Tensor = 0.1, diffusion: float | Tensor = 10.0, growth_yield: float | Tensor = 1.0, rate: float | Tensor = 1.0,
-    size: float = 240.0, spacing: float = 4.0,
-) -> Scene:  # fmt: skip
-    """A colony that eats the nutrient about it, which comes by diffusion from the edge of a box `size` µm wide, where it is kept at `supply`: only a rim grows,
-    and where diffusion is slow its bumps get ahead and branch.
+    supply: float | Tensor = 1.0,
+    half: float | Tensor = 0.1,
+    diffusion: float | Tensor = 10.0,
+    growth_yield: float | Tensor = 1.0,
+    rate: float | Tensor = 1.0,
+    size: float = 240.0,
+    spacing: float = 4.0,
+) -> Scene:
+    """A colony that eats the nutrient about it, which comes by diffusion from the edge of a box
+    `size` µm wide, where it is kept at `supply`: only a rim grows, and where diffusion is slow its
+    bumps get ahead and branch.
 
-    growth `rate` (1/h) · s/(half + s); growth_yield: µm³ of cell from one unit of concentration × µm³. The layer is 1 µm deep, as the cells are.
+    growth `rate` (1/h) · s/(half + s); growth_yield: µm³ of cell from one unit of concentration ×
+    µm³. The layer is 1 µm deep, as the cells are.
     """
     edge = Fixed(supply)
     half_size = size / 2
     return Scene(
-        Monod("nutrient", rate=rate, half=half, growth_yield=growth_yield), Growth(), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2),
+        Monod("nutrient", rate=rate, half=half, growth_yield=growth_yield),
+        Growth(),
+        Division(length=Uniform(3.5, 4.5)),
+        Mechanics(dim=2),
         Medium(
-            nutrient=Signal(diffusion=diffusion, initial=supply), box=((-half_size, -half_size), (half_size, half_size)), spacing=spacing, depth=1.0,
+            nutrient=Signal(diffusion=diffusion, initial=supply),
+            box=((-half_size, -half_size), (half_size, half_size)),
+            spacing=spacing,
+            depth=1.0,
             faces=Faces(x=edge, y=edge),
         ),
-    )  # fmt: skip
+    )

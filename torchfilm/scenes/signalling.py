@@ -1,4 +1,5 @@
-"""Cells that talk through the medium: Lux quorum sensing (the paper's Table 2) and detection of the boundary of two populations (its Fig. 5)."""
+"""Cells that talk through the medium: Lux quorum sensing (the paper's Table 2) and detection of the
+boundary of two populations (its Fig. 5)."""
 
 from __future__ import annotations
 
@@ -27,21 +28,36 @@ def _lux(u: Names, s: Names, p: Names, cell: Names):
 
 
 def quorum_sensing(
-    D1: Value = 100.0, d2: Value = 1e-3, k1: Value = 100.0, k2: Value = 1.0, k3: Value = 1.0, k4: Value = 1e-4, g1: Value = 0.1, diffusion: Value = 1000.0,
-    rate: float = 1.0, size: float = 128.0, spacing: float = 4.0,
-) -> Scene:  # fmt: skip
-    """Lux quorum sensing (Table 2): cells make AHL, which crosses their membranes and spreads; together they make enough of it to switch LuxI on.
+    D1: Value = 100.0,
+    d2: Value = 1e-3,
+    k1: Value = 100.0,
+    k2: Value = 1.0,
+    k3: Value = 1.0,
+    k4: Value = 1e-4,
+    g1: Value = 0.1,
+    diffusion: Value = 1000.0,
+    rate: float = 1.0,
+    size: float = 128.0,
+    spacing: float = 4.0,
+) -> Scene:
+    """Lux quorum sensing (Table 2): cells make AHL, which crosses their membranes and spreads;
+    together they make enough of it to switch LuxI on.
 
-    D1 µm/h, membrane; k1, k2 AHL from LuxI; d2, k3, k4 LuxI, basal and induced; g1 its decay, 1/h. The box, `size` µm wide, lets nothing out. With the
-    constants that Table 2 prints (D1 = k1 = k4 = 1; d2 without a value, its d1 is 1e-3) LuxI is diluted faster than it can be induced and nothing switches;
-    with these it does, the sooner the smaller the box.
+    D1 µm/h, membrane; k1, k2 AHL from LuxI; d2, k3, k4 LuxI, basal and induced; g1 its decay, 1/h.
+    The box, `size` µm wide, lets nothing out. With the constants that Table 2 prints (D1 = k1 = k4
+    = 1; d2 without a value, its d1 is 1e-3) LuxI is diluted faster than it can be induced and
+    nothing switches; with these it does, the sooner the smaller the box.
     """
     half = size / 2
     return Scene(
-        Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2),
+        Growth(rate=rate),
+        Division(length=Uniform(3.5, 4.5)),
+        Mechanics(dim=2),
         Circuit(_lux, species=("luxi", "ahl"), D1=D1, d2=d2, k1=k1, k2=k2, k3=k3, k4=k4, g1=g1),
-        Medium(ahl=Signal(diffusion=diffusion), box=((-half, -half), (half, half)), spacing=spacing),
-    )  # fmt: skip
+        Medium(
+            ahl=Signal(diffusion=diffusion), box=((-half, -half), (half, half)), spacing=spacing
+        ),
+    )
 
 
 def _sources(u: Names, s: Names, p: Names, cell: Names):
@@ -63,27 +79,64 @@ def _sinks(u: Names, s: Names, p: Names, cell: Names):
 
 
 def boundary_detector(
-    D1: Value = 0.1, d1: Value = 1e-3, d2: Value = 1e-5, d3: Value = 1e-3, dr: Value = 0.1, g1: Value = 0.1, g2: Value = 0.1, k1: Value = 1.0,
-    k2: Value = 1.0, k3: Value = 1.0, k4: Value = 5e-5, k5: Value = 0.1, k6: Value = 1e-2, diffusion: Value = 10.0, flow: Value = 0.0,
-    rate: float = 1.0, width: float = 32.0, rtol: float = 1e-4,
-) -> Scene:  # fmt: skip
-    """Detection of the boundary between two populations (Fig. 5), in one plane of a channel `width` µm wide, from one founder of each.
+    D1: Value = 0.1,
+    d1: Value = 1e-3,
+    d2: Value = 1e-5,
+    d3: Value = 1e-3,
+    dr: Value = 0.1,
+    g1: Value = 0.1,
+    g2: Value = 0.1,
+    k1: Value = 1.0,
+    k2: Value = 1.0,
+    k3: Value = 1.0,
+    k4: Value = 5e-5,
+    k5: Value = 0.1,
+    k6: Value = 1e-2,
+    diffusion: Value = 10.0,
+    flow: Value = 0.0,
+    rate: float = 1.0,
+    width: float = 32.0,
+    rtol: float = 1e-4,
+) -> Scene:
+    """Detection of the boundary between two populations (Fig. 5), in one plane of a channel `width`
+    µm wide, from one founder of each.
 
-    Sources (type 0, on the left) make AHL by LuxI and show it by CFP; sinks (type 1) take it apart by AiiA and show it by YFP: only at the
-    boundary do they see any. Constants as published (hours, µm, arbitrary concentration); d3 = 0 is a strain without AiiA. flow: µm/h along the channel.
-    rtol: relative tolerance of the circuits in a step. The grid, 4 µm wide, starts as the paper's 64 × 8 × 12 voxels about the cells' plane and grows along
-    the channel with the colony.
+    Sources (type 0, on the left) make AHL by LuxI and show it by CFP; sinks (type 1) take it apart
+    by AiiA and show it by YFP: only at the boundary do they see any. Constants as published (hours,
+    µm, arbitrary concentration); d3 = 0 is a strain without AiiA. flow: µm/h along the channel.
+    rtol: relative tolerance of the circuits in a step. The grid, 4 µm wide, starts as the paper's
+    64 × 8 × 12 voxels about the cells' plane and grows along the channel with the colony.
     """
     half = width / 2
     return Scene(
-        Growth(rate=rate), Division(length=Uniform(3.5, 4.5)), Mechanics(dim=2, walls=[Channel(width)]),
+        Growth(rate=rate),
+        Division(length=Uniform(3.5, 4.5)),
+        Mechanics(dim=2, walls=[Channel(width)]),
         Circuit(
-            {0: _sources, 1: _sinks}, species=("luxi", "ahl", "aiia", "cfp", "yfp"),
-            rtol=rtol, D1=D1, d1=d1, d2=d2, d3=d3, dr=dr, g1=g1, g2=g2, k1=k1, k2=k2, k3=k3, k4=k4, k5=k5, k6=k6,
+            {0: _sources, 1: _sinks},
+            species=("luxi", "ahl", "aiia", "cfp", "yfp"),
+            rtol=rtol,
+            D1=D1,
+            d1=d1,
+            d2=d2,
+            d3=d3,
+            dr=dr,
+            g1=g1,
+            g2=g2,
+            k1=k1,
+            k2=k2,
+            k3=k3,
+            k4=k4,
+            k5=k5,
+            k6=k6,
         ),
         Medium(
-            ahl=Signal(diffusion=diffusion), box=((-128.0, -half, -24.0), (128.0, half, 24.0)), spacing=4.0, beyond="grow", grows="x",
+            ahl=Signal(diffusion=diffusion),
+            box=((-128.0, -half, -24.0), (128.0, half, 24.0)),
+            spacing=4.0,
+            beyond="grow",
+            grows="x",
             flow=None if isinstance(flow, (int, float)) and flow == 0 else (flow, 0.0, 0.0),
         ),
         founders=Cells([[-1.5, 0.0], [1.5, 0.0]], [[1.0, 0.0], [1.0, 0.0]], cell_type=[0, 1]),
-    )  # fmt: skip
+    )

@@ -1,1 +1,2 @@
-"""Signals: concentrations on one regular grid per colony. Kernels: tensors in and out, never a State."""
+"""Signals: concentrations on one regular grid per colony. Kernels: tensors in and out, never a
+State."""

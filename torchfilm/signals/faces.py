@@ -36,7 +36,8 @@ class Periodic(Face):
 
 @dataclass(frozen=True)
 class Fixed(Face):
-    """The concentration at the face itself, half a voxel from the nearest centre, is `value` ≥ 0: one number or one per colony."""
+    """The concentration at the face itself, half a voxel from the nearest centre, is `value` ≥ 0:
+    one number or one per colony."""
 
     value: float | Tensor
 
@@ -52,7 +53,8 @@ class Fixed(Face):
 
 @dataclass(frozen=True)
 class Open(Face):
-    """No diffusive flux; the flow carries the local concentration out, and `outside` ≥ 0 (one number or one per colony) in."""
+    """No diffusive flux; the flow carries the local concentration out, and `outside` ≥ 0 (one
+    number or one per colony) in."""
 
     outside: float | Tensor = 0.0
 
@@ -68,7 +70,8 @@ class Open(Face):
 
 @dataclass(frozen=True)
 class Faces:
-    """The six faces of a box: along each axis one face for both ends, or (low, high). `Faces(x=(Fixed(1.0), Open()), y=Periodic())`."""
+    """The six faces of a box: along each axis one face for both ends, or (low, high).
+    `Faces(x=(Fixed(1.0), Open()), y=Periodic())`."""
 
     x: Face | tuple[Face, Face] = NoFlux()
     y: Face | tuple[Face, Face] = NoFlux()
@@ -78,12 +81,24 @@ class Faces:
         for axis in AXES:
             given = getattr(self, axis)
             pair = (given, given) if isinstance(given, Face) else given
-            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(isinstance(face, Face) for face in pair)):
+            if not (
+                isinstance(pair, (tuple, list))
+                and len(pair) == 2
+                and all(isinstance(face, Face) for face in pair)
+            ):
                 raise checks.refuse(
-                    f"Faces.{axis}", given, "a face or a pair of faces (low, high)", "Faces are NoFlux(), Periodic(), Fixed(value) and Open(outside)."
+                    f"Faces.{axis}",
+                    given,
+                    "a face or a pair of faces (low, high)",
+                    "Faces are NoFlux(), Periodic(), Fixed(value) and Open(outside).",
                 )
             if isinstance(pair[0], Periodic) != isinstance(pair[1], Periodic):
-                raise checks.refuse(f"Faces.{axis}", pair, "periodic at both ends or at neither", f"Write {axis}=Periodic().")
+                raise checks.refuse(
+                    f"Faces.{axis}",
+                    pair,
+                    "periodic at both ends or at neither",
+                    f"Write {axis}=Periodic().",
+                )
             object.__setattr__(self, axis, tuple(pair))
 
     @property
@@ -104,4 +119,8 @@ class Faces:
 
 
 def _take(given: float | Tensor, places: Tensor) -> float | Tensor:
-    return given.to(places.device).index_select(0, places) if isinstance(given, Tensor) and given.dim() == 1 else given
+    return (
+        given.to(places.device).index_select(0, places)
+        if isinstance(given, Tensor) and given.dim() == 1
+        else given
+    )

@@ -1,8 +1,10 @@
-"""One regular grid of voxels per colony. Grids of a batch may differ in size, so that each can grow with its colony.
+"""One regular grid of voxels per colony. Grids of a batch may differ in size, so that each can grow
+with its colony.
 
-The values of a signal are one flat tensor (nodes,), colony after colony, x slowest and z fastest: voxel (i, j, k) of an
-(nx, ny, nz) grid stands at (i·ny + j)·nz + k behind the first of its colony. A value is the mean concentration of its voxel.
-There are always three axes; in 2-D the third has one voxel, as thick as the layer.
+The values of a signal are one flat tensor (nodes,), colony after colony, x slowest and z fastest:
+voxel (i, j, k) of an (nx, ny, nz) grid stands at (i·ny + j)·nz + k behind the first of its colony.
+A value is the mean concentration of its voxel. There are always three axes; in 2-D the third has
+one voxel, as thick as the layer.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ Shape = tuple[int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Colonies with grids of one shape: their `places` (b,) int64 in the batch, and where their values stand in a flat signal."""
+    """Colonies with grids of one shape: their `places` (b,) int64 in the batch, and where their
+    values stand in a flat signal."""
 
     places: Tensor
     shape: Shape
@@ -30,28 +33,47 @@ class Batch:
 
     def of(self, values: Tensor) -> Tensor:
         """The values of these colonies, (b, nx, ny, nz); a view where they stand together."""
-        part = values[self.index] if isinstance(self.index, slice) else values.index_select(0, self.index)
+        part = (
+            values[self.index]
+            if isinstance(self.index, slice)
+            else values.index_select(0, self.index)
+        )
         return part.view(self.places.numel(), *self.shape)
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The grids of B colonies. origin: (B, 3) float64, µm, the lower corner of each box; shape: (B, 3) int64 voxels; spacing: µm, of all."""
+    """The grids of B colonies. origin: (B, 3) float64, µm, the lower corner of each box; shape: (B,
+    3) int64 voxels; spacing: µm, of all."""
 
     origin: Tensor
     shape: Tensor
     spacing: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        if self.origin.dim() != 2 or self.origin.shape[1] != 3 or self.origin.dtype != torch.float64:
-            raise checks.refuse("Grid.origin", (tuple(self.origin.shape), self.origin.dtype), "a float64 tensor of shape (colonies, 3)")
+        if (
+            self.origin.dim() != 2
+            or self.origin.shape[1] != 3
+            or self.origin.dtype != torch.float64
+        ):
+            raise checks.refuse(
+                "Grid.origin",
+                (tuple(self.origin.shape), self.origin.dtype),
+                "a float64 tensor of shape (colonies, 3)",
+            )
         if self.shape.shape != self.origin.shape or self.shape.dtype != torch.int64:
-            raise checks.refuse("Grid.shape", (tuple(self.shape.shape), self.shape.dtype), f"an int64 tensor of shape {tuple(self.origin.shape)}")
+            raise checks.refuse(
+                "Grid.shape",
+                (tuple(self.shape.shape), self.shape.dtype),
+                f"an int64 tensor of shape {tuple(self.origin.shape)}",
+            )
         spacing = checks.vector("Grid.spacing", self.spacing, 3)
         if min(spacing) <= 0:
             raise checks.refuse("Grid.spacing", self.spacing, "three numbers above 0")
         if not bool((self.shape >= 1).all()):
-            raise checks.refuse("Grid.shape", self.shape.tolist(), "at least one voxel along every axis")
+            raise checks.refuse(
+                "Grid.shape", self.shape.tolist(), "at least one voxel along every axis"
+            )
         object.__setattr__(self, "spacing", spacing)
 
     @property
@@ -86,7 +108,11 @@ class Grid:
     @cached_property
     def owner(self) -> Tensor:
         """(nodes,) int64, the colony of each voxel."""
-        return torch.repeat_interleave(torch.arange(self.colonies, device=self.shape.device), self.counts, output_size=self.nodes)
+        return torch.repeat_interleave(
+            torch.arange(self.colonies, device=self.shape.device),
+            self.counts,
+            output_size=self.nodes,
+        )
 
     @cached_property
     def step(self) -> Tensor:
@@ -101,7 +127,9 @@ class Grid:
     @cached_property
     def places(self) -> Tensor:
         """(nodes, 3) int64, the place (i, j, k) of each voxel in its colony's grid."""
-        within = torch.arange(self.nodes, device=self.shape.device) - self.offsets.index_select(0, self.owner)
+        within = torch.arange(self.nodes, device=self.shape.device) - self.offsets.index_select(
+            0, self.owner
+        )
         ny, nz = (self.shape[:, k].index_select(0, self.owner) for k in (1, 2))
         return torch.stack([within // (ny * nz), within // nz % ny, within % nz], 1)
 
@@ -132,7 +160,8 @@ class Grid:
         return tuple(out)
 
     def join(self, parts: Sequence[Tensor]) -> Tensor:
-        """Values (nodes,) from those of each of the `batches`, (b, nx, ny, nz) each and in their order."""
+        """Values (nodes,) from those of each of the `batches`, (b, nx, ny, nz) each and in their
+        order."""
         if len(parts) == 1:
             return parts[0].reshape(-1)
         return torch.cat([part.reshape(-1) for part in parts]).index_select(0, self._back)
@@ -144,25 +173,56 @@ class Grid:
         return torch.empty_like(order).index_copy_(0, order, everything)
 
     def extended(
-        self, values: Sequence[Tensor], low: Tensor, high: Tensor, *, block: int = 8, fill: Sequence[float | Tensor] | None = None
+        self,
+        values: Sequence[Tensor],
+        low: Tensor,
+        high: Tensor,
+        *,
+        block: int = 8,
+        fill: Sequence[float | Tensor] | None = None,
     ) -> tuple[Grid, list[Tensor]]:
-        """The grid enlarged by whole blocks of `block` voxels, on those sides where it must be to cover the box low … high, and the signals on it.
+        """The grid enlarged by whole blocks of `block` voxels, on those sides where it must be to
+        cover the box low … high, and the signals on it.
 
-        values: signals (nodes,) each. low, high: (B, 3) float64, µm; low = inf and high = −inf ask for nothing along that axis.
-        fill: the value of new voxels for each signal, one number or one per colony; 0 without. Returns self and the same signals when nothing is needed.
+        values: signals (nodes,) each. low, high: (B, 3) float64, µm; low = inf and high = −inf ask
+        for nothing along that axis. fill: the value of new voxels for each signal, one number or
+        one per colony; 0 without. Returns self and the same signals when nothing is needed.
         """
         if low.shape != self.origin.shape or high.shape != self.origin.shape:
-            raise checks.refuse("low, high", (tuple(low.shape), tuple(high.shape)), f"of shape {tuple(self.origin.shape)}")
-        if bool((low == -torch.inf).any() | (high == torch.inf).any() | low.isnan().any() | high.isnan().any()):
-            raise checks.refuse("low, high", (low.tolist(), high.tolist()), "a finite box", "Is a cell's position not finite?")
+            raise checks.refuse(
+                "low, high",
+                (tuple(low.shape), tuple(high.shape)),
+                f"of shape {tuple(self.origin.shape)}",
+            )
+        if bool(
+            (low == -torch.inf).any()
+            | (high == torch.inf).any()
+            | low.isnan().any()
+            | high.isnan().any()
+        ):
+            raise checks.refuse(
+                "low, high",
+                (low.tolist(), high.tolist()),
+                "a finite box",
+                "Is a cell's position not finite?",
+            )
         width = block * self.step
-        before, after = (torch.ceil(beyond / width).clamp(min=0).to(torch.int64) * block for beyond in (self.origin - low, high - self.high))
+        before, after = (
+            torch.ceil(beyond / width).clamp(min=0).to(torch.int64) * block
+            for beyond in (self.origin - low, high - self.high)
+        )
         if not bool((before + after).any()):
             return self, list(values)
-        larger = replace(self, origin=self.origin - before * self.step, shape=self.shape + before + after)
+        larger = replace(
+            self, origin=self.origin - before * self.step, shape=self.shape + before + after
+        )
         place = self.places + before.index_select(0, self.owner)
         size = larger.shape.index_select(0, self.owner)
-        target = larger.offsets.index_select(0, self.owner) + (place[:, 0] * size[:, 1] + place[:, 1]) * size[:, 2] + place[:, 2]
+        target = (
+            larger.offsets.index_select(0, self.owner)
+            + (place[:, 0] * size[:, 1] + place[:, 1]) * size[:, 2]
+            + place[:, 2]
+        )
         out = []
         for value, new in zip(values, [0.0] * len(values) if fill is None else fill, strict=True):
             if isinstance(new, Tensor) and new.dim() == 1:

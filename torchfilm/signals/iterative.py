@@ -1,7 +1,9 @@
-"""Transport over a step by repeated application of the operator: the paper's Crank–Nicolson, and explicit Euler.
+"""Transport over a step by repeated application of the operator: the paper's Crank–Nicolson, and
+explicit Euler.
 
-Both are here to compare with. Crank–Nicolson is second order, but its factor for the shortest waves tends to −1: on sharp data it rings
-for many steps and goes below zero. Euler is first order and positive, with as many sub-steps as that needs.
+Both are here to compare with. Crank–Nicolson is second order, but its factor for the shortest waves
+tends to −1: on sharp data it rings for many steps and goes below zero. Euler is first order and
+positive, with as many sub-steps as that needs.
 """
 
 from __future__ import annotations
@@ -18,14 +20,16 @@ from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 
 Map = Callable[[Tensor], Tensor]
-# Of the right-hand side's norm, what may be left. The solve is worked in float64, where this is far above rounding.
+# Of the right-hand side's norm, what may be left. The solve is worked in float64, where this is far
+# above rounding.
 TOLERANCE = 1e-10
 MAX_ITERATIONS = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class Euler:
-    """u ↦ (I + δT)^m u, in m equal sub-steps δ = Δt/m, for each colony the least m for which δ × the greatest loss rate is at most 1.
+    """u ↦ (I + δT)^m u, in m equal sub-steps δ = Δt/m, for each colony the least m for which δ ×
+    the greatest loss rate is at most 1.
 
     substeps: (B or 1,) int64. Then every entry of I + δT is ≥ 0 and no amount can grow.
     """
@@ -50,7 +54,8 @@ def prepare_euler(operator: Operator, dt: float) -> Euler:
 
 @dataclass(frozen=True, eq=False)
 class SolveReport:
-    """For each colony, (B,): `iterations`, the true relative `residual`, and whether it is `converged` (bool)."""
+    """For each colony, (B,): `iterations`, the true relative `residual`, and whether it is
+    `converged` (bool)."""
 
     iterations: Tensor
     residual: Tensor
@@ -59,7 +64,8 @@ class SolveReport:
 
 @dataclass(frozen=True, eq=False)
 class CrankNicolson:
-    """u ↦ (I − Δt/2 T)⁻¹ [(I + Δt/2 T) u + Δt gain], by conjugate gradients, or BiCGStab where something flows; each colony converged by itself."""
+    """u ↦ (I − Δt/2 T)⁻¹ [(I + Δt/2 T) u + Δt gain], by conjugate gradients, or BiCGStab where
+    something flows; each colony converged by itself."""
 
     operator: Operator
     dt: float
@@ -72,8 +78,8 @@ class CrankNicolson:
     def solve(self, u: Tensor) -> tuple[Tensor, SolveReport]:
         """u a step later, as far as the solve came, and its report."""
         wide = u.double()
-        linear = lambda x: apply(self.operator, x, gain=False)  # noqa: E731
-        left = lambda x: x - 0.5 * self.dt * linear(x)  # noqa: E731
+        linear = lambda x: apply(self.operator, x, gain=False)
+        left = lambda x: x - 0.5 * self.dt * linear(x)
         right = wide + 0.5 * self.dt * linear(wide)
         if self.operator.gain is not None:
             right = right + self.dt * self.operator.gain
@@ -87,7 +93,8 @@ class CrankNicolson:
 
 
 class _Attach(torch.autograd.Function):
-    """The solution x of A x = b given with the remainder b − A x ≈ 0, whose derivative is that of the equation: dx = A⁻¹ d(b − A x)."""
+    """The solution x of A x = b given with the remainder b − A x ≈ 0, whose derivative is that of
+    the equation: dx = A⁻¹ d(b − A x)."""
 
     @staticmethod
     def forward(ctx, remainder: Tensor, x: Tensor, left: Map, symmetric: bool) -> Tensor:
@@ -107,7 +114,12 @@ class _Attach(torch.autograd.Function):
 
         with torch.no_grad():
             found, report = krylov(left, grad, torch.zeros_like(grad), ctx.symmetric)
-        return torch.where(report.converged.reshape(-1, 1, 1, 1), found, torch.nan), None, None, None
+        return (
+            torch.where(report.converged.reshape(-1, 1, 1, 1), found, torch.nan),
+            None,
+            None,
+            None,
+        )
 
 
 def prepare_crank_nicolson(operator: Operator, dt: float) -> CrankNicolson:
@@ -132,7 +144,8 @@ def _ratio(a: Tensor, b: Tensor) -> Tensor:
 
 
 def krylov(apply: Map, b: Tensor, start: Tensor, symmetric: bool) -> tuple[Tensor, SolveReport]:
-    """Solve A x = b, (B, nx, ny, nz), one system for each colony, each until it has converged; float64. No gradient."""
+    """Solve A x = b, (B, nx, ny, nz), one system for each colony, each until it has converged;
+    float64. No gradient."""
     size = _dot(b, b)
     target = TOLERANCE**2 * size
     x, iterations = start.clone(), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
@@ -150,7 +163,9 @@ def krylov(apply: Map, b: Tensor, start: Tensor, symmetric: bool) -> tuple[Tenso
     return x, SolveReport(iterations, residual, (_dot(r, r) <= 100 * target).reshape(-1))
 
 
-def _conjugate_gradients(apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+def _conjugate_gradients(
+    apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor
+) -> tuple[Tensor, Tensor]:
     spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
     p, rr = r, _dot(r, r)
     for _ in range(MAX_ITERATIONS):
@@ -166,7 +181,9 @@ def _conjugate_gradients(apply: Map, x: Tensor, r: Tensor, going: Tensor, target
     return x, spent
 
 
-def _bicgstab(apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+def _bicgstab(
+    apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor
+) -> tuple[Tensor, Tensor]:
     """van der Vorst's stabilised bi-conjugate gradients."""
     spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
     shadow, p, rho = r, r, _dot(r, r)
@@ -191,13 +208,19 @@ def _bicgstab(apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor) -
 
 
 def convolve(operator: Operator, u: Tensor) -> Tensor:
-    """du/dt as `apply` gives it, by conv3d with a stencil of 3 × 3 × 3: the paper's equation 7, for rates that are the same everywhere.
+    """du/dt as `apply` gives it, by conv3d with a stencil of 3 × 3 × 3: the paper's equation 7, for
+    rates that are the same everywhere.
 
-    A second way to the same numbers, to check the first by. On the CPU it is many times slower than differences of fluxes, and its last
-    bits depend on what else is in the batch.
+    A second way to the same numbers, to check the first by. On the CPU it is many times slower than
+    differences of fluxes, and its last bits depend on what else is in the batch.
     """
     if operator.interior is None:
-        raise checks.refuse("velocity", "one that varies from place to place", "uniform for a convolution", "Use apply.")
+        raise checks.refuse(
+            "velocity",
+            "one that varies from place to place",
+            "uniform for a convolution",
+            "Use apply.",
+        )
     kernel = torch.zeros(operator.colonies, 1, 3, 3, 3, dtype=torch.float64, device=u.device)
     inside = u if operator.mask is None else u * operator.mask
     padded = inside

@@ -1,4 +1,5 @@
-"""Where the voxels of a scene's signals are, and what lies between them: the part of a medium that a state carries along."""
+"""Where the voxels of a scene's signals are, and what lies between them: the part of a medium that
+a state carries along."""
 
 from __future__ import annotations
 
@@ -18,8 +19,9 @@ from torchfilm.tools.ragged import expand_ranges
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Where cells meet the medium, the concentration of each signal that they find there, (N,) by name, and which of them stand in the reservoir
-    beyond the box, (N,) bool, or None where there is none or nobody in it."""
+    """Where cells meet the medium, the concentration of each signal that they find there, (N,) by
+    name, and which of them stand in the reservoir beyond the box, (N,) bool, or None where there is
+    none or nobody in it."""
 
     stencil: Stencil
     found: dict[str, Tensor]
@@ -33,9 +35,12 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """grid: one a colony. periodic: along which axes space closes on itself. height: z of the plane of 2-D cells, µm. obstacle: a function from
-    places (nodes, 3) µm to (nodes,) bool, true where no signal can be, or None. reservoir: None, or what cells beyond the box find there, the
-    concentration of each signal by name, one number or one per colony of the scene. work: what was made ready for this grid, to be used again."""
+    """grid: one a colony. periodic: along which axes space closes on itself. height: z of the plane
+    of 2-D cells, µm. obstacle: a function from places (nodes, 3) µm to (nodes,) bool, true where no
+    signal can be, or None. reservoir: None, or what cells beyond the box find there, the
+    concentration of each signal by name, one number or one per colony of the scene. work: what was
+    made ready for this grid, to be used again.
+    """
 
     grid: Grid
     periodic: tuple[bool, bool, bool] = (False, False, False)
@@ -50,33 +55,65 @@ class Layout:
         if self.obstacle is None:
             return None
         solid = self.obstacle(self.grid.centres())
-        if not isinstance(solid, Tensor) or solid.shape != (self.grid.nodes,) or solid.dtype != torch.bool:
+        if (
+            not isinstance(solid, Tensor)
+            or solid.shape != (self.grid.nodes,)
+            or solid.dtype != torch.bool
+        ):
             shown = (tuple(solid.shape), solid.dtype) if isinstance(solid, Tensor) else solid
-            raise checks.refuse("obstacles(places)", shown, f"a bool tensor of shape ({self.grid.nodes},), one value for each place")
+            raise checks.refuse(
+                "obstacles(places)",
+                shown,
+                f"a bool tensor of shape ({self.grid.nodes},), one value for each place",
+            )
         if not bool((~solid).any()):
-            raise checks.InputError("obstacles(places) is true everywhere: nothing is left of the medium.")
+            raise checks.InputError(
+                "obstacles(places) is true everywhere: nothing is left of the medium."
+            )
         return ~solid
 
     def places(self, position: Tensor) -> Tensor:
         """Where cells at (N, d) are in the three dimensions of the grid, (N, 3) float64, µm."""
         if position.shape[1] == 3:
             return position.double()
-        return torch.cat([position.double(), position.new_full((position.shape[0], 1), self.height, dtype=torch.float64)], 1)
+        return torch.cat(
+            [
+                position.double(),
+                position.new_full((position.shape[0], 1), self.height, dtype=torch.float64),
+            ],
+            1,
+        )
 
     def stencil(self, position: Tensor, colony: Tensor, dtype: torch.dtype) -> Stencil:
         """Where cells at (N, d) µm of colonies (N,) meet the grid."""
-        return stencil(self.grid, self.places(position), colony, periodic=self.periodic, mask=self.mask, dtype=dtype)
+        return stencil(
+            self.grid,
+            self.places(position),
+            colony,
+            periodic=self.periodic,
+            mask=self.mask,
+            dtype=dtype,
+        )
 
     def astray(self, position: Tensor, colony: Tensor) -> Tensor:
-        """Which cells at (N, d) µm of colonies (N,) are where no medium is, (N,) bool: beyond the box, if it stands in no reservoir, or in an obstacle."""
+        """Which cells at (N, d) µm of colonies (N,) are where no medium is, (N,) bool: beyond the
+        box, if it stands in no reservoir, or in an obstacle."""
         if self.obstacle is None:
             return beyond_box(self.grid, self.places(position), colony, self.periodic)
         where = self.stencil(position, colony, torch.float64)
         assert where.blocked is not None
         return where.outside if self.reservoir is None else where.blocked
 
-    def contact(self, position: Tensor, colony: Tensor, ids: Tensor, signals: Mapping[str, Tensor], dtype: torch.dtype) -> Contact:
-        """What cells at (N, d) µm of colonies (N,), whose ids are `ids` (N,), find of each signal (nodes,)."""
+    def contact(
+        self,
+        position: Tensor,
+        colony: Tensor,
+        ids: Tensor,
+        signals: Mapping[str, Tensor],
+        dtype: torch.dtype,
+    ) -> Contact:
+        """What cells at (N, d) µm of colonies (N,), whose ids are `ids` (N,), find of each signal
+        (nodes,)."""
         where = self.stencil(position, colony, dtype)
         found = {name: read(value, where) for name, value in signals.items()}
         if self.reservoir is None:
@@ -86,22 +123,35 @@ class Layout:
             return Contact(where, found, None)
         for name, value in found.items():
             given = torch.as_tensor(self.reservoir[name], dtype=value.dtype, device=value.device)
-            found[name] = torch.where(beyond, given.index_select(0, ids) if given.dim() else given, value)
+            found[name] = torch.where(
+                beyond, given.index_select(0, ids) if given.dim() else given, value
+            )
         return Contact(where, found, beyond)
 
-    def on_faces(self, flow: Callable[[Tensor], Tensor], batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-        """A velocity field, a function from places (M, 3) µm to velocities (M, 2 or 3), on the faces of the voxels of some colonies: (b, nx + 1, ny, nz)
-        along x, and so on."""
+    def on_faces(
+        self, flow: Callable[[Tensor], Tensor], batch: Batch
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """A velocity field, a function from places (M, 3) µm to velocities (M, 2 or 3), on the
+        faces of the voxels of some colonies: (b, nx + 1, ny, nz) along x, and so on."""
         out = []
         step, origin = self.grid.step, self.grid.origin.index_select(0, batch.places)
         for axis in range(3):
             counts = [n + (k == axis) for k, n in enumerate(batch.shape)]
-            lines = [(torch.arange(n, device=origin.device) + (0.0 if k == axis else 0.5)) * step[k] for k, n in enumerate(counts)]
-            faces = torch.stack(torch.meshgrid(*lines, indexing="ij"), -1) + origin.reshape(-1, 1, 1, 1, 3)
+            lines = [
+                (torch.arange(n, device=origin.device) + (0.0 if k == axis else 0.5)) * step[k]
+                for k, n in enumerate(counts)
+            ]
+            faces = torch.stack(torch.meshgrid(*lines, indexing="ij"), -1) + origin.reshape(
+                -1, 1, 1, 1, 3
+            )
             found = flow(faces.reshape(-1, 3))
             size = faces[..., 0].numel()
             if not isinstance(found, Tensor) or found.shape not in ((size, 2), (size, 3)):
-                raise checks.refuse("flow(places)", tuple(getattr(found, "shape", ())), f"velocities of shape ({size}, 3)")
+                raise checks.refuse(
+                    "flow(places)",
+                    tuple(getattr(found, "shape", ())),
+                    f"velocities of shape ({size}, 3)",
+                )
             part = found[:, axis] if axis < found.shape[1] else torch.zeros_like(found[:, 0])
             out.append(part.reshape(faces.shape[:-1]))
         return out[0], out[1], out[2]
@@ -112,10 +162,18 @@ class Layout:
 
     def take(self, places: Tensor) -> tuple[Layout, Tensor]:
         """The layout of some colonies (b,), and the rows (nodes,) of their voxels in this one."""
-        grid = Grid(self.grid.origin.index_select(0, places), self.grid.shape.index_select(0, places), self.grid.spacing)
-        _, rows = expand_ranges(self.grid.offsets.index_select(0, places), self.grid.counts.index_select(0, places))
+        grid = Grid(
+            self.grid.origin.index_select(0, places),
+            self.grid.shape.index_select(0, places),
+            self.grid.spacing,
+        )
+        _, rows = expand_ranges(
+            self.grid.offsets.index_select(0, places), self.grid.counts.index_select(0, places)
+        )
         return self.on(grid), rows
 
     def to(self, device: str | torch.device) -> Layout:
         """The same layout on another device."""
-        return self.on(Grid(self.grid.origin.to(device), self.grid.shape.to(device), self.grid.spacing))
+        return self.on(
+            Grid(self.grid.origin.to(device), self.grid.shape.to(device), self.grid.spacing)
+        )

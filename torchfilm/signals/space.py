@@ -9,48 +9,85 @@ from torch import Tensor
 
 from torchfilm.tools import checks
 
-# The most of a colony's grid, 0.27 GB a signal in float32; where it grows, one cell that is flung far away must not take all memory there is.
+# The most of a colony's grid, 0.27 GB a signal in float32; where it grows, one cell that is flung
+# far away must not take all memory there is.
 MOST_VOXELS = 2**26
 
 
-def checked_box(box: Any, spacing: Any, depth: float | None, height: float) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+def checked_box(
+    box: Any, spacing: Any, depth: float | None, height: float
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Lower and upper corner and size of voxels, checked."""
     try:
         low, high = (tuple(float(x) for x in corner) for corner in box)
     except (TypeError, ValueError) as error:
-        raise checks.refuse("Medium.box", box, "two corners, such as ((-64, -64), (64, 64))") from error
-    if len(low) != len(high) or len(low) not in (2, 3) or not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True)):
-        raise checks.refuse("Medium.box", (low, high), "two corners of 2 or 3 finite numbers, the first below the second along every axis")
-    voxel = checks.vector("Medium.spacing", (spacing,) * len(low) if isinstance(spacing, (int, float)) else spacing, len(low))
+        raise checks.refuse(
+            "Medium.box", box, "two corners, such as ((-64, -64), (64, 64))"
+        ) from error
+    if (
+        len(low) != len(high)
+        or len(low) not in (2, 3)
+        or not all(
+            math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True)
+        )
+    ):
+        raise checks.refuse(
+            "Medium.box",
+            (low, high),
+            "two corners of 2 or 3 finite numbers, the first below the second along every axis",
+        )
+    voxel = checks.vector(
+        "Medium.spacing",
+        (spacing,) * len(low) if isinstance(spacing, (int, float)) else spacing,
+        len(low),
+    )
     if min(voxel) <= 0:
         raise checks.refuse("Medium.spacing", spacing, "above 0")
     for letter, a, b, h in zip("xyz", low, high, voxel, strict=False):
         count = (b - a) / h
         if abs(count - round(count)) > 1e-6:
             whole = max(1, round(count)) * h
-            raise checks.refuse(f"Medium.box along {letter}", (a, b), f"a whole number of voxels of {h:g} µm", f"It is {count:g}; make it {whole:g} µm long.")
+            raise checks.refuse(
+                f"Medium.box along {letter}",
+                (a, b),
+                f"a whole number of voxels of {h:g} µm",
+                f"It is {count:g}; make it {whole:g} µm long.",
+            )
     voxels = math.prod(round((b - a) / h) for a, b, h in zip(low, high, voxel, strict=True))
     if voxels > MOST_VOXELS:
         mend = f"Here it is {voxels:,}: a larger spacing, or a smaller box."
-        raise checks.refuse("Medium.box", (low, high), f"of at most {MOST_VOXELS:,} voxels of {spacing} µm a colony", mend)
+        raise checks.refuse(
+            "Medium.box",
+            (low, high),
+            f"of at most {MOST_VOXELS:,} voxels of {spacing} µm a colony",
+            mend,
+        )
     if depth is not None:
         checks.number("Medium.depth", depth, above=0.0)
         if len(low) == 3:
-            raise checks.refuse("Medium.depth", depth, "left out where the box has three dimensions")
+            raise checks.refuse(
+                "Medium.depth", depth, "left out where the box has three dimensions"
+            )
     checks.number("Medium.height", height)
     if len(low) == 3 and not low[2] <= height <= high[2]:
-        raise checks.refuse("Medium.height", height, f"within the box, from {low[2]:g} to {high[2]:g} µm")
+        raise checks.refuse(
+            "Medium.height", height, f"within the box, from {low[2]:g} to {high[2]:g} µm"
+        )
     return low, high, voxel
 
 
 def checked_flow(name: str, given: Any) -> Any:
-    """A velocity as numbers, one or one per colony each, or the function or None that it was given as, checked."""
+    """A velocity as numbers, one or one per colony each, or the function or None that it was given
+    as, checked."""
     if given is None or callable(given):
         return given
     if not isinstance(given, (tuple, list, Tensor)) or len(given) not in (2, 3):
         raise checks.refuse(name, given, "two or three numbers, or a function of places")
     if isinstance(given, Tensor) and given.dim() == 2:
         raise checks.refuse(
-            name, tuple(given.shape), "two or three components", "For one velocity a colony give (vx, vy), each a tensor with one number per colony."
+            name,
+            tuple(given.shape),
+            "two or three components",
+            "For one velocity a colony give (vx, vy), each a tensor with one number per colony.",
         )
     return tuple(checks.value(f"{name}[{k}]", v) for k, v in enumerate(given))

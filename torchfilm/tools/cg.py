@@ -1,4 +1,5 @@
-"""Preconditioned conjugate gradients for many independent systems at once, each converged by itself."""
+"""Preconditioned conjugate gradients for many independent systems at once, each converged by
+itself."""
 
 from __future__ import annotations
 
@@ -10,14 +11,15 @@ from torch import Tensor
 
 from torchfilm.tools.ragged import Groups
 
-# How often the host asks whether every system is done. Asking stalls a GPU's queue; the answer never changes a
-# result, because a finished system no longer moves.
+# How often the host asks whether every system is done. Asking stalls a GPU's queue; the answer
+# never changes a result, because a finished system no longer moves.
 CHECK_EVERY = {"cpu": 1, "cuda": 8}
 
 
 @dataclass(frozen=True)
 class CGResult:
-    """x (N, D); iterations (B,) int64 spent on each system; worst (B,) greatest preconditioned residual left, as recurred."""
+    """x (N, D); iterations (B,) int64 spent on each system; worst (B,) greatest preconditioned
+    residual left, as recurred."""
 
     x: Tensor
     iterations: Tensor
@@ -38,9 +40,13 @@ def _dot(a: Tensor, b: Tensor, groups: Groups) -> Tensor:
 
 
 def _for_rows(value: Tensor, groups: Groups, width: int) -> Tensor:
-    """A number of each group (B, 1) for each entry of (N, D), or (1, 1) for all; as a column, which is spread as it is read, it would take six times as
-    long."""
-    return value if groups.size == 1 else value.expand(-1, width).contiguous().index_select(0, groups.owner)
+    """A number of each group (B, 1) for each entry of (N, D), or (1, 1) for all; as a column, which
+    is spread as it is read, it would take six times as long."""
+    return (
+        value
+        if groups.size == 1
+        else value.expand(-1, width).contiguous().index_select(0, groups.owner)
+    )
 
 
 @torch.no_grad()
@@ -52,10 +58,12 @@ def conjugate_gradients(
     target: Tensor,
     max_iterations: int,
 ) -> CGResult:
-    """Solve A x = b from x = 0 for symmetric positive definite A, rows of each group in `groups` a system of its own.
+    """Solve A x = b from x = 0 for symmetric positive definite A, rows of each group in `groups` a
+    system of its own.
 
-    b: (N, D). `apply` and `precondition` map (N, D) to (N, D) and keep groups apart. A system stops when its greatest
-    preconditioned residual is at most target (B,), or is not finite, or after `max_iterations`; the others go on.
+    b: (N, D). `apply` and `precondition` map (N, D) to (N, D) and keep groups apart. A system stops
+    when its greatest preconditioned residual is at most target (B,), or is not finite, or after
+    `max_iterations`; the others go on.
     """
     x = torch.zeros_like(b)
     r = b.clone()
@@ -72,14 +80,18 @@ def conjugate_gradients(
         q = apply(p)
         curvature = _dot(p, q, groups)
         moves = going.unsqueeze(1) & (curvature > 0)
-        step = _for_rows(torch.where(moves, rz / torch.where(moves, curvature, 1.0), 0.0), groups, b.shape[1])
+        step = _for_rows(
+            torch.where(moves, rz / torch.where(moves, curvature, 1.0), 0.0), groups, b.shape[1]
+        )
         x.addcmul_(step, p)
         r.addcmul_(step, q, value=-1)
         z = precondition(r)
         new = _dot(r, z, groups)
         iterations += going
         worst = torch.where(going, worst_of(z, groups), worst)
-        ratio = _for_rows(torch.where(moves, new / torch.where(rz == 0, 1.0, rz), 0.0), groups, b.shape[1])
+        ratio = _for_rows(
+            torch.where(moves, new / torch.where(rz == 0, 1.0, rz), 0.0), groups, b.shape[1]
+        )
         p = torch.addcmul(z, ratio, p)
         rz = new
         going = moves.squeeze(1) & (worst > target) & (worst < torch.inf)

@@ -28,10 +28,20 @@ class SimulationError(RuntimeError):
 def refuse(name: str, value: object, allowed: str, mend: str = "") -> InputError:
     """The error for a value that is not allowed; raise what this returns."""
     shown = repr(value) if len(repr(value)) < 120 else repr(value)[:117] + "..."
-    return InputError(f"{name} = {shown} is not allowed: it must be {allowed}." + (f" {mend}" if mend else ""))
+    return InputError(
+        f"{name} = {shown} is not allowed: it must be {allowed}." + (f" {mend}" if mend else "")
+    )
 
 
-def number(name: str, value: object, *, above: float = -math.inf, least: float = -math.inf, most: float = math.inf, mend: str = "") -> float:
+def number(
+    name: str,
+    value: object,
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    most: float = math.inf,
+    mend: str = "",
+) -> float:
     """One finite number within bounds."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise refuse(name, value, "a number", mend)
@@ -41,8 +51,16 @@ def number(name: str, value: object, *, above: float = -math.inf, least: float =
     return float(value)
 
 
-def value(name: str, given: object, *, above: float = -math.inf, least: float = -math.inf, most: float = math.inf) -> float | Tensor:
-    """One number, or one per colony: a float or a 1-D tensor of floats, each within bounds. A tensor keeps its gradient."""
+def value(
+    name: str,
+    given: object,
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> float | Tensor:
+    """One number, or one per colony: a float or a 1-D tensor of floats, each within bounds. A
+    tensor keeps its gradient."""
     if isinstance(given, (list, tuple)):
         try:
             given = torch.tensor(given, dtype=torch.float64)
@@ -51,9 +69,20 @@ def value(name: str, given: object, *, above: float = -math.inf, least: float = 
     if hasattr(given, "__array__") and not isinstance(given, Tensor):
         given = torch.as_tensor(given)
     if not isinstance(given, Tensor):
-        return number(name, given, above=above, least=least, most=most, mend="Give one number, or one per colony.")
-    if given.dim() > 1 or not (given.is_floating_point() or given.dtype in (torch.int32, torch.int64)):
-        raise refuse(name, tuple(given.shape), "one number, or a 1-D tensor with one number per colony")
+        return number(
+            name,
+            given,
+            above=above,
+            least=least,
+            most=most,
+            mend="Give one number, or one per colony.",
+        )
+    if given.dim() > 1 or not (
+        given.is_floating_point() or given.dtype in (torch.int32, torch.int64)
+    ):
+        raise refuse(
+            name, tuple(given.shape), "one number, or a 1-D tensor with one number per colony"
+        )
     if not given.is_floating_point():
         given = given.double()
     seen = given.detach()
@@ -62,7 +91,8 @@ def value(name: str, given: object, *, above: float = -math.inf, least: float = 
         where = torch.nonzero(~good.reshape(-1)).reshape(-1)
         at = int(where[0])
         raise InputError(
-            f"{name}[{at}] = {float(seen.reshape(-1)[at])} is not allowed ({len(where)} of {seen.numel()} values): each must be {_rule(above, least, most)}."
+            f"{name}[{at}] = {float(seen.reshape(-1)[at])} is not allowed ({len(where)} of"
+            f" {seen.numel()} values): each must be {_rule(above, least, most)}."
         )
     return given
 
@@ -72,10 +102,18 @@ def below(low: float | Tensor, high: float | Tensor) -> bool:
     return bool((torch.as_tensor(low).detach() < torch.as_tensor(high).detach()).all())
 
 
-def corners(name: str, low: object, high: object, mend: str = "") -> tuple[tuple[float | Tensor, ...], tuple[float | Tensor, ...]]:
-    """Two opposite corners, low < high along every axis; entries are numbers (±inf allowed) or one number per colony."""
-    if not all(isinstance(corner, (tuple, list, Tensor)) or hasattr(corner, "__array__") for corner in (low, high)):
-        raise refuse(f"{name}.low, {name}.high", (low, high), "two corners, such as (0, 0) and (10, 5)")
+def corners(
+    name: str, low: object, high: object, mend: str = ""
+) -> tuple[tuple[float | Tensor, ...], tuple[float | Tensor, ...]]:
+    """Two opposite corners, low < high along every axis; entries are numbers (±inf allowed) or one
+    number per colony."""
+    if not all(
+        isinstance(corner, (tuple, list, Tensor)) or hasattr(corner, "__array__")
+        for corner in (low, high)
+    ):
+        raise refuse(
+            f"{name}.low, {name}.high", (low, high), "two corners, such as (0, 0) and (10, 5)"
+        )
     lows: tuple[Any, ...] = tuple(low)  # type: ignore[arg-type]
     highs: tuple[Any, ...] = tuple(high)  # type: ignore[arg-type]
     if len(lows) != len(highs) or len(lows) not in (2, 3):
@@ -88,7 +126,12 @@ def corners(name: str, low: object, high: object, mend: str = "") -> tuple[tuple
             if single and math.isinf(float(entry)):
                 entries.append(float(entry))
             else:
-                entries.append(value(f"{name}.{side}[{k}]", float(entry) if single and not isinstance(entry, Tensor) else entry))
+                entries.append(
+                    value(
+                        f"{name}.{side}[{k}]",
+                        float(entry) if single and not isinstance(entry, Tensor) else entry,
+                    )
+                )
         checked.append(tuple(entries))
     for axis, a, b in zip("xyz", checked[0], checked[1], strict=False):
         if not below(a, b):

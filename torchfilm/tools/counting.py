@@ -1,4 +1,5 @@
-"""What a piece of work asks of torch: operators dispatched, and bytes allocated for their results. Free of the hardware's speed."""
+"""What a piece of work asks of torch: operators dispatched, and bytes allocated for their results.
+Free of the hardware's speed."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from torch.utils._pytree import tree_leaves
 
 
 class Operators(TorchDispatchMode):
-    """Within `with Operators() as seen:` every operator is counted by name in `seen.calls`, and in `seen.bytes` the memory of results that are not views."""
+    """Within `with Operators() as seen:` every operator is counted by name in `seen.calls`, and in
+    `seen.bytes` the memory of results that are not views."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -20,7 +22,8 @@ class Operators(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        # or torch would load its compiler, a second or two, only to be told to leave this class alone
+        # or torch would load its compiler, a second or two, only to be told to leave this class
+        # alone
         return False
 
     @property
@@ -32,7 +35,11 @@ class Operators(TorchDispatchMode):
         out = func(*args, **(kwargs or {}))
         self.calls[str(func)] += 1
         before = {x.untyped_storage().data_ptr() for x in tree_leaves((args, kwargs)) if _plain(x)}
-        new = {x.untyped_storage().data_ptr(): x.untyped_storage().nbytes() for x in tree_leaves(out) if _plain(x)}
+        new = {
+            x.untyped_storage().data_ptr(): x.untyped_storage().nbytes()
+            for x in tree_leaves(out)
+            if _plain(x)
+        }
         self.bytes += sum(size for place, size in new.items() if place not in before)
         return out
 

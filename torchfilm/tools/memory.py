@@ -11,12 +11,20 @@ KEEP = 1024 * 1024 * 1024
 
 
 def keep_memory() -> bool:
-    """Let this process reuse freed memory: on Linux a fifth faster on the CPU, since fresh pages cost as much as the sums done in them.
+    """Let this process reuse freed memory: on Linux a fifth faster on the CPU, since fresh pages
+    cost as much as the sums done in them.
 
-    A process-wide setting of the C library, so it is yours to make: the command line and the benchmarks do. Returns whether it was set.
+    A process-wide setting of the C library, so it is yours to make: the command line and the
+    benchmarks do. Returns whether it was set.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):
         return False  # another C library
-    return all([mallopt(M_MMAP_THRESHOLD, LARGEST_MMAP_THRESHOLD), mallopt(M_TRIM_THRESHOLD, KEEP), mallopt(M_TOP_PAD, KEEP // 16)])
+    return all(
+        [
+            mallopt(M_MMAP_THRESHOLD, LARGEST_MMAP_THRESHOLD),
+            mallopt(M_TRIM_THRESHOLD, KEEP),
+            mallopt(M_TOP_PAD, KEEP // 16),
+        ]
+    )

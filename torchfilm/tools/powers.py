@@ -1,11 +1,13 @@
 """Powers and other functions whose bits do not depend on where an element stands.
 
-On the CPU torch works through a tensor in blocks of a vector register and finishes the remainder one by one, by another
-library: for some functions the two differ in the last bit, so an element's value depends on its place and on its company.
-Found so on torch 2.13 (AVX-512, both precisions): pow with any exponent other than the plain numbers 0, 1, 2, 3, ±½, −1, −2
-(a tensor that holds 2 is not exempt), a number to the power of a tensor, exp2, sinh, cosh, atanh, sigmoid, softplus, silu, elu, gelu,
-mish, logit (strided), logaddexp, hypot, atan2, gammainc. Found steady, with their derivatives: exp, expm1, log, log2, log10, log1p, sqrt,
-rsqrt, sin, cos, tan, asin, acos, atan, tanh, asinh, acosh, erf, erfc, erfinv, lgamma, gammaincc, log_sigmoid and the four operations.
+On the CPU torch works through a tensor in blocks of a vector register and finishes the remainder
+one by one, by another library: for some functions the two differ in the last bit, so an element's
+value depends on its place and on its company. Found so on torch 2.13 (AVX-512, both precisions):
+pow with any exponent other than the plain numbers 0, 1, 2, 3, ±½, −1, −2 (a tensor that holds 2 is
+not exempt), a number to the power of a tensor, exp2, sinh, cosh, atanh, sigmoid, softplus, silu,
+elu, gelu, mish, logit (strided), logaddexp, hypot, atan2, gammainc. Found steady, with their
+derivatives: exp, expm1, log, log2, log10, log1p, sqrt, rsqrt, sin, cos, tan, asin, acos, atan,
+tanh, asinh, acosh, erf, erfc, erfinv, lgamma, gammaincc, log_sigmoid and the four operations.
 """
 
 from __future__ import annotations
@@ -19,15 +21,18 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 MOST_SQUARED = 64  # a greater whole exponent goes by exp and log, whose error is then the smaller
-# |x| at or below this counts as 0 where a logarithm is taken: the second derivative, ~ 1/x², must stay a number of the dtype
+# |x| at or below this counts as 0 where a logarithm is taken: the second derivative, ~ 1/x², must
+# stay a number of the dtype
 FLOOR = {torch.float32: 1e-18, torch.float64: 1e-150}
 
 
 def power(x: Tensor, n: float | Tensor) -> Tensor:
-    """xⁿ by steady functions, to a few units in the last place times n log x; n a number or a tensor that broadcasts with x.
+    """xⁿ by steady functions, to a few units in the last place times n log x; n a number or a
+    tensor that broadcasts with x.
 
-    Whole exponents take any x; for others a negative x gives NaN, and one at or below FLOOR counts as 0. With n ≥ 1 the value and two
-    derivatives at x = 0 are right where they are finite; those that are infinite there (of √x, the second of x^1.5) come out 0.
+    Whole exponents take any x; for others a negative x gives NaN, and one at or below FLOOR counts
+    as 0. With n ≥ 1 the value and two derivatives at x = 0 are right where they are finite; those
+    that are infinite there (of √x, the second of x^1.5) come out 0.
     """
     if isinstance(n, Tensor):
         return _tensor_power(x, n)
@@ -66,13 +71,16 @@ def _broken_power(x: Tensor, n: float) -> Tensor:
 
 
 def _tensor_power(x: Tensor, n: Tensor) -> Tensor:
-    """xⁿ = xᵐ · |x|ⁿ⁻ᵐ with m = 0, 1 or 2, so that value and two derivatives by x are right at x = 0 for whole exponents."""
+    """xⁿ = xᵐ · |x|ⁿ⁻ᵐ with m = 0, 1 or 2, so that value and two derivatives by x are right at x =
+    0 for whole exponents."""
     m = n.detach().floor().clamp(0, 2)
     rest = n - m
     zero = x.abs() <= _floor(x)
     out = torch.exp(rest * torch.log(torch.where(zero, 1.0, x.abs())))
     fixed = rest.detach()
-    out = torch.where(zero, torch.where(fixed > 0, 0.0, torch.where(fixed < 0, torch.inf, 1.0)).to(out.dtype), out)
+    out = torch.where(
+        zero, torch.where(fixed > 0, 0.0, torch.where(fixed < 0, torch.inf, 1.0)).to(out.dtype), out
+    )
     odd = torch.remainder(fixed, 2.0)
     below = x < 0
     out = torch.where(below & (odd == 1), -out, out)
@@ -146,7 +154,11 @@ def hypot(x: Tensor, y: Tensor) -> Tensor:
 
 def _pow(x: Tensor | float, n: float | Tensor) -> Tensor | None:
     if isinstance(x, Tensor):
-        if not x.is_floating_point() or isinstance(n, (bool, complex)) or (isinstance(n, Tensor) and not n.is_floating_point() and n.dim() == 0):
+        if (
+            not x.is_floating_point()
+            or isinstance(n, (bool, complex))
+            or (isinstance(n, Tensor) and not n.is_floating_point() and n.dim() == 0)
+        ):
             return None
         return power(x, n.to(x.dtype) if isinstance(n, Tensor) and not n.is_floating_point() else n)
     return _rpow(n, x) if isinstance(n, Tensor) else None
@@ -155,7 +167,9 @@ def _pow(x: Tensor | float, n: float | Tensor) -> Tensor | None:
 def _rpow(n: Tensor, x: float | Tensor) -> Tensor | None:
     if isinstance(x, Tensor):
         return _pow(x, n)
-    return exp_base(x, n) if n.is_floating_point() and isinstance(x, (int, float)) and x > 0 else None
+    return (
+        exp_base(x, n) if n.is_floating_point() and isinstance(x, (int, float)) and x > 0 else None
+    )
 
 
 def _ipow(x: Tensor, n: float | Tensor) -> Tensor | None:
@@ -164,7 +178,9 @@ def _ipow(x: Tensor, n: float | Tensor) -> Tensor | None:
 
 
 def _floating(function: Callable[..., Tensor]) -> Callable[..., Tensor | None]:
-    return lambda x, *args, **kwargs: function(x, *args, **kwargs) if isinstance(x, Tensor) and x.is_floating_point() else None
+    return lambda x, *args, **kwargs: (
+        function(x, *args, **kwargs) if isinstance(x, Tensor) and x.is_floating_point() else None
+    )
 
 
 # What stands in for what; a function that returns None leaves the work to torch.
@@ -172,8 +188,13 @@ STEADY: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
     **dict.fromkeys((torch.pow, Tensor.pow, Tensor.__pow__), _pow),
     **dict.fromkeys((Tensor.__rpow__,), _rpow),
     **dict.fromkeys((Tensor.pow_, Tensor.__ipow__), _ipow),
-    **dict.fromkeys((torch.sigmoid, Tensor.sigmoid, torch.special.expit, torch.nn.functional.sigmoid), _floating(sigmoid)),
-    **dict.fromkeys((torch.exp2, Tensor.exp2, torch.special.exp2), _floating(lambda x: exp_base(2.0, x))),
+    **dict.fromkeys(
+        (torch.sigmoid, Tensor.sigmoid, torch.special.expit, torch.nn.functional.sigmoid),
+        _floating(sigmoid),
+    ),
+    **dict.fromkeys(
+        (torch.exp2, Tensor.exp2, torch.special.exp2), _floating(lambda x: exp_base(2.0, x))
+    ),
     **dict.fromkeys((torch.sinh, Tensor.sinh), _floating(sinh)),
     **dict.fromkeys((torch.cosh, Tensor.cosh), _floating(cosh)),
     **dict.fromkeys((torch.atanh, Tensor.atanh, torch.arctanh, Tensor.arctanh), _floating(atanh)),
@@ -196,9 +217,11 @@ class _Steady(TorchFunctionMode):
 
 
 def steady_functions() -> TorchFunctionMode:
-    """Within `with steady_functions():` torch's unsteady functions are replaced by the steady ones of this module.
+    """Within `with steady_functions():` torch's unsteady functions are replaced by the steady ones
+    of this module.
 
-    Covers pow and **, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp and hypot, in the forward and reverse modes of autograd.
-    Not covered: gelu, mish, logit, atan2, gammainc, matrix products. Costs about a microsecond a torch call.
+    Covers pow and **, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp and hypot,
+    in the forward and reverse modes of autograd. Not covered: gelu, mish, logit, atan2, gammainc,
+    matrix products. Costs about a microsecond a torch call.
     """
     return _Steady()

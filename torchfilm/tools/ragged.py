@@ -1,11 +1,13 @@
 """Sums and maxima over ragged groups, each group in its own fixed order.
 
-This is the one place that knows how to scatter. On the CPU a sum over groups is a product with a sparse incidence
-matrix: six times faster than ``index_add_`` and, because every row of the product is accumulated by itself in the order
-of its entries, the same bits come out whatever else stands in the batch. (The matrix-vector product of the same library
-does *not* have that property: it picks a kernel by the shape of the whole matrix. Hence the matrix-matrix product even
-for one column.) Rows that are weighted anew for each sum, in 32 bits, are bags of embeddings: half the time of weighting and summing, and ordered just
-so. On CUDA ``index_add_`` is fast, and ordered when torch's deterministic algorithms are on.
+This is the one place that knows how to scatter. On the CPU a sum over groups is a product with a
+sparse incidence matrix: six times faster than ``index_add_`` and, because every row of the product
+is accumulated by itself in the order of its entries, the same bits come out whatever else stands in
+the batch. (The matrix-vector product of the same library does *not* have that property: it picks a
+kernel by the shape of the whole matrix. Hence the matrix-matrix product even for one column.) Rows
+that are weighted anew for each sum, in 32 bits, are bags of embeddings: half the time of weighting
+and summing, and ordered just so. On CUDA ``index_add_`` is fast, and ordered when torch's
+deterministic algorithms are on.
 """
 
 from __future__ import annotations
@@ -22,12 +24,17 @@ from torch import Tensor
 # Elsewhere bags are summed by a plain loop, many times slower.
 FAST_BAGS = "fbgemm" in torch.backends.quantized.supported_engines
 
-warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta", category=UserWarning)
+warnings.filterwarnings(
+    "ignore", message="Sparse CSR tensor support is in beta", category=UserWarning
+)
 
 
 def csr(row_start: Tensor, column: Tensor, value: Tensor, size: tuple[int, int]) -> Tensor:
-    """A sparse CSR matrix with 32-bit indices, the kind that the CPU multiplies without converting."""
-    return torch.sparse_csr_tensor(row_start.int(), column.int(), value, size, check_invariants=False)
+    """A sparse CSR matrix with 32-bit indices, the kind that the CPU multiplies without
+    converting."""
+    return torch.sparse_csr_tensor(
+        row_start.int(), column.int(), value, size, check_invariants=False
+    )
 
 
 def offsets(counts: Tensor) -> Tensor:
@@ -40,7 +47,8 @@ def offsets(counts: Tensor) -> Tensor:
 def expand_ranges(start: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
     """Write out ranges: for each i the numbers start[i] … start[i] + count[i] − 1.
 
-    Returns (owner, value), each as long as the sum of the counts; owner says which i a value came from.
+    Returns (owner, value), each as long as the sum of the counts; owner says which i a value came
+    from.
     """
     owner = torch.repeat_interleave(torch.arange(count.numel(), device=count.device), count)
     shift = start - (torch.cumsum(count, 0) - count)
@@ -49,7 +57,8 @@ def expand_ranges(start: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Groups:
-    """Rows 0 … K − 1 that belong to groups 0 … size − 1, in any order: sums and maxima over each group.
+    """Rows 0 … K − 1 that belong to groups 0 … size − 1, in any order: sums and maxima over each
+    group.
 
     `owner`: (K,) int64, the group of each row.
     """
@@ -65,12 +74,17 @@ class Groups:
 
     @cached_property
     def order(self) -> tuple[Tensor, Tensor]:
-        """The rows group by group, each group's in their own order: where each group starts and the last ends, (size + 1,), and which row, (K,) int32."""
+        """The rows group by group, each group's in their own order: where each group starts and the
+        last ends, (size + 1,), and which row, (K,) int32."""
         count = self.owner.numel()
         if bool((self.owner[1:] >= self.owner[:-1]).all()):
             return offsets(self.counts).int(), torch.arange(count, dtype=torch.int32)
         # linear time and stable, where a sort would cost more than all the sums of a solve
-        entries = (np.ones(count, np.int8), self.owner.int().numpy(), np.arange(count + 1, dtype=np.int32))
+        entries = (
+            np.ones(count, np.int8),
+            self.owner.int().numpy(),
+            np.arange(count + 1, dtype=np.int32),
+        )
         found = scipy.sparse.csc_array(entries, shape=(self.size, count)).tocsr()
         return torch.from_numpy(found.indptr), torch.from_numpy(found.indices)
 
@@ -78,7 +92,9 @@ class Groups:
         """The (size, K) matrix of ones that sums rows into groups, on the CPU."""
         if dtype not in self._matrix:
             count = self.owner.numel()
-            self._matrix[dtype] = csr(*self.order, torch.ones(count, dtype=dtype), (self.size, count))
+            self._matrix[dtype] = csr(
+                *self.order, torch.ones(count, dtype=dtype), (self.size, count)
+            )
         return self._matrix[dtype]
 
     def sum(self, value: Tensor) -> Tensor:
@@ -87,13 +103,15 @@ class Groups:
         return _GroupSum.apply(flat, self).reshape(self.size, *value.shape[1:])
 
     def sum_into(self, value: Tensor, out: Tensor) -> Tensor:
-        """As `sum` for (K, D) into (size, D), without a gradient and without allocating on the CPU."""
+        """As `sum` for (K, D) into (size, D), without a gradient and without allocating on the
+        CPU."""
         if self.owner.numel() == 0 or value.device.type != "cpu":
             return out.zero_().index_add_(0, self.owner, value)
         return torch.mm(self._incidence(value.dtype), value, out=out)
 
     def max(self, value: Tensor, empty: float = 0.0) -> Tensor:
-        """Greatest of each group, (K,) -> (size,); `empty` where a group has no row. Exact, so in any order. No gradient."""
+        """Greatest of each group, (K,) -> (size,); `empty` where a group has no row. Exact, so in
+        any order. No gradient."""
         if self.size == 1 and value.numel():
             return value.detach().amax(0, keepdim=True)
         out = torch.full((self.size,), empty, dtype=value.dtype, device=value.device)
@@ -105,8 +123,11 @@ class Groups:
 
 
 def _bag(rows: Tensor, which: Tensor, start: Tensor, weight: Tensor) -> Tensor:
-    """Σ weight · row over each bag: rows (M, D), which of them (K,) int32, where each bag starts and the last ends, weight (K,)."""
-    return torch.embedding_bag(rows, which, start, mode=0, per_sample_weights=weight, include_last_offset=True)[0]
+    """Σ weight · row over each bag: rows (M, D), which of them (K,) int32, where each bag starts
+    and the last ends, weight (K,)."""
+    return torch.embedding_bag(
+        rows, which, start, mode=0, per_sample_weights=weight, include_last_offset=True
+    )[0]
 
 
 def _bags_are_fast(value: Tensor) -> bool:
@@ -126,24 +147,33 @@ class WeightedRows:
             self._bags = torch.arange(value.shape[0], dtype=torch.int32), start
 
     def sum(self, weight: Tensor) -> Tensor:
-        """Σ weight · row over each group, (size, D), the weights (K,) in the order of `value` as it stands here."""
+        """Σ weight · row over each group, (size, D), the weights (K,) in the order of `value` as it
+        stands here."""
         if self.fast:
             return _bag(self.value, *self._bags, weight)
-        return self.groups.sum_into(self.value * weight.unsqueeze(1), weight.new_empty(self.groups.size, self.value.shape[1]))
+        return self.groups.sum_into(
+            self.value * weight.unsqueeze(1),
+            weight.new_empty(self.groups.size, self.value.shape[1]),
+        )
 
     def sorted(self, given: Tensor) -> Tensor:
-        """What is given in the order of the rows (K,), in the order of `value` as it stands here."""
+        """What is given in the order of the rows (K,), in the order of `value` as it stands
+        here."""
         return given.index_select(0, self.order) if self.fast else given
 
 
 class Blocks:
-    """Symmetric blocks `value` (N, D, D), each to be multiplied with its own row of (N, D) again and again. No gradient."""
+    """Symmetric blocks `value` (N, D, D), each to be multiplied with its own row of (N, D) again
+    and again. No gradient."""
 
     def __init__(self, value: Tensor):
         self.value, self.fast = value, _bags_are_fast(value)
         if self.fast:
             count, width = value.shape[:2]
-            self._bags = torch.arange(count * width, dtype=torch.int32), torch.arange(count + 1, dtype=torch.int32) * width
+            self._bags = (
+                torch.arange(count * width, dtype=torch.int32),
+                torch.arange(count + 1, dtype=torch.int32) * width,
+            )
 
     def times(self, r: Tensor) -> Tensor:
         """(N, D) -> (N, D)."""

@@ -1,7 +1,9 @@
-"""Random numbers that belong to a cell, not to a moment of the program: Philox4x32-10 (Salmon et al. 2011), counter based.
+"""Random numbers that belong to a cell, not to a moment of the program: Philox4x32-10 (Salmon et
+al. 2011), counter based.
 
-A draw is a pure function of (seed, stream of the colony, cell uid, step, purpose), so it is the same whatever the batch, the
-order of colonies or a restart in between. 32-bit arithmetic is carried out in int64, where products wrap harmlessly.
+A draw is a pure function of (seed, stream of the colony, cell uid, step, purpose), so it is the
+same whatever the batch, the order of colonies or a restart in between. 32-bit arithmetic is carried
+out in int64, where products wrap harmlessly.
 """
 
 from __future__ import annotations
@@ -17,13 +19,20 @@ MULTIPLIER = (0xD2511F53, 0xCD9E8D57)
 WEYL = (0x9E3779B9, 0xBB67AE85)
 
 
-def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor | int, Tensor | int]) -> tuple[Tensor, ...]:
+def philox(
+    counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor | int, Tensor | int]
+) -> tuple[Tensor, ...]:
     """Ten rounds of Philox4x32: four words in [0, 2³²) as int64 in, four out, elementwise."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(10):
         p0, p1 = c0 * MULTIPLIER[0], c2 * MULTIPLIER[1]
-        c0, c1, c2, c3 = ((p1 >> 32) & MASK) ^ c1 ^ k0, p1 & MASK, ((p0 >> 32) & MASK) ^ c3 ^ k1, p0 & MASK
+        c0, c1, c2, c3 = (
+            ((p1 >> 32) & MASK) ^ c1 ^ k0,
+            p1 & MASK,
+            ((p0 >> 32) & MASK) ^ c3 ^ k1,
+            p0 & MASK,
+        )
         k0, k1 = (k0 + WEYL[0]) & MASK, (k1 + WEYL[1]) & MASK
     return c0, c1, c2, c3
 
@@ -41,14 +50,18 @@ def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> tu
     return philox(counter, (mixed & MASK, (mixed >> 32) & MASK))
 
 
-def uniform(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:
+def uniform(
+    seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype
+) -> Tensor:
     """One draw per cell from the open interval (0, 1)."""
     w = words(seed, stream, uid, step, purpose)
     # 23 bits and half a unit: the most that a float32 holds without rounding a draw to 1
     return ((w[0] >> 9).to(torch.float64) + 0.5).mul(2.0**-23).to(dtype)
 
 
-def normal(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype) -> Tensor:
+def normal(
+    seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype
+) -> Tensor:
     """Four standard normal draws per cell, (M, 4), by Box and Muller from four words."""
     w = [(x.to(torch.float64) + 0.5) * 2.0**-32 for x in words(seed, stream, uid, step, purpose)]
     out = []

@@ -9,10 +9,12 @@ from typing import Any
 
 
 def run_file(path: Path) -> dict[str, Any]:
-    """The names that a Python file defines, as a module called as the file is; raises whatever the file does.
+    """The names that a Python file defines, as a module called as the file is; raises whatever the
+    file does.
 
-    While it runs it is listed among the modules, where a dataclass looks up the types of its fields, unless another is called so: nothing that is imported
-    later, by this file or another, comes upon it by mistake.
+    While it runs it is listed among the modules, where a dataclass looks up the types of its
+    fields, unless another is called so: nothing that is imported later, by this file or another,
+    comes upon it by mistake.
     """
     module = ModuleType(path.stem)
     module.__file__ = str(path)

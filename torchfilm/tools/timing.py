@@ -17,7 +17,8 @@ class Timings:
 
     @contextmanager
     def of(self, name: str, device: torch.device) -> Iterator[None]:
-        """Add the time of this block to `name`; waits for a GPU to finish, so that its work is counted where it belongs."""
+        """Add the time of this block to `name`; waits for a GPU to finish, so that its work is
+        counted where it belongs."""
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         start = time.perf_counter()

@@ -1,4 +1,5 @@
-"""What a thing is made of, as a digest: equal for things that are alike, in this process and in another."""
+"""What a thing is made of, as a digest: equal for things that are alike, in this process and in
+another."""
 
 from __future__ import annotations
 
@@ -21,11 +22,14 @@ def lasting(words: str) -> str:
 
 
 def digest(*things: Any) -> str:
-    """A short hexadecimal word that differs where numbers, arrays, options or the code of functions differ.
+    """A short hexadecimal word that differs where numbers, arrays, options or the code of functions
+    differ.
 
-    Lists and tuples, and floats of any precision, go by what they hold. Functions go by what they do: their code, defaults, what they hold on to and what
-    they use of their own module, not their names, line numbers or docstrings; objects of a user's class by their attributes and functions. What is imported
-    from elsewhere is not looked into, and versions of Python may compile one function in two ways.
+    Lists and tuples, and floats of any precision, go by what they hold. Functions go by what they
+    do: their code, defaults, what they hold on to and what they use of their own module, not their
+    names, line numbers or docstrings; objects of a user's class by their attributes and functions.
+    What is imported from elsewhere is not looked into, and versions of Python may compile one
+    function in two ways.
     """
     made = hashlib.sha256()
     _add(made, things, set())
@@ -37,8 +41,11 @@ def _add(made: Any, thing: Any, within: set[int]) -> None:
         thing = thing.detach().cpu().numpy()
     if isinstance(thing, np.ndarray):
         if thing.dtype.kind == "f":
-            thing = thing.astype(np.float64)  # a number from a file is the number that was written, in whatever precision
-        made.update(f"array {thing.dtype} {thing.shape} ".encode() + np.ascontiguousarray(thing).tobytes())
+            # a number from a file is the number that was written, in whatever precision
+            thing = thing.astype(np.float64)
+        made.update(
+            f"array {thing.dtype} {thing.shape} ".encode() + np.ascontiguousarray(thing).tobytes()
+        )
         return
     if isinstance(thing, (str, bytes, int, float, bool, complex, type(None))):
         made.update(f"{type(thing).__name__} {thing!r};".encode())
@@ -63,7 +70,15 @@ def _parts(thing: Any) -> list[Any]:
         code = thing.__code__
         # its first constant may be its docstring, which does nothing
         used = code.co_consts[1:] if code.co_consts[:1] == (thing.__doc__,) else code.co_consts
-        return [code.co_code, code.co_names, used, thing.__defaults__, thing.__kwdefaults__, *held, *_globals(thing)]
+        return [
+            code.co_code,
+            code.co_names,
+            used,
+            thing.__defaults__,
+            thing.__kwdefaults__,
+            *held,
+            *_globals(thing),
+        ]
     if isinstance(thing, MethodType):
         return [thing.__func__, thing.__self__]
     if isinstance(thing, partial):
@@ -76,7 +91,11 @@ def _parts(thing: Any) -> list[Any]:
         return list(thing)
     if isinstance(thing, (set, frozenset)):
         return sorted(map(repr, thing))
-    if isinstance(thing, type) or not hasattr(thing, "__dict__") or type(thing).__module__ == "builtins":
+    if (
+        isinstance(thing, type)
+        or not hasattr(thing, "__dict__")
+        or type(thing).__module__ == "builtins"
+    ):
         return [lasting(repr(thing))]
     kind = type(thing)
     if dataclasses.is_dataclass(thing):
@@ -88,7 +107,11 @@ def _parts(thing: Any) -> list[Any]:
         given = [x for name, value in vars(thing).items() for x in (name, value)]
     # a class of the user's own is also what its functions do
     own = [c for c in kind.__mro__ if c.__module__.split(".")[0] not in OURS]
-    return [kind.__qualname__, *given, *(f for c in own for f in vars(c).values() if isinstance(f, FunctionType))]
+    return [
+        kind.__qualname__,
+        *given,
+        *(f for c in own for f in vars(c).values() if isinstance(f, FunctionType)),
+    ]
 
 
 def _globals(function: FunctionType) -> list[Any]:
@@ -97,11 +120,18 @@ def _globals(function: FunctionType) -> list[Any]:
     codes = [function.__code__]
     while codes:
         code = codes.pop()
-        names += [i.argval for i in dis.get_instructions(code) if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")]
+        names += [
+            i.argval for i in dis.get_instructions(code) if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")
+        ]
         codes += [c for c in code.co_consts if isinstance(c, CodeType)]
     used = [function.__globals__.get(name) for name in dict.fromkeys(names)]
     plain = (str, int, float, bool, tuple, list, dict, np.ndarray, torch.Tensor)
-    return [x for x in used if isinstance(x, plain) or (isinstance(x, FunctionType) and x.__module__ == function.__module__)]
+    return [
+        x
+        for x in used
+        if isinstance(x, plain)
+        or (isinstance(x, FunctionType) and x.__module__ == function.__module__)
+    ]
 
 
 def _is_empty(cell: Any) -> bool:

@@ -1,7 +1,8 @@
 """Small vector algebra, components first: an array of K vectors in d dimensions is (d, K).
 
-Components first keeps every operation a plain pass over contiguous memory, and fixes the order of the two or three
-additions of a dot product, so that results do not depend on how many vectors stand side by side.
+Components first keeps every operation a plain pass over contiguous memory, and fixes the order of
+the two or three additions of a dot product, so that results do not depend on how many vectors stand
+side by side.
 """
 
 from __future__ import annotations
@@ -22,11 +23,14 @@ def cross(u: Tensor, v: Tensor) -> Tensor:
     """u × v: (3, K) in 3-D; in 2-D its one component out of the plane, as (1, K)."""
     if u.shape[0] == 2:
         return (u[0] * v[1] - u[1] * v[0]).unsqueeze(0)
-    return torch.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+    return torch.stack(
+        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+    )
 
 
 def perpendicular(u: Tensor) -> Tensor:
-    """A unit vector perpendicular to unit u, (d, K): the left-hand normal in 2-D; in 3-D built on the axis that u is least along."""
+    """A unit vector perpendicular to unit u, (d, K): the left-hand normal in 2-D; in 3-D built on
+    the axis that u is least along."""
     if u.shape[0] == 2:
         return torch.stack([-u[1], u[0]])
     x, y, z = u.detach().abs().unbind(0)
@@ -46,4 +50,6 @@ def safe_sqrt(x: Tensor, eps: float = 1e-30) -> Tensor:
     if not (torch.is_grad_enabled() and x.requires_grad):
         return torch.where(x > eps, x.sqrt(), 0.0)
     positive = x > eps
-    return torch.where(positive, torch.where(positive, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x))
+    return torch.where(
+        positive, torch.where(positive, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x)
+    )

@@ -1,4 +1,5 @@
-"""The user's functions, from a file that may be edited while a run is going, and what they must not do."""
+"""The user's functions, from a file that may be edited while a run is going, and what they must not
+do."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ T = TypeVar("T")
 
 
 def load_functions(path: Path, names: tuple[str, ...]) -> Functions:
-    """Run a Python file of the user's and return those of its functions that have one of the names."""
+    """Run a Python file of the user's and return those of its functions that have one of the
+    names."""
     given = run_file(path)
     found = {name: given.get(name) for name in names}
     if not any(map(callable, found.values())):
@@ -26,15 +28,17 @@ def load_functions(path: Path, names: tuple[str, ...]) -> Functions:
 
 
 def unchanged(now: Tensor, then: Tensor) -> bool:
-    """Whether two tensors hold the same, a NaN taken for equal to itself: what is not finite is the driver's matter, not a rule's."""
+    """Whether two tensors hold the same, a NaN taken for equal to itself: what is not finite is the
+    driver's matter, not a rule's."""
     return torch.equal(now, then) or bool(((now == then) | ((now != now) & (then != then))).all())
 
 
 class Watched:
     """Functions by name and the file, if any, that they came from.
 
-    While `watching`, an edit is taken up at the next `refresh`; one that is broken is reported in `messages`, at once or when it first fails, and the
-    functions before it go on. Messages carry the simulated time of the last `refresh`.
+    While `watching`, an edit is taken up at the next `refresh`; one that is broken is reported in
+    `messages`, at once or when it first fails, and the functions before it go on. Messages carry
+    the simulated time of the last `refresh`.
     """
 
     def __init__(self, path: Path | None, functions: Functions):
@@ -68,7 +72,8 @@ class Watched:
         self.functions, self._proven = functions, False
 
     def call(self, name: str, act: Callable[[Callable[..., None]], T], otherwise: T) -> T:
-        """`act` on the function of that name, or `otherwise` if there is none. If it fails and there is an earlier version: report, and go back to that."""
+        """`act` on the function of that name, or `otherwise` if there is none. If it fails and
+        there is an earlier version: report, and go back to that."""
         function = self.functions[name]
         try:
             result = otherwise if function is None else act(function)
