@@ -6,11 +6,11 @@ search.
 Uses torchfilm's public names only, as its users would.
 """
 
-from design.colonies import Done
 from design.methods import CMAES, Batch, Bayesian, Method, Racing, Sobol
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
 from design.robust import Robustness, robustness
+from design.rollout import FinishedColonies
 from design.search import Best, Search
 from design.study import Study
 from design.targets import (
@@ -18,9 +18,9 @@ from design.targets import (
     DomainSize,
     Gradient,
     Image,
-    Mask,
     OnFraction,
     Oscillation,
+    ProfileTarget,
     Ring,
     Stripe,
     Target,
@@ -34,16 +34,16 @@ __all__ = [
     "Best",
     "Choice",
     "DomainSize",
-    "Done",
     "Evaluation",
+    "FinishedColonies",
     "Gradient",
     "Image",
-    "Mask",
     "Method",
     "Objective",
     "OnFraction",
     "Oscillation",
     "Parameter",
+    "ProfileTarget",
     "Racing",
     "Ring",
     "Robustness",

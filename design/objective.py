@@ -20,9 +20,9 @@ import numpy as np
 import torch
 
 import torchfilm as tf
-from design import courses, machines, room
-from design.colonies import Done, grow
+from design import executors, growth_cache, memory
 from design.parameters import Choice, Parameter, Space, Value
+from design.rollout import FinishedColonies, grow
 from design.targets.base import Target
 from torchfilm import checks
 
@@ -50,7 +50,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class Piece:
+class WorkItem:
     """Part of an evaluation: rows of it that are alike in how their scene is built, and their
     parameters."""
 
@@ -104,7 +104,7 @@ class Objective:
         self.make = _scene_function(scene)
         self.space, self.target, self.fixed = Space(parameters), target, dict(fixed or {})
         if not isinstance(target, Target):
-            raise checks.refuse("target", target, "a Target, such as Stripe(…)")
+            raise checks.input_error("target", target, "a Target, such as Stripe(…)")
         if cells is None and until is None:
             raise checks.InputError("a colony needs an end: give cells=… or until=… (hours).")
         self.cells = None if cells is None else _whole("cells", cells, 2)
@@ -116,7 +116,7 @@ class Objective:
         if reduce not in REDUCE and (
             isinstance(reduce, bool) or not isinstance(reduce, (int, float)) or not 0 < reduce <= 1
         ):
-            raise checks.refuse(
+            raise checks.input_error(
                 "reduce", reduce, '"mean", "worst" or a quantile above 0 and at most 1'
             )
         _whole("seed", seed, 0)
@@ -131,13 +131,15 @@ class Objective:
         probe = self._probe()
         self.founders = int(probe.founders.count)
         if self.cells is not None and self.cells <= self.founders and probe.founders.colony is None:
-            raise checks.refuse(
+            raise checks.input_error(
                 "cells", self.cells, f"above the {self.founders} that a colony starts from"
             )
         self.dt = probe.dt if dt is None else checks.number("dt", dt, above=0.0)
         steps = 1.0 if self.until is None else self.until / self.dt
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
-            raise checks.refuse("until", until, f"a whole number of steps of dt = {self.dt:g} h")
+            raise checks.input_error(
+                "until", until, f"a whole number of steps of dt = {self.dt:g} h"
+            )
         # a ready scene is built again by its name; a function that calls one has parameters of its
         # own
         self.recipe = (
@@ -146,7 +148,7 @@ class Objective:
             else None
         )
         self.listing = probe.listing()
-        self.regrown = tf.Course.obstacle(probe) if self.replay else OFF
+        self.regrown = tf.GrowthRecording.obstacle(probe) if self.replay else OFF
 
     def _check_names(self) -> None:
         allowed = inspect.signature(self.make).parameters
@@ -155,12 +157,12 @@ class Objective:
             self.space.check(list(allowed), name)
             for given in self.fixed:
                 if given not in allowed:
-                    raise checks.refuse(
+                    raise checks.input_error(
                         "fixed", given, f"a parameter of {name}: {', '.join(allowed)}"
                     )
         both = [n for n in self.fixed if n in self.space.names]
         if both:
-            raise checks.refuse("fixed", both[0], "a parameter that is not searched as well")
+            raise checks.input_error("fixed", both[0], "a parameter that is not searched as well")
 
     def _probe(self) -> tf.Scene:
         """The scene in the middle of the space, after one of each option was built and the target
@@ -222,7 +224,7 @@ class Objective:
             )
         made = self.make(**arguments)
         if not isinstance(made, tf.Scene):
-            raise checks.refuse("scene", made, "a function that returns a tf.Scene")
+            raise checks.input_error("scene", made, "a function that returns a tf.Scene")
         return made
 
     def evaluate(
@@ -250,7 +252,7 @@ class Objective:
             or not len(points)
             or not bool(((points >= 0) & (points <= 1)).all())
         ):
-            raise checks.refuse(
+            raise checks.input_error(
                 "points", points.shape, f"(n, {self.space.size}) coordinates in [0, 1]"
             )
         checks.number("size", size, above=0.0, most=1.0)
@@ -284,7 +286,7 @@ class Objective:
         """The streams asked for, or those of the replicates."""
         found = tuple(range(self.replicates)) if given is None else tuple(int(s) for s in given)
         if not found or len(set(found)) != len(found) or not all(0 <= s < 2**32 for s in found):
-            raise checks.refuse(
+            raise checks.input_error(
                 "streams", given, "different whole numbers from 0 to 2³² − 1, at least one"
             )
         return found
@@ -301,7 +303,7 @@ class Objective:
 
     def _pieces(
         self, values: Sequence[dict[str, Value]], replicates: int, size: float, least: int
-    ) -> list[Piece]:
+    ) -> list[WorkItem]:
         """The designs in groups that one scene can hold and one batch can carry."""
         structural = [p.name for p in self.space.parameters if p.levels is not None]
         groups: dict[tuple[str, ...], list[int]] = {}
@@ -317,28 +319,32 @@ class Objective:
             count = min(len(rows), wanted)
             cuts = [len(rows) * k // count for k in range(count + 1)]  # as even as can be
             out += [
-                Piece(tuple(rows[a:b]), tuple(values[r] for r in rows[a:b]))
+                WorkItem(tuple(rows[a:b]), tuple(values[r] for r in rows[a:b]))
                 for a, b in itertools.pairwise(cuts)
             ]
         return out
 
     def _room(self, values: Sequence[dict[str, Value]], size: float) -> int:
         """How many colonies of designs alike in what builds them memory takes at once; the first
-        that the scene does not refuse tells."""
+        that the scene does not input_error tells."""
         for design in values:
             with contextlib.suppress(tf.InputError):
-                return room.colonies(
+                return memory.max_colonies(
                     self.scene([design]), self.end(size)[0], self.dtype, self.device
                 )
         return 1
 
     def _outcomes(
-        self, pieces: list[Piece], streams: tuple[int, ...], size: float, executor: Executor | None
-    ) -> Iterator[tuple[Piece, Outcome]]:
+        self,
+        pieces: list[WorkItem],
+        streams: tuple[int, ...],
+        size: float,
+        executor: Executor | None,
+    ) -> Iterator[tuple[WorkItem, Outcome]]:
         """Each piece with what became of it, once."""
         if executor is None:
             return ((piece, self.run(piece, streams, size)) for piece in pieces)
-        return machines.outcomes(self, pieces, streams, size, executor)
+        return executors.outcomes(self, pieces, streams, size, executor)
 
     def resized(self, factor: float) -> Objective:
         """The same with colonies `factor` times as large, or `factor` times as many hours: above 1
@@ -354,7 +360,7 @@ class Objective:
             None if self.until is None else max(1, round(self.until * size / self.dt)) * self.dt
         )
 
-    def run(self, piece: Piece, streams: tuple[int, ...], size: float) -> Outcome:
+    def run(self, piece: WorkItem, streams: tuple[int, ...], size: float) -> Outcome:
         """Grow a piece in one batch; in halves where it does not fit, or where the scene refuses
         one of its designs."""
         count, replicates = len(piece.rows), len(streams)
@@ -370,10 +376,12 @@ class Objective:
                     "",
                 )
         except (MemoryError, RuntimeError) as error:
-            if count == 1 or not room.is_lack_of_memory(error):
+            if count == 1 or not memory.is_lack_of_memory(error):
                 raise
         half = count // 2
-        parts = [Piece(piece.rows[a:b], piece.values[a:b]) for a, b in ((0, half), (half, count))]
+        parts = [
+            WorkItem(piece.rows[a:b], piece.values[a:b]) for a, b in ((0, half), (half, count))
+        ]
         first, second = (self.run(part, streams, size) for part in parts)
         reasons = {
             **first.reasons,
@@ -387,7 +395,7 @@ class Objective:
         )
 
     @torch.no_grad()
-    def _score(self, piece: Piece, streams: tuple[int, ...], size: float) -> Outcome:
+    def _score(self, piece: WorkItem, streams: tuple[int, ...], size: float) -> Outcome:
         count, replicates = len(piece.rows), len(streams)
         losses, cells = (
             np.full(count * replicates, self.target.failed, np.float64),
@@ -397,7 +405,7 @@ class Objective:
         step, state, regrown = self._start(piece.values, streams)
         most_cells, until = self.end(size)
         for event in grow(step, state, cells=most_cells, until=until, note=self.target.note):
-            if not isinstance(event, Done):
+            if not isinstance(event, FinishedColonies):
                 reasons[divmod(event.colony_id, replicates)] = event.reason
                 continue
             ids = event.state.colony_id.tolist()
@@ -426,11 +434,13 @@ class Objective:
         ""."""
         scene = self.scene(values, repeat=len(streams))
         tiled = torch.tensor(streams).repeat(len(values))
-        why = tf.Course.obstacle(scene) if self.replay else OFF
+        why = tf.GrowthRecording.obstacle(scene) if self.replay else OFF
         if not why:
             # one course for all replicates, also where a first look grows fewer
             usual = tuple(range(self.replicates))
-            course = courses.of(self, scene, usual if set(streams) <= set(usual) else streams)
+            course = growth_cache.recording_for(
+                self, scene, usual if set(streams) <= set(usual) else streams
+            )
             replay = tf.Replay(scene, course)
             return replay.step, replay.seed(tiled.numel(), streams=tiled), ""
         state = scene.seed(
@@ -441,7 +451,7 @@ class Objective:
     @torch.no_grad()
     def final(
         self, point: np.ndarray, *, streams: Sequence[int] | None = None, size: float = 1.0
-    ) -> list[Done]:
+    ) -> list[FinishedColonies]:
         """The colonies of one design at their ends, for pictures and measures; those that fail are
         left out."""
         try:
@@ -454,7 +464,7 @@ class Objective:
         return [
             e
             for e in grow(step, state, cells=cells, until=until, note=self.target.note)
-            if isinstance(e, Done)
+            if isinstance(e, FinishedColonies)
         ]
 
     def describe(self) -> dict[str, Any]:
@@ -491,7 +501,7 @@ def _lasting(value: Any) -> str:
 def _scene_function(scene: Callable[..., tf.Scene] | str) -> Callable[..., tf.Scene]:
     if isinstance(scene, str):
         if scene not in tf.scenes.READY:
-            raise checks.refuse(
+            raise checks.input_error(
                 "scene",
                 scene,
                 "one of "
@@ -500,7 +510,7 @@ def _scene_function(scene: Callable[..., tf.Scene] | str) -> Callable[..., tf.Sc
             )
         return tf.scenes.READY[scene]
     if isinstance(scene, tf.Scene) or not callable(scene):
-        raise checks.refuse(
+        raise checks.input_error(
             "scene",
             scene,
             "a function from parameters to a tf.Scene",
@@ -511,5 +521,5 @@ def _scene_function(scene: Callable[..., tf.Scene] | str) -> Callable[..., tf.Sc
 
 def _whole(name: str, value: Any, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise checks.refuse(name, value, f"a whole number from {least}")
+        raise checks.input_error(name, value, f"a whole number from {least}")
     return value

@@ -42,28 +42,28 @@ class Parameter:
                 checks.number(f"Parameter({self.name!r}).{bound}", getattr(self, bound)),
             )
         if not self.low < self.high:
-            raise checks.refuse(
+            raise checks.input_error(
                 f"Parameter({self.name!r})",
                 (self.low, self.high),
                 "low < high",
                 "Swap the two, or give a value that is fixed with fixed=….",
             )
         if self.log and self.low <= 0:
-            raise checks.refuse(
+            raise checks.input_error(
                 f"Parameter({self.name!r}).low",
                 self.low,
                 "above 0 with log=True",
                 "A logarithm has no zero: raise the bound, or leave log out.",
             )
         if self.log and self.whole:
-            raise checks.refuse(
+            raise checks.input_error(
                 f"Parameter({self.name!r})",
                 "log=True, whole=True",
                 "one of the two",
                 "Whole numbers have equal shares, whatever their size.",
             )
         if self.whole and not (self.low.is_integer() and self.high.is_integer()):
-            raise checks.refuse(
+            raise checks.input_error(
                 f"Parameter({self.name!r})", (self.low, self.high), "whole numbers with whole=True"
             )
 
@@ -86,7 +86,7 @@ class Parameter:
         number = checks.number(self.name, value, least=self.low, most=self.high)
         if self.whole:
             if not number.is_integer():
-                raise checks.refuse(self.name, value, "a whole number")
+                raise checks.input_error(self.name, value, "a whole number")
             return (number - self.low + 0.5) / (self.high - self.low + 1)
         if self.log:
             return (math.log(number) - math.log(self.low)) / (
@@ -116,7 +116,7 @@ class Choice:
         listed = isinstance(options, Sequence) and not isinstance(options, str)
         odd = [o for o in options if not isinstance(o, (str, bool, int, float))] if listed else []
         if odd:
-            raise checks.refuse(
+            raise checks.input_error(
                 f"Choice({name!r}).options",
                 odd[0],
                 "texts, numbers, True or False",
@@ -124,7 +124,7 @@ class Choice:
             )
         # 1 and True are equal, and could not be told apart by their value
         if not listed or len(options) < 2 or len(set(options)) != len(options):
-            raise checks.refuse(
+            raise checks.input_error(
                 f"Choice({name!r}).options",
                 options,
                 "at least two different ones, such as ('weak', 'strong')",
@@ -143,7 +143,9 @@ class Choice:
     def coordinate(self, value: Value) -> float:
         """The middle of an option's share."""
         if value not in self.options:
-            raise checks.refuse(self.name, value, "one of " + ", ".join(map(repr, self.options)))
+            raise checks.input_error(
+                self.name, value, "one of " + ", ".join(map(repr, self.options))
+            )
         return (self.options.index(value) + 0.5) / len(self.options)
 
     def describe(self) -> str:
@@ -162,14 +164,14 @@ class Space:
             or not parameters
             or not all(isinstance(p, (Parameter, Choice)) for p in parameters)
         ):
-            raise checks.refuse(
+            raise checks.input_error(
                 "parameters", parameters, "a list of Parameter(…) and Choice(…), at least one"
             )
         self.parameters = tuple(parameters)
         self.names = tuple(p.name for p in self.parameters)
         twice = [n for n in self.names if self.names.count(n) > 1]
         if twice:
-            raise checks.refuse("parameters", twice[0], "named once")
+            raise checks.input_error("parameters", twice[0], "named once")
         self.size = len(self.parameters)
         self.levels = tuple(p.levels for p in self.parameters)
 
@@ -181,7 +183,7 @@ class Space:
         """The coordinates (D,) of one design."""
         wrong = [n for n in (*values, *self.names) if n not in values or n not in self.names]
         if wrong:
-            raise checks.refuse(
+            raise checks.input_error(
                 "values",
                 list(values),
                 "one for each of " + ", ".join(self.names),
@@ -194,9 +196,9 @@ class Space:
         for name in self.names:
             if name not in allowed:
                 near = difflib.get_close_matches(name, allowed, 1)
-                mend = f"Did you mean {near[0]!r}?" if near else ""
-                raise checks.refuse(
-                    "Parameter", name, f"a parameter of {scene}: {', '.join(allowed)}", mend
+                hint = f"Did you mean {near[0]!r}?" if near else ""
+                raise checks.input_error(
+                    "Parameter", name, f"a parameter of {scene}: {', '.join(allowed)}", hint
                 )
 
     def describe(self) -> list[str]:
@@ -209,4 +211,4 @@ def _level(unit: float, count: int) -> int:
 
 def _check_name(kind: str, name: Any) -> None:
     if not isinstance(name, str) or not name.isidentifier():
-        raise checks.refuse(f"{kind}.name", name, "the name of an argument of the scene")
+        raise checks.input_error(f"{kind}.name", name, "the name of an argument of the scene")

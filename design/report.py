@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import torchfilm as tf
-from design.colonies import Done
 from design.parameters import Parameter, Value
+from design.rollout import FinishedColonies
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -87,7 +87,7 @@ def shown(value: Value) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def measured(target: Target, done: Iterable[Done]) -> dict[str, float]:
+def measured(target: Target, done: Iterable[FinishedColonies]) -> dict[str, float]:
     """What a target measures, its mean over all these colonies that have the number; NaN where none
     has."""
     found: dict[str, list[float]] = {}
@@ -130,7 +130,7 @@ def draw(best: Best, path: Path) -> Path:
     return path
 
 
-def _places(done: list[Done]) -> list[tuple[Done, int]]:
+def _places(done: list[FinishedColonies]) -> list[tuple[FinishedColonies, int]]:
     """The colonies one by one, by their ids."""
     return sorted(
         ((d, k) for d in done for k in range(d.state.colonies)),
@@ -166,7 +166,7 @@ def _light(name: str, place: int) -> str:
 def _draw_row(
     axes: list[Axes],
     bars: list[Axes],
-    grown: list[tuple[Done, int]],
+    grown: list[tuple[FinishedColonies, int]],
     target: Target,
     size: float,
     title: str,

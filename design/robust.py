@@ -43,7 +43,7 @@ class Resized:
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class ParameterChange:
     """The design with one parameter changed. wanted: the value asked for; value: the one used,
     within the bounds; losses (S,), of the fresh seeds.
 
@@ -97,7 +97,7 @@ class Robustness:
     searched: np.ndarray
     threshold: float | None
     sizes: tuple[Resized, ...]
-    changes: tuple[Change, ...]
+    changes: tuple[ParameterChange, ...]
     indices: Indices | None
 
     @property
@@ -285,7 +285,7 @@ def _check(
 ) -> None:
     whole("seeds", seeds, least=1)
     if isinstance(sizes, str) or not isinstance(sizes, Sequence):
-        raise checks.refuse(
+        raise checks.input_error(
             "sizes",
             sizes,
             "a list of shares of the colony size, such as (0.5, 2.0), or () for none",
@@ -295,14 +295,14 @@ def _check(
             "sizes",
             share,
             above=0.0,
-            mend="A share of the colony size: 2.0 for colonies twice as large.",
+            hint="A share of the colony size: 2.0 for colonies twice as large.",
         )
-    checks.number("change", change, above=0.0, mend="0.2 changes each parameter by 20 %.")
+    checks.number("change", change, above=0.0, hint="0.2 changes each parameter by 20 %.")
     if change >= 1:
-        raise checks.refuse("change", change, "below 1", "0.2 changes each parameter by 20 %.")
+        raise checks.input_error("change", change, "below 1", "0.2 changes each parameter by 20 %.")
     if whole("samples", samples, least=0) and (samples & (samples - 1) or samples == 1):
         below = max(2, 1 << (samples.bit_length() - 1))
-        raise checks.refuse(
+        raise checks.input_error(
             "samples",
             samples,
             "0 or a power of two from 2",
@@ -341,11 +341,11 @@ def _change(
     point: np.ndarray,
     losses: np.ndarray,
     before: np.ndarray,
-) -> Change:
+) -> ParameterChange:
     parameter = objective.space.parameters[k]
     gained = losses - before
     error = float(gained.std(ddof=1)) / math.sqrt(len(gained)) if len(gained) > 1 else math.nan
-    return Change(
+    return ParameterChange(
         parameter.name,
         wanted,
         parameter.value(float(point[k])),
@@ -426,7 +426,7 @@ def _plain(given: Any) -> Any:
         return [_plain(x) for x in given]
     if isinstance(given, float):
         return given if math.isfinite(given) else None
-    if isinstance(given, (Resized, Change, Indices, Robustness, dict)):
+    if isinstance(given, (Resized, ParameterChange, Indices, Robustness, dict)):
         return {
             name: _plain(value)
             for name, value in (given if isinstance(given, dict) else vars(given)).items()

@@ -17,11 +17,11 @@ import torch
 
 import torchfilm as tf
 from design import report, robust
-from design.colonies import Done
 from design.methods import Batch, Method, method_of
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Value
 from design.robust import Robustness
+from design.rollout import FinishedColonies
 from design.study import Entry, Study
 from design.targets.base import Target
 from torchfilm import checks
@@ -77,7 +77,9 @@ class Search:
             most=most,
         )
         self.method, self.seed, self.regrown = method_of(method), seed, self.objective.regrown
-        self.grown: dict[bytes, list[Done]] = {}  # colonies of designs that were looked at
+        self.grown: dict[
+            bytes, list[FinishedColonies]
+        ] = {}  # colonies of designs that were looked at
         self.study = self._new_study(None)
 
     def run(
@@ -100,7 +102,7 @@ class Search:
         batch is cut into for it. progress: show a bar with the best loss so far.
         """
         if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < 1:
-            raise checks.refuse("colonies", colonies, "a whole number from 1")
+            raise checks.input_error("colonies", colonies, "a whole number from 1")
         if stop_at is not None:
             checks.number("stop_at", stop_at)
         self.study = self._new_study(study)
@@ -247,7 +249,7 @@ class Best:
         """Write the design as JSON, which `torchfilm run` takes. Replaces an older one."""
         objective, path = self.search.objective, Path(path)
         if not path.parent.is_dir():
-            raise checks.refuse(
+            raise checks.input_error(
                 "path", str(path), "in a folder that exists", f"Make {path.parent} first."
             )
         home = {} if objective.recipe else _home(objective.make)
@@ -309,7 +311,7 @@ class Best:
             progress=progress,
         )
 
-    def colonies(self) -> list[Done]:
+    def colonies(self) -> list[FinishedColonies]:
         """The replicates, grown again, once: the same colonies as were scored."""
         key = self.point.tobytes()
         if key not in self.search.grown:
@@ -328,7 +330,7 @@ def _home(make: Callable[..., tf.Scene]) -> dict[str, Any]:
     made = inspect.unwrap(make)
     code = getattr(made, "__code__", None)
     if code is None or "<" in made.__qualname__:
-        raise checks.refuse(
+        raise checks.input_error(
             "scene",
             make,
             "a function at the top level of a file, for a design that is saved",
@@ -341,7 +343,7 @@ def _plain(value: Any) -> Any:
     """What JSON can hold of a value that it cannot."""
     if hasattr(value, "tolist"):
         return value.tolist()
-    raise checks.refuse(
+    raise checks.input_error(
         "fixed",
         value,
         "numbers, texts, or arrays of numbers in a design that is saved",

@@ -183,7 +183,7 @@ class Study:
         path = Path(path)
         if not path.exists():
             if not path.parent.is_dir():
-                raise checks.refuse(
+                raise checks.input_error(
                     "study", str(path), "in a folder that exists", f"Make {path.parent} first."
                 )
             return cls(about, tuple(names), tuple(streams), path)
@@ -204,7 +204,7 @@ class Study:
         """A study from its file."""
         path = Path(path)
         if not path.is_file():
-            raise checks.refuse(
+            raise checks.input_error(
                 "study",
                 str(path),
                 "a study file",

@@ -56,7 +56,7 @@ def flag(blue_above=0.5, green_above=0.2, green_below=0.5, red_below=0.2, n=4.0)
             morphogen=tf.Signal(diffusion=10 * REACH**2, decay=10.0, initial=steady),
             box=((-SIDE, -SIDE), (SIDE, SIDE)),
             spacing=4.0,
-            faces=tf.Faces(x=(tf.Fixed(1.0), tf.NoFlux())),
+            boundary=tf.BoundaryConditions(x=(tf.Dirichlet(1.0), tf.NoFlux())),
         ),
         name="flag",
     )

@@ -25,7 +25,7 @@ from pathlib import Path
 import torch
 
 import torchfilm as tf
-from torchfilm.explain import Spending
+from torchfilm.explanation import Spending
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from record import machine, write_page
@@ -106,7 +106,7 @@ def additions() -> dict[str, Sequence[tf.Effect]]:
         ahl=tf.Signal(diffusion=10.0),
         box=((-64.0, -64.0), (64.0, 64.0)),
         spacing=4.0,
-        beyond="grow",
+        outside="grow",
     )
     smooth = tf.Circuit(_made, species=("m",))
     molecules = tf.Circuit(

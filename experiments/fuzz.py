@@ -32,7 +32,7 @@ GROWN = 1.5
 
 
 @dataclass(frozen=True)
-class Bodies:
+class Capsules:
     """Cells at the start. counts: in each colony; within: half the side of the cube that holds
     their centres, µm; lengths: from, to, µm; radius µm."""
 
@@ -74,7 +74,7 @@ class Growing:
 
 @dataclass(frozen=True)
 class Outside:
-    """A medium with one signal. shape: voxels an axis; faces an axis; flow: µm/h along x; beyond:
+    """A medium with one signal. shape: voxels an axis; faces an axis; flow: µm/h along x; outside:
     its policy; obstacle: whether a corner is solid."""
 
     shape: tuple[int, ...]
@@ -84,7 +84,7 @@ class Outside:
     start: float
     faces: tuple[str, ...]
     flow: float
-    beyond: str
+    outside: str
     method: str | None
     obstacle: bool
     splitting: str
@@ -120,7 +120,7 @@ class Inside:
 class Draw:
     """One example."""
 
-    bodies: Bodies
+    bodies: Capsules
     contacts: Contacts | None
     growing: Growing | None
     outside: Outside | None
@@ -138,7 +138,7 @@ def powers(low: int, high: int) -> st.SearchStrategy[float]:
 
 
 BODIES = st.builds(
-    Bodies,
+    Capsules,
     counts=st.lists(st.sampled_from([1, 2, 0, 3, 7, 12]), min_size=1, max_size=3).map(tuple),
     within=st.sampled_from([5.0, 20.0, 2.0, 1.0, 1e4]),
     lengths=st.sampled_from([(2.0, 3.0), (0.0, 0.0), (0.0, 4.0), (1.0, 12.0)]),
@@ -155,7 +155,7 @@ CONTACTS = st.builds(
     passes=st.sampled_from([None, 1, 4]),
     wall=st.sampled_from([None, "plane", "box", "channel", "inside a sphere", "outside a sphere"]),
     beyond=st.sampled_from([1.0, 0.3, 1e-3, 10.0]),
-    soft=st.sampled_from([None, 1.0, 1e4]),
+    edge_width=st.sampled_from([None, 1.0, 1e4]),
 )
 GROWING = st.builds(
     Growing,
@@ -166,11 +166,11 @@ GROWING = st.builds(
     multiple=st.sampled_from([1.5, 1.0001, 10.0]),
     fraction=st.sampled_from([0.5, 0.01, 0.999]),
 )
-FACES = {
+BOUNDARIES = {
     "closed": tf.NoFlux(),
     "periodic": tf.Periodic(),
     "open": tf.Open(0.5),
-    "fixed": tf.Fixed(2.0),
+    "fixed": tf.Dirichlet(2.0),
 }
 OUTSIDE = st.integers(2, 3).flatmap(
     lambda dim: st.builds(
@@ -180,9 +180,9 @@ OUTSIDE = st.integers(2, 3).flatmap(
         diffusion=st.sampled_from([0.0, 1.0, 1e-3, 1e3, 1e6]),
         decay=st.sampled_from([0.0, 1.0, 1e8]),
         start=st.sampled_from([0.0, 1.0, 1e-12, 1e6]),
-        faces=st.tuples(*[st.sampled_from(list(FACES))] * 3),
+        boundary=st.tuples(*[st.sampled_from(list(BOUNDARIES))] * 3),
         flow=st.sampled_from([0.0, 10.0, -1e4]),
-        beyond=st.sampled_from(["open", "grow", "error"]),
+        outside=st.sampled_from(["reservoir", "grow", "error"]),
         method=st.sampled_from([None, "implicit"]),
         obstacle=st.booleans(),
         splitting=st.sampled_from(["strang", "lie"]),
@@ -218,7 +218,7 @@ DRAWS = st.builds(
 ).filter(lambda d: any(x is not None for x in (d.contacts, d.growing, d.outside, d.inside)))
 
 
-def cells(draw: Bodies, within: float) -> tf.Cells:
+def cells(draw: Capsules, within: float) -> tf.Cells:
     """Cells in a cube of 2 · `within` µm."""
     rng, count = np.random.default_rng(draw.place), sum(draw.counts)
     position = rng.uniform(-within, within, (count, draw.dim))
@@ -229,7 +229,7 @@ def cells(draw: Bodies, within: float) -> tf.Cells:
     return tf.Cells(position, axis, rng.uniform(*draw.lengths, count), draw.radius, colony=colony)
 
 
-def mechanics(draw: Contacts, bodies: Bodies) -> tf.Mechanics:
+def mechanics(draw: Contacts, bodies: Capsules) -> tf.Mechanics:
     dim, side = bodies.dim, bodies.within + draw.beyond
     walls: dict[str | None, list] = {
         None: [],
@@ -325,12 +325,14 @@ def medium(draw: Outside, dim: int) -> tf.Medium:
     high = [a + s for a, s in zip(low, size, strict=True)]
     corner = torch.tensor([*high, 0.1][:3], dtype=torch.float64)
     return tf.Medium(
-        ahl=tf.Signal(diffusion=draw.diffusion, decay=draw.decay, initial=draw.start, beyond=0.3),
+        ahl=tf.Signal(
+            diffusion=draw.diffusion, decay=draw.decay, initial=draw.start, reservoir=0.3
+        ),
         box=(low, high),
         spacing=draw.spacing,
-        faces=tf.Faces(*(FACES[f] for f in draw.faces)),
+        boundary=tf.BoundaryConditions(*(BOUNDARIES[f] for f in draw.faces)),
         flow=(draw.flow, 0.0) if draw.flow else None,
-        beyond=draw.beyond,
+        outside=draw.outside,
         method=draw.method,
         splitting=draw.splitting,
         obstacles=(lambda x: (x > 0.5 * corner).all(1)) if draw.obstacle else None,
@@ -402,7 +404,7 @@ def scene_of(draw: Draw) -> tuple[tf.Scene, tf.State]:
     # grids that follow scattered cells are a matter of memory, which tests/test_fuzz.py looks at
     within = (
         min(draw.bodies.within, 20.0)
-        if draw.outside is not None and draw.outside.beyond == "grow"
+        if draw.outside is not None and draw.outside.outside == "grow"
         else draw.bodies.within
     )
     return scene, scene.seed(
@@ -427,7 +429,7 @@ def run(draw: Draw) -> str:
         before, state = state, scene.step(state, draw.dt)
         counted(before, state)
         found = tf.failures(state)
-        assert all(f.reason and f.mend for f in found)
+        assert all(f.reason and f.hint for f in found)
         failed = sorted({f.place for f in found})
         if failed:
             ending = "failed"
@@ -519,8 +521,8 @@ def amounts(state: tf.State) -> Tensor:
     if state.layout is not None:
         grid = state.layout.grid
         total.index_add_(0, grid.owner, state.signals["ahl"].double() * grid.voxel_volume)
-        if "ahl_beyond" in state.fields:
-            total += state.fields["ahl_beyond"].double()
+        if "ahl_reservoir" in state.fields:
+            total += state.fields["ahl_reservoir"].double()
     return total
 
 
@@ -539,7 +541,7 @@ def kept(before: tf.State, after: tf.State, draw: Draw) -> None:
     ):
         return
     if o is not None and (
-        o.decay or o.flow or {"open", "fixed"} & set(o.faces) or (o.beyond == "grow" and o.start)
+        o.decay or o.flow or {"open", "fixed"} & set(o.faces) or (o.outside == "grow" and o.start)
     ):
         return
     then, now = amounts(before), amounts(after)

@@ -79,10 +79,10 @@ def channel() -> tf.Scene:
         tf.Mechanics(dim=2, walls=[tf.Channel(WIDTH, low_end=0.0)]),
         tf.Circuit(lux, species=("luxi", "ahl"), daughters="amount", rtol=0.01),
         tf.Medium(
-            ahl=tf.Signal(diffusion=50.0, beyond=1.0),
+            ahl=tf.Signal(diffusion=50.0, reservoir=1.0),
             box=((8.0, -half), (LENGTH, half)),
             spacing=2.0,
-            beyond="open",
+            outside="reservoir",
         ),
         Carried(),
         tf.Removal(low=(-1.0, -WIDTH), high=(LENGTH, WIDTH)),
@@ -111,7 +111,7 @@ def balance(state: tf.State) -> tuple[float, float, float]:
         (state.ahl.double() * state.circuit_volume.double()).sum()
         + state.signals["ahl"].double().sum() * state.layout.grid.voxel_volume
     )
-    given = float(state.ahl_beyond.double().sum())
+    given = float(state.ahl_reservoir.double().sum())
     return held, -given, held + given + float(state.carried.sum())
 
 

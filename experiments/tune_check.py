@@ -28,9 +28,9 @@ from pathlib import Path
 import torch
 
 import torchfilm as tf
-from torchfilm.cli_ask import parse_error
-from torchfilm.probe import Error, Probe, Seen, begin
-from torchfilm.tune import TIGHT_CONTACTS, Search
+from torchfilm.cli.inspect import parse_error
+from torchfilm.tuning.observables import AccuracyProbe, Error, Seen, begin
+from torchfilm.tuning.tuner import TIGHT_CONTACTS, Search
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "benchmarks"))
@@ -66,7 +66,7 @@ COLUMNS = (
 class Run:
     """A run that `tune` has not seen, and what is right there."""
 
-    probe: Probe
+    probe: AccuracyProbe
     search: Search
     reference: Seen
 

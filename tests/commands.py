@@ -25,7 +25,7 @@ def scene(rate=1.0, longest=4.0):
 
 def shell(*arguments: object, folder: Path, **options) -> subprocess.CompletedProcess:
     """The command as a user types it."""
-    command = [sys.executable, "-m", "torchfilm.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "torchfilm.cli.main", *map(str, arguments)]
     return subprocess.run(
         command,
         cwd=folder,

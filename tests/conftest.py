@@ -49,7 +49,7 @@ def deterministic():
 def command(tmp_path, monkeypatch):
     """The command line without a new process: `command("run", "microcolony", …)` in a folder of its
     own."""
-    from torchfilm import cli
+    from torchfilm.cli import main as cli
 
     monkeypatch.chdir(tmp_path)
     path = list(sys.path)

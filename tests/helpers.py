@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 import torchfilm as tf
-from torchfilm.physics.contacts import Bodies, Contacts, Touching, contacts_of
+from torchfilm.physics.contacts import CandidateContacts, Capsules, Contacts, contacts_of
 from torchfilm.physics.solve import CONVERGED
 
 # (normal to the side of the cells, normal · x at the wall)
@@ -149,11 +149,11 @@ def worst_overlap(state: tf.State, walls: Sequence[Flat] = ()) -> float:
     return max(deepest)
 
 
-def bodies(c, a, length, radius=0.5, *, dtype=torch.float64, device="cpu") -> Bodies:
+def bodies(c, a, length, radius=0.5, *, dtype=torch.float64, device="cpu") -> Capsules:
     """Capsules from arrays (N, d), (N, d), (N,)."""
     t = lambda x: torch.as_tensor(np.asarray(x), dtype=dtype, device=device)
     length = t(length)
-    return Bodies(
+    return Capsules(
         t(c).T.contiguous(),
         t(a).T.contiguous(),
         0.5 * length,
@@ -161,9 +161,9 @@ def bodies(c, a, length, radius=0.5, *, dtype=torch.float64, device="cpu") -> Bo
     )
 
 
-def rows_of(cells: Bodies, first: Tensor, second: Tensor, push: bool = False) -> Contacts:
+def rows_of(cells: Capsules, first: Tensor, second: Tensor, push: bool = False) -> Contacts:
     """All rows that overlap among the given pairs (P,), (P,)."""
-    return contacts_of(Touching.among(cells, first, second), push)
+    return contacts_of(CandidateContacts.among(cells, first, second), push)
 
 
 def unit(rng: np.random.Generator, count: int, dim: int) -> np.ndarray:

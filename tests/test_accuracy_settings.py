@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import torchfilm as tf
-from torchfilm.accuracy import PRESETS
 from torchfilm.tools.checks import InputError
+from torchfilm.tuning.settings import PRESETS
 
 
 def made(u, s, p, cell):

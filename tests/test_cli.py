@@ -52,7 +52,7 @@ def test_run_as_a_newcomer_types_it(tmp_path):
 def test_the_command_is_installed():
     script = Path(sys.executable).with_name("torchfilm")
     assert script.exists()
-    assert "torchfilm.cli" in script.read_text()
+    assert "torchfilm.cli.main" in script.read_text()
 
 
 def test_run_with_settings(command):
@@ -235,7 +235,7 @@ def test_resume_of_a_run_that_is_at_its_end_is_no_error(command):
 def started(folder: Path, results: str, *arguments: str) -> subprocess.Popen:
     """The command in a process of its own, from when its results file is there."""
     child = subprocess.Popen(
-        [sys.executable, "-m", "torchfilm.cli", "run", *arguments],
+        [sys.executable, "-m", "torchfilm.cli.main", "run", *arguments],
         cwd=folder,
         env=ENVIRONMENT,
         stdout=subprocess.PIPE,
@@ -316,7 +316,7 @@ def test_progress_shows_cells_time_rate_and_the_estimated_end(tmp_path, end):
     leader, follower = pty.openpty()
     fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 160, 0, 0))
     child = subprocess.Popen(
-        [sys.executable, "-m", "torchfilm.cli", "run", "microcolony", *end, "--no-picture"],
+        [sys.executable, "-m", "torchfilm.cli.main", "run", "microcolony", *end, "--no-picture"],
         cwd=tmp_path,
         env=ENVIRONMENT,
         stdout=subprocess.DEVNULL,

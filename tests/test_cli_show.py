@@ -273,7 +273,7 @@ def test_info_of_a_results_file(command, capsys, name):
 def test_a_reader_that_has_read_enough_is_no_error(tmp_path, arguments):
     """`torchfilm info microcolony | head -1`: the reader is gone before all is written. No
     traceback, no complaint at the interpreter's end."""
-    command = [sys.executable, "-m", "torchfilm.cli", *arguments]
+    command = [sys.executable, "-m", "torchfilm.cli.main", *arguments]
     with subprocess.Popen(
         command,
         cwd=tmp_path,

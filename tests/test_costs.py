@@ -57,13 +57,13 @@ LISTED = {
     "circuit": lambda: [circuit()],
     "molecules": lambda: [reactions()],
     "medium": lambda: [medium()],
-    "both": lambda: [circuit(), medium(beyond="grow")],
+    "both": lambda: [circuit(), medium(outside="grow")],
     "rules": lambda: [tf.Rules(watching)],
     "removal": lambda: [tf.Removal((-50, -50), (50, 50))],
     "everything": lambda: [
         tf.Rules(watching),
         circuit(),
-        medium(beyond="open"),
+        medium(outside="reservoir"),
         tf.Removal((-50, -50), (50, 50)),
     ],
 }
@@ -227,10 +227,10 @@ def forbid(monkeypatch, *rooms: str) -> None:
 
 
 def _refusing(name: str):
-    def refuse(*_, **__):
+    def input_error(*_, **__):
         raise AssertionError(f"{name} was called, in a scene that does not list it")
 
-    return refuse
+    return input_error
 
 
 def run(scene: tf.Scene, steps: int = 30) -> tf.State:
@@ -301,7 +301,7 @@ def test_fields_and_stages_are_those_of_the_effects_listed():
     for more, added in (
         ([circuit()], {"m", "circuit_volume"}),
         ([medium()], {"out.ahl"}),
-        ([medium(beyond="open")], {"out.ahl", "ahl_beyond"}),
+        ([medium(outside="reservoir")], {"out.ahl", "ahl_reservoir"}),
         ([tf.Circuit({0: made}, species=("m",))], {"m", "circuit_volume", "cell_type"}),
         ([tf.Rules(watching)], {"mark"}),
     ):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from pretended import pretended_cuda  # noqa: F401
+from mock_cuda import pretended_cuda  # noqa: F401
 
 import torchfilm as tf
 

@@ -12,8 +12,8 @@ import torch
 import torchfilm as tf
 from torchfilm.effects import medium as medium_module
 from torchfilm.effects.mechanics import TOLERANCE
-from torchfilm.effects.medium import Cover
-from torchfilm.explain import (
+from torchfilm.effects.medium import GridCoverage
+from torchfilm.explanation import (
     COLUMNS,
     KNOWN,
     ROWS,
@@ -134,7 +134,10 @@ def test_a_way_of_transport_that_was_asked_for_is_told(method):
         ),
         (
             tf.Circuit(
-                [tf.parts.constitutive("m", 1.0)], species="m", method="tau_leap", copies=0.6022
+                [tf.parts.constitutive("m", 1.0)],
+                species="m",
+                method="tau_leap",
+                molecules_per_unit=0.6022,
             ),
             ("tau-leaping", "0.6022 molecules"),
         ),
@@ -144,7 +147,7 @@ def test_a_way_of_transport_that_was_asked_for_is_told(method):
         ),
         # 0.025 · 10/64
         (
-            medium(beyond="grow", grows="x"),
+            medium(outside="grow", grows="x"),
             ("along x, 8 voxels", "8 × 8 × 1 voxels of 8 × 8 × 8 µm", "dt·K/h² = 0.003906"),
         ),
         (
@@ -155,7 +158,7 @@ def test_a_way_of_transport_that_was_asked_for_is_told(method):
             medium(method="implicit", splitting="lie", steps=5),
             ("order 1 in steps of 0.005 h", "Lie"),
         ),
-        (medium(beyond="open"), ("reservoir",)),
+        (medium(outside="reservoir"), ("reservoir",)),
     ],
 )
 def test_methods_and_tolerances_are_those_of_the_scene(effect, words):
@@ -188,7 +191,7 @@ def test_every_effect_that_torchfilm_has_is_known_and_has_words():
         if isinstance(x, type) and issubclass(x, tf.Effect) and x is not tf.Effect
     }
     assert public == set(KNOWN)
-    assert all(how.dispatch(kind) is not how.dispatch(object) for kind in (*KNOWN, Cover))
+    assert all(how.dispatch(kind) is not how.dispatch(object) for kind in (*KNOWN, GridCoverage))
 
 
 def test_an_effect_of_ones_own_is_told_by_its_name_alone():
@@ -218,12 +221,12 @@ def test_what_is_listed_and_what_is_left_out_are_all(name):
 @pytest.mark.parametrize("name", tf.scenes.READY)
 def test_whether_growth_serves_many_designs_is_what_a_course_says(name):
     scene = tf.scenes.build(name)
-    why = tf.Course.obstacle(scene)
+    why = tf.GrowthRecording.obstacle(scene)
     assert replayed(scene) == f"no, {why}" if why else replayed(scene).startswith("yes, ")
     if name == "boundary_detector":
-        assert replayed(scene) == "yes, circuit and transport only follow (Course, Replay)"
+        assert replayed(scene) == "yes, circuit and transport only follow (GrowthRecording, Replay)"
     if name == "toggle_switch":
-        assert replayed(scene) == "yes, circuit only follows (Course, Replay)"
+        assert replayed(scene) == "yes, circuit only follows (GrowthRecording, Replay)"
 
 
 @pytest.mark.parametrize("name", tf.scenes.READY)
@@ -239,10 +242,10 @@ def test_couplings_are_those_of_the_scene(name):
 
 
 def test_without_an_estimate_nothing_runs(monkeypatch):
-    def refuse(*_):
+    def input_error(*_):
         raise AssertionError("a step was taken")
 
-    monkeypatch.setattr(tf.Scene, "step", refuse)
+    monkeypatch.setattr(tf.Scene, "step", input_error)
     said = tf.explain(tf.scenes.boundary_detector(), seconds=0)
     assert "estimated" not in said and said == tf.explain(tf.scenes.boundary_detector(), seconds=0)
 

@@ -48,7 +48,7 @@ def far_apart(distance: float) -> tuple[tf.Scene, tf.Cells]:
         ahl=tf.Signal(diffusion=1.0, initial=1.0),
         box=((-1.2,) * 3, (1.2,) * 3),
         spacing=0.3,
-        beyond="grow",
+        outside="grow",
     )
     cells = tf.Cells([[0.0] * 3, [distance] * 3, [0.0] * 3], [1.0, 0.0, 0.0], colony=[0, 0, 1])
     return tf.Scene(medium, founders=tf.Cells.single(3)), cells
@@ -139,7 +139,7 @@ def test_hard_contacts_fling_no_cell_through_a_wall():
     through a wall is cut.
     """
     contacts = fuzz.Contacts(1e-6, 1.0, 1.0, False, None, "box", 0.3, None)
-    bodies = fuzz.Bodies((7,), 5.0, (2.0, 3.0), 0.5, 2, 0)
+    bodies = fuzz.Capsules((7,), 5.0, (2.0, 3.0), 0.5, 2, 0)
     draw = fuzz.Draw(
         bodies, contacts, None, None, None, fuzz.Beside(False, None, False), 0.01, 1, "float32", 0
     )

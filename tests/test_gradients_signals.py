@@ -71,7 +71,7 @@ def talking(
         ),
         tf.Medium(
             ahl=signal,
-            faces=tf.Faces(x=(tf.Fixed(at["face"]), tf.Open())),
+            boundary=tf.BoundaryConditions(x=(tf.Dirichlet(at["face"]), tf.Open())),
             flow=(at["flow"], 0.0),
             **{**BOX, **(medium or {})},
         ),
@@ -150,7 +150,7 @@ def test_about_an_obstacle():
 
 
 def test_on_a_grid_that_grows():
-    start = {"box": ((-1.5, -1.5), (1.5, 1.5)), "spacing": 0.5, "depth": 1.0, "beyond": "grow"}
+    start = {"box": ((-1.5, -1.5), (1.5, 1.5)), "spacing": 0.5, "depth": 1.0, "outside": "grow"}
     make = lambda x: tf.Scene(
         *body(True),
         tf.Circuit(
@@ -169,10 +169,10 @@ def test_on_a_grid_that_grows():
 
 
 def test_where_cells_are_beyond_an_open_box():
-    box = {"box": ((-2.0, -0.2), (2.0, 0.2)), "spacing": (1.0, 0.2), "beyond": "open"}
+    box = {"box": ((-2.0, -0.2), (2.0, 0.2)), "spacing": (1.0, 0.2), "outside": "reservoir"}
 
     def make(x):
-        signal = tf.Signal(diffusion=15.0, beyond=x)
+        signal = tf.Signal(diffusion=15.0, reservoir=x)
         circuit = tf.Circuit(
             lux, species=("luxi", "ahl"), initial={"luxi": 0.9}, rtol=0.05, atol=0.05, **CONSTANTS
         )
@@ -201,7 +201,7 @@ def feeding(rate=1.0, half=0.3, growth_yield=2.0, diffusion=15.0, supply=0.8) ->
         tf.Mechanics(dim=2, tolerance=1e-10, alpha=0.1),
         tf.Medium(
             food=tf.Signal(diffusion=diffusion, initial=0.5),
-            faces=tf.Faces(x=tf.Fixed(supply)),
+            boundary=tf.BoundaryConditions(x=tf.Dirichlet(supply)),
             depth=1.0,
             **BOX,
         ),

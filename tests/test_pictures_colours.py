@@ -12,11 +12,11 @@ from matplotlib.text import Text
 
 import torchfilm as tf
 from torchfilm.pictures import Frame, colour_bar, draw_cells, draw_signal, frame_of, scale_bar
-from torchfilm.pictures.colours import FLOOR, NOTHING, Look, Seen, scale_of
+from torchfilm.pictures.colours import FLOOR, NOTHING, PlotStyle, Seen, scale_of
 from torchfilm.pictures.draw import BEYOND, numbers
+from torchfilm.pictures.figures import chosen, fill_sheet, sheet_figure
 from torchfilm.pictures.page import page, signal_seen, survey
 from torchfilm.pictures.shapes import section
-from torchfilm.pictures.sheets import chosen, fill_sheet, sheet_figure
 from torchfilm.signals.exchange import read, stencil
 from torchfilm.signals.grid import Grid
 
@@ -72,7 +72,7 @@ class Drawn:
     """A sheet as pixels, to be asked what colour is where."""
 
     def __init__(self, what: Frame, **options):
-        look = Look(**options)
+        look = PlotStyle(**options)
         places, _ = chosen(what.counts > 0, what.colony_id, None, 36)
         self.survey = survey([what], places, look)
         self.figure, self.axes = page(1, len(places), self.survey, "", dpi=100)
@@ -260,31 +260,33 @@ def test_a_section_is_at_the_height_of_the_cells():
         (deep, {"section": 3.0}, (3 + 3.5) / 7, "z = 3 µm"),
         (deep, {"section": "mean"}, 0.5, "mean over z"),
     ):
-        look = Look(background="ahl", **options)
+        look = PlotStyle(background="ahl", **options)
         assert signal_seen(what, 0, look, what.colony(0)) == pytest.approx(np.full((16, 16), level))
         behind = survey([what], [0], look).behind
         assert behind is not None and said in behind.title
     layer = frame([[0, 0]], signals={"ahl": ramp(0, (16, 16, 1))})
-    assert survey([layer], [0], Look(background="ahl")).behind.title == "ahl outside"
+    assert survey([layer], [0], PlotStyle(background="ahl")).behind.title == "ahl outside"
 
 
 def test_a_plane_of_cells_that_is_not_known_is_asked_for():
     """2-D cells stand at z = 0 unless told; where that is not in the box, nothing is guessed."""
     what = frame([[0, 0]], signals={"ahl": ramp(2)}, origin=(-8, -8, 10))
     with pytest.raises(tf.InputError, match=r"section.*10 to 18"):
-        survey([what], [0], Look(background="ahl"))
-    assert survey([what], [0], Look(background="ahl", section=12.0)).behind is not None
+        survey([what], [0], PlotStyle(background="ahl"))
+    assert survey([what], [0], PlotStyle(background="ahl", section=12.0)).behind is not None
 
 
 def test_cells_and_signal_of_one_name_keep_their_own_limits():
     what = frame([[0, 0]], signals={"ahl": ramp(0)}, ahl=[0.3])
     both = survey(
-        [what], [0], Look(colour="ahl", background="ahl", limits={"ahl": (0, 5), "out.ahl": (0, 7)})
+        [what],
+        [0],
+        PlotStyle(colour="ahl", background="ahl", limits={"ahl": (0, 5), "out.ahl": (0, 7)}),
     )
     assert both.scales[0].limits == (0, 5) and both.behind.limits == (0, 7)
-    bare = survey([what], [0], Look(colour="ahl", background="ahl", limits={"ahl": (0, 5)}))
+    bare = survey([what], [0], PlotStyle(colour="ahl", background="ahl", limits={"ahl": (0, 5)}))
     assert bare.scales[0].limits == (0, 5) and bare.behind.limits == (0, 1)
-    alone = survey([what], [0], Look(background="ahl", limits={"ahl": (0, 5)}))
+    alone = survey([what], [0], PlotStyle(background="ahl", limits={"ahl": (0, 5)}))
     assert alone.behind.limits == (0, 5) and alone.behind.title == "ahl outside, z = 0 µm"
 
 
@@ -293,7 +295,7 @@ def test_cells_and_signal_of_one_name_keep_their_own_limits():
 
 def test_a_window_is_cropped_to_the_cells_and_stays_in_the_box():
     what = frame([[6.5, 0.0], [-4.0, 0.0]], colony=[0, 1], signals={"ahl": ramp(0)})
-    made = survey([what], [0, 1], Look(background="ahl"))
+    made = survey([what], [0, 1], PlotStyle(background="ahl"))
     sizes = {(round(r - l, 9), round(t - b, 9)) for l, r, b, t in made.windows.values()}  # noqa: E741
     assert len(sizes) == 1 and 2.0 < made.size[0] < 8.0, (
         "panels of one size, about the cell of 2 µm with some room"
@@ -304,7 +306,7 @@ def test_a_window_is_cropped_to_the_cells_and_stays_in_the_box():
 
 def test_the_whole_box():
     what = frame([[6.5, 0.0]], signals={"ahl": ramp(0)})
-    assert survey([what], [0], Look(background="ahl", whole=True)).windows[0] == pytest.approx(
+    assert survey([what], [0], PlotStyle(background="ahl", whole=True)).windows[0] == pytest.approx(
         (-8, 8, -8, 8)
     )
 
@@ -323,7 +325,7 @@ def test_what_is_beyond_the_box_is_no_concentration():
 def test_pages_have_even_numbers_of_pixels(dpi):
     """Films need it."""
     what = frame([[0.0, 0.0], [7.0, 2.0]], yfp=[1, 2])
-    figure = sheet_figure(what, [0], Look(colour="yfp"), "a title", dpi)
+    figure = sheet_figure(what, [0], PlotStyle(colour="yfp"), "a title", dpi)
     assert all(n % 2 == 0 for n in FigureCanvasAgg(figure).get_width_height())
 
 
@@ -373,7 +375,7 @@ def test_nothing_on_a_page_overlaps(count, apart, options):
     figure = sheet_figure(
         what,
         range(count),
-        Look(**options),
+        PlotStyle(**options),
         "a title of some length, which has to be broken where the page is narrow",
         100,
     )
@@ -412,7 +414,7 @@ def test_numbers_of_a_legend(values, words):
 def test_a_legend_takes_out_the_power_of_ten(high, title):
     seen = Seen()
     seen.note(np.array([0.0, high]))
-    scale = scale_of("yfp", seen, Look(colour="yfp"), {"yfp": "nM"})
+    scale = scale_of("yfp", seen, PlotStyle(colour="yfp"), {"yfp": "nM"})
     assert scale.title == title
     ax = Figure().add_subplot()
     colour_bar(ax, scale)
@@ -422,7 +424,7 @@ def test_a_legend_takes_out_the_power_of_ten(high, title):
 
 @pytest.mark.parametrize("values", [[], [np.nan], [0.0], [5.0, 5.0], [-2.0]])
 def test_a_range_is_never_empty(values):
-    for look in (Look(colour="yfp"), Look(channels={"yfp": "red"})):
+    for look in (PlotStyle(colour="yfp"), PlotStyle(channels={"yfp": "red"})):
         seen = Seen()
         seen.note(np.array(values, dtype=float))
         scale = scale_of("yfp", seen, look, {})
@@ -501,13 +503,13 @@ def test_a_bar_is_as_long_as_it_says():
 )
 def test_what_cannot_be_drawn_is_told(options, message):
     with pytest.raises(tf.InputError, match=message):
-        survey([frame([[0, 0]], signals={"ahl": ramp(0)}, yfp=[1.0])], [0], Look(**options))
+        survey([frame([[0, 0]], signals={"ahl": ramp(0)}, yfp=[1.0])], [0], PlotStyle(**options))
 
 
 def test_a_scene_without_a_medium_has_no_box_and_no_background():
     for options in ({"whole": True}, {"background": "ahl"}):
         with pytest.raises(tf.InputError, match="medium"):
-            survey([frame([[0, 0]])], [0], Look(**options))
+            survey([frame([[0, 0]])], [0], PlotStyle(**options))
 
 
 def test_a_state_is_a_frame(dtype, device):

@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 
 import torchfilm as tf
-from torchfilm.pictures import movies, sheets
-from torchfilm.pictures.colours import Look, paint_cells
+from torchfilm.pictures import figures, movies
+from torchfilm.pictures.colours import PlotStyle, paint_cells
+from torchfilm.pictures.figures import picked
 from torchfilm.pictures.frames import Recorded
 from torchfilm.pictures.movies import Film, _nearest, clock
 from torchfilm.pictures.page import survey
-from torchfilm.pictures.sheets import picked
 
 UNTIL = 2.0
 
@@ -63,7 +63,7 @@ def pixels(path) -> np.ndarray:
 def test_ranges_and_windows_are_those_of_all_frames(run):
     """The first frame is the darkest in yfp and the richest in ahl; all share the ends of both."""
     with tf.Results(run) as results:
-        look = Look(colour="yfp", background="ahl")
+        look = PlotStyle(colour="yfp", background="ahl")
         frames = Recorded(results, range(len(results)), "ahl")
         made = survey(frames, [0, 1], look)
         every = [results.frame(k)["yfp"] for k in range(len(results))]
@@ -142,7 +142,7 @@ def laid_out(monkeypatch) -> dict:
     """What strips are made of: the (rows, columns) of the page, and (time, place, survey, axes) of
     each panel."""
     seen: dict = {"panels": []}
-    page, fill = sheets.page, sheets.fill
+    page, fill = figures.page, figures.fill
 
     def noted_page(rows, columns, made, title, *, dpi):
         seen["shape"], seen["title"] = (rows, columns), title
@@ -153,8 +153,8 @@ def laid_out(monkeypatch) -> dict:
         seen["panels"].append((seen["axes"].index(ax), frame.time, place, made))
         fill(ax, frame, place, made, titles)
 
-    monkeypatch.setattr(sheets, "page", noted_page)
-    monkeypatch.setattr(sheets, "fill", noted_fill)
+    monkeypatch.setattr(figures, "page", noted_page)
+    monkeypatch.setattr(figures, "fill", noted_fill)
     return seen
 
 
@@ -297,7 +297,9 @@ def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
     made = tf.pictures.movie(run, tmp_path / "a.gif", **film_options)
     with tf.Results(run) as results, Image.open(made) as film:
         frames = Recorded(results, range(len(results)), "ahl")
-        shared = survey(frames, [0, 1], Look(channels=film_options["channels"], background="ahl"))
+        shared = survey(
+            frames, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")
+        )
         drawn = Film(frames, shared, "", 50)
         for k in (0, 3, 5):
             film.seek(k)
@@ -329,7 +331,7 @@ def test_a_film_moves_neither_its_window_nor_its_legend(run, film_options):
     """What is outside the panels and the titles is the same in every frame."""
     with tf.Results(run) as results:
         frames = Recorded(results, range(len(results)), None)
-        film = Film(frames, survey(frames, [0], Look(colour="yfp")), "", 60)
+        film = Film(frames, survey(frames, [0], PlotStyle(colour="yfp")), "", 60)
         first, last = film[0], film[5]
     assert first.shape == last.shape
     panel = film.axes[0].get_window_extent()
@@ -395,7 +397,7 @@ def test_an_mp4_has_every_frame(run, tmp_path, film_options):
         shown = Recorded(results, range(len(results)), "ahl")
         drawn = Film(
             shown,
-            survey(shown, [0, 1], Look(channels=film_options["channels"], background="ahl")),
+            survey(shown, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")),
             "",
             50,
         )

@@ -60,7 +60,7 @@ def test_a_replay_is_the_full_run(name, dtype):
     )
     scene = DESIGNS[name](values)
     full = stepped(scene, scene.seed(6, seed=5, streams=streams, dtype=dtype), 130)
-    course = tf.Course(DESIGNS[name](1.0), streams=(3, 7), seed=5, dtype=dtype)
+    course = tf.GrowthRecording(DESIGNS[name](1.0), streams=(3, 7), seed=5, dtype=dtype)
     replay = tf.Replay(scene, course)
     found = stepped(replay, replay.seed(6, streams=streams), 130)
     assert found.cells > 6 * 6
@@ -69,7 +69,7 @@ def test_a_replay_is_the_full_run(name, dtype):
 
 def test_colonies_may_leave_a_replay_and_go_on_alike():
     scene, streams = lit(torch.tensor([1.0, 2.0, 3.0])), [0, 1, 0]
-    replay = tf.Replay(scene, tf.Course(lit(), streams=(0, 1)))
+    replay = tf.Replay(scene, tf.GrowthRecording(lit(), streams=(0, 1)))
     whole = stepped(replay, replay.seed(3, streams=streams), 80)
     part = stepped(replay, replay.seed(3, streams=streams), 50).select([2, 1])
     same(stepped(replay, part, 30), whole.select([2, 1]))
@@ -88,7 +88,7 @@ def test_colonies_of_one_stream_differ_by_their_parameters_only():
 
 
 def test_a_course_grows_as_far_as_it_is_asked_and_no_further():
-    course = tf.Course(lit(), streams=(0,))
+    course = tf.GrowthRecording(lit(), streams=(0,))
     course.changes(9)
     assert len(course.steps) == 10
     course.changes(4)
@@ -118,10 +118,10 @@ def test_a_design_that_acts_on_growth_is_refused():
     with pytest.raises(
         tf.InputError, match=r"Growth\.rate differs between colonies and acts on their growth"
     ):
-        tf.Course(lit(rate=torch.tensor([1.0, 2.0])), streams=(0, 1))
+        tf.GrowthRecording(lit(rate=torch.tensor([1.0, 2.0])), streams=(0, 1))
     with pytest.raises(tf.InputError, match="rules may read and write anything"):
-        tf.Course(tf.scenes.random_partition(), streams=(0,))
-    course = tf.Course(lit(), streams=(0,))
+        tf.GrowthRecording(tf.scenes.random_partition(), streams=(0,))
+    course = tf.GrowthRecording(lit(), streams=(0,))
     with pytest.raises(tf.InputError, match="does not grow as the course did: Growth\\(rate=2"):
         tf.Replay(lit(rate=2.0), course)
     with pytest.raises(
@@ -134,7 +134,7 @@ def test_other_founders_are_another_growth():
     founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.5)
     other = tf.Scene(*lit().listed, founders=founders)
     with pytest.raises(tf.InputError, match="does not grow as the course did"):
-        tf.Replay(other, tf.Course(lit(), streams=(0,)))
+        tf.Replay(other, tf.GrowthRecording(lit(), streams=(0,)))
 
 
 def test_what_fails_in_the_course_fails_in_every_replay():
@@ -145,7 +145,7 @@ def test_what_fails_in_the_course_fails_in_every_replay():
         tf.Circuit(reporter, species=("gfp",), make=1.0),
         founders=tf.Cells.single(2, length=0.3),
     )
-    replay = tf.Replay(scene, tf.Course(scene, streams=(0, 1)))
+    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0, 1)))
     state = replay.seed(3, streams=[1, 0, 1])
     while not tf.failures(state):
         state = replay.step(state)
@@ -201,7 +201,7 @@ class Measured(tf.Effect):
 
 def test_an_effect_between_growth_and_mechanics_sees_the_state_between():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2), Measured())
-    replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
+    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
     full, found = (
         stepped(scene, scene.seed(1), 120),
         stepped(replay, replay.seed(1, streams=[0]), 120),
@@ -213,7 +213,7 @@ def test_an_effect_between_growth_and_mechanics_sees_the_state_between():
 def test_what_founders_bring_keeps_the_rule_of_its_circuit_at_division():
     founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], extra={"gfp": [3.0]})
     scene = tf.Scene(*lit(torch.tensor([1.0, 2.0]), daughters="amount").listed, founders=founders)
-    replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
+    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
     same(
         stepped(replay, replay.seed(2, streams=[0, 0]), 90),
         stepped(scene, scene.seed(2, streams=[0, 0]), 90),
@@ -254,7 +254,7 @@ def rate_at_birth(state, rows):
 
 def test_what_growth_reads_belongs_to_it_also_where_nothing_writes_it():
     scene = tf.Scene(*lit(torch.tensor([1.0, 2.0])).listed, Started("drag", twice))
-    replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
+    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
     full = stepped(scene, scene.seed(2, streams=[0, 0]), 110)
     same(stepped(replay, replay.seed(2, streams=[0, 0]), 110), full)
     assert not torch.equal(
@@ -268,7 +268,7 @@ def test_what_growth_reads_belongs_to_it_also_where_nothing_writes_it():
 
 
 def test_growth_is_told_by_what_its_functions_do():
-    course = tf.Course(tf.Scene(*lit().listed, Started("drag", twice)), streams=(0,))
+    course = tf.GrowthRecording(tf.Scene(*lit().listed, Started("drag", twice)), streams=(0,))
     tf.Replay(tf.Scene(*lit().listed, Started("drag", twice)), course)
     with pytest.raises(tf.InputError, match="does not grow as the course did"):
         tf.Replay(tf.Scene(*lit().listed, Started("drag", four_times)), course)
@@ -284,7 +284,7 @@ def test_daughters_fields_start_from_what_they_see_where_cells_divide():
         circuit,
         Started("born_rate", rate_at_birth, "reset"),
     )
-    replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
+    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
     full = stepped(scene, scene.seed(2, streams=[0, 0]), 110)
     assert full.cells > 8 and not torch.equal(full.born_rate, full.growth_rate)
     same(stepped(replay, replay.seed(2, streams=[0, 0]), 110), full)
@@ -301,7 +301,7 @@ def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
         tf.Division(length=3.5),
         tf.Circuit(reporter, species=("gfp",), make=1.0),
     )
-    replay = tf.Replay(scene, tf.Course(scene, streams=(0,)))
+    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
     full = stepped(scene, scene.seed(1), 20)
     assert float(full.longest.max()) < float(full.length.max())
     same(stepped(replay, replay.seed(1, streams=[0]), 20), full)
@@ -321,6 +321,6 @@ def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
     ],
 )
 def test_more_that_cannot_be_kept(scene, why):
-    assert why in tf.Course.obstacle(scene())
+    assert why in tf.GrowthRecording.obstacle(scene())
     with pytest.raises(tf.InputError, match=why):
-        tf.Course(scene(), streams=(0,))
+        tf.GrowthRecording(scene(), streams=(0,))

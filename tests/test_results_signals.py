@@ -45,7 +45,7 @@ def smooth() -> tf.Scene:
         tf.Medium(
             ahl=tf.Signal(diffusion=[10.0, 20.0, 30.0], decay=[0.1, 0.2, 0.3]),
             flow=([1.0, 0.0, -1.0], 0.0),
-            beyond="grow",
+            outside="grow",
             **BOX,
         ),
         dt=DT,
@@ -68,13 +68,13 @@ def leaping() -> tf.Scene:
             initial={"m": 3.0},
             method="tau_leap",
             make=[5.0, 10.0, 20.0],
-            copies=[1.0, 2.0, 3.0],
+            molecules_per_unit=[1.0, 2.0, 3.0],
         ),
         tf.Medium(
-            m=tf.Signal(diffusion=5.0, beyond=[0.0, 0.5, 1.0]),
+            m=tf.Signal(diffusion=5.0, reservoir=[0.0, 0.5, 1.0]),
             box=((-2.0, -2.0), (2.0, 2.0)),
             spacing=2.0,
-            beyond="open",
+            outside="reservoir",
         ),
         dt=DT,
     )
@@ -111,8 +111,8 @@ def fed() -> tf.Scene:
         *body(),
         tf.Medium(
             food=tf.Signal(diffusion=20.0, initial=[1.0, 2.0, 3.0]),
-            faces=tf.Faces(x=tf.Fixed([1.0, 2.0, 3.0])),
-            beyond="grow",
+            boundary=tf.BoundaryConditions(x=tf.Dirichlet([1.0, 2.0, 3.0])),
+            outside="grow",
             grows="y",
             depth=1.0,
             box=((-16.0, -8.0), (16.0, 8.0)),

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 import torchfilm as tf
-from torchfilm.scene_files import design, load_scene, parse_setting
+from torchfilm.cli.scene_files import design, load_scene, parse_setting
 
 OWN = """
 import torchfilm as tf

@@ -24,7 +24,7 @@ SMALL = {
     "boundary_detector under flow": {"flow": 5.0},
     "random_partition": {},
     "repressilator": {"alpha": [216.0, 100.0], "noise": False, "rate": 1.0},
-    "toggle_switch": {"strength": [10.0, 12.0], "speed": 2, "copies": 2.0, "rate": 1.0},
+    "toggle_switch": {"strength": [10.0, 12.0], "speed": 2, "molecules_per_unit": 2.0, "rate": 1.0},
     "nutrient_limited": {"supply": [1.0, 2.0], "size": 48.0},
 }
 

@@ -177,7 +177,9 @@ def test_random_partition_gives_every_share_alike():
 
 
 def test_toggle_cells_end_on_one_side():
-    last = ran(tf.scenes.toggle_switch(speed=4.0, start=2.0, copies=4.0), 3.0, colonies=4)
+    last = ran(
+        tf.scenes.toggle_switch(speed=4.0, start=2.0, molecules_per_unit=4.0), 3.0, colonies=4
+    )
     red = last.red / (last.red + last.green)
     assert float(((red < 0.2) | (red > 0.8)).double().mean()) > 0.9
     assert 0 < int((red > 0.8).sum()) < last.cells  # both sides are there
@@ -212,7 +214,7 @@ def test_repressilator_goes_round():
 
 
 def test_repressilator_molecule_by_molecule_has_whole_numbers():
-    last = ran(tf.scenes.repressilator(copies=2.0), 0.5, dtype=F64)
+    last = ran(tf.scenes.repressilator(molecules_per_unit=2.0), 0.5, dtype=F64)
     n = last.laci * last.volume * 2.0
     assert float((n - n.round()).abs().max()) < 1e-9 and float(n.sum()) > 0
 

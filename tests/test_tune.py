@@ -10,9 +10,9 @@ import pytest
 import torch
 
 import torchfilm as tf
-from torchfilm.probe import Error, Probe, begin, observables
 from torchfilm.tools.checks import InputError
-from torchfilm.tune import Search
+from torchfilm.tuning.observables import AccuracyProbe, Error, begin, observables
+from torchfilm.tuning.tuner import Search
 
 F64 = torch.float64
 
@@ -118,7 +118,7 @@ def test_what_does_not_hold_in_other_colonies_is_tightened():
     settings are those of an honest search, or finer."""
     probe, other = begin(dividing(), 12, 4, ["m"]), begin(dividing(), 8, 4, ["m"], seed=1)
 
-    class Flatterer(Probe):
+    class Flatterer(AccuracyProbe):
         def errors(self, found, against, apart=False):
             return {
                 n: e if apart else Error(0.01 * e.value, 0.0)
@@ -270,13 +270,13 @@ def test_no_division_changes_the_volume_that_is_compared():
 @pytest.mark.parametrize("colonies, times", [(2, 6.314), (5, 2.132), (24, 1.714)])
 def test_the_band_of_few_colonies_is_wide(colonies, times):
     """Student's t, 95 % on one side, from a printed table."""
-    assert Error(0.5, 0.1, colonies).most == pytest.approx(0.5 + times * 0.1, abs=1e-4)
+    assert Error(0.5, 0.1, colonies).upper_bound == pytest.approx(0.5 + times * 0.1, abs=1e-4)
 
 
 def test_what_other_colonies_never_hold_is_said_after_a_while(monkeypatch):
     monkeypatch.setitem(Search._confirmed.__globals__, "MOST_REFUTED", 3)
 
-    class Strict(Probe):
+    class Strict(AccuracyProbe):
         def errors(self, found, against, apart=False):
             return {
                 n: e if apart else Error(0.7, 0.01)
@@ -293,7 +293,7 @@ def test_what_other_colonies_never_hold_is_said_after_a_while(monkeypatch):
 
 
 def test_a_reference_that_fails_in_the_other_colonies_confirms_nothing():
-    class Broken(Probe):
+    class Broken(AccuracyProbe):
         def observed(self, settings):
             run = super().observed(settings)
             return dataclasses.replace(
@@ -359,14 +359,14 @@ def test_what_chance_leaves_open_is_looked_at_among_more_colonies():
     """A probe of which every error may be chance chooses nothing, unless other colonies tell more
     finely; what these are off by is not chosen."""
 
-    class Unsure(Probe):
+    class Unsure(AccuracyProbe):
         def errors(self, found, against, apart=False):
             return {
                 n: e if apart else Error(e.value, 0.05)
                 for n, e in super().errors(found, against, apart).items()
             }
 
-    class Strict(Probe):
+    class Strict(AccuracyProbe):
         def errors(self, found, against, apart=False):
             return {
                 n: e if apart else Error(0.06, 0.0)

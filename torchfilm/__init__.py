@@ -1,8 +1,6 @@
 """torchfilm: synthetic microbial biofilms, many colonies at once, in PyTorch."""
 
 from torchfilm import effect, measure, pictures, scenes
-from torchfilm.accuracy import Settings, preset
-from torchfilm.cells import Cells
 from torchfilm.circuits import kinetics, parts
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.effect import Effect, LogNormal, Normal, Uniform
@@ -14,36 +12,44 @@ from torchfilm.effects.medium import Medium, Signal
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
-from torchfilm.explain import explain
+from torchfilm.explanation import explain
+from torchfilm.initial_cells import Cells
+from torchfilm.io.recorder import Recorder
+from torchfilm.io.results import Results
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
 from torchfilm.pictures import show
-from torchfilm.recorder import Recorder
-from torchfilm.replay import Course, Replay
-from torchfilm.results import Results
+from torchfilm.replay import GrowthRecording, Replay
 from torchfilm.scene import Scene
-from torchfilm.signals.faces import Faces, Fixed, NoFlux, Open, Periodic
-from torchfilm.simulate import failures, rollout, simulate
+from torchfilm.signals.boundary_conditions import (
+    BoundaryConditions,
+    Dirichlet,
+    NoFlux,
+    Open,
+    Periodic,
+)
+from torchfilm.simulation import failures, rollout, simulate
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError, SimulationError
+from torchfilm.tools.hashing import digest
 from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.timing import Timings
-from torchfilm.tools.told import digest
-from torchfilm.tune import Tuned, tune
+from torchfilm.tuning.settings import Settings, preset
+from torchfilm.tuning.tuner import Tuned, tune
 from torchfilm.version import __version__
 
 __all__ = [
+    "BoundaryConditions",
     "Box",
     "Cells",
     "Channel",
     "Circuit",
-    "Course",
+    "Dirichlet",
     "Division",
     "Effect",
-    "Faces",
     "Field",
-    "Fixed",
     "Growth",
+    "GrowthRecording",
     "InputError",
     "LogNormal",
     "Mechanics",

@@ -19,18 +19,18 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 
 # The paper's stages, in its order; an effect says where it belongs.
-RULES, DIVISION, BEFORE_CELLS, NUTRITION, GROWTH, MECHANICS, COVER, CIRCUIT, TRANSPORT, REMOVAL = (
-    10,
-    20,
-    22,
-    25,
-    30,
-    40,
-    45,
-    50,
-    60,
-    90,
-)
+(
+    RULES,
+    DIVISION,
+    BEFORE_CELLS,
+    NUTRITION,
+    GROWTH,
+    MECHANICS,
+    GRID_COVERAGE,
+    CIRCUIT,
+    TRANSPORT,
+    REMOVAL,
+) = (10, 20, 22, 25, 30, 40, 45, 50, 60, 90)
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.
@@ -134,7 +134,9 @@ class Uniform(Distribution):
         for name in ("low", "high"):
             object.__setattr__(self, name, checks.value(f"Uniform.{name}", getattr(self, name)))
         if bool((torch.as_tensor(self.low) > torch.as_tensor(self.high)).any()):
-            raise checks.refuse("Uniform", (self.low, self.high), "low ≤ high", "Swap the two.")
+            raise checks.input_error(
+                "Uniform", (self.low, self.high), "low ≤ high", "Swap the two."
+            )
 
     def draw(self, state: State, rows: Tensor, purpose: str) -> Tensor:
         low, high = draw("low", self.low, state, rows), draw("high", self.high, state, rows)

@@ -1,7 +1,7 @@
 """Grow once, replay for all: where nothing that a design changes acts back on growth or motion, the
 cells' courses are simulated once, and circuits and signals of any number of designs run on them.
 
-    course = tf.Course(scene, streams=range(4))          # grows only as far as it is asked
+    course = tf.GrowthRecording(scene, streams=range(4))          # grows only as far as it is asked
     replay = tf.Replay(designs, course)                   # `designs`: the same scene with other circuits, one value per colony
     state = replay.seed(256, streams=torch.arange(4).repeat(64))
     state = replay.step(state)                            # as designs.step(state, dt) would, without growth and mechanics
@@ -19,8 +19,8 @@ from torchfilm.effect import BUILT_IN
 from torchfilm.scene import Scene, parameters
 from torchfilm.state import CELL, PER_CELL, Births, State
 from torchfilm.tools import checks
+from torchfilm.tools.hashing import digest
 from torchfilm.tools.ragged import expand_ranges, offsets
-from torchfilm.tools.told import digest
 
 FIRST = -1  # the part of what happens before all effects
 
@@ -105,24 +105,24 @@ class Change:
 
 
 @dataclass(frozen=True)
-class CourseReport:
+class GrowthRecordingReport:
     """`status` (B,): 1 where the growth of a colony failed, and `words` by place in the batch."""
 
     status: Tensor
     words: dict[int, str]
-    mend = "Growth and mechanics failed in the recorded course, as they would in a run of their own"
+    hint = "Growth and mechanics failed in the recorded course, as they would in a run of their own"
 
     def reason(self, place: int) -> str:
         return self.words[place]
 
 
-class Course:
+class GrowthRecording:
     """The growth and motion of some colonies of a scene, without what only follows: grown step by
     step as far as it is asked, and kept.
 
     scene: any design of it; streams: courses of random numbers, one colony each; seed, dt (h, by
     default the scene's), dtype and device as in `scene.seed` and `simulate`. cells: a colony that
-    has as many is not grown on, and is empty from the next step; None: all go on. `Course.nbytes`
+    has as many is not grown on, and is empty from the next step; None: all go on. `GrowthRecording.nbytes`
     tells what it holds. Raises InputError where growth depends on what would only follow.
     """
 
@@ -137,11 +137,11 @@ class Course:
         device: str | torch.device = "cpu",
         cells: int | None = None,
     ):
-        self.scene = Course.scene_of(scene)
+        self.scene = GrowthRecording.scene_of(scene)
         self.dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
         self.streams, self.cells = tuple(streams), cells
         if len(set(self.streams)) != len(self.streams):
-            raise checks.refuse("streams", self.streams, "different whole numbers")
+            raise checks.input_error("streams", self.streams, "different whole numbers")
         self.state = self.scene.seed(
             len(self.streams), seed=seed, streams=self.streams, dtype=dtype, device=device
         )
@@ -174,7 +174,7 @@ class Course:
     def made_of(scene: Scene) -> str:
         """A word that is the same for scenes that grow alike, and for no others. Raises InputError
         where the growth cannot be kept."""
-        return _made_of(Course.scene_of(scene))
+        return _made_of(GrowthRecording.scene_of(scene))
 
     @property
     def nbytes(self) -> int:
@@ -273,13 +273,13 @@ class Replay:
     cells ended as is not told (`state.ended` stays empty).
     """
 
-    def __init__(self, scene: Scene, course: Course):
+    def __init__(self, scene: Scene, course: GrowthRecording):
         self.scene, self.course, self.dt = scene, course, course.dt
-        grown = Course.scene_of(scene)
+        grown = GrowthRecording.scene_of(scene)
         if _made_of(grown) != _made_of(course.scene):
             raise checks.InputError(
                 f"this scene does not grow as the course did: {', '.join(grown.listing())} and its"
-                f" founders, instead of {', '.join(course.scene.listing())}. Make a Course of this"
+                f" founders, instead of {', '.join(course.scene.listing())}. Make a GrowthRecording of this"
                 " scene."
             )
         device = course.state.device
@@ -306,7 +306,7 @@ class Replay:
         )
         strange = sorted(set(state.stream.tolist()) - set(self.course.streams))
         if strange:
-            raise checks.refuse(
+            raise checks.input_error(
                 "streams", strange[0], f"of the course: {', '.join(map(str, self.course.streams))}"
             )
         return state
@@ -375,7 +375,9 @@ class Replay:
             return state
         status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
         status[list(words)] = 1
-        return state.replace(reports={**state.reports, "course": CourseReport(status, words)})
+        return state.replace(
+            reports={**state.reports, "course": GrowthRecordingReport(status, words)}
+        )
 
 
 def _made_of(scene: Scene) -> str:

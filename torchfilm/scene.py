@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.cells import Cells
 from torchfilm.effect import BUILT_IN, Effect
+from torchfilm.initial_cells import Cells
 from torchfilm.state import CELL, OUTSIDE, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.hashing import digest, without_addresses
 from torchfilm.tools.timing import Timings
-from torchfilm.tools.told import digest, lasting
 from torchfilm.version import __version__
 
 CPU = torch.device("cpu")
@@ -44,7 +44,7 @@ class Scene:
     ):
         for effect in effects:
             if not isinstance(effect, Effect):
-                raise checks.refuse(
+                raise checks.input_error(
                     "Scene",
                     effect,
                     "made of effects such as Growth(), Division(), Mechanics()",
@@ -96,7 +96,7 @@ class Scene:
         )
         self.founders = founders if founders is not None else Cells.single(self.dim)
         if self.founders.dim != self.dim:
-            raise checks.refuse(
+            raise checks.input_error(
                 "Scene.founders",
                 f"{self.founders.dim}-D cells",
                 f"{self.dim}-D, as the mechanics are",
@@ -111,7 +111,7 @@ class Scene:
 
     def retuned(self, effects: Sequence[Effect], dt: float, accuracy: dict[str, float]) -> Scene:
         """The same scene with its effects, in the order in which they are listed, and its step
-        simulated by other knobs (`torchfilm.accuracy`)."""
+        simulated by other knobs (`torchfilm.tuning.settings`)."""
         scene = Scene(*effects, name=self.name, dt=dt, founders=self.founders, recipe=self.recipe)
         scene.settings, scene.accuracy = self.settings, accuracy
         return scene
@@ -164,16 +164,16 @@ class Scene:
         random numbers, for comparing designs.
         """
         if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < 1:
-            raise checks.refuse(
+            raise checks.input_error(
                 "colonies", colonies, "a whole number from 1", "A batch has at least one colony."
             )
         if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
-            raise checks.refuse("seed", seed, "a whole number from 0")
+            raise checks.input_error("seed", seed, "a whole number from 0")
         if dtype not in (torch.float32, torch.float64):
-            raise checks.refuse("dtype", dtype, "torch.float32 or torch.float64")
+            raise checks.input_error("dtype", dtype, "torch.float32 or torch.float64")
         start = cells if cells is not None else self.founders
         if start.dim != self.dim:
-            raise checks.refuse("cells", f"{start.dim}-D", f"{self.dim}-D, as the scene is")
+            raise checks.input_error("cells", f"{start.dim}-D", f"{self.dim}-D, as the scene is")
         count = max(colonies, start.colonies)
         for path, tensor in self._per_colony():
             if tensor.numel() != count:
@@ -234,7 +234,7 @@ class Scene:
     def check(self, state: State) -> None:
         """Raise InputError if this is not a state of this scene."""
         if state.dim != self.dim:
-            raise checks.refuse("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
+            raise checks.input_error("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
         most = int(state.colony_id.max())
         for path, tensor in self._per_colony():
             if tensor.numel() <= most:
@@ -315,7 +315,7 @@ class Scene:
     def listing(self) -> list[str]:
         """Each effect as it was listed, with the parameters that differ from their defaults; what a
         results file compares by."""
-        return [lasting(summary(effect)) for effect in self.listed]
+        return [without_addresses(summary(effect)) for effect in self.listed]
 
     @property
     def headline(self) -> str:
@@ -334,7 +334,7 @@ class Scene:
 
     def explain(self) -> str:
         """What this scene simulates, in the order in which it acts, and who drives whom.
-        `torchfilm.explain` tells the methods and what they cost."""
+        `torchfilm.explanation` tells the methods and what they cost."""
         lines = [self.headline]
         for effect in self.effects:
             lines.append(f"  {effect.title:<10} {summary(effect)}")
@@ -372,7 +372,7 @@ def _with_given(state: State, wanted: Field) -> State:
     values = state.fields[wanted.name]
     shape = (state.cells, *wanted.shape)
     if wanted.scope != CELL or tuple(values.shape) != shape:
-        raise checks.refuse(
+        raise checks.input_error(
             f"cells column {wanted.name}",
             f"values of shape {tuple(values.shape)}",
             f"left out, or of shape {shape}",
@@ -450,7 +450,7 @@ def _streams(given: Sequence[int] | Tensor | None, colonies: int) -> Tensor | No
         or found.dtype == torch.bool
         or bool(((found < 0) | (found >= 2**32)).any())
     ):
-        raise checks.refuse(
+        raise checks.input_error(
             "streams", given, f"{colonies} whole numbers from 0 to 2³² − 1, one for each colony"
         )
     return found.to(torch.int64)
@@ -460,16 +460,16 @@ def _known_device(device: str | torch.device) -> torch.device:
     try:
         wanted = torch.device(device)
     except (RuntimeError, TypeError) as error:
-        raise checks.refuse("device", device, '"cpu" or "cuda"') from error
+        raise checks.input_error("device", device, '"cpu" or "cuda"') from error
     if wanted.type not in ("cpu", "cuda"):
-        raise checks.refuse(
+        raise checks.input_error(
             "device",
             str(device),
             '"cpu" or "cuda"',
             "Other devices lack the sparse products and float64 that a step needs.",
         )
     if wanted.type == "cuda" and not torch.cuda.is_available():
-        raise checks.refuse(
+        raise checks.input_error(
             "device",
             str(device),
             "a device that this machine has",

@@ -50,7 +50,7 @@ class Field:
         checks.choice(f"Field({self.name!r}).at_division", self.at_division, ("copy", "reset"))
         plain = self.name.removeprefix(OUTSIDE) if self.scope == GRID else self.name
         if not plain.isidentifier() or self.name in RESERVED:
-            raise checks.refuse(
+            raise checks.input_error(
                 "Field.name", self.name, "an identifier that the state does not use itself"
             )
 
@@ -226,7 +226,7 @@ class State:
         """A state with some of its fields replaced; each must have been declared."""
         unknown = set(values) - set(self.declared)
         if unknown:
-            raise checks.refuse(
+            raise checks.input_error(
                 "field",
                 sorted(unknown),
                 f"declared; known are {', '.join(self.declared) or 'none'}",
@@ -250,7 +250,7 @@ class State:
         )  # type: ignore[union-attr]
         start = field.start(declared, torch.arange(rows, device=self.device))
         if start.shape[0] != rows:
-            raise checks.refuse(
+            raise checks.input_error(
                 f"initial value of {field.name}", tuple(start.shape), f"of {rows} rows"
             )
         return declared.with_fields(**{field.name: start})
@@ -291,11 +291,11 @@ class State:
         have in the whole."""
         places = torch.as_tensor(colonies, dtype=torch.int64, device=self.device).reshape(-1)
         if places.numel() == 0 or bool((places < 0).any()) or bool((places >= self.colonies).any()):
-            raise checks.refuse(
+            raise checks.input_error(
                 "colonies", places.tolist(), f"places from 0 to {self.colonies - 1}, at least one"
             )
         if torch.unique(places).numel() != places.numel():
-            raise checks.refuse("colonies", places.tolist(), "different places")
+            raise checks.input_error("colonies", places.tolist(), "different places")
         start = offsets(self.counts)
         counts = self.counts.index_select(0, places)
         owner = torch.repeat_interleave(torch.arange(places.numel(), device=self.device), counts)

@@ -31,7 +31,7 @@ def method_of(given: str | Method) -> Method:
         name for name in ("start", "ask", "tell") if not callable(getattr(given, name, None))
     ]
     if isinstance(given, type) or missing:
-        raise checks.refuse(
+        raise checks.input_error(
             "method",
             given,
             "one of " + ", ".join(map(repr, METHODS)) + ", or an object with start, ask and tell",

@@ -43,11 +43,13 @@ class Batch:
     def __post_init__(self) -> None:
         points = np.array(self.points, dtype=np.float64)
         if points.ndim != 2 or not len(points):
-            raise checks.refuse("Batch.points", points.shape, "of shape (n, D) with n at least 1")
+            raise checks.input_error(
+                "Batch.points", points.shape, "of shape (n, D) with n at least 1"
+            )
         bad = ~((points >= 0) & (points <= 1)).all(1)
         if bad.any():
             row = int(bad.argmax())
-            raise checks.refuse(
+            raise checks.input_error(
                 f"Batch.points[{row}]", points[row].tolist(), "within [0, 1] in every dimension"
             )
         points.setflags(write=False)
@@ -108,7 +110,7 @@ class Turns:
         """Begin, or begin anew. seed: a whole number from 0; replicates: how many the search grows
         of each design."""
         if len(space.levels) != space.size or space.size < 1:
-            raise checks.refuse(
+            raise checks.input_error(
                 "space.levels", space.levels, "one entry for each of at least one dimension"
             )
         self._space = space
@@ -169,7 +171,7 @@ def alike(asked: tuple[int, int, float, int | None], told: Batch, name: str) -> 
     """Refuse a batch of another kind than was asked: (points, dimensions, size, replicates)."""
     given = (*told.points.shape, told.size, told.replicates)
     if given != asked:
-        raise checks.refuse(
+        raise checks.input_error(
             f"{name}.tell: (points, dimensions, size, replicates)",
             given,
             f"{asked}, as asked",
@@ -184,7 +186,7 @@ def same(asked: Batch, told: Batch, name: str) -> None:
     far = (np.abs(asked.points - told.points) > 1e-6).any(1)
     if far.any():
         row = int(far.argmax())
-        raise checks.refuse(
+        raise checks.input_error(
             f"{name}.tell: points[{row}]",
             told.points[row].tolist(),
             f"{asked.points[row].tolist()}, as asked",
@@ -196,13 +198,13 @@ def scores(batch: Batch, loss: Any) -> np.ndarray:
     """The losses of a batch, (n,) float64, finite."""
     out = np.array(loss, dtype=np.float64)
     if out.shape != (len(batch.points),):
-        raise checks.refuse(
+        raise checks.input_error(
             "loss of shape", out.shape, f"({len(batch.points)},), one number for each point"
         )
     bad = ~np.isfinite(out)
     if bad.any():
         row = int(bad.argmax())
-        raise checks.refuse(
+        raise checks.input_error(
             f"loss[{row}]",
             float(out[row]),
             "finite",
@@ -242,7 +244,7 @@ def sobol(space: Dimensions, seed: int, at: int, count: int) -> np.ndarray:
 def whole(name: str, value: object, *, least: int) -> int:
     """A whole number from `least`."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise checks.refuse(name, value, f"a whole number from {least}")
+        raise checks.input_error(name, value, f"a whole number from {least}")
     return int(value)
 
 

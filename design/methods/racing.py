@@ -51,7 +51,7 @@ class Racing(Turns):
         if isinstance(self.inner, type) or not all(
             hasattr(type(self.inner), name) for name in ("wanted", "fresh", "draw", "take")
         ):
-            raise checks.refuse(
+            raise checks.input_error(
                 "Racing.inner",
                 self.inner,
                 "a method whose points can be sieved, such as CMAES() or Sobol()",
@@ -63,7 +63,7 @@ class Racing(Turns):
             or self.sizes[-1] != 1
             or any(a >= b for a, b in zip(self.sizes, self.sizes[1:], strict=False))
         ):
-            raise checks.refuse(
+            raise checks.input_error(
                 "Racing.sizes",
                 self.sizes,
                 "two or more rising shares above 0, the last of them 1, such as (0.25, 1)",

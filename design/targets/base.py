@@ -77,8 +77,8 @@ def require(state: tf.State, names: tuple[str, ...]) -> None:
     for name in names:
         if name not in there:
             near = difflib.get_close_matches(name, there, 1, cutoff=0.5)
-            mend = f"Did you mean {near[0]!r}?" if near else ""
-            raise checks.refuse(
+            hint = f"Did you mean {near[0]!r}?" if near else ""
+            raise checks.input_error(
                 "species",
                 name,
                 (
@@ -86,7 +86,7 @@ def require(state: tf.State, names: tuple[str, ...]) -> None:
                     if there
                     else "a species of a Circuit; the scene has none"
                 ),
-                mend,
+                hint,
             )
 
 
@@ -101,7 +101,7 @@ def levels(state: tf.State, name: str) -> Tensor:
     return contact.found[name.removeprefix(OUTSIDE)]
 
 
-def seen(state: tf.State, names: tuple[str, ...]) -> tuple[Tensor, Tensor]:
+def valid_levels(state: tf.State, names: tuple[str, ...]) -> tuple[Tensor, Tensor]:
     """Levels of several species, (N, k) float64, none below 0, and which colonies can be scored,
     (B,) bool: those with cells, all of whose levels are finite.
 
@@ -136,7 +136,7 @@ def ratio(above: Tensor, below: Tensor, otherwise: float) -> Tensor:
 def species_name(name: str, given: object) -> None:
     """Raises `tf.InputError` unless this may be the name of a species or signal."""
     if not isinstance(given, str) or not given.removeprefix(OUTSIDE).isidentifier():
-        raise checks.refuse(
+        raise checks.input_error(
             name, given, 'the name of a species, such as "yfp", or of a signal, such as "out.ahl"'
         )
 
@@ -150,9 +150,9 @@ def species_names(name: str, given: object, count: int | None = None) -> tuple[s
         or not given
         or (count is not None and len(given) != count)
     ):
-        raise checks.refuse(name, given, wanted, 'Write ("cfp", "yfp").')
+        raise checks.input_error(name, given, wanted, 'Write ("cfp", "yfp").')
     for one in given:
         species_name(name, one)
     if len(set(given)) != len(given):
-        raise checks.refuse(name, given, wanted)
+        raise checks.input_error(name, given, wanted)
     return tuple(given)

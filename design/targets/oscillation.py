@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import Target, ratio, require, seen, species_name, total, weights
+from design.targets.base import Target, ratio, require, species_name, total, valid_levels, weights
 from design.targets.patterns import FOUND, WANTED
 from torchfilm import checks
 
@@ -65,7 +65,7 @@ class Oscillation(Target):
     def note(self, state: tf.State) -> Tensor:
         """Time, mean and mean square over the cells' volume, (B, 3) float64; NaN for a colony that
         cannot be scored."""
-        y, sound = seen(state, (self.species,))
+        y, sound = valid_levels(state, (self.species,))
         w = weights(state).unsqueeze(1)
         sums = total(state, torch.cat([w, w * y, w * y * y], 1))
         means = ratio(sums[:, 1:], sums[:, :1], 0.0)
@@ -73,7 +73,7 @@ class Oscillation(Target):
         return torch.where(sound.unsqueeze(1), kept, math.nan)
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        _, sound = seen(state, (self.species,))
+        _, sound = valid_levels(state, (self.species,))
         window = self._window(history)
         explained = _explained(
             window, torch.tensor([1.0 / self.period], dtype=torch.float64, device=state.device)
@@ -85,10 +85,10 @@ class Oscillation(Target):
         )
         return torch.where(sound, (1.0 - share).clamp(min=0.0), self.failed)
 
-    def _window(self, history: Tensor | None) -> _Window:
+    def _window(self, history: Tensor | None) -> _Samples:
         if history is None or history.dim() != 3 or history.shape[2] != 3 or not len(history):
             shape = None if history is None else tuple(history.shape)
-            raise checks.refuse(
+            raise checks.input_error(
                 "history",
                 shape,
                 "(T, B, 3), the notes after every step",
@@ -109,7 +109,7 @@ class Oscillation(Target):
         average = _sum(used * mean) / n
         swing = used * (mean - average)
         spread = _sum(used * (square - mean * mean).clamp(min=0.0)) / n
-        return _Window(
+        return _Samples(
             time - torch.where(count > 0, last, 0.0),
             used,
             swing,
@@ -188,7 +188,7 @@ class Oscillation(Target):
 
 
 @dataclass(frozen=True)
-class _Window:
+class _Samples:
     """The samples used: time from the last one and `used`, 1 or 0, and swing of the mean about its
     average, (T, B) each; for each colony, (B,): `n` samples over `length` h, whether that is `long`
     enough, the mean square of the swing, that of the cells about their mean, and that of their
@@ -206,7 +206,7 @@ class _Window:
     level: Tensor
 
 
-def _explained(window: _Window, frequency: Tensor) -> Tensor:
+def _explained(window: _Samples, frequency: Tensor) -> Tensor:
     """The mean square of the swing that a wave of each frequency (F,) 1/h fits, by least squares
     with a constant, (B, F)."""
     used, n = window.used.unsqueeze(2), window.n.unsqueeze(1)

@@ -14,10 +14,10 @@ from design.targets.base import (
     Target,
     ratio,
     require,
-    seen,
     species_name,
     species_names,
     total,
+    valid_levels,
     weights,
 )
 from torchfilm import checks
@@ -63,7 +63,7 @@ class DomainSize(Target):
         require(state, self.species)
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        _, sound = seen(state, self.species)
+        _, sound = valid_levels(state, self.species)
         unlike, distance, _ = self._pairs(state)
         # clamped, the logarithm stays finite and its loss is 1 to the last bit, with zero gradient
         log = torch.log(
@@ -75,7 +75,7 @@ class DomainSize(Target):
     def _pairs(self, state: tf.State) -> tuple[Tensor, Tensor, Tensor]:
         """Share of unlike neighbours, mean centre distance (0 without neighbours, µm) and number of
         pairs, of each colony: (B,) float64 each."""
-        a, b = seen(state, self.species)[0].unbind(1)
+        a, b = valid_levels(state, self.species)[0].unbind(1)
         z = ratio(a - b, a + b, 0.0)
         i, j, apart = tf.measure.neighbours(state, GAP)
         colony = state.colony.index_select(0, i)
@@ -143,7 +143,7 @@ class OnFraction(Target):
         species_name("OnFraction.species", self.species)
         checks.number("OnFraction.fraction", self.fraction, above=0.0)
         if self.fraction >= 1:
-            raise checks.refuse(
+            raise checks.input_error(
                 "OnFraction.fraction",
                 self.fraction,
                 "above 0 and below 1",
@@ -159,7 +159,7 @@ class OnFraction(Target):
         require(state, (self.species,))
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        y, sound = seen(state, (self.species,))
+        y, sound = valid_levels(state, (self.species,))
         square = (y[:, 0] / self.level).clamp(max=BRIGHTEST) ** 2
         on = square * square / (1.0 + square * square)
         w = weights(state)
@@ -174,7 +174,7 @@ class OnFraction(Target):
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """on_share: share of the volume above the level; on_level and off_level: mean level of the
         cells above and of the others."""
-        y, w = seen(state, (self.species,))[0][:, 0], weights(state)
+        y, w = valid_levels(state, (self.species,))[0][:, 0], weights(state)
         on = (y > self.level).double()
         parts = total(
             state, torch.stack([w, w * on, w * on * y, w * (1 - on), w * (1 - on) * y], 1)

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import ratio, seen, species_name, total, weights
-from design.targets.masks import COLOURS, Mask, between, common, half, lines
+from design.targets.base import ratio, species_name, total, valid_levels, weights
+from design.targets.profiles import COLOURS, ProfileTarget, between, common, half, lines
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ FEWEST = 3  # cells, for a mean over a strip to count
 
 
 @dataclass(frozen=True)
-class Stripe(Mask):
+class Stripe(ProfileTarget):
     """A stripe across the colony: the species is wanted within `width` µm, and dark beyond.
 
     at: "border", the border between the two populations (cell types) of the colony, or a number,
@@ -36,7 +36,7 @@ class Stripe(Mask):
     wrong side. along: "x" or "y", the axis that the stripe lies across. cell_type: only cells of
     this type count. place: of the stripe's middle from `at`, µm towards the type that lies higher
     on the axis. By default 0; with "border" and a cell_type, the stripe adjoins the border on the
-    side of that type. floor: level from which a cell counts as lit. soft: µm, how soft the edges
+    side of that type. floor: level from which a cell counts as lit. edge_width: µm, how soft the edges
     are. A colony that has lost one of its two types has no border, and loss 1.
     """
 
@@ -48,7 +48,7 @@ class Stripe(Mask):
     along: str = "x"
     cell_type: int | None = None
     floor: float = 0.0
-    soft: float = 1.0
+    edge_width: float = 1.0
     straight: bool = False
 
     def __post_init__(self) -> None:
@@ -56,7 +56,7 @@ class Stripe(Mask):
         if isinstance(self.at, str):
             checks.choice("Stripe.at", self.at, ("border",))
         else:
-            checks.number("Stripe.at", self.at, mend='Give a place in µm, or "border".')
+            checks.number("Stripe.at", self.at, hint='Give a place in µm, or "border".')
         checks.number("Stripe.width", self.width, above=0.0)
         if self.place is not None:
             checks.number("Stripe.place", self.place)
@@ -66,11 +66,11 @@ class Stripe(Mask):
             or not isinstance(self.cell_type, int)
             or self.cell_type < 0
         ):
-            raise checks.refuse(
+            raise checks.input_error(
                 "Stripe.cell_type", self.cell_type, "a whole number from 0, or None for all cells"
             )
         checks.choice("Stripe.straight", self.straight, (True, False))
-        common("Stripe", self.floor, self.soft)
+        common("Stripe", self.floor, self.edge_width)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,13 +88,13 @@ class Stripe(Mask):
         for k in range(state.colonies):
             there = torch.unique(state.cell_type[state.colony == k]).tolist()
             if self.at == "border" and len(there) != 2:
-                mend = "Found the colonies with two, or give at= a place in µm."
+                hint = "Found the colonies with two, or give at= a place in µm."
                 raise tf.InputError(
                     'Stripe(at="border"): a border needs exactly two types of cells, and colony'
-                    f" {k} has {there}. {mend}"
+                    f" {k} has {there}. {hint}"
                 )
             if self.cell_type is not None and self.cell_type not in there:
-                raise checks.refuse(
+                raise checks.input_error(
                     "Stripe.cell_type",
                     self.cell_type,
                     f"a type in every colony; colony {k} has {there}",
@@ -107,7 +107,7 @@ class Stripe(Mask):
 
     @property
     def least(self) -> float:
-        return half(self.width, self.soft)
+        return half(self.width, self.edge_width)
 
     @property
     def winds(self) -> bool:
@@ -140,14 +140,14 @@ class Stripe(Mask):
             ),
         )
 
-    def wanted(self, state: tf.State) -> Tensor:
+    def target_profile(self, state: tf.State) -> Tensor:
         _, middle, distance = self.reference(state)
         x = distance - middle.index_select(0, state.colony)
         low, high = -0.5 * self.width, 0.5 * self.width
         if self.winds and self.place is None and self.cell_type is not None:
             # towards the border there is nothing but the border
             low, x = -math.inf, torch.where(middle.index_select(0, state.colony) < 0, -x, x)
-        return torch.nan_to_num(between(x, low, high, self.soft)).unsqueeze(1)
+        return torch.nan_to_num(between(x, low, high, self.edge_width)).unsqueeze(1)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
@@ -160,7 +160,7 @@ class Stripe(Mask):
         strips of 4 µm across, the middle of the cells at least half as bright as the peak is from a
         straight line.
         """
-        y, (_, middle, x) = seen(state, self.names)[0][:, 0], self.reference(state)
+        y, (_, middle, x) = valid_levels(state, self.names)[0][:, 0], self.reference(state)
         # without a border there is no place: such colonies' cells are left out, and their measures
         # are NaN
         w = torch.where(self.counted(state) & torch.isfinite(x), weights(state), 0.0)
@@ -194,7 +194,11 @@ class Stripe(Mask):
         """The edges of the stripe and the border as lines or, where it winds, a dot on each cell
         that is wanted lit."""
         if self.winds:
-            mine = (state.colony == place) & self.counted(state) & (self.wanted(state)[:, 0] > 0.5)
+            mine = (
+                (state.colony == place)
+                & self.counted(state)
+                & (self.target_profile(state)[:, 0] > 0.5)
+            )
             x, y = state.position[mine, :2].cpu().numpy().T
             ax.plot(x, y, ".", color=COLOURS[0], ms=3)
             return

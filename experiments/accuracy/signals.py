@@ -326,7 +326,7 @@ def in_space(name: str, words: str, diffusion: float, speed: float, quick: bool)
             diffusion=diffusion,
             velocity=(speed, 0.0, 0.0) if speed else None,
             dtype=torch.float64,
-            faces=tf.Faces(tf.Open(), tf.Open()) if speed else None,
+            boundary=tf.BoundaryConditions(tf.Open(), tf.Open()) if speed else None,
         )
         u = torch.tensor(first).reshape(1, n, n, 1)
         for method, dt in (

@@ -234,7 +234,7 @@ def detector(splitting: str, rtol: float) -> tf.Scene:
                 **effect.signals,
                 box=box,
                 spacing=spacing,
-                beyond=effect.beyond,
+                outside=effect.outside,
                 grows=effect.grows,
                 splitting=splitting,
             )

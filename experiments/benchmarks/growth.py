@@ -27,7 +27,7 @@ import torch
 from record import machine
 
 import torchfilm as tf
-from torchfilm.physics.rows import ContactRows
+from torchfilm.physics.jacobian import ContactJacobian
 
 CASES = {
     "2d-3000": (2, 1, 3000), "2d-10000": (2, 1, 10000), "2d-32000": (2, 1, 32000),
@@ -57,7 +57,7 @@ class RowCounter:
 
     def __init__(self) -> None:
         self.bytes, self.products = 0, 0
-        self._apply, self._transpose = ContactRows.apply, ContactRows.apply_transpose
+        self._apply, self._transpose = ContactJacobian.apply, ContactJacobian.apply_transpose
 
     def __enter__(self) -> RowCounter:
         def counted(method):
@@ -68,14 +68,14 @@ class RowCounter:
 
             return call
 
-        ContactRows.apply, ContactRows.apply_transpose = (
+        ContactJacobian.apply, ContactJacobian.apply_transpose = (
             counted(self._apply),
             counted(self._transpose),
         )
         return self
 
     def __exit__(self, *_: object) -> None:
-        ContactRows.apply, ContactRows.apply_transpose = self._apply, self._transpose
+        ContactJacobian.apply, ContactJacobian.apply_transpose = self._apply, self._transpose
 
 
 def copy_speed(device: str) -> float:

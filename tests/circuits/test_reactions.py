@@ -1,4 +1,4 @@
-"""Reactions, parts and networks: what they say, what they refuse, and their rates against the
+"""Reactions, parts and networks: what they say, what they input_error, and their rates against the
 formulas written out."""
 
 from __future__ import annotations
@@ -213,15 +213,15 @@ def test_propensities_count_combinations(device, dtype):
     )
     cell = Names(("volume",), [volume], "cell")
     p = Names(("k",), [0.4], "p")
-    a = array(net.propensities(counts, p, cell, copies=10.0, pool=pool))
+    a = array(net.propensities(counts, p, cell, molecules_per_unit=10.0, pool=pool))
     assert a.shape == (3, 4)
     assert a[:, 0] == pytest.approx([0.5 * 5 * 4 / 20, 0, 0], rel=1e-6)
     assert a[:, 1] == pytest.approx([60, 90, 30], rel=1e-6)
     assert a[:, 2] == pytest.approx([0.4 * 20 * 3 / 100, 0, 0], rel=1e-6)
     assert a[:, 3] == pytest.approx([2 * 2 * 0.25 / (0.7 + 0.25), 0, 0], rel=1e-6)
     assert torch.equal(
-        net.propensities(counts, p, cell, copies=10.0, pool=pool.unsqueeze(1)),
-        net.propensities(counts, p, cell, copies=10.0, pool=pool),
+        net.propensities(counts, p, cell, molecules_per_unit=10.0, pool=pool.unsqueeze(1)),
+        net.propensities(counts, p, cell, molecules_per_unit=10.0, pool=pool),
     )
     with pytest.raises(tf.InputError, match="pool"):
         net.propensities(counts, p, cell)
@@ -241,7 +241,7 @@ def test_both_ways_of_running_agree():
         ],
         ["a", "b"],
     )
-    none, cells, copies = Names((), ()), 300, 300.0
+    none, cells, molecules_per_unit = Names((), ()), 300, 300.0
     cell = lambda n: Names(("volume",), [torch.full((n,), 1.0, dtype=torch.float64)])
 
     def smooth(u, rows):
@@ -255,11 +255,13 @@ def test_both_ways_of_running_agree():
     draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
     counts, report = direct(
         torch.zeros(cells, 2, dtype=torch.float64),
-        lambda n, rows: net.propensities(n, none, cell(len(rows)), copies=copies),
+        lambda n, rows: net.propensities(
+            n, none, cell(len(rows)), molecules_per_unit=molecules_per_unit
+        ),
         net.stoichiometry,
         1.0,
         draw,
     )
     assert (report.status == DONE).all()
     # a mass action rate k c² takes two molecules an event: d[a]/dt = −2 k [a]²
-    assert array(counts.mean(0)) / copies == pytest.approx(array(u)[0], rel=0.01)
+    assert array(counts.mean(0)) / molecules_per_unit == pytest.approx(array(u)[0], rel=0.01)

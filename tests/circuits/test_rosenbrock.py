@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from torchfilm.circuits import kinetics, linear
 from torchfilm.circuits.rosenbrock import BELOW_ZERO, DONE, NOT_FINITE, TOO_MANY_STEPS, rosenbrock
-from torchfilm.tools.powers import steady_functions
+from torchfilm.tools.deterministic_math import deterministic_functions
 
 F64 = torch.float64
 
@@ -50,7 +50,7 @@ def lux(u, rows):
 def ring(u, rows):
     """Six species, each activated by the one before; written as a user would, with a broken
     power."""
-    with steady_functions():
+    with deterministic_functions():
         x = u.unbind(1)
         return torch.stack(
             [0.1 + x[i - 1] ** 1.7 / (0.5 + x[i - 1] ** 1.7) - x[i] for i in range(len(x))], 1

@@ -27,7 +27,7 @@ def circuit(
     *,
     pool=(8.0, 16.0, 4.0),
     signals=(1.0, 0.0, 2.0),
-    beyond=None,
+    in_reservoir=None,
     given=("a",),
     rows=(0, 1, 2),
     dtype=F64,
@@ -44,13 +44,20 @@ def circuit(
         {"D1": torch.tensor(D1, dtype=dtype)},
         {"a": torch.tensor(signals, dtype=dtype)},
         torch.tensor(pool, dtype=dtype),
-        None if beyond is None else torch.tensor(beyond),
+        None if in_reservoir is None else torch.tensor(in_reservoir),
     )
 
 
 def settings(method: str = "rosenbrock", **given) -> run.Settings:
     return run.Settings(
-        **{"method": method, "steps": 200, "rtol": 1e-9, "atol": 1e-12, "copies": 1.0, **given}
+        **{
+            "method": method,
+            "steps": 200,
+            "rtol": 1e-9,
+            "atol": 1e-12,
+            "molecules_per_unit": 1.0,
+            **given,
+        }
     )
 
 
@@ -67,7 +74,7 @@ def test_what_cells_lose_their_pools_gain(method):
     )
     assert (
         torch.equal(found.concentrations[:, 1], start[:, 1])
-        and found.beyond == {}
+        and found.reservoir == {}
         and not bool(found.failed.any())
     )
     # d/dt (u − s) = −D1 (1/V + 1/pool)(u − s)
@@ -89,17 +96,17 @@ def test_only_the_rows_asked_for_in_their_order():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_reservoir_does_not_change_and_what_it_got_is_told(method):
-    made = circuit(beyond=(True, False, True))
+    made = circuit(in_reservoir=(True, False, True))
     start = torch.tensor([[5.0, 0.0], [5.0, 0.0], [0.0, 0.0]], dtype=F64)
     found = run.step(made, start, 0.2, settings(method))
     lost = (start[:, 0] - found.concentrations[:, 0]) * made.cell["volume"]
     assert torch.allclose(
-        found.beyond["a"],
+        found.reservoir["a"],
         torch.stack([lost[0], lost.new_zeros(()), lost[2]]),
         rtol=1e-9,
         atol=1e-12,
     )
-    assert found.beyond["a"][2] < 0 < found.beyond["a"][0]
+    assert found.reservoir["a"][2] < 0 < found.reservoir["a"][0]
     assert torch.allclose(
         found.pools["a"],
         torch.stack([lost.new_zeros(()), lost[1], lost.new_zeros(())]),

@@ -94,10 +94,12 @@ class Level(Target):
 
     def check(self, state):
         if self.species not in state.fields:
-            raise tf.checks.refuse("species", self.species, "one of " + ", ".join(state.fields))
+            raise tf.checks.input_error(
+                "species", self.species, "one of " + ", ".join(state.fields)
+            )
 
     def loss(self, state, history=None):
-        return (mean(state, self.species) - self.wanted).abs()
+        return (mean(state, self.species) - self.target_profile).abs()
 
     def measures(self, state, history=None):
         return {"mean_level": mean(state, self.species)}

@@ -27,8 +27,8 @@ from searching import (
 )
 
 import torchfilm as tf
-from design import Choice, Objective, Parameter, Stripe, Target, colonies, courses
-from design.colonies import Done
+from design import Choice, Objective, Parameter, Stripe, Target, growth_cache, rollout
+from design.rollout import FinishedColonies
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 PACED = [Parameter("rate", 1.2, 2.4), Parameter("make", 1, 2)]
@@ -133,10 +133,10 @@ def test_the_quick_do_not_grow_on_while_a_slow_replicate_is_waited_for():
         Objective(uneven, parameter, Level(), cells=10, replicates=2, seed=2, replay=r)
         for r in (True, False)
     )
-    courses._kept.clear()
+    growth_cache._kept.clear()
     found, points = kept.evaluate(np.array([[0.0], [0.5]])), np.array([[0.0], [0.5]])
     alike(found, anew.evaluate(points))
-    (course,) = courses._kept.values()
+    (course,) = growth_cache._kept.values()
     # one takes more than twice as long as the other, which without an end of its own would have 128
     # cells by then
     assert len(course.steps) == 24 and int(course.state.counts.max()) < 2 * 10
@@ -328,7 +328,7 @@ def test_a_loss_of_the_wrong_shape_is_no_failure_of_the_design():
 
 
 def test_a_colony_that_does_not_grow_is_given_up_and_its_neighbours_are_not(monkeypatch):
-    monkeypatch.setattr(colonies, "PATIENCE", 6.0)
+    monkeypatch.setattr(rollout, "PATIENCE", 6.0)
     made = Objective(paced, [Parameter("rate", 0.0, 1.0)], Level(), cells=8, replicates=2)
     found = made.evaluate(np.array([[0.0], [1.0]]))
     assert found.reasons == {
@@ -345,8 +345,8 @@ def test_patience_is_longer_than_slow_cells_need(rate):
     steps = np.arange(0, 90, 1.0)
     state = tf.Scene(tf.Growth(rate=rate)).seed(1)
     most, since = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.float64)
-    assert not any(bool(colonies._stuck(state.replace(time=t), most, since).any()) for t in steps)
-    assert bool(colonies._stuck(state.replace(time=100.1), most, since).all())
+    assert not any(bool(rollout._stuck(state.replace(time=t), most, since).any()) for t in steps)
+    assert bool(rollout._stuck(state.replace(time=100.1), most, since).all())
 
 
 def test_a_colony_without_cells_fails():
@@ -543,7 +543,7 @@ def test_other_errors_and_one_design_that_does_not_fit_pass_through(monkeypatch,
 def test_colonies_at_their_ends_are_those_that_were_scored():
     made = objective()
     done = made.final(spots(1, 2)[0])
-    assert all(isinstance(d, Done) for d in done)
+    assert all(isinstance(d, FinishedColonies) for d in done)
     found = {
         int(s): float(x)
         for d in done
@@ -558,7 +558,7 @@ def resting(make=1.0):
 
 
 def test_where_the_end_is_a_time_it_comes_also_to_cells_that_rest(monkeypatch):
-    monkeypatch.setattr("design.colonies.PATIENCE", 1.0)
+    monkeypatch.setattr("design.rollout.PATIENCE", 1.0)
     found = Objective(
         resting, [Parameter("make", 0.5, 2.0)], Level(), until=5.0, replicates=1
     ).evaluate(np.array([[0.5]]))

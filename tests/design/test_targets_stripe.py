@@ -107,12 +107,12 @@ def test_a_stripe_of_one_type_adjoins_the_border_on_its_side(turned, low):
     state = field(shift=5.0, turned=turned, low=low)
     along = "y" if turned else "x"
     x = state.position[:, int(turned)] - 5.0
-    far = Stripe("yfp", straight=True, width=6.0, along=along, cell_type=1 - low, soft=SHARP)
-    assert torch.equal(far.wanted(state)[:, 0], ((x > 0) & (x < 6)).double())
+    far = Stripe("yfp", straight=True, width=6.0, along=along, cell_type=1 - low, edge_width=SHARP)
+    assert torch.equal(far.target_profile(state)[:, 0], ((x > 0) & (x < 6)).double())
     # 6 columns at 8 and 14 at 1/8: 1 − (6·8)²/(6 · (6·64 + 14/64))
     assert float(far.loss(state)) == pytest.approx(1 - 48**2 / (6 * (6 * 64 + 14 / 64)), rel=1e-9)
-    near = Stripe("yfp", straight=True, width=6.0, along=along, cell_type=low, soft=SHARP)
-    assert torch.equal(near.wanted(state)[:, 0], ((x > -6) & (x < 0)).double())
+    near = Stripe("yfp", straight=True, width=6.0, along=along, cell_type=low, edge_width=SHARP)
+    assert torch.equal(near.target_profile(state)[:, 0], ((x > -6) & (x < 0)).double())
     # all 20 columns evenly lit
     assert float(near.loss(state)) == pytest.approx(1 - 6 / 20, rel=1e-9)
 
@@ -132,7 +132,9 @@ def test_where_the_stripe_is(options, low, high):
     state = field(shift=5.0)
     x = state.position[:, 0] - 5.0
     assert torch.equal(
-        Stripe("yfp", straight=True, width=6.0, soft=SHARP, **options).wanted(state)[:, 0],
+        Stripe("yfp", straight=True, width=6.0, edge_width=SHARP, **options).target_profile(state)[
+            :, 0
+        ],
         ((x > low) & (x < high)).double(),
     )
 
@@ -290,16 +292,16 @@ def test_a_stripe_follows_a_border_that_winds(kind):
     state, places, kinds = winding()
     apart = (places.unsqueeze(1) - places).double().square().sum(2).sqrt()
     nearest = torch.where(kinds.unsqueeze(1) != kinds, apart, torch.inf).amin(1) - 1.0
-    target = Stripe("yfp", width=4.0, cell_type=kind, soft=SHARP)
+    target = Stripe("yfp", width=4.0, cell_type=kind, edge_width=SHARP)
     mine = kinds == kind
-    assert torch.equal(target.wanted(state)[mine, 0], (nearest < 4.0).double()[mine])
+    assert torch.equal(target.target_profile(state)[mine, 0], (nearest < 4.0).double()[mine])
     assert float(target.loss(state)) == pytest.approx(
         1 - float((nearest < 4.0)[mine].double().mean()), rel=1e-9
     )
-    both = Stripe("yfp", width=4.0, soft=SHARP)
-    assert torch.equal(both.wanted(state)[:, 0], (nearest < 2.0).double())
-    straight = Stripe("yfp", width=4.0, cell_type=kind, soft=SHARP, straight=True)
-    assert not torch.equal(straight.wanted(state)[mine], target.wanted(state)[mine])
+    both = Stripe("yfp", width=4.0, edge_width=SHARP)
+    assert torch.equal(both.target_profile(state)[:, 0], (nearest < 2.0).double())
+    straight = Stripe("yfp", width=4.0, cell_type=kind, edge_width=SHARP, straight=True)
+    assert not torch.equal(straight.target_profile(state)[mine], target.target_profile(state)[mine])
 
 
 def test_a_stripe_that_winds_is_the_same_in_any_batch():

@@ -61,7 +61,7 @@ AT_ONCE = {
     "steps": (bad(idle, method="rk4", steps=0), r"Circuit\.steps = 0"),
     "rtol": (bad(idle, rtol=0.0), r"Circuit\.rtol"),
     "atol": (bad(idle, atol=-1.0), r"Circuit\.atol"),
-    "copies": (bad(idle, copies=0.0), r"Circuit\.copies"),
+    "molecules_per_unit": (bad(idle, molecules_per_unit=0.0), r"Circuit\.molecules_per_unit"),
     "a misspelt option": (bad(idle, metod="rk4"), r"Circuit\.metod = 'rk4'"),
     "a parameter that is no number": (bad(made, k="fast", g=1.0), r"Circuit\.k = 'fast'"),
     "a parameter that is not finite": (
@@ -206,8 +206,8 @@ def test_reactions_are_checked_before_anything_runs(case):
 
 @pytest.mark.parametrize(
     "option",
-    [{"k": [1.0, 2.0]}, {"initial": {"m": [1.0, 2.0]}}, {"copies": [1.0, 2.0]}],
-    ids=["parameter", "initial", "copies"],
+    [{"k": [1.0, 2.0]}, {"initial": {"m": [1.0, 2.0]}}, {"molecules_per_unit": [1.0, 2.0]}],
+    ids=["parameter", "initial", "molecules_per_unit"],
 )
 def test_a_value_per_colony_must_have_one_for_each(option):
     scene = resting(tf.Circuit(made, species=("m",), **{"k": 1.0, "g": 1.0, **option}))

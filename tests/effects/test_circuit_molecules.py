@@ -19,14 +19,14 @@ BIRTH_DEATH = [tf.parts.constitutive("m", "make"), tf.parts.degradation("m", "lo
 INERT = [tf.Reaction.of("m -> w", rate=0.0)]
 
 
-def molecules(state: tf.State, name: str = "m", copies: float = 1.0) -> torch.Tensor:
-    return state.fields[name].double() * state.volume.double() * copies
+def molecules(state: tf.State, name: str = "m", molecules_per_unit: float = 1.0) -> torch.Tensor:
+    return state.fields[name].double() * state.volume.double() * molecules_per_unit
 
 
-def assert_whole(state: tf.State, name: str = "m", copies: float = 1.0) -> None:
+def assert_whole(state: tf.State, name: str = "m", molecules_per_unit: float = 1.0) -> None:
     """A concentration is a number of molecules over a volume, each rounded once: eps of the
     number."""
-    n = molecules(state, name, copies)
+    n = molecules(state, name, molecules_per_unit)
     assert (
         float(((n - n.round()).abs() / n.clamp(min=1.0)).max()) <= 4 * torch.finfo(state.dtype).eps
     )
@@ -57,14 +57,14 @@ def test_numbers_stay_whole_through_growth_and_division(method, dtype, device):
             species=("m",),
             initial={"m": 3.0},
             method=method,
-            copies=2.5,
+            molecules_per_unit=2.5,
             make=8.0,
             lose=1.0,
         ),
     )
     state = scene.seed(2, dtype=dtype, device=device)
     for _ in range(20):
-        assert_whole(state, copies=2.5)
+        assert_whole(state, molecules_per_unit=2.5)
         state = advance(scene, state, 1)
     assert int(state.counts.min()) >= 4 and torch.unique(state.m).numel() > 4
 
@@ -83,17 +83,23 @@ def test_first_numbers_are_whole_and_right_in_the_mean():
     assert float(n.mean()) == pytest.approx(2.3, abs=5 * math.sqrt(0.21 / 4000))
 
 
-@pytest.mark.parametrize("copies", [1.0, [0.5, 4.0]])
-def test_copies_make_molecules_of_concentrations(copies):
+@pytest.mark.parametrize("molecules_per_unit", [1.0, [0.5, 4.0]])
+def test_copies_make_molecules_of_concentrations(molecules_per_unit):
     scene = tf.Scene(
-        tf.Circuit(INERT, species=("m", "w"), initial={"m": 10.0}, method="direct", copies=copies),
+        tf.Circuit(
+            INERT,
+            species=("m", "w"),
+            initial={"m": 10.0},
+            method="direct",
+            molecules_per_unit=molecules_per_unit,
+        ),
         founders=side_by_side(50),
     )
     state = advance(scene, scene.seed(2), 1)
-    for k, each in enumerate((1.0, 1.0) if copies == 1.0 else copies):
+    for k, each in enumerate((1.0, 1.0) if molecules_per_unit == 1.0 else molecules_per_unit):
         one = state.select([k])
-        assert_whole(one, copies=each)
-        assert float(molecules(one, copies=each).mean()) == pytest.approx(
+        assert_whole(one, molecules_per_unit=each)
+        assert float(molecules(one, molecules_per_unit=each).mean()) == pytest.approx(
             10 * each * math.pi * 0.25 * (2 + 2 / 3), rel=0.03
         )
 
@@ -196,16 +202,16 @@ def test_birth_and_death_under_dilution(method):
 
 
 def test_noise_and_no_noise_agree_where_molecules_are_many():
-    """10⁵ copies: the smooth circuit to within 5 standard deviations of √n in n, and the leap's
+    """10⁵ molecules_per_unit: the smooth circuit to within 5 standard deviations of √n in n, and the leap's
     0.03²."""
     ends = []
-    for method, copies in (("tau_leap", 1e5), ("rosenbrock", 1.0)):
+    for method, molecules_per_unit in (("tau_leap", 1e5), ("rosenbrock", 1.0)):
         circuit = tf.Circuit(
             BIRTH_DEATH,
             species=("m",),
             initial={"m": 1.0},
             method=method,
-            copies=copies,
+            molecules_per_unit=molecules_per_unit,
             make=3.0,
             lose=1.0,
             rtol=1e-6,
@@ -221,24 +227,24 @@ BOX = {"box": ((-8.0, -8.0), (8.0, 8.0)), "spacing": 4.0}
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("beyond", ["error", "open"])
-def test_molecules_through_the_membrane_are_conserved(method, beyond, dtype):
+@pytest.mark.parametrize("outside", ["error", "reservoir"])
+def test_molecules_through_the_membrane_are_conserved(method, outside, dtype):
     """What leaves a cell is in the medium or beyond: 10 steps, each rounding some ten sums."""
     circuit = tf.Circuit(
         [tf.parts.exchange("a", "D1")],
         species=("a",),
         initial={"a": 8.0},
         method=method,
-        copies=2.0,
+        molecules_per_unit=2.0,
         D1=1.0,
     )
     scene = tf.Scene(
         circuit,
-        tf.Medium(a=tf.Signal(diffusion=5.0, initial=0.5, beyond=1.0), beyond=beyond, **BOX),
+        tf.Medium(a=tf.Signal(diffusion=5.0, initial=0.5, reservoir=1.0), outside=outside, **BOX),
         founders=side_by_side(3),
     )
     state = scene.seed(2, dtype=dtype)
-    if beyond == "open":
+    if outside == "reservoir":
         position = state.position.clone()
         position[1, 0] = 40.0
         state = state.replace(position=position)
@@ -246,14 +252,16 @@ def test_molecules_through_the_membrane_are_conserved(method, beyond, dtype):
     def total(s: tf.State) -> torch.Tensor:
         here = s.signals["a"].double().reshape(2, -1).sum(1) * s.layout.grid.voxel_volume
         here = here.index_add(0, s.colony, molecules(s, "a"))
-        return here + s.fields["a_beyond"].double() if beyond == "open" else here
+        return here + s.fields["a_reservoir"].double() if outside == "reservoir" else here
 
     last = advance(scene, state, 10)
     assert_whole(last, "a", 2.0)
     assert float(last.signals["a"].min()) >= 0 and not torch.equal(last.a, state.a)
     assert torch.allclose(total(last), total(state), rtol=100 * torch.finfo(dtype).eps, atol=0)
-    if beyond == "open":
-        assert float(last.fields["a_beyond"][0]) != 0 and float(last.fields["a_beyond"][1]) == 0
+    if outside == "reservoir":
+        assert (
+            float(last.fields["a_reservoir"][0]) != 0 and float(last.fields["a_reservoir"][1]) == 0
+        )
 
 
 def test_uptake_of_the_last_molecules_leaves_nothing_negative():
@@ -323,14 +331,14 @@ def test_a_colony_is_the_same_in_any_batch(method, dtype, device):
         method=method,
         make=torch.tensor([5.0, 10.0, 20.0]),
         lose=1.0,
-        copies=torch.tensor([1.0, 2.0, 3.0]),
+        molecules_per_unit=torch.tensor([1.0, 2.0, 3.0]),
     )
     scene = tf.Scene(
         tf.Growth(rate=1.5),
         tf.Division(length=tf.Uniform(3.0, 3.4)),
         tf.Mechanics(dim=2),
         circuit,
-        tf.Medium(m=tf.Signal(diffusion=5.0), box=((-8, -8), (8, 8)), spacing=4.0, beyond="grow"),
+        tf.Medium(m=tf.Signal(diffusion=5.0), box=((-8, -8), (8, 8)), spacing=4.0, outside="grow"),
     )
     first = scene.seed(3, seed=4, dtype=dtype, device=device)
     last = advance(scene, first, 16)

@@ -47,7 +47,9 @@ def totals(state: tf.State, name: str = "ahl", inside: bool = True) -> Tensor:
     if inside:
         out = out.index_add(0, state.colony, state.fields[name].double() * state.volume.double())
     return (
-        out + state.fields[f"{name}_beyond"].double() if f"{name}_beyond" in state.fields else out
+        out + state.fields[f"{name}_reservoir"].double()
+        if f"{name}_reservoir" in state.fields
+        else out
     )
 
 
@@ -61,34 +63,34 @@ def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float) -> tf.State
 # --- what there is, stays -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("beyond", ["error", "grow", "open"])
-def test_amounts_are_conserved_through_growth_division_and_exchange(beyond, dtype, device):
+@pytest.mark.parametrize("outside", ["error", "grow", "reservoir"])
+def test_amounts_are_conserved_through_growth_division_and_exchange(outside, dtype, device):
     """Cells, medium and reservoir together. Every step rounds each of some ten sums once: relative,
     40 steps × 10 × eps / 2."""
-    half = 16.0 if beyond == "error" else 4.0  # where the box may be left, it is
+    half = 16.0 if outside == "error" else 4.0  # where the box may be left, it is
     scene = tf.Scene(
         tf.Growth(rate=1.5),
         tf.Division(length=tf.Uniform(3.0, 3.4)),
         tf.Mechanics(dim=2),
         exchanging(daughters="amount"),
         tf.Medium(
-            ahl=tf.Signal(diffusion=20.0, initial=0.5, beyond=0.7),
+            ahl=tf.Signal(diffusion=20.0, initial=0.5, reservoir=0.7),
             box=((-half, -half), (half, half)),
             spacing=2.0,
-            beyond=beyond,
+            outside=outside,
         ),
     )
     state = scene.seed(2, seed=3, dtype=dtype, device=device)
     first, nodes = totals(state), state.layout.grid.nodes
-    if beyond == "grow":  # new room comes with what it holds at first
+    if outside == "grow":  # new room comes with what it holds at first
         first = first - 0.5 * state.layout.grid.counts * state.layout.grid.voxel_volume
     state = advance(scene, state, 44, 0.05)
     last = totals(state)
-    if beyond == "grow":
+    if outside == "grow":
         assert state.layout.grid.nodes > nodes
         last = last - 0.5 * state.layout.grid.counts * state.layout.grid.voxel_volume
-    if beyond == "open":
-        assert bool((state.fields["ahl_beyond"] != 0).all())
+    if outside == "reservoir":
+        assert bool((state.fields["ahl_reservoir"] != 0).all())
     assert int(state.counts.min()) >= 8
     bound = 44 * 5 * torch.finfo(dtype).eps
     # with the start of new room taken off, what is compared is smaller than what was rounded
@@ -233,7 +235,7 @@ def test_drop_goes_on_without_the_colony_that_strayed(away):
 
 @pytest.mark.parametrize("away", FAR)
 def test_the_grid_grows_to_the_cell_that_strays(away):
-    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, beyond="grow"))
+    scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, outside="grow"))
     state = strayed(scene, away)
     first, grown = totals(state), scene.step(state, 0.1)
     grid = grown.layout.grid
@@ -251,14 +253,16 @@ def test_an_open_box_keeps_count(away):
     """Outside, the cell meets the reservoir's 0.25 and nothing else: its exchange over one step is
     known exactly."""
     scene = resting(
-        tf.Medium(ahl=tf.Signal(diffusion=5.0, beyond=0.25), box=BOX, spacing=4.0, beyond="open"),
+        tf.Medium(
+            ahl=tf.Signal(diffusion=5.0, reservoir=0.25), box=BOX, spacing=4.0, outside="reservoir"
+        ),
         exchanging(3.0, rtol=1e-8),
     )
     state = strayed(scene, away)
     after = scene.step(state, 0.1)
     left = 0.25 + 2.75 * math.exp(-float(state.area[3] / state.volume[3]) * 0.1)
     assert float(after.fields["ahl"][3]) == pytest.approx(left, rel=1e-6)
-    beyond = after.fields["ahl_beyond"]
+    beyond = after.fields["ahl_reservoir"]
     assert beyond[0] == beyond[2] == 0 and float(beyond[1]) == pytest.approx(
         float(state.volume[3]) * (3.0 - left), rel=1e-6
     )
@@ -269,17 +273,17 @@ def test_an_open_box_gives_too():
     """A cell with less than the reservoir takes from it: the count goes below 0."""
     scene = resting(
         tf.Medium(
-            ahl=tf.Signal(diffusion=5.0, beyond=[1.0, 2.0, 4.0]),
+            ahl=tf.Signal(diffusion=5.0, reservoir=[1.0, 2.0, 4.0]),
             box=BOX,
             spacing=4.0,
-            beyond="open",
+            outside="reservoir",
         ),
         exchanging(0.0),
     )
     state = advance(scene, strayed(scene, 4.0), 50, 0.1)
     # colony 1's own reservoir; rtol is 1e-4
     assert float(state.fields["ahl"][3]) == pytest.approx(2.0, rel=1e-3)
-    assert float(state.fields["ahl_beyond"][1]) == pytest.approx(
+    assert float(state.fields["ahl_reservoir"][1]) == pytest.approx(
         -2.0 * float(state.volume[3]), rel=1e-3
     )
     assert torch.allclose(totals(state), torch.zeros(3, dtype=F64), atol=1e-12)
@@ -287,7 +291,7 @@ def test_an_open_box_gives_too():
 
 def test_a_box_that_grows_along_x_only_says_where_else_it_ends():
     scene = resting(
-        tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, beyond="grow", grows="x")
+        tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, outside="grow", grows="x")
     )
     state = strayed(scene, 40.0)
     assert scene.step(state, 0.1).layout.grid.shapes[1] == (24, 8, 1)
@@ -386,12 +390,14 @@ BAD = {
     "negative decay": (lambda: tf.Signal(diffusion=1.0, decay=-0.1), r"Signal\.decay"),
     "negative start": (lambda: tf.Signal(diffusion=1.0, initial=-0.1), r"Signal\.initial"),
     "periodic without its partner": (
-        lambda: tf.Faces(x=(tf.Periodic(), tf.NoFlux())),
-        r"Faces\.x.*periodic at both ends",
+        lambda: tf.BoundaryConditions(x=(tf.Periodic(), tf.NoFlux())),
+        r"BoundaryConditions\.x.*periodic at both ends",
     ),
     "periodic for one signal only": (
         lambda: tf.Medium(
-            a=AHL, b=tf.Signal(diffusion=1.0, faces=tf.Faces(x=tf.Periodic())), **GOOD
+            a=AHL,
+            b=tf.Signal(diffusion=1.0, boundary=tf.BoundaryConditions(x=tf.Periodic())),
+            **GOOD,
         ),
         "periodic for one signal and not for another",
     ),
@@ -430,9 +436,11 @@ BAD = {
         lambda: tf.Medium(ahl=AHL, box=((0, 0, 0), (4, 4, 4)), spacing=4.0, height=5.0),
         r"Medium\.height.*within the box",
     ),
-    "policy": (lambda: tf.Medium(ahl=AHL, beyond="ignore", **GOOD), r"Medium\.beyond.*'grow'"),
+    "policy": (lambda: tf.Medium(ahl=AHL, outside="ignore", **GOOD), r"Medium\.outside.*'grow'"),
     "growing where space closes": (
-        lambda: tf.Medium(ahl=AHL, faces=tf.Faces(x=tf.Periodic()), beyond="grow", **GOOD),
+        lambda: tf.Medium(
+            ahl=AHL, boundary=tf.BoundaryConditions(x=tf.Periodic()), outside="grow", **GOOD
+        ),
         "closes on itself cannot grow",
     ),
     "growing along nothing": (lambda: tf.Medium(ahl=AHL, grows="", **GOOD), r"Medium\.grows"),
@@ -462,7 +470,7 @@ def test_bad_input_is_refused_at_construction(case):
 AT_SEED = {
     "too small for its cells": (
         {"box": ((4.0, 4.0), (8.0, 8.0)), "spacing": 4.0},
-        r"Medium\.box.*too small for colony 0: 1 cell.*\(0, 0, 0\).*beyond='grow'",
+        r"Medium\.box.*too small for colony 0: 1 cell.*\(0, 0, 0\).*outside='grow'",
     ),
     "obstacles of a wrong shape": (
         {"obstacles": lambda at: at > 0},
@@ -510,7 +518,10 @@ def test_a_function_of_places_must_give_one_good_number_for_each(signal):
         ({"ahl": tf.Signal(diffusion=[1.0, 2.0])}, "diffusion"),
         ({"ahl": tf.Signal(diffusion=1.0, decay=[1.0, 2.0])}, "decay"),
         ({"ahl": AHL, "flow": ([1.0, 2.0], 0.0)}, "flow"),
-        ({"ahl": AHL, "faces": tf.Faces(x=tf.Fixed([1.0, 2.0]))}, "faces.*value"),
+        (
+            {"ahl": AHL, "boundary": tf.BoundaryConditions(x=tf.Dirichlet([1.0, 2.0]))},
+            "boundary.*value",
+        ),
     ],
     ids=["diffusion", "decay", "flow", "face"],
 )
@@ -537,5 +548,5 @@ def test_a_flat_box_in_space_is_refused_unless_it_is_meant():
         tf.InputError, match=r"Medium\.box.*of three dimensions in a 3-D scene.*depth"
     ):
         scene().seed()
-    for given in ({"depth": 2.0}, {"beyond": "grow"}, {"beyond": "open"}):
+    for given in ({"depth": 2.0}, {"outside": "grow"}, {"outside": "reservoir"}):
         scene(**given).seed()

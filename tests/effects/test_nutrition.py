@@ -182,7 +182,9 @@ def test_a_cell_beyond_an_open_box_eats_from_the_reservoir(away):
     scene = tf.Scene(
         tf.Monod("food", rate=1.0, half=1.0, growth_yield=2.0),
         tf.Growth(),
-        tf.Medium(food=tf.Signal(diffusion=0.0, initial=1.0, beyond=3.0), beyond="open", **BOX),
+        tf.Medium(
+            food=tf.Signal(diffusion=0.0, initial=1.0, reservoir=3.0), outside="reservoir", **BOX
+        ),
         founders=tf.Cells([[0.0, 0.0], [0.0, 3.0]], [1.0, 0.0]),
     )
     state = scene.seed(dtype=F64)
@@ -194,7 +196,9 @@ def test_a_cell_beyond_an_open_box_eats_from_the_reservoir(away):
     assert float(gained[1]) == pytest.approx(
         float(state.volume[1]) * math.expm1(0.75 * 0.1), rel=1e-12
     )
-    assert float(after.fields["food_beyond"]) == pytest.approx(-float(gained[1]) / 2.0, rel=1e-12)
+    assert float(after.fields["food_reservoir"]) == pytest.approx(
+        -float(gained[1]) / 2.0, rel=1e-12
+    )
     assert float(food(state) - food(after)) == pytest.approx(float(gained[0]) / 2.0, rel=1e-9)
 
 
@@ -203,7 +207,7 @@ def test_a_colony_is_the_same_in_any_batch(dtype, device):
         tf.Monod("food", rate=[1.0, 1.4, 1.7], half=[0.1, 0.2, 0.4], growth_yield=2.0),
         initial=[1.0, 2.0, 0.7],
         more=(tf.Division(length=tf.Uniform(3.0, 3.4)), tf.Mechanics(dim=2)),
-        beyond="grow",
+        outside="grow",
     )
     first = scene.seed(3, seed=4, dtype=dtype, device=device)
     last = advance(scene, first, 30)

@@ -30,7 +30,7 @@ from helpers import (
 )
 
 import torchfilm as tf
-from torchfilm.physics.contacts import LINE_CONTACT_SINE, Bodies, closest_points, contact_gaps
+from torchfilm.physics.contacts import LINE_CONTACT_SINE, Capsules, closest_points, contact_gaps
 from torchfilm.physics.walls import find_wall_contacts
 
 MODES = pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
@@ -93,7 +93,7 @@ def test_case_02_same_centre_crossing(device, dtype, measured, unilateral, rate)
 SWITCH = math.asin(LINE_CONTACT_SINE)
 
 
-def tilted(angle: float, sign: int, about: np.ndarray, dtype, device) -> Bodies:
+def tilted(angle: float, sign: int, about: np.ndarray, dtype, device) -> Capsules:
     """Two cells 0.9 apart along y, the second turned by `angle` about `about` out of parallel (or
     antiparallel)."""
     axis = math.cos(angle) * X + math.sin(angle) * np.cross(about, X)
@@ -102,7 +102,7 @@ def tilted(angle: float, sign: int, about: np.ndarray, dtype, device) -> Bodies:
     )
 
 
-def forces(pair: Bodies, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def forces(pair: Capsules, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Generalised forces JᵀD²g (force, torque, elongation), (7,), on cells 0 and 1; the pair given
     in the order (first, other)."""
     t = lambda k: torch.tensor([k], device=pair.half.device)
@@ -143,13 +143,13 @@ def test_case_03_no_jump_at_the_switch(device, dtype, measured, sign, about, shi
         pair = tilted(angle, sign, about, dtype, device)
         moved = pair.centre.clone()
         moved[0, 1] = shift
-        return forces(Bodies(moved, pair.axis, pair.half, pair.radius))
+        return forces(Capsules(moved, pair.axis, pair.half, pair.radius))
 
     for below, above in zip(at(SWITCH - 1e-6), at(SWITCH + 1e-6), strict=True):
         assert measured("jump of the force", np.abs(below - above).max(), "≤ 1e-3") <= 1e-3
 
 
-def judged(cells: Bodies) -> tuple[np.ndarray, np.ndarray]:
+def judged(cells: Capsules) -> tuple[np.ndarray, np.ndarray]:
     """For the pairs (k, k + half of them): the error of the gap, and the true distance, (P,).
 
     The reference starts from the numbers as rounded to dtype: the formula is judged, not its input.

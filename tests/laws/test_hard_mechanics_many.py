@@ -27,7 +27,7 @@ from helpers import (
 from torch import Tensor
 
 import torchfilm as tf
-from torchfilm.physics.contacts import Bodies
+from torchfilm.physics.contacts import Capsules
 from torchfilm.physics.neighbours import Neighbourhood
 
 MODES = pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
@@ -136,7 +136,7 @@ def test_case_13_one_long_cell(device, dtype, measured, dim):
         local, state.axis, state.length, state.radius, state.colony, 1
     ).pairs()
     found = rows_of(
-        Bodies(local.T.contiguous(), state.axis.T.contiguous(), 0.5 * state.length, state.radius),
+        Capsules(local.T.contiguous(), state.axis.T.contiguous(), 0.5 * state.length, state.radius),
         first,
         second,
     )

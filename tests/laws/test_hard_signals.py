@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet, Periodic
 from torchfilm.signals.exchange import pool_volume, read, stencil, write
-from torchfilm.signals.faces import Faces, Fixed, Periodic
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.operator import operator
 from torchfilm.signals.transport import METHODS, prepare
@@ -79,11 +79,13 @@ def test_case_32_crank_nicolson_goes_below_zero(device, dtype):
 
 @CHOSEN
 @pytest.mark.parametrize(
-    "faces", [Faces(), Faces(Periodic(), Periodic(), Periodic())], ids=["closed", "periodic"]
+    "faces",
+    [BoundaryConditions(), BoundaryConditions(Periodic(), Periodic(), Periodic())],
+    ids=["closed", "periodic"],
 )
 def test_case_33_strong_flow(device, dtype, measured, method, faces):
     """Cell Péclet 100, Courant 10, 48³: u ≥ 0, mass to 1e-6; in each of five steps."""
-    op = cube(48, 1.0, dtype, device, velocity=(100.0, 0.0, 0.0), faces=faces)
+    op = cube(48, 1.0, dtype, device, velocity=(100.0, 0.0, 0.0), boundary=faces)
     stepper, u = prepare(op, 0.1, method), delta(48, dtype, device)
     for _ in range(5):
         before, u = mass(u), stepper.step(u)
@@ -101,12 +103,12 @@ def test_case_35_step_wall(device, dtype, measured, method, r):
     wall = torch.zeros(1, 32, 16, 8, dtype=dtype, device=device)
     wall[:, :16] = 1.0
     for faces in (
-        Faces(),
-        Faces(x=(Fixed(1.0), Fixed(0.0))),
-        Faces(x=Periodic(), y=(Fixed(1.0), Fixed(0.0))),
+        BoundaryConditions(),
+        BoundaryConditions(x=(Dirichlet(1.0), Dirichlet(0.0))),
+        BoundaryConditions(x=Periodic(), y=(Dirichlet(1.0), Dirichlet(0.0))),
     ):
         op = operator(
-            (32, 16, 8), (1.0, 1.0, 1.0), diffusion=r, faces=faces, dtype=dtype, device=device
+            (32, 16, 8), (1.0, 1.0, 1.0), diffusion=r, boundary=faces, dtype=dtype, device=device
         )
         stepper, u = prepare(op, 1.0, method), wall
         for _ in range(20):

@@ -13,18 +13,20 @@ from hypothesis import strategies as st
 
 import torchfilm as tf
 from torchfilm.physics import capsule
-from torchfilm.physics.contacts import Bodies, closest_points, contact_gaps, contact_points
+from torchfilm.physics.contacts import Capsules, closest_points, contact_gaps, contact_points
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
 
 
-def halves(cells: Bodies) -> tuple[torch.Tensor, torch.Tensor]:
+def halves(cells: Capsules) -> tuple[torch.Tensor, torch.Tensor]:
     """The pairs (k, k + half of them)."""
     first = torch.arange(cells.half.numel() // 2, device=cells.half.device)
     return first, first + first.numel()
 
 
-def side_by_side(rng: np.random.Generator, count: int, dim: int, tilt: float, **options) -> Bodies:
+def side_by_side(
+    rng: np.random.Generator, count: int, dim: int, tilt: float, **options
+) -> Capsules:
     """Pairs of rods beside one another that overlap all along, up to `tilt` out of parallel, either
     way round."""
     axis = unit(rng, count, dim)
@@ -86,7 +88,7 @@ def test_distance_is_the_least_and_the_same_when_swapped(seed, dim, lengths, til
     assert bool((s.abs() <= cells.half[first]).all() and (t.abs() <= cells.half[second]).all())
 
 
-def moved(cells: Bodies, which: torch.Tensor, dof: int, by: float) -> Bodies:
+def moved(cells: Capsules, which: torch.Tensor, dof: int, by: float) -> Capsules:
     """The cells `which` moved by `by` in one of their degrees of freedom (place, turn, length)."""
     dim = cells.centre.shape[0]
     turns = 1 if dim == 2 else 3
@@ -99,7 +101,7 @@ def moved(cells: Bodies, which: torch.Tensor, dof: int, by: float) -> Bodies:
         axis[:, which] = capsule.rotate(axis[:, which].T, turn).T
     else:
         half[which] += 0.5 * by
-    return Bodies(centre, axis, half, cells.radius)
+    return Capsules(centre, axis, half, cells.radius)
 
 
 @DIMS
@@ -135,7 +137,7 @@ def test_rows_are_the_derivative_of_the_gap(dim):
 
 
 def gap_at(
-    cells: Bodies, first, second, s, t, end_a, end_b, from_half: torch.Tensor
+    cells: Capsules, first, second, s, t, end_a, end_b, from_half: torch.Tensor
 ) -> torch.Tensor:
     """Gap between two marked points of the cells, which ride along as cells turn, and with the ends
     as they grow."""
@@ -259,7 +261,7 @@ def test_a_cell_squeezed_between_two_comes_to_rest(apart, tilt):
     )
 
 
-def forces(cells: Bodies) -> np.ndarray:
+def forces(cells: Capsules) -> np.ndarray:
     """Force, torque and elongation JᵀD²g on the first cell of each pair, (P, 4 or 7)."""
     first, second = halves(cells)
     found = rows_of(cells, first, second)
@@ -270,7 +272,7 @@ def forces(cells: Bodies) -> np.ndarray:
     return out
 
 
-def sweep(dim: int, angle, shift, apart) -> Bodies:
+def sweep(dim: int, angle, shift, apart) -> Capsules:
     """Pairs that differ by a little from one to the next: an angle, a shift along the axis, a
     distance; one of them an array."""
     angle, shift, apart = np.broadcast_arrays(*map(np.asarray, (angle, shift, apart)))
@@ -433,7 +435,7 @@ def test_gradient_of_gaps_is_finite_where_cells_coincide(dtype):
     cells = bodies(np.zeros((2, 3)), np.eye(3)[:2], [2.0, 2.0], dtype=dtype)
     centre = cells.centre.clone().requires_grad_()
     gap = contact_gaps(
-        Bodies(centre, cells.axis, cells.half, cells.radius), torch.tensor([0]), torch.tensor([1])
+        Capsules(centre, cells.axis, cells.half, cells.radius), torch.tensor([0]), torch.tensor([1])
     )
     gap.sum().backward()
     assert bool(torch.isfinite(centre.grad).all())

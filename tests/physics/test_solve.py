@@ -12,7 +12,7 @@ from helpers import array, crowd, growth, mechanics, pair_gaps, seeded
 from scipy.optimize import minimize
 
 import torchfilm as tf
-from torchfilm.physics.rows import ContactRows
+from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.solve import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem, solve
 from torchfilm.tools.ragged import Groups
 
@@ -83,7 +83,7 @@ class Problem:
     ) -> ContactProblem:
         t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)
         i = lambda x: torch.as_tensor(x, dtype=torch.int64, device=device)
-        rows = ContactRows(
+        rows = ContactJacobian(
             i(self.first),
             i(self.second),
             t(self.half_rows[:, 0]).contiguous(),

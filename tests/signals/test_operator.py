@@ -8,17 +8,27 @@ import numpy as np
 import pytest
 import torch
 
-from torchfilm.signals.faces import Faces, Fixed, NoFlux, Open, Periodic
+from torchfilm.signals.boundary_conditions import (
+    BoundaryConditions,
+    Dirichlet,
+    NoFlux,
+    Open,
+    Periodic,
+)
 from torchfilm.signals.iterative import convolve
 from torchfilm.signals.operator import Operator, apply, fitted, operator
 from torchfilm.tools.checks import InputError
 
 SPACING = (1.0, 2.0, 1.5)
-FACES = {
-    "closed": Faces(),
-    "periodic": Faces(Periodic(), Periodic(), Periodic()),
-    "mixed": Faces(x=(Fixed(2.0), Open(0.5)), y=Periodic(), z=(NoFlux(), Fixed(1.0))),
-    "open": Faces(x=(Open(0.7), Open()), y=(Open(0.2), NoFlux()), z=(Open(), Open(0.3))),
+BOUNDARIES = {
+    "closed": BoundaryConditions(),
+    "periodic": BoundaryConditions(Periodic(), Periodic(), Periodic()),
+    "mixed": BoundaryConditions(
+        x=(Dirichlet(2.0), Open(0.5)), y=Periodic(), z=(NoFlux(), Dirichlet(1.0))
+    ),
+    "open": BoundaryConditions(
+        x=(Open(0.7), Open()), y=(Open(0.2), NoFlux()), z=(Open(), Open(0.3))
+    ),
 }
 SHAPES = [(5, 4, 3), (6, 1, 1), (2, 3, 1), (1, 1, 1), (4, 2, 2)]
 FLOWS = ["still", "uniform", "varying"]
@@ -74,7 +84,7 @@ def assembled(
                         matrix[i, i] -= out / h
                         matrix[i, number[tuple(other)]] += back / h
                     continue
-                if isinstance(face, Fixed):
+                if isinstance(face, Dirichlet):
                     up, down = flux_parts(diffusion, v, h / 2)
                     value = face.value
                 elif isinstance(face, Open):
@@ -118,7 +128,7 @@ def make(
     rng = np.random.default_rng(seed)
     velocity, arrays = flow(kind, shape, rng)
     mask = rng.uniform(size=shape) < 0.7 if masked else np.ones(shape, dtype=bool)
-    chosen = FACES[faces]
+    chosen = BOUNDARIES[faces]
     if isinstance(velocity, tuple) and isinstance(velocity[0], torch.Tensor):
         velocity = tuple(v.to(device) for v in velocity)
     made = operator(
@@ -127,7 +137,7 @@ def make(
         diffusion=diffusion,
         decay=decay,
         velocity=velocity,
-        faces=chosen,
+        boundary=chosen,
         source=source,
         dtype=dtype,
         device=device,
@@ -145,7 +155,7 @@ def dense(op: Operator) -> np.ndarray:
 
 EVERY = [
     pytest.mark.parametrize("shape", SHAPES, ids=str),
-    pytest.mark.parametrize("faces", FACES),
+    pytest.mark.parametrize("faces", BOUNDARIES),
     pytest.mark.parametrize("kind", FLOWS),
 ]
 
@@ -181,7 +191,7 @@ def test_the_operator_is_the_assembled_matrix(device, dtype, shape, faces, kind,
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-@pytest.mark.parametrize("faces", FACES)
+@pytest.mark.parametrize("faces", BOUNDARIES)
 @pytest.mark.parametrize("kind", FLOWS[:2])
 @pytest.mark.parametrize("masked", [False, True], ids=["", "obstacles"])
 def test_the_papers_convolution_gives_the_same(device, dtype, shape, faces, kind, masked):
@@ -291,7 +301,9 @@ def test_each_colony_has_its_own_numbers(device, dtype):
             velocity=velocity[k],
             mask=mask[k],
             source=source[k],
-            faces=Faces(x=(Fixed(fixed[k]), NoFlux()), y=(Open(outside[k]), Open())),
+            boundary=BoundaryConditions(
+                x=(Dirichlet(fixed[k]), NoFlux()), y=(Open(outside[k]), Open())
+            ),
             colonies=len(u[k]),
             dtype=dtype,
             device=device,
@@ -323,7 +335,11 @@ def test_each_colony_has_its_own_numbers(device, dtype):
         ({"source": torch.ones(4, 4, 2)}, "source"),
         ({"source": torch.full((4, 4, 3), torch.inf)}, "source"),
         (
-            {"faces": Faces(x=(Fixed(torch.tensor([1.0, 2.0, 3.0])), NoFlux()))},
+            {
+                "boundary": BoundaryConditions(
+                    x=(Dirichlet(torch.tensor([1.0, 2.0, 3.0])), NoFlux())
+                )
+            },
             "beyond a face along x",
         ),
         ({"shape": (4, 4)}, "shape"),
@@ -344,4 +360,10 @@ def test_one_periodic_face_has_one_velocity():
         torch.zeros(4, 4, 4),
     )
     with pytest.raises(InputError, match="velocity along x"):
-        operator((4, 4, 3), SPACING, diffusion=1.0, velocity=velocity, faces=Faces(x=Periodic()))
+        operator(
+            (4, 4, 3),
+            SPACING,
+            diffusion=1.0,
+            velocity=velocity,
+            boundary=BoundaryConditions(x=Periodic()),
+        )

@@ -10,7 +10,14 @@ import pytest
 import torch
 from scipy.special import ive
 
-from torchfilm.signals.faces import Face, Faces, Fixed, NoFlux, Open, Periodic
+from torchfilm.signals.boundary_conditions import (
+    BoundaryConditions,
+    Dirichlet,
+    Face,
+    NoFlux,
+    Open,
+    Periodic,
+)
 from torchfilm.signals.operator import apply, operator
 from torchfilm.signals.transport import prepare
 
@@ -100,13 +107,13 @@ def test_steady_profile_between_fixed_walls(dtype, device, peclet, axis):
     velocity = [0.0, 0.0, 0.0]
     velocity[axis] = peclet * k / length
     faces: list[Face | tuple[Face, Face]] = [NoFlux(), NoFlux(), NoFlux()]
-    faces[axis] = (Fixed(0.0), Fixed(1.0))
+    faces[axis] = (Dirichlet(0.0), Dirichlet(1.0))
     op = operator(
         tuple(shape),
         tuple(spacing),
         diffusion=k,
         velocity=tuple(velocity),
-        faces=Faces(*faces),
+        boundary=BoundaryConditions(*faces),
         dtype=dtype,
         device=device,
     )
@@ -132,7 +139,7 @@ def test_a_sink_everywhere_has_its_decay_length():
             (h, 1.0, 1.0),
             diffusion=k,
             decay=decay,
-            faces=Faces(x=(Fixed(1.0), NoFlux())),
+            boundary=BoundaryConditions(x=(Dirichlet(1.0), NoFlux())),
             dtype=D,
         )
         kappa = decay * h**2 / k
@@ -168,7 +175,7 @@ def test_a_steady_point_source():
             (h, h, h),
             diffusion=k,
             source=source,
-            faces=Faces(*[Fixed(0.0)] * 3),
+            boundary=BoundaryConditions(*[Dirichlet(0.0)] * 3),
             dtype=D,
         )
         u = prepare(op, 3e4, "exponential").step(torch.zeros(1, n, n, n, dtype=D))[0]
@@ -188,7 +195,7 @@ def test_an_open_box_is_washed_out(method, dtype, device):
         (1.0, 1.0, 1.0),
         diffusion=0.0,
         velocity=(v, 0.0, 0.0),
-        faces=Faces(x=Open(2.0)),
+        boundary=BoundaryConditions(x=Open(2.0)),
         dtype=dtype,
         device=device,
     )
@@ -213,7 +220,7 @@ def test_a_wave_on_a_ring_is_carried_around():
         (h, 1.0, 1.0),
         diffusion=k,
         velocity=(v, 0.0, 0.0),
-        faces=Faces(x=Periodic()),
+        boundary=BoundaryConditions(x=Periodic()),
         dtype=D,
     )
     later = prepare(op, t, "exponential").step(u).reshape(-1)
@@ -234,7 +241,7 @@ def test_a_field_at_rest_has_no_rate():
         (0.5, 1.0, 1.0),
         diffusion=1.0,
         velocity=(2.0, 0.0, 0.0),
-        faces=Faces(x=(Fixed(0.0), Fixed(1.0))),
+        boundary=BoundaryConditions(x=(Dirichlet(0.0), Dirichlet(1.0))),
         dtype=D,
     )
     x = (torch.arange(10, dtype=D) + 0.5) / 10

@@ -11,9 +11,15 @@ import scipy.linalg
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_operator import FACES, FLOWS, SHAPES, SPACING, every, make
+from test_operator import BOUNDARIES, FLOWS, SHAPES, SPACING, every, make
 
-from torchfilm.signals.faces import Faces, Fixed, NoFlux, Open, Periodic
+from torchfilm.signals.boundary_conditions import (
+    BoundaryConditions,
+    Dirichlet,
+    NoFlux,
+    Open,
+    Periodic,
+)
 from torchfilm.signals.iterative import CrankNicolson
 from torchfilm.signals.operator import operator
 from torchfilm.signals.transport import METHODS, choose, prepare
@@ -46,7 +52,7 @@ def exact(matrix: np.ndarray, gain: np.ndarray, dt: float, u: np.ndarray) -> np.
 
 @pytest.mark.parametrize("dt", [1e-3, 0.7, 40.0])
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-@pytest.mark.parametrize("faces", FACES)
+@pytest.mark.parametrize("faces", BOUNDARIES)
 @pytest.mark.parametrize("kind", FLOWS[:2])
 def test_exponential_is_exact(device, dtype, shape, faces, kind, dt):
     """Against scipy's expm, good to some 1e-12 of the values, which reach 10 as source and faces
@@ -154,7 +160,7 @@ def test_implicit_at_rest_is_at_rest():
         (6, 5, 4),
         SPACING,
         diffusion=1.0,
-        faces=Faces(*[(Fixed(5.0), Fixed(5.0))] * 3),
+        boundary=BoundaryConditions(*[(Dirichlet(5.0), Dirichlet(5.0))] * 3),
         dtype=torch.float64,
     )
     for dt in (1e-3, 1.0, 1e6):
@@ -162,7 +168,7 @@ def test_implicit_at_rest_is_at_rest():
 
 
 face = st.one_of(
-    st.just(NoFlux()), st.builds(Fixed, st.floats(0, 1)), st.builds(Open, st.floats(0, 1))
+    st.just(NoFlux()), st.builds(Dirichlet, st.floats(0, 1)), st.builds(Open, st.floats(0, 1))
 )
 pair = st.one_of(st.just(Periodic()), st.tuples(face, face))
 closed = st.sampled_from([NoFlux(), Periodic()])
@@ -207,7 +213,7 @@ def random_operator(seed, shape, power, masked, kind, single, method, faces, dec
         diffusion=k,
         decay=decay,
         velocity=velocity,
-        faces=faces,
+        boundary=faces,
         dtype=dtype,
         mask=torch.as_tensor(mask) if masked else None,
     )
@@ -227,7 +233,7 @@ def roundings(op) -> float:
 @given(**common, decay=st.floats(0, 5), x=pair, y=pair, z=pair)
 def test_nothing_goes_below_zero(x, y, z, decay, **drawn):
     """Exactly, whatever the box, its faces, the flow and the step."""
-    op, u, mask = random_operator(faces=Faces(x, y, z), decay=decay, **drawn)
+    op, u, mask = random_operator(boundary=BoundaryConditions(x, y, z), decay=decay, **drawn)
     after = prepare(op, 1.0, drawn["method"]).step(u)
     assert bool(torch.isfinite(after).all()) and float(after.min()) >= 0
     assert bool((after[0][~mask] == 0).all())  # and obstacles stay empty
@@ -236,7 +242,7 @@ def test_nothing_goes_below_zero(x, y, z, decay, **drawn):
 @settings(max_examples=150, deadline=None)
 @given(**common, x=closed, y=closed, z=closed)
 def test_nothing_is_lost_in_a_closed_box(x, y, z, **drawn):
-    op, u, _ = random_operator(faces=Faces(x, y, z), **drawn)
+    op, u, _ = random_operator(boundary=BoundaryConditions(x, y, z), **drawn)
     before, after = (
         float(u.double().sum()),
         float(prepare(op, 1.0, drawn["method"]).step(u).double().sum()),
@@ -248,7 +254,7 @@ def test_nothing_is_lost_in_a_closed_box(x, y, z, **drawn):
 @given(**common, x=pair, y=pair, z=pair)
 def test_nothing_rises_above_what_is_there_or_beyond_the_faces(x, y, z, **drawn):
     """Without flow: all values and faces between 0 and 1 stay so."""
-    op, u, _ = random_operator(faces=Faces(x, y, z), **(drawn | {"kind": "still"}))
+    op, u, _ = random_operator(boundary=BoundaryConditions(x, y, z), **(drawn | {"kind": "still"}))
     after = prepare(op, 1.0, drawn["method"]).step(u)
     assert float(after.max()) <= 1 + roundings(op)
 
@@ -282,8 +288,9 @@ def test_slopes(method, periodic, masked):
     u = torch.as_tensor(np.random.default_rng(3).uniform(0.5, 1.0, (2, *shape))).requires_grad_()
 
     def run(u, diffusion, decay, velocity, value, source):
-        faces = Faces(
-            x=Periodic() if periodic else (Fixed(value), NoFlux()), y=(Open(value), Fixed(0.5))
+        faces = BoundaryConditions(
+            x=Periodic() if periodic else (Dirichlet(value), NoFlux()),
+            y=(Open(value), Dirichlet(0.5)),
         )
         op = operator(
             shape,
@@ -291,7 +298,7 @@ def test_slopes(method, periodic, masked):
             diffusion=diffusion,
             decay=decay,
             velocity=velocity,
-            faces=faces,
+            boundary=faces,
             mask=mask,
             source=source,
             colonies=2,
@@ -326,7 +333,7 @@ def test_slopes_by_a_velocity_on_faces(method):
                 SPACING,
                 diffusion=1.0,
                 velocity=v,
-                faces=Faces(x=(Fixed(1.0), Open())),
+                boundary=BoundaryConditions(x=(Dirichlet(1.0), Open())),
                 dtype=torch.float64,
             ),
             0.4,
@@ -375,7 +382,7 @@ def test_a_colony_does_not_see_the_others(device, dtype, method, shape, own, det
             velocity=velocity[part] if own else velocity[0],
             source=0.3,
             colonies=size,
-            faces=Faces(x=(Fixed(value[part]), Open()), y=Periodic()),
+            boundary=BoundaryConditions(x=(Dirichlet(value[part]), Open()), y=Periodic()),
             mask=None if method == "exponential" else masks[k],
             dtype=dtype,
             device=device,

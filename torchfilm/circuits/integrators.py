@@ -49,4 +49,4 @@ def runge_kutta(rates: Rates, u: Tensor, dt: float, steps: int = 1, method: str 
 
 def _check_steps(steps: int) -> None:
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise checks.refuse("steps", steps, "a whole number from 1")
+        raise checks.input_error("steps", steps, "a whole number from 1")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchfilm.tools.powers import power as steady_power
+from torchfilm.tools.deterministic_math import power as steady_power
 
 
 def activation(x: Tensor, half: float | Tensor, power: float | Tensor = 1.0) -> Tensor:

@@ -73,33 +73,34 @@ class Network:
         p: Names,
         cell: Names,
         *,
-        copies: float | Tensor = 1.0,
+        molecules_per_unit: float | Tensor = 1.0,
         pool: Tensor | None = None,
     ) -> Tensor:
-        """Events per hour, (n, R), at molecule numbers `counts` (n, S + M); copies: molecules in a
+        """Events per hour, (n, R), at molecule numbers `counts` (n, S + M); molecules_per_unit: molecules in a
         unit of concentration × µm³.
 
         pool: µm³ outside that each cell may draw signals from, (n,) or (n, M), where there are
-        signals. Mass action counts combinations, k Ω n (n − 1)/Ω² for 2 a with Ω = volume × copies;
+        signals. Mass action counts combinations, k Ω n (n − 1)/Ω² for 2 a with Ω = volume × molecules_per_unit;
         a function's rate is used as it is, times Ω.
         """
-        volumes = [cell.volume * copies] * len(self.species)
+        volumes = [cell.volume * molecules_per_unit] * len(self.species)
         if self.signals:
             if pool is None:
-                raise checks.refuse(
+                raise checks.input_error(
                     "pool",
                     pool,
                     "the volume outside of each cell, for the signals " + ", ".join(self.signals),
                 )
             volumes += [
-                (pool if pool.dim() == 1 else pool[:, k]) * copies for k in range(len(self.signals))
+                (pool if pool.dim() == 1 else pool[:, k]) * molecules_per_unit
+                for k in range(len(self.signals))
             ]
         columns = counts.unbind(1)
         density = [n / v for n, v in zip(columns, volumes, strict=True)]
         u = Names(self.species, density[: len(self.species)], "u")
         s = Names(self.signals, density[len(self.species) :], "s")
         place = {n: k for k, n in enumerate(self.names)}
-        size = cell.volume * copies
+        size = cell.volume * molecules_per_unit
         out = []
         for reaction in self.reactions:
             if callable(reaction.rate):
@@ -135,7 +136,7 @@ def network(
     for entry in reactions:
         flat += [entry] if isinstance(entry, Reaction) else network_parts(entry)
     if not flat:
-        raise checks.refuse("reactions", list(reactions), "at least one reaction")
+        raise checks.input_error("reactions", list(reactions), "at least one reaction")
     names = [*species, *(OUTSIDE + s for s in signals)]
     _check_names(species, signals)
     seen: set[str] = set()
@@ -145,7 +146,7 @@ def network(
     )
     for row, reaction in enumerate(flat):
         if reaction.name and reaction.name in seen:
-            raise checks.refuse(
+            raise checks.input_error(
                 "reaction",
                 reaction.name,
                 "there only once",
@@ -188,9 +189,11 @@ def _check_names(species: Sequence[str], signals: Sequence[str]) -> None:
         if isinstance(given, str) or not all(
             isinstance(n, str) and n.isidentifier() for n in given
         ):
-            raise checks.refuse(what, given, "a sequence of names")
+            raise checks.input_error(what, given, "a sequence of names")
         if len(set(given)) != len(given):
-            raise checks.refuse(what, list(given), "different names", "One stands there twice.")
+            raise checks.input_error(
+                what, list(given), "different names", "One stands there twice."
+            )
 
 
 def _parameters(reactions: Sequence[Reaction]) -> tuple[str, ...]:

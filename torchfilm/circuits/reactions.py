@@ -51,9 +51,9 @@ class Reaction:
         if not callable(self.rate):
             object.__setattr__(self, "rate", constant(f"{label}.rate", self.rate))
         if isinstance(self.order, bool) or not isinstance(self.order, int) or self.order < 1:
-            raise checks.refuse(f"{label}.order", self.order, "a whole number from 1")
+            raise checks.input_error(f"{label}.order", self.order, "a whole number from 1")
         if not self.change():
-            raise checks.refuse(
+            raise checks.input_error(
                 label, str(self), "a reaction that changes something", "Both sides are the same."
             )
 
@@ -65,7 +65,7 @@ class Reaction:
         nothing."""
         sides = equation.split("->")
         if len(sides) != 2:
-            raise checks.refuse(
+            raise checks.input_error(
                 "equation", equation, 'two sides with an arrow, such as "2 a + b -> c"'
             )
         return Reaction(
@@ -109,7 +109,7 @@ def constant(name: str, given: object, *, positive: bool = False) -> Constant:
     name."""
     if isinstance(given, str):
         if not given.isidentifier():
-            raise checks.refuse(
+            raise checks.input_error(
                 name, given, "a number, one number per colony, or a parameter's name"
             )
         return given
@@ -120,12 +120,14 @@ def constant(name: str, given: object, *, positive: bool = False) -> Constant:
 
 def _side(name: str, given: object) -> dict[str, int]:
     if not isinstance(given, Mapping):
-        raise checks.refuse(name, given, 'a mapping from names to how many, such as {"a": 2}')
+        raise checks.input_error(name, given, 'a mapping from names to how many, such as {"a": 2}')
     for key, count in given.items():
         if not isinstance(key, str) or not key.removeprefix(OUTSIDE).isidentifier():
-            raise checks.refuse(name, key, 'the name of a species, or "out." and that of a signal')
+            raise checks.input_error(
+                name, key, 'the name of a species, or "out." and that of a signal'
+            )
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise checks.refuse(f"{name}[{key!r}]", count, "a whole number from 1")
+            raise checks.input_error(f"{name}[{key!r}]", count, "a whole number from 1")
     return dict(given)
 
 
@@ -136,7 +138,7 @@ def _parse(side: str, equation: str) -> dict[str, int]:
     for term in side.split("+"):
         found = PLACE.fullmatch(term.strip())
         if not found:
-            raise checks.refuse(
+            raise checks.input_error(
                 "equation",
                 equation,
                 'terms such as "2 a" or "out.ahl", joined by +',

@@ -46,7 +46,7 @@ MOST_SICK = 60
 
 
 @dataclass(frozen=True)
-class Report:
+class RosenbrockReport:
     """For each cell, (N,) int64: steps `accepted` and `rejected`, and `status`, one of STATUS; a
     failed cell keeps its last good concentrations."""
 
@@ -65,7 +65,7 @@ def rosenbrock(
     max_steps: int = 10_000,
     first_step: float | None = None,
     nonnegative: bool = True,
-) -> tuple[Tensor, Report]:
+) -> tuple[Tensor, RosenbrockReport]:
     """Concentrations (N, S) after dt hours: each cell in steps whose error is at most atol + rtol
     |u| in every species.
 
@@ -82,13 +82,13 @@ def rosenbrock(
     whole = torch.full((cells,), float(dt), dtype=torch.float64, device=u.device)
     if cells == 0 or species == 0 or dt == 0:
         none = torch.zeros(cells, dtype=torch.int64, device=u.device)
-        return u.clone(), Report(none, none, none)
+        return u.clone(), RosenbrockReport(none, none, none)
     scale = torch.as_tensor(atol, dtype=torch.float64, device=u.device).reshape(-1, 1)
     one = torch.zeros(1, dtype=torch.int64, device=u.device)
     tracked = torch.is_grad_enabled() and (
         u.requires_grad or rates(u.index_select(0, one), one).requires_grad
     )
-    method = _Method(
+    method = _Tableau(
         rates, u.dtype, max(rtol, 4 * torch.finfo(u.dtype).eps), scale, nonnegative, tracked
     )
     first = whole if first_step is None else whole.clamp(max=first_step)
@@ -106,7 +106,7 @@ def _prepare_forward_mode() -> None:
             forward_ad.make_dual(torch.ones(1), torch.ones(1)).exp()
 
 
-class _Method:
+class _Tableau:
     """One step of the method for some cells; arrays are (S, M) in float64, species first. tracked:
     whether a gradient is wanted."""
 
@@ -268,8 +268,8 @@ class _Method:
 
 
 def _advance(
-    method: _Method, u: Tensor, left: Tensor, h: Tensor, max_steps: int
-) -> tuple[Tensor, Report]:
+    method: _Tableau, u: Tensor, left: Tensor, h: Tensor, max_steps: int
+) -> tuple[Tensor, RosenbrockReport]:
     """All cells over their time `left` (N,); cells that are done leave the batch."""
     count = left.numel()
     rows = torch.arange(count, device=u.device)
@@ -283,7 +283,7 @@ def _advance(
         ends = good & (h >= left)
         every = bool(ends.all())
         if every and not out:
-            return new, Report(accepted + 1, rejected, torch.full_like(rows, DONE))
+            return new, RosenbrockReport(accepted + 1, rejected, torch.full_like(rows, DONE))
         accepted.index_add_(0, rows, good.long())
         rejected.index_add_(0, rows, (~good).long())
         u = new if every else _merge(method, u, new, good, rows, h)
@@ -316,13 +316,13 @@ def _advance(
             break
     out.append((rows, u))
     order = torch.argsort(torch.cat([r for r, _ in out]))
-    return torch.cat([x for _, x in out], 1).index_select(1, order), Report(
+    return torch.cat([x for _, x in out], 1).index_select(1, order), RosenbrockReport(
         accepted, rejected, status
     )
 
 
 def _merge(
-    method: _Method, u: Tensor, new: Tensor, good: Tensor, rows: Tensor, h: Tensor
+    method: _Tableau, u: Tensor, new: Tensor, good: Tensor, rows: Tensor, h: Tensor
 ) -> Tensor:
     """`new` where the step was good, else u."""
     if not new.requires_grad:

@@ -23,7 +23,7 @@ from torchfilm.circuits.names import Names, UnknownName, unknown
 from torchfilm.circuits.network import Network
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
-from torchfilm.tools.powers import steady_functions
+from torchfilm.tools.deterministic_math import deterministic_functions
 
 # rates of change of species by name, conc/h, and amounts per hour given to signals by name,
 # conc·µm³/h
@@ -39,7 +39,7 @@ class Settings:
     steps: int
     rtol: float
     atol: float
-    copies: float | Tensor
+    molecules_per_unit: float | Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Circuit:
 
     rows: (M,) int64. cell, p: columns over the N cells by name. signals: what each cell finds
     outside, (N,) by name. pool: (N,) µm³, the part of the medium that is each cell's own, if
-    anything is exchanged. beyond: (N,) bool, cells whose pool is a reservoir that nothing changes,
+    anything is exchanged. in_reservoir: (N,) bool, cells whose pool is a reservoir that nothing changes,
     or None.
     """
 
@@ -61,7 +61,7 @@ class Circuit:
     p: Mapping[str, Any]
     signals: Mapping[str, Tensor]
     pool: Tensor | None = None
-    beyond: Tensor | None = None
+    in_reservoir: Tensor | None = None
     label: str = "circuit"
     seen: dict[str, set[str]] = field(default_factory=dict)
 
@@ -90,7 +90,7 @@ class Circuit:
         """Rates of species (m,), conc/h, and amounts given to signals (m,), conc·µm³/h, by name; u
         (m, …), rows (m,) among the N cells."""
         u_, s, p, cell = self.names(u, rows)
-        with steady_functions():
+        with deterministic_functions():
             if isinstance(self.part, Network):
                 found = self.part.changes(self.part.concentration_rates(u_, s, p, cell))
                 split = len(self.species)
@@ -152,10 +152,10 @@ class Circuit:
                     " always return it, 0 where nothing passes."
                 )
             flux = [outside.get(n, none) for n in self.given]
-            if self.beyond is None:
+            if self.in_reservoir is None:
                 columns += [x / pool for x in flux]
             else:
-                away = self.beyond.index_select(0, rows)
+                away = self.in_reservoir.index_select(0, rows)
                 columns += [torch.where(away, 0.0, x / pool) for x in flux]
                 columns += [torch.where(away, x.clamp(min=0.0), 0.0) for x in flux]
                 columns += [torch.where(away, (-x).clamp(min=0.0), 0.0) for x in flux]
@@ -165,7 +165,7 @@ class Circuit:
         """The variables at the start: concentrations (M, S), then pools, then what went to a
         reservoir and what came from it."""
         columns = [self.signals[n].index_select(0, self.rows) for n in self.given]
-        if self.beyond is not None:
+        if self.in_reservoir is not None:
             columns += [torch.zeros_like(c) for c in columns] * 2
         return (
             torch.cat([concentrations, *(c.unsqueeze(1) for c in columns)], 1)
@@ -176,13 +176,13 @@ class Circuit:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """After a step: concentrations (M, S); amounts given to the pools and beyond, conc·µm³, (M,) by
+    """After a step: concentrations (M, S); amounts given to the pools and to a reservoir, conc·µm³, (M,) by
     signal; whether a cell failed (M,) bool and why, (M,) codes for `words`; steps taken (M,) int64.
     """
 
     concentrations: Tensor
     pools: dict[str, Tensor]
-    beyond: dict[str, Tensor]
+    reservoir: dict[str, Tensor]
     failed: Tensor
     code: Tensor
     steps: Tensor
@@ -221,15 +221,15 @@ def step(
         # by no more than the tolerance, or the cell has failed
         end = torch.where((end < 0) & (start >= 0), 0.0, end)
     size, more = len(circuit.species), len(circuit.given)
-    pools, beyond = {}, {}
+    pools, reservoir = {}, {}
     for k, name in enumerate(circuit.given):
         assert circuit.pool is not None
         pools[name] = (end[:, size + k] - start[:, size + k]) * circuit.pool.index_select(
             0, circuit.rows
         )
-        if circuit.beyond is not None:
-            beyond[name] = end[:, size + more + k] - end[:, size + 2 * more + k]
-    return Outcome(end[:, :size], pools, beyond, code != 0, code, steps)
+        if circuit.in_reservoir is not None:
+            reservoir[name] = end[:, size + more + k] - end[:, size + 2 * more + k]
+    return Outcome(end[:, :size], pools, reservoir, code != 0, code, steps)
 
 
 def _molecules(
@@ -240,20 +240,22 @@ def _molecules(
     assert isinstance(circuit.part, Network)
     network, rows = circuit.part, circuit.rows
     volume = circuit.names(concentrations, rows)[3].volume.double()
-    copies = (
-        settings.copies.index_select(0, rows).double()
-        if isinstance(settings.copies, Tensor) and settings.copies.dim()
-        else settings.copies
+    molecules_per_unit = (
+        settings.molecules_per_unit.index_select(0, rows).double()
+        if isinstance(settings.molecules_per_unit, Tensor) and settings.molecules_per_unit.dim()
+        else settings.molecules_per_unit
     )
-    parts = [torch.round(concentrations.double() * (volume * copies).unsqueeze(1))]
+    parts = [torch.round(concentrations.double() * (volume * molecules_per_unit).unsqueeze(1))]
     pool = None
     if network.signals:
         assert circuit.pool is not None
         pool = circuit.pool.index_select(0, rows).double()
-        if circuit.beyond is not None:
-            pool = torch.where(circuit.beyond.index_select(0, rows), 1e9 * volume, pool)
+        if circuit.in_reservoir is not None:
+            pool = torch.where(circuit.in_reservoir.index_select(0, rows), 1e9 * volume, pool)
         parts += [
-            (circuit.signals[n].index_select(0, rows).double() * pool * copies).unsqueeze(1)
+            (
+                circuit.signals[n].index_select(0, rows).double() * pool * molecules_per_unit
+            ).unsqueeze(1)
             for n in network.signals
         ]
     start = torch.cat(parts, 1)
@@ -261,14 +263,16 @@ def _molecules(
     def propensities(counts: Tensor, mine: Tensor) -> Tensor:
         _, _, p, cell = circuit.names(counts, rows.index_select(0, mine))
         scale = (
-            copies.index_select(0, mine) if isinstance(copies, Tensor) and copies.dim() else copies
+            molecules_per_unit.index_select(0, mine)
+            if isinstance(molecules_per_unit, Tensor) and molecules_per_unit.dim()
+            else molecules_per_unit
         )
-        with steady_functions():
+        with deterministic_functions():
             return network.propensities(
                 counts,
                 p,
                 cell,
-                copies=scale,
+                molecules_per_unit=scale,
                 pool=None if pool is None else pool.index_select(0, mine),
             )
 
@@ -280,26 +284,27 @@ def _molecules(
         )
     size = len(circuit.species)
     amount = {
-        n: (end[:, size + k] - start[:, size + k]) / copies for k, n in enumerate(network.signals)
+        n: (end[:, size + k] - start[:, size + k]) / molecules_per_unit
+        for k, n in enumerate(network.signals)
     }
-    away = None if circuit.beyond is None else circuit.beyond.index_select(0, rows)
+    away = None if circuit.in_reservoir is None else circuit.in_reservoir.index_select(0, rows)
     pools = {
         n: (x if away is None else torch.where(away, 0.0, x)).to(concentrations.dtype)
         for n, x in amount.items()
     }
-    beyond = (
+    reservoir = (
         {}
         if away is None
         else {n: torch.where(away, x, 0.0).to(concentrations.dtype) for n, x in amount.items()}
     )
-    found = (end[:, :size] / (volume * copies).unsqueeze(1)).to(concentrations.dtype)
+    found = (end[:, :size] / (volume * molecules_per_unit).unsqueeze(1)).to(concentrations.dtype)
     # a code of its own for each reaction that went wrong, apart from those of the smooth methods
     code = torch.where(
         report.status == 0,
         0,
         torch.where(report.reaction >= 0, MOLECULES + report.reaction, report.status),
     )
-    return Outcome(found, pools, beyond, report.status != 0, code, report.steps)
+    return Outcome(found, pools, reservoir, report.status != 0, code, report.steps)
 
 
 MOLECULES = 100

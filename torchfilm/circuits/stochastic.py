@@ -31,7 +31,7 @@ MOST_HALVINGS = 60
 
 
 @dataclass(frozen=True)
-class Report:
+class StochasticReport:
     """For each cell, (N,) int64: `steps` (leaps and single events), `status`, one of STATUS, and
     the `reaction` that went wrong, −1 for none."""
 
@@ -51,7 +51,7 @@ def tau_leap(
     critical: int = 10,
     orders: Tensor | None = None,
     max_steps: int = 100_000,
-) -> tuple[Tensor, Report]:
+) -> tuple[Tensor, StochasticReport]:
     """Molecule numbers (N, S) after dt hours by tau-leaping, single events where leaps do not pay.
 
     What limits a reaction must be a species that it takes: a gene that goes on from "off" is two
@@ -63,7 +63,7 @@ def tau_leap(
     each species, 0 for none; default 2. Numbers stay whole (a remainder given in stays) and never
     negative. Not differentiable; raises nothing.
     """
-    run = _Run(propensities, stoichiometry, draw, counts)
+    run = _TauLeap(propensities, stoichiometry, draw, counts)
     leap = _Leap(run, epsilon, critical, orders)
     return run.advance(counts, dt, leap.step, max_steps)
 
@@ -76,10 +76,10 @@ def direct(
     draw: Draw,
     *,
     max_steps: int = 1_000_000,
-) -> tuple[Tensor, Report]:
+) -> tuple[Tensor, StochasticReport]:
     """Molecule numbers (N, S) after dt hours, event by event: exact, all cells side by side.
     Arguments as in `tau_leap`."""
-    run = _Run(propensities, stoichiometry, draw, counts)
+    run = _TauLeap(propensities, stoichiometry, draw, counts)
     return run.advance(counts, dt, run.single, max_steps)
 
 
@@ -104,7 +104,7 @@ def _choose(parts: Tensor, u: Tensor) -> Tensor:
     return torch.minimum(chosen, last)
 
 
-class _Run:
+class _TauLeap:
     """What both methods share. Within, arrays are float64 with cells last: counts (S, M),
     propensities (R, M)."""
 
@@ -154,7 +154,7 @@ class _Run:
     @torch.no_grad()
     def advance(
         self, counts: Tensor, dt: float, step: Callable[..., tuple[Tensor, Tensor]], most: int
-    ) -> tuple[Tensor, Report]:
+    ) -> tuple[Tensor, StochasticReport]:
         """All cells to the end, each at its own pace: `step` gives a cell's numbers and how much
         time passed."""
         cells = counts.shape[0]
@@ -194,13 +194,13 @@ class _Run:
                 left.index_select(0, stay),
             )
         out.index_copy_(0, rows, x.t().to(self.dtype))
-        return out, Report(steps, status, wrong)
+        return out, StochasticReport(steps, status, wrong)
 
 
 class _Leap:
     """The leaps of `tau_leap`."""
 
-    def __init__(self, run: _Run, epsilon: float, critical: int, orders: Tensor | None):
+    def __init__(self, run: _TauLeap, epsilon: float, critical: int, orders: Tensor | None):
         self.run, self.epsilon, self.critical = run, epsilon, critical
         order = torch.full_like(run.gain[0], 2.0) if orders is None else orders.to(run.gain)
         self.read, self.order = (order > 0).unsqueeze(1), order.clamp(min=1.0).unsqueeze(1)

@@ -39,7 +39,7 @@ GEOMETRY = {
     "y": ("position",),
     "z": ("position",),
 }
-OPTIONS = ("initial", "daughters", "method", "steps", "rtol", "atol", "copies")
+OPTIONS = ("initial", "daughters", "method", "steps", "rtol", "atol", "molecules_per_unit")
 EVERY = "every cell"  # where a circuit runs that is not given by type
 
 
@@ -51,7 +51,7 @@ class CircuitReport:
     status: Tensor
     steps: Tensor
     words: Mapping[int, str]
-    mend = (
+    hint = (
         "A smaller dt, or rates that stay finite and do not push a concentration below 0, may help"
     )
 
@@ -88,7 +88,7 @@ class Circuit(Effect):
     parent's (the paper's way; the two new caps make both together smaller than it was), "amount",
     its molecules are shared by volume and none is lost. method: "rosenbrock" (stiff, adaptive for
     each cell), "euler", "midpoint", "heun2", "heun3", "rk4" (`steps` equal steps), or for reactions
-    "tau_leap" or "direct": molecule by molecule, `copies` of them in a unit of concentration × µm³
+    "tau_leap" or "direct": molecule by molecule, `molecules_per_unit` of them in a unit of concentration × µm³
     (0.6022 for nM). rtol, atol: of the adaptive method. Growth dilutes: amounts stay,
     concentrations are multiplied by V_old/V_new. Further names are parameters: numbers, or one per
     colony.
@@ -102,7 +102,7 @@ class Circuit(Effect):
     steps: int = 1
     rtol: float = 1e-4
     atol: float = 1e-9
-    copies: float | Tensor = 1.0
+    molecules_per_unit: float | Tensor = 1.0
     parameters: Mapping[str, float | Tensor] = field(default_factory=dict)
     noted: Noted = field(default_factory=Noted, repr=False)
 
@@ -120,7 +120,7 @@ class Circuit(Effect):
         steps: int = 1,
         rtol: float = 1e-4,
         atol: float = 1e-9,
-        copies: float | Tensor = 1.0,
+        molecules_per_unit: float | Tensor = 1.0,
         **parameters: float | Tensor,
     ):
         by_type: dict[int | str, Part] = (
@@ -129,7 +129,7 @@ class Circuit(Effect):
         names = _names(species)
         taken = [n for n in names if n in RESERVED or n in GEOMETRY]
         if taken:
-            raise checks.refuse(
+            raise checks.input_error(
                 "Circuit.species",
                 taken[0],
                 "a name that cells do not have already",
@@ -137,16 +137,18 @@ class Circuit(Effect):
             )
         for kind, part in by_type.items():
             if isinstance(rates, Mapping) and (isinstance(kind, bool) or not isinstance(kind, int)):
-                raise checks.refuse("Circuit.rates", kind, "by cell types that are whole numbers")
+                raise checks.input_error(
+                    "Circuit.rates", kind, "by cell types that are whole numbers"
+                )
             if not callable(part) and not (isinstance(part, (list, tuple)) and part):
-                raise checks.refuse(
+                raise checks.input_error(
                     "Circuit.rates",
                     part,
                     "a function (u, s, p, cell), a list of reactions, or a dict of either by cell"
                     " type",
                 )
         if initial is not None and not isinstance(initial, Mapping):
-            raise checks.refuse(
+            raise checks.input_error(
                 "Circuit.initial", initial, f"a dict by species, such as {{{names[0]!r}: 1.0}}"
             )
         for name in initial or {}:
@@ -159,21 +161,21 @@ class Circuit(Effect):
                 near = difflib.get_close_matches(
                     name, [f.name for f in dataclasses.fields(self)], 1
                 )
-                mend = (
+                hint = (
                     f"Did you mean {near[0]}?"
                     if near
                     else "Further names are parameters of the rates."
                 )
-                raise checks.refuse(
-                    f"Circuit.{name}", odd, "a number, or one number per colony", mend
+                raise checks.input_error(
+                    f"Circuit.{name}", odd, "a number, or one number per colony", hint
                 )
         checks.choice("Circuit.daughters", daughters, ("concentration", "amount"))
         checks.choice("Circuit.method", method, METHODS)
         if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-            raise checks.refuse("Circuit.steps", steps, "a whole number from 1")
+            raise checks.input_error("Circuit.steps", steps, "a whole number from 1")
         functions = [part for part in by_type.values() if callable(part)]
         if method in (LEAP, DIRECT) and functions:
-            raise checks.refuse(
+            raise checks.input_error(
                 "Circuit.method",
                 method,
                 f"for reactions; {getattr(functions[0], '__name__', 'a function')} gives rates",
@@ -191,7 +193,9 @@ class Circuit(Effect):
             "steps": steps,
             "rtol": checks.number("Circuit.rtol", rtol, above=0.0, most=0.1),
             "atol": checks.number("Circuit.atol", atol, above=0.0),
-            "copies": checks.value("Circuit.copies", copies, above=0.0),
+            "molecules_per_unit": checks.value(
+                "Circuit.molecules_per_unit", molecules_per_unit, above=0.0
+            ),
             "parameters": {n: checks.value(f"Circuit.{n}", v) for n, v in parameters.items()},
             "noted": Noted(),
         }
@@ -252,8 +256,8 @@ class Circuit(Effect):
         share = volumes[0] / (volumes[0] + volumes[1])
         if not self.is_stochastic:
             return torch.cat([amount * share / volumes[0], amount * (1 - share) / volumes[1]])
-        copies = per_cell(self.copies, births.parents)
-        count = torch.round(amount * copies)
+        molecules_per_unit = per_cell(self.molecules_per_unit, births.parents)
+        count = torch.round(amount * molecules_per_unit)
         taken = binomial(
             count,
             share,
@@ -261,7 +265,12 @@ class Circuit(Effect):
                 torch.arange(count.numel(), device=count.device), f"partition {name}"
             ),
         )
-        return torch.cat([taken / (volumes[0] * copies), (count - taken) / (volumes[1] * copies)])
+        return torch.cat(
+            [
+                taken / (volumes[0] * molecules_per_unit),
+                (count - taken) / (volumes[1] * molecules_per_unit),
+            ]
+        )
 
     def prepare(self, state: State) -> State:
         """Molecules made whole, each rate function tried on a few cells."""
@@ -336,7 +345,7 @@ class Circuit(Effect):
         """First concentrations that are whole numbers of molecules: rounded up or down at random,
         so that the mean stays."""
         rows = torch.arange(state.cells, device=state.device)
-        size = state.volume * per_cell(self.copies, state)
+        size = state.volume * per_cell(self.molecules_per_unit, state)
         found = {
             n: torch.floor(state.fields[n] * size + state.uniform(rows, f"first {n}")) / size
             for n in self.species
@@ -367,7 +376,7 @@ class Circuit(Effect):
         medium = _Medium(state) if state.layout is not None else None
         outside = {} if medium is None else medium.found
         settings = run.Settings(
-            self.method, self.steps, self.rtol, self.atol, per_cell(self.copies, state)
+            self.method, self.steps, self.rtol, self.atol, per_cell(self.molecules_per_unit, state)
         )
         keys = (
             keyed_draws(state.seed, state.own_stream, state.uid, state.step)
@@ -424,7 +433,7 @@ class Circuit(Effect):
         label = getattr(part, "__name__", "the list of reactions") + (
             "" if kind == EVERY else f" (cell type {kind})"
         )
-        pool, beyond = (None, None) if medium is None else (medium.pool, medium.beyond)
+        pool, in_reservoir = (None, None) if medium is None else (medium.pool, medium.in_reservoir)
         if isinstance(part, run.Network):
             given = part.signals
         p = {n: per_cell(v, state) for n, v in self.parameters.items()}
@@ -437,7 +446,7 @@ class Circuit(Effect):
             p,
             outside,
             pool,
-            beyond,
+            in_reservoir,
             label,
             seen or {},
         )
@@ -465,7 +474,7 @@ def _names(species: Sequence[str]) -> tuple[str, ...]:
     names = (species,) if isinstance(species, str) else tuple(species)
     if not fit(names):
         apart = tuple(species.replace(",", " ").split()) if isinstance(species, str) else ()
-        raise checks.refuse(
+        raise checks.input_error(
             "Circuit.species",
             species,
             "different names, at least one",
@@ -509,19 +518,19 @@ class _Medium:
     def __init__(self, state: State):
         contact = state.contact()
         assert contact is not None
-        self.state, self.stencil, self.found, self.pool, self.beyond = (
+        self.state, self.stencil, self.found, self.pool, self.in_reservoir = (
             state,
             contact.stencil,
             contact.found,
             contact.pool,
-            contact.beyond,
+            contact.in_reservoir,
         )
         self.given: dict[str, Tensor] = {}
         self.gone: dict[str, Tensor] = {}
 
     def note(self, rows: Tensor, found: run.Outcome) -> None:
-        """What the cells `rows` (M,) have given, to their pools and beyond."""
-        for here, new in ((self.given, found.pools), (self.gone, found.beyond)):
+        """What the cells `rows` (M,) have given, to their pools and to a reservoir."""
+        for here, new in ((self.given, found.pools), (self.gone, found.reservoir)):
             for name, amount in new.items():
                 start = here.get(name)
                 here[name] = (torch.zeros_like(self.pool) if start is None else start).index_add(
@@ -536,8 +545,8 @@ class _Medium:
             for n, amount in self.given.items()
         }
         changed |= {
-            f"{n}_beyond": (
-                state.fields[f"{n}_beyond"] + state.groups.sum(amount.unsqueeze(1)).squeeze(1)
+            f"{n}_reservoir": (
+                state.fields[f"{n}_reservoir"] + state.groups.sum(amount.unsqueeze(1)).squeeze(1)
             )
             for n, amount in self.gone.items()
         }

@@ -31,7 +31,7 @@ class DivisionReport:
     length: Tensor
     needs: Tensor
 
-    mend: ClassVar[str] = "Divide later, or start from longer cells"
+    hint: ClassVar[str] = "Divide later, or start from longer cells"
 
     def reason(self, place: int) -> str:
         """What went wrong in the colony at this place of the batch."""
@@ -80,7 +80,7 @@ class Division(Effect):
             else float(torch.as_tensor(fraction).max())
         )
         if greatest >= 1.0:
-            raise checks.refuse(
+            raise checks.input_error(
                 "Division.fraction", self.fraction, "between 0 and 1, both excluded"
             )
         object.__setattr__(

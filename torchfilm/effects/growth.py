@@ -25,7 +25,7 @@ class GrowthReport:
     status: Tensor
     uid: Tensor
     rate: Tensor
-    mend = "A smaller dt or growth rate may help (rates are per hour, and dt is in hours)"
+    hint = "A smaller dt or growth rate may help (rates are per hour, and dt is in hours)"
 
     def reason(self, place: int) -> str:
         """What went wrong in the colony at this place of the batch."""

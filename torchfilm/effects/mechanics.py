@@ -11,9 +11,16 @@ from torch import Tensor
 
 from torchfilm.effect import MECHANICS, Effect, per_cell
 from torchfilm.physics import capsule
-from torchfilm.physics.contacts import NEAR, Bodies, Contacts, Touching, contact_gaps, contacts_of
+from torchfilm.physics.contacts import (
+    NEAR,
+    CandidateContacts,
+    Capsules,
+    Contacts,
+    contact_gaps,
+    contacts_of,
+)
+from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.neighbours import Neighbourhood
-from torchfilm.physics.rows import ContactRows
 from torchfilm.physics.solve import (
     CONVERGED,
     NOT_FINITE,
@@ -63,7 +70,7 @@ class MechanicsReport:
     substeps: Tensor
     limited: Tensor
     buried: Tensor
-    mend = "A smaller dt, a larger alpha or more max_iterations may help"
+    hint = "A smaller dt, a larger alpha or more max_iterations may help"
 
     def reason(self, place: int) -> str:
         """What went wrong in the colony at `place`."""
@@ -137,7 +144,7 @@ class Mechanics(Effect):
                     self, name, checks.value(f"Mechanics.{name}", getattr(self, name), above=0.0)
                 )
         if isinstance(self.walls, Wall):
-            raise checks.refuse(
+            raise checks.input_error(
                 "Mechanics.walls",
                 self.walls,
                 "a list of walls",
@@ -145,7 +152,7 @@ class Mechanics(Effect):
             )
         for wall in self.walls:
             if not isinstance(wall, Wall):
-                raise checks.refuse(
+                raise checks.input_error(
                     "Mechanics.walls", wall, "a list of Plane, Sphere, Box or Channel"
                 )
         for name in ("passes", "max_iterations"):
@@ -153,7 +160,7 @@ class Mechanics(Effect):
             if (name, given) == ("passes", None):
                 continue
             if not isinstance(given, int) or given < 1:
-                raise checks.refuse(f"Mechanics.{name}", given, "a whole number from 1")
+                raise checks.input_error(f"Mechanics.{name}", given, "a whole number from 1")
         if self.tolerance is not None:
             checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
         checks.number("Mechanics.max_elongation", self.max_elongation, above=0.0)
@@ -201,7 +208,7 @@ class Mechanics(Effect):
 
     def check(self, state: State) -> None:
         if state.dim != self.dim:
-            raise checks.refuse("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
+            raise checks.input_error("Mechanics.dim", self.dim, f"{state.dim}, like the cells")
         for surface in self.surfaces():
             distance, _ = surface.gap_of_points(state.position, state.own_colony_id)
             beyond = torch.nonzero(distance < 0).squeeze(1)
@@ -343,7 +350,7 @@ class _Run:
                 self.first_move = torch.where(moving.unsqueeze(1), move.detach(), self.first_move)
 
     @torch.no_grad()
-    def _note_buried(self, pairs: Touching, active: Tensor) -> None:
+    def _note_buried(self, pairs: CandidateContacts, active: Tensor) -> None:
         if self.settings.stiffness is None:
             deep = torch.nonzero(pairs.gap < -0.5 * (pairs.a.radius + pairs.b.radius)).squeeze(1)
             cells = torch.zeros_like(self.state.radius)
@@ -355,14 +362,18 @@ class _Run:
                 self.report, buried=torch.where(active, found, self.report.buried)
             )
 
-    def _all_that_touches(self, active: Tensor, sees_near: bool) -> tuple[Touching, WallContacts]:
+    def _all_that_touches(
+        self, active: Tensor, sees_near: bool
+    ) -> tuple[CandidateContacts, WallContacts]:
         """In the colonies that are active, (B,) bool."""
         near, rows, bodies = self._neighbourhood(active, sees_near)
         first, second = (rows.index_select(0, side) for side in near.pairs())
         walls = self._at_walls(active.index_select(0, self.state.colony), sees_near)
-        return Touching.among(bodies, first, second, sees_near), walls
+        return CandidateContacts.among(bodies, first, second, sees_near), walls
 
-    def _left_deep(self, active: Tensor, pairs: Touching) -> tuple[Touching, WallContacts, Tensor]:
+    def _left_deep(
+        self, active: Tensor, pairs: CandidateContacts
+    ) -> tuple[CandidateContacts, WallContacts, Tensor]:
         """After a move, in the colonies that are active: the cells that take part in another pass,
         (N,) bool, those whose move was cut short, or left them too deep; and all that touches them.
         pairs: what touched before the move.
@@ -416,19 +427,19 @@ class _Run:
             theirs = torch.nonzero(
                 left.index_select(0, first) | left.index_select(0, second)
             ).squeeze(1)
-        pairs = Touching.among(
+        pairs = CandidateContacts.among(
             bodies, first.index_select(0, theirs), second.index_select(0, theirs), sees_near
         )
         return pairs, walls.take(torch.nonzero(left.index_select(0, walls.cell)).squeeze(1)), left
 
     def _neighbourhood(
         self, active: Tensor, sees_near: bool
-    ) -> tuple[Neighbourhood, Tensor, Bodies]:
+    ) -> tuple[Neighbourhood, Tensor, Capsules]:
         """The cells of the colonies that are active (others cannot be stepped perhaps), which those
         are (M,), and every cell's body."""
         state = self.state
         local = (self.position - self.reference).to(state.dtype)
-        bodies = Bodies(
+        bodies = Capsules(
             local.T.contiguous(), self.axis.T.contiguous(), 0.5 * self.length, state.radius
         )
         rows = torch.nonzero(active.index_select(0, state.colony)).squeeze(1)
@@ -488,7 +499,7 @@ class _Run:
         scale = torch.stack(drag, 1).rsqrt()
         root = contacts.weight.sqrt().unsqueeze(1)
         wall_root, wall_soft = self._wall_weights(walls)
-        rows = ContactRows(
+        rows = ContactJacobian(
             contacts.first,
             contacts.second,
             contacts.row_first * scale.index_select(0, contacts.first) * root,

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.effect import BEFORE_CELLS, COVER, TRANSPORT, Effect, per_colony
-from torchfilm.signals.faces import Faces, Open
-from torchfilm.signals.grid import Batch, Grid
+from torchfilm.effect import BEFORE_CELLS, GRID_COVERAGE, TRANSPORT, Effect, per_colony
+from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
+from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.signals.layout import Layout
 from torchfilm.signals.operator import operator
 from torchfilm.signals.space import MOST_VOXELS, checked_box, checked_flow
@@ -25,7 +25,7 @@ OnGrid = float | Tensor | Callable[[Tensor], Tensor]
 # A velocity: two or three numbers (or one per colony each), or a function from places (M, 3) µm to
 # velocities (M, 3).
 Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
-BEYOND = ("error", "grow", "open")
+OUTSIDE_CELLS = ("error", "grow", "reservoir")
 SPLITTINGS = ("lie", "strang")
 # A grid that grows with its colony does so by this many voxels at a time, and keeps this many
 # between the cells and its faces.
@@ -38,21 +38,21 @@ class Signal:
 
     diffusion: K, µm²/h; decay: 1/h; each one number or one per colony; decay may also be a function
     from places (M, 3) µm to (M,), a sink. initial: concentration at the start, and source:
-    concentration/h made everywhere, each a number, one per colony, or such a function. faces: what
+    concentration/h made everywhere, each a number, one per colony, or such a function. boundary: what
     happens at the faces of the box, and flow: what carries it, µm/h, if not as the medium says.
-    beyond: the concentration that cells beyond an open box find there.
+    reservoir: the concentration that cells beyond an open box find there.
     """
 
     diffusion: float | Tensor
     decay: OnGrid = 0.0
     initial: OnGrid = 0.0
     source: OnGrid = 0.0
-    faces: Faces | None = None
+    boundary: BoundaryConditions | None = None
     flow: Flow = None
-    beyond: float | Tensor = 0.0
+    reservoir: float | Tensor = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("diffusion", "beyond"):
+        for name in ("diffusion", "reservoir"):
             object.__setattr__(
                 self, name, checks.value(f"Signal.{name}", getattr(self, name), least=0.0)
             )
@@ -72,9 +72,9 @@ class MediumReport:
     status: Tensor
     left: Tensor
     first: Tensor
-    mend = (
+    hint = (
         "Make the box of the Medium larger (one that is flat is a single layer), let it grow with"
-        f" the colony, Medium(…, beyond='grow'), with a spacing that needs at most {MOST_VOXELS:,}"
+        f" the colony, Medium(…, outside='grow'), with a spacing that needs at most {MOST_VOXELS:,}"
         " voxels a colony, or move the obstacle"
     )
 
@@ -92,16 +92,16 @@ class Medium(Effect):
     box=((-64, -64), (64, 64)), spacing=4.0)`.
 
     box: lower and upper corner, µm, in 2 or 3 dimensions; a flat box is one layer `depth` µm thick
-    (by default as thick as a voxel is wide; in a 3-D scene that no cell may leave, beyond="error",
+    (by default as thick as a voxel is wide; in a 3-D scene that no cell may leave, outside="error",
     the depth is to be given). Cells of a 2-D scene may lie in a box with three: in the plane z =
-    `height`. spacing: of voxels, µm, one number or one an axis. faces: of the box; without, nothing
+    `height`. spacing: of voxels, µm, one number or one an axis. boundary: of the box; without, nothing
     passes them, or where the medium flows, what it carries. flow: velocity of the medium, µm/h: two
     or three numbers (or one per colony each), or a function from places (M, 3) µm to velocities (M,
     3). obstacles: a function from places (M, 3) to (M,) bool, true where there is none of the
-    medium. beyond: what cells beyond the box mean: "error"; "grow": the box grows with its colony,
-    along the axes that `grows` names; "open": the box stands in a reservoir in which each signal is
-    at its `beyond`, and what cells give to it and take from it is kept count of in the fields
-    NAME_beyond. method: "exponential" (exact, where the box is all medium and the flow uniform),
+    medium. outside: what cells outside the box mean: "error"; "grow": the box grows with its colony,
+    along the axes that `grows` names; "reservoir": the box stands in a reservoir in which each signal is
+    at its `reservoir`, and what cells give to it and take from it is kept count of in the fields
+    NAME_reservoir. method: "exponential" (exact, where the box is all medium and the flow uniform),
     "implicit" (positive at any step; elsewhere), "crank_nicolson" (the paper's) or "euler"; by
     default the first of them that the scene allows. steps: of transport within one of the scene's,
     for accuracy. splitting: how transport and what cells exchange take turns in a step: "strang",
@@ -114,10 +114,10 @@ class Medium(Effect):
     spacing: tuple[float, ...]
     depth: float | None = None
     height: float = 0.0
-    faces: Faces | None = None
+    boundary: BoundaryConditions | None = None
     flow: Flow = None
     obstacles: Callable[[Tensor], Tensor] | None = None
-    beyond: str = "error"
+    outside: str = "error"
     grows: str = "xyz"
     method: str | None = None
     steps: int = 1
@@ -133,10 +133,10 @@ class Medium(Effect):
         spacing: float | Sequence[float],
         depth: float | None = None,
         height: float = 0.0,
-        faces: Faces | None = None,
+        boundary: BoundaryConditions | None = None,
         flow: Flow = None,
         obstacles: Callable[[Tensor], Tensor] | None = None,
-        beyond: str = "error",
+        outside: str = "error",
         grows: str = "xyz",
         method: str | None = None,
         steps: int = 1,
@@ -149,39 +149,42 @@ class Medium(Effect):
             )
         for name, signal in signals.items():
             if not isinstance(signal, Signal):
-                raise checks.refuse(
+                raise checks.input_error(
                     f"Medium.{name}",
                     signal,
                     "a Signal",
                     f"Write {name}=tf.Signal(diffusion=…), or check the spelling of an option.",
                 )
         low, high, voxel = checked_box(box, spacing, depth, height)
-        if faces is not None and not isinstance(faces, Faces):
-            raise checks.refuse(
-                "Medium.faces", faces, "Faces", "Write faces=tf.Faces(x=tf.Open(), y=tf.NoFlux())."
+        if boundary is not None and not isinstance(boundary, BoundaryConditions):
+            raise checks.input_error(
+                "Medium.boundary",
+                boundary,
+                "BoundaryConditions",
+                "Write boundary=tf.BoundaryConditions(x=tf.Open(), y=tf.NoFlux()).",
             )
-        checks.choice("Medium.beyond", beyond, BEYOND)
+        checks.choice("Medium.outside", outside, OUTSIDE_CELLS)
         if not isinstance(grows, str) or not grows or set(grows) - set("xyz"):
-            raise checks.refuse(
+            raise checks.input_error(
                 "Medium.grows", grows, 'some of the letters x, y and z, such as "x"'
             )
         if method is not None:
             checks.choice("Medium.method", method, tuple(METHODS))
         if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-            raise checks.refuse("Medium.steps", steps, "a whole number from 1")
+            raise checks.input_error("Medium.steps", steps, "a whole number from 1")
         checks.choice("Medium.splitting", splitting, SPLITTINGS)
         if obstacles is not None and not callable(obstacles):
-            raise checks.refuse("Medium.obstacles", obstacles, "a function of places")
+            raise checks.input_error("Medium.obstacles", obstacles, "a function of places")
         given = {
             "signals": dict(signals),
             "box": (low, high),
             "spacing": voxel,
             "depth": depth,
             "height": float(height),
-            "faces": faces,
+            "boundary": boundary,
             "flow": checked_flow("Medium.flow", flow),
             "obstacles": obstacles,
-            "beyond": beyond,
+            "outside": outside,
             "grows": grows,
             "method": method,
             "steps": steps,
@@ -189,26 +192,30 @@ class Medium(Effect):
         }
         for name, value in given.items():
             object.__setattr__(self, name, value)
-        periodic = {self.faces_of(name).periodic for name in signals}
+        periodic = {self.boundary_of(name).periodic for name in signals}
         if len(periodic) > 1:
             raise checks.InputError(
                 "Medium: a face is periodic for one signal and not for another; space closes on"
                 " itself for all or for none."
             )
-        if True in next(iter(periodic)) and beyond == "grow":
-            raise checks.refuse(
-                "Medium.beyond",
-                beyond,
-                '"error" or "open" with periodic faces',
+        if True in next(iter(periodic)) and outside == "grow":
+            raise checks.input_error(
+                "Medium.outside",
+                outside,
+                '"error" or "reservoir" with periodic faces',
                 "A box that closes on itself cannot grow.",
             )
 
-    def faces_of(self, name: str) -> Faces:
+    def boundary_of(self, name: str) -> BoundaryConditions:
         """The faces that a signal meets."""
         signal = self.signals[name]
-        if signal.faces is not None or self.faces is not None:
-            return signal.faces or self.faces or Faces()
-        return Faces() if self.flow_of(name) is None else Faces(Open(), Open(), Open())
+        if signal.boundary is not None or self.boundary is not None:
+            return signal.boundary or self.boundary or BoundaryConditions()
+        return (
+            BoundaryConditions()
+            if self.flow_of(name) is None
+            else BoundaryConditions(Open(), Open(), Open())
+        )
 
     def flow_of(self, name: str) -> Flow:
         """What carries a signal."""
@@ -227,7 +234,9 @@ class Medium(Effect):
 
     def parts(self) -> tuple[Effect, ...]:
         return (
-            (Cover(self), self) if self.splitting == "lie" else (FirstHalf(self), Cover(self), self)
+            (GridCoverage(self), self)
+            if self.splitting == "lie"
+            else (FirstHalf(self), GridCoverage(self), self)
         )
 
     def declares(self, dim: int) -> tuple[Field, ...]:
@@ -241,12 +250,12 @@ class Medium(Effect):
             )
             for name in self.signals
         ]
-        if self.beyond == "open":
+        if self.outside == "reservoir":
             # counted in float64: over thousands of steps a float32 sum would no longer notice what
             # a step adds
             fields += [
                 Field(
-                    f"{name}_beyond",
+                    f"{name}_reservoir",
                     "amount given to the reservoir beyond the box, less what was taken",
                     "conc·µm³",
                     scope=COLONY,
@@ -270,12 +279,14 @@ class Medium(Effect):
             step,
         )
         reservoir = (
-            {name: s.beyond for name, s in self.signals.items()} if self.beyond == "open" else None
+            {name: s.reservoir for name, s in self.signals.items()}
+            if self.outside == "reservoir"
+            else None
         )
         return state.replace(
             layout=Layout(
                 grid,
-                self.faces_of(next(iter(self.signals))).periodic,
+                self.boundary_of(next(iter(self.signals))).periodic,
                 self.height,
                 self.obstacles,
                 reservoir,
@@ -292,7 +303,7 @@ class Medium(Effect):
             label = f"{what}(places) of the signal {name!r}"
             if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
                 shown = tuple(found.shape) if isinstance(found, Tensor) else found
-                raise checks.refuse(
+                raise checks.input_error(
                     label,
                     shown,
                     f"a tensor of shape ({layout.grid.nodes},), one number for each place",
@@ -300,7 +311,7 @@ class Medium(Effect):
             bad = torch.nonzero(~((found >= 0) & (found < torch.inf))).squeeze(1)
             if bad.numel():
                 where = [round(x, 3) for x in layout.grid.centres()[bad[0]].tolist()]
-                raise checks.refuse(
+                raise checks.input_error(
                     label,
                     float(found[bad[0]]),
                     "finite and at least 0 everywhere",
@@ -324,13 +335,15 @@ class Medium(Effect):
             state.dim == 3
             and len(self.box[0]) == 2
             and self.depth is None
-            and self.beyond == "error"
+            and self.outside == "error"
         ):
-            mend = (
+            hint = (
                 "Give both corners a z; or a depth=…, if all cells stay in one layer; or let the"
-                " box grow, beyond='grow'."
+                " box grow, outside='grow'."
             )
-            raise checks.refuse("Medium.box", self.box, "of three dimensions in a 3-D scene", mend)
+            raise checks.input_error(
+                "Medium.box", self.box, "of three dimensions in a 3-D scene", hint
+            )
         for name in self.signals:
             self._stepper(name, state, state.layout.grid.batches[0], 1.0)  # type: ignore[union-attr]
 
@@ -352,7 +365,7 @@ class Medium(Effect):
             changed[OUTSIDE + name] = grid.join(parts)
         return state.with_fields(**changed)
 
-    def _stepper(self, name: str, state: State, batch: Batch, dt: float) -> Stepper:
+    def _stepper(self, name: str, state: State, batch: GridBatch, dt: float) -> Stepper:
         """The step of a signal on the grids of one shape, made once for as long as they stay."""
         assert state.layout is not None
         numbers = [p for p in self._numbers(name) if isinstance(p, Tensor)] + _held(
@@ -381,11 +394,13 @@ class Medium(Effect):
     def _numbers(self, name: str) -> list[Any]:
         """What a signal's transport depends on, tensors among it."""
         signal, flow = self.signals[name], self.flow_of(name)
-        faces = [face.outside_value() for pair in self.faces_of(name).pairs for face in pair]
+        faces = [face.outside_value() for pair in self.boundary_of(name).pairs for face in pair]
         moving = [] if callable(flow) else list(flow or ())
         return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
 
-    def _prepare(self, name: str, state: State, batch: Batch, dt: float) -> tuple[Stepper, bool]:
+    def _prepare(
+        self, name: str, state: State, batch: GridBatch, dt: float
+    ) -> tuple[Stepper, bool]:
         """The step, and whether a gradient passes through what it was made of."""
         signal, layout = self.signals[name], state.layout
         assert layout is not None
@@ -404,7 +419,7 @@ class Medium(Effect):
             diffusion=own(signal.diffusion),
             decay=spread("decay"),
             velocity=_velocity(self.flow_of(name), layout, batch, own),
-            faces=self.faces_of(name).take(ids),
+            boundary=self.boundary_of(name).take(ids),
             mask=None if layout.mask is None else batch.of(layout.mask),
             source=(
                 None
@@ -427,7 +442,7 @@ class Medium(Effect):
         )
 
 
-def _velocity(flow: Flow, layout: Layout, batch: Batch, own: Callable[[Any], Any]) -> Any:
+def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any], Any]) -> Any:
     """The velocity as the operator wants it: none, uniform (b, 3), or on the faces of the voxels,
     three tensors."""
     if flow is None:
@@ -473,13 +488,13 @@ class FirstHalf(Effect):
 
 
 @dataclass(frozen=True, eq=False)
-class Cover(Effect):
+class GridCoverage(Effect):
     """The part of Medium that sees to it that every cell is on the grid, before anything is
     exchanged."""
 
     medium: Medium = field(repr=False)
 
-    stage = COVER
+    stage = GRID_COVERAGE
     title = "cover"
 
     def reads(self) -> tuple[str, ...]:
@@ -488,7 +503,7 @@ class Cover(Effect):
     def writes(self) -> tuple[str, ...]:
         return (
             tuple(OUTSIDE + name for name in self.medium.signals)
-            if self.medium.beyond == "grow"
+            if self.medium.outside == "grow"
             else ()
         )
 
@@ -496,7 +511,7 @@ class Cover(Effect):
         return self.medium.lay(state)
 
     def prepare(self, state: State) -> State:
-        return self._grown(state) if self.medium.beyond == "grow" else state
+        return self._grown(state) if self.medium.outside == "grow" else state
 
     def check(self, state: State) -> None:
         report = self._look(state)
@@ -506,11 +521,11 @@ class Cover(Effect):
             low, high, _ = self.medium.corners
             raise checks.InputError(
                 f"Medium.box, from {low} to {high} µm, is too small for colony {colony}:"
-                f" {report.reason(place)}. {report.mend}."
+                f" {report.reason(place)}. {report.hint}."
             )
 
     def step(self, state: State, dt: float) -> State:
-        if self.medium.beyond == "grow":
+        if self.medium.outside == "grow":
             state = self._grown(state)
         report = self._look(state)
         return (
@@ -523,7 +538,7 @@ class Cover(Effect):
         layout = state.layout
         if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
-        away = layout.astray(state.position, state.colony)
+        away = layout.outside_medium(state.position, state.colony)
         left = torch.bincount(state.colony[away], minlength=state.colonies)
         first = torch.zeros(state.colonies, 3, dtype=torch.float64, device=state.device)
         first[state.colony[away]] = layout.places(state.position)[away]

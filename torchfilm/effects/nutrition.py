@@ -22,7 +22,7 @@ class NutritionReport:
 
     status: Tensor
     uptake: Tensor
-    mend = "A smaller dt may help"
+    hint = "A smaller dt may help"
 
     def reason(self, place: int) -> str:
         return "the uptake of a cell could not be stepped"
@@ -95,7 +95,7 @@ class Monod(Effect):
         name = OUTSIDE + self.signal
         contact, volume = state.contact(), state.volume
         assert contact is not None
-        there, beyond = contact.found[self.signal], contact.beyond
+        there, in_reservoir = contact.found[self.signal], contact.in_reservoir
         greatest, half, gain = (
             per_cell(x, state).expand(state.cells)
             for x in (self.rate, self.half, self.growth_yield)
@@ -111,17 +111,19 @@ class Monod(Effect):
 
         end, report = rosenbrock(rates, torch.stack([there, torch.zeros_like(there)], 1), dt)
         eaten = end[:, 1]
-        if beyond is not None:  # a reservoir stays as it is
+        if in_reservoir is not None:  # a reservoir stays as it is
             eaten = torch.where(
-                beyond, volume / gain * torch.expm1(greatest * there / (half + there) * dt), eaten
+                in_reservoir,
+                volume / gain * torch.expm1(greatest * there / (half + there) * dt),
+                eaten,
             )
         # dV/dt = growth · V over the step, from V to V + gain · eaten
         growth = torch.log1p(gain * eaten / volume) / dt
-        inside = eaten if beyond is None else torch.where(beyond, 0.0, eaten)
+        inside = eaten if in_reservoir is None else torch.where(in_reservoir, 0.0, eaten)
         changed = {name: write(state.fields[name], -inside, contact.stencil)}
-        if beyond is not None:
+        if in_reservoir is not None:
             lost = state.groups.sum((inside - eaten).unsqueeze(1)).squeeze(1)
-            changed[f"{self.signal}_beyond"] = state.fields[f"{self.signal}_beyond"] + lost
+            changed[f"{self.signal}_reservoir"] = state.fields[f"{self.signal}_reservoir"] + lost
         changed |= {
             "growth_rate": growth,
             f"{self.signal}_eaten": state.fields[f"{self.signal}_eaten"] + eaten,

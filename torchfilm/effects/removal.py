@@ -41,7 +41,7 @@ class Removal(Effect):
 
     def check(self, state: State) -> None:
         if len(self.low) != state.dim:
-            raise checks.refuse(
+            raise checks.input_error(
                 "Removal.low", self.low, f"of {state.dim} numbers in a {state.dim}-D scene"
             )
         outside = self._outside(state)

@@ -24,10 +24,10 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import DIVISION, RULES, Effect
+from torchfilm.rule_views import KNOWN_FIELDS, MEANS, CellsView, DivisionView, RuleError
 from torchfilm.state import Births, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.watched import Watched, load_functions
-from torchfilm.views import KNOWN_FIELDS, MEANS, CellsView, DivisionView, RuleError
+from torchfilm.tools.hot_reload import HotReload, load_functions
 
 TRIAL_STEP = 0.025  # h, the step that a rule sees when it is tried
 
@@ -44,7 +44,7 @@ class Rules(Effect):
     update: Callable[[CellsView], None] | str | Path | None = None
     divide: Callable[[DivisionView, DivisionView, DivisionView], None] | None = None
     variables: Mapping[str, float] = field(default_factory=dict)
-    source: Watched = field(init=False, repr=False, compare=False)
+    source: HotReload = field(init=False, repr=False, compare=False)
     noted: dict[str, tuple[str, ...]] = field(init=False, repr=False, compare=False)
 
     stage = RULES
@@ -59,7 +59,7 @@ class Rules(Effect):
             places = [Path(self.update), *(Path(p) / self.update for p in sys.path)]
             path = next((p for p in places if p.is_file()), places[0])
             if not path.is_file():
-                raise checks.refuse(
+                raise checks.input_error(
                     "Rules.update",
                     str(path),
                     "a function or the path of a Python file",
@@ -68,7 +68,7 @@ class Rules(Effect):
             functions = load_functions(path, ("update", "divide"))
         for name, given in functions.items():
             if given is not None and not callable(given):
-                raise checks.refuse(f"Rules.{name}", given, "a function")
+                raise checks.input_error(f"Rules.{name}", given, "a function")
         if not any(functions.values()):
             raise checks.InputError(
                 "Rules() has neither update nor divide: give at least one, such as"
@@ -76,7 +76,7 @@ class Rules(Effect):
             )
         for name, value in self.variables.items():
             checks.number(f"Rules.variables[{name!r}]", value)
-        object.__setattr__(self, "source", Watched(path, functions))
+        object.__setattr__(self, "source", HotReload(path, functions))
         object.__setattr__(
             self, "noted", {"reads": (), "writes": (), "divide reads": (), "divide writes": ()}
         )

@@ -23,7 +23,7 @@ NEAR = 0.1
 
 
 @dataclass(frozen=True)
-class Bodies:
+class Capsules:
     """Capsules, component first: centre (d, N) µm, axis (d, N) unit, half (N,) half centreline µm,
     radius (N,) µm."""
 
@@ -32,8 +32,8 @@ class Bodies:
     half: Tensor
     radius: Tensor
 
-    def take(self, index: Tensor) -> Bodies:
-        return Bodies(
+    def take(self, index: Tensor) -> Capsules:
+        return Capsules(
             self.centre.index_select(1, index),
             self.axis.index_select(1, index),
             self.half.index_select(0, index),
@@ -59,7 +59,7 @@ class Contacts:
     normal: Tensor
 
 
-def closest_points(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor]:
+def closest_points(a: Capsules, b: Capsules) -> tuple[Tensor, Tensor]:
     """Arc lengths (s, t), each (P,) µm from its centre, of the closest points of two centrelines.
 
     The least of five candidates: each of the four ends against the other segment, and the common
@@ -103,7 +103,7 @@ def _distance2(between: Tensor, axis_a: Tensor, axis_b: Tensor, s: Tensor, t: Te
     return dot(d, d)
 
 
-def contact_points(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def contact_points(a: Capsules, b: Capsules) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """One or two touching points of each pair: ((2, P) s, (2, P) t, (2, P) end of a, (2, P) end of
     b, (P,) is a line).
 
@@ -123,7 +123,7 @@ def _slide(turn: Tensor) -> Tensor:
 
 
 def _line_points(
-    a: Bodies, b: Bodies, s0: Tensor, t0: Tensor
+    a: Capsules, b: Capsules, s0: Tensor, t0: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """What `contact_points` gives, from the closest points (s0, t0)."""
     turn = cross(a.axis, b.axis)
@@ -171,7 +171,7 @@ def _line_points(
     return torch.stack(s_all), torch.stack(t_all), torch.stack(end_a), torch.stack(end_b), line
 
 
-def _leaving(s: Tensor, free: Tensor, cell: Bodies, slide: Tensor) -> Tensor:
+def _leaving(s: Tensor, free: Tensor, cell: Capsules, slide: Tensor) -> Tensor:
     """`_end` of a closest point s that would be at `free` on a line without ends. Where a line's
     point has slid away from it, the normal there is not across the cell as the end is left: then
     the less of an end, the less is missing to `free`."""
@@ -189,22 +189,24 @@ def _end(s: Tensor, half: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Touching:
+class CandidateContacts:
     """K pairs of cells that overlap at their closest points, or are near there: first and second
     cell (K,), their bodies a and b, the points s and t of `closest_points`."""
 
     first: Tensor
     second: Tensor
-    a: Bodies
-    b: Bodies
+    a: Capsules
+    b: Capsules
     s: Tensor
     t: Tensor
 
     @staticmethod
-    def among(bodies: Bodies, first: Tensor, second: Tensor, near: bool = False) -> Touching:
+    def among(
+        bodies: Capsules, first: Tensor, second: Tensor, near: bool = False
+    ) -> CandidateContacts:
         """Those of the pairs (P,), (P,); near: with those that come within NEAR."""
         a, b = bodies.take(first), bodies.take(second)
-        found = Touching(first, second, a, b, *closest_points(a, b))
+        found = CandidateContacts(first, second, a, b, *closest_points(a, b))
         with torch.no_grad():
             # no point of a line is nearer than the closest one, but for rounding, of which this is
             # many times more
@@ -218,10 +220,10 @@ class Touching:
         """(K,) µm, at the closest points."""
         return _gap(self.a, self.b, self.s, self.t)
 
-    def take(self, index: Tensor) -> Touching:
+    def take(self, index: Tensor) -> CandidateContacts:
         """The pairs at `index`."""
         pick = lambda x: x.index_select(0, index)
-        return Touching(
+        return CandidateContacts(
             pick(self.first),
             pick(self.second),
             self.a.take(index),
@@ -231,7 +233,7 @@ class Touching:
         )
 
 
-def contacts_of(pairs: Touching, push: bool = False, near: bool = False) -> Contacts:
+def contacts_of(pairs: CandidateContacts, push: bool = False, near: bool = False) -> Contacts:
     """All rows of pairs that overlap (gap < 0), and of a line of contact that overlaps at one end
     what keeps the other from swinging in: a row of gap 0, whose weight falls from that of the line
     to nothing as its end parts as far as the first overlaps. Without it a cell that is squeezed
@@ -304,11 +306,11 @@ def _held_share(one: Tensor, other: Tensor) -> Tensor:
     return ((one + other) / torch.where(deepest < 0, deepest, -1.0)).clamp(min=0.0, max=1.0)
 
 
-def _gap(a: Bodies, b: Bodies, s: Tensor, t: Tensor) -> Tensor:
+def _gap(a: Capsules, b: Capsules, s: Tensor, t: Tensor) -> Tensor:
     return safe_sqrt(_distance2(b.centre - a.centre, a.axis, b.axis, s, t)) - a.radius - b.radius
 
 
-def contact_gaps(bodies: Bodies, first: Tensor, second: Tensor) -> Tensor:
+def contact_gaps(bodies: Capsules, first: Tensor, second: Tensor) -> Tensor:
     """Signed gap of each pair at its closest points, (P,) µm; negative where they overlap."""
     a, b = bodies.take(first), bodies.take(second)
     return _gap(a, b, *closest_points(a, b))
@@ -336,11 +338,11 @@ def gaps_nearby(
         radius.double(),
     )
     first, second = Neighbourhood(position, axis, length, radius, colony, colonies, within).pairs()
-    bodies = Bodies(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
+    bodies = Capsules(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
     return first, second, contact_gaps(bodies, first, second)
 
 
-def _rows(a: Bodies, b: Bodies, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tensor):
+def _rows(a: Capsules, b: Capsules, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tensor):
     """Gap, the two cells' rows and the normal at points s and t of the centrelines."""
     lever_a, lever_b = s * a.axis, t * b.axis
     between = b.centre - a.centre + lever_b - lever_a
@@ -359,7 +361,7 @@ def _rows(a: Bodies, b: Bodies, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tens
     return gap, row_a.T.contiguous(), row_b.T.contiguous(), normal
 
 
-def _fallback_normal(a: Bodies, b: Bodies) -> Tensor:
+def _fallback_normal(a: Capsules, b: Capsules) -> Tensor:
     """A direction to part two cells whose centrelines cross: both axes' common perpendicular; any
     perpendicular when parallel or in 2-D."""
     way = perpendicular(a.axis)

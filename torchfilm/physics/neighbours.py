@@ -54,7 +54,7 @@ class Neighbourhood:
         # a hair more, so that rounding loses no pair that touches exactly
         self.box = (0.5 * length * axis.abs().T + radius + 0.5 * margin) * (1 + 1e-5)
         # of each class, with the cells of larger classes
-        self.grids: list[tuple[_Grid, Tensor]] = []
+        self.grids: list[tuple[_CellGrid, Tensor]] = []
         if colony.numel() < 2:
             return
         smallest = -Groups(colony, colonies).max(-self.reach)
@@ -64,7 +64,7 @@ class Neighbourhood:
         for k in range(int(level.max()) + 1):
             members = torch.nonzero(level == k).squeeze(1)
             if members.numel():
-                grid = _Grid.build(position, self.reach, colony, colonies, members)
+                grid = _CellGrid.build(position, self.reach, colony, colonies, members)
                 self.grids.append((grid, torch.nonzero(level > k).squeeze(1)))
 
     @torch.no_grad()
@@ -107,7 +107,7 @@ class Neighbourhood:
 
 
 @dataclass(frozen=True)
-class _Grid:
+class _CellGrid:
     """Rows of one class of cells, in units of the rows' height."""
 
     at: Tensor  # (d, N) where each cell is: along the row, then across rows
@@ -124,7 +124,7 @@ class _Grid:
     @staticmethod
     def build(
         position: Tensor, reach: Tensor, colony: Tensor, colonies: int, members: Tensor
-    ) -> _Grid:
+    ) -> _CellGrid:
         greatest = Groups(colony.index_select(0, members), colonies).max(
             reach.index_select(0, members), empty=1.0
         )
@@ -145,7 +145,7 @@ class _Grid:
         for k in range(1, len(shape)):
             numbers = numbers * shape[k]
         window = (reach + greatest.index_select(0, colony)) / height * (1 + 1e-5)
-        grid = _Grid(
+        grid = _CellGrid(
             torch.stack(at),
             torch.stack(shape),
             offsets(numbers)[:-1],

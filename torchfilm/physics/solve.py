@@ -5,7 +5,7 @@
 | x = (Δc, Δθ, Δl)    | `x`, (N, 7), or (N, 4) in strict 2-D                                  |
 | M                   | diagonal: `drag` (N, D). A contact on a centreline exerts no torque about it, so the one direction in which |
 |                     | rotational drag differs (about the axis) is never entered             |
-| D J M^(−½)          | `ContactRows`, so that the system is JᵀJ + α and x = M^(−½) y         |
+| D J M^(−½)          | `ContactJacobian`, so that the system is JᵀJ + α and x = M^(−½) y         |
 | bilateral           | every row holds: one linear system                                    |
 | unilateral          | only rows with g − Jx < 0 push: semismooth Newton with a line search  |
 | Δl ≥ −growth        | projected Newton: a cell at its bound leaves the system               |
@@ -21,7 +21,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchfilm.physics.rows import ContactRows
+from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.tools.cg import conjugate_gradients, worst_of
 from torchfilm.tools.ragged import Blocks, Groups
 
@@ -49,7 +49,7 @@ NEWTON_LIMIT = 200
 # A line search leaves at most LEVEL of the slope that it began with; a full step that leaves no
 # more than STEEP of it, upwards, is not looked at closer.
 STEEP, LEVEL = 0.5, 0.1
-LOOKS = 12
+MAX_LINE_SEARCH = 12
 # The inverse block of a cell whose length is held comes of a subtraction that must leave this share
 # of each diagonal entry.
 LEAST_LEFT = 1e-3
@@ -58,7 +58,7 @@ LEAST_LEFT = 1e-3
 BLOCK_FLOOR = 64
 # Lengths stopped at their bounds must leave DOWNHILL of a step's slope, or the step is halved; it
 # is made shorter so many times at most.
-DOWNHILL, SHORTER = 0.01, 30
+DOWNHILL, MAX_HALVINGS = 0.01, 30
 # A solve to no more than this is taken for exact by its adjoint without a word.
 LOOSE = 1e-4
 
@@ -85,7 +85,7 @@ class ContactProblem:
     freedom, so contacts that hold cannot draw it out.
     """
 
-    rows: ContactRows
+    rows: ContactJacobian
     gap: Tensor
     held: Tensor
     alpha: Tensor
@@ -196,7 +196,7 @@ def _detached(p: ContactProblem) -> ContactProblem:
     r = p.rows
     if not torch.is_grad_enabled() and not r.row_first.requires_grad:
         return p
-    rows = ContactRows(
+    rows = ContactJacobian(
         r.first,
         r.second,
         r.row_first.detach(),
@@ -324,7 +324,7 @@ def _newton(
         at.worst,
         at.iterations,
     )
-    within, gradient = _Within(inverse), problem.gradient(y, after * active)
+    within, gradient = FreeDofPreconditioner(inverse), problem.gradient(y, after * active)
     while True:
         free = _free(y, gradient, problem)
         precondition = within.at(free)
@@ -366,7 +366,7 @@ def _newton(
             # a cell that nothing touched before has blocks of α alone: kept, they would weigh its
             # new contact 1/α times too much and hide all else
             inverse = _block_inverse(problem, active)
-            within = _Within(inverse)
+            within = FreeDofPreconditioner(inverse)
         number += 1
 
 
@@ -391,7 +391,7 @@ def _rounding(problem: ContactProblem, precondition: Map, y: Tensor) -> Tensor:
     return 2 * torch.finfo(y.dtype).eps * worst_of(precondition(forces), problem.colonies)
 
 
-class _Within:
+class FreeDofPreconditioner:
     """The preconditioner among the degrees of freedom that are free: what it is given elsewhere it
     does not look at, and leaves at 0."""
 
@@ -459,7 +459,7 @@ def _line_search(problem: ContactProblem, y, after, gradient, direction, going):
     """
     colonies, owner = problem.colonies, problem.colonies.owner
     length = going.to(y.dtype)
-    for _ in range(SHORTER):
+    for _ in range(MAX_HALVINGS):
         new = torch.addcmul(y, length.index_select(0, owner).unsqueeze(1), direction)
         stopped = colonies.any(new[:, -1] < problem.lower)
         new[:, -1] = torch.maximum(new[:, -1], problem.lower)
@@ -532,7 +532,7 @@ def _least(
     share = torch.ones_like(slope)
     here, curvature = look(share)
     low, high = torch.zeros_like(share), torch.ones_like(share)
-    for _ in range(LOOKS):
+    for _ in range(MAX_LINE_SEARCH):
         if not bool(going.any()):
             break
         low, high = torch.where(here > 0, low, share), torch.where(here > 0, share, high)
@@ -571,7 +571,7 @@ def _attach_gradient(
     solve_again = _AdjointSolve(
         _detached(problem), end.active, end.free, end.inverse, tolerance, max_iterations
     )
-    return held + _Implicit.apply(residual, solve_again)
+    return held + _AdjointFunction.apply(residual, solve_again)
 
 
 class _AdjointSolve:
@@ -581,7 +581,7 @@ class _AdjointSolve:
 
     def __call__(self, grad: Tensor) -> Tensor:
         colonies, b = self.problem.colonies, grad * self.free
-        precondition = _Within(self.inverse).at(self.free)
+        precondition = FreeDofPreconditioner(self.inverse).at(self.free)
         # the forward solve's tolerance is a matter of overlaps; a gradient wants more
         tolerance = self.tolerance.clamp(max=1e-4 if grad.dtype == torch.float32 else 1e-8)
         target = tolerance * worst_of(precondition(b), colonies)
@@ -595,7 +595,7 @@ class _AdjointSolve:
         ).x
 
 
-class _Implicit(torch.autograd.Function):
+class _AdjointFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx, residual: Tensor, solve_again: _AdjointSolve) -> Tensor:
         ctx.solve_again = solve_again

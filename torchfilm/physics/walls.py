@@ -38,7 +38,7 @@ class Wall:
     def __post_init__(self) -> None:
         name = type(self).__name__
         if self.stiffness is not None and self.weight is not None:
-            raise checks.refuse(
+            raise checks.input_error(
                 f"{name}.weight",
                 self.weight,
                 "left out when a stiffness is given",
@@ -98,18 +98,18 @@ class Plane(Wall):
         if self.point is not None:
             point, normal = _vector("Plane.point", self.point), _vector("Plane.normal", self.normal)
             if len(point) != len(normal):
-                raise checks.refuse(
+                raise checks.input_error(
                     "Plane.normal", normal, f"as long as point ({len(point)} numbers)"
                 )
             if len(counts := _counts((*point, *normal))) > 1:
-                raise checks.refuse(
+                raise checks.input_error(
                     "Plane.point, Plane.normal",
                     f"one for each of {' and of '.join(map(str, sorted(counts)))} colonies",
                     "one for each colony",
                 )
             zero = sum(torch.as_tensor(n).detach().abs() for n in normal) == 0
             if bool(torch.as_tensor(zero).any()):
-                raise checks.refuse("Plane.normal", normal, "a direction that is not zero")
+                raise checks.input_error("Plane.normal", normal, "a direction that is not zero")
             object.__setattr__(self, "point", point)
             object.__setattr__(self, "normal", normal)
             return
@@ -120,7 +120,7 @@ class Plane(Wall):
     def surfaces(self, dim: int) -> list[Surface]:
         if self.point is not None:
             if len(self.point) != dim:
-                raise checks.refuse(
+                raise checks.input_error(
                     "Plane.point", tuple(self.point), f"of {dim} numbers in a {dim}-D scene"
                 )
             assert self.normal is not None
@@ -137,7 +137,7 @@ class Plane(Wall):
             return [_Flat(self, normal, _inner(point, normal))]
         axis = next(k for k, a in enumerate(AXES) if getattr(self, a) is not None)
         if axis >= dim:
-            raise checks.refuse(
+            raise checks.input_error(
                 f"Plane.{AXES[axis]}",
                 getattr(self, AXES[axis]),
                 f"a place along {AXES[:dim]} in a {dim}-D scene",
@@ -163,7 +163,7 @@ class Sphere(Wall):
 
     def surfaces(self, dim: int) -> list[Surface]:
         if len(tuple(self.center)) != dim:
-            raise checks.refuse(
+            raise checks.input_error(
                 "Sphere.center", tuple(self.center), f"of {dim} numbers in a {dim}-D scene"
             )
         return [_Round(self, tuple(self.center), self.radius, self.inside)]
@@ -188,7 +188,9 @@ class Box(Wall):
 
     def surfaces(self, dim: int) -> list[Surface]:
         if len(tuple(self.low)) != dim:
-            raise checks.refuse("Box.low", tuple(self.low), f"of {dim} numbers in a {dim}-D scene")
+            raise checks.input_error(
+                "Box.low", tuple(self.low), f"of {dim} numbers in a {dim}-D scene"
+            )
         out: list[Surface] = []
         for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             for sign, at in ((1.0, low), (-1.0, high)):
@@ -226,7 +228,7 @@ class Channel(Wall):
             and self.high_end is not None
             and not checks.below(self.low_end, self.high_end)
         ):
-            raise checks.refuse(
+            raise checks.input_error(
                 "Channel.low_end, Channel.high_end",
                 (self.low_end, self.high_end),
                 "low_end < high_end",
@@ -235,7 +237,7 @@ class Channel(Wall):
 
     def surfaces(self, dim: int) -> list[Surface]:
         if self.height is not None and dim == 2:
-            raise checks.refuse("Channel.height", self.height, "left out in a 2-D scene")
+            raise checks.input_error("Channel.height", self.height, "left out in a 2-D scene")
         half = (math.inf, self.width / 2, math.inf if self.height is None else self.height / 2)
         low = [-math.inf if self.low_end is None else self.low_end] + [-h for h in half[1:dim]]
         high = [math.inf if self.high_end is None else self.high_end] + [h for h in half[1:dim]]
@@ -330,7 +332,7 @@ def _vector(name: str, given: object) -> Vector:
     if isinstance(given, (tuple, list)) and any(isinstance(entry, Tensor) for entry in given):
         entries = tuple(checks.value(f"{name}[{k}]", entry) for k, entry in enumerate(given))
         if len(_counts(entries)) > 1:
-            raise checks.refuse(name, given, "as many values for each entry")
+            raise checks.input_error(name, given, "as many values for each entry")
         return entries
     if isinstance(given, Tensor):
         seen = given if given.is_floating_point() else given.double()
@@ -338,15 +340,15 @@ def _vector(name: str, given: object) -> Vector:
         try:
             seen = torch.as_tensor(np.asarray(given, dtype=np.float64))
         except (TypeError, ValueError) as error:
-            raise checks.refuse(name, given, allowed) from error
+            raise checks.input_error(name, given, allowed) from error
         if seen.dim() == 1:
             return checks.vector(name, given)
     if seen.dim() not in (1, 2) or seen.numel() == 0:
-        raise checks.refuse(name, f"an array of shape {tuple(seen.shape)}", allowed)
+        raise checks.input_error(name, f"an array of shape {tuple(seen.shape)}", allowed)
     bad = torch.nonzero(~torch.isfinite(seen.detach()))
     if bad.numel():
         at = tuple(bad[0].tolist())
-        raise checks.refuse(
+        raise checks.input_error(
             f"{name}[{', '.join(map(str, at))}]", float(seen.detach()[at]), "finite"
         )
     with torch.enable_grad():

@@ -8,10 +8,10 @@ draws a state. For figures of your own, `draw_cells` and `draw_signal` draw on m
 
 from torchfilm.pictures.colours import Scale
 from torchfilm.pictures.draw import colour_bar, draw_cells, draw_signal, scale_bar
+from torchfilm.pictures.figures import sheet, show, strip
 from torchfilm.pictures.frames import Frame, frame_of
 from torchfilm.pictures.movies import movie
 from torchfilm.pictures.shapes import VIEWS, outlines
-from torchfilm.pictures.sheets import sheet, show, strip
 
 __all__ = [
     "VIEWS",

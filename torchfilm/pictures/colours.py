@@ -30,7 +30,7 @@ Limits = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Look:
+class PlotStyle:
     """What a picture shows, checked. The options are those of `torchfilm.pictures.show`."""
 
     colour: str | None = None
@@ -51,24 +51,24 @@ class Look:
                     "colour and channels both say what colours the cells: give one of them."
                 )
             if not isinstance(self.channels, Mapping) or not self.channels:
-                raise checks.refuse(
+                raise checks.input_error(
                     "channels",
                     self.channels,
                     'colours by name of quantity, such as {"cfp": "cyan", "yfp": "yellow"}',
                 )
             for name, colour in self.channels.items():
                 if not is_color_like(colour):
-                    raise checks.refuse(
+                    raise checks.input_error(
                         f"channels[{name!r}]", colour, 'a colour, such as "cyan" or "#00ffff"'
                     )
         if self.section not in (CELLS, MEAN):
             if isinstance(self.section, str):
-                raise checks.refuse(
+                raise checks.input_error(
                     "section", self.section, '"cells", "mean", or a coordinate in µm'
                 )
             checks.number("section", self.section)
         if self.section != CELLS and self.background is None:
-            raise checks.refuse(
+            raise checks.input_error(
                 "section",
                 self.section,
                 "left out without a background: it says where to cut the signal",
@@ -76,7 +76,7 @@ class Look:
         for name, pair in (self.limits or {}).items():
             low, high = checks.vector(f"limits[{name!r}]", pair, 2)
             if low >= high:
-                raise checks.refuse(
+                raise checks.input_error(
                     f"limits[{name!r}]", (low, high), "two numbers, the first below the second"
                 )
             if name not in (*self.quantities, self.background, self.signal):
@@ -88,7 +88,7 @@ class Look:
                     )
                     or "nothing that has a range"
                 )
-                raise checks.refuse("limits", name, f"of what is drawn: {drawn}")
+                raise checks.input_error("limits", name, f"of what is drawn: {drawn}")
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -112,13 +112,13 @@ class Look:
     def check(self, frame: Frame) -> None:
         """Raise InputError for what this frame does not have."""
         if max(VIEWS[self.view]) >= frame.dim:
-            raise checks.refuse("view", self.view, '"xy" for 2-D cells')
+            raise checks.input_error("view", self.view, '"xy" for 2-D cells')
         if self.whole and frame.origin is None:
-            raise checks.refuse(
+            raise checks.input_error(
                 "whole", True, "left out where the scene has no medium, and so no box"
             )
         if self.background is not None and self.background not in frame.signals:
-            raise checks.refuse(
+            raise checks.input_error(
                 "background",
                 self.background,
                 "a signal of the medium: " + (", ".join(frame.signals) or "there is none"),
@@ -127,7 +127,7 @@ class Look:
         for name in self.quantities:
             if name not in known and not (name == ANGLE and self.channels is None):
                 what = "colour" if self.channels is None else "channels"
-                raise checks.refuse(
+                raise checks.input_error(
                     what,
                     name,
                     ("'angle' or " if self.channels is None else "") + "one of " + ", ".join(known),
@@ -212,7 +212,9 @@ class Scale:
         return self.cmap(np.ma.masked_invalid(self.level(values)))
 
 
-def scale_of(name: str, seen: Seen, look: Look, units: Mapping[str, str], note: str = "") -> Scale:
+def scale_of(
+    name: str, seen: Seen, look: PlotStyle, units: Mapping[str, str], note: str = ""
+) -> Scale:
     """The scale of a quantity that has taken these values."""
     from matplotlib.colors import ListedColormap
 
@@ -238,7 +240,7 @@ def scale_of(name: str, seen: Seen, look: Look, units: Mapping[str, str], note: 
     return Scale(name, label, unit, _colours(name, look), limits, beyond)
 
 
-def _colours(name: str, look: Look) -> Any:
+def _colours(name: str, look: PlotStyle) -> Any:
     from matplotlib import colormaps
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -274,7 +276,9 @@ def lit(rgb: np.ndarray) -> np.ndarray:
     return FLOOR + (1.0 - FLOOR) * np.clip(rgb, 0.0, 1.0)
 
 
-def paint_cells(cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: Look) -> np.ndarray:
+def paint_cells(
+    cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: PlotStyle
+) -> np.ndarray:
     """The colour of each cell, (N, 4): of its one quantity, or the lights of its channels added up
     as in a fluorescence picture."""
     if look.channels is None:

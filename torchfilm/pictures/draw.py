@@ -12,7 +12,7 @@ import numpy as np
 from torchfilm.pictures.colours import (
     CELLS,
     MEAN,
-    Look,
+    PlotStyle,
     Scale,
     Seen,
     paint_cells,
@@ -49,11 +49,11 @@ def draw_cells(
     colour, channels, limits, view: as for `show`; ranges that are not given are those of these
     cells. window: what the axes show; by default all cells.
     """
-    look = Look(colour=colour, channels=channels, limits=limits, view=view)
+    look = PlotStyle(colour=colour, channels=channels, limits=limits, view=view)
     scales = []
     for name in look.quantities:
         if (name in cells and cells[name].ndim != 1) or name not in (*cells, "angle"):
-            raise checks.refuse(
+            raise checks.input_error(
                 "colour",
                 name,
                 "'angle' or one of " + ", ".join(n for n in cells if cells[n].ndim == 1),
@@ -94,14 +94,14 @@ def draw_signal(
     sight, µm, or "mean", its mean along it. limits: the range from white to black; by default that
     of what is drawn.
     """
-    look = Look(
+    look = PlotStyle(
         background=name,
         view=view,
         section=section,
         limits=None if limits is None else {name: limits},
     )
     if section == CELLS:
-        raise checks.refuse("section", section, 'a coordinate in µm, or "mean"')
+        raise checks.input_error("section", section, 'a coordinate in µm, or "mean"')
     flat = cut(values, np.asarray(origin), np.asarray(spacing), look, None)
     seen = Seen()
     seen.note(flat)
@@ -113,7 +113,11 @@ def draw_signal(
 
 
 def cut(
-    values: np.ndarray, origin: np.ndarray, spacing: np.ndarray, look: Look, height: float | None
+    values: np.ndarray,
+    origin: np.ndarray,
+    spacing: np.ndarray,
+    look: PlotStyle,
+    height: float | None,
 ) -> np.ndarray:
     """What is seen of a signal, (nu, nv); `height` is where the cells are along the line of sight,
     for a section there."""
@@ -145,7 +149,7 @@ def add_signal(ax: Axes, flat: np.ndarray, extent: Window, scale: Scale) -> None
 
 
 def add_cells(
-    ax: Axes, cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: Look
+    ax: Axes, cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: PlotStyle
 ) -> Any:
     """Put cells into the window of the axes, the nearest to the eye last."""
     from matplotlib.collections import PolyCollection

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchfilm.results import Results
+from torchfilm.io.results import Results
 from torchfilm.state import CELL, PER_CELL, State
 from torchfilm.tools import checks
 
@@ -102,7 +102,7 @@ class Recorded(Sequence[Frame]):
         declared = json.loads(results.attributes["declared"])
         self.units, self.walls = {name: entry[1] for name, entry in declared.items()}, results.walls
         if signal is not None and signal not in results.signal_names:
-            raise checks.refuse(
+            raise checks.input_error(
                 "background",
                 signal,
                 "a signal of the medium: "

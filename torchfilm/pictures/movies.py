@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from torchfilm.pictures.colours import CELLS, Limits, Look, paint_cells
+from torchfilm.io.results import Results
+from torchfilm.pictures.colours import CELLS, Limits, PlotStyle, paint_cells
 from torchfilm.pictures.draw import BEYOND
+from torchfilm.pictures.figures import beside, chosen, fill_sheet, seen_along, square
 from torchfilm.pictures.frames import Recorded
-from torchfilm.pictures.page import Survey, entitle, figure_class, page, survey
-from torchfilm.pictures.sheets import beside, chosen, fill_sheet, seen_along, square
-from torchfilm.results import Results
+from torchfilm.pictures.page import PanelLayout, entitle, figure_class, page, survey
 from torchfilm.tools import checks
 
 FASTEST_GIF = 50.0  # frames a second; viewers slow down what is faster
@@ -48,8 +48,8 @@ def movie(
     target = beside(path, out, "")
     write = _writer(target, fps)
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-        raise checks.refuse("every", every, "a whole number from 1")
-    look = Look(colour, channels, background, limits, view, section, whole)
+        raise checks.input_error("every", every, "a whole number from 1")
+    look = PlotStyle(colour, channels, background, limits, view, section, whole)
     with Results(path) as results:
         last = len(results) - 1
         frames = Recorded(results, sorted({*range(0, last + 1, every), last}), background)
@@ -72,7 +72,7 @@ def movie(
 class Film(Sequence[np.ndarray]):
     """The frames of a film, each drawn when it is asked for: (height, width, 3) uint8."""
 
-    def __init__(self, frames: Recorded, made: Survey, more: str, dpi: float):
+    def __init__(self, frames: Recorded, made: PanelLayout, more: str, dpi: float):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         self.frames, self.made = frames, made
@@ -104,16 +104,16 @@ def _writer(target: Path, fps: float) -> Callable[[Path, Film, float], None]:
     """What writes films of this kind, found before anything is drawn."""
     kind = target.suffix.lower()
     if kind not in (".mp4", ".gif"):
-        raise checks.refuse("out", str(target), "a name that ends in .mp4 or .gif")
+        raise checks.input_error("out", str(target), "a name that ends in .mp4 or .gif")
     if not target.parent.is_dir():
-        raise checks.refuse("out", str(target), "in a folder that exists")
+        raise checks.input_error("out", str(target), "in a folder that exists")
     if kind == ".gif":
         checks.number(
             "fps",
             fps,
             above=0.0,
             most=FASTEST_GIF,
-            mend="Write an .mp4 for more, or draw fewer frames with every=.",
+            hint="Write an .mp4 for more, or draw fewer frames with every=.",
         )
         return _gif
     checks.number("fps", fps, above=0.0)

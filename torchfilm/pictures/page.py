@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchfilm.pictures.colours import CELLS, MEAN, Look, Scale, Seen, scale_of
+from torchfilm.pictures.colours import CELLS, MEAN, PlotStyle, Scale, Seen, scale_of
 from torchfilm.pictures.draw import (
     add_cells,
     add_signal,
@@ -49,11 +49,11 @@ def figure_class() -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
+class PanelLayout:
     """What all panels of a picture have in common: the colonies (places in the batch), the window
     of each, and the scales of cells and signal."""
 
-    look: Look
+    look: PlotStyle
     places: Sequence[int]
     windows: Mapping[int, Window]
     scales: tuple[Scale, ...]
@@ -66,7 +66,7 @@ class Survey:
         return right - left, top - bottom
 
 
-def survey(frames: Sequence[Frame], places: Sequence[int], look: Look) -> Survey:
+def survey(frames: Sequence[Frame], places: Sequence[int], look: PlotStyle) -> PanelLayout:
     """Go through the frames once, for one window a colony and one range a quantity over all of
     them."""
     seen = {name: Seen() for name in (*look.quantities, *([look.signal] if look.signal else []))}
@@ -99,7 +99,7 @@ def survey(frames: Sequence[Frame], places: Sequence[int], look: Look) -> Survey
         if look.signal is None
         else scale_of(look.signal, seen[look.signal], look, frame.units, _where(frame, look))
     )
-    return Survey(look, places, _windows(places, covered, boxes, look), scales, behind)
+    return PanelLayout(look, places, _windows(places, covered, boxes, look), scales, behind)
 
 
 def _union(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:
@@ -110,7 +110,7 @@ def _windows(
     places: Sequence[int],
     covered: Mapping[int, np.ndarray],
     boxes: Mapping[int, np.ndarray],
-    look: Look,
+    look: PlotStyle,
 ) -> dict[int, Window]:
     """Windows of one size: about the cells with some room, within the box of the signal where the
     cells are; or the whole box."""
@@ -134,7 +134,7 @@ def _windows(
 
 
 def signal_seen(
-    frame: Frame, place: int, look: Look, cells: Mapping[str, np.ndarray]
+    frame: Frame, place: int, look: PlotStyle, cells: Mapping[str, np.ndarray]
 ) -> np.ndarray:
     """The background of one colony, (nu, nv)."""
     assert look.background is not None and frame.origin is not None and frame.spacing is not None
@@ -144,7 +144,7 @@ def signal_seen(
     )
 
 
-def _height(frame: Frame, place: int, look: Look, cells: Mapping[str, np.ndarray]) -> float:
+def _height(frame: Frame, place: int, look: PlotStyle, cells: Mapping[str, np.ndarray]) -> float:
     """Where cells are along the line of sight: their mean, or the plane of 2-D ones; the middle of
     the box where there are none."""
     assert frame.origin is not None and frame.spacing is not None and frame.shape is not None
@@ -157,11 +157,11 @@ def _height(frame: Frame, place: int, look: Look, cells: Mapping[str, np.ndarray
         told = (
             f"the height of the cells, from {low:g} to {high:g} µm, which this file does not tell"
         )
-        raise checks.refuse("section", look.section, told, 'Give it, or "mean".')
+        raise checks.input_error("section", look.section, told, 'Give it, or "mean".')
     return frame.height or 0.0
 
 
-def _where(frame: Frame, look: Look) -> str:
+def _where(frame: Frame, look: PlotStyle) -> str:
     """Where the signal is cut, for its legend."""
     k = along(look.view)
     if frame.shape is None or bool((frame.shape[:, k] == 1).all()):
@@ -176,7 +176,7 @@ def _where(frame: Frame, look: Look) -> str:
     )
 
 
-def fill(ax: Axes, frame: Frame, place: int, made: Survey, titles: Sequence[str]) -> None:
+def fill(ax: Axes, frame: Frame, place: int, made: PanelLayout, titles: Sequence[str]) -> None:
     """Draw one colony of one frame in a panel, in place of what was there. titles: from long to
     short; the longest that fits is written."""
     for artist in (*ax.collections, *ax.images):
@@ -206,7 +206,7 @@ def fill(ax: Axes, frame: Frame, place: int, made: Survey, titles: Sequence[str]
 
 
 def page(
-    rows: int, columns: int, made: Survey, title: str, *, dpi: float
+    rows: int, columns: int, made: PanelLayout, title: str, *, dpi: float
 ) -> tuple[Figure, list[Axes]]:
     """A figure with a panel for each place of a grid (row by row), its title, a scale bar and
     legends; panels are empty but have their windows."""
@@ -302,7 +302,7 @@ def _legend(
 
 def save(figure: Figure, path: str | Path) -> Path:
     if not Path(path).suffix:  # matplotlib would write beside it, and perhaps over something
-        raise checks.refuse("picture", str(path), "a name that ends in .png, .pdf or .svg")
+        raise checks.input_error("picture", str(path), "a name that ends in .png, .pdf or .svg")
     try:
         figure.savefig(path, dpi=figure.dpi)
     except (OSError, ValueError) as error:  # no such folder; no such kind of picture

@@ -101,7 +101,7 @@ def section(
         return values.mean(k)
     low, high = float(origin[k]), float(origin[k] + spacing[k] * count)
     if not low <= at <= high:
-        raise checks.refuse(
+        raise checks.input_error(
             "section",
             at,
             f"within the box of the signal, from {low:g} to {high:g} µm along {'xyz'[k]}, or"

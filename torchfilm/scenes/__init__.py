@@ -12,10 +12,10 @@ from typing import Any
 
 import torch
 
-from torchfilm.accuracy import Settings
 from torchfilm.scene import Scene
 from torchfilm.scenes import channels, circuits, colonies, nutrients, signalling
 from torchfilm.tools import checks
+from torchfilm.tuning.settings import Settings
 
 
 def _numbers(given: Any) -> bool:
@@ -81,12 +81,12 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
     """The ready-made scene of that name."""
     if name not in READY:
         near = difflib.get_close_matches(name, READY, n=1)
-        mend = f"Did you mean {near[0]}?" if near else ""
-        raise checks.refuse(
+        hint = f"Did you mean {near[0]}?" if near else ""
+        raise checks.input_error(
             "scene",
             name,
             "one of " + ", ".join(READY) + ", or the path of a Python file that defines `scene`",
-            mend,
+            hint,
         )
     allowed = inspect.signature(READY[name]).parameters
     for given in parameters or {}:
@@ -96,5 +96,7 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
                 if given in {f.name for f in dataclasses.fields(Settings)}
                 else ""
             )
-            raise checks.refuse(f"parameter of {name}", given, "one of " + ", ".join(allowed), knob)
+            raise checks.input_error(
+                f"parameter of {name}", given, "one of " + ", ".join(allowed), knob
+            )
     return READY[name](**(parameters or {}))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from torchfilm.cells import Cells
 from torchfilm.effect import Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.removal import Removal
+from torchfilm.initial_cells import Cells
 from torchfilm.physics.walls import Channel
 from torchfilm.scene import Scene
 

@@ -13,8 +13,8 @@ from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.rules import Rules
+from torchfilm.rule_views import DivisionView
 from torchfilm.scene import Scene
-from torchfilm.views import DivisionView
 
 Value = float | Tensor
 
@@ -51,7 +51,7 @@ def repressilator(
     beta: Value = 5.0,
     power: float = 2.0,
     speed: Value = 2.0,
-    copies: float = 0.5,
+    molecules_per_unit: float = 0.5,
     noise: bool = True,
     rate: float = 0.7,
 ) -> Scene:
@@ -60,7 +60,7 @@ def repressilator(
 
     alpha, basal, beta, power: the dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ −
     pᵢ); speed: its unit of time is 1/speed h, the mRNA's lifetime. noise: molecule by molecule
-    (tau-leaping), with `copies` of them in a unit of concentration × µm³; else smoothly.
+    (tau-leaping), with `molecules_per_unit` of them in a unit of concentration × µm³; else smoothly.
     """
     names = ("laci", "tetr", "ci")
     reactions = []
@@ -81,7 +81,7 @@ def repressilator(
             reactions,
             species=(*names, *(f"m_{n}" for n in names)),
             method="tau_leap" if noise else "rosenbrock",
-            copies=copies,
+            molecules_per_unit=molecules_per_unit,
             initial={"laci": 20.0, "m_laci": 20.0},
             production=alpha * speed,
             leak=basal * speed,
@@ -96,7 +96,7 @@ def toggle_switch(
     power: float = 2.0,
     speed: Value = 1.0,
     start: float = 1.65,
-    copies: float = 50.0,
+    molecules_per_unit: float = 50.0,
     noise: bool = True,
     rate: float = 0.7,
 ) -> Scene:
@@ -105,7 +105,7 @@ def toggle_switch(
 
     x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y =
     `start`, by default where decay, dilution and repression balance. noise: molecule by molecule,
-    with `copies` of them in a unit of concentration × µm³. Growth dilutes beside the decay.
+    with `molecules_per_unit` of them in a unit of concentration × µm³. Growth dilutes beside the decay.
     """
     reactions = []
     for name, by in (("red", "green"), ("green", "red")):
@@ -121,7 +121,7 @@ def toggle_switch(
             reactions,
             species=("red", "green"),
             method="tau_leap" if noise else "rosenbrock",
-            copies=copies,
+            molecules_per_unit=molecules_per_unit,
             initial={"red": start, "green": start},
             production=strength * speed,
             speed=speed,

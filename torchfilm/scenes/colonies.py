@@ -11,8 +11,8 @@ from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.rules import Rules
 from torchfilm.physics.walls import Plane
+from torchfilm.rule_views import CellsView
 from torchfilm.scene import Scene
-from torchfilm.views import CellsView
 
 
 def microcolony(

@@ -11,7 +11,7 @@ from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium, Signal
 from torchfilm.effects.nutrition import Monod
 from torchfilm.scene import Scene
-from torchfilm.signals.faces import Faces, Fixed
+from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet
 
 
 def nutrient_limited(
@@ -30,7 +30,7 @@ def nutrient_limited(
     growth `rate` (1/h) · s/(half + s); growth_yield: µm³ of cell from one unit of concentration ×
     µm³. The layer is 1 µm deep, as the cells are.
     """
-    edge = Fixed(supply)
+    edge = Dirichlet(supply)
     half_size = size / 2
     return Scene(
         Monod("nutrient", rate=rate, half=half, growth_yield=growth_yield),
@@ -42,6 +42,6 @@ def nutrient_limited(
             box=((-half_size, -half_size), (half_size, half_size)),
             spacing=spacing,
             depth=1.0,
-            faces=Faces(x=edge, y=edge),
+            boundary=BoundaryConditions(x=edge, y=edge),
         ),
     )

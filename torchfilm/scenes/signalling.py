@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchfilm.cells import Cells
 from torchfilm.circuits.names import Names
 from torchfilm.effect import Uniform
 from torchfilm.effects.circuit import Circuit
@@ -13,6 +12,7 @@ from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.medium import Medium, Signal
+from torchfilm.initial_cells import Cells
 from torchfilm.physics.walls import Channel
 from torchfilm.scene import Scene
 
@@ -134,7 +134,7 @@ def boundary_detector(
             ahl=Signal(diffusion=diffusion),
             box=((-128.0, -half, -24.0), (128.0, half, 24.0)),
             spacing=4.0,
-            beyond="grow",
+            outside="grow",
             grows="x",
             flow=None if isinstance(flow, (int, float)) and flow == 0 else (flow, 0.0, 0.0),
         ),

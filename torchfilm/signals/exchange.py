@@ -64,7 +64,7 @@ class Stencil:
         return self.groups.sum(entry.reshape(-1, 1)).squeeze(1)
 
 
-def beyond_box(
+def outside_box(
     grid: Grid, position: Tensor, colony: Tensor, periodic: tuple[bool, bool, bool]
 ) -> Tensor:
     """Which cells at position (N, 3) are beyond the box of their colony's grid, (N,) bool; a place
@@ -106,14 +106,14 @@ def stencil(
     to a sum of 1. K = 2^(axes with more than one voxel); weights come in `dtype`.
     """
     if position.dim() != 2 or position.shape[1] != 3:
-        raise checks.refuse(
+        raise checks.input_error(
             "position",
             tuple(position.shape),
             "of shape (cells, 3)",
             "A 2-D colony has its cells at one height in its layer.",
         )
     if mask is not None and (mask.shape != (grid.nodes,) or mask.dtype != torch.bool):
-        raise checks.refuse(
+        raise checks.input_error(
             "mask", (tuple(mask.shape), mask.dtype), f"bool of shape ({grid.nodes},)"
         )
     shape = grid.shape.index_select(0, colony)

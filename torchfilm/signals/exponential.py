@@ -89,7 +89,7 @@ def prepare_exponential(operator: Operator, dt: float) -> Exponential:
             if operator.mask is not None
             else "the velocity varies from place to place"
         )
-        raise checks.refuse(
+        raise checks.input_error(
             "method",
             "exponential",
             f"another one where {why}",

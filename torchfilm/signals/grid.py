@@ -23,7 +23,7 @@ Shape = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class GridBatch:
     """Colonies with grids of one shape: their `places` (b,) int64 in the batch, and where their
     values stand in a flat signal."""
 
@@ -56,22 +56,22 @@ class Grid:
             or self.origin.shape[1] != 3
             or self.origin.dtype != torch.float64
         ):
-            raise checks.refuse(
+            raise checks.input_error(
                 "Grid.origin",
                 (tuple(self.origin.shape), self.origin.dtype),
                 "a float64 tensor of shape (colonies, 3)",
             )
         if self.shape.shape != self.origin.shape or self.shape.dtype != torch.int64:
-            raise checks.refuse(
+            raise checks.input_error(
                 "Grid.shape",
                 (tuple(self.shape.shape), self.shape.dtype),
                 f"an int64 tensor of shape {tuple(self.origin.shape)}",
             )
         spacing = checks.vector("Grid.spacing", self.spacing, 3)
         if min(spacing) <= 0:
-            raise checks.refuse("Grid.spacing", self.spacing, "three numbers above 0")
+            raise checks.input_error("Grid.spacing", self.spacing, "three numbers above 0")
         if not bool((self.shape >= 1).all()):
-            raise checks.refuse(
+            raise checks.input_error(
                 "Grid.shape", self.shape.tolist(), "at least one voxel along every axis"
             )
         object.__setattr__(self, "spacing", spacing)
@@ -138,7 +138,7 @@ class Grid:
         return self.origin.index_select(0, self.owner) + (self.places + 0.5) * self.step
 
     @cached_property
-    def batches(self) -> tuple[Batch, ...]:
+    def batches(self) -> tuple[GridBatch, ...]:
         """The colonies, gathered by the shape of their grids, each colony in one batch."""
         device = self.shape.device
         found: dict[Shape, list[int]] = {}
@@ -146,7 +146,9 @@ class Grid:
             found.setdefault(shape, []).append(place)
         if len(found) == 1:
             shape = self.shapes[0]
-            return (Batch(torch.arange(self.colonies, device=device), shape, slice(0, self.nodes)),)
+            return (
+                GridBatch(torch.arange(self.colonies, device=device), shape, slice(0, self.nodes)),
+            )
         out = []
         for shape, places in found.items():
             here, size = torch.tensor(places, device=device), shape[0] * shape[1] * shape[2]
@@ -156,7 +158,7 @@ class Grid:
                 index: Tensor | slice = slice(begin, begin + size * len(places))
             else:
                 index = (first.unsqueeze(1) + torch.arange(size, device=device)).reshape(-1)
-            out.append(Batch(here, shape, index))
+            out.append(GridBatch(here, shape, index))
         return tuple(out)
 
     def join(self, parts: Sequence[Tensor]) -> Tensor:
@@ -189,7 +191,7 @@ class Grid:
         one per colony; 0 without. Returns self and the same signals when nothing is needed.
         """
         if low.shape != self.origin.shape or high.shape != self.origin.shape:
-            raise checks.refuse(
+            raise checks.input_error(
                 "low, high",
                 (tuple(low.shape), tuple(high.shape)),
                 f"of shape {tuple(self.origin.shape)}",
@@ -200,7 +202,7 @@ class Grid:
             | low.isnan().any()
             | high.isnan().any()
         ):
-            raise checks.refuse(
+            raise checks.input_error(
                 "low, high",
                 (low.tolist(), high.tolist()),
                 "a finite box",

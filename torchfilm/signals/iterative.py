@@ -53,7 +53,7 @@ def prepare_euler(operator: Operator, dt: float) -> Euler:
 
 
 @dataclass(frozen=True, eq=False)
-class SolveReport:
+class TransportSolveReport:
     """For each colony, (B,): `iterations`, the true relative `residual`, and whether it is
     `converged` (bool)."""
 
@@ -75,7 +75,7 @@ class CrankNicolson:
         out, report = self.solve(u)
         return torch.where(report.converged.reshape(-1, 1, 1, 1), out, torch.nan)
 
-    def solve(self, u: Tensor) -> tuple[Tensor, SolveReport]:
+    def solve(self, u: Tensor) -> tuple[Tensor, TransportSolveReport]:
         """u a step later, as far as the solve came, and its report."""
         wide = u.double()
         linear = lambda x: apply(self.operator, x, gain=False)
@@ -143,7 +143,9 @@ def _ratio(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(b == 0, 0.0, a / torch.where(b == 0, 1.0, b))
 
 
-def krylov(apply: Map, b: Tensor, start: Tensor, symmetric: bool) -> tuple[Tensor, SolveReport]:
+def krylov(
+    apply: Map, b: Tensor, start: Tensor, symmetric: bool
+) -> tuple[Tensor, TransportSolveReport]:
     """Solve A x = b, (B, nx, ny, nz), one system for each colony, each until it has converged;
     float64. No gradient."""
     size = _dot(b, b)
@@ -160,7 +162,7 @@ def krylov(apply: Map, b: Tensor, start: Tensor, symmetric: bool) -> tuple[Tenso
     r = b - apply(x)
     residual = _ratio(_dot(r, r), size).sqrt().reshape(-1)
     # a right-hand side of zero has the answer zero, and a NaN has none
-    return x, SolveReport(iterations, residual, (_dot(r, r) <= 100 * target).reshape(-1))
+    return x, TransportSolveReport(iterations, residual, (_dot(r, r) <= 100 * target).reshape(-1))
 
 
 def _conjugate_gradients(
@@ -215,7 +217,7 @@ def convolve(operator: Operator, u: Tensor) -> Tensor:
     differences of fluxes, and its last bits depend on what else is in the batch.
     """
     if operator.interior is None:
-        raise checks.refuse(
+        raise checks.input_error(
             "velocity",
             "one that varies from place to place",
             "uniform for a convolution",

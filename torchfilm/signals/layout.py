@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.signals.exchange import Stencil, beyond_box, pool_volume, read, stencil
-from torchfilm.signals.grid import Batch, Grid
+from torchfilm.signals.exchange import Stencil, outside_box, pool_volume, read, stencil
+from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import expand_ranges
 
@@ -25,7 +25,7 @@ class Contact:
 
     stencil: Stencil
     found: dict[str, Tensor]
-    beyond: Tensor | None
+    in_reservoir: Tensor | None
 
     @cached_property
     def pool(self) -> Tensor:
@@ -61,7 +61,7 @@ class Layout:
             or solid.dtype != torch.bool
         ):
             shown = (tuple(solid.shape), solid.dtype) if isinstance(solid, Tensor) else solid
-            raise checks.refuse(
+            raise checks.input_error(
                 "obstacles(places)",
                 shown,
                 f"a bool tensor of shape ({self.grid.nodes},), one value for each place",
@@ -95,11 +95,11 @@ class Layout:
             dtype=dtype,
         )
 
-    def astray(self, position: Tensor, colony: Tensor) -> Tensor:
+    def outside_medium(self, position: Tensor, colony: Tensor) -> Tensor:
         """Which cells at (N, d) µm of colonies (N,) are where no medium is, (N,) bool: beyond the
         box, if it stands in no reservoir, or in an obstacle."""
         if self.obstacle is None:
-            return beyond_box(self.grid, self.places(position), colony, self.periodic)
+            return outside_box(self.grid, self.places(position), colony, self.periodic)
         where = self.stencil(position, colony, torch.float64)
         assert where.blocked is not None
         return where.outside if self.reservoir is None else where.blocked
@@ -118,18 +118,18 @@ class Layout:
         found = {name: read(value, where) for name, value in signals.items()}
         if self.reservoir is None:
             return Contact(where, found, None)
-        beyond = where.outside if where.blocked is None else where.outside & ~where.blocked
-        if not bool(beyond.any()):
+        in_reservoir = where.outside if where.blocked is None else where.outside & ~where.blocked
+        if not bool(in_reservoir.any()):
             return Contact(where, found, None)
         for name, value in found.items():
             given = torch.as_tensor(self.reservoir[name], dtype=value.dtype, device=value.device)
             found[name] = torch.where(
-                beyond, given.index_select(0, ids) if given.dim() else given, value
+                in_reservoir, given.index_select(0, ids) if given.dim() else given, value
             )
-        return Contact(where, found, beyond)
+        return Contact(where, found, in_reservoir)
 
     def on_faces(
-        self, flow: Callable[[Tensor], Tensor], batch: Batch
+        self, flow: Callable[[Tensor], Tensor], batch: GridBatch
     ) -> tuple[Tensor, Tensor, Tensor]:
         """A velocity field, a function from places (M, 3) µm to velocities (M, 2 or 3), on the
         faces of the voxels of some colonies: (b, nx + 1, ny, nz) along x, and so on."""
@@ -147,7 +147,7 @@ class Layout:
             found = flow(faces.reshape(-1, 3))
             size = faces[..., 0].numel()
             if not isinstance(found, Tensor) or found.shape not in ((size, 2), (size, 3)):
-                raise checks.refuse(
+                raise checks.input_error(
                     "flow(places)",
                     tuple(getattr(found, "shape", ())),
                     f"velocities of shape ({size}, 3)",

@@ -20,7 +20,14 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchfilm.signals.faces import Face, Faces, Fixed, NoFlux, Open, Periodic
+from torchfilm.signals.boundary_conditions import (
+    BoundaryConditions,
+    Dirichlet,
+    Face,
+    NoFlux,
+    Open,
+    Periodic,
+)
 from torchfilm.signals.grid import Shape
 from torchfilm.tools import checks
 
@@ -217,7 +224,7 @@ def operator(
     diffusion: float | Tensor,
     decay: float | Tensor = 0.0,
     velocity: Sequence[float] | Tensor | tuple[Tensor, Tensor, Tensor] | None = None,
-    faces: Faces | None = None,
+    boundary: BoundaryConditions | None = None,
     mask: Tensor | None = None,
     source: float | Tensor | None = None,
     colonies: int = 1,
@@ -229,17 +236,17 @@ def operator(
     diffusion: µm²/h, one number or one per colony; decay: 1/h, likewise, or ([B,] nx, ny, nz).
     velocity: µm/h, None, uniform as (3,) or (B, 3), or on faces as three tensors ([B,] nx + 1, ny,
     nz), ([B,] nx, ny + 1, nz), ([B,] nx, ny, nz + 1) of the velocity along x, y, z, from the low
-    face to the high. faces: `Faces`, no flux without. mask: ([B,] nx, ny, nz) bool, False in an
+    face to the high. boundary: `BoundaryConditions`, no flux without. mask: ([B,] nx, ny, nz) bool, False in an
     obstacle, through whose faces nothing passes. source: amount per volume and hour, a number, one
     per colony (B,), or ([B,] nx, ny, nz). B is `colonies`.
     """
     given = _Given(tuple(shape), checks.vector("spacing", spacing, 3), colonies, device)  # type: ignore[arg-type]
-    faces = Faces() if faces is None else faces
+    boundary = BoundaryConditions() if boundary is None else boundary
     rate = given.number("diffusion", diffusion, least=0.0)
     open_ = None if mask is None else given.grid("mask", mask, torch.bool)
     flows = given.flows(velocity)
     axes, inside = [], []
-    for axis, (pair, flow, h) in enumerate(zip(faces.pairs, flows, given.spacing, strict=True)):
+    for axis, (pair, flow, h) in enumerate(zip(boundary.pairs, flows, given.spacing, strict=True)):
         made, interior = _exchange(axis, given.shape[axis], pair, rate / h**2, flow / h, given)
         axes.append(made if open_ is None else _shut(made, open_))
         inside.append(interior)
@@ -269,7 +276,7 @@ def _exchange(
     uniform = flow.shape[dim] == 1
     low, high = (flow, flow) if uniform else (flow.narrow(dim, 0, 1), flow.narrow(dim, n, 1))
     if isinstance(pair[0], Periodic) and not uniform and not torch.equal(low, high):
-        raise checks.refuse(
+        raise checks.input_error(
             f"velocity along {AXES[axis]}",
             "two velocities at one periodic face",
             "the same at the low and the high face",
@@ -302,7 +309,7 @@ def _end(face: Face, diffusion: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
     """(up, down) at a face of the box."""
     if isinstance(face, Periodic):
         return fitted(diffusion, flow)
-    if isinstance(face, Fixed):
+    if isinstance(face, Dirichlet):
         return fitted(2 * diffusion, flow)  # the face is half a voxel away
     if isinstance(face, Open):
         return fitted(torch.zeros_like(diffusion), flow)
@@ -335,14 +342,14 @@ class _Given:
 
     def __post_init__(self) -> None:
         if len(self.shape) != 3 or min(self.shape) < 1:
-            raise checks.refuse(
+            raise checks.input_error(
                 "shape",
                 self.shape,
                 "three numbers of voxels, each at least 1",
                 "In 2-D the third is 1.",
             )
         if min(self.spacing) <= 0:
-            raise checks.refuse("spacing", self.spacing, "three numbers above 0")
+            raise checks.input_error("spacing", self.spacing, "three numbers above 0")
 
     def number(self, name: str, given: object, *, least: float = -float("inf")) -> Tensor:
         """One number, or one per colony, as (B or 1, 1, 1, 1)."""
@@ -350,7 +357,7 @@ class _Given:
             checks.value(name, given, least=least), dtype=torch.float64, device=self.device
         ).reshape(-1)
         if found.numel() not in (1, self.colonies):
-            raise checks.refuse(
+            raise checks.input_error(
                 name,
                 f"{found.numel()} numbers",
                 f"one number, or one for each of the {self.colonies} colonies",
@@ -373,14 +380,14 @@ class _Given:
                 if isinstance(given, Tensor)
                 else type(given).__name__
             )
-            raise checks.refuse(
+            raise checks.input_error(
                 name,
                 shown,
                 f"a tensor of shape {shape} or {(self.colonies, *shape)}"
                 + (", of bools" if dtype == torch.bool else ""),
             )
         if not bool(torch.isfinite(given.detach()).all()):
-            raise checks.refuse(name, "a value that is not finite", "finite everywhere")
+            raise checks.input_error(name, "a value that is not finite", "finite everywhere")
         return given.to(device=self.device, dtype=dtype).reshape(-1, *shape)
 
     def rate(self, name: str, given: float | Tensor) -> Tensor:
@@ -389,7 +396,7 @@ class _Given:
             return self.number(name, given, least=0.0)
         found = self.grid(name, given)
         if bool((found.detach() < 0).any()):
-            raise checks.refuse(name, float(found.detach().min()), "at least 0 everywhere")
+            raise checks.input_error(name, float(found.detach().min()), "at least 0 everywhere")
         return found
 
     def source(self, given: float | Tensor) -> Tensor:
@@ -416,11 +423,11 @@ class _Given:
             ]  # type: ignore[arg-type]
         uniform = torch.as_tensor(given, dtype=torch.float64, device=self.device)
         if tuple(uniform.shape) not in ((3,), (1, 3), (self.colonies, 3)):
-            raise checks.refuse(
+            raise checks.input_error(
                 "velocity",
                 tuple(uniform.shape),
                 f"(3,), ({self.colonies}, 3), or three tensors on the faces of the voxels",
             )
         if not bool(torch.isfinite(uniform.detach()).all()):
-            raise checks.refuse("velocity", uniform.tolist(), "finite")
+            raise checks.input_error("velocity", uniform.tolist(), "finite")
         return [v.reshape(-1, 1, 1, 1) for v in uniform.reshape(-1, 3).unbind(1)]

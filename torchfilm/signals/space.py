@@ -21,7 +21,7 @@ def checked_box(
     try:
         low, high = (tuple(float(x) for x in corner) for corner in box)
     except (TypeError, ValueError) as error:
-        raise checks.refuse(
+        raise checks.input_error(
             "Medium.box", box, "two corners, such as ((-64, -64), (64, 64))"
         ) from error
     if (
@@ -31,7 +31,7 @@ def checked_box(
             math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(low, high, strict=True)
         )
     ):
-        raise checks.refuse(
+        raise checks.input_error(
             "Medium.box",
             (low, high),
             "two corners of 2 or 3 finite numbers, the first below the second along every axis",
@@ -42,12 +42,12 @@ def checked_box(
         len(low),
     )
     if min(voxel) <= 0:
-        raise checks.refuse("Medium.spacing", spacing, "above 0")
+        raise checks.input_error("Medium.spacing", spacing, "above 0")
     for letter, a, b, h in zip("xyz", low, high, voxel, strict=False):
         count = (b - a) / h
         if abs(count - round(count)) > 1e-6:
             whole = max(1, round(count)) * h
-            raise checks.refuse(
+            raise checks.input_error(
                 f"Medium.box along {letter}",
                 (a, b),
                 f"a whole number of voxels of {h:g} µm",
@@ -55,22 +55,22 @@ def checked_box(
             )
     voxels = math.prod(round((b - a) / h) for a, b, h in zip(low, high, voxel, strict=True))
     if voxels > MOST_VOXELS:
-        mend = f"Here it is {voxels:,}: a larger spacing, or a smaller box."
-        raise checks.refuse(
+        hint = f"Here it is {voxels:,}: a larger spacing, or a smaller box."
+        raise checks.input_error(
             "Medium.box",
             (low, high),
             f"of at most {MOST_VOXELS:,} voxels of {spacing} µm a colony",
-            mend,
+            hint,
         )
     if depth is not None:
         checks.number("Medium.depth", depth, above=0.0)
         if len(low) == 3:
-            raise checks.refuse(
+            raise checks.input_error(
                 "Medium.depth", depth, "left out where the box has three dimensions"
             )
     checks.number("Medium.height", height)
     if len(low) == 3 and not low[2] <= height <= high[2]:
-        raise checks.refuse(
+        raise checks.input_error(
             "Medium.height", height, f"within the box, from {low[2]:g} to {high[2]:g} µm"
         )
     return low, high, voxel
@@ -82,9 +82,9 @@ def checked_flow(name: str, given: Any) -> Any:
     if given is None or callable(given):
         return given
     if not isinstance(given, (tuple, list, Tensor)) or len(given) not in (2, 3):
-        raise checks.refuse(name, given, "two or three numbers, or a function of places")
+        raise checks.input_error(name, given, "two or three numbers, or a function of places")
     if isinstance(given, Tensor) and given.dim() == 2:
-        raise checks.refuse(
+        raise checks.input_error(
             name,
             tuple(given.shape),
             "two or three components",

@@ -25,11 +25,11 @@ class SimulationError(RuntimeError):
         self.colonies = tuple(colonies)
 
 
-def refuse(name: str, value: object, allowed: str, mend: str = "") -> InputError:
+def input_error(name: str, value: object, allowed: str, hint: str = "") -> InputError:
     """The error for a value that is not allowed; raise what this returns."""
     shown = repr(value) if len(repr(value)) < 120 else repr(value)[:117] + "..."
     return InputError(
-        f"{name} = {shown} is not allowed: it must be {allowed}." + (f" {mend}" if mend else "")
+        f"{name} = {shown} is not allowed: it must be {allowed}." + (f" {hint}" if hint else "")
     )
 
 
@@ -40,14 +40,14 @@ def number(
     above: float = -math.inf,
     least: float = -math.inf,
     most: float = math.inf,
-    mend: str = "",
+    hint: str = "",
 ) -> float:
     """One finite number within bounds."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise refuse(name, value, "a number", mend)
+        raise input_error(name, value, "a number", hint)
     rule = _rule(above, least, most)
     if not (math.isfinite(value) and value > above and least <= value <= most):
-        raise refuse(name, value, rule, mend)
+        raise input_error(name, value, rule, hint)
     return float(value)
 
 
@@ -65,7 +65,7 @@ def value(
         try:
             given = torch.tensor(given, dtype=torch.float64)
         except (TypeError, ValueError) as error:
-            raise refuse(name, given, "a number or one number per colony") from error
+            raise input_error(name, given, "a number or one number per colony") from error
     if hasattr(given, "__array__") and not isinstance(given, Tensor):
         given = torch.as_tensor(given)
     if not isinstance(given, Tensor):
@@ -75,12 +75,12 @@ def value(
             above=above,
             least=least,
             most=most,
-            mend="Give one number, or one per colony.",
+            hint="Give one number, or one per colony.",
         )
     if given.dim() > 1 or not (
         given.is_floating_point() or given.dtype in (torch.int32, torch.int64)
     ):
-        raise refuse(
+        raise input_error(
             name, tuple(given.shape), "one number, or a 1-D tensor with one number per colony"
         )
     if not given.is_floating_point():
@@ -103,7 +103,7 @@ def below(low: float | Tensor, high: float | Tensor) -> bool:
 
 
 def corners(
-    name: str, low: object, high: object, mend: str = ""
+    name: str, low: object, high: object, hint: str = ""
 ) -> tuple[tuple[float | Tensor, ...], tuple[float | Tensor, ...]]:
     """Two opposite corners, low < high along every axis; entries are numbers (±inf allowed) or one
     number per colony."""
@@ -111,13 +111,15 @@ def corners(
         isinstance(corner, (tuple, list, Tensor)) or hasattr(corner, "__array__")
         for corner in (low, high)
     ):
-        raise refuse(
+        raise input_error(
             f"{name}.low, {name}.high", (low, high), "two corners, such as (0, 0) and (10, 5)"
         )
     lows: tuple[Any, ...] = tuple(low)  # type: ignore[arg-type]
     highs: tuple[Any, ...] = tuple(high)  # type: ignore[arg-type]
     if len(lows) != len(highs) or len(lows) not in (2, 3):
-        raise refuse(f"{name}.low, {name}.high", (low, high), "two corners of 2 or 3 numbers each")
+        raise input_error(
+            f"{name}.low, {name}.high", (low, high), "two corners of 2 or 3 numbers each"
+        )
     checked = []
     for corner, side in ((lows, "low"), (highs, "high")):
         entries: list[float | Tensor] = []
@@ -135,7 +137,7 @@ def corners(
         checked.append(tuple(entries))
     for axis, a, b in zip("xyz", checked[0], checked[1], strict=False):
         if not below(a, b):
-            raise refuse(f"{name}.low, {name}.high along {axis}", (a, b), "low < high", mend)
+            raise input_error(f"{name}.low, {name}.high along {axis}", (a, b), "low < high", hint)
     return checked[0], checked[1]
 
 
@@ -152,7 +154,7 @@ def _rule(above: float, least: float, most: float) -> str:
 
 def choice(name: str, given: object, allowed: Sequence[object]) -> None:
     if given not in allowed:
-        raise refuse(name, given, "one of " + ", ".join(repr(a) for a in allowed))
+        raise input_error(name, given, "one of " + ", ".join(repr(a) for a in allowed))
 
 
 def vector(name: str, given: object, size: int | None = None) -> tuple[float, ...]:
@@ -160,9 +162,9 @@ def vector(name: str, given: object, size: int | None = None) -> tuple[float, ..
     try:
         out = tuple(float(x) for x in given)  # type: ignore[attr-defined]
     except (TypeError, ValueError) as error:
-        raise refuse(name, given, "a sequence of numbers") from error
+        raise input_error(name, given, "a sequence of numbers") from error
     if size is not None and len(out) != size:
-        raise refuse(name, given, f"a sequence of {size} numbers")
+        raise input_error(name, given, f"a sequence of {size} numbers")
     if not all(map(math.isfinite, out)):
-        raise refuse(name, given, "finite")
+        raise input_error(name, given, "finite")
     return out

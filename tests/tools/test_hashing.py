@@ -1,0 +1,101 @@
+"""A digest tells apart what acts in another way, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from torchfilm.tools.hashing import digest
+
+
+def made(code: str):
+    names: dict = {}
+    exec(code, names)
+    return names["f"]
+
+
+def holding(x):
+    return lambda y: x + y
+
+
+@dataclass
+class Thing:
+    size: float
+    worked_out: object = field(default=None, repr=False)
+
+
+class Adding:
+    def __init__(self, size):
+        self.size = size
+
+    def to(self, x):
+        return x + self.size
+
+
+@pytest.mark.parametrize(
+    "one, other",
+    [
+        (1, 1.0),
+        (1.0, 1.0 + 1e-15),
+        ("a", b"a"),
+        ((1, 2), (2, 1)),
+        ({"a": 1}, {"b": 1}),
+        (np.arange(3), np.arange(3.0)),
+        (torch.tensor([1.0, 2.0]), torch.tensor([[1.0], [2.0]])),
+        (torch.tensor(1.0), torch.tensor(1.0000001)),
+        (made("def f(x): return x + 1"), made("def f(x): return x + 2")),
+        (made("def f(x): return x + 1"), made("def f(x): return x - 1")),
+        (made("def f(x, k=1): return x + k"), made("def f(x, k=2): return x + k")),
+        (
+            made("def f(x):\n  def g(y): return y\n  return g(x)"),
+            made("def f(x):\n  def g(y): return -y\n  return g(x)"),
+        ),
+        (
+            made("import math\ndef f(x): return math.sin(x)"),
+            made("import math\ndef f(x): return math.cos(x)"),
+        ),
+        (holding(1), holding(2)),
+        (Thing(1.0), Thing(2.0)),
+        (Adding(1.0).to, Adding(2.0).to),
+        (
+            partial(made("def f(x, k): return x + k"), k=1),
+            partial(made("def f(x, k): return x - k"), k=1),
+        ),
+        (partial(holding, 1), partial(holding, 2)),
+    ],
+)
+def test_what_differs_is_told_apart(one, other):
+    assert digest(one) != digest(other) and digest(one) == digest(one)
+
+
+@pytest.mark.parametrize(
+    "one, other",
+    [
+        (made("def f(x): return x + 1"), made("\n\n# a remark\ndef f(x):\n    return x + 1")),
+        (holding(3), holding(3)),
+        (Thing(1.0, worked_out=object()), Thing(1.0)),
+        (torch.tensor([1.0, 2.0]), np.array([1.0, 2.0], np.float32)),
+        ([object()], [object()]),
+        ((2.0, (1, "a")), [2.0, [1, "a"]]),
+        (
+            made('def f(x):\n  "Adds one."\n  return x + 1'),
+            made('def f(x):\n  "Adds 1 to x."\n  return x + 1'),
+        ),
+        (made("size = 3\ndef f(x): return x.size"), made("size = 4\ndef f(x): return x.size")),
+        (Adding(1.0).to, Adding(1.0).to),
+        (partial(holding, 1), partial(holding, 1)),
+    ],
+)
+def test_what_acts_alike_is_alike(one, other):
+    assert digest(one) == digest(other)
+
+
+def test_a_function_that_calls_itself_has_an_end():
+    def again(n):
+        return again(n - 1) if n else 0
+
+    assert digest(again) == digest(again)

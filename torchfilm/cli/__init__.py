@@ -1,0 +1,1 @@
+"""The command line; `torchfilm.cli.main:main` is the entry point."""

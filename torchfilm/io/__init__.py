@@ -1,0 +1,1 @@
+"""Results files: writing a run, reading it back, resuming from it."""

@@ -1,0 +1,419 @@
+"""What the user's rules see of the cells: Table 1's names, each a whole tensor, that may be read
+and, where the model allows, written."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.circuits.names import Names
+from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, Field, State
+from torchfilm.tools import checks
+from torchfilm.tools.hot_reload import unchanged
+
+# The paper's spellings (Table 1) beside ours.
+PAPER_NAMES = {
+    "pos": "position",
+    "dir": "axis",
+    "cellType": "cell_type",
+    "growthRate": "growth_rate",
+    "divideFlag": "divide_flag",
+}
+GEOMETRY = ("position", "axis", "length", "radius", "volume", "area")
+# What reading a name means in terms of what other effects write.
+MEANS = {
+    "volume": ("length", "radius"),
+    "area": ("length", "radius"),
+    "uid": ("cells",),
+    "parent": ("cells",),
+    "colony": ("cells",),
+}
+IDENTITY = ("uid", "parent", "colony")
+KNOWN_FIELDS = {
+    "cell_type": CELL_TYPE,
+    "drag": Field("drag", "factor on the viscosity that this cell feels", initial=1.0),
+}
+
+
+def _quantity(state: State, name: str) -> Tensor:
+    """A quantity by the name that rules use; a colony goes by its id, which does not depend on the
+    batch."""
+    if name in state.declared and state.declared[name].scope == COLONY:
+        return state.fields[name].index_select(0, state.colony)
+    return state.own_colony_id if name == "colony" else getattr(state, name)
+
+
+def _check_whole(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
+    if (
+        tensor.is_floating_point()
+        and not dtype.is_floating_point
+        and dtype != torch.bool
+        and not bool((tensor == tensor.round()).all())
+    ):
+        raise RuleError(
+            f"{name} holds whole numbers, and was set to broken ones. Give it a first value such as"
+            " 0.0 if it is to hold any number."
+        )
+
+
+class RuleError(checks.InputError, AttributeError):
+    """A rule asked for something that is not there, or set something to what it cannot be."""
+
+
+class CellsView:
+    """What a rule sees: every name a tensor over all cells, (N,) or (N, d); `for cell in cells`
+    gives them one by one (slow).
+
+    Read position (pos), axis (dir), length, radius, volume, area, uid, parent, colony, signals, and
+    every field of the scene; write fields, `divide_flag`, `remove_flag`, and new names, which
+    become variables of the cell. A tensor that was read may be changed in place.
+    """
+
+    _state: State
+    _label: str
+    _dt: float
+    _work: dict[str, Tensor]
+    _read: set[str]
+    _shown: dict[str, Tensor]
+    _written: set[str]
+    _declaring: bool
+    _draws: int
+
+    def __init__(self, state: State, dt: float, label: str, declaring: bool = False):
+        # past __setattr__, which is the rule's
+        self.__dict__.update(
+            _state=state,
+            _label=label,
+            _dt=dt,
+            _work={},
+            _read=set(),
+            _shown={},
+            _written=set(),
+            _declaring=declaring,
+            _draws=0,
+        )
+
+    @property
+    def time(self) -> float:
+        """h."""
+        return self._state.time
+
+    @property
+    def dt(self) -> float:
+        """Step, h."""
+        return self._dt
+
+    @property
+    def count(self) -> int:
+        """Cells in all colonies."""
+        return self._state.cells
+
+    def __len__(self) -> int:
+        return self._state.cells
+
+    def __getattr__(self, name: str) -> Any:
+        name = PAPER_NAMES.get(name, name)
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name in self._work:
+            return self._work[name]
+        if name == "signals":
+            return self._signals()
+        state = self._state
+        if name in GEOMETRY or name in IDENTITY:
+            self._read.update(MEANS.get(name, (name,)))
+            if name not in self._shown:
+                # a copy, so that a rule that writes into it is found out and the state stays as it
+                # was
+                self._shown[name] = _quantity(state, name).clone()
+            return self._shown[name]
+        if name == "remove_flag":
+            self._work[name] = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
+        elif name in state.fields and state.declared[name].scope == COLONY:
+            self._read.add(name)
+            # of the colony's own, each cell gets its colony's; what is written into it is found out
+            # as for geometry
+            if name not in self._shown:
+                self._shown[name] = _quantity(state, name)
+            return self._shown[name]
+        elif name in state.fields:
+            self._read.add(name)
+            # a copy, so that a rule may write into it: states are frozen
+            self._work[name] = state.fields[name].clone()
+        elif self._declaring and name in KNOWN_FIELDS:
+            self._work[name] = KNOWN_FIELDS[name].start(
+                state, torch.arange(state.cells, device=state.device)
+            )
+        else:
+            if OUTSIDE + name in state.fields:
+                raise RuleError(
+                    f"cells have no {name!r}; it is a signal: read cells.signals.{name}."
+                )
+            known = [*GEOMETRY, *IDENTITY, *(n for n in state.fields if n.isidentifier())]
+            raise RuleError(
+                f"cells have no {name!r}; they have {', '.join(known)}. A variable of your own"
+                f" needs a first value: give Rules(…, variables={{{name!r}: 0.0}})."
+            )
+        return self._work[name]
+
+    def _signals(self) -> Names:
+        """What each cell finds outside, (N,) by name: `cells.signals.ahl`."""
+        state = self._state
+        if state.layout is None:
+            raise RuleError("cells have no signals: there is no Medium in this scene.")
+        self._read.update(("position", *(n for n in state.fields if n.startswith(OUTSIDE))))
+        contact = state.contact()
+        assert contact is not None
+        return Names(tuple(contact.found), list(contact.found.values()), "cells.signals")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        name = PAPER_NAMES.get(name, name)
+        state = self._state
+        of_colony = name in state.declared and state.declared[name].scope == COLONY
+        if (
+            of_colony
+            or name in (*GEOMETRY, *IDENTITY, "signals")
+            or isinstance(getattr(type(self), name, None), property)
+        ):
+            raise RuleError(
+                f"cells.{name} can only be read (Table 1 of the paper): rules change fields, flags"
+                " and variables."
+            )
+        declared = (
+            KNOWN_FIELDS.get(name, state.declared.get(name)) if name != "remove_flag" else None
+        )
+        dtype = (
+            torch.bool
+            if name == "remove_flag"
+            else (declared.dtype or state.dtype)
+            if declared is not None
+            else None
+        )
+        tensor = _as_tensor(f"cells.{name}", value, state.device)
+        if dtype is None:
+            known = state.fields.get(name)
+            # a plain number makes a variable that can hold any number
+            plain = tensor.is_floating_point() or (
+                not isinstance(value, (bool, Tensor)) and tensor.dtype != torch.bool
+            )
+            dtype = known.dtype if known is not None else state.dtype if plain else tensor.dtype
+        if self._declaring and name not in (*state.fields, *KNOWN_FIELDS, "remove_flag"):
+            near = difflib.get_close_matches(
+                name, [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES], 1, cutoff=0.85
+            )
+            if near:
+                raise RuleError(
+                    f"cells.{name} is new: did you mean {near[0]!r}? If it is a variable of your"
+                    f" own, give Rules(…, variables={{{name!r}: 0.0}})."
+                )
+        self._written.add(name)
+        shape = (
+            state.fields[name].shape if name in state.fields else (state.cells, *tensor.shape[1:])
+        )
+        self._work[name] = _fitted(f"cells.{name}", tensor.to(state.device), dtype, shape)
+
+    def __iter__(self):
+        return (CellView(self, k) for k in range(self._state.cells))
+
+    def random(self) -> Tensor:
+        """A draw from (0, 1) for each cell, (N,), keyed by seed, colony, cell and step: the same
+        whatever the batch. Each call draws anew."""
+        self.__dict__["_draws"] += 1
+        return self._state.uniform(
+            torch.arange(self._state.cells, device=self._state.device),
+            f"{self._label} {self._draws}",
+        )
+
+    def colony_max(self, value: Tensor) -> Tensor:
+        """The greatest value in each cell's own colony, (N,) -> (N,)."""
+        return self._state.groups.max(value).index_select(0, self._state.colony)
+
+    def colony_min(self, value: Tensor) -> Tensor:
+        """The smallest value in each cell's own colony, (N,) -> (N,)."""
+        return -self.colony_max(-value)
+
+    def colony_sum(self, value: Tensor) -> Tensor:
+        """The sum over each cell's own colony, (N,) -> (N,)."""
+        return (
+            self._state.groups.sum(value.unsqueeze(1))
+            .squeeze(1)
+            .index_select(0, self._state.colony)
+        )
+
+    def contacts(self, within: float = 0.05) -> tuple[Tensor, Tensor]:
+        """Pairs of cells whose surfaces are at most `within` µm apart: two (P,) index tensors, each
+        pair once. Found only when asked for."""
+        self._read.update(("position", "axis", "length", "radius"))
+        s = self._state
+        i, j, gap = gaps_nearby(
+            s.position, s.axis, s.length, s.radius, s.colony, s.colonies, within
+        )
+        keep = torch.nonzero(gap <= within).squeeze(1)
+        return i.index_select(0, keep), j.index_select(0, keep)
+
+    def check_unharmed(self) -> None:
+        """Raise if a rule wrote into something that can only be read."""
+        for name, shown in self._shown.items():
+            if not unchanged(shown, _quantity(self._state, name)):
+                raise RuleError(
+                    f"the rule changed cells.{name} in place, which can only be read: rules change"
+                    " fields, flags and variables."
+                )
+
+    def contact_count(self, within: float = 0.05) -> Tensor:
+        """How many cells each cell touches, (N,) int64."""
+        i, j = self.contacts(within)
+        return torch.bincount(torch.cat([i, j]), minlength=self._state.cells)
+
+
+class CellView:
+    """One cell of a CellsView: the same names, one value each. For loops as in the paper; whole
+    tensors are a thousand times faster."""
+
+    _cells: CellsView
+    _index: int
+
+    def __init__(self, cells: CellsView, index: int):
+        self.__dict__.update(_cells=cells, _index=index)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        found = getattr(self._cells, name)
+        if name == "signals":
+            return Names(tuple(found), [found[n][self._index] for n in found], "cell.signals")
+        return found[self._index]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        name = PAPER_NAMES.get(name, name)
+        cells = self._cells
+        if (
+            name in cells._state.fields
+            or name in ("remove_flag", *KNOWN_FIELDS)
+            or name in cells._work
+        ):
+            column = getattr(cells, name)
+            _check_whole(f"cell.{name}", torch.as_tensor(value), column.dtype)
+            column[self._index] = value
+            cells._written.add(name)
+        elif cells._declaring:
+            setattr(cells, name, False if isinstance(value, bool) else 0.0)
+            getattr(cells, name)[self._index] = value
+        else:
+            setattr(cells, name, value)  # raises, with the reason
+
+
+class DivisionView:
+    """The parents or daughters of one step's divisions, M of each: names as in CellsView;
+    daughters' fields may be written, or changed in place."""
+
+    _state: State
+    _rows: Tensor | None
+    _called: str
+    _purpose: str
+    _set: set[str]
+    _work: dict[str, Tensor]
+    _draws: int
+
+    def __init__(self, state: State, rows: Tensor | None, called: str, purpose: str):
+        self.__dict__.update(
+            _state=state,
+            _rows=rows,
+            _called=called,
+            _purpose=purpose,
+            _set=set(),
+            _work={},
+            _draws=0,
+        )
+
+    def __getattr__(self, name: str) -> Tensor:
+        name = PAPER_NAMES.get(name, name)
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name not in self._work:
+            if not (name in GEOMETRY or name in IDENTITY or name in self._state.fields):
+                raise RuleError(
+                    f"cells have no {name!r}; they have"
+                    f" {', '.join([*GEOMETRY, *IDENTITY, *self._state.fields])}"
+                )
+            self._work[name] = self._copy(name)
+        return self._work[name]
+
+    def _copy(self, name: str) -> Tensor:
+        """The quantity as the state has it, a row for each division; of the colony's own, each
+        division gets its colony's."""
+        value = _quantity(self._state, name)
+        return value.clone() if self._rows is None else value.index_select(0, self._rows)
+
+    def _writable(self, name: str) -> bool:
+        return (
+            self._rows is not None
+            and name in self._state.fields
+            and self._state.declared[name].scope == CELL
+        )
+
+    def check_unharmed(self) -> None:
+        """Raise if a rule wrote into something that can only be read."""
+        for name, shown in self._work.items():
+            if not self._writable(name) and not unchanged(shown, self._copy(name)):
+                raise RuleError(
+                    f"the rule changed {self._called}.{name} in place, which can only be read:"
+                    " rules set daughters' fields."
+                )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        name = PAPER_NAMES.get(name, name)
+        if self._rows is None:
+            raise RuleError(
+                f"parent.{name} can only be read: the parent is gone; set daughter1.{name} and"
+                f" daughter2.{name}."
+            )
+        if name in GEOMETRY or name in IDENTITY:
+            raise RuleError(
+                f"{self._called}.{name} can only be read: Division places the daughters (its"
+                " `fraction` shares the length); rules set fields."
+            )
+        if not self._writable(name):
+            own = ", ".join(filter(self._writable, self._state.fields))
+            raise RuleError(
+                f"daughters have no field {name!r} to write (a colony's can only be read); they"
+                f" have {own}"
+            )
+        like = getattr(self, name)
+        tensor = _as_tensor(f"{self._called}.{name}", value, like.device)
+        self._work[name] = _fitted(f"{self._called}.{name}", tensor, like.dtype, like.shape)
+        self._set.add(name)
+
+    def random(self) -> Tensor:
+        """A draw from (0, 1) for each division, (M,), keyed by seed, colony, cell and step."""
+        self.__dict__["_draws"] += 1
+        rows = (
+            self._rows
+            if self._rows is not None
+            else torch.arange(self._state.cells, device=self._state.device)
+        )
+        return self._state.uniform(rows, f"{self._purpose} {self._draws}")
+
+
+def _as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
+    try:
+        return value if isinstance(value, Tensor) else torch.as_tensor(value, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise RuleError(f"{name} was set to {value!r}: it must be a number or a tensor.") from error
+
+
+def _fitted(name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequence[int]) -> Tensor:
+    """A copy of that type and shape."""
+    _check_whole(name, tensor, dtype)
+    try:
+        return tensor.to(dtype).broadcast_to(shape).clone()
+    except RuntimeError as error:
+        raise RuleError(
+            f"{name} was set to a tensor of shape {tuple(tensor.shape)}: it must be one value or"
+            f" {tuple(shape)}."
+        ) from error

@@ -1,0 +1,126 @@
+"""What happens at the six faces of a box of signal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from torchfilm.tools import checks
+
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Face:
+    """What every face has in common."""
+
+    def outside_value(self) -> float | Tensor:
+        """The concentration beyond the face, one number or one per colony; 0 where none enters."""
+        return 0.0
+
+    def take(self, places: Tensor) -> Face:
+        """The face of the colonies at `places` (b,) int64."""
+        return self
+
+
+@dataclass(frozen=True)
+class NoFlux(Face):
+    """Nothing passes, neither by diffusion nor with the flow."""
+
+
+@dataclass(frozen=True)
+class Periodic(Face):
+    """What leaves here enters at the opposite face, which must be periodic too."""
+
+
+@dataclass(frozen=True)
+class Dirichlet(Face):
+    """The concentration at the face itself, half a voxel from the nearest centre, is `value` ≥ 0:
+    one number or one per colony."""
+
+    value: float | Tensor
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", checks.value("Fixed.value", self.value, least=0.0))
+
+    def outside_value(self) -> float | Tensor:
+        return self.value
+
+    def take(self, places: Tensor) -> Face:
+        return replace(self, value=_take(self.value, places))
+
+
+@dataclass(frozen=True)
+class Open(Face):
+    """No diffusive flux; the flow carries the local concentration out, and `outside` ≥ 0 (one
+    number or one per colony) in."""
+
+    outside: float | Tensor = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "outside", checks.value("Open.outside", self.outside, least=0.0))
+
+    def outside_value(self) -> float | Tensor:
+        return self.outside
+
+    def take(self, places: Tensor) -> Face:
+        return replace(self, outside=_take(self.outside, places))
+
+
+@dataclass(frozen=True)
+class BoundaryConditions:
+    """The six faces of a box: along each axis one face for both ends, or (low, high).
+    `BoundaryConditions(x=(Dirichlet(1.0), Open()), y=Periodic())`."""
+
+    x: Face | tuple[Face, Face] = NoFlux()
+    y: Face | tuple[Face, Face] = NoFlux()
+    z: Face | tuple[Face, Face] = NoFlux()
+
+    def __post_init__(self) -> None:
+        for axis in AXES:
+            given = getattr(self, axis)
+            pair = (given, given) if isinstance(given, Face) else given
+            if not (
+                isinstance(pair, (tuple, list))
+                and len(pair) == 2
+                and all(isinstance(face, Face) for face in pair)
+            ):
+                raise checks.input_error(
+                    f"BoundaryConditions.{axis}",
+                    given,
+                    "a face or a pair of faces (low, high)",
+                    "BoundaryConditions are NoFlux(), Periodic(), Dirichlet(value) and Open(outside).",
+                )
+            if isinstance(pair[0], Periodic) != isinstance(pair[1], Periodic):
+                raise checks.input_error(
+                    f"BoundaryConditions.{axis}",
+                    pair,
+                    "periodic at both ends or at neither",
+                    f"Write {axis}=Periodic().",
+                )
+            object.__setattr__(self, axis, tuple(pair))
+
+    @property
+    def pairs(self) -> tuple[tuple[Face, Face], tuple[Face, Face], tuple[Face, Face]]:
+        """(low, high) along x, y and z."""
+        return self.x, self.y, self.z  # type: ignore[return-value]
+
+    @property
+    def periodic(self) -> tuple[bool, bool, bool]:
+        """Which axes are periodic."""
+        x, y, z = (isinstance(low, Periodic) for low, _ in self.pairs)
+        return x, y, z
+
+    def take(self, places: Tensor) -> BoundaryConditions:
+        """The faces of the colonies at `places` (b,) int64."""
+        x, y, z = ((low.take(places), high.take(places)) for low, high in self.pairs)
+        return BoundaryConditions(x, y, z)
+
+
+def _take(given: float | Tensor, places: Tensor) -> float | Tensor:
+    return (
+        given.to(places.device).index_select(0, places)
+        if isinstance(given, Tensor) and given.dim() == 1
+        else given
+    )

@@ -1,0 +1,227 @@
+"""Powers and other functions whose bits do not depend on where an element stands.
+
+On the CPU torch works through a tensor in blocks of a vector register and finishes the remainder
+one by one, by another library: for some functions the two differ in the last bit, so an element's
+value depends on its place and on its company. Found so on torch 2.13 (AVX-512, both precisions):
+pow with any exponent other than the plain numbers 0, 1, 2, 3, ±½, −1, −2 (a tensor that holds 2 is
+not exempt), a number to the power of a tensor, exp2, sinh, cosh, atanh, sigmoid, softplus, silu,
+elu, gelu, mish, logit (strided), logaddexp, hypot, atan2, gammainc. Found steady, with their
+derivatives: exp, expm1, log, log2, log10, log1p, sqrt, rsqrt, sin, cos, tan, asin, acos, atan,
+tanh, asinh, acosh, erf, erfc, erfinv, lgamma, gammaincc, log_sigmoid and the four operations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+MOST_SQUARED = 64  # a greater whole exponent goes by exp and log, whose error is then the smaller
+# |x| at or below this counts as 0 where a logarithm is taken: the second derivative, ~ 1/x², must
+# stay a number of the dtype
+FLOOR = {torch.float32: 1e-18, torch.float64: 1e-150}
+
+
+def power(x: Tensor, n: float | Tensor) -> Tensor:
+    """xⁿ by steady functions, to a few units in the last place times n log x; n a number or a
+    tensor that broadcasts with x.
+
+    Whole exponents take any x; for others a negative x gives NaN, and one at or below FLOOR counts
+    as 0. With n ≥ 1 the value and two derivatives at x = 0 are right where they are finite; those
+    that are infinite there (of √x, the second of x^1.5) come out 0.
+    """
+    if isinstance(n, Tensor):
+        return _tensor_power(x, n)
+    if n < 0:
+        return power(x, -n).reciprocal()
+    whole = math.floor(n) if math.isfinite(n) else 0
+    if whole > MOST_SQUARED or not math.isfinite(n):
+        return _tensor_power(x, torch.tensor(n, dtype=x.dtype, device=x.device))
+    if n == whole:
+        return _whole_power(x, whole)
+    root = _broken_power(x, n - whole)
+    return _whole_power(x, whole) * root if whole else root
+
+
+def _whole_power(x: Tensor, n: int) -> Tensor:
+    """xⁿ for n = 0, 1, 2, … by squaring."""
+    if n <= 1:
+        return x.clone() if n else torch.ones_like(x)
+    out, square = None, x
+    while n:
+        if n & 1:
+            out = square if out is None else out * square
+        n >>= 1
+        if n:
+            square = square * square
+    assert out is not None
+    return out
+
+
+def _broken_power(x: Tensor, n: float) -> Tensor:
+    """xⁿ for 0 < n < 1; 0 with zero derivative at 0, NaN below."""
+    positive = x > _floor(x)
+    safe = torch.where(positive, x, 1.0)
+    out = safe.sqrt() if n == 0.5 else torch.exp(n * torch.log(safe))
+    return torch.where(positive, out, torch.where(x < 0, torch.nan, 0.0).to(out.dtype))
+
+
+def _tensor_power(x: Tensor, n: Tensor) -> Tensor:
+    """xⁿ = xᵐ · |x|ⁿ⁻ᵐ with m = 0, 1 or 2, so that value and two derivatives by x are right at x =
+    0 for whole exponents."""
+    m = n.detach().floor().clamp(0, 2)
+    rest = n - m
+    zero = x.abs() <= _floor(x)
+    out = torch.exp(rest * torch.log(torch.where(zero, 1.0, x.abs())))
+    fixed = rest.detach()
+    out = torch.where(
+        zero, torch.where(fixed > 0, 0.0, torch.where(fixed < 0, torch.inf, 1.0)).to(out.dtype), out
+    )
+    odd = torch.remainder(fixed, 2.0)
+    below = x < 0
+    out = torch.where(below & (odd == 1), -out, out)
+    # a constant NaN: a product with one would hand NaN back to elements that never used it
+    out = torch.where(below & (odd != 0) & (odd != 1), torch.nan, out)
+    return torch.where(m == 0, out, torch.where(m == 1, x, x * x) * out)
+
+
+def _floor(x: Tensor) -> float:
+    return FLOOR.get(x.dtype, float(torch.finfo(x.dtype).tiny))
+
+
+def exp_base(base: float, x: Tensor) -> Tensor:
+    """baseˣ for a number base > 0."""
+    return torch.exp(x * math.log(base))
+
+
+def sigmoid(x: Tensor) -> Tensor:
+    """1/(1 + e⁻ˣ), without overflow on either side."""
+    positive = x >= 0
+    e = torch.exp(torch.where(positive, -x, x))
+    r = 1.0 / (1.0 + e)
+    return torch.where(positive, r, e * r)
+
+
+def softplus(x: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
+    """log(1 + e^{βx})/β; exact also beyond the threshold, which is there for torch's signature."""
+    y = x * beta
+    positive = y >= 0
+    tail = torch.log1p(torch.exp(torch.where(positive, -y, y)))
+    return torch.where(positive, y + tail, tail) / beta
+
+
+def silu(x: Tensor, inplace: bool = False) -> Tensor:
+    """x/(1 + e⁻ˣ)."""
+    return x * sigmoid(x)
+
+
+def elu(x: Tensor, alpha: float = 1.0, inplace: bool = False) -> Tensor:
+    """x above 0, α (eˣ − 1) below."""
+    return torch.where(x > 0, x, alpha * torch.expm1(torch.where(x > 0, 0.0, x)))
+
+
+def sinh(x: Tensor) -> Tensor:
+    """(eˣ − e⁻ˣ)/2."""
+    return 0.5 * (torch.expm1(x) - torch.expm1(-x))
+
+
+def cosh(x: Tensor) -> Tensor:
+    """(eˣ + e⁻ˣ)/2."""
+    return 0.5 * (torch.exp(x) + torch.exp(-x))
+
+
+def atanh(x: Tensor) -> Tensor:
+    """½ log((1 + x)/(1 − x))."""
+    return 0.5 * (torch.log1p(x) - torch.log1p(-x))
+
+
+def logaddexp(x: Tensor, y: Tensor) -> Tensor:
+    """log(eˣ + eʸ)."""
+    first = x >= y
+    high, low = torch.where(first, x, y), torch.where(first, y, x)
+    gap = torch.where(torch.isfinite(high), low - high, 0.0)  # infinities have no difference
+    return high + torch.log1p(torch.exp(gap))
+
+
+def hypot(x: Tensor, y: Tensor) -> Tensor:
+    """√(x² + y²)."""
+    return torch.sqrt(x * x + y * y)
+
+
+def _pow(x: Tensor | float, n: float | Tensor) -> Tensor | None:
+    if isinstance(x, Tensor):
+        if (
+            not x.is_floating_point()
+            or isinstance(n, (bool, complex))
+            or (isinstance(n, Tensor) and not n.is_floating_point() and n.dim() == 0)
+        ):
+            return None
+        return power(x, n.to(x.dtype) if isinstance(n, Tensor) and not n.is_floating_point() else n)
+    return _rpow(n, x) if isinstance(n, Tensor) else None
+
+
+def _rpow(n: Tensor, x: float | Tensor) -> Tensor | None:
+    if isinstance(x, Tensor):
+        return _pow(x, n)
+    return (
+        exp_base(x, n) if n.is_floating_point() and isinstance(x, (int, float)) and x > 0 else None
+    )
+
+
+def _ipow(x: Tensor, n: float | Tensor) -> Tensor | None:
+    out = _pow(x, n)
+    return None if out is None else x.copy_(out)
+
+
+def _floating(function: Callable[..., Tensor]) -> Callable[..., Tensor | None]:
+    return lambda x, *args, **kwargs: (
+        function(x, *args, **kwargs) if isinstance(x, Tensor) and x.is_floating_point() else None
+    )
+
+
+# What stands in for what; a function that returns None leaves the work to torch.
+STEADY: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
+    **dict.fromkeys((torch.pow, Tensor.pow, Tensor.__pow__), _pow),
+    **dict.fromkeys((Tensor.__rpow__,), _rpow),
+    **dict.fromkeys((Tensor.pow_, Tensor.__ipow__), _ipow),
+    **dict.fromkeys(
+        (torch.sigmoid, Tensor.sigmoid, torch.special.expit, torch.nn.functional.sigmoid),
+        _floating(sigmoid),
+    ),
+    **dict.fromkeys(
+        (torch.exp2, Tensor.exp2, torch.special.exp2), _floating(lambda x: exp_base(2.0, x))
+    ),
+    **dict.fromkeys((torch.sinh, Tensor.sinh), _floating(sinh)),
+    **dict.fromkeys((torch.cosh, Tensor.cosh), _floating(cosh)),
+    **dict.fromkeys((torch.atanh, Tensor.atanh, torch.arctanh, Tensor.arctanh), _floating(atanh)),
+    **dict.fromkeys((torch.logaddexp, Tensor.logaddexp), _floating(logaddexp)),
+    **dict.fromkeys((torch.hypot, Tensor.hypot), _floating(hypot)),
+    torch.nn.functional.softplus: _floating(softplus),
+    torch.nn.functional.silu: _floating(silu),
+    torch.nn.functional.elu: _floating(elu),
+}
+
+
+class _Steady(TorchFunctionMode):
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        mine = STEADY.get(func)
+        if mine is not None and not (kwargs and "out" in kwargs):
+            found = mine(*args, **(kwargs or {}))
+            if found is not None:
+                return found
+        return func(*args, **(kwargs or {}))
+
+
+def deterministic_functions() -> TorchFunctionMode:
+    """Within `with deterministic_functions():` torch's unsteady functions are replaced by the steady ones
+    of this module.
+
+    Covers pow and **, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp and hypot,
+    in the forward and reverse modes of autograd. Not covered: gelu, mish, logit, atan2, gammainc,
+    matrix products. Costs about a microsecond a torch call.
+    """
+    return _Steady()

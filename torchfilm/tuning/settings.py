@@ -1,0 +1,162 @@
+"""How accurately a scene is simulated: the knobs that trade time for error, in one place, apart
+from what the scene says of the world.
+
+`Settings` are a handful of numbers that any scene can be given; `preset` has three, and
+`torchfilm.tuning.tuner` finds them for an error that one names.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchfilm.effect import Effect
+from torchfilm.effects.circuit import STIFF, Circuit
+from torchfilm.effects.mechanics import Mechanics
+from torchfilm.scene import Scene
+from torchfilm.tools import checks
+
+FORMAT = "torchfilm settings"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Knobs of accuracy; None leaves what the scene says.
+
+    dt: step, h. penalty: α·γ of contacts, by how far they give way (0.1 by default; cells that are
+    physically soft, `Mechanics(stiffness=…)`, keep theirs). passes, tolerance: of the contact solve
+    (see `Mechanics`). rtol: of circuits that run by the stiff solver.
+    """
+
+    dt: float | None = None
+    penalty: float | None = None
+    passes: int | None = None
+    tolerance: float | None = None
+    rtol: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, most in (
+            ("dt", float("inf")),
+            ("penalty", float("inf")),
+            ("tolerance", 0.5),
+            ("rtol", 0.1),
+        ):
+            if getattr(self, name) is not None:
+                checks.number(f"Settings.{name}", getattr(self, name), above=0.0, most=most)
+        if self.passes is not None and (
+            isinstance(self.passes, bool) or not isinstance(self.passes, int) or self.passes < 1
+        ):
+            raise checks.input_error("Settings.passes", self.passes, "a whole number from 1")
+
+    @property
+    def given(self) -> dict[str, float]:
+        """The knobs that are set, by name."""
+        return {
+            f.name: value
+            for f in dataclasses.fields(self)
+            if (value := getattr(self, f.name)) is not None
+        }
+
+    def apply(self, scene: Scene) -> Scene:
+        """The same scene, simulated so: its results say so too, and go on so. Knobs of effects that
+        it does not list do nothing."""
+        return scene.retuned(
+            [self._applied(effect) for effect in scene.listed],
+            scene.dt if self.dt is None else self.dt,
+            {**scene.accuracy, **self.given},
+        )
+
+    def _applied(self, effect: Effect) -> Effect:
+        if isinstance(effect, Mechanics):
+            changed: dict[str, Any] = {
+                n: getattr(self, n) for n in ("passes", "tolerance") if getattr(self, n) is not None
+            }
+            if self.penalty is not None and effect.stiffness is None:
+                changed["alpha"] = self.penalty / effect.length_drag
+            return dataclasses.replace(effect, **changed) if changed else effect
+        if isinstance(effect, Circuit) and effect.method == STIFF and self.rtol is not None:
+            return effect.solved_to(self.rtol)
+        return effect
+
+    def save(self, path: str | Path) -> Path:
+        """Write them to a new JSON file."""
+        path = Path(path)
+        Settings.check_new(path)
+        try:
+            path.write_text(json.dumps({"format": FORMAT, **self.given}, indent=1) + "\n")
+        except OSError as error:
+            raise checks.input_error(
+                "path", str(path), "a file that can be written", f"{error.strerror}."
+            ) from error
+        return path
+
+    @staticmethod
+    def check_new(path: Path) -> None:
+        """Refuse to replace a file."""
+        if path.exists() or not path.parent.is_dir():
+            raise checks.input_error(
+                "the settings' path",
+                str(path),
+                "in a folder that exists, where there is no file yet",
+                "Choose another.",
+            )
+
+    @staticmethod
+    def load(path: str | Path) -> Settings:
+        """Read what `save` wrote. Raises InputError for anything else."""
+        try:
+            found = json.loads(Path(path).read_text())
+        except OSError as error:
+            raise checks.InputError(
+                f"{path} cannot be read: {error.strerror}. `torchfilm tune SCENE --out FILE` writes"
+                " settings."
+            ) from error
+        except ValueError:
+            found = None
+        if not isinstance(found, dict) or found.pop("format", None) != FORMAT:
+            raise checks.InputError(
+                f"{path} holds no settings of accuracy: `torchfilm tune SCENE --out FILE` writes"
+                " such a file."
+            )
+        return Settings.named(found, str(path))
+
+    @staticmethod
+    def named(knobs: dict[str, Any], where: str) -> Settings:
+        """From knobs by name, as files hold them. Raises InputError for a name that there is
+        not."""
+        known = [f.name for f in dataclasses.fields(Settings)]
+        for name in knobs:
+            if name not in known:
+                raise checks.input_error(f"knob in {where}", name, "one of " + ", ".join(known))
+        return Settings(**knobs)
+
+
+# By name: the step as a part of the scene's own, and the other knobs. Their places on the fronts
+# are in docs/accuracy.md: a step much longer than a draft's makes cells of usual growth take
+# sub-steps, which cost more than they save.
+PRESETS: dict[str, tuple[float, Settings]] = {
+    "draft": (1.6, Settings(penalty=0.1, tolerance=0.2, rtol=1e-2)),
+    "standard": (1.0, Settings()),
+    "reference": (0.125, Settings(penalty=0.03, passes=4, tolerance=1e-3, rtol=1e-6)),
+}
+
+
+def preset(name: str, scene: Scene) -> Settings:
+    """Named settings for a scene: "draft" to look at it, "standard" (its own, the defaults),
+    "reference" to measure others against."""
+    checks.choice("preset", name, tuple(PRESETS))
+    pace, settings = PRESETS[name]
+    return dataclasses.replace(settings, dt=None if pace == 1.0 else scene.dt * pace)
+
+
+def accurate(scene: Scene, named: str | None, file: Path | None) -> Scene:
+    """The scene as accurately as a preset by name or a file of settings says, if either is given.
+    Raises InputError for both."""
+    if named is not None and file is not None:
+        raise checks.InputError("--preset and --settings: give one of the two.")
+    if file is not None:
+        return Settings.load(file).apply(scene)
+    return scene if named is None else preset(named, scene).apply(scene)
