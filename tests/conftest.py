@@ -78,4 +78,4 @@ def _recorded(path, **options):
     from recorded import make_scene, record
 
     scene = make_scene()
-    return path, record(scene, scene.seed(3, seed=11), path, **options)
+    return path, record(scene, scene.bind(3, seed=11).start(), path, **options)

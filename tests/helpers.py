@@ -33,7 +33,29 @@ def growth(rate: float | Tensor = 1.0, law: str = "length") -> tf.Growth:
 def seeded(
     scene: tf.Scene, cells: tf.Cells, device: torch.device, dtype: torch.dtype, **options
 ) -> tf.State:
-    return scene.seed(cells=cells, device=device, dtype=dtype, **options)
+    return scene.bind(cells=cells, device=device, dtype=dtype, **options).start()
+
+
+_MODELS: dict[tuple, tuple[tf.Scene, tf.Model]] = {}
+
+
+def model_for(scene: tf.Scene, state: tf.State) -> tf.Model:
+    """The scene bound to the batch of a state, once for each batch."""
+    count = max(scene.fixed_colonies, int(state.colony_id.max()) + 1)
+    key = (id(scene), count, state.dtype, state.device, torch.is_grad_enabled())
+    if key not in _MODELS:
+        if len(_MODELS) > 50:
+            _MODELS.clear()
+        # the scene is kept too, so that no other takes its id
+        _MODELS[key] = (scene, scene.bind(state=state))
+    return _MODELS[key][1]
+
+
+def step(
+    scene: tf.Scene, state: tf.State, dt: float, timings: tf.Timings | None = None
+) -> tf.State:
+    """The state dt hours later."""
+    return model_for(scene, state).step(state, dt, timings)
 
 
 def run(
@@ -41,7 +63,7 @@ def run(
 ) -> tf.State:
     """The state `steps` steps later; `check` applies `check_always` to each state on the way."""
     for _ in range(steps):
-        state = scene.step(state, dt)
+        state = step(scene, state, dt)
         if check:
             check_always(state, scene)
     return state

@@ -161,7 +161,7 @@ def test_from_an_even_medium_lie_and_strang_are_one_course(rooms):
     ends = []
     for kind in ("lie", "strang"):
         scene = room.scene_of(case, kind, 1e-4)
-        state = scene.seed(dtype=torch.float64)
+        state = scene.bind(dtype=torch.float64).start()
         state = state.with_fields(
             **{tf.state.OUTSIDE + "ahl": torch.zeros_like(state.signals["ahl"])}
         )
@@ -193,7 +193,7 @@ def test_equations_are_those_of_the_scene(rooms):
     problem = room.problems()[0]
     starts = {n: float(v[0]) for n, v in problem.starts.items()}
     ready = next(
-        e for e in tf.scenes.repressilator(noise=False).listed if isinstance(e, tf.Circuit)
+        e for e in tf.scenes.repressilator(noise=False).effects if isinstance(e, tf.Circuit)
     )
     same = tf.Circuit(
         ready.rates[next(iter(ready.rates))],
@@ -203,7 +203,7 @@ def test_equations_are_those_of_the_scene(rooms):
     )
     ours = tf.Circuit(problem.rates, species=ready.species, initial=starts, **problem.parameters)
     ends = [tf.Scene(c, founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])) for c in (same, ours)]
-    last = [room.advance(s, s.seed(dtype=torch.float64), 0.05, 4) for s in ends]
+    last = [room.advance(s, s.bind(dtype=torch.float64).start(), 0.05, 4) for s in ends]
     for name in ready.species:
         assert float(last[0].fields[name]) == pytest.approx(float(last[1].fields[name]), rel=1e-8)
 

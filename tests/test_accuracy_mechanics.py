@@ -137,7 +137,7 @@ def test_local_order(dim):
     each."""
     x, y = np.eye(dim)[:2]
     cells = tf.Cells([0 * y, 1.1 * y, 0 * y, 2.1 * y], [x, -x, x, y], 2.0, colony=[0, 0, 1, 1])
-    state = tf.Scene(tf.Mechanics(dim=dim), founders=cells).seed()
+    state = tf.Scene(tf.Mechanics(dim=dim), founders=cells).bind().start()
     assert mechanics.local_order(state).tolist() == pytest.approx([1.0, -1.0 if dim == 2 else -0.5])
 
 
@@ -165,9 +165,9 @@ def test_a_choice_says_what_a_user_would_type():
     assert (
         made.dt == 0.05
         and mechanics.mechanics_of(made) == turned.mechanics
-        and len(made.listed) == len(scene.listed)
+        and len(made.effects) == len(scene.effects)
     )
-    state = turned.start(scene.seed())
+    state = turned.start(scene.bind().start())
     assert (
         state.dtype == torch.float64 == state.displacement.dtype and state.uid.dtype == torch.int64
     )

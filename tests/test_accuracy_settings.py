@@ -29,7 +29,7 @@ def scene(**mechanics) -> tf.Scene:
 
 
 def of(made: tf.Scene, kind: type):
-    return next(e for e in made.listed if isinstance(e, kind))
+    return next(e for e in made.effects if isinstance(e, kind))
 
 
 def test_knobs_reach_their_effects_and_nothing_else():
@@ -49,7 +49,7 @@ def test_knobs_reach_their_effects_and_nothing_else():
         and circuit.noted is not of(first, tf.Circuit).noted
     )
     assert (
-        second.listed[:2] == first.listed[:2]
+        second.effects[:2] == first.effects[:2]
         and second.name == "mine"
         and second.founders is first.founders
     )
@@ -124,7 +124,7 @@ def test_presets_are_ordered_by_what_they_cost_and_by_overlap():
     steps, overlaps = [], []
     for name in PRESETS:
         chosen = tf.preset(name, first).apply(first)
-        *_, last = tf.simulate(chosen, chosen.seed(3, seed=2), cells=40)
+        *_, last = tf.simulate(chosen, chosen.bind(3, seed=2).start(), cells=40)
         steps.append(last.step)
         overlaps.append(float(tf.measure.overlaps(last).mean.mean()))
     assert steps == sorted(steps) and steps[0] < steps[-1] / 10
@@ -136,7 +136,7 @@ def test_presets_are_ordered_by_what_they_cost_and_by_overlap():
 def test_results_say_how_accurately_and_go_on_so(tmp_path):
     first = tf.scenes.microcolony()
     drafted = tf.preset("draft", first).apply(first)
-    *_, last = tf.simulate(drafted, drafted.seed(2, seed=1), until=0.4, record=tmp_path / "a.h5")
+    *_, last = tf.simulate(drafted, drafted.bind(2, seed=1).start(), until=0.4, record=tmp_path / "a.h5")
     with tf.Results(tmp_path / "a.h5") as results:
         assert results.accuracy == {
             "dt": pytest.approx(0.04),

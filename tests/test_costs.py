@@ -17,6 +17,8 @@ import sys
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.state import OUTSIDE
 from torchfilm.tools.counting import Operators
@@ -87,7 +89,7 @@ def costs(
 ) -> tuple[list[dict[str, tuple[dict[str, int], int]]], list[tf.State]]:
     """What each effect of each step asked for, by its title: (operators by name, bytes), and the
     states."""
-    state, spent, states = scene.seed(seed=5, dtype=torch.float64), [], []
+    state, spent, states = scene.bind(seed=5, dtype=torch.float64).start(), [], []
     for _ in range(steps):
         here, state = spend(scene, state)
         spent.append(here)
@@ -124,8 +126,8 @@ def test_the_counter_sees_what_it_should(bare):
     """It would tell a scene whose growth did one operation more."""
 
     class Wasteful(tf.Growth):
-        def step(self, state, dt):
-            return super().step(state.replace(length=state.length + 0.0), dt)
+        def step(self, state, dt, values):
+            return super().step(state.replace(length=state.length + 0.0), dt, values)
 
     spent, _ = costs(tf.Scene(Wasteful(rate=1.0), *body()[1:]), steps=2)
     calls, size = spent[0]["growth"]
@@ -144,7 +146,7 @@ def test_on_the_same_cells_nutrition_leaves_the_others_costs_alone():
             [],
         )
     )
-    state, bare = fed.seed(seed=5, dtype=torch.float64), unfed.seed(seed=5, dtype=torch.float64)
+    state, bare = fed.bind(seed=5, dtype=torch.float64).start(), unfed.bind(seed=5, dtype=torch.float64).start()
     compared = 0
     for _ in range(30):
         same = {
@@ -182,7 +184,7 @@ def test_many_colonies_ask_for_no_more_operators_than_two(listed):
     nine: the same operators by name in every step. (Not than one, which goes without what tells
     colonies apart.)"""
     scene = tf.Scene(*body(), *LISTED[listed]())
-    two, nine = (scene.seed(n, seed=5, streams=[3] * n, dtype=torch.float64) for n in (2, 9))
+    two, nine = (scene.bind(n, seed=5, streams=[3] * n, dtype=torch.float64).start() for n in (2, 9))
     for _ in range(30):
         (here, two), (there, nine) = spend(scene, two), spend(scene, nine)
         assert {title: calls for title, (calls, _) in here.items()} == {
@@ -234,9 +236,9 @@ def _refusing(name: str):
 
 
 def run(scene: tf.Scene, steps: int = 30) -> tf.State:
-    state = scene.seed(2, seed=5, dtype=torch.float64)
+    state = scene.bind(2, seed=5, dtype=torch.float64).start()
     for _ in range(steps):
-        state = scene.step(state, 0.05)
+        state = step(scene, state, 0.05)
     return state
 
 

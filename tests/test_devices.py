@@ -7,6 +7,8 @@ import pytest
 import torch
 from mock_cuda import pretended_cuda  # noqa: F401
 
+from helpers import step
+
 import torchfilm as tf
 
 STEPS = {
@@ -22,9 +24,9 @@ STEPS = {
 
 def grown(name: str, device: str) -> tf.State:
     scene = tf.scenes.build(name)
-    state = scene.seed(2, device=device, dtype=torch.float64)
+    state = scene.bind(2, device=device, dtype=torch.float64).start()
     for _ in range(STEPS[name]):
-        state = scene.step(state, scene.dt)
+        state = step(scene, state, scene.dt)
     assert not tf.failures(state)
     return state
 

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.effects import medium as medium_module
 from torchfilm.effects.mechanics import TOLERANCE
@@ -81,7 +83,7 @@ def test_the_way_of_transport_told_is_the_one_that_is_chosen(made, words, monkey
     chosen, choose = [], medium_module.choose
     monkeypatch.setattr(medium_module, "choose", lambda op: chosen.append(choose(op)) or chosen[-1])
     scene = tf.Scene(*BODY, made)
-    scene.step(scene.seed(2), scene.dt)
+    step(scene, scene.bind(2).start(), scene.dt)
     method, why = transport(made, "ahl")
     assert set(chosen) == {method} and words in why
     assert f"ahl: {method}, " in tf.explain(scene, seconds=0)
@@ -172,7 +174,7 @@ def test_methods_and_tolerances_are_those_of_the_scene(effect, words):
 @pytest.mark.parametrize("unilateral", [False, True])
 def test_defaults_told_of_contacts_are_those_used(dim, unilateral):
     effect = tf.Mechanics(dim=dim, unilateral=unilateral)
-    said = " ".join(how(effect, tf.Scene(effect, tf.Growth(rate=1.0)).seed(), 0.025))
+    said = " ".join(how(effect, tf.Scene(effect, tf.Growth(rate=1.0)).bind().start(), 0.025))
     assert (
         f"at most {effect.most_passes} a step" in said
         and f"residual of {TOLERANCE:g} (default)" in said
@@ -201,7 +203,7 @@ def test_an_effect_of_ones_own_is_told_by_its_name_alone():
     class Other(tf.Effect):
         stage, title = 35, "other"
 
-    assert how(Other(), tf.Scene(*BODY).seed(), 0.025) == []
+    assert how(Other(), tf.Scene(*BODY).bind().start(), 0.025) == []
     assert "mine" in tf.explain(tf.Scene(Mine(rate=1.0)), seconds=0)
 
 
@@ -211,7 +213,7 @@ def test_an_effect_of_ones_own_is_told_by_its_name_alone():
 @pytest.mark.parametrize("name", tf.scenes.READY)
 def test_what_is_listed_and_what_is_left_out_are_all(name):
     scene = tf.scenes.build(name)
-    listed, left = [e.title for e in scene.listed], left_out(scene)
+    listed, left = [e.title for e in scene.effects], left_out(scene)
     assert sorted(listed + left) == sorted(kind.title for kind in KNOWN)
     assert f"not simulated: {', '.join(left)} (no field, no operation)" in tf.explain(
         scene, seconds=0
@@ -268,7 +270,7 @@ def test_a_fit_gives_back_what_is_linear():
         Block(n, b, {t: x + y * n + z * b for t, (x, y, z) in truth.items()}, {})
         for n, b in ((32, 1), (40, 1), (256, 8), (300, 8), (420, 8))
     ]
-    state = scene.seed()
+    state = scene.bind().start()
     found = Probe(blocks, state, state, "", True).fit(scene, "seconds")
     for title, expected in truth.items():
         assert found[title] == pytest.approx(expected, rel=1e-6, abs=1e-12), title
@@ -348,7 +350,7 @@ def test_a_crowd_does_not_overlap_and_is_like_its_founders(founders):
 @pytest.mark.parametrize("name", ["microcolony", "quorum_sensing"])
 def test_bytes_of_a_state_are_those_of_its_tensors(name):
     scene = tf.scenes.build(name)
-    state = scene.seed(3, cells=crowd(scene.founders))
+    state = scene.bind(3, cells=crowd(scene.founders)).start()
     cell, grid = state_bytes(state)
     names = ("colony", "uid", "parent", "position", "axis", "length", "radius")
     held = sum(getattr(state, n).nbytes for n in names) + sum(
@@ -362,10 +364,10 @@ def test_spending_is_what_the_operators_are():
     is left between effects but the step's own clock."""
     scene = tf.scenes.quorum_sensing()
     # two, since a state keeps what was worked out of it
-    one, other, spent = scene.seed(), scene.seed(), Spending()
+    one, other, spent = scene.bind().start(), scene.bind().start(), Spending()
     with Operators() as seen:
-        scene.step(one, scene.dt)
-    scene.step(other, scene.dt, spent)
+        step(scene, one, scene.dt)
+    step(scene, other, scene.dt, spent)
     assert seen.total == sum(c.total() for c in spent.calls.values()) and seen.bytes == sum(
         spent.bytes.values()
     )

@@ -10,6 +10,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 
+from helpers import step
+
 import torchfilm as tf
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
@@ -59,7 +61,7 @@ def test_a_medium_does_not_grow_without_end():
     machine has. Refused at the start."""
     scene, cells = far_apart(1e3)
     with pytest.raises(tf.InputError, match=r"too small for colony 0.*at most 67,108,864 voxels"):
-        scene.seed(2, cells=cells)
+        scene.bind(2, cells=cells).start()
 
 
 @pytest.mark.parametrize("distance", [1e3, float("inf"), float("nan")])
@@ -67,15 +69,15 @@ def test_a_cell_that_flies_away_fails_its_own_colony(device, dtype, distance):
     """The same in the middle of a run: that colony is reported and the other goes on as it would
     have alone."""
     scene, cells = far_apart(1.0)
-    state = scene.seed(2, cells=cells, device=device, dtype=dtype)
+    state = scene.bind(2, cells=cells, device=device, dtype=dtype).start()
     position = state.position.clone()
     position[1] = distance
-    after = scene.step(state.replace(position=position), 0.01)
+    after = step(scene, state.replace(position=position), 0.01)
     (failure,) = tf.failures(after)
     assert failure.colony_id == 0 and "1 cell(s) are beyond the box" in failure.reason
     assert all(bool(torch.isfinite(v).all()) for v in after.signals.values())
     assert torch.equal(
-        after.select([1]).signals["ahl"], scene.step(state.select([1]), 0.01).signals["ahl"]
+        after.select([1]).signals["ahl"], step(scene, state.select([1]), 0.01).signals["ahl"]
     )
 
 
@@ -95,12 +97,12 @@ def test_growth_past_all_numbers_is_reported(device, dtype, law, more):
     scene = tf.Scene(
         tf.Growth(rate=torch.tensor([huge, 0.01], dtype=torch.float64), law=law), *more
     )
-    start = scene.seed(2, device=device, dtype=dtype)
-    state = scene.step(start, 100.0)
+    start = scene.bind(2, device=device, dtype=dtype).start()
+    state = step(scene, start, 100.0)
     assert "growth rate" in next(f for f in tf.failures(state) if f.colony_id == 0).reason
     assert all(f.colony_id == 0 for f in tf.failures(state))
     assert float(state.length[0]) == 2.0 and bool(torch.isfinite(state.position).all())
-    assert torch.equal(state.select([1]).length, scene.step(start.select([1]), 100.0).length)
+    assert torch.equal(state.select([1]).length, step(scene, start.select([1]), 100.0).length)
     with pytest.raises(tf.SimulationError, match="of no finite length"):
         list(tf.simulate(scene, start, until=100.0, dt=100.0))
 
@@ -112,7 +114,7 @@ def test_the_fuzzer_notices_a_number_that_is_none(name):
     scene = tf.Scene(
         tf.Growth(rate=1.0), tf.Circuit(lambda u, s, p, cell: {"a": -u.a}, species=("a",))
     )
-    state = scene.seed(2)
+    state = scene.bind(2).start()
     value = (state.fields[name] if name in state.fields else getattr(state, name)).clone()
     value[1] = torch.nan
     broken = state.with_fields(a=value) if name == "a" else state.replace(**{name: value})
@@ -124,7 +126,7 @@ def test_the_fuzzer_notices_a_number_that_is_none(name):
 def test_the_fuzzer_notices_cells_that_do_not_add_up():
     state = tf.Scene(
         tf.Growth(rate=1.0), founders=tf.Cells([[0.0, 0.0], [9.0, 0.0]], [1.0, 0.0])
-    ).seed(1)
+    ).bind(1).start()
     fuzz.counted(state, state)
     with pytest.raises(AssertionError, match="unique"):
         fuzz.counted(state, state.replace(uid=torch.zeros_like(state.uid)))
@@ -145,11 +147,11 @@ def test_hard_contacts_fling_no_cell_through_a_wall():
     )
     assert fuzz.run(draw) == "ran"
     scene, start = fuzz.scene_of(draw)
-    state = tf.Settings(tolerance=0.05).apply(scene).step(start, 0.01)
+    state = step(tf.Settings(tolerance=0.05).apply(scene), start, 0.01)
     assert float(state.displacement[:, :2].norm(dim=1).max()) > 5.0, "the solve must fling a cell"
     assert int(state.reports["mechanics"].limited) >= 1
     deepest = lambda state: min(
         float(s.gap_of_points(state.position, state.own_colony_id)[0].min())
-        for s in scene.listed[0].surfaces()
+        for s in scene.effects[0].surfaces()
     )
     assert deepest(start) > 0 and deepest(state) > -0.5

@@ -19,6 +19,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.tools.checks import SimulationError
 
@@ -55,7 +57,7 @@ def outcome(state: tf.State) -> Tensor:
 
 def run(scene: tf.Scene, state: tf.State, steps: int = 8, dt: float = 0.05) -> tf.State:
     for _ in range(steps):
-        state = scene.step(state, dt)
+        state = step(scene, state, dt)
         report = state.reports.get("mechanics")
         if report is not None and bool((report.status != 0).any()):
             raise SimulationError(str(report))
@@ -112,7 +114,7 @@ def growing(dim: int, rate: Tensor, *more: tf.Effect, law: str = "volume", **opt
 
 
 def seeded(scene: tf.Scene, **options) -> tf.State:
-    return scene.seed(dtype=F64, **options)
+    return scene.bind(dtype=F64, **options).start()
 
 
 MODES = [
@@ -457,7 +459,7 @@ def test_gradients_in_float32():
     for dtype, tolerance in ((torch.float32, 1e-5), (F64, 1e-10)):
         rate = torch.tensor(0.8, dtype=dtype, requires_grad=True)
         scene = growing(2, rate, tolerance=tolerance)
-        state = run(scene, scene.seed(dtype=dtype))
+        state = run(scene, scene.bind(dtype=dtype).start())
         found.append(float(torch.autograd.grad(outcome(state), rate)[0]))
     assert found[0] == pytest.approx(found[1], rel=1e-2)
 
@@ -503,7 +505,7 @@ def test_a_gradient_through_a_loose_solve_is_not_taken_in_silence():
         scene = tf.Scene(
             tf.Growth(rate=rate), tf.Division(length=2.5), tf.Mechanics(dim=2, **given), dt=0.05
         )
-        *_, end = tf.simulate(scene, scene.seed(), cells=4)
+        *_, end = tf.simulate(scene, scene.bind().start(), cells=4)
         return end
 
     rate = torch.tensor(1.0, requires_grad=True)

@@ -16,6 +16,8 @@ import torch
 from test_gradients import F64, compare, weights
 from torch import Tensor
 
+from helpers import step
+
 import torchfilm as tf
 
 DT = 0.05
@@ -91,9 +93,9 @@ def outcome(state: tf.State) -> Tensor:
 
 
 def run(scene: tf.Scene, steps: int, colonies: int = 1) -> tf.State:
-    state = scene.seed(colonies, seed=2, dtype=F64)
+    state = scene.bind(colonies, seed=2, dtype=F64).start()
     for _ in range(steps):
-        state = scene.step(state, DT)
+        state = step(scene, state, DT)
         assert all(bool((r.status == 0).all()) for r in state.reports.values())
         if "circuit" in state.reports and state.cells:
             assert int(state.reports["circuit"].steps.max()) == 1, (
@@ -238,9 +240,9 @@ def test_functions_of_places_may_hold_what_wants_a_gradient():
 
     check(make, 0.5, steps=3)
     scene = make(strength)
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     both = [
-        torch.autograd.grad(outcome(scene.step(scene.step(state, DT), DT)), strength)[0]
+        torch.autograd.grad(outcome(step(scene, step(scene, state, DT), DT)), strength)[0]
         for _ in range(2)
     ]
     assert both[0] == both[1] != 0
@@ -255,14 +257,14 @@ def test_what_was_made_ready_without_a_gradient_does_not_hide_it():
         founders=founders(),
     )
     with torch.no_grad():
-        state = scene.seed(dtype=F64)
-        before = scene.step(state, DT).signals["a"]
-    after = scene.step(state, DT).signals["a"]
+        state = scene.bind(dtype=F64).start()
+        before = step(scene, state, DT).signals["a"]
+    after = step(scene, state, DT).signals["a"]
     assert after.requires_grad and torch.equal(before, after.detach())
     (gradient,) = torch.autograd.grad((after * weights(after)).sum(), K)
     with torch.no_grad():
         K += 1e-3
-        moved = scene.step(state, DT).signals["a"]
+        moved = step(scene, state, DT).signals["a"]
     slope = float(((moved - before) * weights(before)).sum()) / 1e-3
     # a one-sided difference, h times the curvature
     assert slope == pytest.approx(float(gradient), rel=1e-3) and slope != 0
@@ -292,7 +294,7 @@ def saved(work: Callable[[], Tensor]) -> tuple[Tensor, int]:
 def test_rollout_gives_the_gradient_of_simulate_and_keeps_less():
     values = torch.tensor([2.0, 15.0], dtype=F64, requires_grad=True)
     scene = talking(divides=True, make=values[0], diffusion=values[1])
-    state = scene.seed(seed=2, dtype=F64)
+    state = scene.bind(seed=2, dtype=F64).start()
     plain, much = saved(lambda: outcome(list(tf.simulate(scene, state, until=16 * DT, dt=DT))[-1]))
     # keeping by segments: what a segment needs is made on the way back
     short, little = saved(
@@ -310,7 +312,7 @@ def test_rollout_whatever_the_segment(segment):
     """Also where the last one is shorter, and where a colony divides within one."""
     make = torch.tensor([2.0, 3.0], dtype=F64, requires_grad=True)
     scene = talking(divides=True, make=make)
-    state = scene.seed(2, seed=2, dtype=F64)
+    state = scene.bind(2, seed=2, dtype=F64).start()
     last = tf.rollout(scene, state, until=8 * DT, dt=DT, segment=segment)
     plain = list(tf.simulate(scene, state, until=8 * DT, dt=DT))[-1]
     assert (
@@ -331,7 +333,7 @@ def test_rollout_raises_as_simulate_does():
     )
     scene = tf.Scene(circuit, founders=founders())
     with pytest.raises(tf.SimulationError, match=r"(?s)step 4.*colony 0.*'m'") as failed:
-        tf.rollout(scene, scene.seed(dtype=F64), until=0.48, dt=0.04)
+        tf.rollout(scene, scene.bind(dtype=F64).start(), until=0.48, dt=0.04)
     assert failed.value.colonies == (0,)
     with pytest.raises(tf.InputError, match="segment"):
-        tf.rollout(scene, scene.seed(), until=0.5, segment=0)
+        tf.rollout(scene, scene.bind().start(), until=0.5, segment=0)

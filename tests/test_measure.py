@@ -64,7 +64,7 @@ def test_overlap_with_a_wall_is_the_deepest_along_the_cell(device, dtype, dim, k
     """
     wall, distance = WALLS[kind]
     given = cells(dim)
-    state = tf.Scene(tf.Growth(), founders=given).seed(device=device, dtype=dtype)
+    state = tf.Scene(tf.Growth(), founders=given).bind(device=device, dtype=dtype).start()
     found = tf.measure.overlaps(state, [wall(dim)]).walls.cpu().numpy()
     samples = (
         given.position
@@ -78,18 +78,18 @@ def test_overlap_with_a_wall_is_the_deepest_along_the_cell(device, dtype, dim, k
 
 def test_a_ball_under_the_middle_of_a_rod_is_seen(device, dtype):
     """Neither end touches; the middle is 0.25 µm deep, exactly in binary."""
-    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).seed(
+    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).bind(
         2, device=device, dtype=dtype
-    )
+    ).start()
     found = tf.measure.overlaps(state, [tf.Sphere((0.5, -0.75), 0.5, inside=False)])
     assert found.walls.tolist() == [0.25, 0.25] and found.walls.dtype == torch.float64
 
 
 def test_a_wall_for_each_colony_is_measured_in_its_own(device):
     """Colonies taken out of their batch too: a wall goes by the colony's id."""
-    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).seed(
+    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).bind(
         3, device=device
-    )
+    ).start()
     ball = tf.Sphere([[0.5, -0.75], [0.5, -0.875], [0.5, -5.0]], 0.5, inside=False)
     assert tf.measure.overlaps(state, [ball]).walls.tolist() == [0.25, 0.125, 0.0]
     assert tf.measure.overlaps(state.select([2, 1]), [ball]).walls.tolist() == [0.0, 0.125]
@@ -101,7 +101,7 @@ def test_neighbours_are_all_pairs_of_a_colony_within_the_gap(device, dtype, dim,
     """Against every pair whose centres are near enough, both from the state's own numbers; two
     colonies in one place see nothing of each other."""
     scene = tf.Scene(tf.Growth(), founders=crowd(np.random.default_rng(7), 150, dim))
-    state = scene.seed(2, device=device, dtype=dtype)
+    state = scene.bind(2, device=device, dtype=dtype).start()
     i, j, distance = tf.measure.neighbours(state, gap)
     found = {(min(p), max(p)) for p in zip(i.tolist(), j.tolist(), strict=True)}
     assert len(found) == i.numel() and found == set(map(tuple, near_pairs(state, gap).tolist()))
@@ -121,4 +121,4 @@ def test_neighbours_are_all_pairs_of_a_colony_within_the_gap(device, dtype, dim,
 @pytest.mark.parametrize("gap", [-1.0, math.inf, "near"])
 def test_neighbours_within_no_such_gap_are_refused(gap):
     with pytest.raises(tf.InputError, match="gap"):
-        tf.measure.neighbours(tf.Scene(tf.Growth()).seed(), gap)
+        tf.measure.neighbours(tf.Scene(tf.Growth()).bind().start(), gap)

@@ -101,7 +101,7 @@ def cells_of(state: tf.State) -> Frame:
 @pytest.fixture(scope="module")
 def grown() -> tf.State:
     scene = tf.scenes.microcolony(dim=3)
-    for state in tf.simulate(scene, scene.seed(3), until=3.0):  # noqa: B007
+    for state in tf.simulate(scene, scene.bind(3).start(), until=3.0):  # noqa: B007
         pass
     return state
 
@@ -139,7 +139,7 @@ def test_a_frame_of_a_state_is_that_of_its_file(grown, tmp_path):
 def test_one_cell_is_as_large_as_it_should_be(tmp_path):
     """A rod of 4 × 1 µm in a picture of its own: about its share of a square around it, and four
     times as wide as high."""
-    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 3.0)).seed()
+    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 3.0)).bind().start()
     path = sheet(cells_of(state), tmp_path / "one.png")
     image = matplotlib.image.imread(path)[..., :3]
     image = image[: int(0.8 * len(image))]  # below stands the legend
@@ -155,7 +155,7 @@ def test_a_colony_far_from_the_origin_is_drawn(tmp_path, away):
     far = tf.Cells(near.position + np.array(away), [1.0, 0.0])
     shares = []
     for name, cells in (("near", near), ("far", far)):
-        state = tf.Scene(tf.Growth(), founders=cells).seed()
+        state = tf.Scene(tf.Growth(), founders=cells).bind().start()
         shares.append(coloured(sheet(cells_of(state), tmp_path / f"{name}.png")))
     assert shares[0] > 0.02
     assert shares[1] == pytest.approx(shares[0], rel=0.05), (
@@ -166,8 +166,8 @@ def test_a_colony_far_from_the_origin_is_drawn(tmp_path, away):
 def test_colonies_far_apart_are_each_in_the_middle_of_their_panel(tmp_path):
     cells = tf.Cells([[0.0, 0.0], [500.0, 0.0]], [1.0, 0.0], colony=[0, 1])
     one = tf.Cells([[0.0, 0.0]], [1.0, 0.0])
-    two = tf.Scene(tf.Growth(), founders=cells).seed()
-    both = tf.Scene(tf.Growth(), founders=one).seed(2)
+    two = tf.Scene(tf.Growth(), founders=cells).bind().start()
+    both = tf.Scene(tf.Growth(), founders=one).bind(2).start()
     shares = [
         coloured(sheet(cells_of(s), tmp_path / f"{k}.png")) for k, s in enumerate((two, both))
     ]
@@ -189,7 +189,7 @@ def test_too_many_colonies_are_cut_and_it_is_said(tmp_path, monkeypatch):
         "suptitle",
         lambda self, text, **options: titles.append(text) or real(self, text, **options),
     )
-    state = tf.Scene(tf.Growth(), founders=tf.Cells.single(2)).seed(40)
+    state = tf.Scene(tf.Growth(), founders=tf.Cells.single(2)).bind(40).start()
     sheet(cells_of(state), tmp_path / "sheet.png", title="many")
     sheet(cells_of(state), tmp_path / "few.png", title="few", most=4)
     assert (
@@ -200,7 +200,7 @@ def test_too_many_colonies_are_cut_and_it_is_said(tmp_path, monkeypatch):
 
 
 def test_axes_of_a_2_d_state_need_no_third_coordinate(tmp_path):
-    state = tf.scenes.microcolony().seed(2)
+    state = tf.scenes.microcolony().bind(2).start()
     assert coloured(sheet(cells_of(state), tmp_path / "sheet.png")) > 0.02
 
 
@@ -211,7 +211,7 @@ def test_axes_of_a_2_d_state_need_no_third_coordinate(tmp_path):
 def recorded(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("pictures") / "run.h5"
     scene = tf.scenes.microcolony()
-    for _ in tf.simulate(scene, scene.seed(2), until=3.0, record=path):
+    for _ in tf.simulate(scene, scene.bind(2).start(), until=3.0, record=path):
         pass
     return path
 
@@ -250,7 +250,7 @@ def test_what_cannot_be_drawn_is_told(recorded, tmp_path, options, message):
 
 
 def test_a_frame_without_cells_is_told(tmp_path):
-    state = tf.scenes.microcolony().seed()
+    state = tf.scenes.microcolony().bind().start()
     empty = state.remove(torch.tensor([True]), "removed")
     with pytest.raises(tf.InputError, match="no cell"):
         sheet(cells_of(empty), tmp_path / "a.png")
@@ -271,7 +271,7 @@ def walls_drawn(tmp_path, walls, view: str, dim: int = 3, colonies: int = 1) -> 
     from its file."""
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=dim, walls=walls), dt=0.05)
     path = tmp_path / "run.h5"
-    for _ in tf.simulate(scene, scene.seed(colonies), until=0.05, record=path):
+    for _ in tf.simulate(scene, scene.bind(colonies).start(), until=0.05, record=path):
         pass
     with tf.Results(path) as results:
         frame = Recorded(results, [-1])[0]

@@ -521,7 +521,7 @@ def test_a_state_is_a_frame(dtype, device):
         height=1.0,
     )
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), medium)
-    made = frame_of(scene.seed(3, dtype=dtype, device=device))
+    made = frame_of(scene.bind(3, dtype=dtype, device=device).start())
     assert (
         made.height == 1.0
         and made.origin.tolist() == [[-8.0, -4.0, -2.0]] * 3

@@ -47,7 +47,7 @@ def run(tmp_path_factory) -> Path:
         dt=0.1,
     )
     for _ in tf.simulate(
-        scene, scene.seed(2, seed=3), until=UNTIL, record=tf.Recorder(path, scene, every=4)
+        scene, scene.bind(2, seed=3).start(), until=UNTIL, record=tf.Recorder(path, scene, every=4)
     ):
         pass
     return path
@@ -220,7 +220,7 @@ def test_a_colony_that_has_no_cells_yet_or_any_more_is_drawn_empty(tmp_path):
 
     scene = tf.Scene(tf.Rules(end), tf.Growth(rate=1.0), tf.Mechanics(dim=2), medium, dt=0.1)
     path = tmp_path / "run.h5"
-    for _ in tf.simulate(scene, scene.seed(2), until=1.0, record=tf.Recorder(path, scene, every=5)):
+    for _ in tf.simulate(scene, scene.bind(2).start(), until=1.0, record=tf.Recorder(path, scene, every=5)):
         pass
     with tf.Results(path) as results:
         assert results.counts[-1].tolist() == [1, 0]

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
-from torchfilm.replay import split
 from torchfilm.state import PER_CELL
 
 DT = 0.025
@@ -30,9 +31,28 @@ def lit(make=1.0, rate=1.0, **options):
     )
 
 
+class Designs:
+    """Designs of a scene on recorded growth: `start` binds them to some colonies."""
+
+    def __init__(self, scene: tf.Scene, recording: tf.GrowthRecording):
+        self.scene, self.recording = scene, recording
+        self.replay = tf.Replay(scene.bind(per_colony=True), recording)
+
+    def start(self, colonies: int, streams) -> tf.State:
+        first = self.recording.state
+        model = self.scene.bind(
+            colonies, seed=first.seed, streams=streams, dtype=first.dtype, device=first.device
+        )
+        self.replay = tf.Replay(model, self.recording)
+        return self.replay.start()
+
+    def step(self, state: tf.State) -> tf.State:
+        return self.replay.step(state)
+
+
 def stepped(scene, state, steps):
     for _ in range(steps):
-        state = scene.step(state, DT) if isinstance(scene, tf.Scene) else scene.step(state)
+        state = step(scene, state, DT) if isinstance(scene, tf.Scene) else scene.step(state)
     return state
 
 
@@ -59,31 +79,31 @@ def test_a_replay_is_the_full_run(name, dtype):
         torch.tensor([7, 3] * 3),
     )
     scene = DESIGNS[name](values)
-    full = stepped(scene, scene.seed(6, seed=5, streams=streams, dtype=dtype), 130)
+    full = stepped(scene, scene.bind(6, seed=5, streams=streams, dtype=dtype).start(), 130)
     course = tf.GrowthRecording(DESIGNS[name](1.0), streams=(3, 7), seed=5, dtype=dtype)
-    replay = tf.Replay(scene, course)
-    found = stepped(replay, replay.seed(6, streams=streams), 130)
+    replay = Designs(scene, course)
+    found = stepped(replay, replay.start(6, streams=streams), 130)
     assert found.cells > 6 * 6
     same(found, full)
 
 
 def test_colonies_may_leave_a_replay_and_go_on_alike():
     scene, streams = lit(torch.tensor([1.0, 2.0, 3.0])), [0, 1, 0]
-    replay = tf.Replay(scene, tf.GrowthRecording(lit(), streams=(0, 1)))
-    whole = stepped(replay, replay.seed(3, streams=streams), 80)
-    part = stepped(replay, replay.seed(3, streams=streams), 50).select([2, 1])
+    replay = Designs(scene, tf.GrowthRecording(lit(), streams=(0, 1)))
+    whole = stepped(replay, replay.start(3, streams=streams), 80)
+    part = stepped(replay, replay.start(3, streams=streams), 50).select([2, 1])
     same(stepped(replay, part, 30), whole.select([2, 1]))
 
 
 def test_colonies_of_one_stream_differ_by_their_parameters_only():
     scene = lit(torch.tensor([1.0, 1.0, 2.0]))
-    state = stepped(scene, scene.seed(3, streams=[4, 4, 4]), 60)
+    state = stepped(scene, scene.bind(3, streams=[4, 4, 4]).start(), 60)
     first, second, third = (state.select([k]) for k in range(3))
     for name in ("uid", "position", "length", "gfp"):
         assert torch.equal(getattr(first, name), getattr(second, name))
     assert torch.equal(first.position, third.position) and not torch.equal(first.gfp, third.gfp)
     alone = lit(1.0)
-    apart = stepped(alone, alone.seed(5), 60).select([4])
+    apart = stepped(alone, alone.bind(5).start(), 60).select([4])
     assert torch.equal(apart.position, first.position)
 
 
@@ -106,12 +126,11 @@ def test_a_course_grows_as_far_as_it_is_asked_and_no_further():
     ],
 )
 def test_what_follows_is_found_from_what_is_declared(scene, follows, why):
-    found = split(scene)
-    assert (
-        tuple(e.title for k, e in enumerate(scene.listed) if k not in found.growth) == follows
-        or why
-    )
-    assert found.obstacle.startswith(why) and bool(found.obstacle) == bool(why)
+    model = scene.bind()
+    assert tuple(scene.effects[k].title for k in model.following) == follows or why
+    assert sorted((*model.recorded, *model.following)) == list(range(len(scene.effects)))
+    found = model.why_not_replayable
+    assert found.startswith(why) and bool(found) == bool(why)
 
 
 def test_a_design_that_acts_on_growth_is_refused():
@@ -122,19 +141,19 @@ def test_a_design_that_acts_on_growth_is_refused():
     with pytest.raises(tf.InputError, match="rules may read and write anything"):
         tf.GrowthRecording(tf.scenes.random_partition(), streams=(0,))
     course = tf.GrowthRecording(lit(), streams=(0,))
-    with pytest.raises(tf.InputError, match="does not grow as the course did: Growth\\(rate=2"):
-        tf.Replay(lit(rate=2.0), course)
+    with pytest.raises(tf.InputError, match="does not grow as the recording did: Growth\\(rate=2"):
+        Designs(lit(rate=2.0), course)
     with pytest.raises(
-        tf.InputError, match="streams = 1 is not allowed: it must be of the course: 0"
+        tf.InputError, match="streams = 1 is not allowed: it must be of the recording: 0"
     ):
-        tf.Replay(lit(), course).seed(2, streams=[0, 1])
+        Designs(lit(), course).start(2, streams=[0, 1])
 
 
 def test_other_founders_are_another_growth():
     founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.5)
-    other = tf.Scene(*lit().listed, founders=founders)
-    with pytest.raises(tf.InputError, match="does not grow as the course did"):
-        tf.Replay(other, tf.GrowthRecording(lit(), streams=(0,)))
+    other = tf.Scene(*lit().effects, founders=founders)
+    with pytest.raises(tf.InputError, match="does not grow as the recording did"):
+        Designs(other, tf.GrowthRecording(lit(), streams=(0,)))
 
 
 def test_what_fails_in_the_course_fails_in_every_replay():
@@ -145,8 +164,8 @@ def test_what_fails_in_the_course_fails_in_every_replay():
         tf.Circuit(reporter, species=("gfp",), make=1.0),
         founders=tf.Cells.single(2, length=0.3),
     )
-    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0, 1)))
-    state = replay.seed(3, streams=[1, 0, 1])
+    replay = Designs(scene, tf.GrowthRecording(scene, streams=(0, 1)))
+    state = replay.start(3, streams=[1, 0, 1])
     while not tf.failures(state):
         state = replay.step(state)
     found = tf.failures(state)
@@ -157,13 +176,13 @@ def test_what_fails_in_the_course_fails_in_every_replay():
 @pytest.mark.parametrize("streams", [[0], [0, -1], [0.5, 1.0], [0, 2**32], [True, False]])
 def test_streams_are_whole_numbers_one_a_colony(streams):
     with pytest.raises(tf.InputError, match="streams"):
-        lit().seed(2, streams=streams)
+        lit().bind(2, streams=streams).start()
 
 
 def test_streams_are_kept_in_results(tmp_path):
     scene, path = lit(torch.tensor([1.0, 2.0])), tmp_path / "r.h5"
     state = deque(
-        tf.simulate(scene, scene.seed(2, streams=[9, 9]), until=1.0, record=path), maxlen=1
+        tf.simulate(scene, scene.bind(2, streams=[9, 9]).start(), until=1.0, record=path), maxlen=1
     ).pop()
     with tf.Results(path) as results:
         again = results.state(scene)
@@ -195,16 +214,16 @@ class Measured(tf.Effect):
     def writes(self):
         return ("longest",)
 
-    def step(self, state, dt):
+    def step(self, state, dt, values):
         return state.with_fields(longest=state.length)
 
 
 def test_an_effect_between_growth_and_mechanics_sees_the_state_between():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2), Measured())
-    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
+    replay = Designs(scene, tf.GrowthRecording(scene, streams=(0,)))
     full, found = (
-        stepped(scene, scene.seed(1), 120),
-        stepped(replay, replay.seed(1, streams=[0]), 120),
+        stepped(scene, scene.bind(1).start(), 120),
+        stepped(replay, replay.start(1, streams=[0]), 120),
     )
     assert not torch.equal(full.longest, full.length)  # contacts held some back
     same(found, full)
@@ -212,11 +231,11 @@ def test_an_effect_between_growth_and_mechanics_sees_the_state_between():
 
 def test_what_founders_bring_keeps_the_rule_of_its_circuit_at_division():
     founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], extra={"gfp": [3.0]})
-    scene = tf.Scene(*lit(torch.tensor([1.0, 2.0]), daughters="amount").listed, founders=founders)
-    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
+    scene = tf.Scene(*lit(torch.tensor([1.0, 2.0]), daughters="amount").effects, founders=founders)
+    replay = Designs(scene, tf.GrowthRecording(scene, streams=(0,)))
     same(
-        stepped(replay, replay.seed(2, streams=[0, 0]), 90),
-        stepped(scene, scene.seed(2, streams=[0, 0]), 90),
+        stepped(replay, replay.start(2, streams=[0, 0]), 90),
+        stepped(scene, scene.bind(2, streams=[0, 0]).start(), 90),
     )
 
 
@@ -236,7 +255,7 @@ class Started(tf.Effect):
             tf.Field(self.name, "set once", initial=self.initial, at_division=self.at_division),
         )
 
-    def step(self, state, dt):
+    def step(self, state, dt, values):
         return state
 
 
@@ -253,25 +272,25 @@ def rate_at_birth(state, rows):
 
 
 def test_what_growth_reads_belongs_to_it_also_where_nothing_writes_it():
-    scene = tf.Scene(*lit(torch.tensor([1.0, 2.0])).listed, Started("drag", twice))
-    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
-    full = stepped(scene, scene.seed(2, streams=[0, 0]), 110)
-    same(stepped(replay, replay.seed(2, streams=[0, 0]), 110), full)
+    scene = tf.Scene(*lit(torch.tensor([1.0, 2.0])).effects, Started("drag", twice))
+    replay = Designs(scene, tf.GrowthRecording(scene, streams=(0,)))
+    full = stepped(scene, scene.bind(2, streams=[0, 0]).start(), 110)
+    same(stepped(replay, replay.start(2, streams=[0, 0]), 110), full)
     assert not torch.equal(
         full.position,
         stepped(
             lit(torch.tensor([1.0, 2.0])),
-            lit(torch.tensor([1.0, 2.0])).seed(2, streams=[0, 0]),
+            lit(torch.tensor([1.0, 2.0])).bind(2, streams=[0, 0]).start(),
             110,
         ).position,
     )
 
 
 def test_growth_is_told_by_what_its_functions_do():
-    course = tf.GrowthRecording(tf.Scene(*lit().listed, Started("drag", twice)), streams=(0,))
-    tf.Replay(tf.Scene(*lit().listed, Started("drag", twice)), course)
-    with pytest.raises(tf.InputError, match="does not grow as the course did"):
-        tf.Replay(tf.Scene(*lit().listed, Started("drag", four_times)), course)
+    course = tf.GrowthRecording(tf.Scene(*lit().effects, Started("drag", twice)), streams=(0,))
+    Designs(tf.Scene(*lit().effects, Started("drag", twice)), course)
+    with pytest.raises(tf.InputError, match="does not grow as the recording did"):
+        Designs(tf.Scene(*lit().effects, Started("drag", four_times)), course)
 
 
 def test_daughters_fields_start_from_what_they_see_where_cells_divide():
@@ -284,10 +303,10 @@ def test_daughters_fields_start_from_what_they_see_where_cells_divide():
         circuit,
         Started("born_rate", rate_at_birth, "reset"),
     )
-    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
-    full = stepped(scene, scene.seed(2, streams=[0, 0]), 110)
+    replay = Designs(scene, tf.GrowthRecording(scene, streams=(0,)))
+    full = stepped(scene, scene.bind(2, streams=[0, 0]).start(), 110)
     assert full.cells > 8 and not torch.equal(full.born_rate, full.growth_rate)
-    same(stepped(replay, replay.seed(2, streams=[0, 0]), 110), full)
+    same(stepped(replay, replay.start(2, streams=[0, 0]), 110), full)
 
 
 def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
@@ -301,10 +320,10 @@ def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
         tf.Division(length=3.5),
         tf.Circuit(reporter, species=("gfp",), make=1.0),
     )
-    replay = tf.Replay(scene, tf.GrowthRecording(scene, streams=(0,)))
-    full = stepped(scene, scene.seed(1), 20)
+    replay = Designs(scene, tf.GrowthRecording(scene, streams=(0,)))
+    full = stepped(scene, scene.bind(1).start(), 20)
     assert float(full.longest.max()) < float(full.length.max())
-    same(stepped(replay, replay.seed(1, streams=[0]), 20), full)
+    same(stepped(replay, replay.start(1, streams=[0]), 20), full)
 
 
 @pytest.mark.parametrize(
@@ -313,7 +332,7 @@ def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
         (lambda: lit(rate=torch.tensor(1.0, requires_grad=True)), "wants a gradient"),
         (
             lambda: tf.Scene(
-                *lit().listed,
+                *lit().effects,
                 founders=tf.Cells([[0.0, 0.0], [1.0, 0.0]], [[1.0, 0.0]] * 2, colony=[0, 1]),
             ),
             "its first cells name their colonies",
@@ -321,6 +340,6 @@ def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
     ],
 )
 def test_more_that_cannot_be_kept(scene, why):
-    assert why in tf.GrowthRecording.obstacle(scene())
+    assert why in scene().bind().why_not_replayable
     with pytest.raises(tf.InputError, match=why):
         tf.GrowthRecording(scene(), streams=(0,))

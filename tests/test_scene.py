@@ -10,6 +10,8 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.effect import Effect
 
@@ -22,7 +24,7 @@ def named(order: list[str], name: str, at: int, **how) -> Effect:
         stage = at
         title = name
 
-        def step(self, state, dt):
+        def step(self, state, dt, values):
             order.append(name)
             return state
 
@@ -65,7 +67,7 @@ def test_effects_act_in_stage_order_whatever_order_they_are_listed_in():
         )
     ]
     scene = tf.Scene(*effects)
-    scene.step(scene.seed(), 0.1)
+    step(scene, scene.bind().start(), 0.1)
     assert order == ["early", "middle", "also middle", "late", "last"]
 
 
@@ -85,7 +87,7 @@ def test_the_built_in_effects_follow_the_papers_stages():
         "mechanics",
         "removal",
     ]
-    assert scene.listed == listed
+    assert scene.effects == listed
 
 
 def test_order_of_listing_does_not_change_the_result():
@@ -95,9 +97,9 @@ def test_order_of_listing_does_not_change_the_result():
     states = []
     for listed in (effects(), effects()[::-1]):
         scene = tf.Scene(*listed)
-        state = scene.seed(2)
+        state = scene.bind(2).start()
         for _ in range(20):
-            state = scene.step(state, 0.1)
+            state = step(scene, state, 0.1)
         states.append(state)
     assert states[0].cells > 6
     assert torch.equal(states[0].position, states[1].position) and torch.equal(
@@ -169,9 +171,9 @@ def two_designs(make, colonies: int = 2) -> list[tf.State]:
 
 
 def run_a_little(scene: tf.Scene, colonies: int) -> tf.State:
-    state = scene.seed(colonies, dtype=torch.float64)
+    state = scene.bind(colonies, dtype=torch.float64).start()
     for _ in range(6):
-        state = scene.step(state, 0.1)
+        state = step(scene, state, 0.1)
     return state
 
 
@@ -271,7 +273,7 @@ SHORT = {
 def test_too_few_values_are_refused_by_name(name):
     scene = tf.Scene(*SHORT[name](torch.tensor([1.0, 2.0])), founders=cells_in(2))
     with pytest.raises(tf.InputError, match=name.split(".")[1]):
-        scene.seed(3)
+        scene.bind(3).start()
 
 
 @pytest.mark.parametrize("name", list(SHORT))
@@ -280,7 +282,7 @@ def test_too_many_values_are_refused_by_name(name):
     mistake."""
     scene = tf.Scene(*SHORT[name](torch.tensor([1.0, 2.0, 1.0, 2.0])), founders=cells_in(2))
     with pytest.raises(tf.InputError, match=name.split(".")[1]):
-        scene.seed(3)
+        scene.bind(3).start()
 
 
 # --- bad scenes -----------------------------------------------------------------------------------
@@ -310,9 +312,9 @@ def test_two_rules_are_two_effects():
     scene = tf.Scene(
         tf.Rules(lambda cells: order.append("one")), tf.Rules(lambda cells: order.append("two"))
     )
-    state = scene.seed()
+    state = scene.bind().start()
     order.clear()
-    scene.step(state, 0.1)
+    step(scene, state, 0.1)
     assert order == ["one", "two"]
 
 
@@ -333,7 +335,7 @@ def test_a_needed_field_that_nobody_provides_is_told():
 def test_a_needed_field_may_come_with_the_cells_or_be_built_in():
     cells = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], extra={"heat": [2.0]})
     scene = tf.Scene(named([], "sink", 20, needs=("heat", "position", "cells")), founders=cells)
-    assert scene.seed().heat.tolist() == [2.0]
+    assert scene.bind().start().heat.tolist() == [2.0]
 
 
 def test_founders_of_another_dimension_are_refused():
@@ -343,7 +345,7 @@ def test_founders_of_another_dimension_are_refused():
 
 def test_cells_of_another_dimension_are_refused():
     with pytest.raises(tf.InputError, match="2-D"):
-        tf.Scene(tf.Mechanics(dim=2)).seed(cells=cells_in(3))
+        tf.Scene(tf.Mechanics(dim=2)).bind(cells=cells_in(3)).start()
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0, float("nan"), "fast", True])
@@ -355,13 +357,13 @@ def test_a_bad_step_is_refused(dt):
 @pytest.mark.parametrize("colonies", [0, -1, 1.5, True, "two", None])
 def test_a_bad_number_of_colonies_is_refused(colonies):
     with pytest.raises(tf.InputError, match=r"colonies.*whole number"):
-        tf.Scene(tf.Growth(rate=1.0)).seed(colonies)
+        tf.Scene(tf.Growth(rate=1.0)).bind(colonies).start()
 
 
 @pytest.mark.parametrize("seed", [-1, 0.5, True, 2**63, None])
 def test_a_bad_seed_is_refused(seed):
     with pytest.raises(tf.InputError, match="seed"):
-        tf.Scene(tf.Growth(rate=1.0)).seed(seed=seed)
+        tf.Scene(tf.Growth(rate=1.0)).bind(seed=seed).start()
 
 
 @pytest.mark.parametrize(
@@ -369,7 +371,7 @@ def test_a_bad_seed_is_refused(seed):
 )
 def test_a_bad_dtype_is_refused(dtype):
     with pytest.raises(tf.InputError, match=r"dtype.*float32"):
-        tf.Scene(tf.Growth(rate=1.0)).seed(dtype=dtype)
+        tf.Scene(tf.Growth(rate=1.0)).bind(dtype=dtype).start()
 
 
 def unavailable() -> list[object]:
@@ -383,7 +385,7 @@ def test_a_device_that_is_not_there_is_refused(device):
     if device == "mps" and torch.backends.mps.is_available():
         pytest.skip("this machine has one")
     with pytest.raises(tf.InputError, match="device"):
-        tf.Scene(tf.Growth(rate=1.0)).seed(device=device)
+        tf.Scene(tf.Growth(rate=1.0)).bind(device=device).start()
 
 
 @pytest.mark.parametrize(
@@ -401,13 +403,13 @@ def test_a_device_that_is_not_there_is_refused(device):
 def test_a_wall_inside_out_is_told_before_anything_runs(wall):
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, walls=[wall]))
     with pytest.raises(tf.InputError, match=r"cell 0 of colony 0.*inside out"):
-        scene.seed()
+        scene.bind().start()
 
 
 def test_the_colony_behind_the_wall_is_named():
     scene = tf.Scene(tf.Mechanics(dim=2, walls=[tf.Plane(y=[-1.0, -1.0, 1.0], facing="+y")]))
     with pytest.raises(tf.InputError, match="colony 2"):
-        scene.seed(3)
+        scene.bind(3).start()
 
 
 @pytest.mark.parametrize(
@@ -461,10 +463,10 @@ class Operators(TorchDispatchMode):
 
 def operators(*effects: Effect, steps: int = 1) -> Counter[str]:
     scene = tf.Scene(*effects, founders=cells_in(2, 6))
-    state = scene.seed(3)
+    state = scene.bind(3).start()
     with Operators() as counted:
         for _ in range(steps):
-            state = scene.step(state, 0.1)
+            state = step(scene, state, 0.1)
     return counted.seen
 
 
@@ -523,15 +525,15 @@ def test_rules_that_do_not_ask_for_contacts_do_not_pay_for_them():
 
 
 def test_an_effect_that_is_not_listed_leaves_no_field_and_no_report():
-    state = tf.Scene(tf.Growth(rate=1.0)).seed()
+    state = tf.Scene(tf.Growth(rate=1.0)).bind().start()
     assert set(state.fields) == {"growth_rate", "elongation"} and not state.reports
-    assert set(tf.Scene(tf.Division(length=3.0)).seed().fields) == {
+    assert set(tf.Scene(tf.Division(length=3.0)).bind().start().fields) == {
         "divide_flag",
         "division_threshold",
     }
     scene = tf.Scene(tf.Mechanics(dim=2))
-    assert set(scene.seed().fields) == {"displacement"}
-    assert set(scene.step(scene.seed(), 0.1).reports) == {"mechanics"}
+    assert set(scene.bind().start().fields) == {"displacement"}
+    assert set(step(scene, scene.bind().start(), 0.1).reports) == {"mechanics"}
 
 
 def test_a_step_does_not_touch_the_state_before():
@@ -539,7 +541,7 @@ def test_a_step_does_not_touch_the_state_before():
     scene = tf.Scene(
         aging, tf.Growth(rate=1.0), tf.Division(length=2.3), tf.Mechanics(dim=2), founders=crowd()
     )
-    state = scene.seed(2)
+    state = scene.bind(2).start()
     names = (
         "colony",
         "uid",
@@ -556,7 +558,7 @@ def test_a_step_does_not_touch_the_state_before():
     }
     after = state
     for _ in range(5):
-        after = scene.step(after, 0.1)
+        after = step(scene, after, 0.1)
     assert after.cells > state.cells and state.step == 0 and state.time == 0.0
     for name, value in before.items():
         assert torch.equal(getattr(state, name), value), (
@@ -567,7 +569,7 @@ def test_a_step_does_not_touch_the_state_before():
 def test_timings_name_every_effect():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Mechanics(dim=2))
     timings = tf.Timings()
-    scene.step(scene.seed(), 0.1, timings)
+    step(scene, scene.bind().start(), 0.1, timings)
     assert list(timings.seconds) == ["division", "growth", "mechanics"] and all(
         s > 0 for s in timings.seconds.values()
     )
@@ -588,6 +590,6 @@ def test_an_effect_of_ones_own_needs_a_title_and_a_stage():
 
 def test_what_drives_what_is_said_once():
     scene = tf.scenes.quorum_sensing()
-    scene.seed(1)  # what a rate function reads is known once it is tried
+    scene.bind(1).start()  # what a rate function reads is known once it is tried
     told = scene.drives()
     assert "transport -> circuit: out.ahl" in told and "circuit -> transport: out.ahl" in told

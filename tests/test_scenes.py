@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.scenes import READY, build
 
@@ -50,7 +52,7 @@ def test_it_runs_and_its_recipe_builds_it_again(kind):
     scene = small(kind)
     again = build(*json.loads(json.dumps(scene.recipe)))
     assert scene.name == again.name == kind.split()[0]
-    a, b = (run(s, s.seed(2, seed=1), 3.0) for s in (scene, again))
+    a, b = (run(s, s.bind(2, seed=1).start(), 3.0) for s in (scene, again))
     assert (a.counts >= 4).all() and torch.isfinite(a.position).all()
     for name in ("uid", "position", "axis", "length", "growth_rate", "division_threshold"):
         assert torch.equal(getattr(a, name), getattr(b, name)), name
@@ -59,7 +61,7 @@ def test_it_runs_and_its_recipe_builds_it_again(kind):
 @pytest.mark.parametrize("kind", list(SMALL))
 def test_it_explains_itself(kind):
     scene = small(kind)
-    scene.seed(2)
+    scene.bind(2).start()
     assert "growth -> mechanics" in scene.explain()
     assert len(READY[kind.split()[0]].__doc__) > 60
 
@@ -79,7 +81,7 @@ def test_unknown_scenes_and_parameters_are_told():
 @pytest.mark.slow
 def test_a_microcolony_in_the_plane_is_round():
     scene = tf.scenes.microcolony()
-    state = run(scene, scene.seed(3), 6.0)
+    state = run(scene, scene.bind(3).start(), 6.0)
     assert (state.counts > 80).all()
     overlap = tf.measure.overlaps(state)
     assert float(overlap.mean.max()) < 0.05, "µm; the default α is meant for about 0.01"
@@ -96,7 +98,7 @@ def test_volume_doubles_in_ln2_over_rate():
     """Free growth: the cells' volume before the first division, which a free cell's mechanics does
     not hold back."""
     scene = tf.scenes.microcolony(rate=1.3)
-    first = scene.seed(dtype=torch.float64)
+    first = scene.bind(dtype=torch.float64).start()
     # ln 2 / 1.3 = 0.533 h; the founder, l = 2, is then 4.67 long in all and would have divided, so
     # go a third of the way
     last = run(scene, first, 0.175)
@@ -107,7 +109,7 @@ def test_volume_doubles_in_ln2_over_rate():
 @pytest.mark.slow
 def test_a_microcolony_in_space_stays_between_agarose_and_coverslip():
     scene = tf.scenes.microcolony(dim=3)
-    state = run(scene, scene.seed(2), 5.5)
+    state = run(scene, scene.bind(2).start(), 5.5)
     assert (state.counts > 50).all()
     walls = scene.effects[-1].walls
     reach = 0.5 * state.length * state.axis[:, 2].abs() + state.radius
@@ -130,7 +132,7 @@ def test_softer_agarose_gives_way_more():
     depth = []
     for agarose in (2.0, 200.0):
         scene = tf.scenes.microcolony(dim=3, agarose=agarose)
-        depth.append(float(tf.measure.depth(run(scene, scene.seed(2, seed=1), 5.0)).mean()))
+        depth.append(float(tf.measure.depth(run(scene, scene.bind(2, seed=1).start(), 5.0)).mean()))
     assert depth[0] > depth[1] + 0.02
 
 
@@ -145,8 +147,8 @@ def row(length: float) -> tf.Cells:
 
 def test_only_cells_near_the_right_edge_grow():
     scene = tf.scenes.programmed_growth()
-    first = scene.seed(2, cells=row(30.0))
-    state = scene.step(first, 0.025)
+    first = scene.bind(2, cells=row(30.0)).start()
+    state = step(scene, first, 0.025)
     near = first.position[:, 0] >= float(first.position[:, 0].max()) - 10.0
     assert bool(near.any()) and not bool(near.all())
     assert torch.equal(state.growth_rate, torch.where(near, 1.0, 0.0))
@@ -160,7 +162,7 @@ def test_the_tip_moves_right():
     """From the default founder: the right edge runs away from the left one, which hardly moves once
     growth has left it behind."""
     scene = tf.scenes.programmed_growth(edge=3.0)
-    early = run(scene, scene.seed(2), 4.0)
+    early = run(scene, scene.bind(2).start(), 4.0)
     late = run(scene, early, 8.0)
     for k in range(2):
         a, b = early.position[early.colony == k, 0], late.position[late.colony == k, 0]
@@ -171,7 +173,7 @@ def test_the_tip_moves_right():
 @pytest.mark.slow
 def test_cells_left_behind_do_not_grow_any_more():
     scene = tf.scenes.programmed_growth(edge=3.0)
-    state = run(scene, scene.seed(1), 7.0)
+    state = run(scene, scene.bind(1).start(), 7.0)
     still = state.growth_rate == 0
     assert bool(still.any()) and (state.elongation[still] == 0).all()
     x = state.position[:, 0]
@@ -186,7 +188,7 @@ def test_cells_left_behind_do_not_grow_any_more():
 @pytest.mark.slow
 def test_an_open_channel_keeps_its_sides_and_loses_cells_at_its_end(tmp_path):
     scene = tf.scenes.channel(width=4.0, length=15.0)
-    states = list(tf.simulate(scene, scene.seed(2), until=8.0, record=tmp_path / "run.h5"))
+    states = list(tf.simulate(scene, scene.bind(2).start(), until=8.0, record=tmp_path / "run.h5"))
     last = states[-1]
     walls = scene.effects[-2].walls
     # three times the growth of the longest cell in a step, as for any closed channel: 3 · 0.025 ·
@@ -209,7 +211,7 @@ def test_an_open_channel_keeps_its_sides_and_loses_cells_at_its_end(tmp_path):
 @pytest.mark.slow
 def test_a_closed_channel_loses_none_and_pressure_stops_growth():
     scene = tf.scenes.channel(width=4.0, length=8.0, open_ended=False)
-    states = list(tf.simulate(scene, scene.seed(2), until=7.0))
+    states = list(tf.simulate(scene, scene.bind(2).start(), until=7.0))
     last = states[-1]
     assert (
         (last.position[:, 0] > 0).all()
@@ -226,4 +228,4 @@ def test_a_channel_inside_out_is_told():
     with pytest.raises(tf.InputError, match=r"Channel|width"):
         tf.scenes.channel(width=-1.0)
     with pytest.raises(tf.InputError):
-        tf.scenes.channel(length=-5.0).seed()
+        tf.scenes.channel(length=-5.0).bind().start()

@@ -6,6 +6,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.tools.checks import InputError
 
@@ -22,7 +24,7 @@ def ran(
     dtype: torch.dtype = torch.float32,
 ) -> tf.State:
     return list(
-        tf.simulate(scene, scene.seed(colonies, seed=seed, dtype=dtype), until=until, dt=dt)
+        tf.simulate(scene, scene.bind(colonies, seed=seed, dtype=dtype).start(), until=until, dt=dt)
     )[-1]
 
 
@@ -75,7 +77,7 @@ def test_the_channel_holds_the_colony_and_the_grid_grows_along_it_only(boundary)
         and grid.shapes[0][1:] == (8, 12)
         and grid.spacing == (4.0, 4.0, 4.0)
     )
-    assert tf.scenes.boundary_detector().seed().layout.grid.shapes == ((64, 8, 12),)
+    assert tf.scenes.boundary_detector().bind().start().layout.grid.shapes == ((64, 8, 12),)
 
 
 def test_sinks_without_aiia_take_nothing_apart():
@@ -135,9 +137,9 @@ def test_cells_and_medium_keep_what_the_synthase_makes():
     """AHL is made at k1 LuxI/(k2 + LuxI) and lost only in the caps of daughters: without division,
     the sum is what was made, to the order of the step."""
     scene = tf.scenes.quorum_sensing(rate=0.3, D1=10.0, k1=1.0, k4=1.0, diffusion=100.0)
-    state, made = scene.seed(dtype=F64), 0.0
+    state, made = scene.bind(dtype=F64).start(), 0.0
     for _ in range(20):
-        state = scene.step(state, 0.05)
+        state = step(scene, state, 0.05)
         made += 0.05 * float((state.luxi / (1 + state.luxi) * state.volume).sum())
     total = float(
         (state.ahl * state.volume).sum()
@@ -152,7 +154,7 @@ def test_cells_and_medium_keep_what_the_synthase_makes():
 
 def test_random_partition_keeps_the_amount_and_spreads_the_cells():
     scene = tf.scenes.random_partition(start=2.0)
-    state = scene.seed(3, seed=1, dtype=F64)
+    state = scene.bind(3, seed=1, dtype=F64).start()
     last = list(tf.simulate(scene, state, until=3.0, dt=0.1))[-1]
     total = torch.zeros(3, dtype=F64).index_add(0, last.colony, last.plasmid * last.volume)
     assert int(last.counts.min()) >= 8 and total.tolist() == pytest.approx(
@@ -166,8 +168,8 @@ def test_random_partition_gives_every_share_alike():
     """The share of a daughter is uniform: of 600 divisions, mean 1/2 to 5 standard errors of
     √(1/12/600), and each quarter holds a quarter, to 5 of its own."""
     scene = tf.scenes.random_partition()
-    state = scene.seed(600, seed=2, dtype=F64, cells=tf.Cells.single(2, length=3.4))
-    after = scene.step(state.with_fields(divide_flag=torch.ones(600, dtype=torch.bool)), 1e-3)
+    state = scene.bind(600, seed=2, dtype=F64, cells=tf.Cells.single(2, length=3.4)).start()
+    after = step(scene, state.with_fields(divide_flag=torch.ones(600, dtype=torch.bool)), 1e-3)
     share = (after.plasmid * after.volume)[after.births[-1].first] / (state.plasmid * state.volume)
     assert after.cells == 1200 and float(share.mean()) == pytest.approx(
         0.5, abs=5 * (1 / 12 / 600) ** 0.5
@@ -198,10 +200,10 @@ def test_repressilator_goes_round():
     """In one cell that hardly grows: three genes in turn, a period of the model's 8.69/speed for β
     = 5."""
     scene = tf.scenes.repressilator(noise=False, rate=0.0, speed=3.0, beta=5.0)
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     tracks = []
     for _ in range(130):
-        state = scene.step(state, 0.1)
+        state = step(scene, state, 0.1)
         tracks.append([float(state.fields[n]) for n in ("laci", "tetr", "ci")])
     track = torch.tensor(tracks, dtype=F64)[20:]
     rising = [[k for k in range(1, 110) if track[k - 1, g] < 30 <= track[k, g]] for g in range(3)]
@@ -231,9 +233,9 @@ def test_only_a_rim_grows_where_food_is_short():
     scene = tf.scenes.nutrient_limited(
         supply=0.3, diffusion=3.0, half=0.3, growth_yield=0.2, size=80.0
     )
-    state = scene.seed(cells=cells, dtype=F64)
+    state = scene.bind(cells=cells, dtype=F64).start()
     for _ in range(8):
-        state = scene.step(state, 0.1)
+        state = step(scene, state, 0.1)
     away = state.position.norm(dim=1)
     rim, centre = (
         state.growth_rate[away > 0.9 * away.max()],
@@ -251,7 +253,7 @@ def test_what_is_eaten_times_the_yield_is_what_is_grown():
     """While nothing holds growth back: one cell, then none touching for long. Without division, to
     rounding."""
     scene = tf.scenes.nutrient_limited(growth_yield=0.5, size=80.0)
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     last = list(tf.simulate(scene, state, until=0.3, dt=0.05))[-1]
     assert last.cells == 1
     assert float(last.volume - state.volume) == pytest.approx(
@@ -275,4 +277,4 @@ def test_every_scene_explains_itself_and_refuses_nonsense(name):
     said = make().explain()
     assert "who drives whom" in said and ("circuit" in said or "nutrition" in said)
     with pytest.raises((InputError, TypeError)):
-        make(rate=-1.0).seed()
+        make(rate=-1.0).bind().start()

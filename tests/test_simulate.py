@@ -41,20 +41,20 @@ def assert_same(a: tf.State, b: tf.State) -> None:
 
 def test_until_a_time():
     scene = alone()
-    states = list(tf.simulate(scene, scene.seed(), until=1.0))
+    states = list(tf.simulate(scene, scene.bind().start(), until=1.0))
     assert [s.step for s in states] == list(range(1, 11))
     assert states[-1].time == pytest.approx(1.0, rel=1e-12)
 
 
 def test_dt_of_its_own():
     scene = alone()
-    states = list(tf.simulate(scene, scene.seed(), until=1.0, dt=0.25))
+    states = list(tf.simulate(scene, scene.bind().start(), until=1.0, dt=0.25))
     assert [s.time for s in states] == [0.25, 0.5, 0.75, 1.0]
 
 
 def test_until_every_colony_has_so_many_cells():
     scene = scene_of()
-    states = list(tf.simulate(scene, scene.seed(3), cells=8))
+    states = list(tf.simulate(scene, scene.bind(3).start(), cells=8))
     assert (states[-1].counts >= 8).all()
     assert not (states[-2].counts >= 8).all(), "it should have stopped before"
 
@@ -62,16 +62,16 @@ def test_until_every_colony_has_so_many_cells():
 @pytest.mark.parametrize(("until", "cells", "by_time"), [(0.5, 1000, True), (50.0, 4, False)])
 def test_the_first_end_reached_ends_the_run(until, cells, by_time):
     scene = scene_of()
-    last = list(tf.simulate(scene, scene.seed(2), until=until, cells=cells))[-1]
+    last = list(tf.simulate(scene, scene.bind(2).start(), until=until, cells=cells))[-1]
     assert (last.time == pytest.approx(until, rel=1e-12)) == by_time
     assert bool((last.counts >= cells).all()) != by_time
 
 
 def test_a_run_that_is_at_its_end_does_nothing():
     scene = alone()
-    last = list(tf.simulate(scene, scene.seed(), until=0.5))[-1]
+    last = list(tf.simulate(scene, scene.bind().start(), until=0.5))[-1]
     assert list(tf.simulate(scene, last, until=0.5)) == []
-    assert list(tf.simulate(scene, scene.seed(), cells=1)) == []
+    assert list(tf.simulate(scene, scene.bind().start(), cells=1)) == []
 
 
 @pytest.mark.parametrize(
@@ -80,14 +80,14 @@ def test_a_run_that_is_at_its_end_does_nothing():
 def test_an_end_that_has_been_reached_is_not_in_the_past(dt, until):
     """Whatever rounding the time has gathered, a run to 0.5 h has reached 0.5 h."""
     scene = alone()
-    last = list(tf.simulate(scene, scene.seed(), until=until, dt=dt))[-1]
+    last = list(tf.simulate(scene, scene.bind().start(), until=until, dt=dt))[-1]
     assert list(tf.simulate(scene, last, until=until, dt=dt)) == []
 
 
 def test_many_steps_end_on_time():
     """0.1 is not exact in binary: 1000 of them must still be 1000 steps."""
     scene = tf.Scene(tf.Growth(rate=0.0))
-    last = list(tf.simulate(scene, scene.seed(), until=100.0, dt=0.1))[-1]
+    last = list(tf.simulate(scene, scene.bind().start(), until=100.0, dt=0.1))[-1]
     assert last.step == 1000 and last.time == pytest.approx(100.0, rel=1e-12)
     assert len(list(tf.simulate(scene, last, until=100.3, dt=0.1))) == 3
 
@@ -96,12 +96,12 @@ def test_many_steps_end_on_time():
 def test_an_end_between_two_steps_is_refused(until):
     scene = alone()
     with pytest.raises(tf.InputError, match=r"until.*whole number of steps.*0\.1.*Next to it"):
-        tf.simulate(scene, scene.seed(), until=until)
+        tf.simulate(scene, scene.bind().start(), until=until)
 
 
 def test_an_end_in_the_past_is_refused():
     scene = alone()
-    last = list(tf.simulate(scene, scene.seed(), until=1.0))[-1]
+    last = list(tf.simulate(scene, scene.bind().start(), until=1.0))[-1]
     with pytest.raises(tf.InputError, match=r"until.*at least"):
         tf.simulate(scene, last, until=0.5)
 
@@ -126,7 +126,7 @@ def test_an_end_in_the_past_is_refused():
 def test_bad_options_are_refused_before_anything_runs(options, word):
     scene = alone()
     with pytest.raises(tf.InputError, match=word):
-        tf.simulate(scene, scene.seed(), **options)
+        tf.simulate(scene, scene.bind().start(), **options)
 
 
 def test_scene_and_state_the_wrong_way_round_are_told():
@@ -135,7 +135,7 @@ def test_scene_and_state_the_wrong_way_round_are_told():
         with pytest.raises(
             tf.InputError, match=r"\(State, Scene, …\) is not allowed: first comes a Scene"
         ):
-            run(scene.seed(), scene, until=1.0)
+            run(scene.bind().start(), scene, until=1.0)
 
 
 def test_a_number_of_cells_that_no_growth_leads_to_is_refused():
@@ -149,16 +149,16 @@ def test_a_number_of_cells_that_no_growth_leads_to_is_refused():
             r" cells.*until="
         ),
     ):
-        tf.simulate(scene, scene.seed(3), cells=4)
-    assert not list(tf.simulate(scene, scene.seed(3), cells=1))
-    assert len(list(tf.simulate(scene, scene.seed(3), until=0.1))) == 4
+        tf.simulate(scene, scene.bind(3).start(), cells=4)
+    assert not list(tf.simulate(scene, scene.bind(3).start(), cells=1))
+    assert len(list(tf.simulate(scene, scene.bind(3).start(), until=0.1))) == 4
     with pytest.raises(tf.InputError, match=r"growth_rate', which is 0 and which nothing"):
-        tf.simulate(tf.Scene(tf.Growth(rate=0.0)), tf.Scene(tf.Growth(rate=0.0)).seed(2), cells=4)
+        tf.simulate(tf.Scene(tf.Growth(rate=0.0)), tf.Scene(tf.Growth(rate=0.0)).bind(2).start(), cells=4)
 
 
 def test_cells_that_divide_or_lengthen_in_a_way_of_their_own_are_no_mistake():
     flagged = tf.Scene(tf.Growth(rate=0.0), tf.Division())
-    state = flagged.seed(2).with_fields(divide_flag=torch.ones(2, dtype=torch.bool))
+    state = flagged.bind(2).start().with_fields(divide_flag=torch.ones(2, dtype=torch.bool))
     *_, end = tf.simulate(flagged, state, cells=2)
     assert end.counts.tolist() == [2, 2]
 
@@ -169,25 +169,25 @@ def test_cells_that_divide_or_lengthen_in_a_way_of_their_own_are_no_mistake():
         def writes(self):
             return ("length",)
 
-        def step(self, state, dt):
+        def step(self, state, dt, values):
             return state.replace(length=state.length * 1.1)
 
     scene = tf.Scene(tf.Growth(rate=0.0), Stretch(), tf.Division(length=3.0))
-    *_, end = tf.simulate(scene, scene.seed(1), cells=4)
+    *_, end = tf.simulate(scene, scene.bind(1).start(), cells=4)
     assert end.cells >= 4
 
 
 def test_observers_may_come_one_by_one():
     scene, seen = alone(), []
     for _ in tf.simulate(
-        scene, scene.seed(), until=0.1, observers=(o for o in [lambda s: seen.append(s.step)])
+        scene, scene.bind().start(), until=0.1, observers=(o for o in [lambda s: seen.append(s.step)])
     ):
         pass
     assert len(seen) > 1
 
 
 def test_a_state_of_another_scene_is_refused_before_anything_runs():
-    state = alone().seed(cells=tf.Cells.single(3))
+    state = alone().bind(cells=tf.Cells.single(3)).start()
     with pytest.raises(tf.InputError, match="2-D"):
         tf.simulate(scene_of(), state, until=1.0)
     with pytest.raises(tf.InputError, match=r"divide_flag|division_threshold"):
@@ -212,7 +212,7 @@ def failing() -> tuple[tf.Scene, tf.State]:
     scene = tf.Scene(
         tf.Growth(rate=1.0), tf.Mechanics(dim=2, max_iterations=1, tolerance=1e-6), dt=0.1
     )
-    return scene, scene.seed(cells=lonely_and_crowded())
+    return scene, scene.bind(cells=lonely_and_crowded()).start()
 
 
 def test_a_failed_solve_is_raised_and_names_the_colony():
@@ -235,7 +235,7 @@ def test_a_selected_colony_is_named_by_its_own_id():
 def test_all_failed_colonies_are_named_at_once():
     scene, _ = failing()
     heap = lonely_and_crowded()
-    three = scene.seed(3, cells=tf.Cells(heap.position[1:9], heap.axis[1:9], 2.0))
+    three = scene.bind(3, cells=tf.Cells(heap.position[1:9], heap.axis[1:9], 2.0)).start()
     with pytest.raises(tf.SimulationError, match="3 of 3") as caught:
         list(tf.simulate(scene, three, until=1.0))
     assert caught.value.colonies == (0, 1, 2)
@@ -278,7 +278,7 @@ def test_a_colony_that_is_not_finite_fails_alone(unilateral, dtype):
     """NaN in one of three colonies: it is named, and dropped the other two go on to the same bits
     as without it."""
     scene = scene_of(unilateral=unilateral)
-    good = list(tf.simulate(scene, scene.seed(3, dtype=dtype), until=2.0))[-1]
+    good = list(tf.simulate(scene, scene.bind(3, dtype=dtype).start(), until=2.0))[-1]
     assert (good.counts >= 4).all()
     with pytest.raises(tf.SimulationError, match=r"colony 1 .*not finite") as caught:
         list(tf.simulate(scene, with_nan(good, 1), until=2.5))
@@ -300,7 +300,7 @@ def too_short(*others: tf.Effect) -> tuple[tf.Scene, tf.State]:
         colony=[0, 0, 1, 1, 2, 2],
     )
     scene = tf.Scene(tf.Division(), *others, founders=cells, dt=0.1)
-    state = scene.seed()
+    state = scene.bind().start()
     return scene, state.with_fields(divide_flag=torch.ones_like(state.divide_flag))
 
 
@@ -372,7 +372,7 @@ def test_failures_of_two_kinds_are_raised_together():
         founders=cells,
         dt=0.1,
     )
-    state = scene.seed()
+    state = scene.bind().start()
     state = state.with_fields(divide_flag=state.length < 1)
     with pytest.raises(tf.SimulationError, match=r"3 of 3 colonies") as caught:
         list(tf.simulate(scene, state, until=1.0))
@@ -394,7 +394,7 @@ def test_a_failed_step_says_what_may_help():
 
 def test_a_healthy_run_reports_every_colony_converged():
     scene = scene_of()
-    for state in tf.simulate(scene, scene.seed(4), until=2.0):
+    for state in tf.simulate(scene, scene.bind(4).start(), until=2.0):
         report = state.reports["mechanics"]
         assert (report.status == CONVERGED).all() and report.status.shape == (4,)
 
@@ -404,7 +404,7 @@ def test_a_healthy_run_reports_every_colony_converged():
 
 def test_observers_see_the_first_state_and_every_step_in_order():
     scene, seen = alone(), []
-    first = scene.seed()
+    first = scene.bind().start()
     yielded = list(
         tf.simulate(
             scene,
@@ -426,7 +426,7 @@ def test_an_observers_error_closes_the_file(tmp_path):
     with pytest.raises(RuntimeError, match="no luck"):
         list(
             tf.simulate(
-                scene, scene.seed(), until=1.0, record=tmp_path / "run.h5", observers=[fail]
+                scene, scene.bind().start(), until=1.0, record=tmp_path / "run.h5", observers=[fail]
             )
         )
     with tf.Results(tmp_path / "run.h5") as results:
@@ -435,14 +435,14 @@ def test_an_observers_error_closes_the_file(tmp_path):
 
 def test_timings_are_filled(tmp_path):
     timings, scene = tf.Timings(), scene_of()
-    list(tf.simulate(scene, scene.seed(), until=0.5, timings=timings, record=tmp_path / "run.h5"))
+    list(tf.simulate(scene, scene.bind().start(), until=0.5, timings=timings, record=tmp_path / "run.h5"))
     assert set(timings.seconds) == {"division", "growth", "mechanics", "recording"}
     assert all(0 < s < 60 for s in timings.seconds.values())
 
 
 def test_nothing_runs_before_the_first_state_is_asked_for(tmp_path):
     scene = alone()
-    run = tf.simulate(scene, scene.seed(), until=1.0, record=tmp_path / "run.h5")
+    run = tf.simulate(scene, scene.bind().start(), until=1.0, record=tmp_path / "run.h5")
     assert not (tmp_path / "run.h5").exists()
     next(run)
     assert (tmp_path / "run.h5").exists()
@@ -463,7 +463,7 @@ def test_going_on_from_any_state_is_bit_for_bit_the_same(options):
     """From every tenth step, cells that are just due to divide included; through a fresh scene, as
     after a restart."""
     scene = scene_of(**options)
-    states = every_step(scene, scene.seed(2, seed=5), 3.0)
+    states = every_step(scene, scene.bind(2, seed=5).start(), 3.0)
     assert states[-1].cells > 12
     starts = {10, 25, 40, 55} | {
         s.step for s in states[:-1] if bool((s.length >= s.division_threshold).any())
@@ -479,7 +479,7 @@ def test_going_on_from_any_state_is_bit_for_bit_the_same(options):
 )
 def test_one_by_one_equals_the_batch_bit_for_bit(options, dtype):
     scene = scene_of(**options)
-    first = scene.seed(4, seed=2, dtype=dtype)
+    first = scene.bind(4, seed=2, dtype=dtype).start()
     batch = list(tf.simulate(scene, first, until=2.5))[-1]
     assert (batch.counts > 4).all()
     for k in range(4):
@@ -494,7 +494,7 @@ def test_one_by_one_equals_the_batch_bit_for_bit(options, dtype):
 
 def test_the_order_of_colonies_does_not_matter():
     scene = scene_of()
-    first = scene.seed(4, seed=2)
+    first = scene.bind(4, seed=2).start()
     batch = list(tf.simulate(scene, first, until=2.0))[-1]
     shuffled = list(tf.simulate(scene, first.select([2, 0, 3, 1]), until=2.0))[-1]
     assert_same(shuffled.select([1, 3, 0, 2]), batch.select([0, 1, 2, 3]))
@@ -503,20 +503,20 @@ def test_the_order_of_colonies_does_not_matter():
 def test_a_smaller_batch_is_the_beginning_of_a_larger_one():
     """Colony 0 … 2 of a batch of 5 are those of a batch of 3 with the same seed."""
     scene = scene_of()
-    few, many = (list(tf.simulate(scene, scene.seed(n, seed=3), until=2.0))[-1] for n in (3, 5))
+    few, many = (list(tf.simulate(scene, scene.bind(n, seed=3).start(), until=2.0))[-1] for n in (3, 5))
     assert_same(many.select([0, 1, 2]), few.select([0, 1, 2]))
 
 
 def test_the_same_seed_twice_and_another_seed():
     scene = scene_of()
-    a, b, c = (list(tf.simulate(scene, scene.seed(2, seed=s), until=2.0))[-1] for s in (1, 1, 2))
+    a, b, c = (list(tf.simulate(scene, scene.bind(2, seed=s).start(), until=2.0))[-1] for s in (1, 1, 2))
     assert_same(a, b)
     assert not torch.equal(a.length[:2], c.length[:2])
 
 
 def test_colonies_of_one_batch_differ():
     scene = scene_of()
-    state = list(tf.simulate(scene, scene.seed(2), until=2.0))[-1]
+    state = list(tf.simulate(scene, scene.bind(2).start(), until=2.0))[-1]
     assert not torch.equal(state.length[state.colony == 0][:2], state.length[state.colony == 1][:2])
 
 
@@ -524,7 +524,7 @@ def test_a_run_that_may_never_end_is_told():
     """Found in use: a design whose cells stop growing below the number at which the run ends; the
     other colony would grow without end."""
     scene = tf.Scene(tf.Growth(rate=torch.tensor([1e-4, 1.0])), dt=0.001)
-    run = tf.simulate(scene, scene.seed(2), cells=2)
+    run = tf.simulate(scene, scene.bind(2).start(), cells=2)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         for _ in range(1050):

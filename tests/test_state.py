@@ -8,6 +8,8 @@ import math
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.state import PER_CELL
 
@@ -21,7 +23,7 @@ def batch(counts: tuple[int, ...] = (2, 0, 3, 1), **options) -> tf.State:
         [[1.0, 0.0]] * len(colony),
         colony=colony,
     )
-    return tf.Scene(tf.Growth(rate=1.0), founders=cells).seed(len(counts), **options)
+    return tf.Scene(tf.Growth(rate=1.0), founders=cells).bind(len(counts), **options).start()
 
 
 def test_sizes():
@@ -75,7 +77,7 @@ def test_an_unknown_signal_is_named_beside_those_there_are():
         box=((-4, -4), (4, 4)),
         spacing=4.0,
     )
-    signals = tf.Scene(medium, founders=tf.Cells.single(2)).seed().signals
+    signals = tf.Scene(medium, founders=tf.Cells.single(2)).bind().start().signals
     assert (
         list(signals) == ["ahl", "food"]
         and signals["ahl"].numel() == 4
@@ -235,7 +237,7 @@ def test_to_moves_everything(device):
         assert getattr(state, name).device.type == device.type
     assert all(v.device.type == device.type for v in state.fields.values())
     scene = tf.Scene(tf.Growth(rate=1.0), founders=tf.Cells.single(2))
-    assert scene.step(state, 0.1).length.device.type == device.type
+    assert step(scene, state, 0.1).length.device.type == device.type
 
 
 def test_draws_are_keyed_by_seed_colony_cell_step_and_purpose():

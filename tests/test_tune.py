@@ -9,6 +9,8 @@ import math
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.tools.checks import InputError
 from torchfilm.tuning.observables import AccuracyProbe, Error, begin, observables
@@ -48,9 +50,9 @@ def test_what_was_chosen_holds_the_error_in_a_run_of_its_own(colony):
     """Other seeds, another size, and a reference of another kind: contacts that only push, an
     eighth of the step, float64."""
     base = tf.scenes.microcolony()
-    *_, start = tf.simulate(base, base.seed(3, seed=9, dtype=F64), cells=30)
+    *_, start = tf.simulate(base, base.bind(3, seed=9, dtype=F64).start(), cells=30)
     tight = tf.Scene(
-        *base.listed[:2],
+        *base.effects[:2],
         tf.Mechanics(dim=2, unilateral=True, alpha=0.003, passes=4, tolerance=0.005),
         dt=base.dt / 8,
     )
@@ -60,7 +62,7 @@ def test_what_was_chosen_holds_the_error_in_a_run_of_its_own(colony):
         state, steps = start, round(0.6 / scene.dt)
         assert steps * scene.dt == pytest.approx(0.6)
         for _ in range(steps):
-            state = scene.step(state, scene.dt)
+            state = step(scene, state, scene.dt)
         ends.append({n: float(v[0]) for n, v in observables(state).items()})
     first = {n: float(v[0]) for n, v in observables(start).items()}
     mine, right = ends
@@ -159,7 +161,7 @@ def test_molecules_are_probed_by_their_mean():
         and tuned.settings.rtol is None
         and "circuits" not in tuned.parts
     )
-    assert [e.method for e in tuned.scene.listed if isinstance(e, tf.Circuit)] == ["tau_leap"]
+    assert [e.method for e in tuned.scene.effects if isinstance(e, tf.Circuit)] == ["tau_leap"]
 
 
 def test_founders_that_are_as_many_as_asked_for_are_the_start():
@@ -228,7 +230,7 @@ def test_observables_of_a_known_state():
         ),
         founders=cells,
     )
-    found = observables(scene.seed(2, dtype=F64))
+    found = observables(scene.bind(2, dtype=F64).start())
     assert float(found["cells"]) == 4 and float(found["overlap"]) == pytest.approx(0.1)
     assert float(found["volume"]) == pytest.approx(4 * math.pi * 0.25 * (2 + 1))
     assert float(found["radius"]) == pytest.approx(math.sqrt(2) * 0.45)
@@ -257,9 +259,9 @@ def test_chance_is_told_by_how_colonies_differ():
 
 def test_no_division_changes_the_volume_that_is_compared():
     scene = dividing()
-    state = scene.seed(3, dtype=F64)
+    state = scene.bind(3, dtype=F64).start()
     state = state.replace(length=torch.full_like(state.length, 4.6))
-    divided = next(e for e in scene.listed if isinstance(e, tf.Division)).step(state, 0.05)
+    divided = next(e for e in scene.effects if isinstance(e, tf.Division)).step(state, 0.05)
     assert divided.cells == 6
     assert float(observables(divided)["volume"]) == pytest.approx(
         float(observables(state)["volume"]), rel=1e-12

@@ -1,9 +1,12 @@
 """torchfilm: synthetic microbial biofilms, many colonies at once, in PyTorch."""
 
-from torchfilm import effect, measure, pictures, scenes
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from torchfilm import effect, measure, scenes
 from torchfilm.circuits import kinetics, parts
 from torchfilm.circuits.reactions import Reaction
-from torchfilm.effect import Effect, LogNormal, Normal, Uniform
+from torchfilm.effect import Effect
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
@@ -12,12 +15,12 @@ from torchfilm.effects.medium import Medium, Signal
 from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
-from torchfilm.explanation import explain
 from torchfilm.initial_cells import Cells
 from torchfilm.io.recorder import Recorder
 from torchfilm.io.results import Results
+from torchfilm.loop import advance, failures
+from torchfilm.model import Model
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
-from torchfilm.pictures import show
 from torchfilm.replay import GrowthRecording, Replay
 from torchfilm.scene import Scene
 from torchfilm.signals.boundary_conditions import (
@@ -27,16 +30,32 @@ from torchfilm.signals.boundary_conditions import (
     Open,
     Periodic,
 )
-from torchfilm.simulation import failures, rollout, simulate
+from torchfilm.simulation import rollout, simulate
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.timing import Timings
-from torchfilm.tuning.settings import Settings, preset
-from torchfilm.tuning.tuner import Tuned, tune
+from torchfilm.values import LogNormal, Normal, PerColony, Uniform, physical
 from torchfilm.version import __version__
+
+if TYPE_CHECKING:
+    from torchfilm import pictures
+    from torchfilm.explanation import explain
+    from torchfilm.pictures import show
+    from torchfilm.tuning.settings import Settings, preset
+    from torchfilm.tuning.tuner import Tuned, tune
+
+# Imported when first used: `import torchfilm` takes little longer than torch.
+_LAZY = {
+    "explain": "torchfilm.explanation",
+    "show": "torchfilm.pictures",
+    "Settings": "torchfilm.tuning.settings",
+    "preset": "torchfilm.tuning.settings",
+    "Tuned": "torchfilm.tuning.tuner",
+    "tune": "torchfilm.tuning.tuner",
+}
 
 __all__ = [
     "BoundaryConditions",
@@ -54,10 +73,12 @@ __all__ = [
     "LogNormal",
     "Mechanics",
     "Medium",
+    "Model",
     "Monod",
     "NoFlux",
     "Normal",
     "Open",
+    "PerColony",
     "Periodic",
     "Plane",
     "Reaction",
@@ -76,6 +97,7 @@ __all__ = [
     "Tuned",
     "Uniform",
     "__version__",
+    "advance",
     "checks",
     "digest",
     "effect",
@@ -85,6 +107,7 @@ __all__ = [
     "kinetics",
     "measure",
     "parts",
+    "physical",
     "pictures",
     "preset",
     "rollout",
@@ -93,3 +116,15 @@ __all__ = [
     "simulate",
     "tune",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "pictures":
+        return import_module("torchfilm.pictures")
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'torchfilm' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

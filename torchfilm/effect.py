@@ -1,65 +1,129 @@
-"""What an effect is: a step of the model that declares the fields it reads and writes.
+"""What an effect is: a frozen description of one process, and what binding makes of it.
 
-An effect is a frozen dataclass with a `stage`, the fields it `declares`, what it `reads` and
-`writes`, and a `step(state, dt) -> state`. Effects never import each other; they meet only through
-named fields.
+An effect describes: its physical values, the fields that it declares, and what it reads and writes.
+Binding a scene to a batch (`torchfilm.model`) makes a `BoundEffect` of each, once, with its values
+resolved. A step calls `BoundEffect.step(state, dt)`. Effects never import each other; they meet
+only through named fields.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
-from torch import Tensor
 
-from torchfilm.state import Field, State
-from torchfilm.tools import checks
+from torchfilm.state import CELL_TYPE, Field, State
+from torchfilm.tools import checks, hashing
+from torchfilm.values import (
+    Batch,
+    ByType,
+    PerColony,
+    Resolved,
+    Rule,
+    Values,
+    checked,
+    drawn_field,
+    is_drawn,
+    resolve,
+)
+
+if TYPE_CHECKING:
+    from torchfilm.tools.hot_reload import HotReload
 
 # The paper's stages, in its order; an effect says where it belongs.
-(
-    RULES,
-    DIVISION,
-    BEFORE_CELLS,
-    NUTRITION,
-    GROWTH,
-    MECHANICS,
-    GRID_COVERAGE,
-    CIRCUIT,
-    TRANSPORT,
-    REMOVAL,
-) = (10, 20, 22, 25, 30, 40, 45, 50, 60, 90)
+RULES, DIVISION, BEFORE_CELLS, NUTRITION, GROWTH = 10, 20, 22, 25, 30
+MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, REMOVAL = 40, 45, 50, 60, 90
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.
 BUILT_IN = (*GEOMETRY, "cells")
 
 
+@dataclass(frozen=True)
+class Binding:
+    """What an effect sees while it is bound: the batch, the scene's step (h), its dimension, and
+    the names that its other effects declare."""
+
+    batch: Batch
+    dt: float
+    dim: int
+    declared: Mapping[str, str]
+
+
 class Effect:
-    """Base of all effects. Override `step`, and the rest where there is something to say."""
+    """Base of all effects: a frozen dataclass with a `stage` and a `title`. Override `step`, and
+    the rest where it applies.
+
+    A physical value is a field made by `torchfilm.physical(default, unit=…, least=…)`. It may be
+    given as `torchfilm.values` describes, and reaches `step` resolved:
+    `values.NAME.of_cells(state)`.
+    """
 
     stage: ClassVar[int]
     title: ClassVar[str]
-    writes_anything: ClassVar[bool] = False  # what it writes is not known before it runs
+    # May a scene list it more than once?
+    may_repeat: ClassVar[bool] = True
+    # What it reads and writes is known only after it has been tried.
+    writes_anything: ClassVar[bool] = False
+    # Its cost depends on the voxels of the grid, not on the cells.
+    works_on_grid: ClassVar[bool] = False
 
-    def parts(self) -> Sequence[Effect]:
-        """The effects that really run; one for most."""
-        return (self,)
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls._suggest_keywords()
+
+    @classmethod
+    def _suggest_keywords(cls) -> None:
+        """Let a misspelt keyword raise InputError with the nearest name."""
+        inner = cls.__dict__.get("__new__", None)
+        if inner is None:
+            cls.__new__ = _new_with_known_keywords  # type: ignore[method-assign,assignment]
+
+    def __post_init__(self) -> None:
+        for name, (given, rule) in self.physical_fields().items():
+            if given is not None:
+                object.__setattr__(
+                    self, name, checked(f"{type(self).__name__}.{name}", given, rule)
+                )
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and hashing.digest(self) == hashing.digest(other)
+
+    def __hash__(self) -> int:
+        return hash(hashing.digest(self))
+
+    # --- what it describes ---------------------------------------------------------------
+
+    def physical_fields(self) -> dict[str, tuple[Any, Rule]]:
+        """Its own fields that hold physical values, with their rules."""
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        return {
+            f.name: (getattr(self, f.name), f.metadata["physical"])
+            for f in fields
+            if "physical" in f.metadata
+        }
+
+    def physical_values(self) -> dict[str, tuple[Any, Rule]]:
+        """All its physical values by name, with their rules."""
+        return self.physical_fields()
 
     def declares(self, dim: int) -> Sequence[Field]:
-        """The fields that this effect brings into the state of a scene in `dim` dimensions."""
+        """The fields that this effect adds to the state of a scene in `dim` dimensions.
+
+        A field's `initial` may be a function (state, rows, values).
+        """
         return ()
 
     def reads(self) -> Sequence[str]:
-        """Names of what `step` looks at: "position", "axis", "length", "radius", "cells" (how many,
-        which) or fields."""
+        """What `step` reads: "position", "axis", "length", "radius", "cells" (how many, which) or
+        fields."""
         return ()
 
     def needs(self) -> Sequence[str]:
-        """Those names among what it reads without which it cannot run; the others it does
-        without."""
+        """Those names among what it reads without which it cannot run."""
         return ()
 
     def writes(self) -> Sequence[str]:
@@ -67,162 +131,273 @@ class Effect:
         return ()
 
     def waits_for(self) -> Sequence[str]:
-        """Fields that must not be 0 everywhere in a colony if it is to have more cells: another
-        effect, a rule or the first cells set them where this does not."""
+        """Fields that must not be 0 everywhere in a colony if it is to have more cells."""
         return ()
 
-    def begin(self, state: State) -> State:
-        """The first cells made ready for this effect's fields, before any field is declared."""
-        return state
+    def clash_hint(self, name: str) -> str:
+        """What to do where another effect declares a field of this name, too."""
+        return ""
 
-    def prepare(self, state: State) -> State:
-        """The seeded state made ready for this effect, once, after all fields are declared."""
-        return state
+    def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
+        """Raise InputError where this effect does not fit the other effects of a scene, or warn."""
 
-    def check(self, state: State) -> None:
-        """Raise InputError if this effect cannot start from this seeded state; a state in mid-run
-        is not asked again."""
+    def check(self, state: State, values: Values) -> None:
+        """Raise InputError if this effect cannot start from this first state."""
 
-    def step(self, state: State, dt: float) -> State:
+    def check_step(self, dt: float, divides: bool) -> None:
+        """Raise InputError for a step of dt hours that this effect cannot follow. divides: cells
+        may."""
+
+    def step(self, state: State, dt: float, values: Values) -> State:
         """The state after this effect has acted for dt hours."""
         raise NotImplementedError
 
+    def bind(self, binding: Binding) -> Sequence[BoundEffect]:
+        """What acts in a step, in one part or several, made ready for a batch."""
+        return (BoundEffect(self, binding),)
 
-def per_colony(value: float | Tensor, state: State) -> Tensor:
-    """A parameter as (B,) or 0-dim tensor of the state's dtype, looked up by colony id where it is
-    given per colony."""
-    if not isinstance(value, Tensor):
-        return torch.tensor(value, dtype=state.dtype, device=state.device)
-    value = value.to(dtype=state.dtype, device=state.device)
-    if value.dim() == 0:
-        return value
-    return value.index_select(0, state.colony_id)
+    # --- what explaining, tuning, recording and the command line need of it ---------------
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        """By which methods it is computed, in lines: for `explain`. state: a first state."""
+        return []
+
+    def with_settings(self, settings: Any) -> Effect:
+        """The same effect computed by other accuracy settings (`torchfilm.Settings`)."""
+        return self
+
+    def accuracy_knobs(self) -> Mapping[str, float]:
+        """The accuracy settings that it takes, with their usual values."""
+        return {}
+
+    def without_noise(self) -> Effect:
+        """The same effect without random events, for the measurement of numerical errors."""
+        return self
+
+    @property
+    def soft_contacts(self) -> bool:
+        """Whether its cells are physically soft, so that an overlap is no error."""
+        return False
+
+    def wall_surfaces(self) -> Sequence[Any]:
+        """Surfaces that confine cells."""
+        return ()
+
+    @property
+    def hot_reload(self) -> HotReload | None:
+        """The user's functions that may be edited during a run."""
+        return None
 
 
-def per_cell(value: float | Tensor, state: State) -> Tensor:
-    """As `per_colony`, but (N,) or 0-dim: one value for each cell."""
-    found = per_colony(value, state)
-    return found if found.dim() == 0 else found.index_select(0, state.colony)
+def _new_with_known_keywords(cls: type, *args: Any, **given: Any) -> Any:
+    known = (
+        [f.name for f in dataclasses.fields(cls) if f.init]
+        if dataclasses.is_dataclass(cls)
+        else None
+    )
+    if known is not None and "__init__" in cls.__dict__ and not _takes_any(cls):
+        for name in given:
+            if name not in known:
+                raise checks.unknown_keyword(cls.__name__, name, known)
+    return object.__new__(cls)
+
+
+def _takes_any(cls: type) -> bool:
+    code = cls.__init__.__code__  # type: ignore[misc]
+    return bool(code.co_flags & 0x08)
+
+
+class BoundEffect:
+    """An effect made ready for one batch. `values`: its physical values, resolved.
+
+    Most effects need nothing else: `step` calls the description's own. Others override what they
+    need.
+    """
+
+    def __init__(self, effect: Effect, binding: Binding):
+        self.effect, self.binding = effect, binding
+        self.title, self.stage = effect.title, effect.stage
+        self.place = 0  # of the effect in its scene
+        self.values = Values(self._resolve(effect, binding.batch))
+
+    @staticmethod
+    def _resolve(effect: Effect, batch: Batch) -> dict[str, Resolved | None]:
+        found = {}
+        for name, (value, rule) in effect.physical_values().items():
+            kept = None
+            if value is not None and is_drawn(value) and not rule.drawn_by_effect:
+                kept = drawn_field(effect.title, name, value).name
+            found[name] = resolve(f"{type(effect).__name__}.{name}", value, batch, field=kept)
+        return found
+
+    def declares(self) -> list[Field]:
+        """The effect's fields with their first values bound, and one field for each value that is
+        drawn at birth."""
+        return [
+            self._bound(f) for f in self.effect.declares(self.binding.dim)
+        ] + self._value_fields()
+
+    def _value_fields(self) -> list[Field]:
+        out = []
+        for name, (value, rule) in self.effect.physical_values().items():
+            if isinstance(value, ByType):
+                out.append(CELL_TYPE)
+            if value is not None and is_drawn(value) and not rule.drawn_by_effect:
+                kept = drawn_field(self.effect.title, name, value)
+                out.append(dataclasses.replace(kept, initial=_DrawnValue(self.values[name], name)))
+        return out
+
+    def _bound(self, field: Field) -> Field:
+        if not callable(field.initial):
+            return field
+        return dataclasses.replace(field, initial=_FirstValue(field.initial, self.values))
+
+    def reads(self) -> tuple[str, ...]:
+        """Names of what a step reads; the fields of its own drawn values are among them."""
+        drawn = [
+            v.field for v in self.values.__dict__.values() if v is not None and v.field is not None
+        ]
+        typed = [v for v in self.values.__dict__.values() if v is not None and v.types is not None]
+        return tuple(
+            dict.fromkeys((*self.effect.reads(), *drawn, *(("cell_type",) if typed else ())))
+        )
+
+    def writes(self) -> tuple[str, ...]:
+        """Names of what a step changes."""
+        return tuple(self.effect.writes())
+
+    def lay(self, state: State) -> State:
+        """The first cells made ready for this effect's fields, before any field is declared."""
+        return state
+
+    def trace(self, state: State) -> State:
+        """Find out, once, what can only be found by trying; the state made ready, as `ready`
+        does."""
+        return self.ready(state)
+
+    def ready(self, state: State) -> State:
+        """A first state made ready for this effect, after all fields are declared."""
+        return state
+
+    def check(self, state: State) -> None:
+        """Raise InputError if this effect cannot start from this first state."""
+        self.effect.check(state, self.values)
+
+    def check_step(self, dt: float, divides: bool) -> None:
+        """Raise InputError for a step of dt hours that this effect cannot follow. divides: cells
+        may."""
+        self.effect.check_step(dt, divides)
+
+    def step(self, state: State, dt: float) -> State:
+        """The state after this effect has acted for dt hours."""
+        return self.effect.step(state, dt, self.values)
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        """By which methods it is computed, in lines."""
+        return self.effect.numerics(dt, state)
+
+    @property
+    def works_on_grid(self) -> bool:
+        return self.effect.works_on_grid
+
+    def summary(self) -> str:
+        """The effect with the parameters that differ from their defaults, in a line."""
+        return summary(self.effect)
 
 
 @dataclass(frozen=True)
-class Distribution:
-    """A random parameter, drawn once for each cell at its birth. Subclasses: Uniform, Normal,
-    LogNormal."""
+class Concern:
+    """What a report warns of, once it has held for `steps` steps: in which colonies, `where` (B,)
+    bool, and `text(colony ids (B,), where (B,))`, what is wrong and what to do. name: tells
+    concerns apart.
+    """
 
-    def draw(self, state: State, rows: Tensor, purpose: str) -> Tensor:
-        """One value for each of the cells `rows` (M,) -> (M,)."""
-        raise NotImplementedError
-
-    def least(self) -> float:
-        """The smallest value that can be drawn."""
-        raise NotImplementedError
-
-    def greatest(self) -> float:
-        """The greatest value that can be drawn."""
-        raise NotImplementedError
+    name: str
+    where: torch.Tensor
+    steps: int
+    text: Callable[[torch.Tensor, torch.Tensor], str]
 
 
-@dataclass(frozen=True)
-class Uniform(Distribution):
-    """Evenly between low and high; each one number or one per colony."""
+@dataclass(frozen=True, eq=False)
+class _FirstValue:
+    """A field's first value, with the effect's resolved values."""
 
-    low: float | Tensor
-    high: float | Tensor
+    initial: Any
+    values: Values
 
-    def __post_init__(self) -> None:
-        for name in ("low", "high"):
-            object.__setattr__(self, name, checks.value(f"Uniform.{name}", getattr(self, name)))
-        if bool((torch.as_tensor(self.low) > torch.as_tensor(self.high)).any()):
-            raise checks.input_error(
-                "Uniform", (self.low, self.high), "low ≤ high", "Swap the two."
-            )
-
-    def draw(self, state: State, rows: Tensor, purpose: str) -> Tensor:
-        low, high = draw("low", self.low, state, rows), draw("high", self.high, state, rows)
-        return low + (high - low) * state.uniform(rows, purpose)
-
-    def least(self) -> float:
-        return float(torch.as_tensor(self.low).min())
-
-    def greatest(self) -> float:
-        return float(torch.as_tensor(self.high).max())
+    def __call__(self, state: State, rows: torch.Tensor) -> torch.Tensor:
+        return self.initial(state, rows, self.values)
 
 
-@dataclass(frozen=True)
-class Normal(Distribution):
-    """Gaussian of mean and sd, its tails beyond 4 sd (one draw in 16,000) folded back inside; each
-    one number or one per colony."""
+@dataclass(frozen=True, eq=False)
+class _DrawnValue:
+    value: Resolved
+    purpose: str
 
-    mean: float | Tensor
-    sd: float | Tensor
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "mean", checks.value("Normal.mean", self.mean))
-        object.__setattr__(self, "sd", checks.value("Normal.sd", self.sd, least=0.0))
-
-    def draw(self, state: State, rows: Tensor, purpose: str) -> Tensor:
-        z = state.normal(rows, purpose)[:, 0]
-        z = torch.where(z.abs() > 4, z.sign() * (8 - z.abs()).clamp(min=0), z)
-        return draw("mean", self.mean, state, rows) + draw("sd", self.sd, state, rows) * z
-
-    def least(self) -> float:
-        return float((torch.as_tensor(self.mean) - 4 * torch.as_tensor(self.sd)).min())
-
-    def greatest(self) -> float:
-        return float((torch.as_tensor(self.mean) + 4 * torch.as_tensor(self.sd)).max())
+    def __call__(self, state: State, rows: torch.Tensor) -> torch.Tensor:
+        return self.value.of_rows(state, rows)
 
 
-@dataclass(frozen=True)
-class LogNormal(Distribution):
-    """The exponential of a Gaussian: its median, and sigma of the logarithm; each one number or one
-    per colony."""
-
-    median: float | Tensor
-    sigma: float | Tensor
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "median", checks.value("LogNormal.median", self.median, above=0.0))
-        object.__setattr__(self, "sigma", checks.value("LogNormal.sigma", self.sigma, least=0.0))
-
-    def draw(self, state: State, rows: Tensor, purpose: str) -> Tensor:
-        z = Normal(0.0, 1.0).draw(state, rows, purpose)
-        return draw("median", self.median, state, rows) * torch.exp(
-            draw("sigma", self.sigma, state, rows) * z
-        )
-
-    def least(self) -> float:
-        return float(
-            (torch.as_tensor(self.median) * torch.exp(-4 * torch.as_tensor(self.sigma))).min()
-        )
-
-    def greatest(self) -> float:
-        return float(
-            (torch.as_tensor(self.median) * torch.exp(4 * torch.as_tensor(self.sigma))).max()
-        )
+def number_range(value: torch.Tensor) -> str:
+    """One number in text, or the range of several."""
+    low, high = (float(x) for x in torch.aminmax(value.double().detach()))
+    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 
-def parameter(
-    name: str,
-    value: object,
-    *,
-    above: float = -math.inf,
-    least: float = -math.inf,
-    most: float = math.inf,
-) -> float | Tensor | Distribution:
-    """Check a parameter that may be one number, one per colony, or a distribution over cells."""
-    if isinstance(value, Distribution):
-        checks.number(f"least value of {name}", value.least(), above=above, least=least, most=most)
-        checks.number(
-            f"greatest value of {name}", value.greatest(), above=above, least=least, most=most
-        )
-        return value
-    return checks.value(name, value, above=above, least=least, most=most)
+def summary(effect: Any) -> str:
+    """An effect with the parameters that differ from their defaults, in a line."""
+    shown = []
+    for f in dataclasses.fields(effect):
+        value = getattr(effect, f.name)
+        default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
+        if f.repr and not _same(value, default):
+            shown.append(f"{f.name}={shorten(value)}")
+    return f"{type(effect).__name__}({', '.join(shown)})"
 
 
-def draw(name: str, value: float | Tensor | Distribution, state: State, rows: Tensor) -> Tensor:
-    """A parameter's value for the cells `rows` (M,): drawn where it is a distribution."""
-    if isinstance(value, Distribution):
-        return value.draw(state, rows, name)
-    found = per_cell(value, state)
-    return found.expand(rows.numel()) if found.dim() == 0 else found.index_select(0, rows)
+def _same(a: object, b: object) -> bool:
+    tensors = isinstance(a, torch.Tensor) or isinstance(b, torch.Tensor)
+    return a is b or (not tensors and a == b)
+
+
+def shorten(value: object) -> str:
+    """A value in few characters."""
+    if isinstance(value, torch.Tensor):
+        if value.dim() == 0:
+            return f"{float(value):.9g}"
+        return f"<{value.numel()} values, {float(value.min()):g} to {float(value.max()):g}>"
+    if isinstance(value, ByType):
+        return "{" + ", ".join(f"{kind}: {shorten(v)}" for kind, v in value.values.items()) + "}"
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        inner = [
+            f"{f.name}={shorten(getattr(value, f.name))}"
+            for f in dataclasses.fields(value)
+            if not _same(getattr(value, f.name), f.default)
+        ]
+        return f"{type(value).__name__}({', '.join(inner)})"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{name}: {shorten(v)}" for name, v in value.items()) + "}"
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(shorten(v) for v in value) + "]"
+    return getattr(value, "__name__", None) or repr(value)
+
+
+def parameters(part: object, path: str = "") -> list[tuple[str, torch.Tensor]]:
+    """Every tensor among an effect's parameters, by name; those of its distributions, cell types
+    and walls included."""
+    if isinstance(part, torch.Tensor):
+        return [(path, part)]
+    if isinstance(part, (tuple, list)):
+        return [x for k, item in enumerate(part) for x in parameters(item, f"{path}[{k}]")]
+    if isinstance(part, ByType):
+        return [x for k, item in part.values.items() for x in parameters(item, f"{path}[{k}]")]
+    if isinstance(part, PerColony):
+        return parameters(part.values, path)
+    if isinstance(part, Mapping):
+        return [x for name, item in part.items() for x in parameters(item, f"{path}[{name!r}]")]
+    if dataclasses.is_dataclass(part) and not isinstance(part, type):
+        path = path or type(part).__name__
+        # what is not shown is not given by the user but computed
+        shown = [f.name for f in dataclasses.fields(part) if f.repr]
+        return [x for name in shown for x in parameters(getattr(part, name), f"{path}.{name}")]
+    return []

@@ -200,12 +200,14 @@ class State:
             }
         )
 
-    def contact(self) -> Contact | None:
-        """Where cells meet the medium and what they find there; None in a scene without one."""
+    def contact(self, names: Iterable[str] | None = None) -> Contact | None:
+        """Where cells meet the medium and what they find there of each signal, or of these; None in
+        a scene without a medium."""
         if self.layout is None:
             return None
+        values = self.signals if names is None else {n: self.fields[OUTSIDE + n] for n in names}
         return self.layout.contact(
-            self.position, self.colony, self.own_colony_id, self.signals, self.dtype
+            self.position, self.colony, self.own_colony_id, values, self.dtype
         )
 
     @property

@@ -32,10 +32,10 @@ def circuit(
     rows=(0, 1, 2),
     dtype=F64,
     D1=3.0,
-) -> run.Circuit:
+) -> run.CircuitCells:
     """In some of three cells of 2, 4 and 1 µm³."""
     cell = {"volume": torch.tensor([2.0, 4.0, 1.0], dtype=dtype)}
-    return run.Circuit(
+    return run.CircuitCells(
         part,
         ("a", "b"),
         given,
@@ -48,8 +48,8 @@ def circuit(
     )
 
 
-def settings(method: str = "rosenbrock", **given) -> run.Settings:
-    return run.Settings(
+def settings(method: str = "rosenbrock", **given) -> run.IntegrationSettings:
+    return run.IntegrationSettings(
         **{
             "method": method,
             "steps": 200,

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.effect import Effect
 
@@ -20,7 +22,7 @@ def pair_of_cells(dim: int = 2, gap: float = 20.0) -> tf.Cells:
 
 def run(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.1) -> tf.State:
     for _ in range(steps):
-        state = scene.step(state, dt)
+        state = step(scene, state, dt)
     return state
 
 
@@ -47,5 +49,5 @@ class Species(Effect):
     def declares(self, dim):
         return (tf.Field("species", "concentrations", shape=(2,), initial=1.0),)
 
-    def step(self, state, dt):
+    def step(self, state, dt, values):
         return state

@@ -9,6 +9,8 @@ import math
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.physics import capsule
 
@@ -41,7 +43,7 @@ def resting(circuit: tf.Circuit, count: int = 1, *more: tf.Effect, **founders) -
 
 def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.1) -> tf.State:
     for _ in range(steps):
-        state = scene.step(state, dt)
+        state = step(scene, state, dt)
         assert all(bool((r.status == 0).all()) for r in state.reports.values())
     return state
 
@@ -55,7 +57,7 @@ def test_growth_dilutes(dtype, device):
         tf.Growth(rate=tf.Uniform(0.5, 1.5)),
         tf.Circuit(idle, species=("m", "w"), initial={"m": 3.0, "w": 7.0}),
     )
-    state = scene.seed(5, dtype=dtype, device=device)
+    state = scene.bind(5, dtype=dtype, device=device).start()
     last = advance(scene, state, 12)
     assert float((last.volume / state.volume).min()) > 1.5
     bound = 24 * torch.finfo(dtype).eps
@@ -73,7 +75,7 @@ def test_a_volume_that_mechanics_held_back_is_the_one_that_dilutes(dtype):
         tf.Mechanics(dim=2, walls=[tf.Plane(x=-1.6, facing="+x"), tf.Plane(x=1.6, facing="-x")]),
         tf.Circuit(idle, species=("m",), initial={"m": 1.0}),
     )
-    state = scene.seed(dtype=dtype)
+    state = scene.bind(dtype=dtype).start()
     last = advance(scene, state, 40, 0.05)
     assert float(last.volume / state.volume) < 1.5  # e² without walls
     assert float(last.m * last.volume) == pytest.approx(
@@ -84,10 +86,10 @@ def test_a_volume_that_mechanics_held_back_is_the_one_that_dilutes(dtype):
 @pytest.mark.parametrize("daughters", ["concentration", "amount"])
 def test_daughters_have_the_concentration_or_the_amount_of_their_parent(daughters, dtype, device):
     scene = dividing(tf.Circuit(idle, species=("m",), initial={"m": 2.0}, daughters=daughters))
-    state = scene.seed(2, dtype=dtype, device=device)
+    state = scene.bind(2, dtype=dtype, device=device).start()
     divided = 0
     for _ in range(25):
-        before, state = state, scene.step(state, 0.1)
+        before, state = state, step(scene, state, 0.1)
         for births in state.births:
             divided += births.first.numel()
             # what growth after the division did to each daughter is undone with the volumes
@@ -123,8 +125,8 @@ def test_daughters_have_exactly_the_concentration_of_their_parent():
         tf.Circuit(idle, species=("m",), initial={"m": tf.Uniform(0.1, 1.0)}),
         founders=cells,
     )
-    state = scene.seed(dtype=torch.float32)
-    after = scene.step(state.with_fields(divide_flag=torch.tensor([True, True])), 0.1)
+    state = scene.bind(dtype=torch.float32).start()
+    after = step(scene, state.with_fields(divide_flag=torch.tensor([True, True])), 0.1)
     assert after.cells == 4
     for k in range(4):
         assert float(after.m[k]) in state.m.tolist()
@@ -136,8 +138,8 @@ def test_daughters_share_the_amount_by_volume(dtype):
     products and two quotients each."""
     circuit = tf.Circuit(idle, species=("m",), initial={"m": 2.0}, daughters="amount")
     scene = tf.Scene(tf.Division(fraction=0.3), circuit, founders=tf.Cells.single(2, length=4.0))
-    state = scene.seed(dtype=dtype)
-    after = scene.step(state.with_fields(divide_flag=torch.tensor([True])), 0.1)
+    state = scene.bind(dtype=dtype).start()
+    after = step(scene, state.with_fields(divide_flag=torch.tensor([True])), 0.1)
     bound = 5 * torch.finfo(dtype).eps
     assert float(after.volume[0] / after.volume[1]) < 0.7
     assert (
@@ -157,7 +159,7 @@ def test_what_a_rule_shares_out_is_diluted_from_the_daughters_on():
         daughter2.m = 0.0 * parent.m
 
     scene = dividing(tf.Circuit(idle, species=("m",), initial={"m": 2.0}), tf.Rules(divide=divide))
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     last = advance(scene, state, 25)
     assert last.cells >= 4
     amount = last.m * last.volume
@@ -175,7 +177,7 @@ class Stretch(tf.Effect):
     def writes(self):
         return ("length",)
 
-    def step(self, state, dt):
+    def step(self, state, dt, values):
         return state.replace(length=state.length + 1.0) if state.step == 0 else state
 
 
@@ -187,8 +189,8 @@ def test_amounts_refer_to_the_volume_for_which_they_were_worked_out(threshold):
         tf.Division(length=threshold, fraction=0.4),
         tf.Circuit(idle, species=("m",), initial={"m": 2.0}, daughters="amount"),
     )
-    state = scene.seed(dtype=F64)
-    after = scene.step(state, 0.1)
+    state = scene.bind(dtype=F64).start()
+    after = step(scene, state, 0.1)
     assert after.cells == (2 if threshold == 2.5 else 1)
     assert float((after.m * after.volume).sum()) == pytest.approx(
         2.0 * float(state.volume), rel=1e-14
@@ -206,7 +208,7 @@ def test_first_concentrations_as_numbers_per_colony_drawn_or_given(dtype, device
     )
     cells = tf.Cells([[0.0, 0.0], [0.0, 3.0]], [[1.0, 0.0]] * 2, extra={"d": [0.25, 0.75]})
     scene = tf.Scene(circuit, founders=cells)
-    state = scene.seed(3, seed=5, dtype=dtype, device=device)
+    state = scene.bind(3, seed=5, dtype=dtype, device=device).start()
     assert state.a.tolist() == [1.5] * 6 and state.b.tolist() == [1.0, 1.0, 2.0, 2.0, 3.0, 3.0]
     assert (
         float(state.c.min()) >= 2
@@ -216,7 +218,7 @@ def test_first_concentrations_as_numbers_per_colony_drawn_or_given(dtype, device
     assert state.d.tolist() == [0.25, 0.75] * 3 and state.e.tolist() == [0.0] * 6
     assert all(state.fields[n].dtype == dtype for n in "abcde")
     assert state.declared["d"].meaning == "concentration in the cell"
-    assert torch.equal(scene.seed(3, seed=6, dtype=dtype, device=device).c, state.c) is False
+    assert torch.equal(scene.bind(3, seed=6, dtype=dtype, device=device).start().c, state.c) is False
 
 
 def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, device):
@@ -232,7 +234,7 @@ def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, devic
         rtol=1e-8,
     )
     scene = resting(circuit, 5, tf.Growth(rate=0.2), cell_type=[0, 7, 3, 4, 0])
-    state = scene.seed(dtype=dtype, device=device)
+    state = scene.bind(dtype=dtype, device=device).start()
     last = advance(scene, state, 10)
     thin = math.exp(-0.2)  # over one hour, at a relative rate of 0.2/h of the volume
     assert last.m[0] == last.m[4] and last.w[0] == 0
@@ -251,17 +253,17 @@ def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, devic
 def test_a_type_that_changes_takes_up_the_other_circuit():
     circuit = tf.Circuit({0: idle, 1: made}, species=("m",), k=1.0, g=0.0)
     scene = resting(circuit, 2)
-    state = advance(scene, scene.seed(dtype=F64), 3)
+    state = advance(scene, scene.bind(dtype=F64).start(), 3)
     assert state.m.tolist() == [0.0, 0.0]
     state = advance(scene, state.with_fields(cell_type=torch.tensor([0, 1])), 3)
     assert state.m.tolist() == pytest.approx([0.0, 0.3])
 
 
 def test_cells_without_a_type_are_of_type_0():
-    state = resting(tf.Circuit({0: made}, species=("m",), k=1.0, g=0.0), 2).seed()
+    state = resting(tf.Circuit({0: made}, species=("m",), k=1.0, g=0.0), 2).bind().start()
     assert state.cell_type.tolist() == [0, 0]
     assert (
-        "cell_type" not in resting(tf.Circuit(made, species=("m",), k=1.0, g=0.0), 2).seed().fields
+        "cell_type" not in resting(tf.Circuit(made, species=("m",), k=1.0, g=0.0), 2).bind().start().fields
     )
 
 
@@ -270,7 +272,7 @@ def test_parameters_per_colony(dtype, device):
     steps to 40 eps."""
     k, g = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.5, 1.0, 0.25], dtype=F64)
     scene = resting(tf.Circuit(made, species=("m",), k=k, g=g, rtol=1e-8), 2)
-    last = advance(scene, scene.seed(3, dtype=dtype, device=device), 10)
+    last = advance(scene, scene.bind(3, dtype=dtype, device=device).start(), 10)
     exact = (k.double() / g * (1 - torch.exp(-g))).repeat_interleave(2)
     assert last.m.dtype == dtype
     assert torch.allclose(
@@ -295,7 +297,7 @@ def test_parameters_per_colony(dtype, device):
 def test_every_method_gets_there(method, bound):
     """x' = 1 − x over an hour in ten steps: the order's power of 0.1, with a constant below 1."""
     scene = resting(tf.Circuit(made, species=("m",), k=1.0, g=1.0, method=method))
-    assert float(advance(scene, scene.seed(dtype=F64), 10).m) == pytest.approx(
+    assert float(advance(scene, scene.bind(dtype=F64).start(), 10).m) == pytest.approx(
         1 - math.exp(-1), rel=bound
     )
 
@@ -307,7 +309,7 @@ def test_more_steps_of_an_explicit_method_are_smaller_ones():
                 s := resting(
                     tf.Circuit(made, species=("m",), k=1.0, g=1.0, method="euler", steps=n)
                 ),
-                s.seed(dtype=F64),
+                s.bind(dtype=F64).start(),
                 1,
                 0.1 * n,
             ).m
@@ -331,7 +333,7 @@ def test_making_and_thinning_take_turns_at_second_order():
         tf.Circuit(made, species=("u",), rtol=1e-9, atol=1e-12),
         founders=tf.Cells.single(2),
     )
-    first = scene.seed(dtype=F64)
+    first = scene.bind(dtype=F64).start()
     u, n, v0, r = 0.0, 20_000, float(first.volume), float(first.radius)
     slope = lambda t, u: (
         2 * math.pi * r * ((v0 * math.exp(t)) / (math.pi * r * r) + 2 * r / 3) / (v0 * math.exp(t))
@@ -372,8 +374,8 @@ def test_a_rate_may_ask_for_everything_about_its_cell(device):
         tf.Circuit({0: asks}, species=("u",)),
         founders=tf.Cells([[3.0, 4.0]], [1.0, 0]),
     )
-    state = scene.seed(2, dtype=F64, device=device)
-    last = scene.step(state, 0.1)
+    state = scene.bind(2, dtype=F64, device=device).start()
+    last = step(scene, state, 0.1)
     # made at 5/h through a step of 0.1 h, and thinned by half of the step's growth
     assert last.u.tolist() == pytest.approx([0.5 * math.exp(-0.05)] * 2)
     assert seen["y"].tolist() == [4.0, 4.0] and seen["growth_rate"].tolist() == [1.0, 1.0]
@@ -423,7 +425,7 @@ def test_halving_the_step():
                 splitting=splitting,
             )
             scene = resting(circuit, 3, medium)
-            state = advance(scene, scene.seed(dtype=F64), steps, 1.0 / steps)
+            state = advance(scene, scene.bind(dtype=F64).start(), steps, 1.0 / steps)
             ends[steps] = torch.cat([state.luxi, state.ahl]), state.signals["ahl"]
         cells[splitting], signal[splitting] = (
             [float((ends[n][k] - ends[512][k]).abs().max()) for n in (8, 16, 32)] for k in (0, 1)
@@ -455,7 +457,7 @@ def test_reactions_and_a_function_with_the_same_rates_do_the_same():
             2,
             tf.Medium(ahl=tf.Signal(diffusion=10.0), box=((-8.0, -8.0), (8.0, 8.0)), spacing=2.0),
         )
-        ends.append(advance(scene, scene.seed(dtype=F64), 10))
+        ends.append(advance(scene, scene.bind(dtype=F64).start(), 10))
     for name in ("ahl", "out.ahl"):
         assert torch.allclose(ends[0].fields[name], ends[1].fields[name], rtol=1e-13), name
 
@@ -480,7 +482,7 @@ def test_two_types_share_a_crowded_voxel():
         ),
         founders=cells,
     )
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     total = lambda s: float((s.m * s.volume).sum() + s.signals["a"].sum() * 512.0)
     first = total(state)
     for _ in range(4):
@@ -492,6 +494,6 @@ def test_two_types_share_a_crowded_voxel():
 
 def test_an_empty_batch_goes_on():
     scene = dividing(tf.Circuit(made, species=("m",), k=1.0, g=1.0))
-    state = scene.seed(2)
+    state = scene.bind(2).start()
     gone = state.remove(torch.ones(2, dtype=torch.bool), "removed")
     assert advance(scene, gone, 3).cells == 0

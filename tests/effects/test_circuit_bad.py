@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.tools.checks import InputError, SimulationError
 
@@ -145,19 +147,19 @@ def test_a_misspelt_option_is_not_taken_for_a_parameter(
                 rf" option {option}\?"
             ),
         ):
-            resting(tf.Circuit(spelt, species=("m",), k=1.0, **{name: 1.0}), 2).seed()
-    resting(tf.Circuit(lambda u, s, p, cell: {"m": p.rate}, species=("m",), rate=1.0), 2).seed()
-    resting(tf.Circuit(spelt, species=("m",), k=1.0, spare=1.0), 2).seed()
-    resting(tf.Circuit([tf.parts.constitutive("m", "rate")], species=("m",), rate=1.0), 2).seed()
+            resting(tf.Circuit(spelt, species=("m",), k=1.0, **{name: 1.0}), 2).bind().start()
+    resting(tf.Circuit(lambda u, s, p, cell: {"m": p.rate}, species=("m",), rate=1.0), 2).bind().start()
+    resting(tf.Circuit(spelt, species=("m",), k=1.0, spare=1.0), 2).bind().start()
+    resting(tf.Circuit([tf.parts.constitutive("m", "rate")], species=("m",), rate=1.0), 2).bind().start()
 
 
 @pytest.mark.parametrize("case", AT_SEED)
 def test_a_rate_function_is_tried_before_anything_runs(case):
     rates, said = AT_SEED[case]
     with pytest.raises(InputError, match="(?s)" + said):
-        resting(tf.Circuit(rates, species=("m",), k=1.0), 2).seed()
+        resting(tf.Circuit(rates, species=("m",), k=1.0), 2).bind().start()
     with pytest.raises(InputError, match="(?s)" + said) as refused:
-        resting(tf.Circuit({1: rates}, species=("m",), k=1.0), 2, cell_type=[1, 1]).seed()
+        resting(tf.Circuit({1: rates}, species=("m",), k=1.0), 2, cell_type=[1, 1]).bind().start()
     assert "(cell type 1)" in str(refused.value) or "can only be read" in said
 
 
@@ -165,7 +167,7 @@ def test_the_type_is_named_where_the_trial_fails():
     with pytest.raises(InputError, match=r"made \(cell type 1\): u has no 'm'; known are w"):
         resting(
             tf.Circuit({0: idle, 1: made}, species=("w",), k=1.0, g=1.0), 2, cell_type=[0, 0]
-        ).seed()
+        ).bind().start()
 
 
 def test_a_signal_is_named_when_its_amount_is_wrong():
@@ -179,9 +181,9 @@ def test_a_signal_is_named_when_its_amount_is_wrong():
                 tf.Circuit(lambda u, s, p, cell, a=amount: ({}, {"ahl": a(u)}), species=("m",)),
                 2,
                 medium,
-            ).seed()
+            ).bind().start()
     with pytest.raises(InputError, match=r"s has no 'ahi'; known are ahl\. Did you mean 'ahl'"):
-        resting(tf.Circuit(lambda u, s, p, cell: {"m": s.ahi}, species=("m",)), 2, medium).seed()
+        resting(tf.Circuit(lambda u, s, p, cell: {"m": s.ahi}, species=("m",)), 2, medium).bind().start()
 
 
 REACTIONS = {
@@ -201,7 +203,7 @@ REACTIONS = {
 def test_reactions_are_checked_before_anything_runs(case):
     reactions, said = REACTIONS[case]
     with pytest.raises(InputError, match=said):
-        resting(tf.Circuit(reactions, species=("m",), k=1.0)).seed()
+        resting(tf.Circuit(reactions, species=("m",), k=1.0)).bind().start()
 
 
 @pytest.mark.parametrize(
@@ -214,8 +216,8 @@ def test_a_value_per_colony_must_have_one_for_each(option):
     with pytest.raises(
         InputError, match=f"{next(iter(option))}.* has 2 values, but the batch has 3 colonies"
     ):
-        scene.seed(3)
-    assert scene.seed(2).colonies == 2
+        scene.bind(3).start()
+    assert scene.bind(2).start().colonies == 2
 
 
 def test_two_circuits_are_one_too_many():
@@ -225,9 +227,9 @@ def test_two_circuits_are_one_too_many():
 
 def test_a_species_may_not_be_called_as_something_else():
     with pytest.raises(InputError, match="growth_rate"):
-        tf.Scene(tf.Growth(rate=1.0), tf.Circuit(idle, species=("growth_rate",))).seed()
+        tf.Scene(tf.Growth(rate=1.0), tf.Circuit(idle, species=("growth_rate",))).bind().start()
     with pytest.raises(InputError, match="length"):
-        tf.Scene(tf.Circuit(idle, species=("length",))).seed()
+        tf.Scene(tf.Circuit(idle, species=("length",))).bind().start()
 
 
 # --- failure in mid-run ---------------------------------------------------------------------------
@@ -249,7 +251,7 @@ def test_a_rate_that_becomes_nan_names_species_type_step_and_colonies(method, ra
         {2: rates}, species=("m", "w"), k=torch.tensor([0.1, 3.0, 0.0, 3.0]), method=method
     )
     scene = resting(circuit, 2, cell_type=[2, 0])
-    state = scene.seed(4, dtype=F64)
+    state = scene.bind(4, dtype=F64).start()
     with pytest.raises(
         SimulationError,
         match=(
@@ -265,7 +267,7 @@ def test_a_rate_that_becomes_nan_names_species_type_step_and_colonies(method, ra
 def test_drop_goes_on_without_the_colonies_that_failed():
     circuit = tf.Circuit(breaks, species=("m", "w"), k=torch.tensor([0.1, 3.0, 0.0]), method="rk4")
     scene = resting(circuit, 2)
-    last = list(tf.simulate(scene, scene.seed(3, dtype=F64), until=1.0, dt=0.1, on_failure="drop"))[
+    last = list(tf.simulate(scene, scene.bind(3, dtype=F64).start(), until=1.0, dt=0.1, on_failure="drop"))[
         -1
     ]
     assert last.counts.tolist() == [2, 0, 2] and last.m.tolist() == pytest.approx(
@@ -281,7 +283,7 @@ def test_a_rate_that_pushes_below_zero_is_a_failure():
         )
     )
     with pytest.raises(SimulationError, match=r"(?s)step 3.*colony 0.*below zero"):
-        list(tf.simulate(scene, scene.seed(dtype=F64), until=1.0, dt=0.1))
+        list(tf.simulate(scene, scene.bind(dtype=F64).start(), until=1.0, dt=0.1))
 
 
 def test_a_rate_that_numbers_alone_can_follow_is_refused_on_its_trial():
@@ -298,6 +300,6 @@ def test_a_rate_that_numbers_alone_can_follow_is_refused_on_its_trial():
     with pytest.raises(
         tf.InputError, match=r"use torch\.exp and the like rather than math or numpy"
     ):
-        scene().seed(1)
+        scene().bind(1).start()
     plain = scene(method="rk4")  # which asks for none
-    assert float(plain.step(plain.seed(1), 0.1).m) > 0.05
+    assert float(step(plain, plain.bind(1).start(), 0.1).m) > 0.05

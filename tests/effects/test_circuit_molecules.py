@@ -9,6 +9,8 @@ import pytest
 import torch
 from ruled import same
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.circuits.partition import binomial
 from torchfilm.tools.checks import InputError, SimulationError
@@ -34,7 +36,7 @@ def assert_whole(state: tf.State, name: str = "m", molecules_per_unit: float = 1
 
 def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.1) -> tf.State:
     for _ in range(steps):
-        state = scene.step(state, dt)
+        state = step(scene, state, dt)
         assert all(bool((r.status == 0).all()) for r in state.reports.values())
     return state
 
@@ -62,7 +64,7 @@ def test_numbers_stay_whole_through_growth_and_division(method, dtype, device):
             lose=1.0,
         ),
     )
-    state = scene.seed(2, dtype=dtype, device=device)
+    state = scene.bind(2, dtype=dtype, device=device).start()
     for _ in range(20):
         assert_whole(state, molecules_per_unit=2.5)
         state = advance(scene, state, 1)
@@ -78,7 +80,7 @@ def test_first_numbers_are_whole_and_right_in_the_mean():
         tf.Circuit(INERT, species=("m", "w"), initial={"m": 2.3 / volume}, method="tau_leap"),
         founders=cells,
     )
-    n = molecules(scene.seed(dtype=F64)).round()
+    n = molecules(scene.bind(dtype=F64).start()).round()
     assert set(n.tolist()) == {2.0, 3.0}
     assert float(n.mean()) == pytest.approx(2.3, abs=5 * math.sqrt(0.21 / 4000))
 
@@ -95,7 +97,7 @@ def test_copies_make_molecules_of_concentrations(molecules_per_unit):
         ),
         founders=side_by_side(50),
     )
-    state = advance(scene, scene.seed(2), 1)
+    state = advance(scene, scene.bind(2).start(), 1)
     for k, each in enumerate((1.0, 1.0) if molecules_per_unit == 1.0 else molecules_per_unit):
         one = state.select([k])
         assert_whole(one, molecules_per_unit=each)
@@ -118,8 +120,8 @@ def divided(
     scene = tf.Scene(
         tf.Division(fraction=fraction), circuit, founders=side_by_side(count, length=4.0)
     )
-    state = scene.seed(seed=seed, dtype=F64)
-    return state, scene.step(
+    state = scene.bind(seed=seed, dtype=F64).start()
+    return state, step(scene, 
         state.with_fields(divide_flag=torch.ones(count, dtype=torch.bool)), 0.1
     )
 
@@ -190,7 +192,7 @@ def test_birth_and_death_under_dilution(method):
         ),
         founders=side_by_side(400),
     )
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     last = advance(scene, state, 25, 0.04)
     # 400 cells, sd of a concentration √(20/V) ≈ 2: a standard error of 0.1, of which 4, beside the
     # 4 % of splitting
@@ -217,7 +219,7 @@ def test_noise_and_no_noise_agree_where_molecules_are_many():
             rtol=1e-6,
         )
         scene = tf.Scene(tf.Growth(rate=0.5), circuit)
-        ends.append(float(advance(scene, scene.seed(dtype=F64), 10).m))
+        ends.append(float(advance(scene, scene.bind(dtype=F64).start(), 10).m))
     assert ends[0] == pytest.approx(ends[1], rel=5 / math.sqrt(1.7 * 2e5) + 2e-3)
 
 
@@ -243,7 +245,7 @@ def test_molecules_through_the_membrane_are_conserved(method, outside, dtype):
         tf.Medium(a=tf.Signal(diffusion=5.0, initial=0.5, reservoir=1.0), outside=outside, **BOX),
         founders=side_by_side(3),
     )
-    state = scene.seed(2, dtype=dtype)
+    state = scene.bind(2, dtype=dtype).start()
     if outside == "reservoir":
         position = state.position.clone()
         position[1, 0] = 40.0
@@ -273,7 +275,7 @@ def test_uptake_of_the_last_molecules_leaves_nothing_negative():
         tf.Medium(a=tf.Signal(diffusion=0.0, initial=0.05), **BOX),
         founders=side_by_side(3),
     )
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     first = float(state.signals["a"].sum() * 64)
     last = advance(scene, state, 3)
     assert float(last.signals["a"].min()) >= 0 and float(molecules(last, "a").sum()) >= 1
@@ -305,9 +307,9 @@ def test_a_negative_propensity_names_reaction_step_and_colonies(method):
         (SimulationError, InputError),
         match=r"(?s)colony 1.*cell 0.*'m made less and less' has a propensity .*negative",
     ) as failed:
-        list(tf.simulate(scene, scene.seed(3, dtype=F64), until=0.3, dt=0.1))
+        list(tf.simulate(scene, scene.bind(3, dtype=F64).start(), until=0.3, dt=0.1))
     assert failed.value.colonies == (1,) and "step 1" in str(failed.value)
-    last = list(tf.simulate(scene, scene.seed(3, dtype=F64), until=0.3, dt=0.1, on_failure="drop"))[
+    last = list(tf.simulate(scene, scene.bind(3, dtype=F64).start(), until=0.3, dt=0.1, on_failure="drop"))[
         -1
     ]
     assert last.counts.tolist() == [1, 0, 1]
@@ -316,7 +318,7 @@ def test_a_negative_propensity_names_reaction_step_and_colonies(method):
 def test_a_propensity_that_is_not_a_number_at_the_start_is_refused():
     reaction = tf.Reaction({}, {"m": 1}, lambda u, s, p, cell: u.m / u.m, "undefined")
     with pytest.raises(InputError, match="nan for the species 'm' at the start"):
-        tf.Scene(tf.Circuit([reaction], species=("m",), method="tau_leap")).seed()
+        tf.Scene(tf.Circuit([reaction], species=("m",), method="tau_leap")).bind().start()
 
 
 # --- one colony, whatever the batch ---------------------------------------------------------------
@@ -340,7 +342,7 @@ def test_a_colony_is_the_same_in_any_batch(method, dtype, device):
         circuit,
         tf.Medium(m=tf.Signal(diffusion=5.0), box=((-8, -8), (8, 8)), spacing=4.0, outside="grow"),
     )
-    first = scene.seed(3, seed=4, dtype=dtype, device=device)
+    first = scene.bind(3, seed=4, dtype=dtype, device=device).start()
     last = advance(scene, first, 16)
     assert int(last.counts.min()) >= 4
     for places in ([2], [1, 0]):

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from helpers import seeded
+from helpers import seeded, step
 
 import torchfilm as tf
 from torchfilm.physics import capsule
@@ -18,7 +18,7 @@ def one_cell(length: float = 2.0, radius: float = 0.5) -> tf.Cells:
 
 def grown(scene: tf.Scene, state: tf.State, steps: int, dt: float) -> tf.State:
     for _ in range(steps):
-        state = scene.step(state, dt)
+        state = step(scene, state, dt)
     return state
 
 
@@ -76,8 +76,8 @@ def test_a_hundred_steps_equal_one(law, device, dtype):
 
 def test_volume_law_and_length_law_differ_by_the_caps():
     """With l = 2, r = ½ the volume law lengthens by e^g(l + 4r/3) − 4r/3: more than e^g·l."""
-    by_volume = grown(scene := scene_of(1.0, "volume"), scene.seed(dtype=torch.float64), 1, 1.0)
-    by_length = grown(scene := scene_of(1.0, "length"), scene.seed(dtype=torch.float64), 1, 1.0)
+    by_volume = grown(scene := scene_of(1.0, "volume"), scene.bind(dtype=torch.float64).start(), 1, 1.0)
+    by_length = grown(scene := scene_of(1.0, "length"), scene.bind(dtype=torch.float64).start(), 1, 1.0)
     assert float(by_volume.length) == pytest.approx(math.e * (2 + 2 / 3) - 2 / 3, rel=1e-14)
     assert float(by_length.length) == pytest.approx(math.e * 2, rel=1e-14)
 
@@ -91,15 +91,15 @@ def test_an_isolated_cell_grows_the_same_with_mechanics(law, unilateral, dtype):
         scene_of(1.0, law),
         scene_of(1.0, law, one_cell(), tf.Mechanics(dim=2, unilateral=unilateral)),
     )
-    a, b = (grown(s, s.seed(dtype=dtype), 40, 0.025) for s in (free, held))
+    a, b = (grown(s, s.bind(dtype=dtype).start(), 40, 0.025) for s in (free, held))
     assert float(b.length) == pytest.approx(float(a.length), rel=rounding(dtype, 40))
     assert torch.equal(a.position, b.position) and torch.equal(a.axis, b.axis)
 
 
 def test_elongation_is_what_was_added():
     scene = scene_of(1.0, "volume")
-    first = scene.seed(dtype=torch.float64)
-    second = scene.step(first, 0.1)
+    first = scene.bind(dtype=torch.float64).start()
+    second = step(scene, first, 0.1)
     assert torch.equal(second.length, first.length + second.elongation)
     assert float(second.elongation) > 0
 
@@ -110,14 +110,14 @@ def test_elongation_is_what_was_added():
 def test_a_rate_for_each_colony(device, dtype):
     rates = [0.5, 1.0, 2.0]
     scene = scene_of(rates, "length")
-    state = grown(scene, scene.seed(3, device=device, dtype=dtype), 20, 0.05)
+    state = grown(scene, scene.bind(3, device=device, dtype=dtype).start(), 20, 0.05)
     wanted = torch.tensor([2 * math.exp(g) for g in rates], dtype=dtype, device=device)
     assert torch.allclose(state.length, wanted, rtol=rounding(dtype, 20), atol=0)
 
 
 def test_rates_follow_their_colony_through_a_selection():
     scene = scene_of(torch.tensor([0.5, 1.0, 2.0]), "length")
-    whole = scene.seed(3)
+    whole = scene.bind(3).start()
     part = grown(scene, whole.select([2, 0]), 4, 0.25)
     whole = grown(scene, whole, 4, 0.25)
     assert torch.equal(part.length, whole.length[[2, 0]])
@@ -125,9 +125,9 @@ def test_rates_follow_their_colony_through_a_selection():
 
 def test_without_a_rate_cells_rest_until_told():
     scene = scene_of(None, "volume")
-    state = scene.seed()
-    assert torch.equal(scene.step(state, 1.0).length, state.length)
-    told = scene.step(state.with_fields(growth_rate=torch.ones(1)), 1.0)
+    state = scene.bind().start()
+    assert torch.equal(step(scene, state, 1.0).length, state.length)
+    told = step(scene, state.with_fields(growth_rate=torch.ones(1)), 1.0)
     assert float(told.length) > float(state.length)
 
 
@@ -136,27 +136,27 @@ def test_rates_of_single_cells_may_come_with_the_cells():
         [[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0]] * 2, 2.0, extra={"growth_rate": [0.0, 1.0]}
     )
     scene = tf.Scene(tf.Growth(law="length"), founders=cells)
-    state = scene.step(scene.seed(dtype=torch.float64), 1.0)
+    state = step(scene, scene.bind(dtype=torch.float64).start(), 1.0)
     assert state.length.tolist() == pytest.approx([2.0, 2 * math.e], rel=1e-14)
 
 
 def test_drawn_rates_cover_their_range_and_belong_to_cells():
     scene = scene_of(tf.Uniform(0.5, 1.5), "volume")
-    rate = scene.seed(2000, dtype=torch.float64).growth_rate
+    rate = scene.bind(2000, dtype=torch.float64).start().growth_rate
     assert ((rate > 0.5) & (rate < 1.5)).all()
     # mean 1, sd 1/√12: four standard errors of 2000 draws
     assert float(rate.mean()) == pytest.approx(1.0, abs=4 / math.sqrt(12 * 2000))
     assert float(rate.std()) == pytest.approx(1 / math.sqrt(12), rel=0.06)
-    assert torch.equal(scene.seed(3, dtype=torch.float64).growth_rate, rate[:3]), (
+    assert torch.equal(scene.bind(3, dtype=torch.float64).start().growth_rate, rate[:3]), (
         "a draw depends on the batch"
     )
-    assert not torch.equal(scene.seed(3, seed=1, dtype=torch.float64).growth_rate, rate[:3]), (
+    assert not torch.equal(scene.bind(3, seed=1, dtype=torch.float64).start().growth_rate, rate[:3]), (
         "a draw ignores the seed"
     )
 
 
 def flagged(scene: tf.Scene, colonies: int) -> tf.State:
-    state = scene.seed(colonies, dtype=torch.float64)
+    state = scene.bind(colonies, dtype=torch.float64).start()
     return state.with_fields(divide_flag=torch.ones(state.cells, dtype=torch.bool))
 
 
@@ -164,7 +164,7 @@ def test_drawn_rates_are_drawn_anew_at_birth():
     scene = scene_of(tf.Uniform(0.5, 1.5), "volume", one_cell(), tf.Division())
     state = flagged(scene, 200)
     parents = state.growth_rate
-    first, second = scene.step(state, 0.01).growth_rate.reshape(200, 2).T
+    first, second = step(scene, state, 0.01).growth_rate.reshape(200, 2).T
     assert (first != parents).all() and (second != parents).all() and (first != second).all()
     # independent of one another: |correlation| of 200 pairs is below 0.3 but for one chance in 10⁴
     for a, b in ((first, second), (parents, first)):
@@ -173,13 +173,13 @@ def test_drawn_rates_are_drawn_anew_at_birth():
 
 def test_a_given_rate_is_inherited():
     scene = scene_of([0.5, 2.0], "volume", one_cell(), tf.Division())
-    assert scene.step(flagged(scene, 2), 0.01).growth_rate.tolist() == [0.5, 0.5, 2.0, 2.0]
+    assert step(scene, flagged(scene, 2), 0.01).growth_rate.tolist() == [0.5, 0.5, 2.0, 2.0]
 
 
 @pytest.mark.parametrize("distribution", [tf.Normal(1.0, 0.1), tf.LogNormal(1.0, 0.1)])
 def test_other_distributions(distribution):
     """Both have mean ≈ 1 and sd ≈ 0.1 (the log-normal's are 1.005 and 0.1008)."""
-    rate = scene_of(distribution, "volume").seed(2000, dtype=torch.float64).growth_rate
+    rate = scene_of(distribution, "volume").bind(2000, dtype=torch.float64).start().growth_rate
     assert float(rate.mean()) == pytest.approx(1.0025, abs=0.0025 + 4 * 0.1 / math.sqrt(2000))
     assert float(rate.std()) == pytest.approx(0.1, rel=4 / math.sqrt(2 * 2000) + 0.01)
     assert (
@@ -195,7 +195,7 @@ def test_gradient_of_length_with_respect_to_rate(law):
     """dl/dg = t·l by length, t·(l + 4r/3) by volume, t by the linear law."""
     rate = torch.tensor(0.9, dtype=torch.float64, requires_grad=True)
     scene = scene_of(rate, law)
-    state = grown(scene, scene.seed(dtype=torch.float64), 40, 0.025)
+    state = grown(scene, scene.bind(dtype=torch.float64).start(), 40, 0.025)
     (slope,) = torch.autograd.grad(state.length.sum(), rate)
     length = float(state.length.detach())
     wanted = {"length": length, "volume": length + 2 / 3, "linear": 1.0}[law]
@@ -205,7 +205,7 @@ def test_gradient_of_length_with_respect_to_rate(law):
 def test_gradient_of_each_colony_is_its_own():
     rate = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64, requires_grad=True)
     scene = scene_of(rate, "length")
-    state = grown(scene, scene.seed(3, dtype=torch.float64), 4, 0.25)
+    state = grown(scene, scene.bind(3, dtype=torch.float64).start(), 4, 0.25)
     (slope,) = torch.autograd.grad(state.length[1], rate)
     assert slope.tolist() == pytest.approx([0.0, float(state.length[1].detach()), 0.0], rel=1e-12)
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import crowd, run, seeded
+from helpers import crowd, run, seeded, step
 
 import torchfilm as tf
 from torchfilm.physics.capsule import rotate
@@ -111,10 +111,10 @@ def test_contacts_do_not_draw_out_a_cell_that_does_not_grow(device, dtype, dim):
     grow, but a cell whose growth rate is 0 keeps its length to the bit."""
     cells = crowd(np.random.default_rng(0), 60, dim)
     scene = tf.Scene(tf.Growth(rate=[0.0, 0.1]), tf.Mechanics(dim=dim))
-    state = scene.seed(2, cells=cells, device=device, dtype=dtype)
+    state = scene.bind(2, cells=cells, device=device, dtype=dtype).start()
     still, first = state.colony == 0, state.length
     for _ in range(4):
-        before, state = state, scene.step(state, 0.025)
+        before, state = state, step(scene, state, 0.025)
         assert torch.equal(state.length[still], first[still]) and bool(
             (state.elongation[still] == 0).all()
         )

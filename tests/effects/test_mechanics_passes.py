@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from helpers import run, seeded
+from helpers import run, seeded, step
 
 import torchfilm as tf
 from torchfilm.effects.mechanics import _Run
@@ -166,7 +166,7 @@ def test_what_is_left_deep_is_found_wherever_it_is(dtype, limit, unilateral, mon
     )
     state = seeded(scene, cells, "cpu", dtype)
     for _ in range(4):
-        state = scene.step(state, 0.025)
+        state = step(scene, state, 0.025)
     assert len(seen) >= 4 and max(n for n, _, _ in seen) > 0
     if limit == "small":  # all that there is to go wrong went by
         assert (
@@ -179,7 +179,7 @@ def test_what_is_left_deep_is_found_wherever_it_is(dtype, limit, unilateral, mon
 def full_channel() -> tf.State:
     """Four colonies of some 150 cells in an open channel, under pressure."""
     scene = tf.scenes.channel()
-    *_, state = tf.simulate(scene, scene.seed(4, seed=1), until=10.0)
+    *_, state = tf.simulate(scene, scene.bind(4, seed=1).start(), until=10.0)
     return state
 
 
@@ -208,7 +208,7 @@ def test_more_passes_over_hard_contacts_keep_a_full_channel_apart(full_channel, 
     usual = float(tf.measure.overlaps(full_channel).mean.max())
     state, deepest_of_each = full_channel, []
     for _ in range(20):
-        state = scene.step(state, 0.025)
+        state = step(scene, state, 0.025)
         deepest_of_each.append(float(tf.measure.overlaps(state, mechanics.walls).worst.max()))
     assert float(tf.measure.overlaps(state).mean.max()) < 0.5 * usual
     # half a radius; cells on one another are 1 µm deep
@@ -221,14 +221,14 @@ def test_a_colony_whose_cells_stay_in_one_another_is_told():
     is loose. No solve fails."""
     scene = tf.Scene(tf.Mechanics(dim=3, alpha=1e4), founders=thrown(0.3, 6.0))
     with pytest.warns(RuntimeWarning, match=r"for 20 steps in colony 0 \(\d+ cells\).*alpha"):
-        states = list(tf.simulate(scene, scene.seed(2), until=25 * 0.025, dt=0.025))
+        states = list(tf.simulate(scene, scene.bind(2).start(), until=25 * 0.025, dt=0.025))
     assert int(states[0].reports["mechanics"].buried[0]) > 10
 
 
 def test_a_heap_that_parts_is_no_collapse():
     """Warnings are errors here."""
     scene = tf.Scene(tf.Mechanics(dim=3), founders=thrown(1.0, 6.0))
-    *_, state = tf.simulate(scene, scene.seed(2), until=40 * 0.025, dt=0.025)
+    *_, state = tf.simulate(scene, scene.bind(2).start(), until=40 * 0.025, dt=0.025)
     assert int(state.reports["mechanics"].buried.max()) == 0
 
 
@@ -249,7 +249,7 @@ def test_nearly_hard_contacts_converge_in_32_bits(alpha, unilateral):
         tf.Growth(rate=1.0),
         tf.Mechanics(dim=3, unilateral=unilateral, alpha=alpha, passes=1, max_iterations=500),
     )
-    report = scene.step(seeded(scene, cells, "cpu", torch.float32), 0.005).reports["mechanics"]
+    report = step(scene, seeded(scene, cells, "cpu", torch.float32), 0.005).reports["mechanics"]
     assert int((report.status == CONVERGED).sum()) >= 16
     assert float(report.iterations.double().median()) < 60
 

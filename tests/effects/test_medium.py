@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.tools.checks import InputError, SimulationError
 
@@ -55,7 +57,7 @@ def totals(state: tf.State, name: str = "ahl", inside: bool = True) -> Tensor:
 
 def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float) -> tf.State:
     for _ in range(steps):
-        state = scene.step(state, dt)
+        state = step(scene, state, dt)
         assert all(bool((r.status == 0).all()) for r in state.reports.values())
     return state
 
@@ -80,7 +82,7 @@ def test_amounts_are_conserved_through_growth_division_and_exchange(outside, dty
             outside=outside,
         ),
     )
-    state = scene.seed(2, seed=3, dtype=dtype, device=device)
+    state = scene.bind(2, seed=3, dtype=dtype, device=device).start()
     first, nodes = totals(state), state.layout.grid.nodes
     if outside == "grow":  # new room comes with what it holds at first
         first = first - 0.5 * state.layout.grid.counts * state.layout.grid.voxel_volume
@@ -104,7 +106,7 @@ def test_exchange_conserves_whatever_integrates_it(method):
         tf.Medium(ahl=tf.Signal(diffusion=20.0), box=BOX, spacing=4.0),
         exchanging(method=method, steps=4),
     )
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     assert float(totals(advance(scene, state, 20, 0.01))) == pytest.approx(
         float(totals(state)), rel=1e-13
     )
@@ -125,11 +127,11 @@ def test_one_voxel_relaxes_at_the_rate_of_its_membranes(count):
         depth=1.0,
     )
     scene = resting(medium, exchanging(D1=2.0, rtol=1e-8, atol=1e-12), cells)
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     volume, area, room = float(state.volume[0]), float(state.area[0]), 64.0 / count
     rate = 2.0 * area * (1 / volume + 1 / room)
     for k in range(1, 21):
-        state = scene.step(state, 0.01)
+        state = step(scene, state, 0.01)
         gap = float(state.fields["ahl"][0] - state.signals["ahl"][0])
         assert gap == pytest.approx(2.5 * math.exp(-rate * 0.01 * k), abs=1e-6)
     state = advance(scene, state, 10, 0.5)
@@ -152,7 +154,7 @@ def test_a_stiff_membrane_leaves_nothing_negative(start, dtype, device):
         exchanging(start, D1=1e6),
         cells,
     )
-    state = scene.seed(dtype=dtype, device=device)
+    state = scene.bind(dtype=dtype, device=device).start()
     first = float(totals(state))
     for _ in range(5):
         state = advance(scene, state, 1, 0.1)
@@ -180,7 +182,7 @@ def test_uptake_a_thousand_times_faster_than_the_step(dtype, device):
     scene = resting(
         tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=1.0), box=BOX, spacing=4.0), circuit, cells
     )
-    state = scene.seed(dtype=dtype, device=device)
+    state = scene.bind(dtype=dtype, device=device).start()
     first = float(totals(state))
     for _ in range(3):
         state = advance(scene, state, 1, 0.1)
@@ -200,7 +202,7 @@ FAR = [pytest.param(4e-3, id="a thousandth of a voxel"), pytest.param(40.0, id="
 def strayed(scene: tf.Scene, away: float) -> tf.State:
     """Three colonies of two cells, of which one of colony 1 is `away` µm beyond the box."""
     cells = tf.Cells([[0.0, 0.0], [0.0, 3.0]], [[1.0, 0.0]] * 2)
-    state = scene.seed(3, cells=cells, dtype=F64)
+    state = scene.bind(3, cells=cells, dtype=F64).start()
     position = state.position.clone()
     position[3] = torch.tensor([16.0 + away, 1.0], dtype=F64)
     return state.replace(position=position)
@@ -237,7 +239,7 @@ def test_drop_goes_on_without_the_colony_that_strayed(away):
 def test_the_grid_grows_to_the_cell_that_strays(away):
     scene = resting(tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, outside="grow"))
     state = strayed(scene, away)
-    first, grown = totals(state), scene.step(state, 0.1)
+    first, grown = totals(state), step(scene, state, 0.1)
     grid = grown.layout.grid
     assert float(grid.high[1, 0]) >= 16 + away + 4.0 and grid.shapes[0] == grid.shapes[2] == (
         8,
@@ -259,7 +261,7 @@ def test_an_open_box_keeps_count(away):
         exchanging(3.0, rtol=1e-8),
     )
     state = strayed(scene, away)
-    after = scene.step(state, 0.1)
+    after = step(scene, state, 0.1)
     left = 0.25 + 2.75 * math.exp(-float(state.area[3] / state.volume[3]) * 0.1)
     assert float(after.fields["ahl"][3]) == pytest.approx(left, rel=1e-6)
     beyond = after.fields["ahl_reservoir"]
@@ -294,7 +296,7 @@ def test_a_box_that_grows_along_x_only_says_where_else_it_ends():
         tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, outside="grow", grows="x")
     )
     state = strayed(scene, 40.0)
-    assert scene.step(state, 0.1).layout.grid.shapes[1] == (24, 8, 1)
+    assert step(scene, state, 0.1).layout.grid.shapes[1] == (24, 8, 1)
     up = state.replace(position=state.position.flip(1))
     with pytest.raises(SimulationError, match=r"colony 1.*beyond the box"):
         list(tf.simulate(scene, up, until=0.1, dt=0.1))
@@ -324,11 +326,11 @@ def test_first_values_and_constants_may_be_numbers_per_colony_or_functions(dtype
         spacing=4.0,
     )
     scene = tf.Scene(medium, founders=tf.Cells.single(2))
-    state = scene.seed(2, dtype=dtype)
+    state = scene.bind(2, dtype=dtype).start()
     assert state.signals["a"].dtype == dtype and state.signals["a"].reshape(2, -1).mean(
         1
     ).tolist() == [3.0, 4.0]
-    after = scene.step(state, 0.5)
+    after = step(scene, state, 0.5)
     close = {"rel": 20 * torch.finfo(dtype).eps}  # eight voxels an axis, two products
     assert after.signals["a"].reshape(2, -1).amax(1).tolist() == pytest.approx(
         [3.0, 4.0 * math.exp(-0.5)], **close
@@ -350,7 +352,7 @@ def test_obstacles_hold_nothing_at_first():
         ),
         founders=tf.Cells([[-5.0, 0]], [1.0, 0]),
     )
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     after = advance(scene, state, 3, 0.5)
     assert (
         float(state.signals["a"].sum()) == 32
@@ -367,10 +369,10 @@ def test_flat_cells_may_lie_in_a_box_with_three_dimensions():
         ),
         exchanging(1.0),
     )
-    after = scene.step(scene.seed(dtype=F64), 1e-6)
+    after = step(scene, scene.bind(dtype=F64).start(), 1e-6)
     layers = after.signals["ahl"].reshape(4, 4, 4).sum((0, 1))
     assert int(layers.argmax()) == 2  # the layer from 0 to 4 µm, with the plane z = 2 in its middle
-    assert float(totals(after)) == pytest.approx(float(totals(scene.seed(dtype=F64))), rel=1e-14)
+    assert float(totals(after)) == pytest.approx(float(totals(scene.bind(dtype=F64).start())), rel=1e-14)
 
 
 # --- what is refused ------------------------------------------------------------------------------
@@ -490,7 +492,7 @@ def test_bad_input_that_shows_with_the_cells_is_refused_by_seed(case):
     options, said = AT_SEED[case]
     scene = tf.Scene(tf.Medium(ahl=AHL, **{**GOOD, **options}), founders=tf.Cells.single(2))
     with pytest.raises(InputError, match="(?s)" + said):
-        scene.seed()
+        scene.bind().start()
 
 
 @pytest.mark.parametrize(
@@ -509,7 +511,7 @@ def test_a_function_of_places_must_give_one_good_number_for_each(signal):
         InputError,
         match=r"\(places\) of the signal 'ahl'.*(one number for each place|at least 0 everywhere)",
     ):
-        tf.Scene(tf.Medium(ahl=signal, **GOOD), founders=tf.Cells.single(2)).seed()
+        tf.Scene(tf.Medium(ahl=signal, **GOOD), founders=tf.Cells.single(2)).bind().start()
 
 
 @pytest.mark.parametrize(
@@ -528,8 +530,8 @@ def test_a_function_of_places_must_give_one_good_number_for_each(signal):
 def test_a_value_per_colony_must_have_one_for_each(medium, path):
     scene = tf.Scene(tf.Medium(**medium, **GOOD), founders=tf.Cells.single(2))
     with pytest.raises(InputError, match=f"{path}.* has 2 values, but the batch has 3 colonies"):
-        scene.seed(3)
-    assert scene.seed(2).colonies == 2
+        scene.bind(3).start()
+    assert scene.bind(2).start().colonies == 2
 
 
 def test_two_media_are_one_too_many():
@@ -547,6 +549,6 @@ def test_a_flat_box_in_space_is_refused_unless_it_is_meant():
     with pytest.raises(
         tf.InputError, match=r"Medium\.box.*of three dimensions in a 3-D scene.*depth"
     ):
-        scene().seed()
+        scene().bind().start()
     for given in ({"depth": 2.0}, {"outside": "grow"}, {"outside": "reservoir"}):
-        scene(**given).seed()
+        scene(**given).bind().start()

@@ -9,6 +9,8 @@ import pytest
 import torch
 from ruled import same
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.tools.checks import InputError
 
@@ -54,7 +56,7 @@ def volumes(state: tf.State) -> torch.Tensor:
 
 def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float = 0.05) -> tf.State:
     for _ in range(steps):
-        state = scene.step(state, dt)
+        state = step(scene, state, dt)
         assert all(bool((r.status == 0).all()) for r in state.reports.values())
     return state
 
@@ -72,7 +74,7 @@ def test_what_cells_gain_is_what_the_medium_loses(growth_yield, dtype, device):
     """Volume made / yield = amount gone; each step rounds some five sums, of which food is the
     greater by five."""
     scene = eating(tf.Monod("food", rate=1.0, half=0.2, growth_yield=growth_yield), cells=pack())
-    state = scene.seed(2, dtype=dtype, device=device)
+    state = scene.bind(2, dtype=dtype, device=device).start()
     last = advance(scene, state, 20)
     gain, loss = volumes(last) - volumes(state), food(state) - food(last)
     assert float(gain.min()) > 1.0
@@ -91,7 +93,7 @@ def test_with_food_in_plenty_growth_is_exponential():
     """s stays at 1 to a part 1e-6 and half = 1: dV/dt = V·rate/2, to the tolerance of the
     solver."""
     scene = eating(tf.Monod("food", rate=1.0, half=1.0, growth_yield=1e7))
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     last = advance(scene, state, 20)
     assert float(last.volume / state.volume) == pytest.approx(math.exp(0.5), rel=1e-5)
     assert float(last.growth_rate) == pytest.approx(0.5, rel=1e-5)
@@ -102,7 +104,7 @@ def test_abundance_does_not_drown_what_is_eaten(dtype, supply):
     """In float32 a cell's meal is less than the last bit of a rich medium: growth must not be read
     off the difference."""
     scene = eating(tf.Monod("food", rate=1.0, half=0.1), initial=supply)
-    last = scene.step(scene.seed(dtype=dtype), 0.025)
+    last = step(scene, scene.bind(dtype=dtype).start(), 0.025)
     assert float(last.growth_rate) == pytest.approx(supply / (0.1 + supply), rel=1e-4)
 
 
@@ -111,7 +113,7 @@ def test_growth_follows_monod(half):
     scene = eating(
         tf.Monod("food", rate=[1.0, 1.0, 2.0], half=half, growth_yield=1e7), initial=[1.0, 0.2, 0.2]
     )
-    last = scene.step(scene.seed(3, dtype=F64), 1e-4)
+    last = step(scene, scene.bind(3, dtype=F64).start(), 1e-4)
     wanted = [r * s / (half + s) for r, s in ((1.0, 1.0), (1.0, 0.2), (2.0, 0.2))]
     # over a step of 1e-4 h the volume grows by that much
     assert last.growth_rate.tolist() == pytest.approx(wanted, rel=2e-4)
@@ -125,7 +127,7 @@ def test_in_a_closed_voxel_food_runs_out(dtype):
         box=((-4.0, -4.0), (4.0, 4.0)),
         spacing=8.0,
     )
-    state = scene.seed(dtype=dtype)
+    state = scene.bind(dtype=dtype).start()
     last = advance(scene, state, 60, 0.1)
     assert 0 <= float(food(last)) < 1e-6
     assert float(last.volume) == pytest.approx(float(state.volume) + 0.5 * 0.1 * 64, rel=1e-5)
@@ -138,7 +140,7 @@ def test_hunger_a_thousand_times_faster_than_the_step(dtype, device):
     scene = eating(
         tf.Monod("food", rate=1e4, half=1.0, growth_yield=0.05), initial=0.02, cells=pack()
     )
-    state = scene.seed(dtype=dtype, device=device)
+    state = scene.bind(dtype=dtype, device=device).start()
     first, start = float(food(state)), float(volumes(state))
     for _ in range(3):
         state = advance(scene, state, 1, 0.1)
@@ -158,16 +160,16 @@ def test_daughters_begin_to_eat_anew():
         tf.Monod("food", rate=1.5, half=0.1, growth_yield=2.0),
         more=(tf.Division(length=2.5), tf.Mechanics(dim=2)),
     )
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     while state.cells == 1:
-        before, state = state, scene.step(state, 0.05)
+        before, state = state, step(scene, state, 0.05)
     assert float(before.food_eaten) > 0.2 and float(state.food_eaten.max()) < 0.1
     assert float((state.births[-1].parents.food_eaten).max()) == float(before.food_eaten)
 
 
 def test_without_food_nothing_happens(dtype):
     scene = eating(tf.Monod("food", rate=1.0, half=0.1), initial=0.0)
-    state = scene.seed(dtype=dtype)
+    state = scene.bind(dtype=dtype).start()
     last = advance(scene, state, 3)
     assert (
         torch.equal(last.length, state.length)
@@ -187,11 +189,11 @@ def test_a_cell_beyond_an_open_box_eats_from_the_reservoir(away):
         ),
         founders=tf.Cells([[0.0, 0.0], [0.0, 3.0]], [1.0, 0.0]),
     )
-    state = scene.seed(dtype=F64)
+    state = scene.bind(dtype=F64).start()
     position = state.position.clone()
     position[1, 0] = 8.0 + away
     state = state.replace(position=position)
-    after = scene.step(state, 0.1)
+    after = step(scene, state, 0.1)
     gained = after.volume - state.volume
     assert float(gained[1]) == pytest.approx(
         float(state.volume[1]) * math.expm1(0.75 * 0.1), rel=1e-12
@@ -209,7 +211,7 @@ def test_a_colony_is_the_same_in_any_batch(dtype, device):
         more=(tf.Division(length=tf.Uniform(3.0, 3.4)), tf.Mechanics(dim=2)),
         outside="grow",
     )
-    first = scene.seed(3, seed=4, dtype=dtype, device=device)
+    first = scene.bind(3, seed=4, dtype=dtype, device=device).start()
     last = advance(scene, first, 30)
     assert int(last.counts.max()) >= 4
     for places in ([2], [1, 0]):
@@ -248,7 +250,7 @@ def test_what_is_missing_is_told():
         tf.Monod("food", rate=[1.0, 2.0]), tf.Growth(), medium, founders=tf.Cells.single(2)
     )
     with pytest.raises(InputError, match=r"Monod\.rate has 2 values, but the batch has 3"):
-        scene.seed(3)
+        scene.bind(3).start()
 
 
 def test_explain_says_who_drives_whom():

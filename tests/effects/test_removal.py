@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.effect import Effect
 
@@ -23,7 +25,7 @@ class Drift(Effect):
     def writes(self):
         return ("position",)
 
-    def step(self, state, dt):
+    def step(self, state, dt, values):
         move = torch.zeros_like(state.position)
         move[:, 0] = self.speed * dt
         return state.replace(position=state.position + move)
@@ -39,17 +41,17 @@ def at(*x: float, dim: int = 2) -> tf.Cells:
 
 def test_cells_whose_centre_leaves_are_gone(device, dtype):
     scene = tf.Scene(Drift(), tf.Removal((-10.0, -10.0), (10.0, 10.0)), founders=at(0.0, 5.0, 9.5))
-    state = scene.step(scene.seed(2, device=device, dtype=dtype), 1.0)
+    state = step(scene, scene.bind(2, device=device, dtype=dtype).start(), 1.0)
     assert state.counts.tolist() == [2, 2]
     assert state.uid.tolist() == [0, 1, 0, 1]
     (note,) = state.ended
     assert note.fate == "left" and note.uid.tolist() == [2, 2] and note.colony_id.tolist() == [0, 1]
-    assert not scene.step(state, 1.0).ended
+    assert not step(scene, state, 1.0).ended
 
 
 def test_a_cell_on_the_edge_stays():
     scene = tf.Scene(Drift(), tf.Removal((-10.0, -10.0), (10.0, 10.0)), founders=at(9.0))
-    state = scene.step(scene.seed(), 1.0)
+    state = step(scene, scene.bind().start(), 1.0)
     assert state.cells == 1 and float(state.position[0, 0]) == 10.0
 
 
@@ -58,7 +60,7 @@ def test_an_open_side_loses_none(dim):
     low, high = [-math.inf] * dim, [math.inf] * dim
     high[1] = 1.0
     scene = tf.Scene(Drift(speed=1e6), tf.Removal(low, high), founders=at(0.0, dim=dim))
-    assert scene.step(scene.seed(), 1.0).cells == 1
+    assert step(scene, scene.bind().start(), 1.0).cells == 1
 
 
 def test_a_colony_may_lose_all_its_cells_and_the_others_go_on():
@@ -71,9 +73,9 @@ def test_a_colony_may_lose_all_its_cells_and_the_others_go_on():
         tf.Removal((-10, -10), (10, 10)),
         founders=cells,
     )
-    state = scene.seed()
+    state = scene.bind().start()
     for _ in range(16):
-        state = scene.step(state, 0.0625)
+        state = step(scene, state, 0.0625)
     assert state.counts.tolist() == [0, 2] and state.colonies == 2
     assert torch.isfinite(state.position).all()
 
@@ -86,7 +88,7 @@ def test_a_region_of_several_pieces_is_all_of_them():
         tf.Removal((-5, -5), (5, 5)),
         founders=at(0.0, 4.5),
     )
-    assert scene.step(scene.seed(), 1.0).uid.tolist() == [0]
+    assert step(scene, scene.bind().start(), 1.0).uid.tolist() == [0]
 
 
 def test_the_results_file_remembers_who_left_and_who_was_removed(tmp_path):
@@ -99,7 +101,7 @@ def test_the_results_file_remembers_who_left_and_who_was_removed(tmp_path):
         tf.Removal((-10.0, -10.0), (10.0, 10.0)),
         founders=at(0.0, 1.0, 8.5),
     )
-    for _ in tf.simulate(scene, scene.seed(2), until=4.0, dt=1.0, record=tmp_path / "run.h5"):
+    for _ in tf.simulate(scene, scene.bind(2).start(), until=4.0, dt=1.0, record=tmp_path / "run.h5"):
         pass
     with tf.Results(tmp_path / "run.h5") as results:
         found = results.lineage()
@@ -117,7 +119,7 @@ def test_removed_and_divided_in_one_step_are_both_noted(tmp_path):
         cells.remove_flag = cells.uid == 1
 
     scene = tf.Scene(tf.Rules(update), tf.Division(), founders=at(0.0, 5.0))
-    state = scene.step(scene.seed(), 0.1)
+    state = step(scene, scene.bind().start(), 0.1)
     assert {n.fate: n.uid.tolist() for n in state.ended} == {"removed": [1], "divided": [0]}
     assert state.uid.tolist() == [2, 3]
 
@@ -141,9 +143,9 @@ def test_bad_regions_are_refused(low, high):
 
 def test_wrong_dimension_is_refused():
     with pytest.raises(tf.InputError, match=r"Removal\.low.*3 numbers"):
-        tf.Scene(tf.Removal((-1, -1), (1, 1)), founders=at(0.0, dim=3)).seed()
+        tf.Scene(tf.Removal((-1, -1), (1, 1)), founders=at(0.0, dim=3)).bind().start()
 
 
 def test_a_cell_outside_from_the_start_is_refused():
     with pytest.raises(tf.InputError, match=r"cell 1 of colony 0.*20"):
-        tf.Scene(tf.Removal((-10, -10), (10, 10)), founders=at(0.0, 20.0)).seed()
+        tf.Scene(tf.Removal((-10, -10), (10, 10)), founders=at(0.0, 20.0)).bind().start()

@@ -8,6 +8,8 @@ import pytest
 import torch
 from ruled import pair_of_cells, run, same, short_update
 
+from helpers import step
+
 import torchfilm as tf
 
 # --- the paper's listings -------------------------------------------------------------------------
@@ -34,7 +36,7 @@ def test_the_papers_update_doubles_every_twenty_minutes():
     """Volume grows by e^0.035 a minute; the founder, V = 2.094, passes 3 after ln(3/2.094)/0.035 =
     10.3 minutes."""
     scene = minutes_scene(paper_update)
-    first = scene.seed()
+    first = scene.bind().start()
     state = run(scene, first, 11, 1.0)
     assert state.cells == 1
     assert float(state.volume) == pytest.approx(float(first.volume) * 2 ** (11 / 19.804), rel=1e-4)
@@ -43,7 +45,7 @@ def test_the_papers_update_doubles_every_twenty_minutes():
 
 def test_loop_and_whole_tensors_do_the_same():
     states = [
-        run(scene := minutes_scene(u), scene.seed(2, seed=4), 60, 1.0)
+        run(scene := minutes_scene(u), scene.bind(2, seed=4).start(), 60, 1.0)
         for u in (paper_update, tensor_update, short_update)
     ]
     assert states[0].cells >= 8
@@ -61,7 +63,7 @@ def test_a_variable_of_the_users_own_keeps_its_value_and_is_inherited():
     scene = tf.Scene(
         tf.Rules(update, variables={"age": 0.0}), tf.Division(), founders=pair_of_cells()
     )
-    state = run(scene, scene.seed(dtype=torch.float64), 4)
+    state = run(scene, scene.bind(dtype=torch.float64).start(), 4)
     assert state.cells == 4
     assert state.age.tolist() == pytest.approx([0.4] * 4, rel=1e-12)
 
@@ -73,7 +75,7 @@ def test_a_first_value_is_the_first_value():
         ),
         founders=pair_of_cells(),
     )
-    first = scene.seed()
+    first = scene.bind().start()
     assert first.energy.tolist() == [3.0, 3.0], "trying the rule must not run it"
     assert run(scene, first, 2).energy.tolist() == [12.0, 12.0]
 
@@ -86,7 +88,7 @@ def test_a_new_name_becomes_a_variable():
         cells.weight = 1
 
     scene = tf.Scene(tf.Rules(update), founders=pair_of_cells())
-    state = run(scene, scene.seed(), 1)
+    state = run(scene, scene.bind().start(), 1)
     assert state.near.tolist() == [True, False] and state.near.dtype == torch.bool
     assert state.rank.tolist() == [0, 2] and state.rank.dtype == torch.int64
     assert state.place.shape == (2, 2) and float(state.place[1, 0]) == 40.0
@@ -99,7 +101,7 @@ def test_a_new_variable_from_a_loop():
             cell.score = float(cell.uid) + 0.5
 
     scene = tf.Scene(tf.Rules(update), founders=pair_of_cells())
-    assert run(scene, scene.seed(), 2).score.tolist() == [0.5, 1.5]
+    assert run(scene, scene.bind().start(), 2).score.tolist() == [0.5, 1.5]
 
 
 def test_cell_type_is_a_whole_number_and_drives_growth():
@@ -108,7 +110,7 @@ def test_cell_type_is_a_whole_number_and_drives_growth():
         cells.growth_rate = torch.where(cells.cell_type == 1, 1.0, 0.0)
 
     scene = tf.Scene(tf.Rules(update), tf.Growth(law="length"), founders=pair_of_cells())
-    state = run(scene, scene.seed(dtype=torch.float64), 1, 1.0)
+    state = run(scene, scene.bind(dtype=torch.float64).start(), 1, 1.0)
     assert state.cell_type.tolist() == [0, 1] and state.cell_type.dtype == torch.int64
     assert state.length.tolist() == pytest.approx([2.0, 2 * 2.718281828459045], rel=1e-12)
 
@@ -138,7 +140,7 @@ def test_table_1_names():
     scene = tf.Scene(
         tf.Rules(update), tf.Growth(rate=0.25), tf.Division(length=4.0), founders=cells
     )
-    scene.step(scene.seed(dtype=torch.float64), 0.1)
+    step(scene, scene.bind(dtype=torch.float64).start(), 0.1)
     pi = 3.141592653589793
     assert seen["pos"].tolist() == [[1.0, 2.0]] and seen["dir"].tolist() == [[0.0, 1.0]]
     assert float(seen["volume"]) == pytest.approx(pi * 0.25 * (2 + 2 / 3), rel=1e-14)
@@ -156,7 +158,7 @@ def test_time_step_and_count_are_readable():
         tf.Rules(lambda cells: seen.append((cells.time, cells.dt, cells.count, len(cells)))),
         founders=pair_of_cells(),
     )
-    run(scene, scene.seed(3), 2, 0.25)
+    run(scene, scene.bind(3).start(), 2, 0.25)
     assert seen[-2:] == [(0.0, 0.25, 6, 6), (0.25, 0.25, 6, 6)]
 
 
@@ -176,7 +178,7 @@ def test_contacts_and_their_count():
 
     cells = tf.Cells([[0.0, 0.0], [1.02, 0.0], [2.04, 0.0], [30.0, 0.0]], [[0.0, 1.0]] * 4)
     scene = tf.Scene(tf.Rules(update), founders=cells)
-    state = run(scene, scene.seed(2), 1)
+    state = run(scene, scene.bind(2).start(), 1)
     assert state.touching.tolist() == [1, 2, 1, 0] * 2
     assert seen["pairs"] == {(0, 1), (1, 2), (4, 5), (5, 6)}
     assert seen["wide"] == 6, "the outer two of the three are 1.04 µm apart"
@@ -195,7 +197,7 @@ def test_greatest_smallest_and_sum_of_the_colony():
 
     cells = tf.Cells([[1.0, 0.0], [5.0, 0.0], [-3.0, 0.0]], [[1.0, 0.0]] * 3, colony=[0, 0, 1])
     scene = tf.Scene(tf.Rules(update), founders=cells)
-    run(scene, scene.seed(), 1)
+    run(scene, scene.bind().start(), 1)
     assert seen == {"max": [5.0, 5.0, -3.0], "min": [1.0, 1.0, -3.0], "sum": [6.0, 6.0, -3.0]}
 
 
@@ -204,7 +206,7 @@ def test_rules_remove_cells():
         cells.remove_flag = cells.position[:, 0] > 10
 
     scene = tf.Scene(tf.Rules(update), founders=pair_of_cells())
-    state = scene.step(scene.seed(2), 0.1)
+    state = step(scene, scene.bind(2).start(), 0.1)
     assert state.uid.tolist() == [0, 0]
     (note,) = state.ended
     assert (
@@ -219,7 +221,7 @@ def test_rules_remove_cells_one_by_one():
                 cell.remove_flag = True
 
     scene = tf.Scene(tf.Rules(update), founders=pair_of_cells())
-    assert scene.step(scene.seed(), 0.1).uid.tolist() == [1]
+    assert step(scene, scene.bind().start(), 0.1).uid.tolist() == [1]
 
 
 def test_removing_everyone_is_no_accident():
@@ -229,7 +231,7 @@ def test_removing_everyone_is_no_accident():
     scene = tf.Scene(
         tf.Rules(update), tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2)
     )
-    state = run(scene, scene.seed(2), 6)
+    state = run(scene, scene.bind(2).start(), 6)
     assert state.cells == 0 and state.colonies == 2
 
 
@@ -242,7 +244,7 @@ def test_draws_belong_to_cell_and_step_and_not_to_the_batch():
         cells.two = cells.random()
 
     scene = tf.Scene(tf.Rules(update), founders=pair_of_cells())
-    first = scene.seed(300)
+    first = scene.bind(300).start()
     state = run(scene, first, 1)
     drawn = torch.cat([state.one, state.two])
     assert torch.unique(drawn).numel() == 1200 and ((drawn > 0) & (drawn < 1)).all()
@@ -252,7 +254,7 @@ def test_draws_belong_to_cell_and_step_and_not_to_the_batch():
     assert torch.equal(part.one, torch.cat([state.one[14:16], state.one[6:8]]))
     later = run(scene, state, 1)
     assert not (later.one == state.one).any()
-    assert not (run(scene, scene.seed(300, seed=1), 1).one == state.one).any()
+    assert not (run(scene, scene.bind(300, seed=1).start(), 1).one == state.one).any()
 
 
 def test_random_growth_in_a_batch_is_random_growth_alone():
@@ -262,7 +264,7 @@ def test_random_growth_in_a_batch_is_random_growth_alone():
     scene = tf.Scene(
         tf.Rules(update), tf.Growth(), tf.Division(length=tf.Uniform(3.0, 4.0)), tf.Mechanics(dim=2)
     )
-    whole = scene.seed(3, seed=9)
+    whole = scene.bind(3, seed=9).start()
     alone = [run(scene, whole.select([k]), 40, 0.05) for k in range(3)]
     whole = run(scene, whole, 40, 0.05)
     assert whole.cells > 8
@@ -283,8 +285,8 @@ def test_writing_in_place_leaves_the_old_state_alone():
     scene = tf.Scene(
         tf.Rules(update, variables={"age": 0.0}), tf.Growth(rate=1.0), founders=pair_of_cells()
     )
-    old = scene.seed()
-    new = scene.step(old, 0.0)
+    old = scene.bind().start()
+    new = step(scene, old, 0.0)
     assert old.age.tolist() == [0.0, 0.0] and old.growth_rate.tolist() == [1.0, 1.0]
     assert new.age.tolist() == [1.0, 1.0] and new.growth_rate.tolist() == [10.0, 2.0]
 
@@ -299,7 +301,7 @@ def test_writing_into_what_is_read_only_never_reaches_the_state(name):
         getattr(cells, name)[0] = 1
 
     scene = tf.Scene(tf.Growth(rate=1.0), founders=pair_of_cells(gap=3.0))
-    state = scene.seed()
+    state = scene.bind().start()
     state = state.replace(**{name: getattr(state, name) + 3})
     before = {
         n: getattr(state, n).clone()
@@ -308,7 +310,7 @@ def test_writing_into_what_is_read_only_never_reaches_the_state(name):
     ruled = tf.Rules(update)
     # a colony that the batch has not is refused too
     with contextlib.suppress(AttributeError, RuntimeError, TypeError, IndexError):
-        ruled.step(state, 0.1)
+        step(ruled, state, 0.1)
     for n, value in before.items():
         assert torch.equal(getattr(state, n), value), f"the rule changed {n} of the frozen state"
 
@@ -340,12 +342,12 @@ def write(name, value):
 )
 def test_what_table_1_only_reads_cannot_be_written(name):
     with pytest.raises(AttributeError, match="can only be read"):
-        tf.Scene(tf.Rules(write(name, 1.0))).seed()
+        tf.Scene(tf.Rules(write(name, 1.0))).bind().start()
 
 
 def test_a_misspelt_name_is_told_with_those_that_exist():
     with pytest.raises(AttributeError, match=r"'lenght'.*length.*growth_rate"):
-        tf.Scene(tf.Rules(lambda cells: cells.lenght), tf.Growth()).seed()
+        tf.Scene(tf.Rules(lambda cells: cells.lenght), tf.Growth()).bind().start()
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 2), (1, 2, 1)])
@@ -353,17 +355,17 @@ def test_a_wrong_shape_is_told_before_anything_runs(shape):
     with pytest.raises(ValueError, match=r"cells\.growth_rate.*shape"):
         tf.Scene(
             tf.Rules(write("growth_rate", torch.ones(shape))), tf.Growth(), founders=pair_of_cells()
-        ).seed()
+        ).bind().start()
 
 
 def test_a_new_variable_of_wrong_length_is_told():
     with pytest.raises(ValueError, match=r"cells\.mine.*shape"):
-        tf.Scene(tf.Rules(write("mine", torch.ones(5))), founders=pair_of_cells()).seed()
+        tf.Scene(tf.Rules(write("mine", torch.ones(5))), founders=pair_of_cells()).bind().start()
 
 
 def test_a_value_that_is_no_number_is_told_by_name():
     with pytest.raises((ValueError, TypeError), match="growth_rate"):
-        tf.Scene(tf.Rules(write("growth_rate", "fast")), tf.Growth()).seed()
+        tf.Scene(tf.Rules(write("growth_rate", "fast")), tf.Growth()).bind().start()
 
 
 def test_a_variable_that_first_comes_up_in_mid_run_is_told():
@@ -373,7 +375,7 @@ def test_a_variable_that_first_comes_up_in_mid_run_is_told():
 
     scene = tf.Scene(tf.Rules(update), founders=pair_of_cells())
     with pytest.raises(tf.SimulationError, match=r"'late'.*variables="):
-        run(scene, scene.seed(), 3)
+        run(scene, scene.bind().start(), 3)
 
 
 @pytest.mark.parametrize(
@@ -399,7 +401,7 @@ def test_a_negative_rate_from_a_rule_never_makes_a_negative_length(law):
         tf.Rules(write("growth_rate", -1.0)), tf.Growth(law=law), founders=pair_of_cells()
     )
     try:
-        state = run(scene, scene.seed(), 4, 1.0)
+        state = run(scene, scene.bind().start(), 4, 1.0)
     except (tf.InputError, tf.SimulationError):
         return
     assert (state.length >= 0).all()
@@ -410,7 +412,7 @@ def test_a_negative_rate_from_a_rule_never_makes_a_negative_length(law):
 
 def test_what_a_rule_reads_and_writes_is_declared():
     scene = tf.Scene(tf.Rules(short_update), tf.Growth(), tf.Division(), founders=pair_of_cells())
-    scene.seed()
+    scene.bind().start()
     found = scene.couplings()
     assert ("rules", "growth_rate", "growth") in found
     assert ("rules", "divide_flag", "division") in found
@@ -424,7 +426,7 @@ def test_reading_a_derived_quantity_is_reading_the_length(name):
         cells.big = getattr(cells, name) > 3
 
     scene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), founders=pair_of_cells())
-    scene.seed()
+    scene.bind().start()
     assert "growth" in {w for w, _, r in scene.couplings() if r == "rules"}
 
 
@@ -435,7 +437,7 @@ def test_looking_for_contacts_is_reading_the_geometry():
     scene = tf.Scene(
         tf.Rules(update), tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=pair_of_cells()
     )
-    scene.seed()
+    scene.bind().start()
     assert {"growth", "mechanics"} <= {w for w, _, r in scene.couplings() if r == "rules"}
 
 
@@ -448,14 +450,14 @@ def test_a_rule_that_would_fail_with_two_cells_is_told_at_once_with_one():
     with pytest.raises(
         tf.InputError, match=r"test_rules\.py, line \d+ \(if cells\.length > 3:\).*torch\.where"
     ):
-        scene.seed()
+        scene.bind().start()
 
 
 def test_a_rule_that_names_a_new_variable_sees_one_founder_as_it_is():
     def update(cells):
         cells.age = cells.length * 0 + 2.0
 
-    state = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division()).seed()
+    state = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division()).bind().start()
     assert state.cells == 1 and state.age.shape == (1,)
 
 
@@ -465,5 +467,5 @@ def test_one_number_of_all_cells_is_refused_where_cells_divide(ask):
         cells.growth_rate = 1.0 if ask(cells.length) else 0.0
 
     with pytest.raises(tf.InputError, match=r"test_rules\.py, line \d+ .*torch\.where"):
-        tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division()).seed()
-    assert tf.Scene(tf.Rules(update), tf.Growth(rate=0.5)).seed().cells == 1
+        tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division()).bind().start()
+    assert tf.Scene(tf.Rules(update), tf.Growth(rate=0.5)).bind().start().cells == 1

@@ -9,6 +9,8 @@ import pytest
 import torch
 from ruled import Species, pair_of_cells
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.effect import Effect
 
@@ -24,9 +26,9 @@ def test_the_papers_divide_partitions_at_random():
         daughter2.species[:, 0] = parent.species[:, 0] * r2
 
     scene = tf.Scene(tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells())
-    state = scene.seed(3)
+    state = scene.bind(3).start()
     state = state.with_fields(divide_flag=torch.tensor([True, False] * 3))
-    after = scene.step(state, 0.1)
+    after = step(scene, state, 0.1)
     first, second = after.species[[0, 3, 6]], after.species[[1, 4, 7]]
     assert torch.allclose(first[:, 0] + second[:, 0], torch.ones(3), rtol=1e-6)
     assert 0 < float(first[0, 0]) < 1
@@ -42,12 +44,12 @@ def test_divide_draws_for_each_division_and_not_for_the_batch():
         daughter2.species = parent.species * (1 - r1).unsqueeze(1)
 
     scene = tf.Scene(tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells())
-    whole = scene.seed(4)
+    whole = scene.bind(4).start()
     whole = whole.with_fields(divide_flag=torch.ones(8, dtype=torch.bool))
-    after = scene.step(whole, 0.1)
+    after = step(scene, whole, 0.1)
     share = after.species[0::2, 0]
     assert torch.unique(share).numel() == 8 and ((share > 0) & (share < 1)).all()
-    alone = scene.step(whole.select([2]), 0.1)
+    alone = step(scene, whole.select([2]), 0.1)
     assert torch.equal(alone.species, after.species[after.colony == 2])
 
 
@@ -58,8 +60,8 @@ def test_divide_may_set_flags_types_and_read_geometry():
 
     cells = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 3.0, cell_type=[4])
     scene = tf.Scene(tf.Rules(divide=divide), tf.Growth(rate=0.0), tf.Division(), founders=cells)
-    state = scene.seed().with_fields(divide_flag=torch.tensor([True]))
-    after = scene.step(state, 0.1)
+    state = scene.bind().start().with_fields(divide_flag=torch.tensor([True]))
+    after = step(scene, state, 0.1)
     assert after.cell_type.tolist() == [5, 4] and after.cell_type.dtype == torch.int64
     assert after.growth_rate.tolist() == [0.0, 0.5]
 
@@ -69,8 +71,8 @@ def test_division_views_refuse_what_makes_no_sense():
         scene = tf.Scene(
             tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells()
         )
-        state = scene.seed()
-        scene.step(state.with_fields(divide_flag=torch.ones(2, dtype=torch.bool)), 0.1)
+        state = scene.bind().start()
+        step(scene, state.with_fields(divide_flag=torch.ones(2, dtype=torch.bool)), 0.1)
 
     def write_parent(parent, daughter1, daughter2):
         parent.species = 1.0
@@ -118,7 +120,7 @@ def test_what_divide_can_only_read_cannot_be_changed_in_place(kind):
     name, divide = IN_PLACE[kind]
     scene = tf.Scene(tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells())
     with pytest.raises(AttributeError, match=rf"{name}.*can only be read"):
-        scene.step(flagged_to_divide(scene.seed()), 0.1)
+        step(scene, flagged_to_divide(scene.bind().start()), 0.1)
 
 
 def flagged_to_divide(state: tf.State) -> tf.State:
@@ -133,7 +135,7 @@ def test_fields_of_daughters_may_be_changed_in_place_and_geometry_worked_with():
         half += parent.position[:, 0]
 
     scene = tf.Scene(tf.Rules(divide=divide), tf.Division(), Species(), founders=pair_of_cells())
-    after = scene.step(flagged_to_divide(scene.seed()), 0.1)
+    after = step(scene, flagged_to_divide(scene.bind().start()), 0.1)
     assert after.species.tolist() == [[3.0, 1.0], [2.0, 2.0]] * 2
 
 
@@ -148,10 +150,10 @@ def test_a_colony_that_is_not_finite_is_no_fault_of_the_rules():
         daughter1.growth_rate = 0.0 * daughter1.position[:, 0] + parent.position[:, 0]
 
     scene = tf.Scene(tf.Rules(update, divide), tf.Growth(), tf.Division(), founders=pair_of_cells())
-    state = flagged_to_divide(scene.seed())
+    state = flagged_to_divide(scene.bind().start())
     position = state.position.clone()
     position[0, 0] = float("nan")
-    assert scene.step(state.replace(position=position), 0.1).cells == 4
+    assert step(scene, state.replace(position=position), 0.1).cells == 4
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,7 @@ class Plate(Effect):
             ),
         )
 
-    def step(self, state, dt):
+    def step(self, state, dt, values):
         return state
 
 
@@ -186,7 +188,7 @@ def test_divide_reads_the_colonys_own_quantities_and_cannot_write_them():
         Plate(),
         founders=pair_of_cells(),
     )
-    after = scene.step(flagged_to_divide(scene.seed(3)), 0.1)
+    after = step(scene, flagged_to_divide(scene.bind(3).start()), 0.1)
     assert after.growth_rate[::2].tolist() == [
         2.0,
         2.0,
@@ -202,7 +204,7 @@ def test_divide_reads_the_colonys_own_quantities_and_cannot_write_them():
         founders=pair_of_cells(),
     )
     with pytest.raises(tf.InputError, match=r"'plate'.*a colony's can only be read"):
-        wrong.seed()
+        wrong.bind().start()
 
 
 def test_what_a_divide_rule_writes_is_declared():
@@ -212,5 +214,5 @@ def test_what_a_divide_rule_writes_is_declared():
     scene = tf.Scene(
         tf.Rules(divide=divide), tf.Growth(rate=1.0), tf.Division(), founders=pair_of_cells()
     )
-    scene.seed()
+    scene.bind().start()
     assert "growth" in {r for w, _, r in scene.couplings() if w.startswith("rules")}

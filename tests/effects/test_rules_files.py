@@ -6,6 +6,8 @@ import pytest
 import torch
 from ruled import pair_of_cells, run
 
+from helpers import step
+
 import torchfilm as tf
 
 
@@ -25,7 +27,7 @@ def watched(path, *effects: tf.Effect) -> tuple[tf.Rules, tf.Scene]:
 def test_rules_from_a_file(rules_file):
     for given in (rules_file, str(rules_file)):
         scene = tf.Scene(tf.Rules(given), tf.Growth(), founders=pair_of_cells())
-        assert run(scene, scene.seed(), 1).growth_rate.tolist() == [1.0, 1.0]
+        assert run(scene, scene.bind().start(), 1).growth_rate.tolist() == [1.0, 1.0]
 
 
 def test_a_rules_file_may_define_dataclasses(rules_file):
@@ -34,13 +36,13 @@ def test_a_rules_file_may_define_dataclasses(rules_file):
         " update(cells):\n    cells.growth_rate = P().rate\n"
     )
     scene = tf.Scene(tf.Rules(rules_file), tf.Growth(), founders=pair_of_cells())
-    assert run(scene, scene.seed(), 1).growth_rate.tolist() == [0.5, 0.5]
+    assert run(scene, scene.bind().start(), 1).growth_rate.tolist() == [0.5, 0.5]
 
 
 def test_an_edit_takes_effect_at_the_next_step(rules_file):
     rules, scene = watched(rules_file)
     rates = []
-    for state in tf.simulate(scene, scene.seed(), until=0.6, dt=0.1):
+    for state in tf.simulate(scene, scene.bind().start(), until=0.6, dt=0.1):
         rates.append(float(state.growth_rate[0]))
         if state.step == 3:
             rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
@@ -53,7 +55,7 @@ def test_an_edit_takes_effect_at_the_next_step(rules_file):
 def test_without_watching_an_edit_waits(rules_file):
     rules, scene = watched(rules_file)
     rules.source.watching = False
-    state = run(scene, scene.seed(), 1)
+    state = run(scene, scene.bind().start(), 1)
     rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
     assert run(scene, state, 2).growth_rate.tolist() == [1.0, 1.0] and not rules.source.messages
 
@@ -77,7 +79,7 @@ BROKEN = {
 def test_a_broken_edit_is_told_and_the_run_goes_on_with_the_last_good_one(rules_file, kind):
     text, word = BROKEN[kind]
     rules, scene = watched(rules_file)
-    state = run(scene, scene.seed(), 2)
+    state = run(scene, scene.bind().start(), 2)
     rules_file.write_text(text)
     state = run(scene, state, 3)
     assert state.growth_rate.tolist() == [1.0, 1.0] and state.step == 5
@@ -90,7 +92,7 @@ def test_a_broken_edit_is_told_and_the_run_goes_on_with_the_last_good_one(rules_
 
 def test_a_file_that_is_gone_for_a_moment_is_no_error(rules_file):
     _, scene = watched(rules_file)
-    state = run(scene, scene.seed(), 1)
+    state = run(scene, scene.bind().start(), 1)
     rules_file.unlink()
     state = run(scene, state, 1)
     rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
@@ -101,7 +103,7 @@ def test_an_edit_that_breaks_only_later_does_not_end_the_run(rules_file):
     """It passes when it is taken up and fails two steps after: the last good rules must carry
     on."""
     rules, scene = watched(rules_file)
-    state = run(scene, scene.seed(), 1)
+    state = run(scene, scene.bind().start(), 1)
     rules_file.write_text(
         "def update(cells):\n    cells.growth_rate = 2.0 if cells.time < 0.25 else speed\n"
     )
@@ -115,7 +117,7 @@ DIVIDE = "def divide(parent, daughter1, daughter2):\n    daughter1.growth_rate =
 
 def grow_and_divide(path) -> tuple[tf.Rules, tf.Scene, tf.State]:
     rules, scene = watched(path, tf.Growth(rate=1.0), tf.Division())
-    return rules, scene, scene.seed()
+    return rules, scene, scene.bind().start()
 
 
 def flagged(state: tf.State) -> tf.State:
@@ -128,17 +130,17 @@ def flagged(state: tf.State) -> tf.State:
 def test_divide_in_a_file_and_its_edit(rules_file):
     rules_file.write_text(DIVIDE.format(5.0))
     _, scene, state = grow_and_divide(rules_file)
-    state = scene.step(flagged(state), 0.1)
+    state = step(scene, flagged(state), 0.1)
     assert state.growth_rate.tolist() == [5.0, 1.0] * 2
     rules_file.write_text(DIVIDE.format(6.0))
     long_enough = flagged(state).replace(length=torch.full_like(state.length, 3.0))
-    assert scene.step(long_enough, 0.1).growth_rate.tolist() == [6.0, 1.0] * 4
+    assert step(scene, long_enough, 0.1).growth_rate.tolist() == [6.0, 1.0] * 4
 
 
 def test_a_broken_divide_is_told_and_the_run_goes_on(rules_file):
     rules_file.write_text(DIVIDE.format(5.0))
     rules, scene, state = grow_and_divide(rules_file)
     rules_file.write_text(DIVIDE.format("speed"))
-    state = scene.step(flagged(state.replace(time=1.5)), 0.1)
+    state = step(scene, flagged(state.replace(time=1.5)), 0.1)
     assert state.growth_rate.tolist() == [5.0, 1.0] * 2
     assert any("t = 1.5 h" in m and "broken" in m and "speed" in m for m in rules.source.messages)

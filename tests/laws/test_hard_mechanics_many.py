@@ -8,22 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from helpers import (
-    array,
-    check_always,
-    crowd,
-    ends,
-    growth,
-    mechanics,
-    near_pairs,
-    rotation,
-    rows_of,
-    run,
-    seeded,
-    unit,
-    wall_overlap,
-    worst_overlap,
-)
+from helpers import array, check_always, crowd, ends, growth, mechanics, near_pairs, rotation, rows_of, run, seeded, step, unit, wall_overlap, worst_overlap
 from torch import Tensor
 
 import torchfilm as tf
@@ -108,11 +93,11 @@ def test_case_12_one_giant_step(device, dtype, measured, unilateral, dim):
         tf.Division(length=tf.Uniform(3.5, 4.5)),
         tf.Mechanics(dim=dim, unilateral=unilateral),
     )
-    state = scene.seed(4, seed=12, device=device, dtype=dtype)
+    state = scene.bind(4, seed=12, device=device, dtype=dtype).start()
     while int(state.counts.min()) < 64:
-        state = scene.step(state, 0.05)
+        state = step(scene, state, 0.05)
     check_always(state, scene)
-    grown = scene.step(state, 0.7)
+    grown = step(scene, state, 0.7)
     check_always(grown, scene)
     assert (grown.reports["mechanics"].substeps > 1).all()
     # not by holding growth back: outside walls cells gain most of e^0.7 − 1 = 101 %
@@ -222,7 +207,7 @@ def test_case_17_rotated_where_turns_are_cut_short(device, dtype, measured, unil
         np.stack([a, b]),
         {"drag": [1.0, 1e4]},
     )
-    plain = scene.step(seeded(scene, tf.Cells(position, axis, 1.4, extra=heavy), device, dtype), DT)
+    plain = step(scene, seeded(scene, tf.Cells(position, axis, 1.4, extra=heavy), device, dtype), DT)
     wanted = float(plain.displacement[0, 3:6].norm())
     assert wanted > 0.6 and float(plain.axis[0, 0]) > np.cos(0.9 * wanted), (
         "the turn should have been cut short"
@@ -230,7 +215,7 @@ def test_case_17_rotated_where_turns_are_cut_short(device, dtype, measured, unil
     for _ in range(4):
         turn = rotation(rng, 3)
         turned = tf.Cells(position @ turn.T, axis @ turn.T, 1.4, extra=heavy)
-        other = scene.step(seeded(scene, turned, device, dtype), DT)
+        other = step(scene, seeded(scene, turned, device, dtype), DT)
         assert (
             measured(
                 "difference when rotated, µm",
@@ -304,7 +289,7 @@ def grown_apart(scene: tf.Scene, state: tf.State, steps: int) -> tuple[tf.State,
     """The state after `steps` steps, and the solve's iterations in each of them, (steps, B)."""
     iterations = []
     for _ in range(steps):
-        state = scene.step(state, DT)
+        state = step(scene, state, DT)
         iterations.append(state.reports["mechanics"].iterations)
     check_always(state, scene)
     return state, torch.stack(iterations)
@@ -365,7 +350,7 @@ class Partition(tf.Effect):
     stage = 25
     title = "partition"
 
-    def step(self, state: tf.State, dt: float) -> tf.State:
+    def step(self, state: tf.State, dt: float, values) -> tf.State:
         amount = state.amount.clone()
         for birth in state.births:
             share = (
@@ -404,7 +389,7 @@ def test_case_23_thousands_of_divisions(device, dtype, measured, dim):
     scene = tf.Scene(tf.Division(axis_noise=0.0), Partition(), founders=tf.Cells.single(dim))
     start = seeded(scene, cells, device, dtype)
     start = start.with_fields(divide_flag=torch.as_tensor(divides, device=device))
-    state = scene.step(start, DT)
+    state = step(scene, start, DT)
     assert state.cells == count + 4096
     key = array(state.colony) * 10**6 + array(state.uid)
     before = array(start.colony) * 10**6 + array(start.uid)

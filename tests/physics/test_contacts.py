@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import array, bodies, crowd, growth, mechanics, rows_of, seeded, segment_distance, unit
+from helpers import array, bodies, crowd, growth, mechanics, rows_of, seeded, segment_distance, step, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -252,9 +252,9 @@ def test_a_cell_squeezed_between_two_comes_to_rest(apart, tilt):
         extra={"drag": [1e3, 1.0, 1e3]},
     )
     scene = tf.Scene(tf.Mechanics(dim=2, tolerance=0.01), founders=cells)
-    state, angles = scene.seed(dtype=torch.float64), []
+    state, angles = scene.bind(dtype=torch.float64).start(), []
     for _ in range(30):
-        state = scene.step(state, 0.025)
+        state = step(scene, state, 0.025)
         angles.append(float(torch.atan2(state.axis[1, 1], state.axis[1, 0])))
     assert max(map(abs, angles)) < max(tilt, 0.1) + 0.02 and max(map(abs, angles[-5:])) < 1e-3, (
         angles
@@ -401,7 +401,7 @@ def test_a_colony_does_not_push_or_turn_itself(device, dim, unilateral):
     """
     scene = tf.Scene(growth(), mechanics(dim=dim, unilateral=unilateral, passes=1, tolerance=1e-11))
     start = seeded(scene, crowd(np.random.default_rng(5), 60, dim), device, torch.float64)
-    state = scene.step(start, 0.01)
+    state = step(scene, start, 0.01)
     assert not (state.reports["mechanics"].limited > 0).any()
     move = array(state.displacement)
     whole = array(start.length) * math.exp(0.01) + 1.0  # L at the time of the solve

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from helpers import array, crowd, growth, mechanics, pair_gaps, seeded
+from helpers import array, crowd, growth, mechanics, pair_gaps, seeded, step
 from scipy.optimize import minimize
 
 import torchfilm as tf
@@ -338,7 +338,7 @@ def test_two_capsules_side_by_side(unilateral, dtype, device, alpha):
     start = seeded(scene, tf.Cells([[0, 0, 0], [0, 0.9, 0]], [X, X], 2.0), device, dtype)
     pair = np.array([[0, 1]])
     m = alpha * 3.0
-    left = pair_gaps(scene.step(start, 0.01), pair)[0] / pair_gaps(start, pair)[0]
+    left = pair_gaps(step(scene, start, 0.01), pair)[0] / pair_gaps(start, pair)[0]
     assert left == pytest.approx(m / (2 + m), abs=1e-4)
 
 
@@ -361,7 +361,7 @@ def test_no_cell_ends_shorter_than_before_it_grew(unilateral, dtype, device, dim
     held = 0
     for _ in range(10):
         before = state.length
-        state = scene.step(state, 0.02)
+        state = step(scene, state, 0.02)
         assert (
             float((before - state.length).max())
             <= {torch.float32: 2.4e-7, torch.float64: 4.5e-16}[dtype]
@@ -396,9 +396,9 @@ def test_a_broken_colony_is_reported_and_harms_no_other(unilateral, dtype, devic
     start = seeded(scene, cells, device, dtype)
     broken = getattr(start, name).clone()
     broken[15] = float(bad)
-    state = scene.step(start.replace(**{name: broken}), 0.01)
+    state = step(scene, start.replace(**{name: broken}), 0.01)
     assert state.reports["mechanics"].status.tolist() == [CONVERGED, NOT_FINITE, CONVERGED]
-    sound = scene.step(start.select([0, 2]), 0.01)
+    sound = step(scene, start.select([0, 2]), 0.01)
     assert torch.equal(
         sound.reports["mechanics"].iterations, state.reports["mechanics"].iterations[[0, 2]]
     )
@@ -444,7 +444,7 @@ def test_gradient_through_the_solve(unilateral):
 
     def outcome(position, length):
         return (
-            scene.step(start.replace(position=position, length=length), 0.01).position * goal
+            step(scene, start.replace(position=position, length=length), 0.01).position * goal
         ).sum()
 
     place, length = start.position.clone().requires_grad_(), start.length.clone().requires_grad_()

@@ -379,12 +379,12 @@ def test_a_scene_counts_a_walls_vectors():
     """Vectors for two colonies in a batch of three, or of one: refused by name before anything
     runs."""
     scene = tf.Scene(tf.Mechanics(walls=[tf.Sphere(center=[[0.0, 0, 0], [0.1, 0, 0]], radius=5.0)]))
-    assert scene.seed(2).colonies == 2
+    assert scene.bind(2).start().colonies == 2
     for count in (1, 3):
         with pytest.raises(tf.InputError, match=r"center.*2 values"):
-            scene.seed(count)
+            scene.bind(count).start()
     one = tf.Scene(tf.Mechanics(walls=[tf.Sphere(center=torch.zeros(3), radius=5.0)]))
-    assert one.seed(2).colonies == 2, "one vector serves any number of colonies"
+    assert one.bind(2).start().colonies == 2, "one vector serves any number of colonies"
 
 
 @pytest.mark.parametrize("dim, wall", ALL)
@@ -480,4 +480,4 @@ def test_walls_that_make_no_sense_are_refused(make):
 def test_cells_behind_a_wall_are_refused_before_the_first_step():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(walls=[tf.Plane(x=1.0, facing="+x")]))
     with pytest.raises(tf.InputError, match="inside out"):
-        scene.seed(2)
+        scene.bind(2).start()

@@ -31,7 +31,7 @@ RateFunction = Callable[[Names, Names, Names, Names], Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Settings:
+class IntegrationSettings:
     """How circuits are stepped: method, its `steps` or tolerances, and molecules per unit of
     concentration × µm³, (N,) or one number."""
 
@@ -43,7 +43,7 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Circuit:
+class CircuitCells:
     """A circuit in M of N cells. part: a rate function, or reactions made ready. species: its
     variables. given: the signals it exchanges.
 
@@ -175,7 +175,7 @@ class Circuit:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class CircuitOutcome:
     """After a step: concentrations (M, S); amounts given to the pools and to a reservoir, conc·µm³, (M,) by
     signal; whether a cell failed (M,) bool and why, (M,) codes for `words`; steps taken (M,) int64.
     """
@@ -189,12 +189,12 @@ class Outcome:
 
 
 def step(
-    circuit: Circuit,
+    circuit: CircuitCells,
     concentrations: Tensor,
     dt: float,
-    settings: Settings,
+    settings: IntegrationSettings,
     draw: Draw | None = None,
-) -> Outcome:
+) -> CircuitOutcome:
     """The circuit `dt` hours later, from concentrations (M, S). Raises nothing for a cell that
     fails; it is marked."""
     if settings.method in ("tau_leap", "direct"):
@@ -229,12 +229,12 @@ def step(
         )
         if circuit.in_reservoir is not None:
             reservoir[name] = end[:, size + more + k] - end[:, size + 2 * more + k]
-    return Outcome(end[:, :size], pools, reservoir, code != 0, code, steps)
+    return CircuitOutcome(end[:, :size], pools, reservoir, code != 0, code, steps)
 
 
 def _molecules(
-    circuit: Circuit, concentrations: Tensor, dt: float, settings: Settings, draw: Draw
-) -> Outcome:
+    circuit: CircuitCells, concentrations: Tensor, dt: float, settings: IntegrationSettings, draw: Draw
+) -> CircuitOutcome:
     """The same molecule by molecule. A reservoir is a pool so large that what is given to it or
     taken does not show."""
     assert isinstance(circuit.part, Network)
@@ -304,14 +304,14 @@ def _molecules(
         0,
         torch.where(report.reaction >= 0, MOLECULES + report.reaction, report.status),
     )
-    return Outcome(found, pools, reservoir, report.status != 0, code, report.steps)
+    return CircuitOutcome(found, pools, reservoir, report.status != 0, code, report.steps)
 
 
 MOLECULES = 100
 
 
 def words(
-    circuit: Circuit, outcome: Outcome, concentrations: Tensor, k: int, method: str, dt: float
+    circuit: CircuitCells, outcome: CircuitOutcome, concentrations: Tensor, k: int, method: str, dt: float
 ) -> str:
     """What went wrong in the k-th of the M cells, from concentrations (M, S) on."""
     code = int(outcome.code[k])
@@ -347,7 +347,7 @@ def words(
 
 
 @torch.no_grad()
-def _not_finite(circuit: Circuit, concentrations: Tensor, k: int, dt: float) -> list[str]:
+def _not_finite(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float) -> list[str]:
     """The species and signals whose rates in the k-th cell are not finite, at the start of the step
     or ahead of it: a careful method stops short of there."""
     one = torch.tensor([k], device=concentrations.device)
@@ -369,7 +369,7 @@ def _not_finite(circuit: Circuit, concentrations: Tensor, k: int, dt: float) -> 
     return []
 
 
-def trial(circuit: Circuit, concentrations: Tensor, derivatives: bool = False) -> tuple[str, ...]:
+def trial(circuit: CircuitCells, concentrations: Tensor, derivatives: bool = False) -> tuple[str, ...]:
     """Try the circuit once at concentrations (M, S), with derivatives where its method asks for
     them: raise InputError for what it returns wrongly; the signals that it exchanges."""
     try:

@@ -1,2 +1,23 @@
-"""The effects that a scene may list. They never import each other; they meet only through named
-fields."""
+"""The effects that torchfilm has. They never import each other and meet through named fields
+only."""
+
+from torchfilm.effects.circuit import Circuit
+from torchfilm.effects.division import Division
+from torchfilm.effects.growth import Growth
+from torchfilm.effects.mechanics import Mechanics
+from torchfilm.effects.medium import Medium
+from torchfilm.effects.nutrition import Monod
+from torchfilm.effects.removal import Removal
+from torchfilm.effects.rules import Rules
+
+# In the order of a step, by the names that `explain` uses.
+KNOWN = {
+    "rules": Rules,
+    "division": Division,
+    "nutrition": Monod,
+    "growth": Growth,
+    "mechanics": Mechanics,
+    "circuit": Circuit,
+    "transport": Medium,
+    "removal": Removal,
+}

@@ -8,11 +8,22 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchfilm.effect import DIVISION, Distribution, Effect, draw, parameter
+from torchfilm.effect import DIVISION, Effect
 from torchfilm.physics import capsule
 from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
+from torchfilm.values import (
+    ByType,
+    Resolved,
+    Value,
+    Values,
+    is_drawn,
+    is_inherited,
+    largest,
+    physical,
+    smallest,
+)
 
 CRITERIA = ("length", "volume", "added")
 
@@ -41,25 +52,27 @@ class DivisionReport:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Division(Effect):
     """Cells divide, by one criterion or by flag.
 
     length: centreline length, µm, at which a cell divides; volume: µm³; added: µm of centreline
-    grown since birth (the adder). Each one number, one per colony, or a distribution drawn for each
-    cell at birth. None of them: only cells whose `divide_flag` a rule sets divide; the flag works
-    beside a criterion too. fraction: share of the length that the first daughter (at the −axis end)
-    gets. axis_noise: standard deviation of the noise on each component of a daughter's axis.
+    grown since birth (the adder). Each a number, one per colony, one per cell type, or a
+    distribution drawn for each cell at birth. None of them: only cells whose `divide_flag` a rule
+    sets divide; the flag works beside a criterion too. fraction: share of the length that the first
+    daughter (at the −axis end) gets, drawn at each division where it is a distribution. axis_noise:
+    standard deviation of the noise on each component of a daughter's axis.
     """
 
-    length: float | Tensor | Distribution | None = None
-    volume: float | Tensor | Distribution | None = None
-    added: float | Tensor | Distribution | None = None
-    fraction: float | Tensor | Distribution = 0.5
-    axis_noise: float | Tensor = 0.001
+    length: Value | None = physical(None, unit="µm", above=0.0, drawn_by_effect=True)
+    volume: Value | None = physical(None, unit="µm³", above=0.0, drawn_by_effect=True)
+    added: Value | None = physical(None, unit="µm", above=0.0, drawn_by_effect=True)
+    fraction: Value = physical(0.5, above=0.0, most=1.0, drawn_by_effect=True)
+    axis_noise: Value = physical(0.001, least=0.0, most=0.5, drawn_by_effect=True)
 
     stage = DIVISION
     title = "division"
+    may_repeat = False
 
     def __post_init__(self) -> None:
         given = [name for name in CRITERIA if getattr(self, name) is not None]
@@ -68,26 +81,11 @@ class Division(Effect):
                 f"Division got {' and '.join(given)}: give one criterion (length, volume or added),"
                 " or none and a rule."
             )
-        for name in given:
-            object.__setattr__(
-                self, name, parameter(f"Division.{name}", getattr(self, name), above=0.0)
-            )
-        fraction = parameter("Division.fraction", self.fraction, above=0.0, most=1.0)
-        object.__setattr__(self, "fraction", fraction)
-        greatest = (
-            fraction.greatest()
-            if isinstance(fraction, Distribution)
-            else float(torch.as_tensor(fraction).max())
-        )
-        if greatest >= 1.0:
+        super().__post_init__()
+        if largest(self.fraction) >= 1.0:
             raise checks.input_error(
                 "Division.fraction", self.fraction, "between 0 and 1, both excluded"
             )
-        object.__setattr__(
-            self,
-            "axis_noise",
-            checks.value("Division.axis_noise", self.axis_noise, least=0.0, most=0.5),
-        )
 
     @property
     def criterion(self) -> str | None:
@@ -105,13 +103,14 @@ class Division(Effect):
         name = self.criterion
         if name is not None:
             threshold = getattr(self, name)
+            reset = is_drawn(threshold) and not is_inherited(threshold)
             fields.append(
                 Field(
                     "division_threshold",
                     f"{name} at which the cell divides",
                     "µm³" if name == "volume" else "µm",
-                    initial=lambda state, rows: draw(f"Division.{name}", threshold, state, rows),
-                    at_division="reset" if isinstance(threshold, Distribution) else "copy",
+                    initial=_FIRST_THRESHOLD[name],
+                    at_division="reset" if reset or isinstance(threshold, ByType) else "copy",
                 )
             )
         if name == "added":
@@ -144,13 +143,13 @@ class Division(Effect):
     def writes(self) -> tuple[str, ...]:
         return ("cells", "position", "axis", "length", "divide_flag")
 
-    def check(self, state: State) -> None:
+    def check(self, state: State, values: Values) -> None:
         if self.criterion is None or state.cells == 0:
             return
         given = getattr(self, self.criterion)
         # cells from a micrograph may be past the threshold drawn for them, and then divide at once;
         # none may be past all that can be drawn
-        most = given.greatest() if isinstance(given, Distribution) else state.division_threshold
+        most = largest(given) if is_drawn(given) else state.division_threshold
         start = {
             "length": state.length,
             "volume": state.volume,
@@ -165,11 +164,7 @@ class Division(Effect):
                 f" its {self.criterion} at birth, {float(start[k]):g}. Raise the threshold or start"
                 " from smaller cells."
             )
-        least = (
-            given.least()
-            if isinstance(given, Distribution)
-            else float(torch.as_tensor(given).min())
-        )
+        least = smallest(given)
         radius = float(state.radius.max())
         needed = 2 * radius
         if self.criterion == "volume":
@@ -180,6 +175,9 @@ class Division(Effect):
                 f" radius {radius:g} µm, or the daughters would be shorter than nothing (each loses"
                 " a new cap). Raise the threshold."
             )
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        return [f"checked once a step: up to {dt:g} h late"]
 
     def due(self, state: State) -> Tensor:
         """Which cells divide now, (N,) bool."""
@@ -192,7 +190,7 @@ class Division(Effect):
             return due | (state.length - state.birth_length >= state.division_threshold)
         return due
 
-    def step(self, state: State, dt: float) -> State:
+    def step(self, state: State, dt: float, values: Values) -> State:
         with torch.no_grad():
             due = self.due(state)
             if not bool(due.any()):
@@ -204,7 +202,7 @@ class Division(Effect):
                 due = due & (report.status != TOO_SHORT).index_select(0, state.colony)
                 if not bool(due.any()):
                     return state
-        return divide(state, due, self.fraction, self.axis_noise)
+        return divide(state, due, values.fraction, values.axis_noise)
 
 
 def _too_short(state: State, short: Tensor) -> DivisionReport:
@@ -222,9 +220,7 @@ def _too_short(state: State, short: Tensor) -> DivisionReport:
     )
 
 
-def divide(
-    state: State, due: Tensor, fraction: float | Tensor | Distribution, axis_noise: float | Tensor
-) -> State:
+def divide(state: State, due: Tensor, fraction: Resolved, axis_noise: Resolved) -> State:
     """The state in which each cell that is due (N,) bool has become two neighbours in the batch,
     first daughter at its −axis end.
 
@@ -240,7 +236,7 @@ def divide(
     new = state.take(source)
 
     everyone = torch.arange(parents.cells, device=state.device)
-    share = draw("Division.fraction", fraction, parents, everyone)
+    share = fraction.of_rows(parents, everyone, "Division.fraction")
     rest = parents.length - 2 * parents.radius
     length_1, length_2 = rest * share, rest * (1 - share)
     shift_1, shift_2 = 0.5 * (length_1 - parents.length), 0.5 * (parents.length - length_2)
@@ -274,15 +270,28 @@ def _new_ids(new: State, daughters: Tensor, parents: State) -> tuple[Tensor, Ten
     return uid, parent, new.next_uid + per_colony
 
 
-def _with_noise(new: State, daughters: Tensor, axis_noise: float | Tensor) -> Tensor:
-    if not isinstance(axis_noise, Tensor) and axis_noise == 0:
+def _with_noise(new: State, daughters: Tensor, axis_noise: Resolved) -> Tensor:
+    if axis_noise.is_zero:
         return new.axis
-    sd = draw("axis_noise", axis_noise, new, daughters).unsqueeze(1)
+    sd = axis_noise.of_rows(new, daughters, "axis_noise").unsqueeze(1)
     noise = sd * new.normal(daughters, "Division.axis_noise")[:, : new.dim]
     axis = new.axis.index_select(0, daughters) + noise
     axis = torch.where(sd > 0, axis / (axis * axis).sum(1, keepdim=True).sqrt(), axis)
     return new.axis.index_copy(0, daughters, axis)
 
 
-def _length_of_rows(state: State, rows: Tensor) -> Tensor:
+def _length_of_rows(state: State, rows: Tensor, values: Values) -> Tensor:
     return state.length.index_select(0, rows)
+
+
+@dataclass(frozen=True)
+class _FirstThreshold:
+    """The threshold of new cells, by one criterion."""
+
+    name: str
+
+    def __call__(self, state: State, rows: Tensor, values: Values) -> Tensor:
+        return values[self.name].of_rows(state, rows)
+
+
+_FIRST_THRESHOLD = {name: _FirstThreshold(name) for name in CRITERIA}

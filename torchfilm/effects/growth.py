@@ -1,17 +1,21 @@
-"""Growth: how much each cell wants to lengthen in a step. Contacts, where there are any, may then
-hold it back."""
+"""Growth: how much each cell elongates in a step. Contacts, where there are any, may then hold it
+back."""
 
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchfilm.effect import GROWTH, Distribution, Effect, draw, parameter
+from torchfilm.effect import GROWTH, Binding, BoundEffect, Effect
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
+from torchfilm.values import ByType, Value, Values, is_drawn, is_inherited, physical, smallest
 
 LAWS = ("volume", "length", "linear")
 UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}
@@ -19,8 +23,8 @@ UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}
 
 @dataclass(frozen=True)
 class GrowthReport:
-    """Made only where a cell of some colony would grow past all numbers: `status` (B,), 1 for its
-    colony, of which no cell grew, and the `rate` (B,) and `uid` (B,) of the first such cell."""
+    """Made only where a cell would grow past all numbers: `status` (B,), 1 for its colony, in which
+    no cell grew, and the `rate` (B,) and `uid` (B,) of the first such cell."""
 
     status: Tensor
     uid: Tensor
@@ -35,37 +39,42 @@ class GrowthReport:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Growth(Effect):
-    """Cells lengthen.
+    """Cells grow longer.
 
-    rate: 1/h (µm/h with law "linear"); one number, one per colony, or a distribution drawn at
-    birth. None: cells grow at whatever rules write to `growth_rate`, at first 0. law: "volume",
-    dV/dt = rate·V, so that ln 2/rate is the doubling time whatever the shape (the paper's wording);
-    "length", dl/dt = rate·l of the centreline (the authors' program); "linear", dl/dt = rate.
-    Exponentials are exact over a step.
+    rate: 1/h (µm/h with law "linear"): a number, one per colony, one per cell type, or a
+    distribution drawn at birth. None: cells grow at whatever rules or nutrition write to
+    `growth_rate`, at first 0. law: "volume", dV/dt = rate·V, so that ln 2/rate is the doubling time
+    whatever the shape (the paper's wording); "length", dl/dt = rate·l of the centreline (the
+    authors' program); "linear", dl/dt = rate. Exponentials are exact over a step.
     """
 
-    rate: float | Tensor | Distribution | None = None
+    rate: Value | None = physical(None, unit="1/h", least=0.0, drawn_by_effect=True)
     law: str = "volume"
 
     stage = GROWTH
     title = "growth"
+    may_repeat = False
 
     def __post_init__(self) -> None:
         checks.choice("Growth.law", self.law, LAWS)
-        if self.rate is not None:
-            object.__setattr__(self, "rate", parameter("Growth.rate", self.rate, least=0.0))
+        super().__post_init__()
+
+    @property
+    def by_type(self) -> bool:
+        """Whether the rate goes by the cell's type at each moment."""
+        return isinstance(self.rate, ByType) and not self.rate.is_drawn
 
     def declares(self, dim: int) -> tuple[Field, ...]:
-        rate = 0.0 if self.rate is None else self.rate
+        drawn = self.rate is not None and is_drawn(self.rate)
         return (
             Field(
                 "growth_rate",
                 "relative growth rate" if self.law != "linear" else "growth of the centreline",
                 UNITS[self.law],
-                initial=lambda state, rows: draw("Growth.rate", rate, state, rows),
-                at_division="reset" if isinstance(rate, Distribution) else "copy",
+                initial=0.0 if self.rate is None else _first_rate,
+                at_division="reset" if drawn and not is_inherited(self.rate) else "copy",
             ),
             Field("elongation", "growth wanted in this step, contained in length", "µm"),
         )
@@ -77,9 +86,43 @@ class Growth(Effect):
         return ("growth_rate",)
 
     def writes(self) -> tuple[str, ...]:
-        return ("length", "elongation")
+        return ("length", "elongation", *(("growth_rate",) if self.by_type else ()))
 
-    def step(self, state: State, dt: float) -> State:
+    def check_scene(self, effects: Sequence[Effect], founders: Any) -> None:
+        others = [
+            e for e in effects if e is not self and type(e).__module__.startswith("torchfilm.")
+        ]
+        sets = any(e.writes_anything or "growth_rate" in e.writes() for e in others) or len(
+            others
+        ) + 1 < len(effects)
+        if self.rate is None and not sets and "growth_rate" not in founders.extra:
+            warnings.warn(
+                "Growth() has no rate, and no rule or nutrition sets growth_rate: nothing grows."
+                " Write tf.Growth(rate=1.0), in 1/h.",
+                stacklevel=4,
+            )
+
+    def check_step(self, dt: float, divides: bool) -> None:
+        if self.rate is None or not divides or self.law == "linear":
+            return
+        rate = smallest(self.rate)
+        if rate * dt > math.log(2.0):
+            raise checks.InputError(
+                f"dt = {dt:g} h is too long for Growth.rate = {rate:g}/h: a cell would be due to"
+                f" divide more than once in a step. Take dt below {math.log(2.0) / rate:.2g} h;"
+                f" {math.log(2.0) / rate / 28:.1g} h is usual. (Rates are per hour.)"
+            )
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        held = "; what contacts hold back is taken off afterwards"
+        return ["exact over a step" + (held if "displacement" in state.fields else "")]
+
+    def bind(self, binding: Binding) -> Sequence[BoundEffect]:
+        return (_BoundGrowth(self, binding),)
+
+    def step(self, state: State, dt: float, values: Values) -> State:
+        if self.by_type:
+            state = state.with_fields(growth_rate=values.rate.of_cells(state))
         wanted = state.growth_rate * dt
         if self.law == "volume":
             # V = π r² (l + 4r/3), so l + 4r/3 grows like V
@@ -89,7 +132,7 @@ class Growth(Effect):
         else:
             elongation = wanted
         length = state.length + elongation
-        # one look at the longest: NaN is the greatest of all
+        # one look at the longest: NaN is the largest of all
         if state.cells and not length.max().item() < math.inf:
             report = _too_long(state, torch.isfinite(length))
             elongation = torch.where(
@@ -102,8 +145,28 @@ class Growth(Effect):
         return state.replace(length=length).with_fields(elongation=elongation)
 
 
+class _BoundGrowth(BoundEffect):
+    """The drawn rate is the field growth_rate itself."""
+
+    def trace(self, state: State) -> State:
+        if self.effect.law != "linear" and state.cells:  # type: ignore[attr-defined]
+            usual = float(state.growth_rate.median())
+            if 0 < usual < 0.05 and state.step == 0 and self.effect.rate is not None:  # type: ignore[attr-defined]
+                warnings.warn(
+                    f"Growth.rate is {usual:g} per hour: a doubling takes"
+                    f" {math.log(2.0) / usual:.0f} h. Rates are per hour; a rate per minute is to"
+                    f" be multiplied by 60 ({60 * usual:g}).",
+                    stacklevel=2,
+                )
+        return self.ready(state)
+
+
+def _first_rate(state: State, rows: Tensor, values: Values) -> Tensor:
+    return values.rate.of_rows(state, rows)
+
+
 def _too_long(state: State, good: Tensor) -> GrowthReport:
-    """The report of the cells that cannot be as long as they want, ~good (N,)."""
+    """The report of the cells that cannot be as long as they would be, ~good (N,)."""
     number = torch.arange(state.cells, device=state.device)
     first = state.cells - state.groups.max(torch.where(good, 0, state.cells - number))
     row = first.clamp(max=state.cells - 1)

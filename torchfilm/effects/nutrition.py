@@ -3,16 +3,18 @@ starves from the inside (Monod 1949)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchfilm.circuits.rosenbrock import rosenbrock
-from torchfilm.effect import NUTRITION, Effect, per_cell
-from torchfilm.signals.exchange import write
+from torchfilm.effect import NUTRITION, Binding, BoundEffect, Effect
+from torchfilm.medium_exchange import MediumExchange
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
+from torchfilm.values import Value, Values, physical
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class NutritionReport:
         return "the uptake of a cell could not be stepped"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Monod(Effect):
     """Growth on a nutrient: dV/dt = rate · s/(half + s) · V, and an amount dV/dt / yield is taken
     from the medium about the cell.
@@ -43,19 +45,13 @@ class Monod(Effect):
     """
 
     signal: str
-    rate: float | Tensor = 1.0
-    half: float | Tensor = 1.0
-    growth_yield: float | Tensor = 1.0
+    rate: Value = physical(1.0, unit="1/h", least=0.0)
+    half: Value = physical(1.0, unit="conc", above=0.0)
+    growth_yield: Value = physical(1.0, unit="1/conc", above=0.0)
 
     stage = NUTRITION
     title = "nutrition"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "rate", checks.value("Monod.rate", self.rate, least=0.0))
-        for name in ("half", "growth_yield"):
-            object.__setattr__(
-                self, name, checks.value(f"Monod.{name}", getattr(self, name), above=0.0)
-            )
+    may_repeat = False
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (
@@ -76,7 +72,16 @@ class Monod(Effect):
     def writes(self) -> tuple[str, ...]:
         return ("growth_rate", OUTSIDE + self.signal, f"{self.signal}_eaten")
 
-    def check(self, state: State) -> None:
+    def bind(self, binding: Binding) -> Sequence[BoundEffect]:
+        return (_BoundMonod(self, binding),)
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        return [
+            "each cell by the stiff solver, with its default tolerances; what cells take up the"
+            " medium loses, to rounding"
+        ]
+
+    def check(self, state: State, values: Values) -> None:
         unit = state.declared["growth_rate"].unit
         if unit != "1/h":
             raise checks.InputError(
@@ -89,45 +94,53 @@ class Monod(Effect):
                 " overwritten: write Growth()."
             )
 
-    def step(self, state: State, dt: float) -> State:
-        if state.cells == 0 or state.layout is None:
+    def step(self, state: State, dt: float, values: Values) -> State:
+        medium = MediumExchange.of(state, (self.signal,))
+        if state.cells == 0 or medium is None:
             return state
-        name = OUTSIDE + self.signal
-        contact, volume = state.contact(), state.volume
-        assert contact is not None
-        there, in_reservoir = contact.found[self.signal], contact.in_reservoir
+        volume, there, in_reservoir = state.volume, medium.found[self.signal], medium.in_reservoir
         greatest, half, gain = (
-            per_cell(x, state).expand(state.cells)
-            for x in (self.rate, self.half, self.growth_yield)
+            x.of_cells(state).expand(state.cells)
+            for x in (values.rate, values.half, values.growth_yield)
         )
-        columns = (greatest, half, gain, volume, contact.pool)
+        columns = (greatest, half, gain, volume, medium.pool)
 
         def rates(x: Tensor, rows: Tensor) -> Tensor:
-            """Of what is left, and of what was eaten: kept apart, since where food abounds their
-            sum would hide it from rounding."""
+            """Of the nutrient left in the pool, and of what was taken up: kept apart, since where
+            nutrient abounds their sum would hide the uptake in rounding."""
             rate, k, y, start, pool = (c.index_select(0, rows) for c in columns)
             eating = rate * (start / y + x[:, 1]) * x[:, 0] / (k + x[:, 0])
             return torch.stack([-eating / pool, eating], 1)
 
         end, report = rosenbrock(rates, torch.stack([there, torch.zeros_like(there)], 1), dt)
         eaten = end[:, 1]
+        to_reservoir, inside = None, eaten
         if in_reservoir is not None:  # a reservoir stays as it is
-            eaten = torch.where(
-                in_reservoir,
-                volume / gain * torch.expm1(greatest * there / (half + there) * dt),
-                eaten,
-            )
+            there_for_good = volume / gain * torch.expm1(greatest * there / (half + there) * dt)
+            eaten = torch.where(in_reservoir, there_for_good, eaten)
+            inside = torch.where(in_reservoir, 0.0, eaten)
+            to_reservoir = inside - eaten
         # dV/dt = growth · V over the step, from V to V + gain · eaten
         growth = torch.log1p(gain * eaten / volume) / dt
-        inside = eaten if in_reservoir is None else torch.where(in_reservoir, 0.0, eaten)
-        changed = {name: write(state.fields[name], -inside, contact.stencil)}
-        if in_reservoir is not None:
-            lost = state.groups.sum((inside - eaten).unsqueeze(1)).squeeze(1)
-            changed[f"{self.signal}_reservoir"] = state.fields[f"{self.signal}_reservoir"] + lost
-        changed |= {
-            "growth_rate": growth,
-            f"{self.signal}_eaten": state.fields[f"{self.signal}_eaten"] + eaten,
-        }
+        medium.give(self.signal, -inside, to_reservoir)
+        own = f"{self.signal}_eaten"
+        state = medium.settle().with_fields(growth_rate=growth, **{own: state.fields[own] + eaten})
         uptake = state.groups.sum(eaten.unsqueeze(1)).squeeze(1)
         note = NutritionReport(state.groups.any(report.status != 0).long(), uptake)
-        return state.with_fields(**changed).replace(reports={**state.reports, "nutrition": note})
+        return state.replace(reports={**state.reports, "nutrition": note})
+
+
+class _BoundMonod(BoundEffect):
+    """The reservoir's field is read and written where the medium has one."""
+
+    effect: Monod
+
+    def _reservoir(self) -> tuple[str, ...]:
+        name = f"{self.effect.signal}_reservoir"
+        return (name,) if name in self.binding.declared else ()
+
+    def reads(self) -> tuple[str, ...]:
+        return (*super().reads(), f"{self.effect.signal}_eaten", *self._reservoir())
+
+    def writes(self) -> tuple[str, ...]:
+        return (*super().writes(), *self._reservoir())

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchfilm.effect import REMOVAL, Effect, per_cell
+from torchfilm.effect import REMOVAL, Effect
 from torchfilm.state import State
 from torchfilm.tools import checks
+from torchfilm.values import COLONY, Rule, Values
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Removal(Effect):
     """Cells whose centre leaves the box from `low` to `high` are removed, as at a channel's open
     end.
@@ -39,12 +41,22 @@ class Removal(Effect):
     def writes(self) -> tuple[str, ...]:
         return ("cells",)
 
-    def check(self, state: State) -> None:
+    def physical_values(self) -> dict[str, tuple[Any, Rule]]:
+        corners = {"low": self.low, "high": self.high}
+        rule = Rule("µm", scope=COLONY)
+        return {
+            f"{n}[{k}]": (x, rule) for n, corner in corners.items() for k, x in enumerate(corner)
+        }
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        return ["once a step, by the cell's centre"]
+
+    def check(self, state: State, values: Values) -> None:
         if len(self.low) != state.dim:
             raise checks.input_error(
                 "Removal.low", self.low, f"of {state.dim} numbers in a {state.dim}-D scene"
             )
-        outside = self._outside(state)
+        outside = self._outside(state, values)
         if bool(outside.any()):
             k = int(torch.nonzero(outside)[0])
             raise checks.InputError(
@@ -54,12 +66,13 @@ class Removal(Effect):
                 " or the region."
             )
 
-    def _outside(self, state: State) -> torch.Tensor:
+    def _outside(self, state: State, values: Values) -> torch.Tensor:
         outside = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
-        for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+        for k in range(len(self.low)):
             x = state.position[:, k]
-            outside = outside | (x < per_cell(low, state)) | (x > per_cell(high, state))
+            low, high = (values[f"{name}[{k}]"].of_cells(state) for name in ("low", "high"))
+            outside = outside | (x < low) | (x > high)
         return outside
 
-    def step(self, state: State, dt: float) -> State:
-        return state.remove(self._outside(state), "left")
+    def step(self, state: State, dt: float, values: Values) -> State:
+        return state.remove(self._outside(state, values), "left")

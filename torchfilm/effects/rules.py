@@ -5,16 +5,16 @@ names, on whole tensors.
         cells.growth_rate = 2.1
         cells.divide_flag = cells.volume > 3
 
-Rules are the user's own Python. `update` is tried once on the first state, before anything runs:
-names that it sets and that nothing declares become variables, and what it reads and writes is
-noted, so that the scene knows who drives whom.
+Rules are the user's own Python. Binding tries `update` once on the first state, before anything
+runs: names that it sets and that nothing declares become variables, and what it reads and writes is
+noted, so that the model knows who drives whom.
 """
 
 from __future__ import annotations
 
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.effect import DIVISION, RULES, Effect
+from torchfilm.effect import DIVISION, RULES, Binding, BoundEffect, Effect
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS, CellsView, DivisionView, RuleError
 from torchfilm.state import Births, Field, State
 from torchfilm.tools import checks
@@ -32,7 +32,7 @@ from torchfilm.tools.hot_reload import HotReload, load_functions
 TRIAL_STEP = 0.025  # h, the step that a rule sees when it is tried
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rules(Effect):
     """The user's rules: `update(cells)` at the start of each step, `divide(parent, daughter1,
     daughter2)` after divisions.
@@ -44,8 +44,8 @@ class Rules(Effect):
     update: Callable[[CellsView], None] | str | Path | None = None
     divide: Callable[[DivisionView, DivisionView, DivisionView], None] | None = None
     variables: Mapping[str, float] = field(default_factory=dict)
-    source: HotReload = field(init=False, repr=False, compare=False)
-    noted: dict[str, tuple[str, ...]] = field(init=False, repr=False, compare=False)
+    path: Path | None = field(init=False, repr=False)
+    functions: dict[str, Any] = field(init=False, repr=False)
 
     stage = RULES
     title = "rules"
@@ -76,17 +76,12 @@ class Rules(Effect):
             )
         for name, value in self.variables.items():
             checks.number(f"Rules.variables[{name!r}]", value)
-        object.__setattr__(self, "source", HotReload(path, functions))
-        object.__setattr__(
-            self, "noted", {"reads": (), "writes": (), "divide reads": (), "divide writes": ()}
-        )
+        object.__setattr__(self, "path", path)
+        object.__setattr__(self, "functions", functions)
 
-    def parts(self) -> tuple[Effect, ...]:
-        return (
-            (self, DivisionRule(self))
-            if self.source.functions["divide"] or self.source.path
-            else (self,)
-        )
+    def __reduce__(self) -> tuple[Any, ...]:
+        # a rules file is read again where it is unpickled
+        return (Rules, (self.update, self.divide, dict(self.variables)))
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return tuple(
@@ -94,67 +89,129 @@ class Rules(Effect):
             for name, value in self.variables.items()
         )
 
+    def numerics(self, dt: float, state: State) -> list[str]:
+        return ["your own Python, once a step on whole tensors"]
+
+    def bind(self, binding: Binding) -> Sequence[BoundEffect]:
+        source = HotReload(self.path, dict(self.functions))
+        main = BoundRules(self, binding, source)
+        divides = self.functions["divide"] is not None or self.path is not None
+        return (main, DivisionRule(self, binding, source)) if divides else (main,)
+
+
+class BoundRules(BoundEffect):
+    """Rules that have been tried once: what they read and write, and the variables that they
+    bring."""
+
+    effect: Rules
+
+    def __init__(self, effect: Rules, binding: Binding, source: HotReload):
+        super().__init__(effect, binding)
+        self.source = source
+        self.traced_reads: tuple[str, ...] = ()
+        self.traced_writes: tuple[str, ...] = ()
+        self.variables: tuple[Field, ...] = ()
+
+    @property
+    def hot_reload(self) -> HotReload:
+        """The functions, which may be edited during a run."""
+        return self.source
+
     def reads(self) -> tuple[str, ...]:
-        return self.noted["reads"]
+        return self.traced_reads
 
     def writes(self) -> tuple[str, ...]:
-        return self.noted["writes"]
+        return self.traced_writes
 
-    def prepare(self, state: State) -> State:
-        """Try `update` once on the first state: new names become fields, and what is read and
-        written is noted."""
-        update = self.source.functions["update"]
-        if update is not None:
-            # one cell would let pass what fails with two, such as `if cells.length > 3`; where none
-            # divides, there may never be two
-            twice = state.cells == 1 and "divide_flag" in state.fields
-            tried = (
-                state.take(torch.zeros(2, dtype=torch.int64, device=state.device))
-                if twice
-                else state
-            )
-            view = CellsView(tried, TRIAL_STEP, _label(update), declaring=True)
-            _act(update, view)
-            for name, value in view._work.items():
-                if name not in state.fields and name != "remove_flag":
-                    new = KNOWN_FIELDS.get(name) or Field(
-                        name,
-                        "variable of the user's rules",
-                        dtype=value.dtype,
-                        shape=tuple(value.shape[1:]),
-                    )
-                    state, tried = state.declare(new), tried.declare(new)
-            changed = [
-                n
-                for n, v in view._work.items()
-                if n != "remove_flag" and not torch.equal(v, tried.fields[n])
-            ]
-            writes = view._written | set(changed)
-            self.noted["reads"] = tuple(sorted(view._read))
-            self.noted["writes"] = tuple(
-                "cells" if n == "remove_flag" else n for n in sorted(writes)
-            )
-        divide = self.source.functions["divide"]
-        if divide is not None and state.cells:
-            self._try_division(divide, state)
+    def ready(self, state: State) -> State:
+        for new in self.variables:
+            if new.name not in state.fields:
+                state = state.declare(new)
         return state
 
-    def _try_division(self, divide: Callable[..., None], state: State) -> None:
-        """Try `divide` on a first cell and two copies of it, and note what it reads and writes."""
-        one = torch.zeros(1, dtype=torch.int64, device=state.device)
-        twice = state.take(torch.cat([one, one]))
-        births = Births(one, one + 1, torch.cat([one, one]), state.take(one))
-        views = _after_divide(divide, twice, births)
-        self.noted["divide reads"] = tuple(
-            sorted({MEANS.get(n, (n,))[0] for view in views for n in view._work})
-        )
-        self.noted["divide writes"] = tuple(sorted(views[1]._set | views[2]._set))
+    def trace(self, state: State) -> State:
+        """Try `update` once: new names become fields, and what is read and written is noted."""
+        update = self.source.functions["update"]
+        if update is None:
+            return state
+        # one cell would let pass what fails with two, such as `if cells.length > 3`; where none
+        # divides, there may never be two
+        twice = state.cells == 1 and "divide_flag" in state.fields
+        both = torch.zeros(2, dtype=torch.int64, device=state.device)
+        tried = state.take(both) if twice else state
+        view = CellsView(tried, TRIAL_STEP, _label(update), declaring=True)
+        _act(update, view)
+        new = [n for n in view._work if n not in state.fields and n != "remove_flag"]
+        self.variables = tuple(_variable(name, view._work[name]) for name in new)
+        for variable in self.variables:
+            tried = tried.declare(variable)
+        changed = [
+            n
+            for n, v in view._work.items()
+            if n != "remove_flag" and not torch.equal(v, tried.fields[n])
+        ]
+        self.traced_reads = tuple(sorted(view._read))
+        written = sorted(view._written | set(changed))
+        self.traced_writes = tuple("cells" if n == "remove_flag" else n for n in written)
+        return self.ready(state)
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
             return state
         self.source.refresh(state.time)
         return self.source.call("update", lambda update: _apply(update, state, dt), state)
+
+
+def _variable(name: str, value: Tensor) -> Field:
+    """The field of a variable that a rule has set."""
+    known = KNOWN_FIELDS.get(name)
+    meaning, shape = "variable of the user's rules", tuple(value.shape[1:])
+    return known or Field(name, meaning, dtype=value.dtype, shape=shape)
+
+
+class DivisionRule(BoundEffect):
+    """The part of Rules that acts after division: the user's `divide(parent, daughter1,
+    daughter2)`."""
+
+    effect: Rules
+
+    def __init__(self, effect: Rules, binding: Binding, source: HotReload):
+        super().__init__(effect, binding)
+        self.stage, self.title, self.source = DIVISION + 1, "rules at division", source
+        self.traced_reads: tuple[str, ...] = ()
+        self.traced_writes: tuple[str, ...] = ()
+
+    def declares(self) -> list[Field]:
+        return []
+
+    def reads(self) -> tuple[str, ...]:
+        return ("cells", *self.traced_reads)
+
+    def writes(self) -> tuple[str, ...]:
+        return self.traced_writes
+
+    def trace(self, state: State) -> State:
+        """Try `divide` on a first cell and two copies of it, and note what it reads and writes."""
+        divide = self.source.functions["divide"]
+        if divide is None or not state.cells:
+            return state
+        one = torch.zeros(1, dtype=torch.int64, device=state.device)
+        twice = state.take(torch.cat([one, one]))
+        births = Births(one, one + 1, torch.cat([one, one]), state.take(one))
+        views = _after_divide(divide, twice, births)
+        read = {MEANS.get(n, (n,))[0] for view in views for n in view._work}
+        self.traced_reads = tuple(sorted(read))
+        self.traced_writes = tuple(sorted(views[1]._set | views[2]._set))
+        return state
+
+    def step(self, state: State, dt: float) -> State:
+        for births in state.births:
+            act = partial(_divide, state=state, births=births)
+            state = self.source.call("divide", act, state)
+        return state
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        return ["your own Python, once for all divisions of a step"]
 
 
 def _label(rule: Callable[..., None]) -> str:
@@ -217,29 +274,6 @@ def _apply(update: Callable[[CellsView], None], state: State, dt: float) -> Stat
             state = state.declare(KNOWN_FIELDS[name])
     state = state.with_fields(**work)
     return state if gone is None else state.remove(gone, "removed")
-
-
-@dataclass(frozen=True)
-class DivisionRule(Effect):
-    """The part of Rules that acts after division: the user's `divide(parent, daughter1,
-    daughter2)`."""
-
-    rules: Rules
-
-    stage = DIVISION + 1
-    title = "rules at division"
-
-    def reads(self) -> tuple[str, ...]:
-        return ("cells", *self.rules.noted["divide reads"])
-
-    def writes(self) -> tuple[str, ...]:
-        return self.rules.noted["divide writes"]
-
-    def step(self, state: State, dt: float) -> State:
-        source = self.rules.source
-        for births in state.births:
-            state = source.call("divide", partial(_divide, state=state, births=births), state)
-        return state
 
 
 def _after_divide(

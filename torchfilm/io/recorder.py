@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.effects.mechanics import Mechanics
 from torchfilm.io.results import (
     CHUNK_ROWS,
     CHUNK_VOXELS,
@@ -27,6 +26,7 @@ from torchfilm.io.results import (
     Results,
     committed,
 )
+from torchfilm.model import Model
 from torchfilm.physics.walls import as_data
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, COLONY, PER_CELL, State
@@ -97,12 +97,22 @@ class Recorder:
             )
         self.overwrite = overwrite
         self.file: h5py.File | None = None
-        self.dt = scene.dt  # `simulate` sets the one that it uses
+        self.dt = scene.dt
+        self.model: Model | None = None
         self.tables: dict[str, h5py.Dataset] = {}
         self.births: list[tuple[np.ndarray, ...]] = []
         self.ends: list[tuple[np.ndarray, ...]] = []
         self.last: State | None = None
         self.written = -1
+
+    def attach(self, model: Model, dt: float) -> None:
+        """Take the model and the step that the run uses. Raises InputError for another scene's."""
+        if model.scene is not self.scene and model.scene != self.scene:
+            raise checks.InputError(
+                "the Recorder was made for another scene than the one that runs: its file would"
+                " describe the wrong one."
+            )
+        self.model, self.dt = model, dt
 
     def __call__(self, state: State) -> None:
         self.last = state
@@ -167,7 +177,7 @@ class Recorder:
                     "Start from its last frame.",
                 )
             # of one that was changed on purpose
-            for name, value in {**_about(self.scene), "dt": self.dt}.items():
+            for name, value in {**_about(self.scene, self.model), "dt": self.dt}.items():
                 self.file.attrs[name] = value
             self.file.swmr_mode = True
             self.written, self.first_step = last, int(self.file["frames/step"][0])
@@ -197,7 +207,7 @@ class Recorder:
             "device": str(state.device),
             "dt": self.dt,
             "every": self.every,
-            **_about(scene),
+            **_about(scene, self.model),
             "torchfilm": __version__,
             "torch": str(torch.__version__),
             "declared": json.dumps(
@@ -347,16 +357,11 @@ class Recorder:
         self.births, self.ends = [], []
 
 
-def _about(scene: Scene) -> dict[str, str]:
+def _about(scene: Scene, model: Model | None) -> dict[str, str]:
     """What tells which scene a file is of, and from which it is built again."""
-    walls = [
-        as_data(s)
-        for effect in scene.effects
-        if isinstance(effect, Mechanics)
-        for s in effect.surfaces()
-    ]
+    walls = [as_data(s) for effect in scene.effects for s in effect.wall_surfaces()]
     return {
-        "scene": scene.explain(),
+        "scene": (model or scene.bind()).describe(),
         "effects": json.dumps(scene.listing()),
         "code": json.dumps(scene.code),
         "walls": json.dumps(walls),

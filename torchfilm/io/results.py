@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.model import bind
 from torchfilm.scene import Scene
 from torchfilm.signals.grid import Grid
 from torchfilm.state import OUTSIDE, PER_CELL, Field, State
@@ -427,12 +428,15 @@ class Results:
         k = self._index(frame)
         dtype = getattr(torch, str(self.file.attrs["dtype"]))
         device = torch.device(device if device is not None else "cpu")
-        template = scene.unchecked(
+        model = bind(
+            scene,
             int(self.colony_id.max()) + 1,
             seed=int(self.file.attrs["seed"]),
             dtype=dtype,
             device=device,
+            check_first=False,
         )
+        template = model.start()
         if template.dim != int(self.file.attrs["dim"]):
             raise checks.input_error(
                 "scene", f"{template.dim}-D", f"{self.file.attrs['dim']}-D, as {self.path} is"

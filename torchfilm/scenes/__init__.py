@@ -43,8 +43,7 @@ def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
             }
         )
         plain = {n: v.tolist() if hasattr(v, "tolist") else v for n, v in bound.arguments.items()}
-        scene.name, scene.recipe = make.__name__, (make.__name__, plain)
-        return scene
+        return scene.replace(name=make.__name__, recipe=(make.__name__, plain))
 
     # where it is found by its name, as pickling for another process does
     build.__module__ = __name__

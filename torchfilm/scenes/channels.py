@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from torchfilm.effect import Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
@@ -10,6 +9,7 @@ from torchfilm.effects.removal import Removal
 from torchfilm.initial_cells import Cells
 from torchfilm.physics.walls import Channel
 from torchfilm.scene import Scene
+from torchfilm.values import Uniform
 
 
 def channel(

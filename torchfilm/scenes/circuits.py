@@ -7,7 +7,6 @@ from torch import Tensor
 
 from torchfilm.circuits import parts
 from torchfilm.circuits.reactions import Reaction
-from torchfilm.effect import Uniform
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
@@ -15,6 +14,7 @@ from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.rules import Rules
 from torchfilm.rule_views import DivisionView
 from torchfilm.scene import Scene
+from torchfilm.values import Uniform
 
 Value = float | Tensor
 
@@ -60,7 +60,8 @@ def repressilator(
 
     alpha, basal, beta, power: the dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ −
     pᵢ); speed: its unit of time is 1/speed h, the mRNA's lifetime. noise: molecule by molecule
-    (tau-leaping), with `molecules_per_unit` of them in a unit of concentration × µm³; else smoothly.
+    (tau-leaping), with `molecules_per_unit` of them in a unit of concentration × µm³; else
+    smoothly.
     """
     names = ("laci", "tetr", "ci")
     reactions = []
@@ -105,7 +106,8 @@ def toggle_switch(
 
     x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y =
     `start`, by default where decay, dilution and repression balance. noise: molecule by molecule,
-    with `molecules_per_unit` of them in a unit of concentration × µm³. Growth dilutes beside the decay.
+    with `molecules_per_unit` of them in a unit of concentration × µm³. Growth dilutes beside the
+    decay.
     """
     reactions = []
     for name, by in (("red", "green"), ("green", "red")):

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import torch
 
-from torchfilm.effect import Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
@@ -13,6 +12,7 @@ from torchfilm.effects.rules import Rules
 from torchfilm.physics.walls import Plane
 from torchfilm.rule_views import CellsView
 from torchfilm.scene import Scene
+from torchfilm.values import Uniform
 
 
 def microcolony(

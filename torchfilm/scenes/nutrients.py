@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchfilm.effect import Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
@@ -12,6 +11,7 @@ from torchfilm.effects.medium import Medium, Signal
 from torchfilm.effects.nutrition import Monod
 from torchfilm.scene import Scene
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet
+from torchfilm.values import Uniform
 
 
 def nutrient_limited(

@@ -6,7 +6,6 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchfilm.circuits.names import Names
-from torchfilm.effect import Uniform
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
@@ -15,6 +14,7 @@ from torchfilm.effects.medium import Medium, Signal
 from torchfilm.initial_cells import Cells
 from torchfilm.physics.walls import Channel
 from torchfilm.scene import Scene
+from torchfilm.values import Uniform
 
 Value = float | Tensor
 

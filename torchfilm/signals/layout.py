@@ -4,9 +4,8 @@ a state carries along."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,8 +37,7 @@ class Layout:
     """grid: one a colony. periodic: along which axes space closes on itself. height: z of the plane
     of 2-D cells, µm. obstacle: a function from places (nodes, 3) µm to (nodes,) bool, true where no
     signal can be, or None. reservoir: None, or what cells beyond the box find there, the
-    concentration of each signal by name, one number or one per colony of the scene. work: what was
-    made ready for this grid, to be used again.
+    concentration of each signal by name, one number or one per colony of the scene.
     """
 
     grid: Grid
@@ -47,7 +45,6 @@ class Layout:
     height: float = 0.0
     obstacle: Callable[[Tensor], Tensor] | None = None
     reservoir: Mapping[str, float | Tensor] | None = None
-    work: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
     def mask(self) -> Tensor | None:
@@ -158,7 +155,7 @@ class Layout:
 
     def on(self, grid: Grid) -> Layout:
         """The same medium on another grid."""
-        return self if grid is self.grid else replace(self, grid=grid, work={})
+        return self if grid is self.grid else replace(self, grid=grid)
 
     def take(self, places: Tensor) -> tuple[Layout, Tensor]:
         """The layout of some colonies (b,), and the rows (nodes,) of their voxels in this one."""

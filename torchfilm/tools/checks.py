@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import difflib
+import functools
+import inspect
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
 
 Number = float | int
+F = TypeVar("F", bound=Callable[..., Any])
 Value = float | Tensor | Sequence[float]
 
 
@@ -31,6 +35,28 @@ def input_error(name: str, value: object, allowed: str, hint: str = "") -> Input
     return InputError(
         f"{name} = {shown} is not allowed: it must be {allowed}." + (f" {hint}" if hint else "")
     )
+
+
+def unknown_keyword(name: str, given: str, allowed: Sequence[str]) -> InputError:
+    """The error for a keyword that nothing takes, with the nearest one that is."""
+    near = difflib.get_close_matches(given, allowed, 1)
+    hint = f" Did you mean {near[0]}?" if near else ""
+    return InputError(f"{name} has no keyword {given!r}: it has {', '.join(allowed)}.{hint}")
+
+
+def known_keywords(function: F) -> F:
+    """Let a function raise InputError, with the nearest name, for a keyword that it does not
+    take."""
+    allowed = [n for n in inspect.signature(function).parameters]
+
+    @functools.wraps(function)
+    def checked(*args: Any, **given: Any) -> Any:
+        for name in given:
+            if name not in allowed:
+                raise unknown_keyword(function.__name__, name, allowed)
+        return function(*args, **given)
+
+    return cast(F, checked)
 
 
 def number(

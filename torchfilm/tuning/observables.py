@@ -31,10 +31,10 @@ from torch import Tensor
 
 from torchfilm import measure
 from torchfilm.effect import DIVISION, GROWTH
-from torchfilm.effects.circuit import Circuit
-from torchfilm.effects.mechanics import Mechanics
+from torchfilm.loop import Standstill, advance
+from torchfilm.model import Model
 from torchfilm.scene import Scene
-from torchfilm.simulation import Standstill, simulate
+from torchfilm.simulation import simulate
 from torchfilm.state import State
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.timing import Timings
@@ -98,6 +98,7 @@ class AccuracyProbe:
 
     given: Scene
     scene: Scene  # as it is probed: molecules by their mean
+    model: Model  # of that, as its own settings have it
     start: State
     dt: float
     of: tuple[str, ...] | None
@@ -113,7 +114,8 @@ class AccuracyProbe:
 
     def observed(self, settings: Settings) -> WindowRun:
         """What is read off the window by these settings."""
-        made, steps = settings.apply(self.scene), self.steps(settings)
+        steps = self.steps(settings)
+        made = settings.apply(self.scene).bind(state=self.start, per_colony=True)
         dt, state, seen, timings, broken, several = (
             self.dt * WINDOW / steps,
             self.start,
@@ -125,15 +127,17 @@ class AccuracyProbe:
         # what other work on the machine takes does not count, where the work is this thread's own
         clock = time.thread_time if state.device.type == "cpu" else time.perf_counter
         begun = clock()
-        for k in range(steps):
-            state = made.step(state, dt, timings)
+        last = self.start.step + steps
+        stop = lambda s: s.step >= last
+        for after in advance(partial(made.step, dt=dt, timings=timings), state, stop=stop):
+            state = after
             broken = broken or any(bool((r.status != 0).any()) for r in state.reports.values())
             several = several or any(
                 bool((r.substeps > 1).any())
                 for r in state.reports.values()
                 if hasattr(r, "substeps")
             )
-            if 2 * (k + 1) % steps == 0:
+            if 2 * (state.step - self.start.step) % steps == 0:
                 seen.append(state)
         seconds = clock() - begun
         found: Seen = {}
@@ -153,7 +157,7 @@ class AccuracyProbe:
     def _due(self, state: State) -> Tensor:
         """The number of cells after the divisions with which the next step would begin, (B, 1):
         until then it is late, by a step that is known."""
-        for effect in self.scene.effects:
+        for effect in self.model.effects:
             if effect.stage <= DIVISION:
                 state = effect.step(state, self.dt)
         return state.counts.double().cpu().unsqueeze(1)
@@ -161,7 +165,7 @@ class AccuracyProbe:
     def _wanted(self, state: State) -> Tensor:
         """By how much the volume would grow in an hour if nothing held it back, (B, 1) µm³."""
         grown = state
-        for effect in self.scene.effects:
+        for effect in self.model.effects:
             if effect.stage == GROWTH:
                 grown = effect.step(grown, self.dt)
         return _over(state, math.pi * state.radius**2 * (grown.length - state.length) / self.dt)
@@ -199,13 +203,7 @@ class AccuracyProbe:
             return (value[:, -1, 0] - value[:, 0, 0] - added).abs() / torch.maximum(
                 added.abs(), growth * self.dt * WINDOW / 2
             ).clamp(min=1e-30)
-        if (
-            name == "overlap"
-            and not apart
-            and not any(
-                isinstance(e, Mechanics) and e.stiffness is not None for e in self.scene.listed
-            )
-        ):
+        if name == "overlap" and not apart and not any(e.soft_contacts for e in self.scene.effects):
             each = value
         elif name == "overlap":
             each = (value - right).abs()
@@ -226,16 +224,16 @@ def begin(
     device: str | torch.device = "cpu",
 ) -> AccuracyProbe:
     """The scene as it is probed, grown to where the windows begin."""
-    smooth = [e.smooth() if isinstance(e, Circuit) and e.is_stochastic else e for e in scene.listed]
-    made = scene.retuned(smooth, scene.dt, scene.accuracy)
+    made = scene.replace(*(e.without_noise() for e in scene.effects))
     fixed = scene.fixed_colonies
-    founded = state = made.seed(fixed if fixed > 1 else colonies, seed=seed, device=device)
+    model = made.bind(fixed if fixed > 1 else colonies, seed=seed, device=device, per_colony=True)
+    founded = state = model.start()
     standstill = Standstill(cells, STILL)
-    for state in simulate(made, founded, cells=cells, until=MOST_STEPS * scene.dt):
+    for state in simulate(model, founded, cells=cells, until=MOST_STEPS * scene.dt):
         # one colony that stays small is enough: the others would grow without end
         if bool(standstill(state).any()):
             break
-    return AccuracyProbe(scene, made, state, scene.dt, None if of is None else tuple(of))
+    return AccuracyProbe(scene, made, model, state, scene.dt, None if of is None else tuple(of))
 
 
 def observables(state: State) -> dict[str, Tensor]:

@@ -13,9 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchfilm.effect import Effect
-from torchfilm.effects.circuit import STIFF, Circuit
-from torchfilm.effects.mechanics import Mechanics
 from torchfilm.scene import Scene
 from torchfilm.tools import checks
 
@@ -63,23 +60,11 @@ class Settings:
     def apply(self, scene: Scene) -> Scene:
         """The same scene, simulated so: its results say so too, and go on so. Knobs of effects that
         it does not list do nothing."""
-        return scene.retuned(
-            [self._applied(effect) for effect in scene.listed],
-            scene.dt if self.dt is None else self.dt,
-            {**scene.accuracy, **self.given},
+        return scene.replace(
+            *(effect.with_settings(self) for effect in scene.effects),
+            dt=scene.dt if self.dt is None else self.dt,
+            accuracy={**scene.accuracy, **self.given},
         )
-
-    def _applied(self, effect: Effect) -> Effect:
-        if isinstance(effect, Mechanics):
-            changed: dict[str, Any] = {
-                n: getattr(self, n) for n in ("passes", "tolerance") if getattr(self, n) is not None
-            }
-            if self.penalty is not None and effect.stiffness is None:
-                changed["alpha"] = self.penalty / effect.length_drag
-            return dataclasses.replace(effect, **changed) if changed else effect
-        if isinstance(effect, Circuit) and effect.method == STIFF and self.rtol is not None:
-            return effect.solved_to(self.rtol)
-        return effect
 
     def save(self, path: str | Path) -> Path:
         """Write them to a new JSON file."""

@@ -3,11 +3,11 @@
 A few colonies of the scene are grown by its own settings; from that same state a window of some
 steps is run again and again: once by far tighter settings, the reference, and then by other
 settings, each step by knobs from loose to tight. What a user would read off at the end is compared,
-observable by observable: the table is in `torchfilm.tuning.observables`. Each error, with what of it may be
-chance, must be within what was asked; of the settings that are, the one that took the least time is
-chosen, confirmed in other colonies that are smaller by a third, and measured once more with each of
-its knobs tightened, which tells the knobs' parts in the error. Cheaper ones whose error is within
-it but for chance are looked at among more colonies, and chosen if it is there.
+observable by observable: the table is in `torchfilm.tuning.observables`. Each error, with what of
+it may be chance, must be within what was asked; of the settings that are, the one that took the
+least time is chosen, confirmed in other colonies that are smaller by a third, and measured once
+more with each of its knobs tightened, which tells the knobs' parts in the error. Cheaper ones whose
+error is within it but for chance are looked at among more colonies, and chosen if it is there.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ from dataclasses import dataclass
 
 import torch
 
-from torchfilm.effects.circuit import STIFF, Circuit
-from torchfilm.effects.mechanics import Mechanics
 from torchfilm.scene import Scene
 from torchfilm.tools import checks
 from torchfilm.tuning.observables import (
@@ -217,17 +215,12 @@ class Search:
         more: Callable[[], AccuracyProbe] | None = None,
     ):
         self.probe, self.other, self.error, self.watch, self.more = probe, other, error, watch, more
-        self.mechanics = next((e for e in probe.scene.listed if isinstance(e, Mechanics)), None)
-        self.circuit = next(
-            (e for e in probe.given.listed if isinstance(e, Circuit) and e.method == STIFF), None
-        )
-        self.contacts = CONTACTS if self.mechanics is not None else (TIGHT_CONTACTS,)
+        self.knobs = _knobs(probe.scene)
+        # of the scene as it is given: circuits that run molecule by molecule have no tolerance
+        self.stiff = "rtol" in _knobs(probe.given)
+        self.contacts = CONTACTS if "tolerance" in self.knobs else (TIGHT_CONTACTS,)
         self.tight = TIGHT * error
-        self.rtols = (
-            tuple(r for r in CIRCUITS if r > self.tight)
-            if self.circuit is not None
-            else (self.tight,)
-        )
+        self.rtols = tuple(r for r in CIRCUITS if r > self.tight) if self.stiff else (self.tight,)
         self.finest = FINEST
         self.runs: dict[Settings, WindowRun] = {}
         self.errors: dict[Settings, dict[str, Error]] = {}
@@ -242,13 +235,13 @@ class Search:
     def settings(self, steps: int, contacts: tuple[float, int, float], rtol: float) -> Settings:
         """As knobs of the scene; those of effects that it does not list stay unset."""
         penalty, more, tolerance = contacts
-        mechanics = self.mechanics
+        knobs = self.knobs
         return Settings(
             dt=self.probe.dt * WINDOW / steps,
-            rtol=None if self.circuit is None else rtol,
-            tolerance=None if mechanics is None else tolerance,
-            passes=None if mechanics is None or more == 0 else mechanics.usual_passes + more,
-            penalty=None if mechanics is None or mechanics.stiffness is not None else penalty,
+            rtol=rtol if self.stiff else None,
+            tolerance=tolerance if "tolerance" in knobs else None,
+            passes=int(knobs["passes"]) + more if more and "passes" in knobs else None,
+            penalty=penalty if "penalty" in knobs else None,
         )
 
     @torch.no_grad()
@@ -448,8 +441,8 @@ class Search:
         return sum(each.values())
 
     def _look_at(self, steps: int, limit: float) -> None:
-        """Trial a window of so many steps with tighter and tighter knobs until the error is held, or
-        more than `limit` seconds are taken; not at all what is hopeless."""
+        """Trial a window of so many steps with tighter and tighter knobs until the error is held,
+        or more than `limit` seconds are taken; not at all what is hopeless."""
         tightest = self.settings(steps, TIGHT_CONTACTS, self.tight)
         if (
             self._hopeless(tightest)
@@ -502,7 +495,7 @@ class Search:
 
     def _circuits_add(self, steps: int, rtol: float) -> float:
         """What circuits at `rtol` change in the worst observable, contacts as they usually are."""
-        usual = CONTACTS[3] if self.mechanics is not None else TIGHT_CONTACTS
+        usual = CONTACTS[3] if "tolerance" in self.knobs else TIGHT_CONTACTS
         loose, tight = (self._run(self.settings(steps, usual, r)).found for r in (rtol, self.tight))
         return _greatest(
             self.probe.errors(
@@ -516,9 +509,9 @@ class Search:
         s = best.settings
         tight = self.settings(self.probe.steps(s), TIGHT_CONTACTS, self.tight)
         parts = {"step": self._found(tight)}
-        if self.mechanics is not None:
+        if "tolerance" in self.knobs:
             parts["contacts"] = self._difference(s, dataclasses.replace(tight, rtol=s.rtol))
-        if self.circuit is not None:
+        if self.stiff:
             parts["circuits"] = self._difference(s, dataclasses.replace(s, rtol=tight.rtol))
         return parts
 
@@ -527,6 +520,13 @@ class Search:
         return self.probe.errors(
             found, {n: v for n, v in against.items() if n in self.reference}, apart=True
         )
+
+
+def _knobs(scene: Scene) -> dict[str, float]:
+    """The accuracy settings that a scene's effects take, with their usual values."""
+    return {
+        name: value for effect in scene.effects for name, value in effect.accuracy_knobs().items()
+    }
 
 
 def _smallest(probe: AccuracyProbe) -> int:

@@ -1,0 +1,297 @@
+"""About what a scene will cost: measured, not modelled.
+
+The scene itself is run for a moment on a small crowd of cells, once in a single colony and once in
+several. The time and bytes of each effect are fitted by a + b · cells, or a + b · colonies where it
+works on their grids.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+
+from torchfilm.initial_cells import Cells
+from torchfilm.loop import advance, failures
+from torchfilm.model import Model
+from torchfilm.scene import Scene
+from torchfilm.state import CELL, GRID, PER_CELL, State
+from torchfilm.tools import checks
+from torchfilm.tools.counting import Operators
+from torchfilm.tools.timing import Timings
+
+# The probe: a colony of ROWS × COLUMNS cells alone for a few blocks of steps, then several side by
+# side, until time is up or each has so many cells. The steps of a block are timed; at first, and
+# whenever there are so many times the cells, the bytes of one more step are counted, which takes
+# far longer.
+ROWS, COLUMNS, ALONE_BLOCKS, PROBE_COLONIES, PROBE_CELLS, BLOCK_STEPS, COUNT_AGAIN = (
+    8,
+    4,
+    4,
+    8,
+    100,
+    5,
+    2,
+)
+
+
+class Spending(Timings):
+    """In place of seconds, what each effect of `model.step(state, dt, spending)` asks of torch, by
+    title: operators by name, and bytes for their results."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: dict[str, Counter[str]] = {}
+        self.bytes: dict[str, int] = {}
+
+    @contextmanager
+    def of(self, name: str, device: torch.device) -> Iterator[None]:
+        """Count what this block asks for under `name`."""
+        with Operators() as seen:
+            yield
+        self.calls[name] = self.calls.get(name, Counter()) + seen.calls
+        self.bytes[name] = self.bytes.get(name, 0) + seen.bytes
+
+
+@dataclass(frozen=True)
+class Block:
+    """A few steps of a probe: mean cells in all, colonies, and by effect the median seconds of a
+    step and, if they were counted, the bytes that one allocated for results."""
+
+    cells: float
+    colonies: int
+    seconds: dict[str, float]
+    bytes: dict[str, int]
+
+
+@dataclass(frozen=True)
+class CostProbe:
+    """What a scene's first steps took: blocks, where the several colonies began and ended, what
+    failed, if something did, and whether they began as a crowd that was laid out, or as the scene's
+    founders."""
+
+    model: Model
+    blocks: list[Block]
+    first: State
+    last: State
+    failed: str
+    laid: bool
+
+    def fit(self, what: str) -> dict[str, tuple[float, float, float]]:
+        """By effect (a, b, c) ≥ 0 of a + b · cells + c · colonies, for "seconds" or "bytes" of a
+        step, by least squares of the relative errors. A grid is per colony, all else per cell:
+        effects that work on grids have b = 0, the others c = 0."""
+        found = {}
+        for title in self.blocks[0].seconds:
+            on_grid = any(e.title == title and e.works_on_grid for e in self.model.effects)
+            blocks = [block for block in self.blocks if getattr(block, what)]
+            rows = [(1.0, float(block.colonies if on_grid else block.cells)) for block in blocks]
+            value = np.array([getattr(block, what)[title] for block in blocks], dtype=float)
+            weight = 1.0 / np.maximum(value, 1e-9)
+            (start, slope), _ = nnls(np.array(rows) * weight[:, None], value * weight)
+            found[title] = (start, 0.0, slope) if on_grid else (start, slope, 0.0)
+        return found
+
+
+def crowd(founders: Cells) -> Cells:
+    """Cells like the nearest founder each, laid side by side about the founders' middle: a small
+    colony that need not be grown."""
+    mine = (
+        np.flatnonzero(founders.colony == 0)
+        if founders.colony is not None
+        else np.arange(founders.count)
+    )
+    along = founders.axis[mine[0]]
+    across = np.zeros_like(along)
+    across[:2] = (-along[1], along[0]) if along[:2].any() else (0.0, 1.0)
+    across /= np.linalg.norm(across)
+    width = 2.0 * float(founders.radius[mine].max())
+    long = float(founders.length[mine].max()) + width
+    column, row = (
+        x.reshape(-1, 1)
+        for x in np.meshgrid(
+            np.arange(COLUMNS) - (COLUMNS - 1) / 2, np.arange(ROWS) - (ROWS - 1) / 2
+        )
+    )
+    position = founders.position[mine].mean(0) + column * long * along + row * width * across
+    like = mine[((position[:, None] - founders.position[mine]) ** 2).sum(2).argmin(1)]
+    kind = None if founders.cell_type is None else founders.cell_type[like]
+    extra = {name: values[like] for name, values in founders.extra.items()}
+    return Cells(position, along, founders.length[like], founders.radius[like], kind, extra=extra)
+
+
+def probe(scene: Scene, colonies: int, device: str | torch.device, seconds: float) -> CostProbe:
+    """Run a scene's first steps: one colony, then several, of `colonies` that it can be seeded
+    with, for about so many seconds."""
+    begun, laid = time.perf_counter(), True
+    try:
+        laid_out = crowd(scene.founders)
+        model = scene.bind(colonies, cells=laid_out, device=device, per_colony=True)
+    except checks.InputError:  # no room for a crowd, between walls or in the medium's box
+        laid, model = False, scene.bind(colonies, device=device, per_colony=True)
+    state = model.start()
+    blocks, _, failed = _watched(model, state.select([0]), ALONE_BLOCKS, begun + seconds / 4)
+    first = state.select(list(range(min(PROBE_COLONIES, state.colonies))))
+    more, last, also = _watched(model, first, 10**6, begun + seconds)
+    return CostProbe(model, blocks + more, first, last, failed or also, laid)
+
+
+@torch.no_grad()
+def _watched(model: Model, state: State, most: int, end: float) -> tuple[list[Block], State, str]:
+    """Blocks of steps, at least one, until there are `most`, or cells enough, or the clock shows
+    `end`; the state then; what failed."""
+    state = model.step(state)  # what is made once is made now
+    blocks: list[Block] = []
+    counted, broken = 0, failures(state)
+    while not broken and (
+        not blocks
+        or (
+            len(blocks) < most
+            and time.perf_counter() < end
+            and bool((state.counts < PROBE_CELLS).any())
+        )
+    ):
+        taken: list[dict[str, float]] = []
+        counts = []
+        timings = Timings()
+        for later in advance(partial(model.step, timings=timings), state):
+            state = later
+            taken.append(dict(timings.seconds))
+            timings.seconds.clear()
+            counts.append(state.cells)
+            broken = broken or failures(state)
+            if len(taken) == BLOCK_STEPS or time.perf_counter() > end:
+                break
+        spent = Spending()
+        if state.cells >= counted * COUNT_AGAIN and (
+            time.perf_counter() < end or state.colonies == 1
+        ):
+            counted = state.cells
+            state = model.step(state, timings=spent)
+        medians = {title: float(np.median([t[title] for t in taken])) for title in taken[0]}
+        blocks.append(Block(float(np.mean(counts)), state.colonies, medians, spent.bytes))
+    return blocks, state, broken[0].reason if broken else ""
+
+
+def state_bytes(state: State) -> tuple[float, float]:
+    """Bytes of a state for each cell, and for each colony's grid."""
+    cell = sum(getattr(state, n).nbytes for n in PER_CELL) + sum(
+        v.nbytes for n, v in state.fields.items() if state.declared[n].scope == CELL
+    )
+    grid = sum(v.nbytes for n, v in state.fields.items() if state.declared[n].scope == GRID)
+    return cell / max(1, state.cells), grid / state.colonies
+
+
+def cost_lines(
+    scene: Scene,
+    seedable: int,
+    cells: int,
+    colonies: int,
+    device: str | torch.device,
+    seconds: float,
+) -> list[str]:
+    """The estimate in lines."""
+    begun = time.perf_counter()
+    seen = probe(scene, seedable, device, seconds)
+    took = time.perf_counter() - begun
+    if not seen.blocks:
+        return [f"estimated cost: none, since the first step failed: {seen.failed}"]
+    spent, asked = seen.fit("seconds"), seen.fit("bytes")
+    total = cells * colonies
+    each = {title: value(abc, total, colonies) for title, abc in spent.items()}
+    step = sum(each.values())
+    shares = ", ".join(
+        f"{title} {100 * t / step:.0f} %"
+        for title, t in sorted(each.items(), key=lambda x: -x[1])
+        if t >= 0.005 * step
+    )
+    per_cell, per_grid = state_bytes(seen.last)
+    working = sum(value(abc, total, colonies) for abc in asked.values())
+    where = f"{cells} cells" + (f" in each of {colonies} colonies" if colonies > 1 else "")
+    start = f"{ROWS * COLUMNS} cells laid side by side" if seen.laid else "the founders"
+    lines = [
+        (
+            f"estimated cost at {where}, {seen.last.device.type}, float32,"
+            f" {torch.get_num_threads()} thread(s) of this machine:"
+        ),
+        f"  a step   {_time(step)}: {shares}",
+        f"  a run    {_run(scene, seen, spent, cells, colonies)}",
+        (
+            f"  memory   the state {_size(per_cell * total + per_grid * colonies)}; a step"
+            f" allocates {_size(working)} in all and frees most as it goes; with gradients, up to"
+            " that is kept for each step"
+        ),
+        (
+            f"  how      measured for {took:.1f} s from {start}: at most"
+            f" {ALONE_BLOCKS * BLOCK_STEPS} steps of one colony, then {seen.last.step} of"
+            f" {seen.last.colonies}, to {seen.last.cells} cells in all;"
+        ),
+        "           fitted by a + b · cells, for grids a + b · colonies",
+        (
+            "           an estimate, to a factor of two or three: larger colonies take more"
+            " iterations to solve, circuits may get busier than they begin,"
+        ),
+        "           and other work on the machine counts too",
+    ]
+    return lines + ([f"  warning  a probe failed: {seen.failed}"] if seen.failed else [])
+
+
+def value(abc: tuple[float, float, float], cells: float, colonies: float) -> float:
+    """a + b · cells + c · colonies."""
+    return abc[0] + abc[1] * cells + abc[2] * colonies
+
+
+def _run(
+    scene: Scene,
+    seen: CostProbe,
+    spent: dict[str, tuple[float, float, float]],
+    cells: int,
+    colonies: int,
+) -> str:
+    """Steps and time of a run from the founders to so many cells, at the pace at which the probe's
+    volume grew."""
+    before, after = (max(1e-30, float(state.volume.sum())) for state in (seen.first, seen.last))
+    pace = math.log2(after / before) / max(1, seen.last.step)
+    if pace <= 0:
+        return "not foretold: the probe did not grow"
+    start = scene.founders.count / scene.founders.colonies
+    steps = math.ceil(max(0.0, math.log2(cells / max(1.0, start))) / pace)
+    taken = sum(
+        value(abc, start * 2 ** (pace * k) * colonies, colonies)
+        for k in range(steps)
+        for abc in spent.values()
+    )
+    return (
+        f"{steps} steps ({steps * scene.dt:.3g} h), {_time(taken)}, from the founders at the"
+        " probe's pace; more where pressure or hunger holds growth back"
+    )
+
+
+def _time(seconds: float) -> str:
+    """Seconds in a unit that suits."""
+    for unit, size in (("h", 3600.0), ("min", 60.0), ("s", 1.0)):
+        if seconds >= size:
+            return (
+                f"{seconds / size:.2g} {unit}"
+                if seconds < 10 * size
+                else f"{seconds / size:.0f} {unit}"
+            )
+    return f"{seconds * 1e3:.2g} ms" if seconds < 0.01 else f"{seconds * 1e3:.0f} ms"
+
+
+def _size(count: float) -> str:
+    """Bytes in a unit that suits."""
+    for unit, size in (("GB", 1e9), ("MB", 1e6)):
+        if count >= size:
+            return (
+                f"{count / size:.2g} {unit}" if count < 10 * size else f"{count / size:.0f} {unit}"
+            )
+    return f"{count / 1e3:.2g} kB" if count < 1e4 else f"{count / 1e3:.0f} kB"

@@ -1,0 +1,387 @@
+"""A circuit bound to a batch: traced once, then stepped."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.circuits import run
+from torchfilm.circuits.columns import Lazy
+from torchfilm.circuits.draws import keyed_draws
+from torchfilm.circuits.names import unknown
+from torchfilm.circuits.network import network
+from torchfilm.effect import Binding, BoundEffect, number_range
+from torchfilm.medium_exchange import MediumExchange
+from torchfilm.state import CELL, OUTSIDE, State
+from torchfilm.tools import checks
+from torchfilm.values import numbers, snapshot
+
+if TYPE_CHECKING:
+    from torchfilm.effects.circuit import Circuit
+
+# What of the cell's geometry a name stands for.
+GEOMETRY = {
+    "volume": ("length", "radius"),
+    "area": ("length", "radius"),
+    "x": ("position",),
+    "y": ("position",),
+    "z": ("position",),
+}
+OPTIONS = (
+    "initial",
+    "daughters",
+    "method",
+    "steps",
+    "rtol",
+    "atol",
+    "molecules_per_unit",
+    "name",
+    "shared",
+)
+
+
+@dataclass(frozen=True)
+class CircuitReport:
+    """`status` (B,): 0, or 1 where a cell's circuit could not be stepped, and `words`, by place in
+    the batch, what happened there. steps, (N,) int64: how many steps each cell's circuit took."""
+
+    status: Tensor
+    steps: Tensor
+    words: Mapping[int, str]
+    hint = (
+        "A smaller dt, or rates that stay finite and do not push a concentration below 0, may help"
+    )
+
+    def reason(self, place: int) -> str:
+        return self.words[place]
+
+
+class BoundCircuit(BoundEffect):
+    """A circuit with its networks built, and with the names that its rates read and the signals
+    that they change known."""
+
+    effect: Circuit
+
+    def __init__(self, effect: Circuit, binding: Binding):
+        super().__init__(effect, binding)
+        self.rates = snapshot(effect.rates, "Circuit.rates", binding.batch)
+        self.networks: dict[int | str, run.Network] = {}
+        self.exchanged: dict[int | str, tuple[str, ...]] = {}
+        self.traced_reads: tuple[str, ...] = ()
+        self.signals: tuple[str, ...] = ()  # that rates read or change
+        self.fields = tuple(effect.variables.values())
+
+    # --- binding -------------------------------------------------------------------------
+
+    def reads(self) -> tuple[str, ...]:
+        reservoir = [
+            f"{n}_reservoir" for n in self._signals() if f"{n}_reservoir" in self.binding.declared
+        ]
+        return tuple(dict.fromkeys((*super().reads(), *self.traced_reads, *reservoir)))
+
+    def writes(self) -> tuple[str, ...]:
+        written = [OUTSIDE + n for n in self._signals()]
+        reservoir = [
+            f"{n}_reservoir" for n in self._signals() if f"{n}_reservoir" in self.binding.declared
+        ]
+        return (*super().writes(), *written, *reservoir)
+
+    def _signals(self) -> tuple[str, ...]:
+        """The signals that cells exchange."""
+        return tuple(dict.fromkeys(n for names in self.exchanged.values() for n in names))
+
+    def ready(self, state: State) -> State:
+        return self._whole_molecules(state) if self.effect.is_stochastic and state.cells else state
+
+    def trace(self, state: State) -> State:
+        """Build the networks, and try each rate function on a few cells."""
+        if state.step == 0:
+            state = self.ready(state)
+        if state.cells == 0:
+            return state
+        circuit, signals = self.effect, tuple(state.signals)
+        names = tuple(circuit.variables)
+        self.networks = {
+            k: network(part, names, signals) for k, part in self.rates.items() if not callable(part)
+        }
+        named = [n for made in self.networks.values() for n in made.parameters]
+        for name in named:
+            if name not in circuit.parameters:
+                what = f"a reaction needs the parameter {name!r}, which Circuit was not given"
+                raise checks.InputError(unknown(what, name, list(circuit.parameters)))
+        seen: dict[str, set[str]] = {"s": set(), "cell": set(), "p": set(named)}
+        contact = state.contact()
+        found = {} if contact is None else contact.found
+        exchanged = {}
+        for kind in self.rates:
+            rows = _cells_of(state, kind)
+            # at least two, so that a function that works for a single cell only is found out
+            rows = (
+                rows if rows.numel() else torch.zeros(1, dtype=torch.int64, device=state.device)
+            ).repeat(2)[:64]
+            tried = self._cells(state, rows, kind, (), found, seen=seen)
+            derivatives = circuit.method == "rosenbrock"
+            exchanged[kind] = run.trial(
+                tried, self._concentrations(state, rows), derivatives=derivatives
+            )
+        self._check_constants(seen["p"])
+        self.exchanged = exchanged
+        of_networks = [n for made in self.networks.values() for n in made.signals]
+        self.signals = tuple(
+            n for n in signals if n in {*seen["s"], *self._signals(), *of_networks}
+        )
+        geometry = {
+            g for n in seen["cell"] for g in GEOMETRY.get(n, (n,) if n in state.fields else ())
+        }
+        if self.signals:
+            geometry.add("position")
+        outside = {OUTSIDE + n for n in self.signals}
+        self.traced_reads = tuple(sorted({*geometry, *outside}))
+        return state
+
+    def _check_constants(self, read: set[str]) -> None:
+        """Raise InputError for a constant that looks like another name, and warn of one that no
+        rate reads."""
+        given = self.effect.parameters
+        for name in given:
+            if name in read:
+                continue
+            near = difflib.get_close_matches(name, OPTIONS, 1, 0.75)
+            if near:
+                raise checks.InputError(
+                    f"Circuit.{name} is a constant that no rate reads. Did you mean the option"
+                    f" {near[0]}?"
+                )
+            known = [n for n in read if n not in given]
+            like = difflib.get_close_matches(name, known, 1)
+            warnings.warn(
+                f"Circuit.{name} is a constant that no rate reads"
+                + (
+                    f". Did you mean {like[0]!r}?"
+                    if like
+                    else ": remove it, or use it as p." + name + "."
+                ),
+                stacklevel=2,
+            )
+
+    def _whole_molecules(self, state: State) -> State:
+        """First concentrations that are whole numbers of molecules: rounded up or down at random,
+        so that the mean stays."""
+        rows = torch.arange(state.cells, device=state.device)
+        size = state.volume * self.values.molecules_per_unit.of_cells(state)
+        found = {
+            n: torch.floor(state.fields[n] * size + state.uniform(rows, f"first {n}")) / size
+            for n in self.effect.own_fields
+        }
+        return state.with_fields(**found)
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        c = self.effect
+        molecules = (
+            f"{number_range(numbers(c.molecules_per_unit))} molecules in a unit of concentration ×"
+            " µm³; no gradient"
+        )
+        said = {
+            "rosenbrock": (
+                f"stiff solver (Rodas3), each cell in steps of its own: error at most {c.atol:g} +"
+                f" {c.rtol:g}·|u| in each; nothing below 0"
+            ),
+            "tau_leap": f"molecule by molecule, tau-leaping (ε = 0.03), {molecules}",
+            "direct": f"molecule by molecule, one event after the other, {molecules}",
+        }
+        explicit = (
+            f"{c.method}, {c.steps} equal step(s) of {dt / c.steps:g} h; nothing controls its error"
+        )
+        lines = [said.get(c.method, explicit)]
+        if self._signals():
+            names = ", ".join(self._signals())
+            lines.append(
+                f"exchanges {names} with each cell's own pool: amounts kept to rounding; first"
+                " order in dt"
+            )
+        return lines
+
+    # --- stepping ------------------------------------------------------------------------
+
+    def step(self, state: State, dt: float) -> State:
+        if state.cells == 0:
+            return state
+        circuit, volume = self.effect, self.effect.volume_field
+        # dilution, rates in the cell as it is half way, dilution: of second order in dt, and keeps
+        # amounts
+        middle, end = _half_way(state, volume), state.volume
+        diluted = {
+            n: state.fields[n] * (state.fields[volume] / middle.volume) for n in circuit.own_fields
+        }
+        state = state.with_fields(**{volume: end}, **diluted)
+        medium = MediumExchange.of(state, self.signals)
+        found = {} if medium is None else medium.found
+        settings = run.IntegrationSettings(
+            circuit.method,
+            circuit.steps,
+            circuit.rtol,
+            circuit.atol,
+            self.values.molecules_per_unit.of_cells(state),
+        )
+        keys = (
+            keyed_draws(state.seed, state.own_stream, state.uid, state.step)
+            if circuit.is_stochastic
+            else None
+        )
+        report = _Report(state)
+        changed = {n: state.fields[n] for n in self.fields}
+        for kind in self.rates:
+            rows = _cells_of(state, kind)
+            if rows.numel() == 0:
+                continue
+            cells = self._cells(middle, rows, kind, self.exchanged[kind], found, medium)
+            concentrations = self._concentrations(state, rows)
+            made = run.step(
+                cells,
+                concentrations,
+                dt,
+                settings,
+                None if keys is None else partial(_draw, keys, rows),
+            )
+            report.note(cells, made, concentrations, circuit.method, dt)
+            for name, value in zip(self.fields, made.concentrations.unbind(1), strict=True):
+                changed[name] = (
+                    value
+                    if rows.numel() == state.cells
+                    else changed[name].index_copy(0, rows, value)
+                )
+            for name in self.exchanged[kind]:
+                assert medium is not None
+                medium.give(name, made.pools[name], made.reservoir.get(name), rows)
+        if medium is not None:
+            state = medium.settle()
+        thinner = middle.volume / end
+        own = set(circuit.own_fields)
+        state = state.with_fields(**{n: v * thinner if n in own else v for n, v in changed.items()})
+        return state.replace(reports={**state.reports, self.title: report.report()})
+
+    def _concentrations(self, state: State, rows: Tensor) -> Tensor:
+        """Of the cells `rows` (M,), (M, S)."""
+        return torch.stack([state.fields[n].index_select(0, rows) for n in self.fields], 1)
+
+    def _cells(
+        self,
+        state: State,
+        rows: Tensor,
+        kind: int | str,
+        exchanged: tuple[str, ...],
+        found: Mapping[str, Tensor],
+        medium: MediumExchange | None = None,
+        seen: dict[str, set[str]] | None = None,
+    ) -> run.CircuitCells:
+        """The circuit in the cells of one type as they are in this state."""
+        part = self.networks.get(kind, self.rates[kind])
+        label = getattr(part, "__name__", "the list of reactions")
+        label += "" if isinstance(kind, str) else f" (cell type {kind})"
+        pool, in_reservoir = (None, None) if medium is None else (medium.pool, medium.in_reservoir)
+        if isinstance(part, run.Network):
+            exchanged = part.signals
+        p = {n: Lazy(partial(self.values[n].of_cells, state)) for n in self.effect.parameters}
+        return run.CircuitCells(
+            part,
+            tuple(self.effect.variables),
+            exchanged,
+            rows,
+            _cell_columns(state, self.fields),
+            p,
+            found,
+            pool,
+            in_reservoir,
+            label,
+            seen or {},
+        )
+
+
+def _draw(keys: Any, rows: Tensor, mine: Tensor, event: int, what: str, count: int) -> Tensor:
+    return keys(rows.index_select(0, mine), event, what, count)
+
+
+def _half_way(state: State, volume_field: str) -> State:
+    """The cells as long as they were half way, in time, between the volume that their
+    concentrations refer to and their own."""
+    before = state.fields[volume_field]
+    volume = (before * state.volume).sqrt()
+    longer = volume / (math.pi * state.radius * state.radius) - state.radius * (4.0 / 3.0)
+    return state.replace(
+        length=torch.where(before == state.volume, state.length, longer.clamp(min=0.0))
+    )
+
+
+def _cell_columns(state: State, species: tuple[str, ...]) -> dict[str, Any]:
+    """What a rate function may read of its cell, by name, each looked up when it is read."""
+    fields = [n for n in state.fields if state.declared[n].scope == CELL and n not in species]
+    columns: dict[str, Any] = {n: Lazy(partial(state.fields.__getitem__, n)) for n in fields}
+    for name in ("length", "radius", "volume", "area", "uid"):
+        columns[name] = Lazy(partial(getattr, state, name))
+    for k, letter in zip(range(state.dim), "xyz", strict=False):
+        columns[letter] = Lazy(partial(_coordinate, state, k))
+    columns["colony"] = Lazy(partial(getattr, state, "own_colony_id"))
+    return columns | {"time": Lazy(partial(_time, state))}
+
+
+def _coordinate(state: State, k: int) -> Tensor:
+    return state.position[:, k].to(state.dtype)
+
+
+def _time(state: State) -> Tensor:
+    return state.length.new_tensor(state.time)
+
+
+class _Report:
+    """What went wrong where, gathered over the cells of all types."""
+
+    def __init__(self, state: State):
+        self.state = state
+        self.status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
+        self.steps = torch.zeros(state.cells, dtype=torch.int64, device=state.device)
+        self.words: dict[int, str] = {}
+
+    def note(
+        self,
+        cells: run.CircuitCells,
+        found: run.CircuitOutcome,
+        concentrations: Tensor,
+        method: str,
+        dt: float,
+    ) -> None:
+        state = self.state
+        self.steps = self.steps.index_copy(0, cells.rows, found.steps)
+        if not bool(found.failed.any()):
+            return
+        at = torch.nonzero(found.failed).squeeze(1)
+        owner = state.colony.index_select(0, cells.rows.index_select(0, at)).tolist()
+        for place in sorted(set(owner)):
+            mine = [k for k, o in zip(at.tolist(), owner, strict=True) if o == place]
+            row = int(cells.rows[mine[0]])
+            said = run.words(cells, found, concentrations, mine[0], method, dt)
+            kind = (
+                f" (type {int(state.fields['cell_type'][row])})"
+                if "cell_type" in state.fields
+                else ""
+            )
+            more = f"; and {len(mine) - 1} more cell(s)" if len(mine) > 1 else ""
+            self.words[place] = f"circuit of cell {int(state.uid[row])}{kind}: {said}{more}"
+            self.status[place] = 1
+
+    def report(self) -> CircuitReport:
+        return CircuitReport(self.status, self.steps, self.words)
+
+
+def _cells_of(state: State, kind: int | str) -> Tensor:
+    """The cells in which a circuit runs, (M,)."""
+    if isinstance(kind, str):
+        return torch.arange(state.cells, device=state.device)
+    return torch.nonzero(torch.eq(state.fields["cell_type"], kind)).squeeze(1)

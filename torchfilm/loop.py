@@ -1,0 +1,161 @@
+"""The time loop: step a state, let monitors look at it, yield it. Running, recording growth,
+replaying and probing all drive this one loop, and share its monitors."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.state import State
+from torchfilm.tools.checks import SimulationError
+
+Step = Callable[[State], State]
+# looks at a state after each step; what it returns, if anything, takes the state's place
+Monitor = Callable[[State], State | None]
+
+# How often, in steps, a run that ends at a number of cells is checked for colonies that no longer
+# grow, and how long they may stand still.
+LOOK, STILL = 100, 1000
+
+
+def advance(
+    step: Step,
+    state: State,
+    *,
+    stop: Callable[[State], bool] | None = None,
+    monitors: Sequence[Monitor] = (),
+) -> Iterator[State]:
+    """The states after each step, until `stop(state)` is true; without `stop`, for ever."""
+    while stop is None or not stop(state):
+        state = step(state)
+        for monitor in monitors:
+            seen = monitor(state)
+            state = state if seen is None else seen
+        yield state
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A colony that failed in the last step: its place in the batch, its id and cells, why, and
+    what may help."""
+
+    place: int
+    colony_id: int
+    cells: int
+    reason: str
+    hint: str
+
+
+def failures(state: State) -> list[Failure]:
+    """The colonies whose last step failed, once for each reason: a solve that did not converge, a
+    cell too short to divide, a circuit whose rates are not finite.
+
+    Every report of the step has a `status` (B,), 0 where all is well, and says what went wrong,
+    `reason(place)`, and what helps, `hint`.
+    """
+    found = []
+    for report in state.reports.values():
+        for place in torch.nonzero(report.status).squeeze(1).tolist():
+            id_, cells = int(state.colony_id[place]), int(state.counts[place])
+            found.append(Failure(place, id_, cells, report.reason(place), report.hint))
+    return found
+
+
+def handle_failures(state: State, on_failure: str) -> State:
+    """Raise SimulationError for the colonies whose last step failed, all at once, or drop their
+    cells."""
+    found = failures(state)
+    if not found:
+        return state
+    places = sorted({f.place for f in found})
+    if on_failure == "raise":
+        raise SimulationError(
+            f"step {state.step} (t = {state.time:g} h) failed in {len(places)} of {state.colonies}"
+            " colonies:\n  "
+            + "\n  ".join(f"colony {f.colony_id} ({f.cells} cells): {f.reason}" for f in found[:20])
+            + "\n"
+            + ". ".join(dict.fromkeys(f.hint for f in found))
+            + '; on_failure="drop" continues without them.',
+            [int(state.colony_id[p]) for p in places],
+        )
+    return state.remove(
+        torch.isin(state.colony, torch.tensor(places, device=state.device)), "failed"
+    )
+
+
+class Standstill:
+    """Which colonies have fewer than `cells` cells and come no nearer: for `steps` steps none has
+    become larger by a hundredth than it ever was."""
+
+    def __init__(self, cells: int, steps: int):
+        self.cells, self.steps = cells, steps
+        self.largest: Tensor | None = None  # (B,) µm³, and at which step that was
+
+    @torch.no_grad()
+    def __call__(self, state: State) -> Tensor:
+        """(B,) bool, of those that have cells."""
+        size = state.groups.sum(state.volume)
+        if self.largest is None:
+            self.largest, self.since = size, torch.full_like(state.counts, state.step)
+        grown = size > 1.01 * self.largest
+        self.largest = torch.where(grown, size, self.largest)
+        self.since = torch.where(grown, state.step, self.since)
+        return (
+            (state.step - self.since >= self.steps)
+            & (state.counts > 0)
+            & (state.counts < self.cells)
+        )
+
+
+class EndlessRunWarning:
+    """Warns, once, of colonies that come no nearer to the number of cells at which a run ends: it
+    might continue for ever."""
+
+    def __init__(self, cells: int):
+        self.standstill, self.warned = Standstill(cells, STILL), False
+
+    def __call__(self, state: State) -> None:
+        if self.warned or state.step % LOOK:
+            return
+        still = self.standstill(state)
+        self.warned = bool(still.any())
+        if self.warned:
+            names = ", ".join(map(str, state.colony_id[still].tolist()[:5]))
+            warnings.warn(
+                f"colony {names}: no larger than {STILL} steps ago, with fewer than the"
+                f" {self.standstill.cells} cells at which this run ends. It may continue for ever:"
+                " give a time to stop at as well (until=…, --until).",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+
+
+class ReportWarnings:
+    """Warns, once each, of what the reports of effects are concerned about, when it has held for as
+    many steps as they say."""
+
+    def __init__(self) -> None:
+        self.steps: dict[tuple[str, str], Tensor] = {}
+        self.warned: set[tuple[str, str]] = set()
+
+    def __call__(self, state: State) -> None:
+        for title, report in state.reports.items():
+            for concern in report.concerns() if hasattr(report, "concerns") else ():
+                self._look(state, (title, concern.name), concern)
+
+    def _look(self, state: State, key: tuple[str, str], concern) -> None:
+        if key in self.warned:
+            return
+        before = self.steps.get(key, torch.zeros_like(state.counts))
+        self.steps[key] = torch.where(concern.where, before + 1, 0)
+        lasting = self.steps[key] >= concern.steps
+        if bool(lasting.any()):
+            self.warned.add(key)
+            text = concern.text(state.colony_id, lasting)
+            warnings.warn(
+                f"step {state.step} (t = {state.time:g} h): {text}", RuntimeWarning, stacklevel=5
+            )

@@ -1,0 +1,408 @@
+"""A scene bound to a batch of colonies: all that is decided once, and the step that decides
+nothing.
+
+    model = scene.bind(colonies=64, seed=0)     # values resolved, circuits and rules traced, declarations checked
+    state = model.start()
+    state = model.step(state, dt)               # for effect in model.effects: state = effect.step(state, dt)
+
+A model also says what depends on what: who drives whom, and which effects grow the colonies and can
+be recorded once (`recorded`), while the others only follow (`following`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchfilm.effect import BUILT_IN, Binding, BoundEffect, parameters
+from torchfilm.initial_cells import Cells
+from torchfilm.state import CELL, Field, State
+from torchfilm.tools import checks
+from torchfilm.tools.timing import Timings
+from torchfilm.values import Batch
+
+if TYPE_CHECKING:
+    from torchfilm.scene import Scene
+
+
+@dataclass(frozen=True)
+class _Start:
+    """From what a batch starts: seed, streams (B,) or None, and its first cells."""
+
+    colonies: int
+    seed: int
+    streams: Tensor | None
+    cells: Cells
+
+
+class Model:
+    """A scene bound to a batch. Made by `scene.bind(…)`.
+
+    effects: what acts in a step, in order. fields: every field of its states by name. batch:
+    colonies, dtype, device. dt: the scene's step, h. `start` gives the first state, `step` the next
+    one. A model holds no state of a run: it may run many states, one after the other or in turn.
+    Values are as they were when the scene was bound; bind again after an optimiser has changed a
+    parameter.
+    """
+
+    def __init__(self, scene: Scene, batch: Batch, start: _Start, places: Collection[int] | None):
+        self.scene, self.batch, self.dt, self.dim = scene, batch, scene.dt, scene.dim
+        self._begin = start
+        binding = Binding(batch, scene.dt, scene.dim, scene.declared_by)
+        bound: list[BoundEffect] = []
+        for place, effect in enumerate(scene.effects):
+            if places is not None and place not in places:
+                continue
+            for part in effect.bind(binding):
+                part.place = place
+                bound.append(part)
+        self.effects: tuple[BoundEffect, ...] = tuple(sorted(bound, key=lambda e: e.stage))
+
+    # --- running -------------------------------------------------------------------------
+
+    def start(self) -> State:
+        """The first state: founders, all fields at their first values, grids laid."""
+        state = self._laid()
+        for effect in self.effects:
+            state = effect.ready(state)
+        return state
+
+    def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
+        """The state dt hours later (by default the scene's step): each effect in turn."""
+        dt = self.dt if dt is None else dt
+        state = state.replace(births=(), ended=(), reports={})
+        for effect in self.effects:
+            if timings is None:
+                state = effect.step(state, dt)
+            else:
+                with timings.of(effect.title, state.device):
+                    state = effect.step(state, dt)
+        return advanced(state, dt)
+
+    def _laid(self) -> State:
+        start = self._begin
+        state = start.cells.state(start.colonies, start.seed, self.batch.device, self.batch.dtype)
+        if start.streams is not None:
+            state = state.replace(stream=start.streams.to(self.batch.device))
+        for effect in self.effects:
+            state = effect.lay(state)
+        for field in self._first_fields.values():
+            state = (
+                _with_given(state, field) if field.name in state.fields else state.declare(field)
+            )
+        return state
+
+    @cached_property
+    def _first_fields(self) -> dict[str, Field]:
+        """Fields that the effects declare, those declared alike once."""
+        found: dict[str, Field] = {}
+        for effect in self.effects:
+            for field in effect.declares():
+                found.setdefault(field.name, field)
+        return found
+
+    @torch.no_grad()
+    def trace(self, state: State | None) -> State:
+        """Let each effect find out, once, what can only be found by trying: names that rules and
+        circuits read and write.
+
+        state: of a run that is to be continued, or None for the first state. Returns the state
+        tried on, made ready.
+        """
+        tried = self._laid() if state is None else state
+        for effect in self.effects:
+            tried = effect.trace(tried)
+        return tried
+
+    # --- checks --------------------------------------------------------------------------
+
+    def check(self, state: State) -> None:
+        """Raise InputError if this is not a state of this model."""
+        if state.dim != self.dim:
+            raise checks.input_error("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
+        highest = int(state.colony_id.max())
+        if highest >= self.batch.colonies and self.scene.per_colony():
+            path, tensor = self.scene.per_colony()[0]
+            raise checks.InputError(
+                f"{path} has {tensor.numel()} values, but the batch has a colony number {highest}:"
+                " the state is not of this scene."
+            )
+        for effect in self.effects:
+            for name in (*effect.effect.needs(), *(f.name for f in effect.declares())):
+                if name not in state.fields and name not in BUILT_IN:
+                    raise checks.InputError(
+                        f"{effect.title} needs the field {name!r}, which this state lacks. Make the"
+                        " state with this scene: scene.bind(…).start()."
+                    )
+
+    def check_step(self, dt: float) -> None:
+        """Raise InputError for a step that no effect can follow."""
+        for effect in self.effects:
+            effect.check_step(dt, any("divide_flag" in e.writes() for e in self.effects))
+
+    def check_end(self, state: State, cells: int) -> None:
+        """Raise InputError if no run would come to `cells` cells: an effect waits for a field that
+        is 0 everywhere in a colony and that nothing sets."""
+        for effect in self.effects:
+            for name in effect.effect.waits_for():
+                if self._sets(name, effect):
+                    continue
+                moves = state.fields[name] != 0
+                if "divide_flag" in state.fields:
+                    moves = moves | (state.fields["divide_flag"] != 0)
+                still = (state.counts > 0) & (state.counts < cells) & ~state.groups.any(moves)
+                if bool(still.any()):
+                    ids = state.colony_id[still].tolist()
+                    some = f" in {len(ids)} of {state.colonies} colonies, first in colony {ids[0]}"
+                    raise checks.InputError(
+                        f"{effect.title} waits for {name!r}, which is"
+                        f" 0{'' if len(ids) == state.colonies else some} and which nothing in this"
+                        f" scene sets: no run would come to {cells} cells. Give"
+                        f" {type(effect.effect).__name__} a parameter above 0 (such as rate=1.0),"
+                        " or a rule that sets it; or end the run by a time, until=…"
+                    )
+
+    def _sets(self, name: str, effect: BoundEffect) -> bool:
+        """Whether another effect may set a field, or lengthen or add cells in its own way."""
+        others = [e for e in self.effects if e.effect is not effect.effect]
+        return any(
+            e.effect.writes_anything
+            or name in e.writes()
+            or not type(e.effect).__module__.startswith("torchfilm.")
+            for e in others
+        )
+
+    # --- what depends on what ------------------------------------------------------------
+
+    def couplings(self) -> list[tuple[str, str, str]]:
+        """Who drives whom: (writer, name, reader) for every name that one effect writes and another
+        reads."""
+        return [
+            (w.title, name, r.title)
+            for w in self.effects
+            for r in self.effects
+            if w.title != r.title
+            for name in w.writes()
+            if name in r.reads() or name in r.effect.needs()
+        ]
+
+    def drives(self) -> list[str]:
+        """The couplings in words: "growth -> mechanics: length, elongation"; "nobody" where there
+        are none."""
+        drives: dict[tuple[str, str], list[str]] = {}
+        for writer, name, reader in self.couplings():
+            drives.setdefault((writer, reader), []).append(name)
+        lines = [
+            f"{w} -> {r}: {', '.join(dict.fromkeys(names))}" for (w, r), names in drives.items()
+        ]
+        return lines or ["nobody"]
+
+    def describe(self) -> str:
+        """What is simulated, in order, with what each effect reads, writes and declares, and who
+        drives whom."""
+        lines = [self.scene.headline]
+        for effect in self.effects:
+            lines.append(f"  {effect.title:<10} {effect.summary()}")
+            lines.append(f"             reads  {', '.join(effect.reads()) or '-'}")
+            lines.append(f"             writes {', '.join(effect.writes()) or '-'}")
+            for f in effect.declares():
+                about = f"({f.unit or '1'}, per {f.scope}; daughters: {f.at_division}): {f.meaning}"
+                lines.append(f"             field  {f.name} {about}")
+        lines += ["  who drives whom:", *(f"    {line}" for line in self.drives())]
+        return "\n".join(lines)
+
+    @cached_property
+    def recorded(self) -> tuple[int, ...]:
+        """Which effects, by their places in the scene, move, grow, divide or remove cells, or drive
+        what does."""
+        everything = {e.place for e in self.effects}
+        if any(e.effect.writes_anything for e in self.effects):
+            return tuple(sorted(everything))
+        reads, writes = self._by_place()
+        growth = {k for k in everything if writes[k] & set(BUILT_IN)}
+        while True:
+            wanted = set().union(*(reads[k] for k in growth))
+            more = {k for k in everything if writes[k] & wanted} - growth
+            if not more:
+                return tuple(sorted(growth))
+            growth |= more
+
+    @property
+    def following(self) -> tuple[int, ...]:
+        """Which effects, by their places in the scene, act back on nothing of that."""
+        return tuple(sorted({e.place for e in self.effects} - set(self.recorded)))
+
+    def _by_place(self) -> tuple[dict[int, set[str]], dict[int, set[str]]]:
+        reads: dict[int, set[str]] = {e.place: set() for e in self.effects}
+        writes: dict[int, set[str]] = {e.place: set() for e in self.effects}
+        for e in self.effects:
+            reads[e.place] |= {*e.reads(), *e.effect.needs()}
+            # what is declared has a first value, and whoever reads that needs it
+            writes[e.place] |= {*e.writes(), *(f.name for f in e.declares())}
+        return reads, writes
+
+    @cached_property
+    def why_not_replayable(self) -> str:
+        """Why growth cannot be recorded once for all designs of this scene, or "" if it can."""
+        return why_not_replayable(self)
+
+    def __repr__(self) -> str:
+        b = self.batch
+        return (
+            f"Model({self.scene.name!r}, {b.colonies} colonies, {str(b.dtype)[6:]} on {b.device})"
+        )
+
+
+def advanced(state: State, dt: float) -> State:
+    """The state with its step counted. With an even step time is counted in steps, so that it
+    gathers no rounding."""
+    even = abs(state.step * dt - state.time) < 1e-9 * max(1.0, state.time)
+    return state.replace(
+        step=state.step + 1, time=(state.step + 1) * dt if even else state.time + dt
+    )
+
+
+def why_not_replayable(model: Model) -> str:
+    """Why the growth of a model cannot be recorded for other designs, or ""."""
+    anything = [e.title for e in model.effects if e.effect.writes_anything]
+    if anything:
+        return f"{anything[0]} may read and write anything"
+    if model.scene.founders.colony is not None:
+        return "its first cells name their colonies, so that these do not start alike"
+    for e in model.effects:
+        for f in e.declares():
+            if f.scope != CELL and e.place in model.recorded:
+                return (
+                    f"{e.effect.title} acts on growth or motion by {f.name!r}, which is no quantity"
+                    " of cells"
+                )
+    if not model.following:
+        return "every effect acts on growth or motion"
+    for path, tensor in (x for k in model.recorded for x in parameters(model.scene.effects[k])):
+        if tensor.dim() == 1:
+            return f"{path} differs between colonies and acts on their growth"
+        if tensor.requires_grad:
+            return f"{path} requires a gradient, which recorded growth does not carry"
+    return ""
+
+
+def bind(
+    scene: Scene,
+    colonies: int | None = None,
+    *,
+    seed: int = 0,
+    streams: Sequence[int] | Tensor | None = None,
+    cells: Cells | None = None,
+    device: str | torch.device = "cpu",
+    dtype: torch.dtype = torch.float32,
+    state: State | None = None,
+    per_colony: bool = False,
+    places: Collection[int] | None = None,
+    check_first: bool = True,
+) -> Model:
+    """As `Scene.bind`. places: bind only the effects at these places of the scene. check_first:
+    check whether the first cells may be where they are; not needed where a file replaces them."""
+    if state is not None:
+        return _bind_to_state(scene, state, per_colony, places)
+    founders = cells if cells is not None else scene.founders
+    count = _count(scene, colonies, founders, places)
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+        raise checks.input_error("seed", seed, "an integer from 0")
+    if dtype not in (torch.float32, torch.float64):
+        raise checks.input_error("dtype", dtype, "torch.float32 or torch.float64")
+    if founders.dim != scene.dim:
+        raise checks.input_error("cells", f"{founders.dim}-D", f"{scene.dim}-D, as the scene is")
+    batch = Batch(count, dtype, known_device(device), _types(founders), per_colony)
+    model = Model(scene, batch, _Start(count, seed, _streams(streams, count), founders), places)
+    first = model.trace(None)
+    model.check(first)
+    for effect in model.effects if check_first else ():
+        effect.check(first)
+    return model
+
+
+def _bind_to_state(
+    scene: Scene, state: State, per_colony: bool, places: Collection[int] | None
+) -> Model:
+    if not isinstance(state, State):
+        raise checks.input_error("state", state, "a State, such as scene.bind(colonies=8).start()")
+    count = max(scene.fixed_colonies if places is None else 1, int(state.colony_id.max()) + 1)
+    batch = Batch(count, state.dtype, state.device, _types(scene.founders), per_colony)
+    streams = torch.arange(count) if count != state.colonies else state.stream
+    model = Model(scene, batch, _Start(count, state.seed, streams, scene.founders), places)
+    model.check(state)
+    # what it can be tried on: cells that there are, or else the founders
+    model.trace(state.replace(births=(), ended=(), reports={}) if state.cells else None)
+    return model
+
+
+def _count(
+    scene: Scene, colonies: int | None, founders: Cells, places: Collection[int] | None
+) -> int:
+    fixed = 1 if places is not None else scene.fixed_colonies
+    if colonies is None:
+        return max(fixed, founders.colonies)
+    if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < 1:
+        raise checks.input_error(
+            "colonies", colonies, "an integer from 1", "A batch has at least one colony."
+        )
+    return max(colonies, founders.colonies)
+
+
+def _types(founders: Cells) -> tuple[int, ...]:
+    return () if founders.cell_type is None else tuple(sorted({int(k) for k in founders.cell_type}))
+
+
+def _streams(given: Sequence[int] | Tensor | None, colonies: int) -> Tensor | None:
+    if given is None:
+        return None
+    found = torch.as_tensor(given)
+    integers = not (found.is_floating_point() or found.dtype == torch.bool)
+    if found.shape != (colonies,) or not integers or bool(((found < 0) | (found >= 2**32)).any()):
+        raise checks.input_error(
+            "streams", given, f"{colonies} integers from 0 to 2³² − 1, one for each colony"
+        )
+    return found.to(torch.int64)
+
+
+def known_device(device: str | torch.device) -> torch.device:
+    """The device of that name, if this machine has it."""
+    try:
+        wanted = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise checks.input_error("device", device, '"cpu" or "cuda"') from error
+    if wanted.type not in ("cpu", "cuda"):
+        raise checks.input_error(
+            "device",
+            str(device),
+            '"cpu" or "cuda"',
+            "Other devices lack the sparse products and float64 that a step needs.",
+        )
+    if wanted.type == "cuda" and not torch.cuda.is_available():
+        raise checks.input_error(
+            "device",
+            str(device),
+            "a device that this machine has",
+            'torch sees no CUDA GPU; use device="cpu".',
+        )
+    return wanted
+
+
+def _with_given(state: State, wanted: Field) -> State:
+    """A field that came with the first cells, under the effect's own declaration: its dtype and
+    rule at division."""
+    values = state.fields[wanted.name]
+    shape = (state.cells, *wanted.shape)
+    if wanted.scope != CELL or tuple(values.shape) != shape:
+        raise checks.input_error(
+            f"cells column {wanted.name}",
+            f"values of shape {tuple(values.shape)}",
+            f"left out, or of shape {shape}",
+        )
+    declared = state.replace(declared={**state.declared, wanted.name: wanted})
+    return declared.with_fields(**{wanted.name: values.to(wanted.dtype or state.dtype)})
