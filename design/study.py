@@ -124,7 +124,7 @@ class Study:
         return colonies, seconds, np.where(np.isfinite(best), best, np.nan)
 
     def add(self, entry: Entry) -> None:
-        """Add a batch, and write the file. Raises SimulationError if the file cannot be written."""
+        """Add a batch and write the file. Raises SimulationError where that fails."""
         self.entries.append(entry)
         if self.path is not None:
             self._write(self.path)
@@ -242,6 +242,8 @@ def _refusal(
     path: Path, names: list[str], there: Mapping[str, Any], here: Mapping[str, Any]
 ) -> str:
     """The message for the study of another search: what differs, then as many values as fit."""
+    # the effects that are listed are those in the middle of the bounds, so they follow from the rest
+    names = sorted(names, key=lambda name: (name in DIGESTS, name == "effects"))
     out = f"{path.name} is the study of another search. Different: {', '.join(names)}."
     close = " Give another path, or restore the search."
     for name in names:

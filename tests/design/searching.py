@@ -9,9 +9,14 @@ import numpy as np
 import torch
 
 import torchfilm as tf
-from design import Target
+from design import Objective, Target, Task
 
 DT = 0.1
+
+
+def objective_of(scene, parameters, target, **options) -> Objective:
+    """The objective of a task with these arguments."""
+    return Objective(Task(scene, parameters, target, **options))
 
 
 def filling(u, s, p, cell):
@@ -99,7 +104,7 @@ class Level(Target):
             )
 
     def loss(self, state, history=None):
-        return (mean(state, self.species) - self.target_profile).abs()
+        return (mean(state, self.species) - self.wanted).abs()
 
     def measures(self, state, history=None):
         return {"mean_level": mean(state, self.species)}

@@ -25,14 +25,16 @@ import torch
 from searching import Level, lit, spots
 
 import torchfilm as tf
-from design import Objective, Parameter, Target
+from design import Objective, Parameter, Target, Task
+from design.executors import run_work_items
+from design.scoring import cut_work_items
 
 MAKE = Parameter("make", 0.1, 10, log=True)
 SPAWN = multiprocessing.get_context("spawn")  # a fork of a process that has run torch may hang
 
 
 def objective(scene=lit, target: Target | None = None, **options) -> Objective:
-    return Objective(
+    task = Task(
         scene,
         [MAKE, Parameter("decay", 0.5, 2)],
         target or Level(wanted=1.0),
@@ -40,6 +42,7 @@ def objective(scene=lit, target: Target | None = None, **options) -> Objective:
         replicates=2,
         **options,
     )
+    return Objective(task)
 
 
 POINTS = spots(6, 2)
@@ -144,7 +147,7 @@ GONE = [
 def test_a_piece_that_is_lost_once_is_given_again(here, error):
     careless = Careless(4, error)
     assert np.array_equal(
-        objective().evaluate(POINTS, executor=careless, pieces=3 + 1).losses, here
+        objective().evaluate(POINTS, executor=careless, work_items=3 + 1).losses, here
     )
     assert careless.given == 4 + 4
 
@@ -154,9 +157,9 @@ def test_a_piece_that_is_lost_again_is_grown_here_and_said_so(here, error):
     careless = Careless(1000, error)
     with pytest.warns(
         RuntimeWarning,
-        match=f"lost 3 of 3 pieces, which were grown in this process .{type(error).__name__}",
+        match=f"lost 3 of 3 work items; this process ran them .{type(error).__name__}",
     ):
-        found = objective().evaluate(POINTS, executor=careless, pieces=3)
+        found = objective().evaluate(POINTS, executor=careless, work_items=3)
     assert np.array_equal(found.losses, here)
     assert careless.given == 3 * 2
 
@@ -164,25 +167,28 @@ def test_a_piece_that_is_lost_again_is_grown_here_and_said_so(here, error):
 def test_an_executor_that_takes_nothing_any_more_loses_everything(here):
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
-    with pytest.warns(RuntimeWarning, match="lost 2 of 2 pieces"):
-        assert np.array_equal(objective().evaluate(POINTS, executor=pool, pieces=2).losses, here)
+    with pytest.warns(RuntimeWarning, match="lost 2 of 2 work items"):
+        assert np.array_equal(
+            objective().evaluate(POINTS, executor=pool, work_items=2).losses, here
+        )
 
 
 def test_every_row_is_answered_once(here):
     """Pieces that are lost, and come back later than others, still have rows of their own."""
-    wanted = objective()
+    task = objective().task
     answered: list[int] = []
-    pieces = wanted._pieces([wanted.space.values(p) for p in POINTS], 2, 1.0, 4)
-    for piece, _ in wanted._outcomes(pieces, (0, 1), 1.0, Careless(2, CancelledError())):
-        answered += piece.rows
+    items = cut_work_items(task, [task.space.values(p) for p in POINTS], 2, 1.0, 4)
+    careless = Careless(2, CancelledError())
+    for item, _ in run_work_items(task, items, (0, 1), 1.0, careless):
+        answered += item.rows
     assert sorted(answered) == list(range(6))
 
 
-@pytest.mark.parametrize("pieces", [1, 3, 6, 20])
-def test_threads_find_the_same(here, pieces):
+@pytest.mark.parametrize("work_items", [1, 3, 6, 20])
+def test_threads_find_the_same(here, work_items):
     with ThreadPoolExecutor(3) as pool:
         assert np.array_equal(
-            objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here
+            objective().evaluate(POINTS, executor=pool, work_items=work_items).losses, here
         )
 
 
@@ -199,7 +205,9 @@ def test_an_error_of_the_task_ends_the_rest():
 
     futures: list[Future] = []
     with Waiting(1) as pool, pytest.raises(FileNotFoundError, match="no such table"):
-        objective(target=Raising(wanted=1.0, kind="os")).evaluate(POINTS, executor=pool, pieces=6)
+        objective(target=Raising(wanted=1.0, kind="os")).evaluate(
+            POINTS, executor=pool, work_items=6
+        )
     assert len(futures) == 6
     assert any(f.cancelled() for f in futures)
 
@@ -211,9 +219,10 @@ def test_an_error_of_the_task_ends_the_rest():
 def test_an_objective_is_the_same_from_a_pickle(scene, fixed):
     name = {"boundary_detector": "k3", lit: "make"}.get(scene, "strength")
     target = Level({"boundary_detector": "yfp", lit: "gfp"}.get(scene, "red"), 1.0)
-    one = Objective(scene, [Parameter(name, 0.5, 5)], target, until=0.5, replicates=1, fixed=fixed)
+    task = Task(scene, [Parameter(name, 0.5, 5)], target, until=0.5, replicates=1, fixed=fixed)
+    one = Objective(task)
     two = pickle.loads(pickle.dumps(one))
-    assert one.describe() == two.describe()
+    assert one.task.describe() == two.task.describe()
     assert np.array_equal(one.evaluate(POINTS[:2, :1]).losses, two.evaluate(POINTS[:2, :1]).losses)
 
 
@@ -222,9 +231,9 @@ def test_an_objective_is_the_same_from_a_pickle(scene, fixed):
 class TestElsewhere:
     def test_the_bits_are_the_same(self, where, request, here):
         pool = request.getfixturevalue(where)
-        for pieces in (2, 5):
+        for work_items in (2, 5):
             assert np.array_equal(
-                objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here
+                objective().evaluate(POINTS, executor=pool, work_items=work_items).losses, here
             )
 
     @pytest.mark.parametrize(
@@ -238,7 +247,7 @@ class TestElsewhere:
         pool = request.getfixturevalue(where)
         with pytest.raises(error, match=words) as raised:
             objective(target=Raising(wanted=1.0, kind=kind, home=os.getpid())).evaluate(
-                POINTS, executor=pool, pieces=2
+                POINTS, executor=pool, work_items=2
             )
         # where it was raised, though that is on another machine
         assert "in loss" in "".join([str(raised.value), *getattr(raised.value, "__notes__", ())])
@@ -250,14 +259,14 @@ def test_a_scene_that_cannot_be_carried_is_refused(processes):
         return lit(make, decay)
 
     with pytest.raises(tf.InputError, match=r"mine.* top level of a module"):
-        objective(mine).evaluate(POINTS, executor=processes, pieces=2)
+        objective(mine).evaluate(POINTS, executor=processes, work_items=2)
 
 
 @pytest.mark.slow
 def test_dask_carries_functions_by_themselves(dask, here):
     assert np.array_equal(
         objective(lambda make=1.0, decay=1.0: lit(make, decay))
-        .evaluate(POINTS, executor=dask, pieces=2)
+        .evaluate(POINTS, executor=dask, work_items=2)
         .losses,
         here,
     )
@@ -270,13 +279,13 @@ def test_a_killed_process_takes_the_pool_along_and_nothing_is_lost(here, tmp_pat
         ProcessPoolExecutor(1, mp_context=SPAWN) as pool,
         pytest.warns(RuntimeWarning, match="BrokenProcessPool"),
     ):
-        found = deadly(tmp_path).evaluate(POINTS, executor=pool, pieces=3)
+        found = deadly(tmp_path).evaluate(POINTS, executor=pool, work_items=3)
     assert (tmp_path / "done").exists()
     assert np.array_equal(found.losses, here)
 
 
 @pytest.mark.slow
 def test_dask_grows_elsewhere_what_a_killed_worker_had(dask, here, tmp_path):
-    found = deadly(tmp_path).evaluate(POINTS, executor=dask, pieces=4)
+    found = deadly(tmp_path).evaluate(POINTS, executor=dask, work_items=4)
     assert (tmp_path / "done").exists()
     assert np.array_equal(found.losses, here)

@@ -20,6 +20,7 @@ from searching import (
     fragile,
     grown,
     lit,
+    objective_of,
     paced,
     short,
     spots,
@@ -27,8 +28,9 @@ from searching import (
 )
 
 import torchfilm as tf
-from design import Choice, Objective, Parameter, Stripe, Target, growth_cache, rollout
+from design import Choice, Parameter, Stripe, Target, Task, growth_cache, rollout, scoring
 from design.rollout import FinishedColonies
+from design.scoring import cut_work_items
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 PACED = [Parameter("rate", 1.2, 2.4), Parameter("make", 1, 2)]
@@ -37,9 +39,8 @@ KINDS = {"on recorded growth": (lit, LIT), "each grown anew": (paced, PACED)}
 
 def objective(kind="on recorded growth", target=None, **options):
     scene, parameters = KINDS[kind]
-    return Objective(
-        scene, parameters, target or Level(), **{"cells": 8, "replicates": 3, **options}
-    )
+    options = {"cells": 8, "replicates": 3, **options}
+    return objective_of(scene, parameters, target or Level(), **options)
 
 
 def alike(one, other):
@@ -65,10 +66,15 @@ def test_a_loss_is_that_of_the_colony_run_alone(kind, end):
     found = made.evaluate(points)
     for row, point in enumerate(points):
         for stream in (1, 0)[row:]:
-            loss, state = alone(made.make(**made.space.values(point)), made.target, stream, **end)
+            loss, state = alone(
+                made.task.family.function(**made.task.space.values(point)),
+                made.task.target,
+                stream,
+                **end,
+            )
             assert found.losses[row, stream] == loss and found.cells[row, stream] == state.cells
     assert not found.reasons and found.loss == pytest.approx(found.losses.mean(1))
-    assert bool(found.regrown) == (kind != "on recorded growth")
+    assert bool(found.why_regrown) == (kind != "on recorded growth")
 
 
 @pytest.mark.slow
@@ -79,7 +85,7 @@ def test_losses_do_not_depend_on_how_designs_are_batched(kind):
     alike(objective(kind, most=1, **options).evaluate(points), whole)
     alike(objective(kind, most=5, **options).evaluate(points), whole)
     with ThreadPoolExecutor(2) as pool:
-        alike(objective(kind, **options).evaluate(points, pieces=3, executor=pool), whole)
+        alike(objective(kind, **options).evaluate(points, work_items=3, executor=pool), whole)
     turned = objective(kind, **options).evaluate(points[order])
     assert np.array_equal(turned.losses, whole.losses[order]) and np.array_equal(
         turned.loss, whole.loss[order]
@@ -90,7 +96,7 @@ def test_recorded_growth_changes_no_bit():
     points = spots(4, 2)
     kept, anew = objective().evaluate(points), objective(replay=False).evaluate(points)
     alike(kept, anew)
-    assert (kept.regrown, anew.regrown) == ("", "replay=False")
+    assert (kept.why_regrown, anew.why_regrown) == ("", "replay=False")
 
 
 @pytest.mark.parametrize(
@@ -103,12 +109,12 @@ def test_recorded_growth_changes_no_bit():
         (5, 1, 1, [1] * 5),
     ],
 )
-def test_pieces_are_even_and_as_many_as_asked(rows, least, most, sizes):
+def test_work_items_are_even_and_as_many_as_requested(rows, least, most, sizes):
     made = objective(most=most, replicates=3)
-    pieces = made._pieces([made.space.values(p) for p in spots(rows, 2)], 3, 1.0, least)
-    assert [len(p.rows) for p in pieces] == sizes and [r for p in pieces for r in p.rows] == list(
-        range(rows)
-    )
+    values = [made.task.space.values(p) for p in spots(rows, 2)]
+    items = cut_work_items(made.task, values, 3, 1.0, least)
+    assert [len(item.rows) for item in items] == sizes
+    assert [row for item in items for row in item.rows] == list(range(rows))
 
 
 @pytest.mark.slow
@@ -121,7 +127,7 @@ def test_a_colony_is_measured_at_its_own_first_step_of_that_size():
     for row, point in enumerate(points):
         assert np.array_equal(made.evaluate(points[[row]]).losses[0], found.losses[row])
         for stream in range(2):
-            scene = made.make(**made.space.values(point))
+            scene = made.task.family.function(**made.task.space.values(point))
             *_, before, last = tf.simulate(scene, scene.seed(1, streams=[stream]), cells=5)
             assert before.cells < 5 <= last.cells == found.cells[row, stream]
 
@@ -130,7 +136,7 @@ def test_a_colony_is_measured_at_its_own_first_step_of_that_size():
 def test_the_quick_do_not_grow_on_while_a_slow_replicate_is_waited_for():
     parameter = [Parameter("make", 0.5, 1)]
     kept, anew = (
-        Objective(uneven, parameter, Level(), cells=10, replicates=2, seed=2, replay=r)
+        objective_of(uneven, parameter, Level(), cells=10, replicates=2, seed=2, replay=r)
         for r in (True, False)
     )
     growth_cache._kept.clear()
@@ -155,7 +161,7 @@ def test_replicates_share_random_numbers_and_streams_differ():
         other.losses[0, [0, 2]].tolist() == found.losses[0, [2, 0]].tolist()
         and other.losses[0, 1] not in found.losses
     )
-    loss, _ = alone(lit(**made.space.values(spots(1, 2)[0])), made.target, 40, cells=8)
+    loss, _ = alone(lit(**made.task.space.values(spots(1, 2)[0])), made.task.target, 40, cells=8)
     assert other.losses[0, 1] == loss
 
 
@@ -171,13 +177,13 @@ def test_a_share_of_the_size_is_fewer_cells_and_less_time():
     found = made.evaluate(spots(2, 2), size=0.25)
     assert found.size == 0.25 and (found.cells >= 4).all() and (found.cells < 8).all()
     assert np.array_equal(found.losses, objective(cells=4).evaluate(spots(2, 2)).losses)
-    assert made.end(0.01) == (2, None)
+    assert made.task.end(0.01) == (2, None)
     timed = objective(cells=None, until=1.2)
     assert np.array_equal(
         timed.evaluate(spots(2, 2), size=0.5).losses,
         objective(cells=None, until=0.6).evaluate(spots(2, 2)).losses,
     )
-    assert timed.end(0.001) == (None, DT)
+    assert timed.task.end(0.001) == (None, DT)
 
 
 @pytest.mark.slow
@@ -187,10 +193,10 @@ def test_whole_numbers_and_choices_build_scenes_of_their_own():
         Choice("promoter", ("weak", "strong")),
         Parameter("make", 1, 2),
     ]
-    made = Objective(built, parameters, Level("g0"), cells=3, replicates=2)
+    made = objective_of(built, parameters, Level("g0"), cells=3, replicates=2)
     points = np.array(
         [
-            made.space.point({"genes": g, "promoter": p, "make": m})
+            made.task.space.point({"genes": g, "promoter": p, "make": m})
             for g in (1, 3)
             for p in ("strong", "weak")
             for m in (1.0, 1.75)
@@ -198,7 +204,7 @@ def test_whole_numbers_and_choices_build_scenes_of_their_own():
     )
     found = made.evaluate(points)
     for row, point in enumerate(points):
-        values = made.space.values(point)
+        values = made.task.space.values(point)
         assert found.losses[row, 1] == alone(built(**values), Level("g0"), 1, cells=3)[0]
     # rates without decay of growth are linear in what makes them; the first species does not know
     # how many there are
@@ -222,7 +228,7 @@ def test_replicates_become_one_loss(reduce, expected):
 
 
 def test_fixed_arguments_reach_the_scene():
-    made = Objective(
+    made = objective_of(
         lit, [Parameter("decay", 0.5, 2)], Level(), fixed={"make": 3.0}, cells=6, replicates=1
     )
     assert (
@@ -238,13 +244,13 @@ def test_ready_scenes_by_name_are_the_functions(dtype):
         {"cells": 2, "dt": 0.1, "replicates": 2, "dtype": dtype},
     )
     named, given = (
-        Objective(s, parameter, Level("red"), **options)
+        objective_of(s, parameter, Level("red"), **options)
         for s in ("toggle_switch", tf.scenes.toggle_switch)
     )
     assert np.array_equal(
         named.evaluate(np.array([[0.5]])).losses, given.evaluate(np.array([[0.5]])).losses
     )
-    assert named.recipe is not None and named.recipe[0] == "toggle_switch"
+    assert named.task.tried.recipe[0] == "toggle_switch"
 
 
 # --- what fails -----------------------------------------------------------------------------------
@@ -252,7 +258,7 @@ def test_ready_scenes_by_name_are_the_functions(dtype):
 
 @pytest.mark.parametrize("most", [None, 100, 1])
 def test_a_design_that_the_scene_refuses_fails_alone(most):
-    made = Objective(
+    made = objective_of(
         banned,
         [Parameter("low", 3.0, 4.0), Parameter("make", 1, 2)],
         Level(),
@@ -269,13 +275,13 @@ def test_a_design_that_the_scene_refuses_fails_alone(most):
         np.array_equal(found.losses[[1, 3]], made.evaluate(points[[1, 3]]).losses)
         and (found.losses[[1, 3]] != 1.5).all()
     )
-    assert made.final(points[0]) == []
+    assert made.colonies(points[0]) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("replay", [True, False])
 def test_rates_that_are_not_finite_fail_with_time_and_cell(replay):
-    made = Objective(
+    made = objective_of(
         fragile, [Parameter("make", 1, 10)], Level(), cells=8, replicates=2, replay=replay
     )
     points = np.array([[0.1], [0.9], [0.3]])
@@ -288,13 +294,13 @@ def test_rates_that_are_not_finite_fail_with_time_and_cell(replay):
         and (found.losses[[0, 2]] != 1.5).all()
     )
     assert (
-        len(made.final(points[1])) == 0
-        and sum(d.state.colonies for d in made.final(points[0])) == 2
+        len(made.colonies(points[1])) == 0
+        and sum(d.state.colonies for d in made.colonies(points[0])) == 2
     )
 
 
 def test_a_division_too_short_fails_with_time_and_cell():
-    made = Objective(short, [Parameter("added", 0.2, 3)], Spread(), cells=6, replicates=1)
+    made = objective_of(short, [Parameter("added", 0.2, 3)], Spread(), cells=6, replicates=1)
     found = made.evaluate(np.array([[0.0], [0.7]]))
     assert found.losses[0, 0] == 1.5 and found.cells[0, 0] == 0 and found.cells[1, 0] >= 6
     assert found.reasons == {(0, 0): found.reasons[0, 0]}
@@ -329,10 +335,10 @@ def test_a_loss_of_the_wrong_shape_is_no_failure_of_the_design():
 
 def test_a_colony_that_does_not_grow_is_given_up_and_its_neighbours_are_not(monkeypatch):
     monkeypatch.setattr(rollout, "PATIENCE", 6.0)
-    made = Objective(paced, [Parameter("rate", 0.0, 1.0)], Level(), cells=8, replicates=2)
+    made = objective_of(paced, [Parameter("rate", 0.0, 1.0)], Level(), cells=8, replicates=2)
     found = made.evaluate(np.array([[0.0], [1.0]]))
     assert found.reasons == {
-        (0, k): "it has 1 of 8 cells at 6.2 h, and has had no more for 6 h" for k in range(2)
+        (0, k): "it has 1 of 8 cells at 6.2 h and gained none for 6 h" for k in range(2)
     }
     monkeypatch.undo()
     assert np.array_equal(found.losses[1], made.evaluate(np.array([[1.0]])).losses[0])
@@ -357,11 +363,11 @@ def test_a_colony_without_cells_fails():
             tf.Growth(rate=rate), tf.Division(length=4.0), tf.Mechanics(dim=2), edge, dt=DT
         )
 
-    found = Objective(dying, [Parameter("rate", 0.5, 1)], Spread(), cells=8, replicates=1).evaluate(
-        np.array([[1.0]])
-    )
+    found = objective_of(
+        dying, [Parameter("rate", 0.5, 1)], Spread(), cells=8, replicates=1
+    ).evaluate(np.array([[1.0]]))
     assert found.losses.tolist() == [[1.5]] and found.reasons[0, 0].startswith(
-        "no cell was left at "
+        "no cells remain at "
     )
 
 
@@ -400,7 +406,7 @@ def test_notes_belong_to_their_colony_though_others_end_at_other_times(kind):
     found = made.evaluate(spots(3, 2))
     assert len(set(found.losses.ravel())) > 1 and not found.reasons
     for stream in range(2):
-        scene = made.make(**made.space.values(spots(3, 2)[1]))
+        scene = made.task.family.function(**made.task.space.values(spots(3, 2)[1]))
         *_, state = tf.simulate(scene, scene.seed(1, streams=[stream]), cells=6)
         assert found.losses[1, stream] == pytest.approx(state.time, abs=1e-9)
 
@@ -449,14 +455,14 @@ def ungrown(make=1.0):
         ({"scene": lit()}, "a function from parameters to a tf.Scene.*def scene"),
         ({"scene": "colony"}, "scene = 'colony'.*one of microcolony"),
         ({"scene": lambda make: 3}, "scene = 3.*a function that returns a tf.Scene"),
-        ({"scene": lambda make, other: lit()}, "cannot be built.*'other'"),
+        ({"scene": lambda make, other: lit()}, "'other'.*cannot be built"),
         (
             {"scene": paced, "parameters": [Parameter("rate", -1, 1)]},
-            r"cannot be built with \{'rate': -1.0\}.*at least 0.*narrow the bounds",
+            r"at least 0.*cannot be built with \{'rate': -1.0\}.*Narrow the bounds",
         ),
         (
             {"scene": plain, "parameters": [Parameter("rate", 0.5, 1)], "target": Spread()},
-            "one plain number or as a name can be searched with whole=True or",
+            "takes a plain number or a name there, use whole=True or a Choice",
         ),
         (
             {"scene": plain, "parameters": [Parameter("longest", 2.0, 4.0)], "target": Spread()},
@@ -477,7 +483,7 @@ def test_bad_input_is_refused_in_words(given, words):
         **given,
     }
     with pytest.raises(tf.InputError, match=words):
-        Objective(**options)
+        Task(**options)
 
 
 @pytest.mark.parametrize(
@@ -514,15 +520,15 @@ def test_a_batch_that_does_not_fit_is_halved(monkeypatch, error):
     points = spots(5, 2)
     whole = objective().evaluate(points)
     tried = []
-    score = Objective._score
+    score = scoring._grow_and_score
 
-    def small(self, piece, streams, size):
-        tried.append(len(piece.rows))
-        if len(piece.rows) > 2:
+    def small(task, item, streams, size):
+        tried.append(len(item.rows))
+        if len(item.rows) > 2:
             raise error
-        return score(self, piece, streams, size)
+        return score(task, item, streams, size)
 
-    monkeypatch.setattr(Objective, "_score", small)
+    monkeypatch.setattr(scoring, "_grow_and_score", small)
     alike(objective().evaluate(points), whole)
     assert tried == [5, 2, 3, 1, 2]
 
@@ -531,10 +537,10 @@ def test_a_batch_that_does_not_fit_is_halved(monkeypatch, error):
     "error", [RuntimeError("shapes differ"), ZeroDivisionError(), MemoryError()], ids=repr
 )
 def test_other_errors_and_one_design_that_does_not_fit_pass_through(monkeypatch, error):
-    def broken(self, piece, streams, size):
+    def broken(*_):
         raise error
 
-    monkeypatch.setattr(Objective, "_score", broken)
+    monkeypatch.setattr(scoring, "_grow_and_score", broken)
     with pytest.raises(type(error)) as caught:
         objective().evaluate(spots(1, 2))
     assert caught.value is error
@@ -542,12 +548,12 @@ def test_other_errors_and_one_design_that_does_not_fit_pass_through(monkeypatch,
 
 def test_colonies_at_their_ends_are_those_that_were_scored():
     made = objective()
-    done = made.final(spots(1, 2)[0])
+    done = made.colonies(spots(1, 2)[0])
     assert all(isinstance(d, FinishedColonies) for d in done)
     found = {
         int(s): float(x)
         for d in done
-        for s, x in zip(d.state.stream, made.target.loss(d.state), strict=True)
+        for s, x in zip(d.state.stream, made.task.target.loss(d.state), strict=True)
     }
     assert [found[k] for k in range(3)] == made.evaluate(spots(1, 2)).losses[0].tolist()
 
@@ -559,7 +565,7 @@ def resting(make=1.0):
 
 def test_where_the_end_is_a_time_it_comes_also_to_cells_that_rest(monkeypatch):
     monkeypatch.setattr("design.rollout.PATIENCE", 1.0)
-    found = Objective(
+    found = objective_of(
         resting, [Parameter("make", 0.5, 2.0)], Level(), until=5.0, replicates=1
     ).evaluate(np.array([[0.5]]))
     assert not found.reasons and found.loss[0] < 1.5
@@ -570,8 +576,8 @@ def test_a_colony_must_have_somewhere_to_grow():
         tf.InputError,
         match="cells = 2 is not allowed: it must be above the 2 that a colony starts from",
     ):
-        Objective("boundary_detector", [Parameter("k3", 0.1, 10)], Level("yfp"), cells=2)
-    small = Objective(
+        objective_of("boundary_detector", [Parameter("k3", 0.1, 10)], Level("yfp"), cells=2)
+    small = objective_of(
         "boundary_detector",
         [Parameter("k3", 0.1, 10)],
         Level("yfp"),
@@ -579,4 +585,4 @@ def test_a_colony_must_have_somewhere_to_grow():
         dt=0.05,
         replicates=1,
     )
-    assert small.end(0.01)[0] == 3 and not small.evaluate(np.array([[0.5]]), size=0.01).reasons
+    assert small.task.end(0.01)[0] == 3 and not small.evaluate(np.array([[0.5]]), size=0.01).reasons

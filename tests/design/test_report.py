@@ -71,7 +71,7 @@ def test_the_table_has_every_parameter_with_bounds_first_guess_and_best():
         [
             float(x)
             for d in best.colonies()
-            for x in best.search.objective.target.measures(d.state)["mean_level"]
+            for x in best.search.objective.task.target.measures(d.state)["mean_level"]
         ]
     )
     assert found["mean_level"][-1] == f"{level:.4g}" and best.losses.mean() == pytest.approx(

@@ -74,7 +74,7 @@ def test_the_best_is_the_first_of_the_least_over_all_full_designs():
         and np.array_equal(best.losses, found.losses[row])
         and np.array_equal(best.point, points[row])
     )
-    assert best.values == made.objective.space.values(points[row])
+    assert best.values == made.objective.task.space.values(points[row])
     colonies, seconds, least = made.study.convergence()
     assert (
         colonies.tolist() == [6, 12, 18]
@@ -84,7 +84,7 @@ def test_the_best_is_the_first_of_the_least_over_all_full_designs():
     scored = {
         int(s): float(x)
         for d in best.colonies()
-        for s, x in zip(d.state.stream, made.objective.target.loss(d.state), strict=True)
+        for s, x in zip(d.state.stream, made.objective.task.target.loss(d.state), strict=True)
     }
     assert [scored[0], scored[1]] == best.losses.tolist()
 
@@ -253,13 +253,13 @@ def test_a_saved_design_runs_as_it_was_scored(command, tmp_path, kind):
     made = search(Sobol(batch=2), **SAVED[kind](tmp_path))
     best = made.run(4, progress=False)
     best.save("best.json")
-    target, cells = made.objective.target, made.objective.cells
+    target, cells = made.objective.task.target, made.objective.task.cells
     command("run", "best.json", "--out", "one.h5", "--no-picture")
     with tf.Results("one.h5") as results:
         state = results.state(best.scene())
         assert (
-            results.attributes["seed"] == made.objective.seed
-            and results.attributes["dt"] == made.objective.dt
+            results.attributes["seed"] == made.objective.task.seed
+            and results.attributes["dt"] == made.objective.task.dt
         )
         assert state.cells >= cells if cells else state.time == pytest.approx(1.1)
     assert float(target.loss(state)[0]) == best.losses[0]
@@ -301,7 +301,7 @@ def test_a_design_says_all_that_it_needs(tmp_path):
         and told["losses"] == best.losses.tolist()
         and told["colonies"] == 6
     )
-    assert told["target"] == made.objective.target.describe()
+    assert told["target"] == made.objective.task.target.describe()
     assert made.study.about["scene"] == "doubled"
 
 
@@ -388,7 +388,7 @@ def test_hidden_parameters_are_found_again(hidden):
         seed=1,
     )
     best = made.run(640, progress=False)
-    own = made.objective.evaluate(made.objective.space.point(hidden)[None])
+    own = made.objective.evaluate(made.objective.task.space.point(hidden)[None])
     # the levels of a colony differ by 2 % between seeds, and so does what they are compared with:
     # the mean of 8 by 0.7 %, that of 2 by 1.5 %
     assert own.loss[0] < 0.04 and best.loss < own.loss[0] + 0.01

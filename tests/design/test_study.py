@@ -194,14 +194,16 @@ def test_what_a_study_holds_counts(tmp_path, monkeypatch):
     path = tmp_path / "s.h5"
     search().run(12, study=path, progress=False)
     monkeypatch.setattr(
-        "design.objective.Objective.evaluate", lambda *_, **__: pytest.fail("nothing is left to do")
+        "design.objective.Objective.evaluate", lambda *_, **__: pytest.fail("the budget is used up")
     )
     made = search()
     assert made.run(12, study=path, progress=False).loss == Study.read(path).best()[1]
     assert made.run(10**6, study=path, stop_at=1e9, progress=False).loss <= 1e9
     assert (
-        search("sobol", paced, [Parameter("rate", 1, 2)]).regrown.startswith("Growth.rate differs")
-        and made.regrown == ""
+        search("sobol", paced, [Parameter("rate", 1, 2)]).why_regrown.startswith(
+            "Growth.rate differs"
+        )
+        and made.why_regrown == ""
     )
 
 
@@ -213,7 +215,9 @@ def test_a_full_disk_is_said_and_costs_nothing(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.replace", full)
-    with pytest.raises(tf.SimulationError, match=r"could not write .*s.h5: .*No space left.*go on"):
+    with pytest.raises(
+        tf.SimulationError, match=r"could not write .*s.h5: .*No space left.*resume"
+    ):
         search().run(12, study=path, progress=False)
     monkeypatch.undo()
     assert len(Study.read(path).entries) == 1
@@ -248,8 +252,8 @@ def quicker(make=1.0, decay=1.0):
 moved.__name__ = quicker.__name__ = "lit"
 
 OTHERS = {
-    "founders": ({"scene": moved}, ["founders and functions: "]),
-    "what a function does": ({"scene": quicker}, ["founders and functions: "]),
+    "founders": ({"scene": moved}, ["Different: founders and functions."]),
+    "what a function does": ({"scene": quicker}, ["Different: founders and functions."]),
     "scene": ({"scene": brighter}, ["lit", "brighter", "rate=2.0", "rate=1.9"]),
     "target": ({"target": Level(wanted=2.0)}, ["wanted=1.0", "wanted=2.0"]),
     "bounds": (
@@ -262,11 +266,11 @@ OTHERS = {
     "cells": ({"cells": 4}, ["cells: 3 there, 4 here"]),
     "until": ({"until": 5.0}, ["until: None there, 5.0 here"]),
     "replicates": ({"replicates": 3}, ["replicates: 2 there, 3 here"]),
-    "reduce": ({"reduce": "worst"}, ["'mean' there, 'worst' here"]),
+    "reduce": ({"reduce": "worst"}, ["reduce: mean there, worst here"]),
     "step": ({"dt": 0.05}, ["dt: 0.1 there, 0.05 here"]),
     "names": (
         {"parameters": [LIT[0]], "fixed": {"decay": 1.0}},
-        ["'decay': '1.0'", "['make', 'decay'] there, ['make'] here"],
+        ["names: decay there, none here", "fixed: none there, decay=1.0 here"],
     ),
 }
 
@@ -285,6 +289,7 @@ def test_the_file_of_another_search_is_refused_with_both_values(kept, other):
     with pytest.raises(tf.InputError, match="is the study of another search") as error:
         search(**given).run(12, study=kept, progress=False)
     assert all(w in str(error.value) for w in words), str(error.value)
+    assert len(str(error.value)) <= 300
     assert kept.read_bytes() == before
 
 
@@ -306,7 +311,9 @@ def test_a_method_that_asks_otherwise_is_not_gone_on_with(kept, tmp_path):
     shutil.copy(kept, path)
     with h5py.File(path, "r+") as file:
         file["designs/point"][1, 0] += 0.01
-    with pytest.raises(tf.InputError, match="its batch 0 is not what the method asks for"):
+    with pytest.raises(
+        tf.InputError, match="the method proposes other points than its batch 0 holds"
+    ):
         search().run(12, study=path, progress=False)
 
 
@@ -352,11 +359,11 @@ def test_foreign_files_are_refused(tmp_path, kept):
     for name, words in (
         ("a.h5", "cannot be read"),
         ("b.h5", r"is not a torchfilm study \(its format is 'torchfilm results'"),
-        ("c.h5", "format version 99, newer"),
-        ("", r"a study file\. That is a folder"),
+        ("c.h5", "format version 99; this torchfilm reads up to version 1"),
+        ("", r"a study file\. This path is a folder"),
         ("no/such.h5", "in a folder that exists"),
     ):
         with pytest.raises(tf.InputError, match=words):
             search().run(12, study=tmp_path / name, progress=False)
-    with pytest.raises(tf.InputError, match=r"a study file\. No such file"):
+    with pytest.raises(tf.InputError, match=r"a study file\. There is no such file"):
         Study.read(tmp_path / "none.h5")

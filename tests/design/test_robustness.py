@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from searching import Level, built, fragile, lit, mean
+from searching import Level, built, fragile, lit, mean, objective_of
 
 import torchfilm as tf
-from design import Best, Choice, Objective, Parameter, Search, Target
-from design.robust import robustness
+from design import Best, Choice, Parameter, Search, Target, check_robustness
 
 MAKE = Parameter("make", 0.1, 10, log=True)
 
@@ -38,10 +37,14 @@ def best(
         method="sobol",
         **options,
     )
-    point = search.objective.space.point(values)
+    point = search.objective.task.space.point(values)
     found = search.objective.evaluate(point[None])
     return Best(
-        search, search.objective.space.values(point), point, float(found.loss[0]), found.losses[0]
+        search,
+        search.objective.task.space.values(point),
+        point,
+        float(found.loss[0]),
+        found.losses[0],
     )
 
 
@@ -77,10 +80,10 @@ def test_what_is_told_of_the_losses(held):
 def test_another_size_is_the_objective_of_that_size(held, place, share, cells):
     found = held.sizes[place]
     assert (found.share, found.cells, found.until) == (share, cells, None)
-    direct = Objective(
+    direct = objective_of(
         spared, [MAKE, Parameter("nothing", 0, 1)], Level(wanted=1.0), cells=cells, replicates=2
     )
-    point = direct.space.point(held.values)
+    point = direct.task.space.point(held.values)
     assert np.array_equal(
         found.losses, direct.evaluate(point[None], streams=held.streams).losses[0]
     )
@@ -92,7 +95,8 @@ def test_a_change_is_compared_on_the_same_seeds(spare, held):
     assert change.value == pytest.approx(2.4, rel=1e-12)
     objective = spare.search.objective
     moved = objective.evaluate(
-        objective.space.point({"make": change.value, "nothing": 0.5})[None], streams=held.streams
+        objective.task.space.point({"make": change.value, "nothing": 0.5})[None],
+        streams=held.streams,
     ).losses[0]
     # the value's coordinate is rounded on its way back, and that changes float32 levels by their
     # last bits at most
@@ -113,8 +117,8 @@ def test_a_parameter_without_effect_has_none(held):
     assert held.indices.colonies == 8 * (2 + 2) * 2
 
 
-@pytest.mark.parametrize("most, pieces", [(3, 1), (None, 4)])
-def test_nothing_depends_on_how_it_is_divided(held, spare, most, pieces):
+@pytest.mark.parametrize("most, work_items", [(3, 1), (None, 4)])
+def test_nothing_depends_on_how_it_is_divided(held, spare, most, work_items):
     search = Search(
         spared,
         [MAKE, Parameter("nothing", 0, 1)],
@@ -125,12 +129,12 @@ def test_nothing_depends_on_how_it_is_divided(held, spare, most, pieces):
         most=most,
     )
     with ThreadPoolExecutor(2) as pool:
-        other = robustness(
+        other = check_robustness(
             Best(search, spare.values, spare.point, spare.loss, spare.losses),
             seeds=6,
             samples=8,
             executor=pool,
-            pieces=pieces,
+            work_items=work_items,
             progress=False,
         )
     assert np.array_equal(other.losses, held.losses)
@@ -350,4 +354,4 @@ def test_bad_input_is_refused_before_anything_grows(spare, options, words):
 @pytest.mark.parametrize("factor", [0.0, -1.0, math.inf])
 def test_an_objective_is_not_resized_to_nothing(spare, factor):
     with pytest.raises(tf.InputError, match="factor"):
-        spare.search.objective.resized(factor)
+        spare.search.objective.task.resized(factor)
