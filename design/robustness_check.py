@@ -64,14 +64,7 @@ def check_robustness(
     objective, task = best.objective, best.objective.task
     searched, dimensions = task.replicates, task.space.size
     streams = tuple(range(searched, searched + seeds))
-    changes = [
-        (k, *pair)
-        for k, p in enumerate(task.space.parameters)
-        for pair in _changed_values(p, best.values[p.name], change)
-    ]
-    points = np.concatenate(
-        [best.point[None], *(_moved(task.space, best.point, k, value) for k, _, value in changes)]
-    )
+    changes, points = _changed_points(task.space, best, change)
     moved = (points != best.point).any(1)
     moved[0] = True
     cost = samples * (dimensions + 2) * searched
@@ -86,11 +79,8 @@ def check_robustness(
         losses[moved] = found.losses
         resized = []
         for share in sizes:
-            other = task.resized(share)
-            there = Objective(other).evaluate(
-                best.point[None], streams=streams, executor=executor, work_items=work_items
-            )
-            resized.append(Resized(float(share), other.cells, other.until, there.losses[0]))
+            other = Objective(task.resized(share))
+            resized.append(_resized(other, share, best.point, streams, executor, work_items))
             advance(bar, seeds * share)
         indices = (
             loss_indices(objective, samples, executor=executor, work_items=work_items, bar=bar)
@@ -111,6 +101,34 @@ def check_robustness(
         ),
         indices=indices,
     )
+
+
+def _changed_points(
+    space: Space, best: ScoredDesign, change: float
+) -> tuple[list[tuple[int, Value, Value]], np.ndarray]:
+    """The changes, as (number of the parameter, requested value, used value), and the points: that
+    of the design, then that of each change."""
+    changes = [
+        (k, *pair)
+        for k, p in enumerate(space.parameters)
+        for pair in _changed_values(p, best.values[p.name], change)
+    ]
+    moved = [_moved(space, best.point, k, value) for k, _, value in changes]
+    return changes, np.concatenate([best.point[None], *moved])
+
+
+def _resized(
+    objective: Objective,
+    share: float,
+    point: np.ndarray,
+    streams: tuple[int, ...],
+    executor: Executor | None,
+    work_items: int,
+) -> Resized:
+    found = objective.evaluate(
+        point[None], streams=streams, executor=executor, work_items=work_items
+    )
+    return Resized(float(share), objective.task.cells, objective.task.until, found.losses[0])
 
 
 def _check_arguments(

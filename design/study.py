@@ -124,7 +124,7 @@ class Study:
         return colonies, seconds, np.where(np.isfinite(best), best, np.nan)
 
     def add(self, entry: Entry) -> None:
-        """Add a batch and write the file. Raises SimulationError where that fails."""
+        """Add a batch, and write the file. Raises SimulationError where that fails."""
         self.entries.append(entry)
         if self.path is not None:
             self._write(self.path)
@@ -157,8 +157,8 @@ class Study:
             os.replace(beside, path)
         except OSError as error:
             raise tf.SimulationError(
-                f"could not write {path}: {error}. Is the disk full? The file still holds the earlier"
-                " batches; run the search again to resume it."
+                f"could not write {path}: {error}. Is the disk full? The file keeps the earlier"
+                " batches. Run the search again to resume it."
             ) from error
 
     def _write_tables(self, file: h5py.File) -> None:
@@ -221,8 +221,8 @@ class Study:
                     )
                 if int(file.attrs["version"]) > VERSION:
                     raise tf.InputError(
-                        f"{path} has format version {file.attrs['version']}; this torchfilm reads up"
-                        f" to version {VERSION}. Update torchfilm."
+                        f"{path} has format version {file.attrs['version']}; this torchfilm reads"
+                        f" versions up to {VERSION}. Update torchfilm."
                     )
                 about = json.loads(file.attrs["about"])
                 study = cls(
@@ -242,7 +242,7 @@ def _refusal(
     path: Path, names: list[str], there: Mapping[str, Any], here: Mapping[str, Any]
 ) -> str:
     """The message for the study of another search: what differs, then as many values as fit."""
-    # the effects that are listed are those in the middle of the bounds, so they follow from the rest
+    # the listed effects are those in the middle of the bounds, so bounds change them too
     names = sorted(names, key=lambda name: (name in DIGESTS, name == "effects"))
     out = f"{path.name} is the study of another search. Different: {', '.join(names)}."
     close = " Give another path, or restore the search."

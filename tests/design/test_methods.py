@@ -137,7 +137,7 @@ def test_what_was_not_asked_is_refused(make):
     given = begun(make(), SPACES["cube"])
     batch = given.ask()
     other = np.clip(batch.points + 0.01, 0, 1)
-    with pytest.raises(InputError, match=r"points\[0\].*as asked.*same settings"):
+    with pytest.raises(InputError, match=r"points\[0\].*as proposed.*same settings"):
         given.tell(Batch(other, size=batch.size, replicates=batch.replicates), ellipsoid(other))
     with pytest.raises(InputError, match=r"\(points, dimensions, size, replicates\)"):
         given.tell(

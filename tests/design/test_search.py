@@ -162,7 +162,7 @@ def test_a_bad_run_is_refused_in_words(given, words):
     "method, words",
     [
         ("annealing", "method = 'annealing'.*'sobol'"),
-        (Sobol, "an object with start, ask and tell.*write CMAES"),
+        (Sobol, "an object with start, ask and tell.*make an object of it"),
     ],
 )
 def test_a_bad_method_is_refused_in_words(method, words):
@@ -204,7 +204,8 @@ def filling(u, s, p, cell):
 
 def lamp(make=1.0, decay=1.0, shortest=3.0):
     circuit = tf.Circuit(filling, species=("gfp",), make=make, decay=decay)
-    return tf.Scene(tf.Growth(rate=2.0), tf.Division(length=tf.Uniform(shortest, 4.0)), tf.Mechanics(dim=2), circuit, dt=0.1)
+    division = tf.Division(length=tf.Uniform(shortest, 4.0))
+    return tf.Scene(tf.Growth(rate=2.0), division, tf.Mechanics(dim=2), circuit, dt=0.1)
 """
 
 

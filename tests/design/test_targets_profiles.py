@@ -338,7 +338,7 @@ def test_unknown_species_are_told_with_what_there_is(name):
         (lambda: Bands(("a",), (0, 1), along="z"), "Bands.along"),
         (lambda: Bands(("a",), (0, 1), centre="middle"), "Bands.centre"),
         (lambda: Bands(("a",), (0, 1), centre=(0, 1, 2)), "Bands.centre"),
-        (lambda: Bands(("a",), (0, 1), edge_width=0.0), "Bands.soft"),
+        (lambda: Bands(("a",), (0, 1), edge_width=0.0), "Bands.edge_width"),
         (lambda: Bands(("a",), (0, 1), floor=-1.0), "Bands.floor"),
         (lambda: Ring(("a",), 1.0, 1.0), "Ring.species"),
         (lambda: Ring("a", 0.0, 1.0), "Ring.radius"),

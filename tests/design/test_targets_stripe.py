@@ -257,7 +257,7 @@ def test_a_first_state_with_what_is_needed_passes():
         ({"width": 1.0, "along": "radius"}, "Stripe.along"),
         ({"width": 1.0, "cell_type": 1.0}, "Stripe.cell_type"),
         ({"width": 1.0, "cell_type": -1}, "Stripe.cell_type"),
-        ({"width": 1.0, "soft": 0}, "Stripe.soft"),
+        ({"width": 1.0, "edge_width": 0}, "Stripe.edge_width"),
         ({"width": 1.0, "floor": -1}, "Stripe.floor"),
     ],
 )
