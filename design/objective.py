@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from design import executors
+from design.parameters import Value
 from design.rollout import FinishedColonies
 from design.scoring import cut_work_items, finished_colonies, run_work_item
 from design.task import Task
@@ -20,19 +21,21 @@ from torchfilm import checks
 class Evaluation:
     """The losses of some designs.
 
-    points (n, D); losses (n, R), of each replicate; loss (n,); cells (n, R), of each colony at its
-    end; reasons, by (row, replicate), why a colony failed; size: share of the full size;
-    why_regrown: the reason why colonies did not follow recorded growth, or ""; seconds.
+    points (n, D); values: their parameters by name; losses (n, R), of each replicate; loss (n,);
+    cells (n, R), of each colony at its end; reasons, by (row, replicate), why a colony failed;
+    size: share of the full size; why_regrown: the reason why colonies did not follow recorded
+    growth, or ""; seconds.
     """
 
     points: np.ndarray
+    values: list[dict[str, Value]]
     losses: np.ndarray
     loss: np.ndarray
     cells: np.ndarray
-    reasons: dict[tuple[int, int], str] = field(default_factory=dict)
-    size: float = 1.0
-    why_regrown: str = ""
-    seconds: float = 0.0
+    reasons: dict[tuple[int, int], str]
+    size: float
+    why_regrown: str
+    seconds: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +93,7 @@ class Objective:
             reasons |= {(rows[row], k): words for (row, k), words in found.reasons.items()}
             why_regrown = why_regrown or found.why_regrown
         loss, seconds = task.reduced(losses), time.perf_counter() - begun
-        return Evaluation(points, losses, loss, cells, reasons, size, why_regrown, seconds)
+        return Evaluation(points, values, losses, loss, cells, reasons, size, why_regrown, seconds)
 
     def colonies(
         self, point: np.ndarray, *, streams: Sequence[int] | None = None

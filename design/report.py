@@ -72,7 +72,7 @@ def table(report: SearchReport) -> str:
         for reason, times in study.failures()[:1]
     ]
     how = (
-        f"grown anew for each design: {report.why_regrown}"
+        f"grown again for each design: {report.why_regrown}"
         if report.why_regrown
         else "circuits ran on one recorded growth"
     )

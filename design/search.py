@@ -166,7 +166,7 @@ class Search(TaskOptions):
             found.size,
             found.losses.shape[1],
             found.seconds,
-            [self.objective.task.space.values(p) for p in found.points],
+            found.values,
         )
         self.study.add(entry)
         self._progress.why_regrown = found.why_regrown

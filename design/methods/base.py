@@ -211,8 +211,8 @@ def scores(batch: Batch, loss: Any) -> np.ndarray:
             f"loss[{row}]",
             float(out[row]),
             "finite",
-            f"{int(bad.sum())} of {len(out)} are not. Give a failed design a bad finite loss, such as"
-            " 1.5.",
+            f"{int(bad.sum())} of {len(out)} are not. Give a failed design a bad finite loss, such"
+            " as 1.5.",
         )
     return out
 

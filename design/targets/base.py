@@ -144,16 +144,16 @@ def species_name(name: str, given: object) -> None:
 
 def species_names(name: str, given: object, count: int | None = None) -> tuple[str, ...]:
     """Several different species as a tuple. Raises `tf.InputError` for anything else."""
-    wanted = f"{'some' if count is None else count} different names of species"
+    rule = f"{'some' if count is None else count} different names of species"
     if (
         isinstance(given, str)
         or not isinstance(given, (tuple, list))
         or not given
         or (count is not None and len(given) != count)
     ):
-        raise checks.input_error(name, given, wanted, 'Write ("cfp", "yfp").')
+        raise checks.input_error(name, given, rule, 'Write ("cfp", "yfp").')
     for one in given:
         species_name(name, one)
     if len(set(given)) != len(given):
-        raise checks.input_error(name, given, wanted)
+        raise checks.input_error(name, given, rule)
     return tuple(given)

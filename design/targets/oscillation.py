@@ -12,7 +12,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import Target, ratio, require, species_name, total, valid_levels, weights
-from design.targets.patterns import FOUND, WANTED
+from design.targets.patterns import FOUND, TARGET
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ class Oscillation(Target):
         inset.plot(
             time,
             0.5 * (mean.max() + mean.min()) + 0.5 * np.ptp(mean) * wave,
-            color=WANTED,
+            color=TARGET,
             linewidth=0.8,
             linestyle="--",
         )

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 GAP = 0.5  # µm: cells with a smaller gap are neighbours
 FEWEST = 1e-12  # a smaller share of unlike neighbours counts as none
 BRIGHTEST = 1e6  # levels, in thresholds, from which a cell is fully on in float64
-WANTED, FOUND = "#c2185b", "#757575"
+TARGET, FOUND = "#c2185b", "#757575"
 
 
 @dataclass(frozen=True)
@@ -106,17 +106,17 @@ class DomainSize(Target):
         ax.plot(
             [x, x + math.copysign(self.size, right - left)],
             [y, y],
-            color=WANTED,
+            color=TARGET,
             linewidth=3.0,
             solid_capstyle="butt",
             zorder=3,
         )
         ax.annotate(
-            f"wanted {self.size:g} µm",
+            f"target {self.size:g} µm",
             (x, y),
             xytext=(0, 3),
             textcoords="offset points",
-            color=WANTED,
+            color=TARGET,
             fontsize=7.0,
             zorder=3,
         )
@@ -191,8 +191,8 @@ class OnFraction(Target):
         """Draw two bars in a corner: the target share and the share found."""
         inset = ax.inset_axes((0.02, 0.02, 0.2, 0.2))
         found = float(self.measures(state)["on_share"][place])
-        inset.bar([0, 1], [self.fraction, found], color=[WANTED, FOUND])
-        inset.set_xticks([0, 1], ["wanted", "found"], fontsize=5.0)
+        inset.bar([0, 1], [self.fraction, found], color=[TARGET, FOUND])
+        inset.set_xticks([0, 1], ["target", "found"], fontsize=5.0)
         inset.set(ylim=(0, 1), yticks=[])
 
     def describe(self) -> str:

@@ -1,5 +1,4 @@
-"""The objective: every colony is scored as if it were alone, however designs are batched; what
-fails is data."""
+"""The objective: the loss of a colony does not depend on its batch, and failures are data."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ from design.scoring import cut_work_items
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 PACED = [Parameter("rate", 1.2, 2.4), Parameter("make", 1, 2)]
-KINDS = {"on recorded growth": (lit, LIT), "each grown anew": (paced, PACED)}
+KINDS = {"on recorded growth": (lit, LIT), "each grown again": (paced, PACED)}
 
 
 def objective(kind="on recorded growth", target=None, **options):
@@ -52,7 +51,7 @@ def alike(one, other):
     assert one.reasons == other.reasons
 
 
-# --- every colony is scored by itself -------------------------------------------------------------
+# --- every colony is scored alone -----------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -94,9 +93,9 @@ def test_losses_do_not_depend_on_how_designs_are_batched(kind):
 
 def test_recorded_growth_changes_no_bit():
     points = spots(4, 2)
-    kept, anew = objective().evaluate(points), objective(replay=False).evaluate(points)
-    alike(kept, anew)
-    assert (kept.why_regrown, anew.why_regrown) == ("", "replay=False")
+    kept, regrown = objective().evaluate(points), objective(replay=False).evaluate(points)
+    alike(kept, regrown)
+    assert (kept.why_regrown, regrown.why_regrown) == ("", "replay=False")
 
 
 @pytest.mark.parametrize(
@@ -119,9 +118,9 @@ def test_work_items_are_even_and_as_many_as_requested(rows, least, most, sizes):
 
 @pytest.mark.slow
 def test_a_colony_is_measured_at_its_own_first_step_of_that_size():
-    """A design of half the pace beside it changes nothing, and each count is the first that is
-    enough."""
-    made = objective("each grown anew", Count(), replicates=2, cells=5)
+    """A design of half the pace in the same batch changes nothing, and each count is the first that
+    is large enough."""
+    made = objective("each grown again", Count(), replicates=2, cells=5)
     points = np.array([[0.0, 0.5], [1.0, 0.5]])
     found = made.evaluate(points)
     for row, point in enumerate(points):
@@ -133,19 +132,19 @@ def test_a_colony_is_measured_at_its_own_first_step_of_that_size():
 
 
 @pytest.mark.slow
-def test_the_quick_do_not_grow_on_while_a_slow_replicate_is_waited_for():
+def test_fast_replicates_stop_while_slow_ones_grow():
     parameter = [Parameter("make", 0.5, 1)]
-    kept, anew = (
+    kept, regrown = (
         objective_of(uneven, parameter, Level(), cells=10, replicates=2, seed=2, replay=r)
         for r in (True, False)
     )
     growth_cache._kept.clear()
     found, points = kept.evaluate(np.array([[0.0], [0.5]])), np.array([[0.0], [0.5]])
-    alike(found, anew.evaluate(points))
-    (course,) = growth_cache._kept.values()
-    # one takes more than twice as long as the other, which without an end of its own would have 128
-    # cells by then
-    assert len(course.steps) == 24 and int(course.state.counts.max()) < 2 * 10
+    alike(found, regrown.evaluate(points))
+    (recording,) = growth_cache._kept.values()
+    # one replicate takes more than twice as long as the other, which would have 128 cells by then
+    # without an end of its own
+    assert len(recording.steps) == 24 and int(recording.state.counts.max()) < 2 * 10
     alike(kept.evaluate(points), found)
 
 
@@ -206,8 +205,8 @@ def test_whole_numbers_and_choices_build_scenes_of_their_own():
     for row, point in enumerate(points):
         values = made.task.space.values(point)
         assert found.losses[row, 1] == alone(built(**values), Level("g0"), 1, cells=3)[0]
-    # rates without decay of growth are linear in what makes them; the first species does not know
-    # how many there are
+    # the levels are linear in their rates of production, and the first species is independent of
+    # the number of species
     strong, weak = found.losses[[0, 1, 4, 5]], found.losses[[2, 3, 6, 7]]
     assert strong == pytest.approx(3 * weak, rel=1e-3)
     assert found.losses[:4] == pytest.approx(found.losses[4:], rel=1e-3)
@@ -309,7 +308,7 @@ def test_a_division_too_short_fails_with_time_and_cell():
 
 @dataclasses.dataclass(frozen=True)
 class Patchy(Target):
-    """No number for the colony of stream 1."""
+    """The loss of the colony of stream 1 is NaN."""
 
     failed = 7.0
 
@@ -317,13 +316,13 @@ class Patchy(Target):
         return torch.where(state.stream == 1, torch.nan, 0.25)
 
 
-def test_a_loss_that_is_no_number_fails():
+def test_a_loss_that_is_nan_is_a_failure():
     found = objective(target=Patchy()).evaluate(spots(2, 2))
     assert found.losses.tolist() == [[0.25, 7.0, 0.25]] * 2 and found.loss.tolist() == [2.5, 2.5]
     assert found.reasons == {(row, 1): "the target's loss was nan" for row in range(2)}
 
 
-def test_a_loss_of_the_wrong_shape_is_no_failure_of_the_design():
+def test_a_loss_of_the_wrong_shape_is_an_error_of_the_target():
     @dataclasses.dataclass(frozen=True)
     class Single(Target):
         def loss(self, state, history=None):
@@ -333,7 +332,7 @@ def test_a_loss_of_the_wrong_shape_is_no_failure_of_the_design():
         objective(target=Single()).evaluate(spots(1, 2))
 
 
-def test_a_colony_that_does_not_grow_is_given_up_and_its_neighbours_are_not(monkeypatch):
+def test_a_colony_that_does_not_grow_fails_alone(monkeypatch):
     monkeypatch.setattr(rollout, "PATIENCE", 6.0)
     made = objective_of(paced, [Parameter("rate", 0.0, 1.0)], Level(), cells=8, replicates=2)
     found = made.evaluate(np.array([[0.0], [1.0]]))
@@ -346,8 +345,8 @@ def test_a_colony_that_does_not_grow_is_given_up_and_its_neighbours_are_not(monk
 
 @pytest.mark.parametrize("rate", [0.02, 0.2])
 def test_patience_is_longer_than_slow_cells_need(rate):
-    """From 2 µm to division at 4 µm by the law of volume takes ln(4.67/2.67)/rate, 28 h at 0.02/h;
-    the counts of every step are asked."""
+    """The law of volume takes ln(4.67/2.67)/rate from 2 µm to division at 4 µm: 28 h at 0.02/h. The
+    counts are checked after every hour."""
     steps = np.arange(0, 90, 1.0)
     state = tf.Scene(tf.Growth(rate=rate)).seed(1)
     most, since = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.float64)
@@ -357,7 +356,7 @@ def test_patience_is_longer_than_slow_cells_need(rate):
 
 def test_a_colony_without_cells_fails():
     def dying(rate=1.0):
-        # daughters of the first cell are beyond
+        # the daughters of the first cell are outside the region
         edge = tf.Removal(low=(-0.5, -0.5), high=(0.5, 0.5))
         return tf.Scene(
             tf.Growth(rate=rate), tf.Division(length=4.0), tf.Mechanics(dim=2), edge, dt=DT
@@ -376,8 +375,8 @@ def test_a_colony_without_cells_fails():
 
 @dataclasses.dataclass(frozen=True)
 class Diary(Target):
-    """Notes time and number of cells after every step, and reads them back: the loss is the
-    colony's own age."""
+    """Notes time and number of cells after every step, and reads them back: the loss is the age of
+    the colony."""
 
     def note(self, state):
         return torch.stack(
@@ -474,7 +473,7 @@ def ungrown(make=1.0):
         ),
     ],
 )
-def test_bad_input_is_refused_in_words(given, words):
+def test_bad_input_is_refused(given, words):
     options = {
         "scene": lit,
         "parameters": [Parameter("make", 1, 2)],
@@ -499,7 +498,7 @@ def test_bad_input_is_refused_in_words(given, words):
         ({"streams": []}, "streams = .*at least one"),
     ],
 )
-def test_bad_points_are_refused_in_words(given, words):
+def test_bad_points_are_refused(given, words):
     with pytest.raises(tf.InputError, match=words):
         objective().evaluate(**{"points": spots(1, 2), **given})
 
@@ -563,7 +562,7 @@ def resting(make=1.0):
     return grown(0.0, make)
 
 
-def test_where_the_end_is_a_time_it_comes_also_to_cells_that_rest(monkeypatch):
+def test_cells_that_do_not_grow_reach_an_end_in_time(monkeypatch):
     monkeypatch.setattr("design.rollout.PATIENCE", 1.0)
     found = objective_of(
         resting, [Parameter("make", 0.5, 2.0)], Level(), until=5.0, replicates=1
@@ -571,7 +570,7 @@ def test_where_the_end_is_a_time_it_comes_also_to_cells_that_rest(monkeypatch):
     assert not found.reasons and found.loss[0] < 1.5
 
 
-def test_a_colony_must_have_somewhere_to_grow():
+def test_the_end_must_exceed_the_founders():
     with pytest.raises(
         tf.InputError,
         match="cells = 2 is not allowed: it must be above the 2 that a colony starts from",
