@@ -1,15 +1,15 @@
-"""The design layer: name a scene, the parameters that may change and the pattern wanted, and
-search.
+"""The design layer: search the parameters of a scene for colonies that form a pattern.
 
     from design import Parameter, Search, Stripe
 
-Uses torchfilm's public names only, as its users would.
+It uses torchfilm's public names only, as any user can.
 """
 
 from design.methods import CMAES, Batch, Bayesian, Method, Racing, Sobol
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
-from design.robust import Robustness, robustness
+from design.robustness import Robustness
+from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
 from design.search import Best, Search
 from design.study import Study
@@ -25,6 +25,7 @@ from design.targets import (
     Stripe,
     Target,
 )
+from design.task import Task
 
 __all__ = [
     "CMAES",
@@ -53,5 +54,6 @@ __all__ = [
     "Stripe",
     "Study",
     "Target",
-    "robustness",
+    "Task",
+    "check_robustness",
 ]

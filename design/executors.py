@@ -1,5 +1,5 @@
-"""Pieces of an evaluation on other processes or machines, by the interface of `concurrent.futures`:
-what a worker takes along as it dies is done again."""
+"""Work items in other processes or on other machines, through the interface of
+`concurrent.futures`. Work that is lost when a worker dies is repeated."""
 
 from __future__ import annotations
 
@@ -10,97 +10,87 @@ import warnings
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
-from typing import TYPE_CHECKING
 
 import torchfilm as tf
+from design.scoring import WorkItem, WorkResult, run_work_item
+from design.task import Task
 
-if TYPE_CHECKING:
-    from design.objective import Objective, Outcome, WorkItem
-
-# times that a lost piece is given to the executor anew; Dask tries by itself with four workers each
-# time
-AGAIN = 1
-# threads of one process share its recorded growth, which only one may lengthen at a time
+# how often a lost work item is submitted again; Dask itself tries four workers each time
+RETRIES = 1
+# threads of one process share its growth recordings, and only one may extend them at a time
 _TURN = threading.Lock()
 
 
-def outcomes(
-    objective: Objective,
-    pieces: list[WorkItem],
-    streams: tuple[int, ...],
-    size: float,
-    executor: Executor,
-) -> Iterator[tuple[WorkItem, Outcome]]:
-    """Each piece with what became of it, once; those that the executor loses are given to it again,
-    and in the end done here, with a warning."""
+def run_work_items(
+    task: Task, items: list[WorkItem], streams: tuple[int, ...], size: float, executor: Executor
+) -> Iterator[tuple[WorkItem, WorkResult]]:
+    """Yield each work item once, with its result.
+
+    A work item that the executor loses is submitted again. If it is lost again, this process runs
+    it and warns.
+    """
     lost: list[Exception] = []
-    waiting = deque(
-        (piece, _submit(executor, objective, piece, streams, size, 0), 0) for piece in pieces
-    )
+    waiting = deque((item, _submit(executor, task, item, streams, size, 0), 0) for item in items)
     try:
         while waiting:
-            piece, future, times = waiting.popleft()
+            item, future, tries = waiting.popleft()
             try:
                 found = future.result()
-            # not the piece's own, which is an answer: the executor could not carry it, or its
-            # worker is gone
+            # an error of the work item itself is a result; this one is the executor's: it could
+            # not carry the work item, or its worker is gone
             except Exception as error:
-                _check_carried(objective, error)
-                if times < AGAIN:
-                    waiting.append(
-                        (
-                            piece,
-                            _submit(executor, objective, piece, streams, size, times + 1),
-                            times + 1,
-                        )
-                    )
+                _check_pickled(task, error)
+                if tries < RETRIES:
+                    again = _submit(executor, task, item, streams, size, tries + 1)
+                    waiting.append((item, again, tries + 1))
                     continue
                 lost.append(error)
-                found = _run(objective, piece, streams, size)
+                found = _run_guarded(task, item, streams, size)
             if isinstance(found, Exception):
                 raise found
-            yield piece, found
+            yield item, found
     finally:
         for _, future, _ in waiting:
             future.cancel()
     if lost:
-        words = (
-            f"the executor lost {len(lost)} of {len(pieces)} pieces, which were grown in this"
-            f" process ({type(lost[-1]).__name__}: {lost[-1]})"
+        warnings.warn(
+            f"the executor lost {len(lost)} of {len(items)} work items; this process ran them"
+            f" ({type(lost[-1]).__name__}: {lost[-1]})",
+            RuntimeWarning,
+            stacklevel=3,
         )
-        warnings.warn(words, RuntimeWarning, stacklevel=4)
 
 
 def _submit(
     executor: Executor,
-    objective: Objective,
-    piece: WorkItem,
+    task: Task,
+    item: WorkItem,
     streams: tuple[int, ...],
     size: float,
-    times: int,
-) -> Future[Outcome | Exception]:
-    """A piece given to an executor; what it says against that is kept in the future, as what
-    happens later is."""
+    tries: int,
+) -> Future[WorkResult | Exception]:
+    """Submit a work item. An error of `submit` is kept in the future, like errors that come
+    later."""
     try:
-        return executor.submit(_run, objective, piece, streams, size, times)
+        return executor.submit(_run_guarded, task, item, streams, size, tries)
     except Exception as error:
-        future: Future[Outcome | Exception] = Future()
+        future: Future[WorkResult | Exception] = Future()
         future.set_exception(error)
         return future
 
 
-def _run(
-    objective: Objective, piece: WorkItem, streams: tuple[int, ...], size: float, times: int = 0
-) -> Outcome | Exception:
-    """A piece in another process or thread. Its own error is an answer too, so that whatever the
-    future raises is the executor's.
+def _run_guarded(
+    task: Task, item: WorkItem, streams: tuple[int, ...], size: float, tries: int = 0
+) -> WorkResult | Exception:
+    """Run a work item in another process or thread. It returns its own errors, so that whatever a
+    future raises is an error of the executor.
 
-    times: how often it was lost before; a cluster that keeps answers by what was asked (Dask) must
-    see a new question.
+    tries: how often the item was lost before. A cluster that caches results by their arguments
+    (Dask) must see new arguments.
     """
     try:
         with _TURN:
-            return objective.run(piece, streams, size)
+            return run_work_item(task, item, streams, size)
     except Exception as error:
         error.add_note("Where it was raised:\n" + traceback.format_exc())
         try:
@@ -112,14 +102,13 @@ def _run(
         return error
 
 
-def _check_carried(objective: Objective, error: Exception) -> None:
-    """Raises InputError where an executor failed because it cannot carry the objective to another
-    process."""
+def _check_pickled(task: Task, error: Exception) -> None:
+    """Raises InputError where an executor failed because the task cannot be pickled."""
     if isinstance(error, (pickle.PicklingError, AttributeError, TypeError, ImportError)):
-        name = getattr(objective.make, "__qualname__", repr(objective.make))
+        function = task.family.function
+        name = getattr(function, "__qualname__", repr(function))
         raise tf.InputError(
-            f"{name} and its target cannot be carried to a worker ({error}). Define the scene at"
-            " the top level of a module that the workers can import, not inside a function and not"
-            " as a lambda, and give it and the target nothing that belongs to one process, such as"
-            " open files."
+            f"{name} and its target cannot be pickled for a worker ({error}). Define the scene"
+            " function at the top level of a module that the workers can import. Give it and the"
+            " target no lambda and no open file."
         ) from error

@@ -1,48 +1,34 @@
-"""Recorded growths, kept for as long as the process lives, so that every batch of a search uses the
-same."""
+"""Growth recordings, kept while the process lives, so that every batch of a search shares them."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import torchfilm as tf
 
-if TYPE_CHECKING:
-    from design.objective import Objective
-
-MOST_BYTES = 2**30  # of recorded steps; beyond, those used longest ago are let go
+MOST_BYTES = 2**30  # of recorded steps; above this, the least recently used recordings are dropped
 _kept: dict[Any, tf.GrowthRecording] = {}
 
 
-def recording_for(
-    objective: Objective, scene: tf.Scene, streams: tuple[int, ...]
+def find_or_record(
+    key: tuple[Any, ...],
+    streams: tuple[int, ...],
+    cells: int | None,
+    record: Callable[[], tf.GrowthRecording],
 ) -> tf.GrowthRecording:
-    """The growth of this scene for these streams, recorded before or begun now."""
-    key = (
-        tf.GrowthRecording.made_of(scene),
-        objective.seed,
-        objective.dt,
-        objective.dtype,
-        objective.device,
-    )
-    for known, course in _kept.items():
-        # colonies leave a course by themselves, so one that goes further serves as well
-        far_enough = course.cells is None or (
-            objective.cells is not None and course.cells >= objective.cells
-        )
-        if known[:-2] == key and set(streams) <= set(course.streams) and far_enough:
-            _kept[known] = _kept.pop(known)  # the last used stands last
-            return course
-    course = tf.GrowthRecording(
-        scene,
-        streams=streams,
-        seed=objective.seed,
-        dt=objective.dt,
-        dtype=objective.dtype,
-        device=objective.device,
-        cells=objective.cells,
-    )
-    while _kept and sum(c.nbytes for c in _kept.values()) > MOST_BYTES:
+    """Return a kept recording that serves these streams up to `cells` cells, or start a new one.
+
+    key: everything else that the growth depends on. record: starts a new recording.
+    """
+    for known, recording in _kept.items():
+        # a colony leaves the recording at its own end, so a longer recording serves as well
+        long_enough = recording.cells is None or (cells is not None and recording.cells >= cells)
+        if known[:-2] == key and set(streams) <= set(recording.streams) and long_enough:
+            _kept[known] = _kept.pop(known)  # the dictionary is in order of use, the latest last
+            return recording
+    recording = record()
+    while _kept and sum(kept.nbytes for kept in _kept.values()) > MOST_BYTES:
         _kept.pop(next(iter(_kept)))
-    _kept[(*key, streams, objective.cells)] = course
-    return course
+    _kept[(*key, streams, cells)] = recording
+    return recording

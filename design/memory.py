@@ -1,4 +1,5 @@
-"""How many colonies a batch can carry: what a colony is likely to take, and what memory is left."""
+"""How many colonies a batch can hold: the memory that a colony needs, and the memory that is
+free."""
 
 from __future__ import annotations
 
@@ -7,35 +8,28 @@ from pathlib import Path
 
 import torch
 
-import torchfilm as tf
-
 # Measured peak of a step of the boundary detector (5 species, stiff, one signal), bytes in float32,
-# with half as much again to spare
+# plus half as much again as a reserve
 BYTES_A_CELL, BYTES_A_VOXEL = 6000, 60
-USE = 0.5  # of what is left: other batches, and whatever else the machine does
-CELLS = 1000  # of a colony whose end is a time
+USE = 0.5  # share of the free memory: other batches and other programs use it too
+CELLS = 1000  # assumed cells of a colony whose end is a time
 
 
-def max_colonies(scene: tf.Scene, cells: int | None, dtype: torch.dtype, device: str) -> int:
-    """At most how many colonies of this scene to grow at once, at least 1."""
-    first = scene.seed(1, dtype=dtype, device="cpu")
-    voxels = 0 if first.layout is None else first.layout.grid.nodes
+def max_colonies(nodes: int, cells: int | None, dtype: torch.dtype, device: str) -> int:
+    """The greatest number of colonies to grow at once, at least 1.
+
+    nodes: grid nodes of a colony; cells: at its end, or None where its end is a time.
+    """
     wide = 2 if dtype == torch.float64 else 1
-    # a colony may have up to twice the cells wanted when it is measured
-    return max(
-        1,
-        math.floor(
-            USE
-            * left(device)
-            / (wide * (BYTES_A_CELL * 2 * (cells or CELLS) + BYTES_A_VOXEL * voxels))
-        ),
-    )
+    # a colony may have up to twice the requested cells when it is measured
+    bytes_a_colony = wide * (BYTES_A_CELL * 2 * (cells or CELLS) + BYTES_A_VOXEL * nodes)
+    return max(1, math.floor(USE * free_bytes(device) / bytes_a_colony))
 
 
-def left(device: str) -> int:
-    """Bytes that can still be taken."""
+def free_bytes(device: str) -> int:
+    """Bytes of memory that are free on a device."""
     if torch.device(device).type == "cuda":
-        # what torch holds in reserve is free for its next batch
+        # torch reuses the memory that it holds in reserve for its next batch
         return (
             torch.cuda.mem_get_info(torch.device(device))[0]
             + torch.cuda.memory_reserved(device)
@@ -46,10 +40,11 @@ def left(device: str) -> int:
     ):
         if line.startswith("MemAvailable:"):
             return 1024 * int(line.split()[1])
-    return 4 * 2**30  # not Linux: what any machine has
+    return 4 * 2**30  # not Linux: a size that any machine has
 
 
 def is_lack_of_memory(error: BaseException) -> bool:
+    """Whether an error reports that memory ran out."""
     return (
         isinstance(error, (MemoryError, torch.cuda.OutOfMemoryError))
         or "not enough memory" in str(error)

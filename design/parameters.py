@@ -1,5 +1,5 @@
-"""What a search may change: named parameters of a scene, each with its bounds or its options, and
-the unit cube that they span."""
+"""The parameters that a search changes, each with its bounds or its options, and the unit cube that
+they span."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from torchfilm import checks
 
-# What a parameter's value may be: a number, or one of the options of a choice.
+# The value of a parameter: a number, or one of the options of a choice.
 Value = Any
 
 
@@ -21,10 +21,11 @@ Value = Any
 class Parameter:
     """A number between two bounds: `Parameter("k3", 0.1, 10, log=True)`.
 
-    name: of the scene function's argument. log: spread evenly in its logarithm, for what may lie
-    anywhere over decades; bounds above 0. whole: a whole number, both bounds among them. A whole
-    number makes a scene of its own for each value, so that it may say how a circuit is built, such
-    as how many genes; others are given to one scene as one value per colony.
+    name: of an argument of the scene function. log: use a logarithmic scale, for a parameter whose
+    order of magnitude is unknown; both bounds above 0. whole: an integer, bounds included. Each
+    value of a whole parameter makes its own scene, so it may set the structure of a circuit, such
+    as the number of genes. Other parameters reach one scene as one value per colony. Raises
+    InputError for bounds that are not allowed.
     """
 
     name: str
@@ -46,21 +47,21 @@ class Parameter:
                 f"Parameter({self.name!r})",
                 (self.low, self.high),
                 "low < high",
-                "Swap the two, or give a value that is fixed with fixed=….",
+                "Swap the two. A fixed value belongs in fixed={…}.",
             )
         if self.log and self.low <= 0:
             raise checks.input_error(
                 f"Parameter({self.name!r}).low",
                 self.low,
                 "above 0 with log=True",
-                "A logarithm has no zero: raise the bound, or leave log out.",
+                "0 has no logarithm: raise the bound, or leave log out.",
             )
         if self.log and self.whole:
             raise checks.input_error(
                 f"Parameter({self.name!r})",
                 "log=True, whole=True",
                 "one of the two",
-                "Whole numbers have equal shares, whatever their size.",
+                "All whole numbers have equal shares of the scale.",
             )
         if self.whole and not (self.low.is_integer() and self.high.is_integer()):
             raise checks.input_error(
@@ -69,20 +70,20 @@ class Parameter:
 
     @property
     def levels(self) -> int | None:
-        """How many values it can have; None: any."""
+        """The number of its values; None: continuous."""
         return int(self.high - self.low) + 1 if self.whole else None
 
     def value(self, unit: float) -> Value:
-        """The value at a coordinate in [0, 1]; whole numbers have equal shares."""
+        """The value at a coordinate in [0, 1]. Whole numbers have equal shares of it."""
         if self.levels is not None:
             return int(self.low) + _level(unit, self.levels)
         low, high = (math.log(self.low), math.log(self.high)) if self.log else (self.low, self.high)
         found = low + unit * (high - low)
-        # rounding must not lead over a bound
+        # rounding must not exceed a bound
         return min(max(math.exp(found) if self.log else found, self.low), self.high)
 
     def coordinate(self, value: Value) -> float:
-        """The coordinate of a value within the bounds."""
+        """The coordinate, in [0, 1], of a value within the bounds."""
         number = checks.number(self.name, value, least=self.low, most=self.high)
         if self.whole:
             if not number.is_integer():
@@ -102,10 +103,10 @@ class Parameter:
 @dataclass(frozen=True, init=False)
 class Choice:
     """One of several options, such as promoters: `Choice("promoter", ("weak", "strong"))`. Each
-    option makes a scene of its own.
+    option makes its own scene.
 
-    name: of the scene function's argument. options: at least two, all different, each a text, a
-    number, True or False, so that a file can keep it.
+    name: of an argument of the scene function. options: at least two, all different, each a text, a
+    number, True or False, so that a file can store it. Raises InputError for other options.
     """
 
     name: str
@@ -120,9 +121,9 @@ class Choice:
                 f"Choice({name!r}).options",
                 odd[0],
                 "texts, numbers, True or False",
-                "Name what stands for it, and let the scene look it up.",
+                "Give a name, and let the scene function look the object up.",
             )
-        # 1 and True are equal, and could not be told apart by their value
+        # 1 and True are equal, so that their values could not be distinguished
         if not listed or len(options) < 2 or len(set(options)) != len(options):
             raise checks.input_error(
                 f"Choice({name!r}).options",
@@ -137,11 +138,11 @@ class Choice:
         return len(self.options)
 
     def value(self, unit: float) -> Value:
-        """The option at a coordinate in [0, 1]; all have equal shares."""
+        """The option at a coordinate in [0, 1]. All options have equal shares of it."""
         return self.options[_level(unit, len(self.options))]
 
     def coordinate(self, value: Value) -> float:
-        """The middle of an option's share."""
+        """The coordinate in the middle of an option's share."""
         if value not in self.options:
             raise checks.input_error(
                 self.name, value, "one of " + ", ".join(map(repr, self.options))
@@ -153,9 +154,9 @@ class Choice:
 
 
 class Space:
-    """The parameters of a search side by side: points are (n, D) coordinates in [0, 1], float64.
+    """The parameters of a search. Points are (n, D) coordinates in [0, 1], float64.
 
-    size: D; names; levels: how many values each dimension has, None for any.
+    size: D; names; levels: the number of values of each dimension, None where it is continuous.
     """
 
     def __init__(self, parameters: Sequence[Parameter | Choice]):
@@ -176,23 +177,23 @@ class Space:
         self.levels = tuple(p.levels for p in self.parameters)
 
     def values(self, point: np.ndarray) -> dict[str, Value]:
-        """The parameters of one design, from its coordinates (D,)."""
+        """The values of one design by name, from its coordinates (D,)."""
         return {p.name: p.value(float(u)) for p, u in zip(self.parameters, point, strict=True)}
 
     def point(self, values: Mapping[str, Value]) -> np.ndarray:
-        """The coordinates (D,) of one design."""
+        """The coordinates (D,) of one design, from its values by name."""
         wrong = [n for n in (*values, *self.names) if n not in values or n not in self.names]
         if wrong:
             raise checks.input_error(
                 "values",
                 list(values),
                 "one for each of " + ", ".join(self.names),
-                f"Look at {wrong[0]!r}.",
+                f"{wrong[0]!r} is missing or unknown.",
             )
         return np.array([p.coordinate(values[p.name]) for p in self.parameters])
 
     def check(self, allowed: Sequence[str], scene: str) -> None:
-        """Raises InputError for a parameter that the scene has not."""
+        """Raises InputError for a parameter that the scene does not have."""
         for name in self.names:
             if name not in allowed:
                 near = difflib.get_close_matches(name, allowed, 1)
@@ -212,3 +213,8 @@ def _level(unit: float, count: int) -> int:
 def _check_name(kind: str, name: Any) -> None:
     if not isinstance(name, str) or not name.isidentifier():
         raise checks.input_error(f"{kind}.name", name, "the name of an argument of the scene")
+
+
+def show_value(value: Value) -> str:
+    """A value in a table."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,60 +1,63 @@
-"""What a search shows: a bar while it runs, a table, and a picture of first guess, best design and
+"""The report of a search: a table, and a picture of the first guess, the best design and the
 target."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import torchfilm as tf
-from design.parameters import Parameter, Value
+from design.parameters import Choice, Parameter, Value, show_value
 from design.rollout import FinishedColonies
+from design.study import Study
+from design.targets.base import Target
+from design.task import Task
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from tqdm import tqdm
-
-    from design.search import Best
-    from design.targets import Target
 
 SHOWN = 3  # replicates side by side
 
 
-def bar(total: float, progress: bool) -> AbstractContextManager[tqdm | None]:
-    """A bar of colonies simulated, or nothing. Needs tqdm (the `app` extra) where it is to be
-    seen."""
-    if not progress:
-        return nullcontext()
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise tf.InputError(
-            'a progress bar needs tqdm: pip install "torchfilm[app]", or give progress=False.'
-        ) from error
-    form = "{desc} |{bar}| {n:.0f}/{total:.0f} colonies {elapsed}<{remaining}{postfix}"
-    return tqdm(total=total, bar_format=form, desc="search", disable=None, mininterval=0.3)
+@dataclass(frozen=True, eq=False)
+class ReportedDesign:
+    """A design that a report shows: its values by name, its point (D,), its loss, and its colonies
+    at their ends."""
+
+    title: str
+    values: dict[str, Value]
+    point: np.ndarray
+    loss: float
+    colonies: list[FinishedColonies]
 
 
-def table(best: Best) -> str:
-    """Parameters with bounds, first guess and best value, then losses and measures."""
-    search = best.search
-    first = search.first()
-    rows = [("parameter", "bounds", "first guess", "best")]
-    for p in search.objective.space.parameters:
-        bounds = (
-            f"{p.low:g} … {p.high:g}"
-            if isinstance(p, Parameter)
-            else " | ".join(map(str, p.options))
-        )
-        rows.append((p.name, bounds, shown(first.values[p.name]), shown(best.values[p.name])))
+@dataclass(frozen=True, eq=False)
+class SearchReport:
+    """What a report of a search shows. why_regrown: the reason why colonies did not follow recorded
+    growth, or ""."""
+
+    task: Task
+    study: Study
+    why_regrown: str
+    first: ReportedDesign
+    best: ReportedDesign
+
+
+def table(report: SearchReport) -> str:
+    """Parameters with bounds, first guess and best value; then losses and measures."""
+    first, best, study = report.first, report.best, report.study
+    rows: list[tuple[str, ...]] = [("parameter", "bounds", first.title, best.title)]
+    for p in report.task.space.parameters:
+        values = (show_value(design.values[p.name]) for design in (first, best))
+        rows.append((p.name, _bounds(p), *values))
     rows.append(("loss", "", f"{first.loss:.4f}", f"{best.loss:.4f}"))
-    before, after = (measured(search.objective.target, b.colonies()) for b in (first, best))
-    for name in after:
-        rows.append((name, "", shown(before.get(name, float("nan"))), shown(after[name])))
+    old, new = (measured(report.task.target, design.colonies) for design in (first, best))
+    for name in new:
+        rows.append((name, "", show_value(old.get(name, float("nan"))), show_value(new[name])))
     wide = [max(len(r[k]) for r in rows) for k in range(4)]
     lines = [
         "  ".join(
@@ -63,35 +66,31 @@ def table(best: Best) -> str:
         )
         for r in rows
     ]
-    study = search.study
     failed = sum(len(e.reasons) for e in study.entries)
-    end = f"{study.colonies:.0f} colonies in {study.seconds:.0f} s" + (
-        f", {failed} failed" if failed else ""
+    lines += [
+        f"most frequent failure: {reason} ({times} colonies)"
+        for reason, times in study.failures()[:1]
+    ]
+    how = (
+        f"grown again for each design: {report.why_regrown}"
+        if report.why_regrown
+        else "circuits ran on one recorded growth"
     )
-    lines += [f"most failures: {words} ({times} colonies)" for words, times in study.failures()[:1]]
-    return "\n".join(
-        [
-            *lines,
-            end
-            + (
-                f"; grown anew for each design: {search.regrown}"
-                if search.regrown
-                else "; circuits ran on one recorded growth"
-            ),
-        ]
-    )
+    spent = f"{study.colonies:.0f} colonies in {study.seconds:.0f} s"
+    lines.append(spent + (f", {failed} failed" if failed else "") + f"; {how}")
+    return "\n".join(lines)
 
 
-def shown(value: Value) -> str:
-    """A parameter's value in a table."""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+def _bounds(parameter: Parameter | Choice) -> str:
+    if isinstance(parameter, Parameter):
+        return f"{parameter.low:g} … {parameter.high:g}"
+    return " | ".join(map(str, parameter.options))
 
 
-def measured(target: Target, done: Iterable[FinishedColonies]) -> dict[str, float]:
-    """What a target measures, its mean over all these colonies that have the number; NaN where none
-    has."""
+def measured(target: Target, finished: Iterable[FinishedColonies]) -> dict[str, float]:
+    """The mean of each measure of a target over the colonies that have it; NaN where none has."""
     found: dict[str, list[float]] = {}
-    for part in done:
+    for part in finished:
         for name, value in target.measures(part.state, part.history).items():
             found.setdefault(name, []).extend(value.double().tolist())
     return {
@@ -100,16 +99,15 @@ def measured(target: Target, done: Iterable[FinishedColonies]) -> dict[str, floa
     }
 
 
-def draw(best: Best, path: Path) -> Path:
-    """First guess above, best design below, the target drawn over each colony, and beside them how
-    the search got there."""
+def draw(report: SearchReport, path: Path) -> Path:
+    """Draw the first guess above and the best design below, with the target over each colony, and
+    the course of the search beside them. Needs matplotlib (the `app` extra)."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise tf.InputError('pictures need matplotlib: pip install "torchfilm[app]".') from error
-    search = best.search
-    first = search.first()
-    grown = [_places(one.colonies())[:SHOWN] for one in (first, best)]
+    designs = (report.first, report.best)
+    grown = [_one_by_one(d.colonies)[:SHOWN] for d in designs]
     columns = max(1, *(len(g) for g in grown))
     figure = Figure(figsize=(2.6 * columns + 4.2, 6.4), layout="constrained")
     grid = figure.add_gridspec(
@@ -118,28 +116,27 @@ def draw(best: Best, path: Path) -> Path:
     size = max(
         (_extent(tf.pictures.frame_of(d.state).colony(k)) for g in grown for d, k in g), default=1.0
     )
-    for row, (title, one) in enumerate((("first guess", first), ("best", best))):
+    for row, one in enumerate(designs):
         axes = [figure.add_subplot(grid[2 * row, k]) for k in range(columns)]
         bars = [figure.add_subplot(grid[2 * row + 1, k]) for k in range(columns)]
-        _draw_row(
-            axes, bars, grown[row], search.objective.target, size, f"{title}, loss {one.loss:.3f}"
-        )
-    _draw_convergence(figure.add_subplot(grid[0, columns]), search)
-    _draw_parameters(figure.add_subplot(grid[2:, columns]), best)
+        title = f"{one.title}, loss {one.loss:.3f}"
+        _draw_row(axes, bars, grown[row], report.task.target, size, title)
+    _draw_convergence(figure.add_subplot(grid[0, columns]), report.study)
+    _draw_parameters(figure.add_subplot(grid[2:, columns]), report)
     figure.savefig(path, dpi=160)
     return path
 
 
-def _places(done: list[FinishedColonies]) -> list[tuple[FinishedColonies, int]]:
-    """The colonies one by one, by their ids."""
+def _one_by_one(finished: list[FinishedColonies]) -> list[tuple[FinishedColonies, int]]:
+    """Single colonies as (batch, place in it), in order of their ids."""
     return sorted(
-        ((d, k) for d in done for k in range(d.state.colonies)),
+        ((d, k) for d in finished for k in range(d.state.colonies)),
         key=lambda x: int(x[0].state.colony_id[x[1]]),
     )
 
 
 def _extent(cells: dict[str, np.ndarray]) -> float:
-    """Half the side of a square that holds a colony, µm."""
+    """Half the side of a square that contains a colony, µm."""
     place = cells["position"][:, :2]
     return (
         float((place.max(0) - place.min(0)).max()) / 2
@@ -148,8 +145,8 @@ def _extent(cells: dict[str, np.ndarray]) -> float:
     )
 
 
-def _light(name: str, place: int) -> str:
-    """The colour of a species: what its name says, or one of a few."""
+def _colour(name: str, place: int) -> str:
+    """The colour of a species: the one that its name states, or one of a list."""
     known = {
         "cfp": "cyan",
         "gfp": "lime",
@@ -171,12 +168,12 @@ def _draw_row(
     size: float,
     title: str,
 ) -> None:
-    """Colonies of one design to one scale, coloured over one range by what the target looks at."""
+    """Draw colonies of one design to one scale, coloured by the species of the target."""
     names = [n for n in target.names if not n.startswith("out.")]
     frames = [tf.pictures.frame_of(d.state).colony(k) for d, k in grown]
     limits = {n: (0.0, max((float(f[n].max()) for f in frames), default=1.0) or 1.0) for n in names}
     colour = names[0] if len(names) == 1 else None
-    channels = {n: _light(n, k) for k, n in enumerate(names)} if len(names) > 1 else None
+    channels = {n: _colour(n, k) for k, n in enumerate(names)} if len(names) > 1 else None
     scales: list[Any] = []
     for ax, (done, k), cells in zip(axes, grown, frames, strict=False):
         x, y = (cells["position"][:, :2].max(0) + cells["position"][:, :2].min(0)) / 2
@@ -199,11 +196,12 @@ def _draw_row(
         ax.set_visible(False)
 
 
-def _draw_convergence(ax: Axes, search: Any) -> None:
-    colonies, _, best = search.study.convergence()
+def _draw_convergence(ax: Axes, study: Study) -> None:
+    """The loss of every full-size design, and the lowest loss so far."""
+    colonies, _, best = study.convergence()
     spent = np.concatenate([[0.0], colonies])
-    for entry, begin, end in zip(search.study.entries, spent[:-1], spent[1:], strict=True):
-        if search.study.is_full(entry):
+    for entry, begin, end in zip(study.entries, spent[:-1], spent[1:], strict=True):
+        if study.is_full(entry):
             ax.plot(
                 np.linspace(begin, end, len(entry.loss) + 1)[1:],
                 entry.loss,
@@ -214,25 +212,25 @@ def _draw_convergence(ax: Axes, search: Any) -> None:
             )
     ax.step(colonies, best, where="post", color="C3")
     ax.set(xlabel="colonies simulated", ylabel="loss", ylim=(0, None))
-    ax.set_title("every design (grey), the best yet (red)", fontsize=9)
+    ax.set_title("every design (grey), the best so far (red)", fontsize=9)
 
 
-def _draw_parameters(ax: Axes, best: Best) -> None:
-    """Where the best design and the first guess lie between the bounds."""
-    space, first = best.search.objective.space, best.search.first()
+def _draw_parameters(ax: Axes, report: SearchReport) -> None:
+    """The best design and the first guess between the bounds."""
+    space, first, best = report.task.space, report.first, report.best
     rows = np.arange(space.size)[::-1]
     ax.hlines(rows, 0, 1, color="0.85", lw=4, zorder=0)
-    ax.plot(first.point, rows, "o", color="0.55", label="first guess")
-    ax.plot(best.point, rows, "D", color="C3", label="best")
+    ax.plot(first.point, rows, "o", color="0.55", label=first.title)
+    ax.plot(best.point, rows, "D", color="C3", label=best.title)
     for y, p in zip(rows, space.parameters, strict=True):
         low, high = (
             (f"{p.low:g}", f"{p.high:g}")
             if isinstance(p, Parameter)
             else (str(p.options[0]), str(p.options[-1]))
         )
-        for x, words, side in ((0, low, "right"), (1, high, "left")):
+        for x, bound, side in ((0, low, "right"), (1, high, "left")):
             ax.annotate(
-                words,
+                bound,
                 (x, y),
                 xytext=(-4 if side == "right" else 4, 0),
                 textcoords="offset points",
@@ -243,7 +241,7 @@ def _draw_parameters(ax: Axes, best: Best) -> None:
             )
     ax.set(
         yticks=rows,
-        yticklabels=[f"{p.name} = {shown(best.values[p.name])}" for p in space.parameters],
+        yticklabels=[f"{p.name} = {show_value(best.values[p.name])}" for p in space.parameters],
         xticks=[],
         xlim=(-0.28, 1.28),
     )

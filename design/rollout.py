@@ -1,9 +1,8 @@
-"""Colonies of a batch on their way: each is measured when it is done, whoever else is in the batch,
-and leaves; one that fails leaves with its reason."""
+"""The run of a batch of colonies. Each colony is measured at its own end and leaves the batch; a
+colony that fails leaves with its reason."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -11,14 +10,16 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
+from design import colonies
+from design.colonies import PreparedColonies
 
-# h: a colony that has not gained a cell in so long never will
+# h: a colony that has not gained a cell for so long is given up
 PATIENCE = 100.0
 
 
 @dataclass(frozen=True)
 class FinishedColonies:
-    """Colonies that have reached their end in one step, as a state of them alone, and their notes
+    """Colonies that reached their end in the same step, as a state of them alone, and their history
     (T, B, k), or None."""
 
     state: tf.State
@@ -26,88 +27,102 @@ class FinishedColonies:
 
 
 @dataclass(frozen=True)
-class Failed:
-    """A colony, by its id, that could not go on, and why."""
+class FailedColony:
+    """The id of a colony that could not continue, and the reason."""
 
     colony_id: int
     reason: str
 
 
 def grow(
-    step: Callable[[tf.State], tf.State],
-    state: tf.State,
+    prepared: PreparedColonies,
     *,
     cells: int | None,
     until: float | None,
     note: Callable[[tf.State], Tensor | None],
-) -> Iterator[FinishedColonies | Failed]:
-    """Step a batch until each of its colonies is done: at `cells` cells or at `until` h, whichever
-    it reaches first.
+) -> Iterator[FinishedColonies | FailedColony]:
+    """Step a batch until each colony reaches its end: `cells` cells or `until` h, whichever comes
+    first.
 
-    A colony's end depends on itself alone, so that its outcome does not depend on its batch. note:
-    called after every step; see `Target.note`.
+    The end of a colony depends on that colony alone, so its result does not depend on its batch.
+    note: called after every step; see `Target.note`.
     """
-    everyone, last = state.colonies, math.inf if until is None else until
-    most, since = (
-        state.counts.new_zeros(everyone),
-        state.counts.new_zeros(everyone, dtype=torch.float64),
-    )
+    state = prepared.first
+    count = state.colonies
+    most = state.counts.new_zeros(count)
+    since = state.counts.new_zeros(count, dtype=torch.float64)
     notes: list[Tensor] = []
     while True:
-        state = step(state)
-        failures = {f.place: f for f in reversed(tf.failures(state))}
-        for place in sorted(failures):
-            yield Failed(
-                failures[place].colony_id, f"at {state.time:g} h: {failures[place].reason}"
-            )
-        gone = torch.zeros(state.colonies, dtype=torch.bool, device=state.device)
-        gone[list(failures)] = True
-        empty = (state.counts == 0) & ~gone
-        for colony_id in state.colony_id[empty].tolist():
-            yield Failed(colony_id, f"no cell was left at {state.time:g} h")
-        gone = gone | empty
+        state = prepared.step(state)
+        failed, gone = _failed(state)
+        yield from failed
         if bool(gone.all()):
             return
         state = _keep(state, ~gone)
         found = note(state)
         if found is not None:
-            row = found.new_full((everyone, *found.shape[1:]), torch.nan)
+            row = found.new_full((count, *found.shape[1:]), torch.nan)
             notes.append(row.index_copy(0, state.colony_id, found))
-        late = state.time >= last - 1e-9
-        done = (
-            torch.full_like(state.counts, late, dtype=torch.bool)
-            if cells is None or (until is not None and late)
-            else state.counts >= cells
-        )
+        done = _at_end(state, cells, until)
         if bool(done.any()):
             finished = _keep(state, done)
-            yield FinishedColonies(
-                finished,
-                (
-                    torch.stack([n.index_select(0, finished.colony_id) for n in notes])
-                    if notes
-                    else None
-                ),
-            )
-        # where the end is a time, it comes by itself
+            yield FinishedColonies(finished, _history(notes, finished))
+        # a time always comes, so only a number of cells may never be reached
         stuck = _stuck(state, most, since) & ~done if until is None else torch.zeros_like(done)
-        for colony_id, count in zip(
-            state.colony_id[stuck].tolist(), state.counts[stuck].tolist(), strict=True
-        ):
-            yield Failed(
-                colony_id,
-                f"it has {count} of {cells} cells at {state.time:g} h, and has had no more for"
-                f" {PATIENCE:g} h",
-            )
+        yield from _given_up(state, stuck, cells)
         gone = done | stuck
         if bool(gone.all()):
             return
         state = _keep(state, ~gone)
 
 
+def _failed(state: tf.State) -> tuple[list[FailedColony], Tensor]:
+    """The colonies that failed in the last step or have no cells, and a mask of them, (B,)."""
+    failures = colonies.failures(state)
+    out = [
+        FailedColony(colony_id, f"at {state.time:g} h: {reason}")
+        for colony_id, reason in failures.values()
+    ]
+    gone = torch.zeros(state.colonies, dtype=torch.bool, device=state.device)
+    gone[list(failures)] = True
+    empty = (state.counts == 0) & ~gone
+    out += [
+        FailedColony(colony_id, f"no cells remain at {state.time:g} h")
+        for colony_id in state.colony_id[empty].tolist()
+    ]
+    return out, gone | empty
+
+
+def _at_end(state: tf.State, cells: int | None, until: float | None) -> Tensor:
+    """The colonies that are at their end, (B,) bool."""
+    late = until is not None and state.time >= until - 1e-9
+    if cells is None or late:
+        return torch.full_like(state.counts, late, dtype=torch.bool)
+    return state.counts >= cells
+
+
+def _history(notes: list[Tensor], finished: tf.State) -> Tensor | None:
+    if not notes:
+        return None
+    return torch.stack([n.index_select(0, finished.colony_id) for n in notes])
+
+
+def _given_up(state: tf.State, stuck: Tensor, cells: int | None) -> Iterator[FailedColony]:
+    ids, counts = state.colony_id[stuck].tolist(), state.counts[stuck].tolist()
+    for colony_id, count in zip(ids, counts, strict=True):
+        yield FailedColony(
+            colony_id,
+            f"it has {count} of {cells} cells at {state.time:g} h and gained none for {PATIENCE:g}"
+            " h",
+        )
+
+
 def _stuck(state: tf.State, most: Tensor, since: Tensor) -> Tensor:
-    """Which colonies have gained no cell in `PATIENCE`, (B,). most, since: by colony id, cells so
-    far and h of the last gain; written anew here."""
+    """The colonies that gained no cell for `PATIENCE` h, (B,) bool.
+
+    most, since: by colony id, the most cells so far and the time (h) of the last gain. This
+    function updates both.
+    """
     known = most.index_select(0, state.colony_id)
     since[state.colony_id[state.counts > known]] = state.time
     most[state.colony_id] = torch.maximum(known, state.counts)
@@ -115,5 +130,5 @@ def _stuck(state: tf.State, most: Tensor, since: Tensor) -> Tensor:
 
 
 def _keep(state: tf.State, which: Tensor) -> tf.State:
-    """Some colonies of the batch, (B,) bool, at least one."""
+    """The colonies of a mask (B,), at least one."""
     return state if bool(which.all()) else state.select(torch.nonzero(which).squeeze(1))

@@ -1,86 +1,81 @@
-"""A search: a method asks, an objective answers, a study keeps, until the budget is spent."""
+"""A search: a method proposes designs, the objective scores them, and a study keeps the results,
+until the budget is used."""
 
 from __future__ import annotations
 
-import inspect
-import json
-import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 import torchfilm as tf
-from design import report, robust
+from design import report
 from design.methods import Batch, Method, method_of
 from design.objective import Evaluation, Objective
-from design.parameters import Choice, Parameter, Value
-from design.robust import Robustness
+from design.parameters import Value
+from design.progress import advance, open_bar
+from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
+from design.saved_design import write_design
 from design.study import Entry, Study
-from design.targets.base import Target
+from design.task import Task, TaskOptions
 from torchfilm import checks
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
 
-class Search:
-    """Search the parameters of a scene for colonies that draw a pattern.
+@dataclass(eq=False)
+class SearchProgress:
+    """What a search has found so far. grown: the colonies of designs that were drawn or measured,
+    by their points."""
 
-        search = Search(tf.scenes.boundary_detector, parameters=[Parameter("k3", 0.1, 10, log=True)],
-                        target=Stripe("yfp", at="border", width=8.0, cell_type=1), cells=150)
+    study: Study
+    why_regrown: str
+    grown: dict[bytes, list[FinishedColonies]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Search(TaskOptions):
+    """Search the parameters of a scene for colonies that form a pattern.
+
+        search = Search(
+            tf.scenes.boundary_detector,
+            parameters=[Parameter("k3", 0.1, 10, log=True)],
+            target=Stripe("yfp", at="border", width=8.0, cell_type=1),
+            cells=150,
+        )
         best = search.run(colonies=2000, study="stripe.h5")
 
     method: "cmaes", "sobol", "racing", "bayesian", one of their objects with settings of its own,
-    or any object that asks and is told (`Method`). The other arguments are those of `Objective`.
+    or any object with start, ask and tell (`Method`). `TaskOptions` documents the other arguments;
+    `search.objective.task` holds them checked. Raises the errors of `Task`, and InputError for a
+    method that is not allowed.
     """
 
-    def __init__(
-        self,
-        scene: Callable[..., tf.Scene] | str,
-        parameters: Sequence[Parameter | Choice],
-        target: Target,
-        *,
-        method: str | Method = "cmaes",
-        cells: int | None = None,
-        until: float | None = None,
-        replicates: int = 4,
-        reduce: str | float = "mean",
-        fixed: Mapping[str, Any] | None = None,
-        seed: int = 0,
-        dt: float | None = None,
-        dtype: torch.dtype = torch.float32,
-        device: str = "cpu",
-        replay: bool = True,
-        most: int | None = None,
-    ):
-        self.objective = Objective(
-            scene,
-            parameters,
-            target,
-            cells=cells,
-            until=until,
-            replicates=replicates,
-            reduce=reduce,
-            fixed=fixed,
-            seed=seed,
-            dt=dt,
-            dtype=dtype,
-            device=device,
-            replay=replay,
-            most=most,
-        )
-        self.method, self.seed, self.regrown = method_of(method), seed, self.objective.regrown
-        self.grown: dict[
-            bytes, list[FinishedColonies]
-        ] = {}  # colonies of designs that were looked at
-        self.study = self._new_study(None)
+    method: str | Method = field(default="cmaes", kw_only=True)
+    objective: Objective = field(init=False, repr=False)
+    _progress: SearchProgress = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        task = Task.of(self)
+        object.__setattr__(self, "method", method_of(self.method))
+        object.__setattr__(self, "objective", Objective(task))
+        started = SearchProgress(self._open_study(None), task.tried.why_regrown)
+        object.__setattr__(self, "_progress", started)
+
+    @property
+    def study(self) -> Study:
+        """The evaluations so far."""
+        return self._progress.study
+
+    @property
+    def why_regrown(self) -> str:
+        """The reason why colonies do not follow recorded growth, or ""."""
+        return self._progress.why_regrown
 
     def run(
         self,
@@ -89,145 +84,101 @@ class Search:
         study: str | Path | None = None,
         stop_at: float | None = None,
         executor: Executor | None = None,
-        pieces: int = 1,
+        work_items: int = 1,
         progress: bool = True,
     ) -> Best:
-        """Search anew, or on from what `study` holds, until `colonies` have been simulated, or a
-        design's loss is at most `stop_at`; returns the best design.
+        """Search until `colonies` have been simulated, or until the loss of a design is at most
+        `stop_at`; returns the best design.
 
-        colonies: each replicate of each design counts as one, a smaller colony by its share of the
-        full size; the last batch may go over. study: file in which every evaluation is kept; if
-        there is one already of this search, it goes on from there, and what it holds counts.
-        executor: of the `concurrent.futures` kind (processes, Dask, …), pieces: how many parts a
-        batch is cut into for it. progress: show a bar with the best loss so far.
+        colonies: each replicate of each design counts as one, a smaller colony as its share of the
+        full size. The last batch may exceed the budget. study: the file that keeps every
+        evaluation. If it exists and belongs to this search, the search resumes from it, and its
+        colonies count. executor: of the `concurrent.futures` kind (processes, Dask, …). work_items:
+        the least number of parts into which a batch is cut for it. progress: show a bar with the
+        lowest loss so far. Raises InputError for an argument that is not allowed, for the study of
+        another search, and where no design was grown to full size.
         """
         if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < 1:
             raise checks.input_error("colonies", colonies, "a whole number from 1")
         if stop_at is not None:
             checks.number("stop_at", stop_at)
-        self.study = self._new_study(study)
-        self.method.start(self.objective.space, self.seed, self.objective.replicates)
-        self._catch_up()
+        self._progress.study = self._open_study(study)
+        task, method = self.objective.task, method_of(self.method)
+        method.start(task.space, task.seed, task.replicates)
+        _repeat_study(method, self.study)
         try:
-            with report.bar(colonies, progress) as bar:
-                self._show(bar)
-                while self.study.colonies < colonies and not self._reached(stop_at):
-                    self._batch(executor, pieces)
-                    self._show(bar)
+            with open_bar(colonies, progress) as bar:
+                _show(bar, self.study)
+                while self.study.colonies < colonies and not _reached(self.study, stop_at):
+                    batch = _ask(method, task)
+                    found = self.objective.evaluate(
+                        batch.points,
+                        streams=range(min(batch.replicates or task.replicates, task.replicates)),
+                        size=batch.size,
+                        executor=executor,
+                        work_items=work_items,
+                    )
+                    self._keep(found)
+                    method.tell(batch, found.loss)
+                    _show(bar, self.study)
         except KeyboardInterrupt:
-            kept = (
-                f"they are in {self.study.path}: run the search again to go on"
-                if self.study.path
-                else "best() gives the best of them"
-            )
-            print(
-                f"stopped at {self.study.colonies:.0f} of {colonies} colonies; {kept}.",
-                file=sys.stderr,
-            )
+            self._report_interrupt(colonies)
             raise
         if self.study.entries and all(len(e.reasons) == e.losses.size for e in self.study.entries):
-            print(
-                f"every colony failed; most often: {self.study.failures()[0][0]}", file=sys.stderr
-            )
+            reason = self.study.failures()[0][0]
+            print(f"every colony failed; the most frequent reason: {reason}", file=sys.stderr)
         return self.best()
 
     def best(self) -> Best:
-        """The best design so far."""
+        """The best design so far. Raises InputError before a design was grown to full size."""
         found = self.study.best()
         if found is None:
             raise _none_yet()
-        point, loss, losses = found
-        return Best(self, self.objective.space.values(point), point, loss, losses)
+        return self._design(*found)
 
     def first(self) -> Best:
-        """The first design that was grown to full size: where the search began."""
+        """The first design that was grown to full size. Raises InputError before there is one."""
         full = self.study.full()
         if not full:
             raise _none_yet()
-        entry = full[0]
-        return Best(
-            self,
-            self.objective.space.values(entry.points[0]),
-            entry.points[0],
-            float(entry.loss[0]),
-            entry.losses[0],
-        )
+        return self._design(full[0].points[0], float(full[0].loss[0]), full[0].losses[0])
 
-    def _new_study(self, path: str | Path | None) -> Study:
-        about = self.objective.describe() | {
-            "names": list(self.objective.space.names),
-            "method": _described(self.method),
-        }
-        streams = tuple(range(self.objective.replicates))
-        return (
-            Study(about, self.objective.space.names, streams)
-            if path is None
-            else Study.open(path, about, self.objective.space.names, streams)
-        )
+    def _design(self, point: np.ndarray, loss: float, losses: np.ndarray) -> Best:
+        return Best(self, self.objective.task.space.values(point), point, loss, losses)
 
-    def _catch_up(self) -> None:
-        """Tell the method what the study holds: it then stands where it stood, and asks what it
-        would have asked."""
-        for k, entry in enumerate(self.study.entries):
-            batch = self.method.ask()
-            # another machine may round another way
-            if batch.points.shape != entry.points.shape or not np.allclose(
-                batch.points, entry.points, rtol=0, atol=1e-6
-            ):
-                raise tf.InputError(
-                    f"{self.study.path}: its batch {k} is not what the method asks for here, as if"
-                    " another version of it had made it. Start a new study."
-                )
-            self.method.tell(Batch(entry.points, batch.size, batch.replicates), entry.loss)
+    def _open_study(self, path: str | Path | None) -> Study:
+        task = self.objective.task
+        names = task.space.names
+        about = task.describe() | {"names": list(names), "method": _describe(self.method)}
+        streams = task.streams(None)
+        if path is None:
+            return Study(about, names, streams)
+        return Study.open(path, about, names, streams)
 
-    def _batch(self, executor: Executor | None, pieces: int) -> Evaluation:
-        batch = self.method.ask()
-        if not isinstance(batch, Batch):
-            raise tf.InputError(
-                f"{type(self.method).__name__}.ask must return a design.Batch of points (n,"
-                f" {self.objective.space.size}), not {type(batch).__name__}."
-            )
-        replicates = (
-            self.objective.replicates
-            if batch.replicates is None
-            else min(batch.replicates, self.objective.replicates)
-        )
-        found = self.objective.evaluate(
-            batch.points,
-            streams=range(replicates),
-            size=batch.size,
-            executor=executor,
-            pieces=pieces,
-        )
-        values = [self.objective.space.values(p) for p in found.points]
+    def _keep(self, found: Evaluation) -> None:
+        """Add an evaluation to the study."""
         entry = Entry(
             found.points,
             found.loss,
             found.losses,
             found.cells,
             found.reasons,
-            batch.size,
-            replicates,
+            found.size,
+            found.losses.shape[1],
             found.seconds,
-            values,
+            found.values,
         )
         self.study.add(entry)
-        self.method.tell(batch, found.loss)
-        self.regrown = found.regrown
-        return found
+        self._progress.why_regrown = found.why_regrown
 
-    def _reached(self, stop_at: float | None) -> bool:
-        found = self.study.best()
-        return stop_at is not None and found is not None and found[1] <= stop_at
-
-    def _show(self, bar: tqdm | None) -> None:
-        if bar is None:
-            return
-        found = self.study.best()
-        bar.update(min(self.study.colonies, bar.total) - bar.n)
-        failed = sum(len(e.reasons) for e in self.study.entries)
-        words = "no full-size colony yet" if found is None else f"best loss {found[1]:.4f}"
-        bar.set_postfix_str(words + (f", {failed} colonies failed" if failed else ""))
+    def _report_interrupt(self, colonies: int) -> None:
+        study = self.study
+        kept = (
+            f"{study.path} keeps them; run the search again to resume it"
+            if study.path
+            else "best() returns the best of them"
+        )
+        print(f"stopped at {study.colonies:.0f} of {colonies} colonies; {kept}.", file=sys.stderr)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,82 +192,98 @@ class Best:
     loss: float
     losses: np.ndarray
 
+    # `best.check(…)` is `check_robustness(best, …)`
+    check = check_robustness
+
+    @property
+    def objective(self) -> Objective:
+        """The objective that scored the design."""
+        return self.search.objective
+
     def scene(self) -> tf.Scene:
         """The scene with these parameters, for one colony or any number of them."""
-        return self.search.objective.make(**self.search.objective.fixed, **self.values)
+        family = self.objective.task.family
+        return family.function(**family.fixed, **self.values)
 
     def save(self, path: str | Path) -> Path:
-        """Write the design as JSON, which `torchfilm run` takes. Replaces an older one."""
-        objective, path = self.search.objective, Path(path)
-        if not path.parent.is_dir():
-            raise checks.input_error(
-                "path", str(path), "in a folder that exists", f"Make {path.parent} first."
-            )
-        home = {} if objective.recipe else _home(objective.make)
-        end = {
-            name: value
-            for name, value in (("cells", objective.cells), ("until", objective.until))
-            if value is not None
-        }
-        told = {
-            "torchfilm": tf.__version__,
-            "scene": objective.recipe[0] if objective.recipe else home["function"],
-            **home,
-            "parameters": {**objective.fixed, **self.values},
-            **end,
-            "seed": objective.seed,
-            "dt": objective.dt,
-            "dtype": str(objective.dtype)[6:],
-            "target": objective.target.describe(),
-            "species": list(objective.target.names),
-            "loss": self.loss,
-            "losses": self.losses.tolist(),
-            "colonies": self.search.study.colonies,
-        }
-        path.write_text(json.dumps(told, indent=1, default=_plain) + "\n")
-        return path
-
-    def plot(self, path: str | Path) -> Path:
-        """Draw the first guess, the best design and the target, and how the search got there. Needs
-        matplotlib (the `app` extra)."""
-        return report.draw(self, Path(path))
-
-    def table(self) -> str:
-        """The parameters, with their bounds and the first guess, and the losses."""
-        return report.table(self)
-
-    def check(
-        self,
-        *,
-        seeds: int = 32,
-        sizes: Sequence[float] = (0.5, 2.0),
-        change: float = 0.2,
-        samples: int = 0,
-        threshold: float | None = None,
-        executor: Executor | None = None,
-        pieces: int = 1,
-        progress: bool = True,
-    ) -> Robustness:
-        """How it holds up on fresh seeds, at other sizes and with other parameters; see
-        `robustness`."""
-        return robust.robustness(
-            self,
-            seeds=seeds,
-            sizes=sizes,
-            change=change,
-            samples=samples,
-            threshold=threshold,
-            executor=executor,
-            pieces=pieces,
-            progress=progress,
+        """Write the design as JSON, which `torchfilm run` takes. Replaces an older file."""
+        return write_design(
+            Path(path),
+            self.objective.task,
+            self.values,
+            loss=self.loss,
+            losses=self.losses,
+            colonies=self.search.study.colonies,
         )
 
+    def plot(self, path: str | Path) -> Path:
+        """Draw the first guess, the best design, the target and the course of the search. Needs
+        matplotlib (the `app` extra)."""
+        return report.draw(self._report(), Path(path))
+
+    def table(self) -> str:
+        """The parameters with their bounds and the first guess, the losses and the measures."""
+        return report.table(self._report())
+
     def colonies(self) -> list[FinishedColonies]:
-        """The replicates, grown again, once: the same colonies as were scored."""
-        key = self.point.tobytes()
-        if key not in self.search.grown:
-            self.search.grown[key] = self.search.objective.final(self.point)
-        return self.search.grown[key]
+        """The replicates at their ends, grown again once: the same colonies as were scored."""
+        grown, key = self.search._progress.grown, self.point.tobytes()
+        if key not in grown:
+            grown[key] = self.objective.colonies(self.point)
+        return grown[key]
+
+    def _report(self) -> report.SearchReport:
+        first, best = (
+            report.ReportedDesign(title, d.values, d.point, d.loss, d.colonies())
+            for title, d in (("first guess", self.search.first()), ("best", self))
+        )
+        search = self.search
+        return report.SearchReport(
+            self.objective.task, search.study, search.why_regrown, first, best
+        )
+
+
+def _repeat_study(method: Method, study: Study) -> None:
+    """Bring a method to where the study ends: it proposes each batch again and learns its losses.
+    Raises InputError where it proposes other points."""
+    for k, entry in enumerate(study.entries):
+        batch = method.ask()
+        # another machine may round in another way
+        if batch.points.shape != entry.points.shape or not np.allclose(
+            batch.points, entry.points, rtol=0, atol=1e-6
+        ):
+            raise tf.InputError(
+                f"{study.path}: the method proposes other points than its batch {k} holds; another"
+                " version of the method may have made the file. Start a new study."
+            )
+        method.tell(Batch(entry.points, batch.size, batch.replicates), entry.loss)
+
+
+def _ask(method: Method, task: Task) -> Batch:
+    """The next batch of a method."""
+    batch = method.ask()
+    if not isinstance(batch, Batch):
+        raise tf.InputError(
+            f"{type(method).__name__}.ask must return a design.Batch of points"
+            f" (n, {task.space.size}), not {type(batch).__name__}."
+        )
+    return batch
+
+
+def _reached(study: Study, stop_at: float | None) -> bool:
+    found = study.best()
+    return stop_at is not None and found is not None and found[1] <= stop_at
+
+
+def _show(bar: tqdm | None, study: Study) -> None:
+    """Show the colonies and the lowest loss so far."""
+    if bar is None:
+        return
+    found = study.best()
+    advance(bar, min(study.colonies, bar.total) - bar.n)
+    failed = sum(len(e.reasons) for e in study.entries)
+    best = "no full-size colony yet" if found is None else f"best loss {found[1]:.4f}"
+    bar.set_postfix_str(best + (f", {failed} colonies failed" if failed else ""))
 
 
 def _none_yet() -> tf.InputError:
@@ -325,32 +292,6 @@ def _none_yet() -> tf.InputError:
     )
 
 
-def _home(make: Callable[..., tf.Scene]) -> dict[str, Any]:
-    """Where a user's own scene function is found again: its file and its name there."""
-    made = inspect.unwrap(make)
-    code = getattr(made, "__code__", None)
-    if code is None or "<" in made.__qualname__:
-        raise checks.input_error(
-            "scene",
-            make,
-            "a function at the top level of a file, for a design that is saved",
-            "A file cannot find it again by its name.",
-        )
-    return {"file": os.path.abspath(code.co_filename), "function": made.__name__}
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold of a value that it cannot."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    raise checks.input_error(
-        "fixed",
-        value,
-        "numbers, texts, or arrays of numbers in a design that is saved",
-        "Let the scene function make it from such.",
-    )
-
-
-def _described(method: Method) -> str:
+def _describe(method: str | Method) -> str:
     describe = getattr(method, "describe", None)
     return describe() if callable(describe) else type(method).__name__

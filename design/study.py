@@ -1,14 +1,16 @@
-"""A study: every evaluation of a search in one file, from which it goes on as if it had never
-stopped.
+"""A study: every evaluation of a search in one HDF5 file. A search resumes from it with the same
+results as if it had never stopped.
 
-    /             attributes: format, version, about (JSON: scene, parameters, target, method, …), torchfilm, torch
-    /streams      (R,) streams of random numbers, one a replicate
-    /batches/     rows, size, replicates, seconds: a row for each batch that was asked and told
-    /designs/     point (N, D), loss (N,), losses (N, R), cells (N, R), NaN and 0 where a replicate was not grown; reasons, JSON by replicate
-    /values/NAME  (N,) the parameters themselves
+    /             attributes: format, version, torchfilm, torch, about (JSON: scene, parameters,
+                  target, method, …)
+    /streams      (R,) streams of random numbers, one for each replicate
+    /batches/     rows, size, replicates, seconds: a row for each batch
+    /designs/     point (N, D), loss (N,), losses (N, R), cells (N, R); NaN and 0 where a replicate
+                  was not grown; reasons, JSON by replicate
+    /values/NAME  (N,) the values of each parameter
 
-The file is written anew after each batch beside the old one and then takes its place, so that a
-kill at any moment costs at most one batch. Files are data only; nothing in them is executed.
+After each batch a new file is written beside the old one and then replaces it, so that a kill at
+any moment costs at most one batch. The file holds data only; nothing in it is executed.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,13 +32,18 @@ from design.parameters import Value
 from torchfilm import checks
 
 FORMAT, VERSION = "torchfilm study", 1
+DIGESTS = ("founders and functions", "code of the target")
+LONGEST, SHORT = 300, 48  # characters of a refusal, and of one value in it
 
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One batch: what was asked, and what was found. points (n, D), loss (n,), losses and cells (n,
-    R); reasons by (row, replicate); size: share of the full size; replicates: how many were grown;
-    seconds; values: the parameters of each point."""
+    """One batch and its results.
+
+    points (n, D); loss (n,); losses and cells (n, R); reasons of failures, by (row, replicate);
+    size: share of the full size; replicates: how many were grown; seconds; values: the parameters
+    of each point.
+    """
 
     points: np.ndarray
     loss: np.ndarray
@@ -50,7 +57,7 @@ class Entry:
 
     @property
     def colonies(self) -> float:
-        """Simulated, in colonies of full size: a smaller one counts by its share."""
+        """Colonies simulated; a smaller one counts as its share of the full size."""
         return len(self.points) * self.replicates * self.size
 
 
@@ -58,7 +65,8 @@ class Entry:
 class Study:
     """The evaluations of a search, and the file that keeps them, if any.
 
-    about: what they depend on, plain data; names: of the parameters; streams: of the replicates.
+    about: what the losses depend on, as plain data; names: of the parameters; streams: of the
+    replicates.
     """
 
     about: dict[str, Any]
@@ -69,7 +77,7 @@ class Study:
 
     @property
     def colonies(self) -> float:
-        """Simulated so far, in colonies of full size."""
+        """Colonies simulated so far; a smaller one counts as its share of the full size."""
         return sum(e.colonies for e in self.entries)
 
     @property
@@ -77,8 +85,7 @@ class Study:
         return sum(e.seconds for e in self.entries)
 
     def full(self) -> list[Entry]:
-        """The batches at full size with all replicates, the only ones whose losses can be
-        compared."""
+        """The batches at full size with all replicates. Only their losses are comparable."""
         return [e for e in self.entries if self.is_full(e)]
 
     def is_full(self, entry: Entry) -> bool:
@@ -86,8 +93,8 @@ class Study:
         return entry.size == 1.0 and entry.replicates == len(self.streams)
 
     def best(self) -> tuple[np.ndarray, float, np.ndarray] | None:
-        """Point (D,), loss and losses (R,) of the best design that was grown to full size; the
-        first of equals. None before there is one."""
+        """Point (D,), loss and losses (R,) of the best design that was grown to full size, the
+        first of equal ones. None before there is one."""
         full = self.full()
         if not full:
             return None
@@ -96,19 +103,20 @@ class Study:
         return entry.points[row], float(entry.loss[row]), entry.losses[row]
 
     def failures(self) -> list[tuple[str, int]]:
-        """Why colonies failed and how many, the commonest reason first; told without its numbers,
-        which differ from colony to colony."""
-        words: dict[str, list[str]] = {}
+        """The reasons of failures and how many colonies each has, the most frequent first.
+
+        Reasons that differ in their numbers only count as one; the first of them is given.
+        """
+        kinds: dict[str, list[str]] = {}
         for entry in self.entries:
             for reason in entry.reasons.values():
-                words.setdefault(re.sub(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", "#", reason), []).append(
-                    reason
-                )
-        return [(alike[0], len(alike)) for alike in sorted(words.values(), key=len, reverse=True)]
+                kind = re.sub(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", "#", reason)
+                kinds.setdefault(kind, []).append(reason)
+        return [(alike[0], len(alike)) for alike in sorted(kinds.values(), key=len, reverse=True)]
 
     def convergence(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """After each batch: colonies and seconds spent so far, and the best loss yet (NaN before
-        there is one), (K,) each."""
+        """After each batch: colonies simulated, seconds spent and the lowest loss so far (NaN
+        before there is one), (K,) each."""
         colonies = np.cumsum([e.colonies for e in self.entries])
         seconds = np.cumsum([e.seconds for e in self.entries])
         lowest = [e.loss.min() if self.is_full(e) else np.inf for e in self.entries]
@@ -116,7 +124,7 @@ class Study:
         return colonies, seconds, np.where(np.isfinite(best), best, np.nan)
 
     def add(self, entry: Entry) -> None:
-        """Note a batch, and write the file."""
+        """Add a batch, and write the file. Raises SimulationError where that fails."""
         self.entries.append(entry)
         if self.path is not None:
             self._write(self.path)
@@ -149,8 +157,8 @@ class Study:
             os.replace(beside, path)
         except OSError as error:
             raise tf.SimulationError(
-                f"could not write {path}: {error}. Is the disk full? What was written before is"
-                " safe; run the search again to go on."
+                f"could not write {path}: {error}. Is the disk full? The file keeps the earlier"
+                " batches. Run the search again to resume it."
             ) from error
 
     def _write_tables(self, file: h5py.File) -> None:
@@ -178,8 +186,8 @@ class Study:
     def open(
         cls, path: str | Path, about: dict[str, Any], names: Sequence[str], streams: Sequence[int]
     ) -> Study:
-        """The study at a path, to go on with, or a new one. Raises InputError where the file is of
-        another search."""
+        """The study at a path, or a new one where there is no file. Raises InputError for the study
+        of another search."""
         path = Path(path)
         if not path.exists():
             if not path.parent.is_dir():
@@ -190,25 +198,19 @@ class Study:
         study = cls.read(path)
         differ = [n for n in {**about, **study.about} if about.get(n) != study.about.get(n)]
         if differ:
-            shown = "; ".join(
-                f"{n}: {study.about.get(n)!r} there, {about.get(n)!r} here" for n in differ
-            )
-            raise tf.InputError(
-                f"{path} is the study of another search. {shown}. Give the study of this search, or"
-                " another path for a new one."
-            )
+            raise tf.InputError(_refusal(path, differ, study.about, about))
         return study
 
     @classmethod
     def read(cls, path: str | Path) -> Study:
-        """A study from its file."""
+        """The study in a file. Raises InputError where the file cannot be read."""
         path = Path(path)
         if not path.is_file():
             raise checks.input_error(
                 "study",
                 str(path),
                 "a study file",
-                "That is a folder." if path.is_dir() else "No such file.",
+                "This path is a folder." if path.is_dir() else "There is no such file.",
             )
         try:
             with h5py.File(path, "r") as file:
@@ -219,8 +221,8 @@ class Study:
                     )
                 if int(file.attrs["version"]) > VERSION:
                     raise tf.InputError(
-                        f"{path} has format version {file.attrs['version']}, newer than this"
-                        f" torchfilm reads ({VERSION}). Update torchfilm."
+                        f"{path} has format version {file.attrs['version']}; this torchfilm reads"
+                        f" versions up to {VERSION}. Update torchfilm."
                     )
                 about = json.loads(file.attrs["about"])
                 study = cls(
@@ -234,6 +236,51 @@ class Study:
                 f"{path} cannot be read: it is truncated or not a study file ({error})."
             ) from error
         return study
+
+
+def _refusal(
+    path: Path, names: list[str], there: Mapping[str, Any], here: Mapping[str, Any]
+) -> str:
+    """The message for the study of another search: what differs, then as many values as fit."""
+    # the listed effects are those in the middle of the bounds, so bounds change them too
+    names = sorted(names, key=lambda name: (name in DIGESTS, name == "effects"))
+    out = f"{path.name} is the study of another search. Different: {', '.join(names)}."
+    close = " Give another path, or restore the search."
+    for name in names:
+        if name in DIGESTS:  # their values say nothing to a reader
+            continue
+        old, new = _differing(there.get(name), here.get(name))
+        detail = f" {name}: {_cut(old)} there, {_cut(new)} here."
+        if len(out) + len(detail) + len(close) <= LONGEST:
+            out += detail
+    return out + close
+
+
+def _differing(old: Any, new: Any) -> tuple[str, str]:
+    """The parts of two values that differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        names = [n for n in {**old, **new} if old.get(n) != new.get(n)]
+        return _differing(
+            [f"{n}={old[n]}" for n in names if n in old],
+            [f"{n}={new[n]}" for n in names if n in new],
+        )
+    if isinstance(old, list) and isinstance(new, list):
+        one, other = [x for x in old if x not in new], [x for x in new if x not in old]
+        if len(one) == len(other) == 1:
+            return _differing(one[0], other[0])
+        return ", ".join(map(str, one)) or "none", ", ".join(map(str, other)) or "none"
+    before, after = str(old), str(new)
+    shortest = min(len(before), len(after))
+    same = next((k for k in range(shortest) if before[k] != after[k]), shortest)
+    # keep the whole argument that differs
+    begin = max((m.end() for m in re.finditer(r"[(,]\s*", before[:same])), default=0)
+    if shortest > SHORT:
+        before, after = before[begin:], after[begin:]
+    return before, after
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= SHORT else text[: SHORT - 1] + "…"
 
 
 def _entries(file: h5py.File) -> list[Entry]:
@@ -269,5 +316,5 @@ def _entries(file: h5py.File) -> list[Entry]:
         )
         at += rows
     if at != len(designs["point"]):
-        raise ValueError(f"its batches have {at} designs, and it lists {len(designs['point'])}")
+        raise ValueError(f"its batches have {at} designs, but it lists {len(designs['point'])}")
     return out

@@ -48,9 +48,9 @@ PUBLISHED = {
 
 def fresh(objective: Objective, values: dict[str, float], seeds: int = 8) -> dict[str, float]:
     """What the stripe of a design is like, the mean over seeds it was not searched on."""
-    done = objective.final(objective.space.point(values), streams=range(100, 100 + seeds))
-    losses = [loss for d in done for loss in objective.target.loss(d.state).tolist()]
-    return measured(objective.target, done) | {"loss": float(np.mean(losses))}
+    done = objective.colonies(objective.task.space.point(values), streams=range(100, 100 + seeds))
+    losses = [loss for d in done for loss in objective.task.target.loss(d.state).tolist()]
+    return measured(objective.task.target, done) | {"loss": float(np.mean(losses))}
 
 
 def main() -> None:

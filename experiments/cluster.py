@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from distributed import Client, LocalCluster
 
-from design import Objective, Parameter, Stripe
+from design import Objective, Parameter, Stripe, Task
 
 
 def end(pid: int) -> None:
@@ -36,15 +36,14 @@ def main() -> None:
     )
     parser.add_argument("--cells", type=int, default=60)
     parser.add_argument("--designs", type=int, default=32)
-    parser.add_argument("--pieces", type=int, default=4)
+    parser.add_argument("--work-items", type=int, default=4)
     options = parser.parse_args()
     parameters, target = (
         [Parameter("k3", 0.1, 10, log=True), Parameter("d3", 1e-3, 1.0, log=True)],
         Stripe("yfp", width=8.0, cell_type=1),
     )
-    objective = Objective(
-        "boundary_detector", parameters, target, cells=options.cells, replicates=2
-    )
+    task = Task("boundary_detector", parameters, target, cells=options.cells, replicates=2)
+    objective = Objective(task)
     points = np.random.default_rng(0).random((options.designs, 2))
     here = objective.evaluate(points)
     print(
@@ -57,8 +56,8 @@ def main() -> None:
     )
     with Client(cluster) as client:
         executor = client.get_executor(pure=False)
-        objective.evaluate(points[:2], executor=executor, pieces=2)  # workers import torch once
-        calm = objective.evaluate(points, executor=executor, pieces=options.pieces)
+        objective.evaluate(points[:2], executor=executor, work_items=2)  # workers import torch once
+        calm = objective.evaluate(points, executor=executor, work_items=options.work_items)
         print(
             f"{len(client.run(os.getpid))} workers: {calm.seconds:.1f} s, the same bits:"
             f" {np.array_equal(calm.losses, here.losses)}",
@@ -69,7 +68,7 @@ def main() -> None:
             0.5 * calm.seconds, lambda: client.run(end, pid, workers=[address], on_error="ignore")
         )
         killer.start()
-        struck = objective.evaluate(points, executor=executor, pieces=options.pieces)
+        struck = objective.evaluate(points, executor=executor, work_items=options.work_items)
         print(
             f"worker {pid} killed after {0.5 * calm.seconds:.1f} s of {struck.seconds:.1f} s;"
             f" workers now {list(client.run(os.getpid).values())}"

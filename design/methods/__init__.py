@@ -1,4 +1,4 @@
-"""Search methods: what to try next, asked and told in turns."""
+"""Search methods: each proposes batches of points and learns their losses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ __all__ = ["CMAES", "METHODS", "Batch", "Bayesian", "Method", "Racing", "Sobol",
 
 
 def method_of(given: str | Method) -> Method:
-    """A method by its name, with its own settings, or any object with start, ask and tell."""
+    """A method, from its name or from an object with start, ask and tell. Raises InputError for
+    anything else."""
     if isinstance(given, str):
         checks.choice("method", given, tuple(METHODS))
         made: Method = METHODS[given]()
@@ -36,7 +37,7 @@ def method_of(given: str | Method) -> Method:
             given,
             "one of " + ", ".join(map(repr, METHODS)) + ", or an object with start, ask and tell",
             (
-                "A class is not yet an object: write CMAES()."
+                "This is a class; make an object of it: CMAES()."
                 if isinstance(given, type)
                 else f"It has no {' and no '.join(missing)}."
             ),

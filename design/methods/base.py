@@ -1,4 +1,4 @@
-"""What a search method is: it is asked what to try, and told how good that was."""
+"""The interface of search methods: `ask` returns a batch of points, `tell` gives their losses."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from scipy.stats import qmc
 
 from torchfilm import checks
 
-AGAIN = (
+SAME_ORDER = (
     "Tell all batches, in order, to a method with the same settings, space, seed and replicates."
 )
 
 
 class Dimensions(Protocol):
-    """What a method knows of a space: how many dimensions, and the levels of each (None:
+    """What a method needs of a space: the number of dimensions, and the levels of each (None:
     continuous)."""
 
     @property
@@ -30,10 +30,11 @@ class Dimensions(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What a method wants tried.
+    """The points that a method proposes.
 
-    points: (n, D), each coordinate in [0, 1]. size: share of the full colony size to grow, above 0,
-    at most 1. replicates: how many of the replicates to grow of each point; None is all.
+    points: (n, D), each coordinate in [0, 1]. size: the share of the full colony size to grow,
+    above 0, at most 1. replicates: how many replicates of each point to grow; None is all. Raises
+    InputError for values that are not allowed.
     """
 
     points: np.ndarray
@@ -60,12 +61,12 @@ class Batch:
 
 
 class Method(Protocol):
-    """How a search chooses what to try next. Any object with these three can be given to a search
-    as its method.
+    """How a search chooses points. Any object with these three functions can be the method of a
+    search.
 
-    What `ask` returns must depend on nothing but what `start` was given, the method's settings, and
-    all that was told: a search that was stopped is continued by a new method that is told what is
-    known. A method with `describe() -> str` is recognised when a search is continued.
+    The result of `ask` must depend only on the arguments of `start`, the method's settings, and all
+    calls of `tell`: a new method resumes a stopped search from the batches and losses of its study.
+    A method with `describe() -> str` is recognised when a search is resumed.
     """
 
     def start(self, space: Dimensions, seed: int, replicates: int) -> None: ...
@@ -76,29 +77,28 @@ class Method(Protocol):
 
 
 class Source(Method, Protocol):
-    """A method whose points may be sieved before it hears of them, as `Racing` does: it draws as
-    many as are wanted and takes the losses of some."""
+    """A method that can draw more points than it needs and learn from some of them, as `Racing`
+    requires."""
 
     @property
     def wanted(self) -> int:
-        """How many losses it wants next."""
+        """How many losses it needs next."""
 
     @property
     def fresh(self) -> bool:
-        """Whether it is about to draw from a new place, not from what it has learnt."""
+        """Whether it is about to start from a new place, not from what it has learnt."""
 
     def draw(self, count: int) -> np.ndarray:
-        """(count, D) points of the distribution that it samples now."""
+        """(count, D) points of its current distribution."""
 
     def take(self, rows: np.ndarray, loss: np.ndarray) -> None:
-        """Learn from `wanted` of the points that were drawn last: which, and their losses."""
+        """Learn from `wanted` of the points that were drawn last: their rows and losses."""
 
 
 class Turns:
-    """Asks and tells in turns: what the ready methods share. Asked again before it was told, a
-    method answers the same.
+    """The base class of the ready methods. `ask` returns the same batch until `tell`.
 
-    A method says what comes next in `_next` and learns in `_take`; `_begin` is called by `start`.
+    A method proposes in `_next` and learns in `_take`; `start` calls `_begin`.
     """
 
     _batch: Batch | None = None
@@ -107,7 +107,7 @@ class Turns:
     _replicates: int = 1
 
     def start(self, space: Dimensions, seed: int, replicates: int) -> None:
-        """Begin, or begin anew. seed: a whole number from 0; replicates: how many the search grows
+        """Begin, or begin again. seed: a whole number from 0; replicates: how many the search grows
         of each design."""
         if len(space.levels) != space.size or space.size < 1:
             raise checks.input_error(
@@ -122,18 +122,18 @@ class Turns:
         self._begin()
 
     def ask(self) -> Batch:
-        """What to try next; the same until `tell`."""
+        """The next batch; the same until `tell`."""
         self._started()
         if self._batch is None:
             self._batch = self._next()
         return self._batch
 
     def tell(self, batch: Batch, loss: np.ndarray) -> None:
-        """How good the points of a batch are: (n,), lower is better, finite (a design that failed
-        has a bad but finite loss).
+        """Learn the losses of a batch: (n,), lower is better, finite (a design that failed has a
+        bad but finite loss).
 
-        Batches are told in the order in which they were asked. InputError for another batch than
-        was asked.
+        Batches are given in the order of `ask`. Raises InputError for a batch that `ask` did not
+        return.
         """
         self._started()
         self._meet(batch)
@@ -142,8 +142,9 @@ class Turns:
 
     def describe(self) -> str:
         """The method and its settings, on one line."""
-        said = (f"{f.name}={_shown(getattr(self, f.name))}" for f in fields(self) if f.init)  # type: ignore[arg-type]
-        return f"{type(self).__name__.lower()}({', '.join(said)})"
+        given = (f for f in fields(self) if f.init)  # type: ignore[arg-type]
+        settings = (f"{f.name}={_shown(getattr(self, f.name))}" for f in given)
+        return f"{type(self).__name__.lower()}({', '.join(settings)})"
 
     def _started(self) -> Dimensions:
         if self._space is None:
@@ -154,8 +155,8 @@ class Turns:
         return self._space
 
     def _meet(self, batch: Batch) -> None:
-        """Refuse a batch that this method would not have asked."""
-        same(self.ask(), batch, type(self).__name__)
+        """Raise InputError for a batch that this method would not propose."""
+        check_same(self.ask(), batch, type(self).__name__)
 
     def _begin(self) -> None:
         raise NotImplementedError
@@ -167,35 +168,37 @@ class Turns:
         raise NotImplementedError
 
 
-def alike(asked: tuple[int, int, float, int | None], told: Batch, name: str) -> None:
-    """Refuse a batch of another kind than was asked: (points, dimensions, size, replicates)."""
-    given = (*told.points.shape, told.size, told.replicates)
-    if given != asked:
+def check_kind(proposed: tuple[int, int, float, int | None], batch: Batch, name: str) -> None:
+    """Raise InputError for a batch of another kind than proposed: (points, dimensions, size,
+    replicates)."""
+    given = (*batch.points.shape, batch.size, batch.replicates)
+    if given != proposed:
         raise checks.input_error(
             f"{name}.tell: (points, dimensions, size, replicates)",
             given,
-            f"{asked}, as asked",
-            AGAIN,
+            f"{proposed}, as proposed",
+            SAME_ORDER,
         )
 
 
-def same(asked: Batch, told: Batch, name: str) -> None:
-    """Refuse a batch that is not the one asked. Another machine may round another way, so the
-    points may differ by 1e-6."""
-    alike((*asked.points.shape, asked.size, asked.replicates), told, name)
-    far = (np.abs(asked.points - told.points) > 1e-6).any(1)
+def check_same(proposed: Batch, batch: Batch, name: str) -> None:
+    """Raise InputError for a batch that is not the proposed one. Another machine may round in
+    another way, so the points may differ by 1e-6."""
+    check_kind((*proposed.points.shape, proposed.size, proposed.replicates), batch, name)
+    far = (np.abs(proposed.points - batch.points) > 1e-6).any(1)
     if far.any():
         row = int(far.argmax())
         raise checks.input_error(
             f"{name}.tell: points[{row}]",
-            told.points[row].tolist(),
-            f"{asked.points[row].tolist()}, as asked",
-            AGAIN,
+            batch.points[row].tolist(),
+            f"{proposed.points[row].tolist()}, as proposed",
+            SAME_ORDER,
         )
 
 
 def scores(batch: Batch, loss: Any) -> np.ndarray:
-    """The losses of a batch, (n,) float64, finite."""
+    """The losses of a batch, (n,) float64. Raises InputError for another shape or for a number that
+    is not finite."""
     out = np.array(loss, dtype=np.float64)
     if out.shape != (len(batch.points),):
         raise checks.input_error(
@@ -208,15 +211,15 @@ def scores(batch: Batch, loss: Any) -> np.ndarray:
             f"loss[{row}]",
             float(out[row]),
             "finite",
-            f"{int(bad.sum())} of {len(out)} are not; give a design that failed a bad finite loss,"
-            " such as 1.5.",
+            f"{int(bad.sum())} of {len(out)} are not. Give a failed design a bad finite loss, such"
+            " as 1.5.",
         )
     return out
 
 
 def snap(points: np.ndarray, levels: Sequence[int | None]) -> np.ndarray:
-    """Points with the coordinates of levels in the middle of their level, (level + ½) / k; others
-    clipped to [0, 1]."""
+    """Points whose coordinates with levels are in the middle of their level, (level + ½) / k.
+    Other coordinates are clipped to [0, 1]."""
     out = np.clip(points, 0.0, 1.0)
     for axis, count in enumerate(levels):
         if count is not None:
@@ -224,11 +227,10 @@ def snap(points: np.ndarray, levels: Sequence[int | None]) -> np.ndarray:
     return out
 
 
-def sobol(space: Dimensions, seed: int, at: int, count: int) -> np.ndarray:
-    """Points number `at` … `at + count` of the scrambled Sobol sequence of a seed, (count, D)."""
+def sobol_points(space: Dimensions, seed: int, at: int, count: int) -> np.ndarray:
+    """`count` points of the scrambled Sobol sequence of a seed, from number `at`, (count, D)."""
     engine = qmc.Sobol(space.size, scramble=True, rng=np.random.default_rng(seed))
-    # scipy warns where the first draw is no power of two; one is, and the sequence goes on from
-    # there
+    # scipy warns where the first draw is not a power of two; one is, and the sequence continues
     if not at:
         return snap(
             (
@@ -242,7 +244,7 @@ def sobol(space: Dimensions, seed: int, at: int, count: int) -> np.ndarray:
 
 
 def whole(name: str, value: object, *, least: int) -> int:
-    """A whole number from `least`."""
+    """A whole number from `least`. Raises InputError for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise checks.input_error(name, value, f"a whole number from {least}")
     return int(value)
@@ -250,8 +252,8 @@ def whole(name: str, value: object, *, least: int) -> int:
 
 @contextmanager
 def numpy_kept(seed: Sequence[int]) -> Iterator[None]:
-    """Inside, numpy's global generator starts from `seed`; outside it is as if nobody had drawn
-    from it. For libraries that do."""
+    """Inside, numpy's global generator starts from `seed`; afterwards it has its earlier state. For
+    libraries that draw from it."""
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(np.random.SeedSequence(list(seed)).generate_state(4))  # noqa: NPY002
     try:

@@ -1,5 +1,4 @@
-"""Bayesian optimisation: a smooth model of the loss, with its own doubts, says where it pays to
-look."""
+"""Bayesian optimisation: a smooth model of the loss and of its uncertainty chooses the points."""
 
 from __future__ import annotations
 
@@ -10,27 +9,27 @@ from importlib.util import find_spec
 import numpy as np
 import torch
 
-from design.methods.base import Batch, Turns, alike, numpy_kept, snap, sobol, whole
+from design.methods.base import Batch, Turns, check_kind, numpy_kept, snap, sobol_points, whole
 from torchfilm import checks
 
-# Where the search for the next points begins: the best few of many samples of the acquisition.
+# The optimisation of the acquisition starts from the best few of many samples.
 RESTARTS, SAMPLES = 4, 128
 
 
 @dataclass(kw_only=True, eq=False)
 class Bayesian(Turns):
-    """A Gaussian process of the loss and the noisy expected improvement over all that was tried
+    """A Gaussian process of the loss, and the noisy expected improvement over all points tried
     (Ament et al., NeurIPS 2023), by botorch.
 
-    For colonies so expensive that only some hundreds can be grown; a batch takes seconds to choose,
-    and more with every point told. batch: points in a batch. first: Sobol points before there is a
-    model, one batch; None is 2 (D + 1), at least `batch`.
+    For colonies so expensive that only some hundreds can be grown. The choice of a batch takes
+    seconds, and more with every known point. batch: points in a batch. first: Sobol points in the
+    first batch, before there is a model; None is 2 (D + 1), at least `batch`.
 
-    Loss is standardised, noise is inferred. A loss worse than the median by more than twice what
-    the best is better counts as that, so that failed designs do not flatten the model. Levels are
-    rounded as the points are chosen; a point already tried is replaced by a Sobol point. While all
-    losses are equal, Sobol points are asked. The same bits need the same machine, versions and
-    number of threads.
+    The loss is standardised; its noise is inferred. A loss that exceeds the median by more than
+    twice the distance from the median to the best counts as that limit, so that failed designs do
+    not flatten the model. Levels are rounded during the choice of points. A point already tried is
+    replaced by a Sobol point. While all losses are equal, the method proposes Sobol points. The
+    same bits need the same machine, versions and number of threads.
     """
 
     batch: int = 8
@@ -53,18 +52,18 @@ class Bayesian(Turns):
         self._open = self.first or max(self.batch, 2 * (size + 1))
 
     def _meet(self, batch: Batch) -> None:
-        """Choosing costs seconds, so a history is told without choosing it again; only its shape is
-        seen to."""
+        """Check only the shape of a batch of a resumed search: to choose it again would take
+        seconds."""
         if self._batch is not None or not len(self._loss):
             super()._meet(batch)
         else:
-            alike((self.batch, self._started().size, 1.0, None), batch, "Bayesian")
+            check_kind((self.batch, self._started().size, 1.0, None), batch, "Bayesian")
 
     def _next(self) -> Batch:
         space, known = self._started(), len(self._loss)
         if not known:
-            return Batch(sobol(space, self._seed, 0, self._open))
-        spare = sobol(space, self._seed, known, self.batch)
+            return Batch(sobol_points(space, self._seed, 0, self._open))
+        spare = sobol_points(space, self._seed, known, self.batch)
         loss = tamed(self._loss)
         if loss.std() == 0:
             return Batch(spare)
@@ -74,7 +73,7 @@ class Bayesian(Turns):
             numpy_kept([self._seed, known]),
         ):
             warnings.simplefilter("ignore")
-            # of this generator alone: torch.manual_seed would change those of the devices too
+            # only this generator: torch.manual_seed would change those of the devices too
             torch.default_generator.manual_seed(
                 int(np.random.SeedSequence([self._seed, known]).generate_state(1)[0])
             )
@@ -87,7 +86,7 @@ class Bayesian(Turns):
         return Batch(points)
 
     def _choose(self, loss: np.ndarray) -> np.ndarray:
-        """The points of most expected improvement, (batch, D), one after the other, each knowing
+        """The points with the greatest expected improvement, (batch, D), chosen in turn, each given
         those before it."""
         from botorch.acquisition.logei import qLogNoisyExpectedImprovement
         from botorch.fit import fit_gpytorch_mll
@@ -127,8 +126,8 @@ class Bayesian(Turns):
 
 
 def tamed(loss: np.ndarray) -> np.ndarray:
-    """Losses, with those far worse than the median brought to the median and twice what the best is
-    better; as they are where the median is the best."""
+    """Losses, limited to the median plus twice the distance from the median to the best; unchanged
+    where the median is the best."""
     middle = float(np.median(loss))
     room = middle - float(loss.min())
     return np.minimum(loss, middle + 2.0 * room) if room > 0 else loss

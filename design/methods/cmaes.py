@@ -1,4 +1,4 @@
-"""CMA-ES: a cloud of points that moves, turns and shrinks towards what is good."""
+"""CMA-ES: a normal distribution of points that moves, turns and shrinks towards low losses."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from design.methods.base import Batch, Turns, numpy_kept, snap, sobol, whole
+from design.methods.base import Batch, Turns, numpy_kept, snap, sobol_points, whole
 from torchfilm import checks
 
-# A restart doubles the population up to this many times the first: the batch must still fit the
-# machine.
+# A restart doubles the population, up to this many times the first: the batch must fit the machine.
 MOST = 16
 # Learning rate of the mean and damping of the step size, for losses with noise; cma's own are 1 and
-# 1 (docs/methods.md has what was measured).
+# 1 (docs/methods.md gives the measurements).
 SLOW = {"CMA_cmean": 0.4, "CSA_dampfac": 3.0}
 
 
@@ -28,19 +27,19 @@ class CMAES(Turns):
     """Covariance matrix adaptation (Hansen, "The CMA evolution strategy: a tutorial",
     arXiv:1604.00772), by the package cma.
 
-    population: points in a batch; None is 4 + 3 ln D, rounded down, or, where there are levels, 6 +
-    3 ln(D · dimensions with levels). sigma: width of the first cloud, as a share of each range.
-    noisy: learn slowly, for losses with noise. A search grows every design on the same seeds, so
-    that its losses have none; those of a user's own may. restarts: when a cloud has converged,
-    begin another with twice the population (IPOP: Auger and Hansen, CEC 2005), at most 16 times the
-    first; False stays with the first cloud for ever.
+    population: points in a batch. None is 4 + 3 ln D, rounded down, or, where there are levels, 6 +
+    3 ln(D · dimensions with levels). sigma: width of the first cloud of points, as a share of each
+    range. noisy: learn slowly, for losses with noise. A search grows every design on the same
+    seeds, so its losses have none; those of a user's own function may. restarts: when a cloud has
+    converged, begin another with twice the population (IPOP: Auger and Hansen, CEC 2005), at most
+    16 times the first; False keeps the first cloud.
 
-    Every cloud begins at the best of a batch of Sobol points, and no cloud begins while these are
-    all equally good, as where every design fails. A cloud that ended where all is equally bad,
-    worse than where it began, is followed by one no larger. Levels are whole numbers for cma, in
-    their order, with its lower bounds on their widths and its centring (Marty et al., PPSN 2024).
-    Dimensions with one level are left out; where fewer than the two dimensions that cma needs are
-    left, it gets idle ones that change nothing.
+    Every cloud begins at the best of a batch of Sobol points. No cloud begins while these are all
+    equally good, as where every design fails. A cloud that ended where all losses are equal and
+    worse than at its start is followed by one of the same size. Levels are whole numbers for cma,
+    in their order, with its lower bounds on their widths and its centring (Marty et al., PPSN
+    2024). Dimensions with one level are left out. Where fewer than the two dimensions that cma
+    needs remain, it gets idle ones that change nothing.
     """
 
     population: int | None = None
@@ -64,14 +63,14 @@ class CMAES(Turns):
         space = self._started()
         self._free = [axis for axis, levels in enumerate(space.levels) if levels != 1]
         counts = [space.levels[axis] for axis in self._free]
-        # a level is a whole number 0 … k - 1 for cma, k wide with the halves at its ends
+        # for cma a level is a whole number 0 … k - 1; with half a level at each end it is k wide
         self._scale = np.array([1.0 if k is None else float(k) for k in counts])
         self._shift = np.array([0.0 if k is None else 0.5 for k in counts])
         self._whole = [place for place, k in enumerate(counts) if k is not None]
         self._idle = max(0, 2 - len(self._free))
         self._first = self._size = self.population or self._usual(len(self._free) + self._idle)
         self._cloud: Any = None
-        self._start = math.inf  # loss of the point where the cloud began
+        self._start = math.inf  # loss at the start of the cloud
         self._tried = self._draws = 0
         self._random = np.random.default_rng(self._seed)
 
@@ -91,7 +90,7 @@ class CMAES(Turns):
     def draw(self, count: int) -> np.ndarray:
         space = self._started()
         if self._cloud is None:
-            self._points = sobol(space, self._seed, self._tried, count)
+            self._points = sobol_points(space, self._seed, self._tried, count)
             self._tried += count
             return self._points
         self._draws += 1
@@ -111,7 +110,7 @@ class CMAES(Turns):
                 )
             return
         with self._quiet():
-            # cma must find its own points again, to the last bit
+            # cma must receive its own points, to the last bit
             self._cloud.tell(list(self._found[rows]), loss.tolist())
             stop = self._cloud.stop() if self.restarts else {}
         if stop:
@@ -126,7 +125,7 @@ class CMAES(Turns):
         self.take(np.arange(len(loss)), loss)
 
     def _new(self, start: np.ndarray) -> Any:
-        """A cloud about a point."""
+        """A cloud around a point."""
         import cma
 
         low, high = -self._shift, self._scale - self._shift
@@ -154,7 +153,7 @@ class CMAES(Turns):
 
     @contextmanager
     def _quiet(self) -> Iterator[None]:
-        """Round calls of cma: it warns about what is handled here, and draws from numpy's global
+        """For calls of cma: it warns of cases that are handled here, and draws from numpy's global
         generator in an assertion of its centring."""
         with warnings.catch_warnings(), numpy_kept([self._seed, self._draws]):
             warnings.simplefilter("ignore")

@@ -1,4 +1,4 @@
-"""Small cheap colonies first; only the promising designs are grown to full size."""
+"""Racing: small cheap colonies first, and only the promising designs at full size."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from design.methods.base import Batch, Source, Turns, whole
 from design.methods.cmaes import CMAES
 from torchfilm import checks
 
-# How fast the trust in small colonies follows what the last races showed.
+# How fast the trust in small colonies follows the agreement in the last races.
 RATE = 0.2
 
 
 @dataclass(kw_only=True, eq=False)
 class Racing(Turns):
-    """Draws more points than another method wants, grows them as small colonies, and goes on at
-    each size with the best of them.
+    """Draws more points than another method needs, grows them as small colonies, and keeps the best
+    at each size.
 
-    inner: the method that draws the points and learns from those that were grown in full, CMAES or
+    inner: the method that draws the points and learns from those grown to full size, CMAES or
     Sobol; None is CMAES(). sizes: shares of the full size, rising, the last 1. keep: the share of
-    the points that goes on from one size to the next. small: replicates grown at all sizes but the
-    last. agree: the race is left out, and as many points as `inner` wants are grown in full at
-    once, where small and full colonies agree less than this about the order of the finalists
-    (Kendall's tau, smoothed over races, from 1). -1 races always. A new cloud of CMAES trusts small
+    the points that continues from one size to the next. small: replicates at all sizes but the
+    last. agree: the race is skipped where the order of the finalists in small and full colonies
+    agrees less than this (Kendall's tau, smoothed over races, from 1). Then as many points as
+    `inner` needs are grown to full size at once. -1 never skips. A new cloud of CMAES trusts small
     colonies again.
 
-    One race is one bracket of successive halving (Jamieson and Talwalkar, AISTATS 2016), and what
-    it hands to CMA-ES a pre-selection (Ulmer, Streichert and Zell, CEC 2003): all points come from
-    the present cloud, and the method hears only losses of full colonies. Should small colonies tell
-    nothing, the finalists are a random part of the cloud, so the step is CMA-ES's own and only the
-    price of the small colonies is lost; should they mislead, `agree` ends it. Brackets across
-    generations were not taken: a point that was drawn from an earlier cloud says little about the
-    present one.
+    A race is one bracket of successive halving (Jamieson and Talwalkar, AISTATS 2016), and a
+    pre-selection for CMA-ES (Ulmer, Streichert and Zell, CEC 2003): all points come from the
+    present cloud, and the method learns only the losses of full colonies. If small colonies say
+    nothing about full ones, the finalists are a random part of the cloud: the step is that of
+    CMA-ES, and only the small colonies are lost. If they mislead, `agree` stops the races. Brackets
+    across generations are not used: a point from an earlier cloud says little about the present
+    one.
     """
 
     inner: Source | None = None
@@ -54,7 +54,7 @@ class Racing(Turns):
             raise checks.input_error(
                 "Racing.inner",
                 self.inner,
-                "a method whose points can be sieved, such as CMAES() or Sobol()",
+                "a method that can draw more points than it needs, such as CMAES() or Sobol()",
             )
         self.sizes = checks.vector("Racing.sizes", self.sizes)
         if (
@@ -78,18 +78,18 @@ class Racing(Turns):
         self._open()
 
     def _open(self) -> None:
-        """Make ready for the next race: nothing drawn, nobody left in it."""
+        """Prepare the next race: no points drawn, none left."""
         self._rung = 0
         self._points = np.empty((0, self._started().size))
         self._left = np.empty(0, dtype=np.int64)
-        self._early: np.ndarray | None = None  # losses of all that were drawn, at the first size
+        self._early: np.ndarray | None = None  # losses of all drawn points, at the first size
 
     @property
     def _last(self) -> int:
         return len(self.sizes) - 1
 
     def _count(self, rung: int) -> int:
-        """How many run at a size, so that as many as are wanted arrive at the last."""
+        """How many points start at a size, so that enough reach the last."""
         return math.ceil(self._source.wanted / self.keep ** (self._last - rung) - 1e-9)
 
     def _next(self) -> Batch:
@@ -116,7 +116,7 @@ class Racing(Turns):
             return
         if self._early is not None:
             found = float(kendalltau(self._early[self._left], loss).statistic)
-            # not a number where all are equal, as where all failed: nothing is known
+            # NaN where all are equal, as where all failed: that says nothing
             if math.isfinite(found):
                 self._trust += RATE * (found - self._trust)
         self._source.take(self._left, loss)

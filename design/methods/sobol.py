@@ -1,4 +1,4 @@
-"""Search without learning: points that fill the space evenly."""
+"""Sobol sequence: points that fill the space evenly, without learning."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from design.methods.base import Batch, Turns, sobol, whole
+from design.methods.base import Batch, Turns, sobol_points, whole
 
 
 @dataclass(kw_only=True, eq=False)
 class Sobol(Turns):
-    """Points of a scrambled Sobol sequence (Owen 1998; scipy.stats.qmc): the measure of every other
-    method, and a map of the whole space.
+    """Points of a scrambled Sobol sequence (Owen 1998; scipy.stats.qmc): the baseline of every
+    other method, and a map of the whole space.
 
-    batch: points in a batch, any number; the sequence goes on from batch to batch.
+    batch: points in a batch, any number; the sequence continues from batch to batch.
     """
 
     batch: int = 64
@@ -31,12 +31,12 @@ class Sobol(Turns):
         return False
 
     def draw(self, count: int) -> np.ndarray:
-        points = sobol(self._started(), self._seed, self._drawn, count)
+        points = sobol_points(self._started(), self._seed, self._drawn, count)
         self._drawn += count
         return points
 
     def take(self, rows: np.ndarray, loss: np.ndarray) -> None:
-        """Nothing is learnt."""
+        """Does nothing: the method does not learn."""
 
     def _begin(self) -> None:
         self._drawn = 0

@@ -1,9 +1,10 @@
-"""Patterns that a colony may be wanted to make, each with a loss that is 0 where it does."""
+"""Targets: patterns of a colony. The loss of each is 0 where the colony has the pattern."""
 
 from design.targets.base import Target
+from design.targets.image import Image
 from design.targets.oscillation import Oscillation
 from design.targets.patterns import DomainSize, OnFraction
-from design.targets.profiles import Bands, Gradient, Image, ProfileTarget, Ring
+from design.targets.profiles import Bands, Gradient, ProfileTarget, Ring
 from design.targets.stripe import Stripe
 
 __all__ = [

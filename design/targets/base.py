@@ -1,4 +1,4 @@
-"""What a target is: a pattern wanted of a colony, and the score of how far a colony is from it."""
+"""The base class of targets, and what targets share: levels, weights, sums over a colony."""
 
 from __future__ import annotations
 
@@ -14,47 +14,47 @@ from torchfilm import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# a signal where the cell is, "out.ahl", beside what the cell itself holds under that name
+# "out.ahl" is the signal at the cell; "ahl" is the level inside the cell
 OUTSIDE = "out."
 
 
 class Target:
-    """A pattern wanted. Its ready kinds are frozen dataclasses whose parameters are checked when
-    they are made.
+    """A pattern that a colony should have. The ready targets are frozen dataclasses that check
+    their parameters when they are made.
 
-    A loss is one number for each colony: 0 is perfect and, for the ready targets, 1 the worst; a
-    colony that failed scores `failed`. It follows from that colony's own cells alone, whatever else
-    is in the batch, and carries gradients to the levels in the cells; places, types and volumes
-    count as given.
+    The loss of a colony is a number: 0 is perfect and, for the ready targets, 1 is the worst; a
+    colony that failed scores `failed`. It depends on the cells of that colony alone, not on its
+    batch. It has gradients with respect to the levels in the cells, but not to places, types and
+    volumes.
     """
 
     failed: ClassVar[float] = 1.5
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The species that it looks at, for pictures."""
+        """The species that the target reads, for pictures."""
         return ()
 
     def check(self, state: tf.State) -> None:
-        """Raises `tf.InputError` if a first state has not what the target looks at."""
+        """Raises `tf.InputError` where a first state lacks something that the target reads."""
 
     def note(self, state: tf.State) -> Tensor | None:
-        """What to keep of a state after every step, (B, k), for a target that needs the history;
-        None: nothing."""
+        """What a target that needs the history keeps of a state after every step, (B, k); None:
+        nothing."""
         return None
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        """How far each colony is from the pattern, (B,) float64. history: the notes, (T, B, k)."""
+        """The loss of each colony, (B,) float64. history: the notes of all steps, (T, B, k)."""
         raise NotImplementedError(f"{type(self).__name__}.loss")
 
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """What a person wants to know of the pattern that is there, (B,) by name; NaN where there
-        is no such number."""
+        """Measures of the pattern that a colony has, (B,) by name; NaN where one is not
+        defined."""
         return {}
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """Draw what is wanted of the colony at `place` of the batch on axes that show that colony,
-        in µm."""
+        """Draw the target of the colony at `place` of the batch, on axes that show that colony, in
+        µm."""
 
     def describe(self) -> str:
         """The pattern in one line."""
@@ -62,7 +62,8 @@ class Target:
 
 
 def known(state: tf.State) -> list[str]:
-    """What a target can look at: fields with one number a cell, and signals as "out.NAME"."""
+    """The names that a target can read: fields with one number for each cell, and signals as
+    "out.NAME"."""
     fields = [
         name
         for name, value in state.fields.items()
@@ -72,7 +73,7 @@ def known(state: tf.State) -> list[str]:
 
 
 def require(state: tf.State, names: tuple[str, ...]) -> None:
-    """Raises `tf.InputError` for the first name that the state does not know."""
+    """Raises `tf.InputError` for the first name that the state does not have."""
     there = known(state)
     for name in names:
         if name not in there:
@@ -91,21 +92,21 @@ def require(state: tf.State, names: tuple[str, ...]) -> None:
 
 
 def levels(state: tf.State, name: str) -> Tensor:
-    """A field of the cells by its name, or, as "out.NAME", a signal where each cell is: (N,), with
-    its gradient."""
+    """A field of the cells, or, as "out.NAME", a signal at each cell: (N,), with its
+    gradient."""
     require(state, (name,))
     if not name.startswith(OUTSIDE):
         return state.fields[name]
     contact = state.contact()
-    assert contact is not None  # a state that knows a signal has a medium
+    assert contact is not None  # a state with a signal has a medium
     return contact.found[name.removeprefix(OUTSIDE)]
 
 
 def valid_levels(state: tf.State, names: tuple[str, ...]) -> tuple[Tensor, Tensor]:
     """Levels of several species, (N, k) float64, none below 0, and which colonies can be scored,
-    (B,) bool: those with cells, all of whose levels are finite.
+    (B,) bool: those that have cells and whose levels are all finite.
 
-    A level that is not finite counts as 0, so that no NaN gets into a sum or a gradient.
+    A level that is not finite counts as 0, so that no sum or gradient becomes NaN.
     """
     found = torch.stack([levels(state, name).double() for name in names], 1)
     finite = torch.isfinite(found)
@@ -114,7 +115,7 @@ def valid_levels(state: tf.State, names: tuple[str, ...]) -> tuple[Tensor, Tenso
 
 
 def weights(state: tf.State) -> Tensor:
-    """What each cell counts for: its volume, (N,) float64 µm³, without gradient."""
+    """The weight of each cell: its volume, (N,) float64 µm³, without gradient."""
     return state.volume.detach().double()
 
 
@@ -128,13 +129,13 @@ def total(state: tf.State, value: Tensor) -> Tensor:
 
 
 def ratio(above: Tensor, below: Tensor, otherwise: float) -> Tensor:
-    """above/below, and `otherwise`, with zero gradient, where below is 0."""
+    """above/below; where below is 0, `otherwise` with zero gradient."""
     some = below > 0
     return torch.where(some, above / torch.where(some, below, 1.0), otherwise)
 
 
 def species_name(name: str, given: object) -> None:
-    """Raises `tf.InputError` unless this may be the name of a species or signal."""
+    """Raises `tf.InputError` unless this can be the name of a species or signal."""
     if not isinstance(given, str) or not given.removeprefix(OUTSIDE).isidentifier():
         raise checks.input_error(
             name, given, 'the name of a species, such as "yfp", or of a signal, such as "out.ahl"'
@@ -142,17 +143,17 @@ def species_name(name: str, given: object) -> None:
 
 
 def species_names(name: str, given: object, count: int | None = None) -> tuple[str, ...]:
-    """Several different species as a tuple."""
-    wanted = f"{'some' if count is None else count} different names of species"
+    """Several different species as a tuple. Raises `tf.InputError` for anything else."""
+    rule = f"{'some' if count is None else count} different names of species"
     if (
         isinstance(given, str)
         or not isinstance(given, (tuple, list))
         or not given
         or (count is not None and len(given) != count)
     ):
-        raise checks.input_error(name, given, wanted, 'Write ("cfp", "yfp").')
+        raise checks.input_error(name, given, rule, 'Write ("cfp", "yfp").')
     for one in given:
         species_name(name, one)
     if len(set(given)) != len(given):
-        raise checks.input_error(name, given, wanted)
+        raise checks.input_error(name, given, rule)
     return tuple(given)

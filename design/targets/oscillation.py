@@ -1,4 +1,4 @@
-"""Swings in time: all cells of a colony, together or not, with a wanted period."""
+"""Oscillations in time with a target period, of all cells together or of their mean."""
 
 from __future__ import annotations
 
@@ -12,33 +12,35 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import Target, ratio, require, species_name, total, valid_levels, weights
-from design.targets.patterns import FOUND, WANTED
+from design.targets.patterns import FOUND, TARGET
 from torchfilm import checks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SAMPLES = 6  # at least, for three numbers to be fitted
-STEADY = 1e-12  # variance, in mean squares of the level, that rounding may make
-SLACK = 1e-6  # periods: times are sums of steps
-FINER = 10  # tried frequencies to each that the window tells apart
-TRIED = 5.0  # periods are looked for between the wanted one over this and times this
+SAMPLES = 6  # the least number, for a fit of three numbers
+STEADY = 1e-12  # variance, in mean squares of the level, that rounding can cause
+SLACK = 1e-6  # periods: tolerance, because times are sums of steps
+FINER = 10  # tried frequencies for each one that the window can resolve
+TRIED = 5.0  # periods are tried from the target divided by this to the target times this
 
 
 @dataclass(frozen=True)
 class Oscillation(Target):
-    """Swings of one period, h, in the mean over the colony and, with synchrony, in all cells alike.
+    """An oscillation with one period, h, of the mean over the colony and, with synchrony, of all
+    cells alike.
 
-    After every step the mean and the mean square over the cells are noted. Of the samples of the
-    last `cycles` periods (at least one is needed), the share F of the variance that swings with the
-    wanted period is the sum of squares that a least-squares fit of the mean by a constant, cos
-    2πt/period and sin 2πt/period explains, over that of all samples: over time and cells with
-    synchrony, else of the mean over time. Loss: 1 − F. With `floor`, the amplitude from which a
-    swing counts, floor²/2 is added to the variance, so that a swing of that amplitude has 1/2. Loss
-    1: a colony that is steady to rounding, or has fewer than six samples or one period of them.
+    After every step the target notes the mean and the mean square over the cells. It uses the
+    samples of the last `cycles` periods (at least one is needed). F is the share of their variance
+    that has the target period: the sum of squares that a least-squares fit of the mean by a
+    constant, cos 2πt/period and sin 2πt/period explains, over that of all samples. With synchrony
+    the variance is that over time and cells, else that of the mean over time. Loss: 1 − F. floor:
+    the amplitude from which an oscillation counts; floor²/2 is added to the variance, so that F of
+    an oscillation of that amplitude is 1/2. The loss is 1 for a colony that is steady to rounding,
+    or that has fewer than six samples or less than one period of them.
 
-    Cells that swing out of step keep their own variance while their mean stands still: F of a
-    population whose phases have spread is small with synchrony.
+    Cells out of phase have a variance of their own while their mean is steady: with synchrony, F of
+    a population whose phases have spread is small.
     """
 
     species: str
@@ -63,8 +65,8 @@ class Oscillation(Target):
         require(state, (self.species,))
 
     def note(self, state: tf.State) -> Tensor:
-        """Time, mean and mean square over the cells' volume, (B, 3) float64; NaN for a colony that
-        cannot be scored."""
+        """Time, mean and mean square, weighted by the cells' volume, (B, 3) float64; NaN for a
+        colony that cannot be scored."""
         y, sound = valid_levels(state, (self.species,))
         w = weights(state).unsqueeze(1)
         sums = total(state, torch.cat([w, w * y, w * y * y], 1))
@@ -91,14 +93,14 @@ class Oscillation(Target):
             raise checks.input_error(
                 "history",
                 shape,
-                "(T, B, 3), the notes after every step",
-                "Keep target.note(state) of every step and stack them.",
+                "(T, B, 3), the notes of every step",
+                "Keep target.note(state) after every step and stack them.",
             )
         present = torch.isfinite(history).all(2)
         time, mean, square = torch.where(present.unsqueeze(2), history, 0.0).unbind(2)
         last = torch.where(present, time, -math.inf).amax(0)
         used = present & (time >= last - (self.cycles + SLACK) * self.period)
-        # samples that no colony uses would only add zeros
+        # drop samples that no colony uses: they are zeros
         kept = used.any(1) | (torch.arange(len(used), device=used.device) == 0)
         used, time, mean, square = (v[kept] for v in (used, time, mean, square))
         length = last - torch.where(used, time, math.inf).amin(0)
@@ -123,10 +125,10 @@ class Oscillation(Target):
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """Of the same samples: period_h, where the power of the mean has its peak, among periods
-        from a fifth of the wanted one to five times it and at most twice as long as the window, NaN
-        for a drift; amplitude, √2 standard deviations of the mean; synchrony, the variance of the
-        mean over that of all cells at all times."""
+        """Of the same samples, (B,) each. period_h: where the power of the mean has its peak,
+        among periods from a fifth of the target to five times it and at most twice as long as the
+        window; NaN for a drift. amplitude: √2 standard deviations of the mean. synchrony: the
+        variance of the mean over that of all cells at all times."""
         window = self._window(history)
         count = math.ceil(FINER * self.cycles * (TRIED - 1.0 / TRIED))
         tried = (
@@ -134,8 +136,8 @@ class Oscillation(Target):
             / self.period
         )
         power = torch.cat([_explained(window, some) for some in tried.split(16)], 1)
-        # no faster than half the samples', no slower than half a swing in the window: a drift has
-        # its greatest power there, and no peak
+        # at most half the sampling frequency, at least half an oscillation in the window: a drift
+        # has its greatest power at that end, and no peak
         fastest = 0.5 * (window.n - 1).clamp(min=1) / window.length
         possible = (tried * window.length.unsqueeze(1) >= 0.5) & (tried < fastest.unsqueeze(1))
         power = torch.where(possible, power, -1.0)
@@ -145,7 +147,7 @@ class Oscillation(Target):
         )
         bend = before - 2 * here + after
         peak = (before >= 0) & (after >= 0) & (here >= before) & (here >= after) & (bend < 0)
-        # the top of the parabola through the three
+        # the top of the parabola through the three points
         shift = 0.5 * (before - after) / torch.where(peak, bend, 1.0)
         frequency = tried[0] + (top + shift) * (tried[1] - tried[0])
         whole = window.mean_square + window.spread
@@ -161,8 +163,8 @@ class Oscillation(Target):
         }
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """The mean over time in a corner, and a swing of the wanted period and the same amplitude
-        in step with its last maximum; nothing without history."""
+        """Draw the mean over time in a corner, and a wave of the target period with the same
+        amplitude, in phase at the maximum; nothing without history."""
         if history is None:
             return
         kept = history[:, place, :2].detach().double().cpu().numpy()
@@ -175,7 +177,7 @@ class Oscillation(Target):
         inset.plot(
             time,
             0.5 * (mean.max() + mean.min()) + 0.5 * np.ptp(mean) * wave,
-            color=WANTED,
+            color=TARGET,
             linewidth=0.8,
             linestyle="--",
         )
@@ -189,10 +191,11 @@ class Oscillation(Target):
 
 @dataclass(frozen=True)
 class _Samples:
-    """The samples used: time from the last one and `used`, 1 or 0, and swing of the mean about its
-    average, (T, B) each; for each colony, (B,): `n` samples over `length` h, whether that is `long`
-    enough, the mean square of the swing, that of the cells about their mean, and that of their
-    levels.
+    """The samples in use.
+
+    (T, B) each: time from the last sample; used, 1 or 0; swing, the mean less its average. (B,)
+    each: n samples over `length` h; long, whether that is enough; mean_square, of the swing;
+    spread, the mean square of the cells about their mean; level, the mean square of their levels.
     """
 
     time: Tensor
@@ -207,23 +210,25 @@ class _Samples:
 
 
 def _explained(window: _Samples, frequency: Tensor) -> Tensor:
-    """The mean square of the swing that a wave of each frequency (F,) 1/h fits, by least squares
-    with a constant, (B, F)."""
+    """The mean square of the swing that a wave of each frequency (F,) 1/h explains, by least
+    squares with a constant, (B, F)."""
     used, n = window.used.unsqueeze(2), window.n.unsqueeze(1)
     phase = 2 * math.pi * window.time.unsqueeze(2) * frequency
     cos, sin = used * torch.cos(phase), used * torch.sin(phase)
     cos, sin = (wave - used * (_sum(wave) / n) for wave in (cos, sin))
     y = window.swing.unsqueeze(2)
     cc, ss, cs, cy, sy = (_sum(v) / n for v in (cos * cos, sin * sin, cos * sin, cos * y, sin * y))
-    # samples at the nodes of one of the waves, or of both, do not tell it
+    # samples at the nodes of a wave do not determine its amplitude
     det = cc * ss - cs * cs
-    told = det > 1e-6
+    determined = det > 1e-6
     return torch.where(
-        told, (ss * cy * cy - 2 * cs * cy * sy + cc * sy * sy) / torch.where(told, det, 1.0), 0.0
+        determined,
+        (ss * cy * cy - 2 * cs * cy * sy + cc * sy * sy) / torch.where(determined, det, 1.0),
+        0.0,
     )
 
 
 def _sum(value: Tensor) -> Tensor:
-    """The sum over time, (T, …) -> (…): one sample after the other, so that it does not depend on
-    how many colonies stand beside each other."""
+    """The sum over time, (T, …) -> (…), sample by sample, so that it does not depend on the number
+    of colonies in the batch."""
     return value.cumsum(0)[-1]

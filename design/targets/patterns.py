@@ -1,4 +1,4 @@
-"""Targets of how cells of two states lie together, of how many are on, and of swings in time."""
+"""Targets for the size of domains of two kinds of cells, and for the share of cells that are on."""
 
 from __future__ import annotations
 
@@ -25,27 +25,28 @@ from torchfilm import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-GAP = 0.5  # µm: cells that are nearer to each other are neighbours
-FEWEST = 1e-12  # share of unlike neighbours that counts as none
+GAP = 0.5  # µm: cells with a smaller gap are neighbours
+FEWEST = 1e-12  # a smaller share of unlike neighbours counts as none
 BRIGHTEST = 1e6  # levels, in thresholds, from which a cell is fully on in float64
-WANTED, FOUND = "#c2185b", "#757575"
+TARGET, FOUND = "#c2185b", "#757575"
 
 
 @dataclass(frozen=True)
 class DomainSize(Target):
-    """Domains of cells in one of two states, as wide as `size`, µm: the mean length that a straight
-    line runs in one domain.
+    """Domains of cells in one of two states, `size` µm wide: the mean length that a straight line
+    runs in one domain.
 
     The state of a cell is z = (a − b)/(a + b), from −1 to 1, of the levels of two species (0 where
-    it has neither). Of the n pairs of neighbours, cells with a gap under 0.5 µm, the share p = Σ (1
-    − zᵢzⱼ)/2 / n is unlike, and with their mean centre distance d the domains are d/p wide. Loss: 1
-    − exp(−ln²(d/p / size)); 1 where no pair is unlike, or no cell has a neighbour.
+    both are 0). Neighbours are cells with a gap under 0.5 µm. Of the n pairs of neighbours, the
+    share p = Σ (1 − zᵢzⱼ)/2 / n is unlike; with their mean centre distance d, the domains are d/p
+    wide. Loss: 1 − exp(−ln²(d/p / size)); 1 where no pair is unlike or no cell has a neighbour.
 
-    Why: let domains have borders of length A per area. A short segment of length d, thrown anyhow,
-    crosses them 2dA/π times on average (Buffon); so does each length d of a straight line, whose
-    mean run in one domain is therefore ℓ = π/(2A) (Crofton), and p = d/ℓ; in space, with A per
-    volume, dA/2 and ℓ = 2/A do the same. A segment that crosses twice looks like one that does not:
-    the estimate holds for ℓ well above d, and is 2d for cells whose states are drawn at random.
+    Derivation: the borders of the domains have length A per area. A short segment of length d, at a
+    random place and angle, crosses them 2dA/π times on average (Buffon). So does each length d of a
+    straight line, whose mean run in one domain is therefore ℓ = π/(2A) (Crofton), and p = d/ℓ. In
+    space, with A per volume, dA/2 and ℓ = 2/A give the same. A segment that crosses twice looks
+    like one that does not cross: the estimate is valid for ℓ well above d, and is 2d for cells
+    whose states are random.
     """
 
     species: tuple[str, str]
@@ -65,7 +66,7 @@ class DomainSize(Target):
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         _, sound = valid_levels(state, self.species)
         unlike, distance, _ = self._pairs(state)
-        # clamped, the logarithm stays finite and its loss is 1 to the last bit, with zero gradient
+        # with the clamp the logarithm is finite, and the loss is exactly 1 with zero gradient
         log = torch.log(
             torch.where(distance > 0, distance, 1.0) / (unlike.clamp(min=FEWEST) * self.size)
         )
@@ -73,8 +74,8 @@ class DomainSize(Target):
         return torch.where(sound, loss, self.failed)
 
     def _pairs(self, state: tf.State) -> tuple[Tensor, Tensor, Tensor]:
-        """Share of unlike neighbours, mean centre distance (0 without neighbours, µm) and number of
-        pairs, of each colony: (B,) float64 each."""
+        """The share of unlike neighbours, their mean centre distance (µm, 0 without neighbours) and
+        the number of pairs of each colony, (B,) float64 each."""
         a, b = valid_levels(state, self.species)[0].unbind(1)
         z = ratio(a - b, a + b, 0.0)
         i, j, apart = tf.measure.neighbours(state, GAP)
@@ -88,7 +89,8 @@ class DomainSize(Target):
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """domain_size_um; unlike_share of the neighbours; pairs, how many neighbours there are."""
+        """domain_size_um; unlike_share, of the pairs of neighbours; pairs, their number; (B,)
+        each."""
         unlike, distance, count = self._pairs(state)
         return {
             "domain_size_um": ratio(distance, unlike, math.nan),
@@ -97,24 +99,24 @@ class DomainSize(Target):
         }
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """A bar as long as the domains should be wide."""
+        """Draw a bar of the target size."""
         window = ax.get_xlim(), ax.get_ylim()
         (left, right), (bottom, top) = window
         x, y = left + 0.05 * (right - left), bottom + 0.05 * (top - bottom)
         ax.plot(
             [x, x + math.copysign(self.size, right - left)],
             [y, y],
-            color=WANTED,
+            color=TARGET,
             linewidth=3.0,
             solid_capstyle="butt",
             zorder=3,
         )
         ax.annotate(
-            f"wanted {self.size:g} µm",
+            f"target {self.size:g} µm",
             (x, y),
             xytext=(0, 3),
             textcoords="offset points",
-            color=WANTED,
+            color=TARGET,
             fontsize=7.0,
             zorder=3,
         )
@@ -126,13 +128,13 @@ class DomainSize(Target):
 
 @dataclass(frozen=True)
 class OnFraction(Target):
-    """A share of the cells on, the rest off, wherever they are.
+    """A share of the cells is on and the rest is off, wherever they are.
 
-    fraction: wanted share of the volume, above 0 and below 1. A cell is on above `level`; smoothly,
-    for the loss, s = y⁴/(y⁴ + level⁴). Loss: 1 − (1 − d²)(1 − g), with d = (mean s −
-    fraction)/max(fraction, 1 − fraction), which is 1 where the share is as wrong as it can be, and
-    g the mean of 4 s (1 − s): 1 where all cells are at the level itself, neither on nor off, 0
-    where all have decided.
+    fraction: target share of the volume, above 0 and below 1. A cell is on above `level`; for the
+    loss, smoothly: s = y⁴/(y⁴ + level⁴). Loss: 1 − (1 − d²)(1 − g). d = (mean s −
+    fraction)/max(fraction, 1 − fraction); |d| is 1 where the share is as wrong as possible. g is
+    the mean of 4 s (1 − s): 1 where all cells are at the level itself, 0 where each cell is clearly
+    on or off.
     """
 
     species: str
@@ -147,7 +149,7 @@ class OnFraction(Target):
                 "OnFraction.fraction",
                 self.fraction,
                 "above 0 and below 1",
-                "For all cells on, want one wide band of Bands.",
+                "For all cells on, use Bands with one wide band.",
             )
         checks.number("OnFraction.level", self.level, above=0.0)
 
@@ -173,7 +175,7 @@ class OnFraction(Target):
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """on_share: share of the volume above the level; on_level and off_level: mean level of the
-        cells above and of the others."""
+        cells above it and of the others; (B,) each."""
         y, w = valid_levels(state, (self.species,))[0][:, 0], weights(state)
         on = (y > self.level).double()
         parts = total(
@@ -186,11 +188,11 @@ class OnFraction(Target):
         }
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """Two bars in a corner: the share wanted and the share found."""
+        """Draw two bars in a corner: the target share and the share found."""
         inset = ax.inset_axes((0.02, 0.02, 0.2, 0.2))
         found = float(self.measures(state)["on_share"][place])
-        inset.bar([0, 1], [self.fraction, found], color=[WANTED, FOUND])
-        inset.set_xticks([0, 1], ["wanted", "found"], fontsize=5.0)
+        inset.bar([0, 1], [self.fraction, found], color=[TARGET, FOUND])
+        inset.set_xticks([0, 1], ["target", "found"], fontsize=5.0)
         inset.set(ylim=(0, 1), yticks=[])
 
     def describe(self) -> str:

@@ -1,5 +1,5 @@
-"""A stripe at the border of two populations, or at a given place, and what the one that is there is
-like."""
+"""A stripe at the border of two populations or at a given place, and measures of the stripe that a
+colony has."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import ratio, species_name, total, valid_levels, weights
-from design.targets.profiles import COLOURS, ProfileTarget, between, common, half, lines
+from design.targets.geometry import COLOURS, between, check_profile, half, lines
+from design.targets.profiles import ProfileTarget
 from torchfilm import checks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-STRIP = 2.0  # µm, of the profile along the stripe's axis
-ACROSS = 4.0  # µm, of the places across at which the middle of the stripe is looked up
-BLOCK = 2048  # cells whose distances to all others are held at once
-FEWEST = 3  # cells, for a mean over a strip to count
+STRIP = 2.0  # µm: width of the strips of the profile along the stripe's axis
+ACROSS = 4.0  # µm: width of the strips across, in which the middle of the stripe is located
+BLOCK = 2048  # cells whose distances to all others are in memory at once
+FEWEST = 3  # cells: the least number for the mean of a strip
 
 
 @dataclass(frozen=True)
 class Stripe(ProfileTarget):
-    """A stripe across the colony: the species is wanted within `width` µm, and dark beyond.
+    """A stripe across the colony: the species should be lit within `width` µm, and dark beyond.
 
-    at: "border", the border between the two populations (cell types) of the colony, or a number,
-    µm. straight: False, the stripe follows the border wherever it winds: a cell's distance from it
-    is that to the nearest cell of the other type, from centre to centre, less a cell's diameter;
+    at: "border", the border between the two populations (cell types) of the colony, or a place, µm.
+    straight: False, the stripe follows the border wherever it winds. The distance of a cell from it
+    is that to the nearest cell of the other type, from centre to centre, less a cell's diameter.
     True, the border is one straight line, at the place along the axis with the fewest cells on the
     wrong side. along: "x" or "y", the axis that the stripe lies across. cell_type: only cells of
-    this type count. place: of the stripe's middle from `at`, µm towards the type that lies higher
-    on the axis. By default 0; with "border" and a cell_type, the stripe adjoins the border on the
-    side of that type. floor: level from which a cell counts as lit. edge_width: µm, how soft the edges
-    are. A colony that has lost one of its two types has no border, and loss 1.
+    this type count. place: of the middle of the stripe from `at`, µm towards the type that lies
+    higher on the axis. The default is 0; with "border" and a cell_type, the stripe adjoins the
+    border on the side of that type. floor: the level from which a cell counts as lit. edge_width:
+    µm, as for `Bands`. A colony that has lost one of its two types has no border, and loss 1.
     """
 
     species: str
@@ -70,7 +71,7 @@ class Stripe(ProfileTarget):
                 "Stripe.cell_type", self.cell_type, "a whole number from 0, or None for all cells"
             )
         checks.choice("Stripe.straight", self.straight, (True, False))
-        common("Stripe", self.floor, self.edge_width)
+        check_profile("Stripe", self.floor, self.edge_width)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -82,13 +83,13 @@ class Stripe(ProfileTarget):
             return
         if "cell_type" not in state.fields:
             raise tf.InputError(
-                "Stripe: the cells have no types. Found the colonies with them:"
+                "Stripe: the cells have no types. Give types to the founders:"
                 " founders=tf.Cells(…, cell_type=[0, 1])."
             )
         for k in range(state.colonies):
             there = torch.unique(state.cell_type[state.colony == k]).tolist()
             if self.at == "border" and len(there) != 2:
-                hint = "Found the colonies with two, or give at= a place in µm."
+                hint = "Give the founders two types, or give at= a place in µm."
                 raise tf.InputError(
                     'Stripe(at="border"): a border needs exactly two types of cells, and colony'
                     f" {k} has {there}. {hint}"
@@ -115,9 +116,9 @@ class Stripe(ProfileTarget):
         return self.at == "border" and not self.straight
 
     def reference(self, state: tf.State) -> tuple[Tensor, Tensor, Tensor]:
-        """The place of `at` along the axis and of the stripe's middle from there, (B,) float64 µm,
-        and the distance of each cell from `at`, (N,) µm, above 0 towards where the axis points; NaN
-        where a colony has no border."""
+        """The place of `at` along the axis and the middle of the stripe relative to it, (B,)
+        float64 µm each, and the distance of each cell from `at`, (N,) µm, positive along the axis.
+        NaN where a colony has no border."""
         place = 0.0 if self.place is None else self.place
         if not isinstance(self.at, str):
             at = torch.full(
@@ -145,7 +146,7 @@ class Stripe(ProfileTarget):
         x = distance - middle.index_select(0, state.colony)
         low, high = -0.5 * self.width, 0.5 * self.width
         if self.winds and self.place is None and self.cell_type is not None:
-            # towards the border there is nothing but the border
+            # on the side of the border the border itself is the edge
             low, x = -math.inf, torch.where(middle.index_select(0, state.colony) < 0, -x, x)
         return torch.nan_to_num(between(x, low, high, self.edge_width)).unsqueeze(1)
 
@@ -153,16 +154,15 @@ class Stripe(ProfileTarget):
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """Of the cells that count, each (B,):
 
-        place_um: mean distance from `at` of what is brighter than the cells farther than 2·width
-        from the wanted middle; width_um: full width at half maximum of the profile in strips of 2
-        µm; peak: the greatest mean of a strip; contrast: mean level inside the wanted stripe over
-        that of the cells farther than 2·width; straightness_um: how far, root mean square over
-        strips of 4 µm across, the middle of the cells at least half as bright as the peak is from a
-        straight line.
+        place_um: mean distance from `at` of the light above the level of far cells, those farther
+        than 2·width from the target's middle; width_um: full width at half maximum of the profile
+        in strips of 2 µm; peak: the greatest mean of a strip; contrast: mean level inside the
+        target stripe over that of the far cells; straightness_um: root mean square distance from a
+        straight line of the middle of the bright cells, over strips of 4 µm across. Bright cells
+        have at least half the peak.
         """
         y, (_, middle, x) = valid_levels(state, self.names)[0][:, 0], self.reference(state)
-        # without a border there is no place: such colonies' cells are left out, and their measures
-        # are NaN
+        # a colony without a border has no place: its cells are left out, and its measures are NaN
         w = torch.where(self.counted(state) & torch.isfinite(x), weights(state), 0.0)
         x = torch.nan_to_num(x)
         away = (x - middle.index_select(0, state.colony)).abs()
@@ -191,8 +191,8 @@ class Stripe(ProfileTarget):
         return found | {"contrast": ratio(bright, dark, math.nan)}
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        """The edges of the stripe and the border as lines or, where it winds, a dot on each cell
-        that is wanted lit."""
+        """Draw the edges of the stripe and the border as lines or, where it winds, a dot on each
+        cell that should be lit."""
         if self.winds:
             mine = (
                 (state.colony == place)
@@ -225,15 +225,15 @@ class Stripe(ProfileTarget):
 
 
 def _axis(state: tf.State, along: str) -> Tensor:
-    """The cells' places along x or y, (N,) float64 µm, without gradient."""
+    """The coordinate of each cell along x or y, (N,) float64 µm, without gradient."""
     return state.position.detach()[:, "xy".index(along)].double()
 
 
 @torch.no_grad()
 def _from_border(state: tf.State, low_type: Tensor) -> Tensor:
-    """How far each cell is from the nearest cell of the other type, seen from above, centre to
-    centre less a diameter, (N,) float64 µm, below 0 for `low_type` (B,), the type that lies lower
-    on the axis; NaN where there is no other type."""
+    """The distance of each cell to the nearest cell of the other type, (N,) float64 µm: seen from
+    above, centre to centre less a diameter. It is negative for `low_type` (B,), the type that lies
+    lower on the axis, and NaN where there is no other type."""
     position, kind = state.position.detach()[:, :2], state.cell_type
     found = torch.full((state.cells,), math.nan, dtype=torch.float64, device=state.device)
     start = 0
@@ -259,8 +259,9 @@ def border(state: tf.State, along: str = "x") -> tuple[Tensor, Tensor]:
     before it, (B,) int64.
 
     It is the place along x or y with the fewest cells on the wrong side, half-way between two cells
-    (of several such places the first); the type whose mean place is the lower belongs before it.
-    NaN where a colony has one type only; of more than two the lowest and the highest number count.
+    (the first of several such places). The type with the lower mean place belongs before it. NaN
+    where a colony has one type only; of more than two types, the lowest and the highest number
+    count.
     """
     groups, colony, x = state.groups, state.colony, _axis(state, along)
     if not state.cells:
@@ -272,8 +273,7 @@ def border(state: tf.State, along: str = "x") -> tuple[Tensor, Tensor]:
     )
     straight = sums[:, 0] * sums[:, 3] <= sums[:, 2] * sums[:, 1]
     before = torch.where(straight, one, other)
-    # from place to place along the axis, how many more cells are on the wrong side than with all of
-    # them after it
+    # cells on the wrong side for a border after each cell, less those for a border before all cells
     order = torch.argsort(x, stable=True)
     order = order.index_select(0, torch.argsort(colony.index_select(0, order), stable=True))
     step = (is_other.long() - is_one.long()) * torch.where(straight, 1, -1).index_select(0, colony)
@@ -296,8 +296,7 @@ def profile(
     """The greatest mean level of a strip and the full width at half of it, µm, of each colony, (B,)
     each; NaN where nothing is lit.
 
-    owner, x, level, weight: (N,), colony by colony. Strips with fewer than three cells are passed
-    over.
+    owner, x, level, weight: (N,), colony by colony. Strips with fewer than three cells are ignored.
     """
     colony, centre, strip = strips(owner, x, STRIP)
     mean = np.bincount(strip, weights=weight * level) / np.bincount(strip, weights=weight)
@@ -307,7 +306,7 @@ def profile(
     np.fmax.at(peak, colony, mean)
     peak[~(peak > 0)] = np.nan
     high = mean >= 0.5 * peak[colony]
-    # runs of strips side by side that are all high or all low; the one with the peak is the stripe
+    # runs of adjacent strips that are all high or all low; the run with the peak is the stripe
     run = np.cumsum((np.diff(colony, prepend=-1) != 0) | np.diff(high, prepend=False))
     top = np.flatnonzero(mean == peak[colony])
     there, first = np.unique(colony[top], return_index=True)
@@ -329,11 +328,11 @@ def straightness(
     weight: np.ndarray,
     peak: np.ndarray,
 ) -> np.ndarray:
-    """Root mean square distance, µm, (B,), along x of the middles of a stripe from the straight
-    line that fits them best; NaN for fewer than three middles.
+    """The root mean square distance, along x, of the middles of a stripe from the straight line
+    that fits them best, (B,) µm; NaN for fewer than three middles.
 
-    A middle is the mean x of the cells with at least half the colony's peak (B,), in a strip
-    across.
+    A middle is the mean x, in one strip across, of the cells with at least half the peak (B,) of
+    their colony.
     """
     lit = level >= 0.5 * peak[owner]
     owner, x, light = owner[lit], x[lit], (weight * level)[lit]
@@ -351,8 +350,8 @@ def straightness(
 def strips(
     owner: np.ndarray, x: np.ndarray, size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The strips, `size` µm wide, that hold cells: colony and centre of each, colony by colony and
-    in order, and the strip of each cell."""
+    """The strips, `size` µm wide, that contain cells: the colony and centre of each, colony by
+    colony and in order, and the strip of each cell."""
     number = np.floor(x / size).astype(np.int64)
     low, span = (int(number.min()), int(np.ptp(number)) + 1) if len(number) else (0, 1)
     key, strip = np.unique(owner * span + number - low, return_inverse=True)

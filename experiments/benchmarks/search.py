@@ -24,7 +24,7 @@ import numpy as np
 from record import machine
 
 import torchfilm as tf
-from design import CMAES, Bayesian, DomainSize, Objective, Racing, Sobol
+from design import CMAES, Bayesian, DomainSize, Objective, Racing, Sobol, Task
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bands
@@ -73,16 +73,16 @@ class Run:
 
     def __init__(self, objective: Objective, name: str, seed: int):
         self.method, self.objective = METHODS[name](), objective
-        self.method.start(objective.space, seed, objective.replicates)
+        self.method.start(objective.task.space, seed, objective.task.replicates)
         self.colonies, self.seconds, self.loss, self.point = 0.0, 0.0, float("inf"), None
         self.course: list[tuple[float, float, float]] = []
 
     def tell(self, batch, loss: np.ndarray, seconds: float) -> None:
         self.method.tell(batch, loss)
-        count = batch.replicates or self.objective.replicates
+        count = batch.replicates or self.objective.task.replicates
         self.colonies += len(loss) * count * batch.size
         self.seconds += seconds
-        if batch.size == 1.0 and count == self.objective.replicates and loss.min() < self.loss:
+        if batch.size == 1.0 and count == self.objective.task.replicates and loss.min() < self.loss:
             self.loss, self.point = float(loss.min()), batch.points[loss.argmin()]
         self.course.append((self.colonies, self.seconds, self.loss))
 
@@ -93,9 +93,9 @@ def together(objective: Objective, runs: list[Run], colonies: int) -> None:
         groups: dict[tuple[float, int], list] = {}
         for run in open_runs:
             batch = run.method.ask()
-            groups.setdefault((batch.size, batch.replicates or objective.replicates), []).append(
-                (run, batch)
-            )
+            groups.setdefault(
+                (batch.size, batch.replicates or objective.task.replicates), []
+            ).append((run, batch))
         for (size, count), mine in groups.items():
             found = objective.evaluate(
                 np.concatenate([b.points for _, b in mine]), streams=range(count), size=size
@@ -115,7 +115,7 @@ def together(objective: Objective, runs: list[Run], colonies: int) -> None:
 
 def objective_of(target: str, **options) -> Objective:
     scene, parameters, wanted, colony, *_ = TARGETS[target]
-    return Objective(scene, parameters, wanted, **colony, replicates=REPLICATES, **options)
+    return Objective(Task(scene, parameters, wanted, **colony, replicates=REPLICATES, **options))
 
 
 def methods(options: argparse.Namespace) -> dict:
@@ -139,7 +139,7 @@ def methods(options: argparse.Namespace) -> dict:
                 "needed": needed,
                 "loss": [r.loss for r in runs],
                 "seconds": [r.seconds for r in runs],
-                "best": [objective.space.values(r.point) for r in runs],
+                "best": [objective.task.space.values(r.point) for r in runs],
                 "course": [r.course for r in runs],
             }
             middle = f"{np.median([n if n is not None else np.inf for n in needed]):.0f}"
@@ -163,7 +163,7 @@ def unseen(options: argparse.Namespace) -> dict:
     for target, found in known.items():
         objective = objective_of(target)
         for name, record in found.items():
-            points = np.array([objective.space.point(values) for values in record["best"]])
+            points = np.array([objective.task.space.point(values) for values in record["best"]])
             losses = objective.evaluate(points, streams=range(100, 132)).losses
             out.setdefault(target, {})[name] = losses.mean(1).tolist()
             held = int((losses.mean(1) <= record["threshold"]).sum())
@@ -185,7 +185,7 @@ def rate(options: argparse.Namespace) -> dict:
             ("batch on recorded growth", options.designs, True),
         ):
             scene, parameters, wanted, colony, *_ = TARGETS["stripe"]
-            objective = Objective(
+            task = Task(
                 scene,
                 parameters,
                 wanted,
@@ -193,7 +193,8 @@ def rate(options: argparse.Namespace) -> dict:
                 replicates=REPLICATES,
                 replay=replay,
             )
-            points = np.random.default_rng(0).random((count, objective.space.size))
+            objective = Objective(task)
+            points = np.random.default_rng(0).random((count, objective.task.space.size))
             if replay:
                 objective.evaluate(points[:1])  # grow the course: once for a whole search
             begun = time.perf_counter()

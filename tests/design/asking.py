@@ -1,4 +1,4 @@
-"""Functions to search, a space as methods see it, and ask-and-tell loops."""
+"""Functions to minimise, spaces as methods see them, and loops of ask and tell."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ SPACES = {
 
 
 def ellipsoid(points: np.ndarray, centre: float = 0.3) -> np.ndarray:
-    """Axes of length 1 … 10, the least of 0 where all coordinates are `centre`."""
+    """An ellipsoid with axes of length 1 … 10 and its minimum, 0, where all coordinates are
+    `centre`."""
     weight = 100.0 ** np.linspace(0, 1, points.shape[1]) if points.shape[1] > 1 else np.ones(1)
     return (weight * (points - centre) ** 2).sum(1) / weight.mean() / 2
 
@@ -52,7 +53,7 @@ def begun(given, space: Room, seed: int = 0, replicates: int = 4):
 
 
 def follow(given, function: Callable, batches: int) -> list[tuple[Batch, np.ndarray]]:
-    """Ask and tell, and keep what was asked and told."""
+    """Ask and tell; returns the batches and their losses."""
     history = []
     for _ in range(batches):
         batch = given.ask()

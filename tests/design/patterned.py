@@ -1,4 +1,4 @@
-"""Colonies placed by hand, for the tests of targets."""
+"""Colonies with given cells, for the tests of targets."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 
 import torchfilm as tf
 
-# µm: an edge so sharp that cells 0.1 µm from it are wanted fully lit or dark, to the last bit
+# µm: an edge width at which the target level is exactly 0 or 1 from 0.1 µm on
 SHARP = 1e-3
 
 
@@ -51,7 +51,7 @@ def crowded(
 
 
 def graded(target, state: tf.State, history=None) -> bool:
-    """gradcheck of the loss by the levels of all species of the target."""
+    """gradcheck of the loss with respect to the levels of all species of the target."""
     names = (
         target.names
         if hasattr(target, "names")

@@ -1,5 +1,5 @@
-"""Small scenes to search, at the top level of a module so that they pickle, and targets whose
-losses tell what was measured."""
+"""Small scenes to search, at the top level of a module so that they can be pickled, and targets
+with losses that equal a measured number."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ import numpy as np
 import torch
 
 import torchfilm as tf
-from design import Target
+from design import Objective, Target, Task
 
 DT = 0.1
+
+
+def objective_of(scene, parameters, target, **options) -> Objective:
+    """The objective of a task with these arguments."""
+    return Objective(Task(scene, parameters, target, **options))
 
 
 def filling(u, s, p, cell):
@@ -19,8 +24,8 @@ def filling(u, s, p, cell):
 
 
 def grown(rate, make=1.0, decay=1.0, *more, low=3.0, high=4.0):
-    """Colonies that fill with one species, more so at their ends. Without mechanics they are quick,
-    and what is tested here does not ask for it."""
+    """Colonies that produce one species, more of it at the ends. Without mechanics they are fast;
+    these tests do not need it."""
     circuit = tf.Circuit(filling, species=("gfp",), make=make, decay=decay)
     return tf.Scene(
         tf.Growth(rate=rate), tf.Division(length=tf.Uniform(low, high)), circuit, *more, dt=DT
@@ -28,23 +33,23 @@ def grown(rate, make=1.0, decay=1.0, *more, low=3.0, high=4.0):
 
 
 def lit(make=1.0, decay=1.0):
-    """Nothing that is searched acts back on growth."""
+    """No searched parameter affects growth."""
     return grown(2.0, make, decay, tf.Mechanics(dim=2))
 
 
 def paced(rate=1.0, make=1.0):
-    """Growth itself is searched, so that every design has its own pace."""
+    """The growth rate is searched, so that every design has its own pace."""
     return grown(rate, make)
 
 
 def uneven(make=1.0):
-    """Cells of very different pace: with seed 2, stream 0 takes more than twice as long as stream
+    """Growth rates differ widely: with seed 2, stream 0 takes more than twice as long as stream
     1."""
     return grown(tf.Uniform(0.2, 4.0), make)
 
 
 def banned(low=3.0, make=1.0):
-    """Refused between 3.2 and 3.4, where no bound and no middle lies."""
+    """The scene refuses `low` between 3.2 and 3.4, where no bound and no middle lies."""
     odd = (torch.as_tensor(low) > 3.2) & (torch.as_tensor(low) < 3.4)
     return grown(2.0, make, low=low + torch.where(odd, 1.0, 0.0), high=4.0)
 
@@ -55,13 +60,13 @@ def exploding(u, s, p, cell):
 
 
 def fragile(make=1.0):
-    """Its rates are not finite in mid-run where make is above 5."""
+    """The rates are not finite during the run where `make` is above 5."""
     circuit = tf.Circuit(exploding, species=("gfp",), make=make)
     return tf.Scene(tf.Growth(rate=2.0), tf.Division(length=tf.Uniform(3.0, 4.0)), circuit, dt=DT)
 
 
 def short(added=2.0):
-    """Cells divide while too short for two new caps where less than 0.7 µm is added."""
+    """Cells divide while too short for two new caps, where less than 0.7 µm is added."""
     return tf.Scene(
         tf.Growth(rate=1.0),
         tf.Division(added=added),
@@ -71,7 +76,7 @@ def short(added=2.0):
 
 
 def built(genes=1, promoter="weak", make=1.0):
-    """How many species there are and how strong they are made only a scene of its own can have."""
+    """The number of species and their strength need a scene of their own."""
     strength = {"weak": 1.0, "strong": 3.0}[promoter]
 
     def rates(u, s, p, cell):
@@ -83,7 +88,7 @@ def built(genes=1, promoter="weak", make=1.0):
 
 @dataclass(frozen=True)
 class Level(Target):
-    """The mean of a species over the cells, wanted at a level: their distance."""
+    """The distance of the mean level of a species from `wanted`."""
 
     species: str = "gfp"
     wanted: float = 0.0
@@ -99,7 +104,7 @@ class Level(Target):
             )
 
     def loss(self, state, history=None):
-        return (mean(state, self.species) - self.target_profile).abs()
+        return (mean(state, self.species) - self.wanted).abs()
 
     def measures(self, state, history=None):
         return {"mean_level": mean(state, self.species)}
@@ -107,7 +112,7 @@ class Level(Target):
 
 @dataclass(frozen=True)
 class Spread(Target):
-    """No species at all: how far the cells are from the origin, µm²."""
+    """The mean square distance of the cells from the origin, µm²; it reads no species."""
 
     def loss(self, state, history=None):
         return (
@@ -118,7 +123,7 @@ class Spread(Target):
 
 @dataclass(frozen=True)
 class Count(Target):
-    """How many cells there are."""
+    """The number of cells."""
 
     def loss(self, state, history=None):
         return state.counts.double()
@@ -129,7 +134,7 @@ def mean(state, name):
 
 
 def alone(scene, target, stream, *, seed=0, **end) -> tuple[float, tf.State]:
-    """The loss of one colony that runs by itself, step by step, and its last state."""
+    """The loss of one colony that runs alone, step by step, and its last state."""
     *_, state = tf.simulate(scene, scene.seed(1, seed=seed, streams=[stream]), **end)
     return float(target.loss(state)[0]), state
 

@@ -1,5 +1,5 @@
-"""Other processes and machines: the same bits wherever a piece is grown, and nothing is lost with a
-worker."""
+"""Work items in other processes and on other machines: the losses have the same bits, and no work
+item is lost with its worker."""
 
 from __future__ import annotations
 
@@ -25,14 +25,16 @@ import torch
 from searching import Level, lit, spots
 
 import torchfilm as tf
-from design import Objective, Parameter, Target
+from design import Objective, Parameter, Target, Task
+from design.executors import run_work_items
+from design.scoring import cut_work_items
 
 MAKE = Parameter("make", 0.1, 10, log=True)
 SPAWN = multiprocessing.get_context("spawn")  # a fork of a process that has run torch may hang
 
 
 def objective(scene=lit, target: Target | None = None, **options) -> Objective:
-    return Objective(
+    task = Task(
         scene,
         [MAKE, Parameter("decay", 0.5, 2)],
         target or Level(wanted=1.0),
@@ -40,6 +42,7 @@ def objective(scene=lit, target: Target | None = None, **options) -> Objective:
         replicates=2,
         **options,
     )
+    return Objective(task)
 
 
 POINTS = spots(6, 2)
@@ -47,14 +50,14 @@ POINTS = spots(6, 2)
 
 @pytest.fixture(scope="module")
 def here():
-    """The losses when nobody helps."""
+    """The losses without an executor."""
     return objective().evaluate(POINTS).losses
 
 
 @dataclass(frozen=True)
 class Deadly(Level):
-    """Kills the process that looks at it in mid-growth, unless that is the one at home or a flag
-    says that it has been done."""
+    """Kills its process in the middle of growth, except the one at home, and only once: a flag file
+    records it."""
 
     flag: str = ""
     home: int = 0
@@ -70,7 +73,7 @@ def deadly(folder) -> Objective:
 
 
 class OwnError(Exception):
-    """Takes two arguments, so that it cannot be unpickled by the one that it keeps."""
+    """It takes two arguments, so that it cannot be unpickled from the one that it keeps."""
 
     def __init__(self, what, where):
         super().__init__(f"{what} at {where}")
@@ -78,7 +81,7 @@ class OwnError(Exception):
 
 @dataclass(frozen=True)
 class Raising(Level):
-    """An error of the user's own code, in any process but that at home."""
+    """Raises an error of the user's own code, in any process but the one at home."""
 
     kind: str = ""
     home: int = 0
@@ -115,8 +118,7 @@ def dask():
 
 
 class Careless(Executor):
-    """Loses the first pieces that it is given, as if their workers had died, and does the
-    others."""
+    """Loses the first submitted work items, as if their workers had died, and runs the others."""
 
     def __init__(self, losses: int, error: Exception):
         self.losses, self.error, self.given = losses, error, 0
@@ -141,53 +143,56 @@ GONE = [
 
 
 @pytest.mark.parametrize("error", GONE, ids=lambda e: type(e).__name__)
-def test_a_piece_that_is_lost_once_is_given_again(here, error):
+def test_a_lost_work_item_is_submitted_again(here, error):
     careless = Careless(4, error)
     assert np.array_equal(
-        objective().evaluate(POINTS, executor=careless, pieces=3 + 1).losses, here
+        objective().evaluate(POINTS, executor=careless, work_items=3 + 1).losses, here
     )
     assert careless.given == 4 + 4
 
 
 @pytest.mark.parametrize("error", GONE, ids=lambda e: type(e).__name__)
-def test_a_piece_that_is_lost_again_is_grown_here_and_said_so(here, error):
+def test_a_work_item_lost_twice_runs_here_with_a_warning(here, error):
     careless = Careless(1000, error)
     with pytest.warns(
         RuntimeWarning,
-        match=f"lost 3 of 3 pieces, which were grown in this process .{type(error).__name__}",
+        match=f"lost 3 of 3 work items; this process ran them .{type(error).__name__}",
     ):
-        found = objective().evaluate(POINTS, executor=careless, pieces=3)
+        found = objective().evaluate(POINTS, executor=careless, work_items=3)
     assert np.array_equal(found.losses, here)
     assert careless.given == 3 * 2
 
 
-def test_an_executor_that_takes_nothing_any_more_loses_everything(here):
+def test_an_executor_that_is_shut_down_loses_everything(here):
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
-    with pytest.warns(RuntimeWarning, match="lost 2 of 2 pieces"):
-        assert np.array_equal(objective().evaluate(POINTS, executor=pool, pieces=2).losses, here)
-
-
-def test_every_row_is_answered_once(here):
-    """Pieces that are lost, and come back later than others, still have rows of their own."""
-    wanted = objective()
-    answered: list[int] = []
-    pieces = wanted._pieces([wanted.space.values(p) for p in POINTS], 2, 1.0, 4)
-    for piece, _ in wanted._outcomes(pieces, (0, 1), 1.0, Careless(2, CancelledError())):
-        answered += piece.rows
-    assert sorted(answered) == list(range(6))
-
-
-@pytest.mark.parametrize("pieces", [1, 3, 6, 20])
-def test_threads_find_the_same(here, pieces):
-    with ThreadPoolExecutor(3) as pool:
+    with pytest.warns(RuntimeWarning, match="lost 2 of 2 work items"):
         assert np.array_equal(
-            objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here
+            objective().evaluate(POINTS, executor=pool, work_items=2).losses, here
         )
 
 
-def test_an_error_of_the_task_ends_the_rest():
-    """It is not taken for a loss, and pieces that have not begun are not grown for nothing."""
+def test_every_row_has_one_result(here):
+    """A work item that is lost and comes back later than others keeps its rows."""
+    task = objective().task
+    answered: list[int] = []
+    items = cut_work_items(task, [task.space.values(p) for p in POINTS], 2, 1.0, 4)
+    careless = Careless(2, CancelledError())
+    for item, _ in run_work_items(task, items, (0, 1), 1.0, careless):
+        answered += item.rows
+    assert sorted(answered) == list(range(6))
+
+
+@pytest.mark.parametrize("work_items", [1, 3, 6, 20])
+def test_threads_give_the_same_losses(here, work_items):
+    with ThreadPoolExecutor(3) as pool:
+        assert np.array_equal(
+            objective().evaluate(POINTS, executor=pool, work_items=work_items).losses, here
+        )
+
+
+def test_an_error_of_the_task_cancels_the_rest():
+    """The error is not scored as a loss, and waiting work items are cancelled."""
     begun = threading.Event()
 
     class Waiting(ThreadPoolExecutor):
@@ -199,7 +204,9 @@ def test_an_error_of_the_task_ends_the_rest():
 
     futures: list[Future] = []
     with Waiting(1) as pool, pytest.raises(FileNotFoundError, match="no such table"):
-        objective(target=Raising(wanted=1.0, kind="os")).evaluate(POINTS, executor=pool, pieces=6)
+        objective(target=Raising(wanted=1.0, kind="os")).evaluate(
+            POINTS, executor=pool, work_items=6
+        )
     assert len(futures) == 6
     assert any(f.cancelled() for f in futures)
 
@@ -208,12 +215,13 @@ def test_an_error_of_the_task_ends_the_rest():
     "scene, fixed",
     [("boundary_detector", {"width": 16.0}), (tf.scenes.toggle_switch, {"power": 2.0}), (lit, {})],
 )
-def test_an_objective_is_the_same_from_a_pickle(scene, fixed):
+def test_an_objective_survives_pickling(scene, fixed):
     name = {"boundary_detector": "k3", lit: "make"}.get(scene, "strength")
     target = Level({"boundary_detector": "yfp", lit: "gfp"}.get(scene, "red"), 1.0)
-    one = Objective(scene, [Parameter(name, 0.5, 5)], target, until=0.5, replicates=1, fixed=fixed)
+    task = Task(scene, [Parameter(name, 0.5, 5)], target, until=0.5, replicates=1, fixed=fixed)
+    one = Objective(task)
     two = pickle.loads(pickle.dumps(one))
-    assert one.describe() == two.describe()
+    assert one.task.describe() == two.task.describe()
     assert np.array_equal(one.evaluate(POINTS[:2, :1]).losses, two.evaluate(POINTS[:2, :1]).losses)
 
 
@@ -222,9 +230,9 @@ def test_an_objective_is_the_same_from_a_pickle(scene, fixed):
 class TestElsewhere:
     def test_the_bits_are_the_same(self, where, request, here):
         pool = request.getfixturevalue(where)
-        for pieces in (2, 5):
+        for work_items in (2, 5):
             assert np.array_equal(
-                objective().evaluate(POINTS, executor=pool, pieces=pieces).losses, here
+                objective().evaluate(POINTS, executor=pool, work_items=work_items).losses, here
             )
 
     @pytest.mark.parametrize(
@@ -234,49 +242,49 @@ class TestElsewhere:
             ("own", RuntimeError, "OwnError: lost at sea"),
         ],
     )
-    def test_an_error_of_the_task_comes_through(self, where, request, kind, error, words):
+    def test_an_error_of_the_task_is_raised_here(self, where, request, kind, error, words):
         pool = request.getfixturevalue(where)
         with pytest.raises(error, match=words) as raised:
             objective(target=Raising(wanted=1.0, kind=kind, home=os.getpid())).evaluate(
-                POINTS, executor=pool, pieces=2
+                POINTS, executor=pool, work_items=2
             )
-        # where it was raised, though that is on another machine
+        # the traceback of the other process is part of the error
         assert "in loss" in "".join([str(raised.value), *getattr(raised.value, "__notes__", ())])
 
 
 @pytest.mark.slow
-def test_a_scene_that_cannot_be_carried_is_refused(processes):
+def test_a_scene_that_cannot_be_pickled_is_refused(processes):
     def mine(make=1.0, decay=1.0):
         return lit(make, decay)
 
     with pytest.raises(tf.InputError, match=r"mine.* top level of a module"):
-        objective(mine).evaluate(POINTS, executor=processes, pieces=2)
+        objective(mine).evaluate(POINTS, executor=processes, work_items=2)
 
 
 @pytest.mark.slow
-def test_dask_carries_functions_by_themselves(dask, here):
+def test_dask_pickles_local_functions(dask, here):
     assert np.array_equal(
         objective(lambda make=1.0, decay=1.0: lit(make, decay))
-        .evaluate(POINTS, executor=dask, pieces=2)
+        .evaluate(POINTS, executor=dask, work_items=2)
         .losses,
         here,
     )
 
 
 @pytest.mark.slow
-def test_a_killed_process_takes_the_pool_along_and_nothing_is_lost(here, tmp_path):
-    """A broken pool of the standard library takes nothing any more: what is left is grown here."""
+def test_a_killed_process_breaks_the_pool_and_no_work_is_lost(here, tmp_path):
+    """A broken pool of the standard library accepts no more work: this process runs the rest."""
     with (
         ProcessPoolExecutor(1, mp_context=SPAWN) as pool,
         pytest.warns(RuntimeWarning, match="BrokenProcessPool"),
     ):
-        found = deadly(tmp_path).evaluate(POINTS, executor=pool, pieces=3)
+        found = deadly(tmp_path).evaluate(POINTS, executor=pool, work_items=3)
     assert (tmp_path / "done").exists()
     assert np.array_equal(found.losses, here)
 
 
 @pytest.mark.slow
-def test_dask_grows_elsewhere_what_a_killed_worker_had(dask, here, tmp_path):
-    found = deadly(tmp_path).evaluate(POINTS, executor=dask, pieces=4)
+def test_dask_moves_the_work_of_a_killed_worker(dask, here, tmp_path):
+    found = deadly(tmp_path).evaluate(POINTS, executor=dask, work_items=4)
     assert (tmp_path / "done").exists()
     assert np.array_equal(found.losses, here)

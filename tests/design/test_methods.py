@@ -1,4 +1,4 @@
-"""Search methods: what all of them promise, of their points and of going on after a stop."""
+"""What all search methods promise of their points, and of a search that is resumed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAKE: dict[str, Callable] = {
 if find_spec("botorch"):
     MAKE["bayesian"] = lambda: Bayesian(batch=2, first=4)
 made = pytest.mark.parametrize("make", MAKE.values(), ids=MAKE)
-# a batch of Bayesian takes a second, so it sees only two of the spaces
+# a batch of Bayesian takes a second, so only two spaces test it
 CASES = [(m, s) for m in MAKE for s in SPACES if m != "bayesian" or s in ("line", "mixed")]
 everywhere = pytest.mark.parametrize(
     ("make", "space"), [(MAKE[m], SPACES[s]) for m, s in CASES], ids=[f"{m} {s}" for m, s in CASES]
@@ -64,14 +64,14 @@ def test_after_a_stop_the_next_batches_have_the_same_bits(make, space):
 
 
 @made
-def test_asked_again_it_answers_the_same(make):
+def test_ask_returns_the_same_batch_until_tell(make):
     given = begun(make(), SPACES["mixed"])
     follow(given, ellipsoid, 3)
     assert given.ask() is given.ask()
 
 
 @made
-def test_started_again_it_begins_anew(make):
+def test_start_resets_a_method(make):
     given = begun(make(), SPACES["mixed"], seed=2)
     first = follow(given, ellipsoid, 4)
     second = follow(begun(given, SPACES["mixed"], seed=2), ellipsoid, 4)
@@ -114,7 +114,7 @@ def test_global_random_numbers_are_neither_read_nor_changed(make):
 
 
 @everywhere
-def test_where_every_design_fails_it_goes_on_asking_as_much(make, space):
+def test_batches_keep_their_size_where_every_design_fails(make, space):
     history = follow(begun(make(), space), lambda points: np.full(len(points), 1.5), 30)
     sizes = [len(batch.points) for batch, _ in history]
     assert max(sizes[15:]) <= max(sizes[:15])
@@ -133,11 +133,11 @@ def test_a_loss_that_is_not_finite_is_refused_with_its_row(make, bad):
 
 
 @made
-def test_what_was_not_asked_is_refused(make):
+def test_a_batch_that_was_not_proposed_is_refused(make):
     given = begun(make(), SPACES["cube"])
     batch = given.ask()
     other = np.clip(batch.points + 0.01, 0, 1)
-    with pytest.raises(InputError, match=r"points\[0\].*as asked.*same settings"):
+    with pytest.raises(InputError, match=r"points\[0\].*as proposed.*same settings"):
         given.tell(Batch(other, size=batch.size, replicates=batch.replicates), ellipsoid(other))
     with pytest.raises(InputError, match=r"\(points, dimensions, size, replicates\)"):
         given.tell(
@@ -154,7 +154,7 @@ def test_what_was_not_asked_is_refused(make):
 
 
 @made
-def test_without_a_space_it_says_what_to_do(make):
+def test_ask_before_start_names_the_remedy(make):
     with pytest.raises(InputError, match="call start"):
         make().ask()
     for seed, replicates in ((-1, 1), (0.5, 1), (0, 0), (True, 1)):
@@ -191,7 +191,7 @@ def test_describe_gives_all_settings(given, said):
 
 
 @pytest.mark.parametrize("bad", ["annealing", 3, Sobol, None])
-def test_what_is_no_method_is_refused(bad):
+def test_other_objects_are_refused_as_methods(bad):
     with pytest.raises(InputError, match=r"method = .*'cmaes'"):
         method_of(bad)
 

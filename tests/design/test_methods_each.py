@@ -1,4 +1,4 @@
-"""What each search method finds, and what it spends."""
+"""What each search method finds, and at what cost."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_converged_cloud_is_followed_by_one_of_twice_the_population_up_to_sixt
     assert {len(batch.points) for batch, _ in lone} == {4}
 
 
-def test_a_cloud_in_which_all_fails_is_given_up_without_doubling():
+def test_a_cloud_in_which_all_fails_ends_without_doubling():
     given = begun(CMAES(population=8), SPACES["cube"])
     began = []
     for _ in range(60):
@@ -107,7 +107,7 @@ def test_a_cloud_in_which_all_fails_is_given_up_without_doubling():
     assert sum(began) >= 5
 
 
-def test_the_cloud_begins_about_the_best_of_the_first_points():
+def test_the_cloud_begins_at_the_best_of_the_first_points():
     given = begun(CMAES(population=400, sigma=0.01), SPACES["cube"])
     (first, loss), (second, _) = follow(given, ellipsoid, 2)
     assert np.abs(second.points.mean(0) - first.points[loss.argmin()]).max() < 5 * 0.01 / math.sqrt(
@@ -136,7 +136,7 @@ def test_a_race_grows_all_small_and_the_best_in_full():
         assert {row.tobytes() for row in after.points} <= {row.tobytes() for row in before.points}
 
 
-def test_the_inner_method_hears_only_of_full_colonies(monkeypatch):
+def test_the_inner_method_learns_only_from_full_colonies(monkeypatch):
     inner, heard = CMAES(population=6), []
     take = inner.take
     monkeypatch.setattr(
@@ -171,7 +171,7 @@ def race(given, seed: int, *, shift: float, target: float, budget: float) -> flo
     return budget
 
 
-def test_racing_spends_half_where_small_colonies_tell_something():
+def test_racing_costs_half_where_small_colonies_are_informative():
     plain = [
         race(CMAES(noisy=True), seed, shift=0.05, target=0.04, budget=400) for seed in range(6)
     ]
@@ -183,7 +183,7 @@ def test_racing_spends_half_where_small_colonies_tell_something():
 
 
 @pytest.mark.parametrize(("agree", "races"), [(0.1, False), (-1.0, True)])
-def test_small_colonies_that_mislead_are_given_up(agree, races):
+def test_races_stop_where_small_colonies_mislead(agree, races):
     """Small colonies say the opposite: Kendall's tau is -1, and 1 · 0.8ⁿ - (1 - 0.8ⁿ) falls below
     0.1 after three races."""
     given = begun(Racing(inner=Sobol(batch=6), agree=agree), SPACES["cube"])

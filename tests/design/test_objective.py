@@ -1,5 +1,4 @@
-"""The objective: every colony is scored as if it were alone, however designs are batched; what
-fails is data."""
+"""The objective: the loss of a colony does not depend on its batch, and failures are data."""
 
 from __future__ import annotations
 
@@ -20,6 +19,7 @@ from searching import (
     fragile,
     grown,
     lit,
+    objective_of,
     paced,
     short,
     spots,
@@ -27,19 +27,19 @@ from searching import (
 )
 
 import torchfilm as tf
-from design import Choice, Objective, Parameter, Stripe, Target, growth_cache, rollout
+from design import Choice, Parameter, Stripe, Target, Task, growth_cache, rollout, scoring
 from design.rollout import FinishedColonies
+from design.scoring import cut_work_items
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 PACED = [Parameter("rate", 1.2, 2.4), Parameter("make", 1, 2)]
-KINDS = {"on recorded growth": (lit, LIT), "each grown anew": (paced, PACED)}
+KINDS = {"on recorded growth": (lit, LIT), "each grown again": (paced, PACED)}
 
 
 def objective(kind="on recorded growth", target=None, **options):
     scene, parameters = KINDS[kind]
-    return Objective(
-        scene, parameters, target or Level(), **{"cells": 8, "replicates": 3, **options}
-    )
+    options = {"cells": 8, "replicates": 3, **options}
+    return objective_of(scene, parameters, target or Level(), **options)
 
 
 def alike(one, other):
@@ -51,7 +51,7 @@ def alike(one, other):
     assert one.reasons == other.reasons
 
 
-# --- every colony is scored by itself -------------------------------------------------------------
+# --- every colony is scored alone -----------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -65,10 +65,15 @@ def test_a_loss_is_that_of_the_colony_run_alone(kind, end):
     found = made.evaluate(points)
     for row, point in enumerate(points):
         for stream in (1, 0)[row:]:
-            loss, state = alone(made.make(**made.space.values(point)), made.target, stream, **end)
+            loss, state = alone(
+                made.task.family.function(**made.task.space.values(point)),
+                made.task.target,
+                stream,
+                **end,
+            )
             assert found.losses[row, stream] == loss and found.cells[row, stream] == state.cells
     assert not found.reasons and found.loss == pytest.approx(found.losses.mean(1))
-    assert bool(found.regrown) == (kind != "on recorded growth")
+    assert bool(found.why_regrown) == (kind != "on recorded growth")
 
 
 @pytest.mark.slow
@@ -79,7 +84,7 @@ def test_losses_do_not_depend_on_how_designs_are_batched(kind):
     alike(objective(kind, most=1, **options).evaluate(points), whole)
     alike(objective(kind, most=5, **options).evaluate(points), whole)
     with ThreadPoolExecutor(2) as pool:
-        alike(objective(kind, **options).evaluate(points, pieces=3, executor=pool), whole)
+        alike(objective(kind, **options).evaluate(points, work_items=3, executor=pool), whole)
     turned = objective(kind, **options).evaluate(points[order])
     assert np.array_equal(turned.losses, whole.losses[order]) and np.array_equal(
         turned.loss, whole.loss[order]
@@ -88,9 +93,9 @@ def test_losses_do_not_depend_on_how_designs_are_batched(kind):
 
 def test_recorded_growth_changes_no_bit():
     points = spots(4, 2)
-    kept, anew = objective().evaluate(points), objective(replay=False).evaluate(points)
-    alike(kept, anew)
-    assert (kept.regrown, anew.regrown) == ("", "replay=False")
+    kept, regrown = objective().evaluate(points), objective(replay=False).evaluate(points)
+    alike(kept, regrown)
+    assert (kept.why_regrown, regrown.why_regrown) == ("", "replay=False")
 
 
 @pytest.mark.parametrize(
@@ -103,43 +108,43 @@ def test_recorded_growth_changes_no_bit():
         (5, 1, 1, [1] * 5),
     ],
 )
-def test_pieces_are_even_and_as_many_as_asked(rows, least, most, sizes):
+def test_work_items_are_even_and_as_many_as_requested(rows, least, most, sizes):
     made = objective(most=most, replicates=3)
-    pieces = made._pieces([made.space.values(p) for p in spots(rows, 2)], 3, 1.0, least)
-    assert [len(p.rows) for p in pieces] == sizes and [r for p in pieces for r in p.rows] == list(
-        range(rows)
-    )
+    values = [made.task.space.values(p) for p in spots(rows, 2)]
+    items = cut_work_items(made.task, values, 3, 1.0, least)
+    assert [len(item.rows) for item in items] == sizes
+    assert [row for item in items for row in item.rows] == list(range(rows))
 
 
 @pytest.mark.slow
 def test_a_colony_is_measured_at_its_own_first_step_of_that_size():
-    """A design of half the pace beside it changes nothing, and each count is the first that is
-    enough."""
-    made = objective("each grown anew", Count(), replicates=2, cells=5)
+    """A design of half the pace in the same batch changes nothing, and each count is the first that
+    is large enough."""
+    made = objective("each grown again", Count(), replicates=2, cells=5)
     points = np.array([[0.0, 0.5], [1.0, 0.5]])
     found = made.evaluate(points)
     for row, point in enumerate(points):
         assert np.array_equal(made.evaluate(points[[row]]).losses[0], found.losses[row])
         for stream in range(2):
-            scene = made.make(**made.space.values(point))
+            scene = made.task.family.function(**made.task.space.values(point))
             *_, before, last = tf.simulate(scene, scene.seed(1, streams=[stream]), cells=5)
             assert before.cells < 5 <= last.cells == found.cells[row, stream]
 
 
 @pytest.mark.slow
-def test_the_quick_do_not_grow_on_while_a_slow_replicate_is_waited_for():
+def test_fast_replicates_stop_while_slow_ones_grow():
     parameter = [Parameter("make", 0.5, 1)]
-    kept, anew = (
-        Objective(uneven, parameter, Level(), cells=10, replicates=2, seed=2, replay=r)
+    kept, regrown = (
+        objective_of(uneven, parameter, Level(), cells=10, replicates=2, seed=2, replay=r)
         for r in (True, False)
     )
     growth_cache._kept.clear()
     found, points = kept.evaluate(np.array([[0.0], [0.5]])), np.array([[0.0], [0.5]])
-    alike(found, anew.evaluate(points))
-    (course,) = growth_cache._kept.values()
-    # one takes more than twice as long as the other, which without an end of its own would have 128
-    # cells by then
-    assert len(course.steps) == 24 and int(course.state.counts.max()) < 2 * 10
+    alike(found, regrown.evaluate(points))
+    (recording,) = growth_cache._kept.values()
+    # one replicate takes more than twice as long as the other, which would have 128 cells by then
+    # without an end of its own
+    assert len(recording.steps) == 24 and int(recording.state.counts.max()) < 2 * 10
     alike(kept.evaluate(points), found)
 
 
@@ -155,7 +160,7 @@ def test_replicates_share_random_numbers_and_streams_differ():
         other.losses[0, [0, 2]].tolist() == found.losses[0, [2, 0]].tolist()
         and other.losses[0, 1] not in found.losses
     )
-    loss, _ = alone(lit(**made.space.values(spots(1, 2)[0])), made.target, 40, cells=8)
+    loss, _ = alone(lit(**made.task.space.values(spots(1, 2)[0])), made.task.target, 40, cells=8)
     assert other.losses[0, 1] == loss
 
 
@@ -171,13 +176,13 @@ def test_a_share_of_the_size_is_fewer_cells_and_less_time():
     found = made.evaluate(spots(2, 2), size=0.25)
     assert found.size == 0.25 and (found.cells >= 4).all() and (found.cells < 8).all()
     assert np.array_equal(found.losses, objective(cells=4).evaluate(spots(2, 2)).losses)
-    assert made.end(0.01) == (2, None)
+    assert made.task.end(0.01) == (2, None)
     timed = objective(cells=None, until=1.2)
     assert np.array_equal(
         timed.evaluate(spots(2, 2), size=0.5).losses,
         objective(cells=None, until=0.6).evaluate(spots(2, 2)).losses,
     )
-    assert timed.end(0.001) == (None, DT)
+    assert timed.task.end(0.001) == (None, DT)
 
 
 @pytest.mark.slow
@@ -187,10 +192,10 @@ def test_whole_numbers_and_choices_build_scenes_of_their_own():
         Choice("promoter", ("weak", "strong")),
         Parameter("make", 1, 2),
     ]
-    made = Objective(built, parameters, Level("g0"), cells=3, replicates=2)
+    made = objective_of(built, parameters, Level("g0"), cells=3, replicates=2)
     points = np.array(
         [
-            made.space.point({"genes": g, "promoter": p, "make": m})
+            made.task.space.point({"genes": g, "promoter": p, "make": m})
             for g in (1, 3)
             for p in ("strong", "weak")
             for m in (1.0, 1.75)
@@ -198,10 +203,10 @@ def test_whole_numbers_and_choices_build_scenes_of_their_own():
     )
     found = made.evaluate(points)
     for row, point in enumerate(points):
-        values = made.space.values(point)
+        values = made.task.space.values(point)
         assert found.losses[row, 1] == alone(built(**values), Level("g0"), 1, cells=3)[0]
-    # rates without decay of growth are linear in what makes them; the first species does not know
-    # how many there are
+    # the levels are linear in their rates of production, and the first species is independent of
+    # the number of species
     strong, weak = found.losses[[0, 1, 4, 5]], found.losses[[2, 3, 6, 7]]
     assert strong == pytest.approx(3 * weak, rel=1e-3)
     assert found.losses[:4] == pytest.approx(found.losses[4:], rel=1e-3)
@@ -222,7 +227,7 @@ def test_replicates_become_one_loss(reduce, expected):
 
 
 def test_fixed_arguments_reach_the_scene():
-    made = Objective(
+    made = objective_of(
         lit, [Parameter("decay", 0.5, 2)], Level(), fixed={"make": 3.0}, cells=6, replicates=1
     )
     assert (
@@ -238,13 +243,13 @@ def test_ready_scenes_by_name_are_the_functions(dtype):
         {"cells": 2, "dt": 0.1, "replicates": 2, "dtype": dtype},
     )
     named, given = (
-        Objective(s, parameter, Level("red"), **options)
+        objective_of(s, parameter, Level("red"), **options)
         for s in ("toggle_switch", tf.scenes.toggle_switch)
     )
     assert np.array_equal(
         named.evaluate(np.array([[0.5]])).losses, given.evaluate(np.array([[0.5]])).losses
     )
-    assert named.recipe is not None and named.recipe[0] == "toggle_switch"
+    assert named.task.tried.recipe[0] == "toggle_switch"
 
 
 # --- what fails -----------------------------------------------------------------------------------
@@ -252,7 +257,7 @@ def test_ready_scenes_by_name_are_the_functions(dtype):
 
 @pytest.mark.parametrize("most", [None, 100, 1])
 def test_a_design_that_the_scene_refuses_fails_alone(most):
-    made = Objective(
+    made = objective_of(
         banned,
         [Parameter("low", 3.0, 4.0), Parameter("make", 1, 2)],
         Level(),
@@ -269,13 +274,13 @@ def test_a_design_that_the_scene_refuses_fails_alone(most):
         np.array_equal(found.losses[[1, 3]], made.evaluate(points[[1, 3]]).losses)
         and (found.losses[[1, 3]] != 1.5).all()
     )
-    assert made.final(points[0]) == []
+    assert made.colonies(points[0]) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("replay", [True, False])
 def test_rates_that_are_not_finite_fail_with_time_and_cell(replay):
-    made = Objective(
+    made = objective_of(
         fragile, [Parameter("make", 1, 10)], Level(), cells=8, replicates=2, replay=replay
     )
     points = np.array([[0.1], [0.9], [0.3]])
@@ -288,13 +293,13 @@ def test_rates_that_are_not_finite_fail_with_time_and_cell(replay):
         and (found.losses[[0, 2]] != 1.5).all()
     )
     assert (
-        len(made.final(points[1])) == 0
-        and sum(d.state.colonies for d in made.final(points[0])) == 2
+        len(made.colonies(points[1])) == 0
+        and sum(d.state.colonies for d in made.colonies(points[0])) == 2
     )
 
 
 def test_a_division_too_short_fails_with_time_and_cell():
-    made = Objective(short, [Parameter("added", 0.2, 3)], Spread(), cells=6, replicates=1)
+    made = objective_of(short, [Parameter("added", 0.2, 3)], Spread(), cells=6, replicates=1)
     found = made.evaluate(np.array([[0.0], [0.7]]))
     assert found.losses[0, 0] == 1.5 and found.cells[0, 0] == 0 and found.cells[1, 0] >= 6
     assert found.reasons == {(0, 0): found.reasons[0, 0]}
@@ -303,7 +308,7 @@ def test_a_division_too_short_fails_with_time_and_cell():
 
 @dataclasses.dataclass(frozen=True)
 class Patchy(Target):
-    """No number for the colony of stream 1."""
+    """The loss of the colony of stream 1 is NaN."""
 
     failed = 7.0
 
@@ -311,13 +316,13 @@ class Patchy(Target):
         return torch.where(state.stream == 1, torch.nan, 0.25)
 
 
-def test_a_loss_that_is_no_number_fails():
+def test_a_loss_that_is_nan_is_a_failure():
     found = objective(target=Patchy()).evaluate(spots(2, 2))
     assert found.losses.tolist() == [[0.25, 7.0, 0.25]] * 2 and found.loss.tolist() == [2.5, 2.5]
     assert found.reasons == {(row, 1): "the target's loss was nan" for row in range(2)}
 
 
-def test_a_loss_of_the_wrong_shape_is_no_failure_of_the_design():
+def test_a_loss_of_the_wrong_shape_is_an_error_of_the_target():
     @dataclasses.dataclass(frozen=True)
     class Single(Target):
         def loss(self, state, history=None):
@@ -327,12 +332,12 @@ def test_a_loss_of_the_wrong_shape_is_no_failure_of_the_design():
         objective(target=Single()).evaluate(spots(1, 2))
 
 
-def test_a_colony_that_does_not_grow_is_given_up_and_its_neighbours_are_not(monkeypatch):
+def test_a_colony_that_does_not_grow_fails_alone(monkeypatch):
     monkeypatch.setattr(rollout, "PATIENCE", 6.0)
-    made = Objective(paced, [Parameter("rate", 0.0, 1.0)], Level(), cells=8, replicates=2)
+    made = objective_of(paced, [Parameter("rate", 0.0, 1.0)], Level(), cells=8, replicates=2)
     found = made.evaluate(np.array([[0.0], [1.0]]))
     assert found.reasons == {
-        (0, k): "it has 1 of 8 cells at 6.2 h, and has had no more for 6 h" for k in range(2)
+        (0, k): "it has 1 of 8 cells at 6.2 h and gained none for 6 h" for k in range(2)
     }
     monkeypatch.undo()
     assert np.array_equal(found.losses[1], made.evaluate(np.array([[1.0]])).losses[0])
@@ -340,8 +345,8 @@ def test_a_colony_that_does_not_grow_is_given_up_and_its_neighbours_are_not(monk
 
 @pytest.mark.parametrize("rate", [0.02, 0.2])
 def test_patience_is_longer_than_slow_cells_need(rate):
-    """From 2 µm to division at 4 µm by the law of volume takes ln(4.67/2.67)/rate, 28 h at 0.02/h;
-    the counts of every step are asked."""
+    """The law of volume takes ln(4.67/2.67)/rate from 2 µm to division at 4 µm: 28 h at 0.02/h. The
+    counts are checked after every hour."""
     steps = np.arange(0, 90, 1.0)
     state = tf.Scene(tf.Growth(rate=rate)).seed(1)
     most, since = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.float64)
@@ -351,17 +356,17 @@ def test_patience_is_longer_than_slow_cells_need(rate):
 
 def test_a_colony_without_cells_fails():
     def dying(rate=1.0):
-        # daughters of the first cell are beyond
+        # the daughters of the first cell are outside the region
         edge = tf.Removal(low=(-0.5, -0.5), high=(0.5, 0.5))
         return tf.Scene(
             tf.Growth(rate=rate), tf.Division(length=4.0), tf.Mechanics(dim=2), edge, dt=DT
         )
 
-    found = Objective(dying, [Parameter("rate", 0.5, 1)], Spread(), cells=8, replicates=1).evaluate(
-        np.array([[1.0]])
-    )
+    found = objective_of(
+        dying, [Parameter("rate", 0.5, 1)], Spread(), cells=8, replicates=1
+    ).evaluate(np.array([[1.0]]))
     assert found.losses.tolist() == [[1.5]] and found.reasons[0, 0].startswith(
-        "no cell was left at "
+        "no cells remain at "
     )
 
 
@@ -370,8 +375,8 @@ def test_a_colony_without_cells_fails():
 
 @dataclasses.dataclass(frozen=True)
 class Diary(Target):
-    """Notes time and number of cells after every step, and reads them back: the loss is the
-    colony's own age."""
+    """Notes time and number of cells after every step, and reads them back: the loss is the age of
+    the colony."""
 
     def note(self, state):
         return torch.stack(
@@ -400,7 +405,7 @@ def test_notes_belong_to_their_colony_though_others_end_at_other_times(kind):
     found = made.evaluate(spots(3, 2))
     assert len(set(found.losses.ravel())) > 1 and not found.reasons
     for stream in range(2):
-        scene = made.make(**made.space.values(spots(3, 2)[1]))
+        scene = made.task.family.function(**made.task.space.values(spots(3, 2)[1]))
         *_, state = tf.simulate(scene, scene.seed(1, streams=[stream]), cells=6)
         assert found.losses[1, stream] == pytest.approx(state.time, abs=1e-9)
 
@@ -449,14 +454,14 @@ def ungrown(make=1.0):
         ({"scene": lit()}, "a function from parameters to a tf.Scene.*def scene"),
         ({"scene": "colony"}, "scene = 'colony'.*one of microcolony"),
         ({"scene": lambda make: 3}, "scene = 3.*a function that returns a tf.Scene"),
-        ({"scene": lambda make, other: lit()}, "cannot be built.*'other'"),
+        ({"scene": lambda make, other: lit()}, "'other'.*cannot be built"),
         (
             {"scene": paced, "parameters": [Parameter("rate", -1, 1)]},
-            r"cannot be built with \{'rate': -1.0\}.*at least 0.*narrow the bounds",
+            r"at least 0.*cannot be built with \{'rate': -1.0\}.*Narrow the bounds",
         ),
         (
             {"scene": plain, "parameters": [Parameter("rate", 0.5, 1)], "target": Spread()},
-            "one plain number or as a name can be searched with whole=True or",
+            "takes a plain number or a name there, use whole=True or a Choice",
         ),
         (
             {"scene": plain, "parameters": [Parameter("longest", 2.0, 4.0)], "target": Spread()},
@@ -468,7 +473,7 @@ def ungrown(make=1.0):
         ),
     ],
 )
-def test_bad_input_is_refused_in_words(given, words):
+def test_bad_input_is_refused(given, words):
     options = {
         "scene": lit,
         "parameters": [Parameter("make", 1, 2)],
@@ -477,7 +482,7 @@ def test_bad_input_is_refused_in_words(given, words):
         **given,
     }
     with pytest.raises(tf.InputError, match=words):
-        Objective(**options)
+        Task(**options)
 
 
 @pytest.mark.parametrize(
@@ -493,7 +498,7 @@ def test_bad_input_is_refused_in_words(given, words):
         ({"streams": []}, "streams = .*at least one"),
     ],
 )
-def test_bad_points_are_refused_in_words(given, words):
+def test_bad_points_are_refused(given, words):
     with pytest.raises(tf.InputError, match=words):
         objective().evaluate(**{"points": spots(1, 2), **given})
 
@@ -514,15 +519,15 @@ def test_a_batch_that_does_not_fit_is_halved(monkeypatch, error):
     points = spots(5, 2)
     whole = objective().evaluate(points)
     tried = []
-    score = Objective._score
+    score = scoring._grow_and_score
 
-    def small(self, piece, streams, size):
-        tried.append(len(piece.rows))
-        if len(piece.rows) > 2:
+    def small(task, item, streams, size):
+        tried.append(len(item.rows))
+        if len(item.rows) > 2:
             raise error
-        return score(self, piece, streams, size)
+        return score(task, item, streams, size)
 
-    monkeypatch.setattr(Objective, "_score", small)
+    monkeypatch.setattr(scoring, "_grow_and_score", small)
     alike(objective().evaluate(points), whole)
     assert tried == [5, 2, 3, 1, 2]
 
@@ -531,10 +536,10 @@ def test_a_batch_that_does_not_fit_is_halved(monkeypatch, error):
     "error", [RuntimeError("shapes differ"), ZeroDivisionError(), MemoryError()], ids=repr
 )
 def test_other_errors_and_one_design_that_does_not_fit_pass_through(monkeypatch, error):
-    def broken(self, piece, streams, size):
+    def broken(*_):
         raise error
 
-    monkeypatch.setattr(Objective, "_score", broken)
+    monkeypatch.setattr(scoring, "_grow_and_score", broken)
     with pytest.raises(type(error)) as caught:
         objective().evaluate(spots(1, 2))
     assert caught.value is error
@@ -542,12 +547,12 @@ def test_other_errors_and_one_design_that_does_not_fit_pass_through(monkeypatch,
 
 def test_colonies_at_their_ends_are_those_that_were_scored():
     made = objective()
-    done = made.final(spots(1, 2)[0])
+    done = made.colonies(spots(1, 2)[0])
     assert all(isinstance(d, FinishedColonies) for d in done)
     found = {
         int(s): float(x)
         for d in done
-        for s, x in zip(d.state.stream, made.target.loss(d.state), strict=True)
+        for s, x in zip(d.state.stream, made.task.target.loss(d.state), strict=True)
     }
     assert [found[k] for k in range(3)] == made.evaluate(spots(1, 2)).losses[0].tolist()
 
@@ -557,21 +562,21 @@ def resting(make=1.0):
     return grown(0.0, make)
 
 
-def test_where_the_end_is_a_time_it_comes_also_to_cells_that_rest(monkeypatch):
+def test_cells_that_do_not_grow_reach_an_end_in_time(monkeypatch):
     monkeypatch.setattr("design.rollout.PATIENCE", 1.0)
-    found = Objective(
+    found = objective_of(
         resting, [Parameter("make", 0.5, 2.0)], Level(), until=5.0, replicates=1
     ).evaluate(np.array([[0.5]]))
     assert not found.reasons and found.loss[0] < 1.5
 
 
-def test_a_colony_must_have_somewhere_to_grow():
+def test_the_end_must_exceed_the_founders():
     with pytest.raises(
         tf.InputError,
         match="cells = 2 is not allowed: it must be above the 2 that a colony starts from",
     ):
-        Objective("boundary_detector", [Parameter("k3", 0.1, 10)], Level("yfp"), cells=2)
-    small = Objective(
+        objective_of("boundary_detector", [Parameter("k3", 0.1, 10)], Level("yfp"), cells=2)
+    small = objective_of(
         "boundary_detector",
         [Parameter("k3", 0.1, 10)],
         Level("yfp"),
@@ -579,4 +584,4 @@ def test_a_colony_must_have_somewhere_to_grow():
         dt=0.05,
         replicates=1,
     )
-    assert small.end(0.01)[0] == 3 and not small.evaluate(np.array([[0.5]]), size=0.01).reasons
+    assert small.task.end(0.01)[0] == 3 and not small.evaluate(np.array([[0.5]]), size=0.01).reasons

@@ -1,5 +1,5 @@
-"""What a search shows: the table of its parameters and the picture of first guess, best design and
-target."""
+"""The report of a search: the table of its parameters, and the picture of the first guess, the best
+design and the target."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_table_has_every_parameter_with_bounds_first_guess_and_best():
         [
             float(x)
             for d in best.colonies()
-            for x in best.search.objective.target.measures(d.state)["mean_level"]
+            for x in best.search.objective.task.target.measures(d.state)["mean_level"]
         ]
     )
     assert found["mean_level"][-1] == f"{level:.4g}" and best.losses.mean() == pytest.approx(
@@ -82,16 +82,16 @@ def test_the_table_has_every_parameter_with_bounds_first_guess_and_best():
     )
 
 
-def test_the_table_says_why_colonies_were_grown_anew_and_how_many_failed():
+def test_the_table_says_why_growth_was_not_recorded_and_how_many_colonies_failed():
     best = searched(fragile, [Parameter("make", 1, 10)], Level(), 16, Sobol(batch=8), replay=False)
     failed = sum(len(e.reasons) for e in best.search.study.entries)
     assert failed and best.table().endswith(
-        f", {failed} failed; grown anew for each design: replay=False"
+        f", {failed} failed; grown again for each design: replay=False"
     )
 
 
 class Given:
-    """Asks for these points."""
+    """Proposes these points."""
 
     def __init__(self, *points):
         self.points = np.array(points)
@@ -120,7 +120,7 @@ class Half(Level):
         }
 
 
-def test_measures_that_are_not_defined_everywhere_are_means_of_those_that_are():
+def test_a_measure_is_the_mean_over_the_colonies_that_have_it():
     found = rows(searched(lit, LIT, Half()))
     assert found["some_um"] == ["some_um", "2.5", "2.5"] and found["none_um"] == [
         "none_um",
@@ -170,7 +170,7 @@ def test_a_picture_shows_the_colonies(tmp_path, kind):
 
 @pytest.mark.slow
 def test_what_failed_is_left_out_of_the_picture_and_the_table(tmp_path):
-    """The first guess fails in mid-run, or is refused by the scene; the best is drawn beside it."""
+    """The first guess fails during the run, or the scene refuses it. The best design is drawn."""
     broken = searched(
         fragile, [Parameter("make", 1, 10)], Level(), method=Given([0.9], [0.2]), cells=6
     )
@@ -222,7 +222,7 @@ def test_a_target_draws_on_each_colony_that_is_shown(tmp_path):
     assert drawn == [0, 1, 2, 0, 1, 2]
 
 
-def test_a_bad_picture_name_is_said(tmp_path):
+def test_a_bad_picture_name_is_refused(tmp_path):
     best = searched(lit, LIT, Spread())
     with pytest.raises((tf.InputError, ValueError), match="Format 'xyz' is not supported"):
         best.plot(tmp_path / "best.xyz")

@@ -1,8 +1,9 @@
-"""A search spends its budget as documented, finds what is hidden, and saves what it found."""
+"""A search keeps to its budget, finds hidden parameters, and saves what it found."""
 
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import io
 import json
 import sys
@@ -13,7 +14,7 @@ import torch
 from searching import Level, fragile, lit, mean
 
 import torchfilm as tf
-from design import CMAES, Batch, Parameter, Racing, Search, Sobol, Target
+from design import CMAES, Batch, Parameter, Racing, Search, Sobol, Target, Task
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -32,13 +33,13 @@ def search(method=None, scene=lit, parameters=LIT, target=None, **options):
 
 
 @pytest.mark.parametrize("colonies, batches", [(1, 1), (6, 1), (7, 2), (12, 2), (13, 3)])
-def test_each_replicate_of_each_design_counts_and_the_last_batch_may_go_over(colonies, batches):
+def test_each_replicate_counts_and_the_last_batch_may_exceed_the_budget(colonies, batches):
     made = search()
     made.run(colonies, progress=False)
     assert len(made.study.entries) == batches and made.study.colonies == 6 * batches
 
 
-def test_small_colonies_count_by_their_share():
+def test_small_colonies_count_as_their_share():
     made = search(Racing(inner=Sobol(batch=3), sizes=(0.5, 1.0), keep=0.5), cells=4)
     made.run(9, progress=False)
     small, full = made.study.entries
@@ -46,11 +47,11 @@ def test_small_colonies_count_by_their_share():
     assert (full.size, full.replicates, len(full.points), full.colonies) == (1.0, 2, 3, 6.0)
     assert made.study.colonies == 9.0 and made.study.full() == [full]
     assert small.losses.shape == (6, 1) and (small.cells < 4).all() and (full.cells >= 4).all()
-    # small colonies are brighter or darker by their size: only those in full can be compared
+    # the brightness depends on the size: only full colonies are comparable
     assert made.best().loss == full.loss.min() and made.first().loss == full.loss[0]
 
 
-def test_a_search_stops_as_soon_as_it_is_good_enough():
+def test_a_search_stops_at_the_requested_loss():
     whole = search()
     whole.run(30, progress=False)
     losses = [e.loss.min() for e in whole.study.entries]
@@ -63,7 +64,7 @@ def test_a_search_stops_as_soon_as_it_is_good_enough():
     assert len(made.study.entries) == 5
 
 
-def test_the_best_is_the_first_of_the_least_over_all_full_designs():
+def test_the_best_design_is_the_first_with_the_lowest_loss():
     made = search()
     best = made.run(18, progress=False)
     points = np.concatenate([e.points for e in made.study.entries])
@@ -74,7 +75,7 @@ def test_the_best_is_the_first_of_the_least_over_all_full_designs():
         and np.array_equal(best.losses, found.losses[row])
         and np.array_equal(best.point, points[row])
     )
-    assert best.values == made.objective.space.values(points[row])
+    assert best.values == made.objective.task.space.values(points[row])
     colonies, seconds, least = made.study.convergence()
     assert (
         colonies.tolist() == [6, 12, 18]
@@ -84,24 +85,24 @@ def test_the_best_is_the_first_of_the_least_over_all_full_designs():
     scored = {
         int(s): float(x)
         for d in best.colonies()
-        for s, x in zip(d.state.stream, made.objective.target.loss(d.state), strict=True)
+        for s, x in zip(d.state.stream, made.objective.task.target.loss(d.state), strict=True)
     }
     assert [scored[0], scored[1]] == best.losses.tolist()
 
 
 def test_there_is_no_best_before_a_full_design():
-    made = search(METHOD_SMALL())
-    for ask in (made.best, made.first, lambda: made.run(1, progress=False)):
+    made = search(SmallOnly())
+    for call in (made.best, made.first, lambda: made.run(1, progress=False)):
         with pytest.raises(
             tf.InputError,
             match="no design has been grown to full size yet: run the search for more colonies",
         ):
-            ask()
+            call()
     assert np.isnan(made.study.convergence()[2]).all()
 
 
-class METHOD_SMALL:
-    """Grows nothing to full size, and one replicate of two is not full either."""
+class SmallOnly:
+    """Grows no design to full size: one replicate of two is not full either."""
 
     def start(self, space, seed, replicates):
         self.turn = 0
@@ -117,7 +118,7 @@ class METHOD_SMALL:
 
 @dataclasses.dataclass
 class Listener:
-    """Asks for one point, and keeps what it is told."""
+    """Proposes one point, and keeps what it learns."""
 
     told: list = dataclasses.field(default_factory=list)
 
@@ -131,7 +132,7 @@ class Listener:
         self.told.append((batch.points.tolist(), loss.tolist()))
 
 
-def test_a_method_of_ones_own_is_asked_and_told():
+def test_a_users_own_method_proposes_and_learns():
     method = Listener()
     made = search(method, seed=3)
     made.run(4, progress=False)
@@ -140,7 +141,7 @@ def test_a_method_of_ones_own_is_asked_and_told():
         method.told == [(e.points.tolist(), e.loss.tolist()) for e in made.study.entries]
         and len(method.told) == 2
     )
-    assert made.study.entries[0].replicates == 2  # nine were asked, two are what there is
+    assert made.study.entries[0].replicates == 2  # the method requests nine; the task has two
 
 
 @pytest.mark.parametrize(
@@ -153,7 +154,7 @@ def test_a_method_of_ones_own_is_asked_and_told():
         ({"colonies": 6, "stop_at": "good"}, "stop_at = 'good'.*a number"),
     ],
 )
-def test_a_bad_run_is_refused_in_words(given, words):
+def test_bad_arguments_of_run_are_refused(given, words):
     with pytest.raises(tf.InputError, match=words):
         search().run(**given, progress=False)
 
@@ -162,10 +163,10 @@ def test_a_bad_run_is_refused_in_words(given, words):
     "method, words",
     [
         ("annealing", "method = 'annealing'.*'sobol'"),
-        (Sobol, "an object with start, ask and tell.*write CMAES"),
+        (Sobol, "an object with start, ask and tell.*make an object of it"),
     ],
 )
-def test_a_bad_method_is_refused_in_words(method, words):
+def test_a_bad_method_is_refused(method, words):
     with pytest.raises(tf.InputError, match=words):
         search(method)
 
@@ -177,7 +178,7 @@ def test_without_tqdm_a_search_runs_without_a_bar(monkeypatch):
         search().run(6)
 
 
-def test_the_bar_tells_the_best_loss_and_what_failed(monkeypatch):
+def test_the_bar_shows_the_best_loss_and_the_failures(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):
             return True
@@ -194,6 +195,12 @@ def test_the_bar_tells_the_best_loss_and_what_failed(monkeypatch):
     )
 
 
+def test_a_search_takes_the_arguments_of_a_task_and_a_method():
+    task, search = (inspect.signature(kind).parameters for kind in (Task, Search))
+    assert set(search) == {*task, "method"}
+    assert all(search[name] == parameter for name, parameter in task.items())
+
+
 # --- saved designs --------------------------------------------------------------------------------
 
 OWN = """
@@ -204,7 +211,8 @@ def filling(u, s, p, cell):
 
 def lamp(make=1.0, decay=1.0, shortest=3.0):
     circuit = tf.Circuit(filling, species=("gfp",), make=make, decay=decay)
-    return tf.Scene(tf.Growth(rate=2.0), tf.Division(length=tf.Uniform(shortest, 4.0)), tf.Mechanics(dim=2), circuit, dt=0.1)
+    division = tf.Division(length=tf.Uniform(shortest, 4.0))
+    return tf.Scene(tf.Growth(rate=2.0), division, tf.Mechanics(dim=2), circuit, dt=0.1)
 """
 
 
@@ -248,18 +256,18 @@ SAVED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SAVED)
 def test_a_saved_design_runs_as_it_was_scored(command, tmp_path, kind):
-    """`torchfilm run best.json` grows the very colonies: the last frame of one colony has the loss
-    of replicate 0, and of several each has its own in its first frame of that size."""
+    """`torchfilm run best.json` grows the same colonies. The last frame of one colony has the loss
+    of replicate 0. Of several, each has its loss in its first frame of that size."""
     made = search(Sobol(batch=2), **SAVED[kind](tmp_path))
     best = made.run(4, progress=False)
     best.save("best.json")
-    target, cells = made.objective.target, made.objective.cells
+    target, cells = made.objective.task.target, made.objective.task.cells
     command("run", "best.json", "--out", "one.h5", "--no-picture")
     with tf.Results("one.h5") as results:
         state = results.state(best.scene())
         assert (
-            results.attributes["seed"] == made.objective.seed
-            and results.attributes["dt"] == made.objective.dt
+            results.attributes["seed"] == made.objective.task.seed
+            and results.attributes["dt"] == made.objective.task.dt
         )
         assert state.cells >= cells if cells else state.time == pytest.approx(1.1)
     assert float(target.loss(state)[0]) == best.losses[0]
@@ -279,7 +287,7 @@ def doubled(strength=1.0):
     return tf.scenes.toggle_switch(strength=2 * strength, noise=False)
 
 
-def test_a_design_says_all_that_it_needs(tmp_path):
+def test_a_saved_design_is_complete(tmp_path):
     made = search(
         scene=doubled,
         parameters=[Parameter("strength", 1, 4)],
@@ -289,23 +297,23 @@ def test_a_design_says_all_that_it_needs(tmp_path):
         seed=2,
     )
     best = made.run(6, progress=False)
-    told = json.loads(best.save(tmp_path / "best.json").read_text())
-    assert told["scene"] == told["function"] == "doubled" and told["file"] == __file__
+    saved = json.loads(best.save(tmp_path / "best.json").read_text())
+    assert saved["scene"] == saved["function"] == "doubled" and saved["file"] == __file__
     assert (
-        told["parameters"] == best.values
-        and (told["seed"], told["dt"], told["dtype"], told["cells"]) == (2, 0.1, "float64", 3)
-        and "until" not in told
+        saved["parameters"] == best.values
+        and (saved["seed"], saved["dt"], saved["dtype"], saved["cells"]) == (2, 0.1, "float64", 3)
+        and "until" not in saved
     )
     assert (
-        told["loss"] == best.loss
-        and told["losses"] == best.losses.tolist()
-        and told["colonies"] == 6
+        saved["loss"] == best.loss
+        and saved["losses"] == best.losses.tolist()
+        and saved["colonies"] == 6
     )
-    assert told["target"] == made.objective.target.describe()
+    assert saved["target"] == made.objective.task.target.describe()
     assert made.study.about["scene"] == "doubled"
 
 
-def test_given_settings_come_before_the_saved(command, tmp_path):
+def test_given_settings_override_the_saved(command, tmp_path):
     best = search(**SAVED["file"](tmp_path)).run(6, progress=False)
     best.save("best.json")
     command(
@@ -340,7 +348,7 @@ def test_given_settings_come_before_the_saved(command, tmp_path):
 
 
 def two(feed=1.0, leak=1.0):
-    """Two species, of which the second tells of one rate alone."""
+    """Two species; the second depends on one rate only."""
     circuit = tf.Circuit(paired, species=("a", "b"), feed=feed, leak=leak)
     return tf.Scene(
         tf.Growth(rate=tf.Uniform(1.6, 2.4)),
@@ -371,8 +379,8 @@ class Levels(Target):
     "hidden", [{"feed": 2.0, "leak": 3.0}, {"feed": 0.4, "leak": 1.5}], ids=str
 )
 def test_hidden_parameters_are_found_again(hidden):
-    """A pattern was made by constants that the search does not know, with random numbers of its
-    own. What is found is as near as seeds differ."""
+    """A pattern has constants that the search does not know, and random numbers of its own. The
+    difference from them is that between seeds."""
     scene = two(**hidden)
     *_, state = tf.simulate(scene, scene.seed(8, seed=99), until=1.0)
     measured = {n: float(mean(state, n).mean()) for n in ("a", "b")}
@@ -388,11 +396,10 @@ def test_hidden_parameters_are_found_again(hidden):
         seed=1,
     )
     best = made.run(640, progress=False)
-    own = made.objective.evaluate(made.objective.space.point(hidden)[None])
-    # the levels of a colony differ by 2 % between seeds, and so does what they are compared with:
-    # the mean of 8 by 0.7 %, that of 2 by 1.5 %
+    own = made.objective.evaluate(made.objective.task.space.point(hidden)[None])
+    # the levels of a colony differ by 2 % between seeds, the mean of 8 by 0.7 %, that of 2 by 1.5 %
     assert own.loss[0] < 0.04 and best.loss < own.loss[0] + 0.01
-    # they are as good as proportional to the rates: b to leak, a to feed · leak^-0.6
+    # the levels are nearly proportional to the rates: b to leak, a to feed · leak^-0.6
     for name, value in hidden.items():
         assert best.values[name] == pytest.approx(value, rel=0.05), name
     assert made.first().loss > 5 * best.loss

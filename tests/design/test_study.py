@@ -1,5 +1,5 @@
-"""A study keeps every evaluation, in a file of plain data, from which a search goes on as if it had
-never stopped."""
+"""A study keeps every evaluation in a file of plain data. A search resumes from it with the same
+results as if it had never stopped."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ METHODS = {
 
 
 class Halving:
-    """A method of a user's own: three points about the best so far, ever nearer."""
+    """A user's own method: three points around the best so far, with a shrinking distance."""
 
     def start(self, space, seed, replicates):
         self.best, self.loss, self.width, self.size = (
@@ -119,7 +119,7 @@ def test_the_file_holds_numbers_and_text_only(tmp_path):
 
 @pytest.mark.parametrize("options", [("weak", "strong"), (1, "x"), (1, 2.5), (True, False)])
 def test_values_of_all_kinds_are_written(tmp_path, options):
-    """A user who opens the file finds the parameters themselves, over several batches."""
+    """The file holds the parameters themselves, over several batches."""
     chosen = Choice("kind", options)
     made = search(
         Sobol(batch=2), of_a_kind, [chosen, Parameter("rate", 1, 2)], Spread(), replicates=1
@@ -128,10 +128,10 @@ def test_values_of_all_kinds_are_written(tmp_path, options):
     points = np.concatenate([e.points for e in made.study.entries])
     with h5py.File(tmp_path / "s.h5") as file:
         found, rates = file["values/kind"][...].tolist(), file["values/rate"][...].tolist()
-    wanted = [chosen.value(u) for u in points[:, 0]]
-    assert len(found) == 6 and set(wanted) == set(options)
+    expected = [chosen.value(u) for u in points[:, 0]]
+    assert len(found) == 6 and set(expected) == set(options)
     text = any(isinstance(o, str) for o in options)
-    assert [v.decode() if text else v for v in found] == [str(v) if text else v for v in wanted]
+    assert [v.decode() if text else v for v in found] == [str(v) if text else v for v in expected]
     assert rates == (1 + points[:, 1]).tolist()
 
 
@@ -139,12 +139,12 @@ def of_a_kind(kind="weak", rate=1.0):
     return tf.Scene(tf.Growth(rate=rate), tf.Division(length=4.0), dt=0.1)
 
 
-# --- going on -------------------------------------------------------------------------------------
+# --- resuming -------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def whole():
-    """Searches that nothing interrupted, by method."""
+    """Searches without interruption, by method."""
     found = {name: search(make()) for name, make in METHODS.items()}
     for one in found.values():
         one.run(30, progress=False)
@@ -154,9 +154,7 @@ def whole():
 @pytest.mark.slow
 @pytest.mark.parametrize("stops", [(1,), (9,), (5, 13, 21)], ids=str)
 @pytest.mark.parametrize("method", METHODS)
-def test_stopped_and_gone_on_it_is_the_search_that_was_never_stopped(
-    tmp_path, whole, method, stops
-):
+def test_a_resumed_search_equals_one_without_interruption(tmp_path, whole, method, stops):
     path = tmp_path / "s.h5"
     for colonies in stops:
         try:
@@ -172,8 +170,7 @@ def test_stopped_and_gone_on_it_is_the_search_that_was_never_stopped(
 
 @pytest.mark.parametrize("when", ["before the file takes its place", "between batches"])
 def test_a_kill_costs_at_most_one_batch(tmp_path, monkeypatch, whole, when):
-    """The file as a kill leaves it: the batch in work is lost, a half-written file may lie
-    beside."""
+    """The file after a kill: the current batch is lost, and a half-written file may remain."""
     path, made = tmp_path / "s.h5", search()
     made.run(12, study=path, progress=False)
     (tmp_path / "s.h5.new").write_bytes(path.read_bytes()[:500])
@@ -190,22 +187,24 @@ def test_a_kill_costs_at_most_one_batch(tmp_path, monkeypatch, whole, when):
     assert not (tmp_path / "s.h5.new").exists()
 
 
-def test_what_a_study_holds_counts(tmp_path, monkeypatch):
+def test_colonies_of_a_study_count(tmp_path, monkeypatch):
     path = tmp_path / "s.h5"
     search().run(12, study=path, progress=False)
     monkeypatch.setattr(
-        "design.objective.Objective.evaluate", lambda *_, **__: pytest.fail("nothing is left to do")
+        "design.objective.Objective.evaluate", lambda *_, **__: pytest.fail("the budget is used up")
     )
     made = search()
     assert made.run(12, study=path, progress=False).loss == Study.read(path).best()[1]
     assert made.run(10**6, study=path, stop_at=1e9, progress=False).loss <= 1e9
     assert (
-        search("sobol", paced, [Parameter("rate", 1, 2)]).regrown.startswith("Growth.rate differs")
-        and made.regrown == ""
+        search("sobol", paced, [Parameter("rate", 1, 2)]).why_regrown.startswith(
+            "Growth.rate differs"
+        )
+        and made.why_regrown == ""
     )
 
 
-def test_a_full_disk_is_said_and_costs_nothing(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_loses_nothing(tmp_path, monkeypatch):
     path, made = tmp_path / "s.h5", search()
     made.run(6, study=path, progress=False)
 
@@ -213,13 +212,15 @@ def test_a_full_disk_is_said_and_costs_nothing(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.replace", full)
-    with pytest.raises(tf.SimulationError, match=r"could not write .*s.h5: .*No space left.*go on"):
+    with pytest.raises(
+        tf.SimulationError, match=r"could not write .*s.h5: .*No space left.*resume"
+    ):
         search().run(12, study=path, progress=False)
     monkeypatch.undo()
     assert len(Study.read(path).entries) == 1
 
 
-# --- what is refused ------------------------------------------------------------------------------
+# --- refused files --------------------------------------------------------------------------------
 
 
 def brighter(make=1.0, decay=1.0):
@@ -236,7 +237,7 @@ def faster(u, s, p, cell):
 
 
 def quicker(make=1.0, decay=1.0):
-    """Its listing is that of `lit`: what a function does is not listed."""
+    """Its listing is that of `lit`: a listing does not show the code of functions."""
     faster.__name__ = "filling"
     scene = lit(make, decay)
     circuit = tf.Circuit(faster, species=("gfp",), make=make, decay=decay)
@@ -248,8 +249,8 @@ def quicker(make=1.0, decay=1.0):
 moved.__name__ = quicker.__name__ = "lit"
 
 OTHERS = {
-    "founders": ({"scene": moved}, ["founders and functions: "]),
-    "what a function does": ({"scene": quicker}, ["founders and functions: "]),
+    "founders": ({"scene": moved}, ["Different: founders and functions."]),
+    "what a function does": ({"scene": quicker}, ["Different: founders and functions."]),
     "scene": ({"scene": brighter}, ["lit", "brighter", "rate=2.0", "rate=1.9"]),
     "target": ({"target": Level(wanted=2.0)}, ["wanted=1.0", "wanted=2.0"]),
     "bounds": (
@@ -262,11 +263,11 @@ OTHERS = {
     "cells": ({"cells": 4}, ["cells: 3 there, 4 here"]),
     "until": ({"until": 5.0}, ["until: None there, 5.0 here"]),
     "replicates": ({"replicates": 3}, ["replicates: 2 there, 3 here"]),
-    "reduce": ({"reduce": "worst"}, ["'mean' there, 'worst' here"]),
+    "reduce": ({"reduce": "worst"}, ["reduce: mean there, worst here"]),
     "step": ({"dt": 0.05}, ["dt: 0.1 there, 0.05 here"]),
     "names": (
         {"parameters": [LIT[0]], "fixed": {"decay": 1.0}},
-        ["'decay': '1.0'", "['make', 'decay'] there, ['make'] here"],
+        ["names: decay there, none here", "fixed: none there, decay=1.0 here"],
     ),
 }
 
@@ -279,17 +280,18 @@ def kept(tmp_path_factory):
 
 
 @pytest.mark.parametrize("other", OTHERS)
-def test_the_file_of_another_search_is_refused_with_both_values(kept, other):
+def test_the_file_of_another_search_is_refused_with_the_differences(kept, other):
     given, words = OTHERS[other]
     before = kept.read_bytes()
     with pytest.raises(tf.InputError, match="is the study of another search") as error:
         search(**given).run(12, study=kept, progress=False)
     assert all(w in str(error.value) for w in words), str(error.value)
+    assert len(str(error.value)) <= 300
     assert kept.read_bytes() == before
 
 
 def test_fixed_functions_are_the_same_in_another_process():
-    """What a value's text says of its place in memory is no part of what a study is of."""
+    """The address in the memory of a process is not part of the description."""
     one, other = (
         search(scene=chosen, parameters=[LIT[0]], fixed={"how": lambda x: x}).study.about
         for _ in range(2)
@@ -301,12 +303,14 @@ def chosen(make=1.0, how=None):
     return grown(2.0, how(make))
 
 
-def test_a_method_that_asks_otherwise_is_not_gone_on_with(kept, tmp_path):
+def test_a_method_that_proposes_other_points_is_refused(kept, tmp_path):
     path = tmp_path / "s.h5"
     shutil.copy(kept, path)
     with h5py.File(path, "r+") as file:
         file["designs/point"][1, 0] += 0.01
-    with pytest.raises(tf.InputError, match="its batch 0 is not what the method asks for"):
+    with pytest.raises(
+        tf.InputError, match="the method proposes other points than its batch 0 holds"
+    ):
         search().run(12, study=path, progress=False)
 
 
@@ -352,11 +356,11 @@ def test_foreign_files_are_refused(tmp_path, kept):
     for name, words in (
         ("a.h5", "cannot be read"),
         ("b.h5", r"is not a torchfilm study \(its format is 'torchfilm results'"),
-        ("c.h5", "format version 99, newer"),
-        ("", r"a study file\. That is a folder"),
+        ("c.h5", "format version 99; this torchfilm reads versions up to 1"),
+        ("", r"a study file\. This path is a folder"),
         ("no/such.h5", "in a folder that exists"),
     ):
         with pytest.raises(tf.InputError, match=words):
             search().run(12, study=tmp_path / name, progress=False)
-    with pytest.raises(tf.InputError, match=r"a study file\. No such file"):
+    with pytest.raises(tf.InputError, match=r"a study file\. There is no such file"):
         Study.read(tmp_path / "none.h5")

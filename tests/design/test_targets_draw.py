@@ -1,5 +1,5 @@
-"""What targets draw over a colony: where the lines are, and that what the axes show stays as it
-was."""
+"""What targets draw over a colony: the places of the lines. The limits of the axes do not
+change."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def state():
 
 
 def at(ax, axis: int) -> list[float]:
-    """Where the lines that cross an axis stand."""
+    """The places of the lines that cross an axis."""
     return sorted(float(line.get_data()[axis][0]) for line in ax.lines)
 
 
@@ -62,8 +62,8 @@ def at(ax, axis: int) -> list[float]:
         (Gradient("yfp", "x", 3, -3), 0, [-3, 3]),
     ],
 )
-def test_lines_stand_where_bands_are_wanted(ax, target, axis, places):
-    """Also beyond what is seen, which moves nothing."""
+def test_lines_are_at_the_edges_of_the_bands(ax, target, axis, places):
+    """Lines outside the axes do not change their limits."""
     target.draw(ax, state(), 1)
     assert at(ax, axis) == places
     assert (ax.get_xlim(), ax.get_ylim()) == WINDOW
@@ -89,7 +89,7 @@ def test_rings_are_circles(ax, target, centre, radii):
     [((1.0, 1.0), (1.0, 1.0)), ((0.5,),), ((0.0, 0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))],
 )
 def test_an_image_is_outlined_about_its_lit_part(ax, mask):
-    """Within the image and half a pixel of its rim; a picture with one grey only too."""
+    """Within the image and half a pixel of its rim; also for an image with one grey level."""
     Image("yfp", mask, (6.0, 4.0), centre="colony").draw(ax, state(), 1)
     points = np.concatenate([p.vertices for c in ax.collections for p in c.get_paths()])
     assert len(points) >= 4
@@ -110,8 +110,8 @@ def test_a_share_has_two_bars(ax):
     assert [p.get_height() for p in ax.child_axes[0].patches] == pytest.approx([0.25, 0.5])
 
 
-def test_swings_have_a_curve_if_there_is_a_history(ax):
-    """Of this colony; the wanted wave has its maximum where the curve has it."""
+def test_an_oscillation_has_a_curve_if_there_is_a_history(ax):
+    """The curve is that of this colony; the target wave has its maximum where the curve has it."""
     target, time = Oscillation("yfp", 2.0), torch.arange(40, dtype=torch.float64) * 0.1
     target.draw(ax, state(), 1)
     assert not ax.child_axes
@@ -119,14 +119,14 @@ def test_swings_have_a_curve_if_there_is_a_history(ax):
     history = torch.stack([time.unsqueeze(1).expand_as(mean), mean, mean**2], 2)
     history[30:, 1] = math.nan
     target.draw(ax, state(), 1, history)
-    wanted, curve = (line.get_ydata() for line in ax.child_axes[0].lines)
+    wave, curve = (line.get_ydata() for line in ax.child_axes[0].lines)
     assert len(curve) == 30 and np.array_equal(curve, mean[:30, 1].numpy())
-    assert np.allclose(wanted, curve, atol=1e-9) and int(np.argmax(curve)) in (4, 24)
+    assert np.allclose(wave, curve, atol=1e-9) and int(np.argmax(curve)) in (4, 24)
     target.draw(ax, state(), 1, torch.full((3, 2, 3), math.nan))
 
 
-def test_a_target_of_ones_own_needs_a_loss_only(ax):
-    """What it does not say otherwise: nothing to check, to note, to measure or to draw."""
+def test_a_users_own_target_needs_a_loss_only(ax):
+    """The defaults check, note, measure and draw nothing."""
 
     class Long(Target):
         def loss(self, state, history=None):

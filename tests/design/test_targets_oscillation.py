@@ -1,4 +1,4 @@
-"""Swings in time, on histories whose period, amplitude and spread are known."""
+"""Oscillations, on histories with known period, amplitude and spread."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def test_notes_are_time_mean_and_mean_square_by_volume():
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3, 4.0])
-def test_loss_is_the_share_of_variance_that_does_not_swing_so(spread):
-    """A pure wave of the period is fitted exactly, whatever its phase: left is the spread over the
-    cells, and that only with synchrony. A fit by least squares in float64: 1e-12."""
+def test_loss_is_the_share_of_variance_without_the_period(spread):
+    """A fit explains a pure wave of the period exactly, at any phase. The spread over the cells
+    remains, and counts only with synchrony. Least squares in float64: 1e-12."""
     time = np.arange(241) * 0.05
     history = notes(time, swing(time, 2.0), spread)
     variance = np.var(swing(time, 2.0)[time >= 12 - 6 - 1e-9])
@@ -57,7 +57,7 @@ def test_floor_is_the_amplitude_that_has_loss_one_half():
 
 
 def test_only_the_last_cycles_count():
-    """Before them anything may have been."""
+    """Earlier samples may hold anything."""
     time = np.arange(241) * 0.05
     mean = np.where(time < 12 - 4 - 1e-9, 100 * time, swing(time, 2.0))
     assert float(Oscillation("yfp", 2.0, cycles=2).loss(STATE, notes(time, mean))) == pytest.approx(
@@ -68,8 +68,8 @@ def test_only_the_last_cycles_count():
 
 @pytest.mark.parametrize("period, loss", [(1.0, 1.0), (2.0 / 3.0, 1.0), (1.9, 0.1), (3.0, 0.9)])
 def test_other_periods_do_not_count(period, loss):
-    """Waves with a whole number of periods in the window are orthogonal to the wanted one; three
-    periods hardly tell 5 %."""
+    """Waves with a whole number of periods in the window are orthogonal to that of the target;
+    three periods hardly resolve 5 %."""
     time = np.arange(120) * 0.05
     found = float(TARGET.loss(STATE, notes(time, swing(time, period))))
     assert (
@@ -91,7 +91,7 @@ def test_other_periods_do_not_count(period, loss):
         (np.arange(20) * 1.0, None),  # twice
     ],
 )
-def test_where_no_swing_can_be_seen_the_loss_is_1_with_a_gradient(time, mean):
+def test_without_an_oscillation_the_loss_is_1_with_a_gradient(time, mean):
     history = notes(time, swing(time, 2.0) if mean is None else mean).requires_grad_()
     loss = TARGET.loss(STATE, history)
     assert loss.tolist() == [1.0]
@@ -104,8 +104,9 @@ def test_a_whole_period_is_enough():
     assert float(TARGET.loss(STATE, notes(time, swing(time, 2.0)))) == pytest.approx(0, abs=1e-12)
 
 
-def test_cells_out_of_step_do_not_swing_together():
-    """100 cells with phases all round: the mean stands still, each swings. In step all do."""
+def test_cells_out_of_phase_have_no_synchrony():
+    """100 cells with evenly spread phases: the mean is steady while each cell oscillates. In phase
+    all oscillate together."""
     time, phase = np.arange(120) * 0.05, 2 * math.pi * np.arange(100) / 100
     level = 5 + np.cos(math.pi * time[:, None] + phase)
     apart = torch.tensor(np.stack([time, level.mean(1), (level**2).mean(1)], 1)).unsqueeze(1)
@@ -117,7 +118,7 @@ def test_cells_out_of_step_do_not_swing_together():
 
 
 def test_notes_of_a_run_are_a_history():
-    """Levels set by hand at each step: what is noted is what is scored."""
+    """Given levels at each step: the notes are what is scored."""
     state = placed([(0, 0), (2, 0)], yfp=0.0)
     kept = []
     for step in range(121):
@@ -137,8 +138,8 @@ def test_notes_of_a_run_are_a_history():
 
 @pytest.mark.parametrize("period", [0.6, 1.0, 1.7, 2.0, 2.9])
 def test_the_period_is_measured(period):
-    """Six hours of samples tell it, by the parabola through the greatest power, to a hundredth; the
-    amplitude to what a broken number of periods leaves."""
+    """Six hours of samples give the period to a hundredth, by the parabola through the greatest
+    power; the amplitude is less exact for a fraction of a period."""
     time = np.arange(121) * 0.05
     found = TARGET.measures(STATE, notes(time, swing(time, period, amplitude=0.5)))
     assert float(found["period_h"]) == pytest.approx(period, rel=0.01)
@@ -160,7 +161,7 @@ def test_one_period_is_enough_to_be_measured():
     assert float(found["period_h"]) == pytest.approx(3.0, rel=0.01)
 
 
-def test_what_stands_still_has_no_period():
+def test_a_steady_level_has_no_period():
     found = TARGET.measures(STATE, notes(np.arange(200) * 0.05, 5.0))
     assert (
         math.isnan(found["period_h"])
@@ -171,7 +172,7 @@ def test_what_stands_still_has_no_period():
     assert all(math.isnan(v) for v in short.values())
 
 
-def test_gradient_by_the_levels():
+def test_gradient_with_respect_to_the_levels():
     time = np.arange(50) * 0.05
     history = notes(time, swing(time, 1.8), 0.2)
     means = history[:, :, 1:].clone().requires_grad_()
@@ -185,7 +186,7 @@ def test_gradient_by_the_levels():
 
 
 def test_a_colony_scores_the_same_in_any_batch():
-    """To the last bit; also where others were not noted for some time, or failed."""
+    """To the last bit, also where other colonies have missing notes or failed."""
     rng = np.random.default_rng(0)
     time = np.arange(200) * 0.05
     each = [
@@ -206,7 +207,7 @@ def test_a_colony_scores_the_same_in_any_batch():
         )
 
 
-def test_a_colony_that_failed_scores_so():
+def test_a_failed_colony_scores_as_failed():
     time = np.arange(120) * 0.05
     state = placed([(0, 0)], yfp=1.0, colonies=2)
     history = notes(time, swing(time, 2.0)).repeat(1, 2, 1)
@@ -234,12 +235,12 @@ def test_without_history_there_is_no_score(history):
         ({"period": 1.0, "species": ""}, "Oscillation.species"),
     ],
 )
-def test_what_is_not_allowed_is_refused_when_made(options, what):
+def test_bad_settings_are_refused(options, what):
     with pytest.raises(tf.InputError, match=what):
         Oscillation(**{"species": "yfp", **options})
 
 
-def test_unknown_species_are_told_with_what_there_is():
+def test_an_unknown_species_is_refused_with_the_known_ones():
     with pytest.raises(tf.InputError, match=r"Did you mean 'yfp'\?"):
         Oscillation("yfb", 1.0).check(STATE)
     TARGET.check(STATE)

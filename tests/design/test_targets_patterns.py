@@ -1,4 +1,4 @@
-"""Domains and shares of cells, on colonies whose domains and shares are known."""
+"""Domains and shares of cells, on colonies with known domains and shares."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_domains_of_a_striped_lattice(width):
 
 
 def test_checkers_are_as_small_as_domains_can_be():
-    """Every pair is unlike: the domain is as wide as neighbours are apart."""
+    """Every pair is unlike: a domain is as wide as the distance of neighbours."""
     found = DOMAINS.measures(lattice(np.indices((9, 9)).sum(0) % 2))
     assert float(found["domain_size_um"]) == pytest.approx(1.2, rel=1e-12)
 
@@ -54,20 +54,20 @@ def test_size_is_the_mean_run_of_a_straight_line(dim, length):
     place = rng.uniform(0, side, (24000, dim))
     kind = np.floor(place[:, 0] / layer + 0.5).astype(int) % 2
     found = DOMAINS.measures(placed(place, a=kind, b=1 - kind))
-    # borders at 2, 6, … µm: as many as the side is long in layers
+    # borders at 2, 6, … µm: one for each layer in the side
     assert float(found["domain_size_um"]) == pytest.approx(length * layer, rel=0.08)
 
 
-def test_loss_goes_by_the_ratio_of_sizes():
-    """0 at the wanted size, 1 − 1/e a factor e either way."""
+def test_loss_depends_on_the_ratio_of_sizes():
+    """0 at the target size, 1 − 1/e at a factor e above or below."""
     state = lattice(np.broadcast_to(np.arange(20) // 4 % 2, (20, 20)))
     size = float(DOMAINS.measures(state)["domain_size_um"])
-    for wanted, loss in (
+    for target_size, loss in (
         (size, 0.0),
         (size * math.e, 1 - 1 / math.e),
         (size / math.e, 1 - 1 / math.e),
     ):
-        found = DomainSize(("a", "b"), wanted).loss(state)
+        found = DomainSize(("a", "b"), target_size).loss(state)
         assert float(found) == pytest.approx(loss, abs=1e-14) and found.dtype == torch.float64
 
 
@@ -85,7 +85,7 @@ def test_one_domain_has_loss_1_and_a_gradient(a, b):
 
 
 def test_cells_with_neither_species_are_half_like_any():
-    """z = 0: a pair of them is unlike by half; the gradient is finite there."""
+    """z = 0: a pair of them is unlike by half, and the gradient is finite."""
     state = placed([(0, 0), (1, 0)], a=0.0, b=0.0)
     given = state.a.clone().requires_grad_()
     loss = DomainSize(("a", "b"), 2.0).loss(state.with_fields(a=given))
@@ -114,7 +114,7 @@ TARGETS = {"domains": DomainSize(("yfp", "cfp"), 3.0), "share": OnFraction("yfp"
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_gradient_by_the_levels(name):
+def test_gradient_with_respect_to_the_levels(name):
     assert graded(TARGETS[name], crowded(colonies=2, count=12, size=4.0))
 
 
@@ -132,7 +132,7 @@ def test_a_colony_scores_the_same_in_any_batch(name):
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_colonies_that_failed_score_so_and_harm_no_other(name):
+def test_failed_colonies_do_not_affect_others(name):
     target, state = TARGETS[name], crowded(colonies=4, size=4.0)
     good = target.loss(state)
     state = state.remove(state.colony == 1, "removed")
@@ -198,13 +198,13 @@ def test_share_measured_is_that_of_the_volume_above_the_level():
         (lambda: OnFraction(None, 0.5, 1.0), "OnFraction.species"),
     ],
 )
-def test_what_is_not_allowed_is_refused_when_made(make, what):
+def test_bad_settings_are_refused(make, what):
     with pytest.raises(tf.InputError, match=what):
         make()
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_unknown_species_are_told_with_what_there_is(name):
+def test_an_unknown_species_is_refused_with_the_known_ones(name):
     with pytest.raises(tf.InputError, match=r"'yfp'.*Did you mean 'yfq'\?"):
         TARGETS[name].check(crowded(names=("yfq", "cfp")))
     TARGETS[name].check(crowded())

@@ -1,5 +1,4 @@
-"""Targets that say how bright each cell should be: their loss, worked out by hand, and the profiles
-that they want."""
+"""Targets with a profile: losses computed by hand, and the profiles."""
 
 from __future__ import annotations
 
@@ -14,10 +13,10 @@ import torchfilm as tf
 from design.targets import Bands, Gradient, Image, Ring, Stripe
 from design.targets.profiles import LEAST, between
 
-# wanted at x < 0, dark at x > 0
+# lit at x < 0, dark at x > 0
 LEFT = Bands(("yfp",), (-math.inf, 0.0), edge_width=SHARP)
 PICTURE = ((0.0, 0.25, 0.5), (1.0, 0.75, 0.0))
-MASKS = {
+PROFILES = {
     "stripe": Stripe("yfp", width=4.0, cell_type=1),
     "stripe anywhere": Stripe("yfp", at=1.0, width=4.0, along="y", floor=0.3),
     "bands": Bands(("yfp", "cfp"), (-6.0, 0.0, 5.0)),
@@ -32,7 +31,7 @@ MASKS = {
     "levels, loss",
     [
         ((1, 1, 0, 0), 0.0),
-        ((1, 1, 1, 1), 0.5),  # evenly lit: the share that is wanted dark
+        ((1, 1, 1, 1), 0.5),  # evenly lit: the share that should be dark
         ((1, 0, 0, 0), 0.5),  # (1)² / (2 · 1)
         ((2, 1, 0, 0), 0.1),  # 9/(2 · 5)
         ((0, 0, 1, 1), 1.0),
@@ -40,7 +39,7 @@ MASKS = {
         ((3, 1, 0, 2), 1 - 16 / 28),
     ],
 )
-def test_loss_is_that_worked_out_by_hand(levels, loss):
+def test_loss_equals_the_hand_calculation(levels, loss):
     """A few operations in float64: 1e-15."""
     state = row([-4, -2, 2, 4], yfp=levels)
     assert LEFT.loss(state).tolist() == pytest.approx([loss], abs=1e-15)
@@ -48,7 +47,7 @@ def test_loss_is_that_worked_out_by_hand(levels, loss):
 
 
 @pytest.mark.parametrize("level", [0.01, 1.0, 3.0])
-def test_floor_takes_off_its_share(level):
+def test_floor_adds_its_share_of_the_loss(level):
     """y = c·m: L = floor²/(c² + floor²)."""
     target = Bands(("yfp",), (-math.inf, 0.0), edge_width=SHARP, floor=0.5)
     found = target.loss(row([-4, -2, 2, 4], yfp=[level, level, 0, 0]))
@@ -56,34 +55,34 @@ def test_floor_takes_off_its_share(level):
 
 
 def test_cells_count_by_their_volume():
-    """Evenly lit, the loss is the share of the volume that is wanted dark; a ball and a rod of 4
-    µm: π/6 and π/6 + π µm³."""
+    """Evenly lit, the loss is the share of the volume that should be dark; a ball and a rod of 4 µm
+    have π/6 and π/6 + π µm³."""
     state = placed([[-4.0, 0.0], [4.0, 0.0]], length=[0.0, 4.0], yfp=1.0)
     assert float(LEFT.loss(state)) == pytest.approx((1 / 6 + 1) / (1 / 6 + 1 / 6 + 1), rel=1e-14)
 
 
-@pytest.mark.parametrize("name", MASKS)
-def test_perfect_where_levels_are_as_wanted(name):
+@pytest.mark.parametrize("name", PROFILES)
+def test_perfect_where_levels_follow_the_profile(name):
     """y = c·m for each species by its own c has no loss but the floor's. LEAST may take m ≤ 1e-3
     off up to 47 of 51 cells, 1e-6 each of Σ m²."""
-    target, state = MASKS[name], crowded()
-    wanted = target.target_profile(state)
-    assert wanted.shape == (state.cells, len(target.names)) and bool(
-        ((wanted >= 0) & (wanted <= 1)).all()
+    target, state = PROFILES[name], crowded()
+    profile = target.target_profile(state)
+    assert profile.shape == (state.cells, len(target.names)) and bool(
+        ((profile >= 0) & (profile <= 1)).all()
     )
     scale = {n: 0.7 * 3**k for k, n in enumerate(target.names)}
     found = target.loss(
-        state.with_fields(**{n: scale[n] * wanted[:, k] for k, n in enumerate(target.names)})
+        state.with_fields(**{n: scale[n] * profile[:, k] for k, n in enumerate(target.names)})
     )
     left = np.mean([target.floor**2 / (target.floor**2 + c**2) for c in scale.values()])
     assert found.tolist() == pytest.approx([left] * 4, abs=1e-4)
 
 
-@pytest.mark.parametrize("name", MASKS)
+@pytest.mark.parametrize("name", PROFILES)
 def test_loss_is_a_share_and_free_of_scale(name):
     """In [0, 1] for 400 random colonies; not changed by a power of two of the levels, if the floor
     goes with them."""
-    target, state = MASKS[name], crowded(seed=5, colonies=40, count=3)
+    target, state = PROFILES[name], crowded(seed=5, colonies=40, count=3)
     noise = torch.rand(state.cells, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     some = {n: (10 * noise) ** (k + 1) for k, n in enumerate(target.names)}
     found = target.loss(state.with_fields(**some))
@@ -94,16 +93,16 @@ def test_loss_is_a_share_and_free_of_scale(name):
         )
 
 
-@pytest.mark.parametrize("name", MASKS)
-def test_gradient_by_the_levels(name):
-    assert graded(MASKS[name], crowded(colonies=2, count=12))
+@pytest.mark.parametrize("name", PROFILES)
+def test_gradient_with_respect_to_the_levels(name):
+    assert graded(PROFILES[name], crowded(colonies=2, count=12))
 
 
-@pytest.mark.parametrize("name", MASKS)
+@pytest.mark.parametrize("name", PROFILES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 def test_a_colony_scores_the_same_in_any_batch(name, dtype):
     """To the last bit, and its measures too."""
-    target, state = MASKS[name], crowded(seed=2, colonies=7, dtype=dtype)
+    target, state = PROFILES[name], crowded(seed=2, colonies=7, dtype=dtype)
     whole, measured = target.loss(state), target.measures(state)
     for k in (0, 3, 6):
         alone = state.select([k])
@@ -114,10 +113,10 @@ def test_a_colony_scores_the_same_in_any_batch(name, dtype):
             ), what
 
 
-@pytest.mark.parametrize("name", MASKS)
-def test_without_light_or_wish_the_loss_is_1_with_a_gradient(name):
-    """All dark; or, far away from all that is wanted, no cell wanted lit."""
-    target, state = MASKS[name], crowded(colonies=2)
+@pytest.mark.parametrize("name", PROFILES)
+def test_without_light_or_pattern_the_loss_is_1_with_a_gradient(name):
+    """All cells are dark, or the colony lies far from the pattern."""
+    target, state = PROFILES[name], crowded(colonies=2)
     dark = state.with_fields(
         **{
             n: torch.zeros(state.cells, dtype=torch.float64, requires_grad=True)
@@ -133,18 +132,18 @@ def test_without_light_or_wish_the_loss_is_1_with_a_gradient(name):
         assert target.loss(far).tolist() == [1.0, 1.0]
 
 
-def test_a_cell_that_is_hardly_wanted_is_wanted_dark():
-    """40 µm from a band with soft edges nothing is wanted, though a logistic is never 0."""
+def test_a_very_low_target_level_counts_as_dark():
+    """40 µm from a band with soft edges the target level is 0, though a logistic is never 0."""
     target = Bands(("yfp",), (0.0, 10.0))
     assert 0 < float(target.target_profile(row([20.0], yfp=[1.0]))[0, 0]) < LEAST
     assert target.loss(row([20.0], yfp=[1.0])).tolist() == [1.0]
 
 
-@pytest.mark.parametrize("name", MASKS)
-def test_colonies_that_failed_score_so_and_harm_no_other(name):
-    """Without cells, or with a level that is not a number; the gradient stays finite, and that of
-    the others is what it is without them."""
-    target, state = MASKS[name], crowded(colonies=4)
+@pytest.mark.parametrize("name", PROFILES)
+def test_failed_colonies_do_not_affect_others(name):
+    """Without cells, or with a level that is NaN. The gradient is finite, and that of the other
+    colonies is the same as without them."""
+    target, state = PROFILES[name], crowded(colonies=4)
     good = target.loss(state)
     state = state.remove(state.colony == 1, "removed")
     levels = {n: state.fields[n].clone() for n in target.names}
@@ -166,7 +165,7 @@ def test_levels_below_zero_count_as_none():
 
 
 def test_edges_are_logistic_and_bands_add_up():
-    """σ at the edge, one and two `soft` beyond; bands side by side are one wide band."""
+    """σ at the edge, one and two edge widths beyond; adjacent bands add up to one wide band."""
     x = torch.tensor([-2.0, 0.0, 1.0, 4.0], dtype=torch.float64)
     assert between(x, 0.0, math.inf, 2.0).tolist() == pytest.approx(
         [1 / (1 + math.exp(-v / 2)) for v in x.tolist()], rel=1e-14
@@ -185,8 +184,8 @@ def test_edges_are_logistic_and_bands_add_up():
     "along, place", [("x", (3.0, 9.0)), ("y", (9.0, 3.0)), ("radius", (0.0, 3.0))]
 )
 def test_bands_lie_along_their_axis(along, place):
-    """3 µm is in the second of three bands, 9 in none; at the very centre the first is wanted, for
-    there is nothing on its other side."""
+    """3 µm is in the second of three bands, 9 in none. The centre itself is in the first, because a
+    radius is never negative."""
     target = Bands(("a", "b", "c"), (0.0, 2.0, 4.0, 6.0), along=along, edge_width=SHARP)
     state = placed([place, (9.0, 9.0), (0.0, 0.0)], a=1.0, b=1.0, c=1.0)
     wanted = target.target_profile(state).tolist()
@@ -313,10 +312,10 @@ def test_a_signal_is_seen_where_the_cells_are():
         Bands(("ahl",), (0.0, 1.0)).check(state)
 
 
-@pytest.mark.parametrize("name", MASKS)
-def test_unknown_species_are_told_with_what_there_is(name):
+@pytest.mark.parametrize("name", PROFILES)
+def test_an_unknown_species_is_refused_with_the_known_ones(name):
     state = crowded(names=("yfq", "cfp"))
-    for look in (MASKS[name].check, MASKS[name].loss):
+    for look in (PROFILES[name].check, PROFILES[name].loss):
         with pytest.raises(
             tf.InputError, match=r"'yfp' is not allowed.*'yfq'.*Did you mean 'yfq'\?"
         ):
@@ -338,7 +337,7 @@ def test_unknown_species_are_told_with_what_there_is(name):
         (lambda: Bands(("a",), (0, 1), along="z"), "Bands.along"),
         (lambda: Bands(("a",), (0, 1), centre="middle"), "Bands.centre"),
         (lambda: Bands(("a",), (0, 1), centre=(0, 1, 2)), "Bands.centre"),
-        (lambda: Bands(("a",), (0, 1), edge_width=0.0), "Bands.soft"),
+        (lambda: Bands(("a",), (0, 1), edge_width=0.0), "Bands.edge_width"),
         (lambda: Bands(("a",), (0, 1), floor=-1.0), "Bands.floor"),
         (lambda: Ring(("a",), 1.0, 1.0), "Ring.species"),
         (lambda: Ring("a", 0.0, 1.0), "Ring.radius"),
@@ -355,16 +354,17 @@ def test_unknown_species_are_told_with_what_there_is(name):
         (lambda: Image("a", [[1.0]], (1, 0)), r"Image.size\[1\]"),
     ],
 )
-def test_what_is_not_allowed_is_refused_when_made(make, what):
+def test_bad_settings_are_refused(make, what):
     with pytest.raises(tf.InputError, match=what):
         make()
 
 
 def test_targets_are_values():
-    """Equal if made equal, hashable, frozen, and each has its line."""
+    """Targets with equal settings are equal and hashable; they are frozen and have a
+    description."""
     assert Image("a", np.array(PICTURE), [12, 8]) == Image("a", PICTURE, (12.0, 8.0))
-    assert len({*MASKS.values(), *MASKS.values()}) == len(MASKS)
-    assert all("yfp" in t.describe() and "\n" not in t.describe() for t in MASKS.values())
+    assert len({*PROFILES.values(), *PROFILES.values()}) == len(PROFILES)
+    assert all("yfp" in t.describe() and "\n" not in t.describe() for t in PROFILES.values())
     with pytest.raises(AttributeError):
         LEFT.floor = 1.0
 
@@ -377,7 +377,7 @@ def test_targets_are_values():
     ],
 )
 def test_the_soft_tail_of_an_edge_that_is_not_reached_is_no_pattern(target, places):
-    """Lit in proportion to the tail, the colony has nothing of what is wanted."""
+    """A colony that is lit in proportion to the tail does not have the pattern."""
     state = placed(places, yfp=1.0)
     wanted = target.target_profile(state)[:, 0]
     assert 0 < float(wanted.max()) < 0.25

@@ -1,5 +1,5 @@
-"""The stripe at the border of two populations: where the border is, what is wanted, and what is
-measured, on colonies laid out by hand."""
+"""The stripe at the border of two populations: the border, the profile and the measures, on
+colonies with given cells."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def field(
     [
         ([-2, -1, 1, 2], [0, 0, 1, 1], 0.0),
         ([-2, -1, 1, 2], [1, 1, 0, 0], 0.0),  # the other way round
-        # a stray at 2: before it or after it, one is wrong; the first such place
+        # a stray cell at 2: before or after it one cell is wrong; the first such place counts
         ([-3, -1, 1, 2, 3, 9], [0, 0, 1, 0, 1, 1], 0.0),
         ([9, 3, 7, -1, 1, 2, -3], [1, 0, 1, 0, 1, 0, 0], 5.0),  # in any order of rows; a stray at 1
         ([0, 4], [3, 7], 2.0),  # any two numbers
@@ -75,7 +75,7 @@ def test_border_against_every_place_tried():
         assert wrong[-1] == min(wrong)
 
 
-def test_border_is_where_it_is_in_the_mirror():
+def test_border_is_the_same_in_the_mirror():
     state = field(shift=3.0)
     mirrored = state.replace(position=-state.position)
     assert border(mirrored)[0].tolist() == [-3.0] and border(state)[0].tolist() == [3.0]
@@ -83,7 +83,7 @@ def test_border_is_where_it_is_in_the_mirror():
 
 
 def test_there_is_no_border_without_two_types():
-    """One type, or no cell: NaN; and a colony that has lost a type along the way has loss 1."""
+    """One type or no cell: NaN. A colony that has lost a type has loss 1."""
     state = placed(
         [(-1, 0), (1, 0), (0, 0), (2, 0)],
         cell_type=[0, 1, 1, 1],
@@ -102,8 +102,8 @@ def test_there_is_no_border_without_two_types():
 @pytest.mark.parametrize("turned", [False, True], ids=["x", "y"])
 @pytest.mark.parametrize("low", [0, 1])
 def test_a_stripe_of_one_type_adjoins_the_border_on_its_side(turned, low):
-    """The cells of the far type are wanted lit within 6 µm, those of the near one on the other
-    side; cells of the other type are left out."""
+    """The cells of the far type should be lit within 6 µm, those of the near type on the other
+    side; cells of the other type do not count."""
     state = field(shift=5.0, turned=turned, low=low)
     along = "y" if turned else "x"
     x = state.position[:, int(turned)] - 5.0
@@ -176,7 +176,7 @@ def test_a_slanted_stripe_is_straight(slope):
     state = field(columns=range(-40, 40))
     x, y = state.position.unbind(1)
     state = state.with_fields(yfp=((x - 20 - slope * y).abs() < 2).double() + 0.01)
-    # columns 1 µm apart: the middle of a slanted stripe is right to half of that
+    # columns 1 µm apart: the middle of a slanted stripe is exact to half of that
     assert (
         float(
             Stripe("yfp", straight=True, width=4.0, cell_type=1).measures(state)["straightness_um"]
@@ -186,8 +186,8 @@ def test_a_slanted_stripe_is_straight(slope):
 
 
 def test_width_is_that_of_the_run_about_the_peak():
-    """Other stripes beside it, less bright than half, or brighter than half but apart, are not
-    counted."""
+    """Other stripes beside it do not count, whether less bright than half, or brighter but
+    apart."""
     x = np.repeat(np.arange(0.5, 30.5), 4)
     y = np.tile(np.arange(4.0), 30)
     level = np.select([(x > 4) & (x < 10), (x > 16) & (x < 20)], [4.0, 3.0], 0.5)
@@ -257,11 +257,11 @@ def test_a_first_state_with_what_is_needed_passes():
         ({"width": 1.0, "along": "radius"}, "Stripe.along"),
         ({"width": 1.0, "cell_type": 1.0}, "Stripe.cell_type"),
         ({"width": 1.0, "cell_type": -1}, "Stripe.cell_type"),
-        ({"width": 1.0, "soft": 0}, "Stripe.soft"),
+        ({"width": 1.0, "edge_width": 0}, "Stripe.edge_width"),
         ({"width": 1.0, "floor": -1}, "Stripe.floor"),
     ],
 )
-def test_what_is_not_allowed_is_refused_when_made(options, what):
+def test_bad_settings_are_refused(options, what):
     with pytest.raises(tf.InputError, match=what):
         Stripe("yfp", **options)
 
@@ -287,7 +287,7 @@ def winding():
 
 @pytest.mark.parametrize("kind", [0, 1])
 def test_a_stripe_follows_a_border_that_winds(kind):
-    """Wanted are the cells whose nearest cell of the other type is nearer than the width and a
+    """A cell should be lit if its nearest cell of the other type is nearer than the width and a
     diameter, centre to centre."""
     state, places, kinds = winding()
     apart = (places.unsqueeze(1) - places).double().square().sum(2).sqrt()

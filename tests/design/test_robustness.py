@@ -1,5 +1,5 @@
-"""How a design holds up: fresh seeds, other sizes, changed parameters, and the parameters that
-matter, where the answer is known."""
+"""The robustness check, where the result is known: fresh seeds, other sizes, changed parameters,
+and the parameters that matter."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from searching import Level, built, fragile, lit, mean
+from searching import Level, built, fragile, lit, mean, objective_of
 
 import torchfilm as tf
-from design import Best, Choice, Objective, Parameter, Search, Target
-from design.robust import robustness
+from design import Best, Choice, Parameter, Search, Target, check_robustness
 
 MAKE = Parameter("make", 0.1, 10, log=True)
 
 
 def spared(make=1.0, nothing=0.5):
-    """One of its parameters does nothing."""
+    """One of the parameters has no effect."""
     return lit(make)
 
 
 def best(
     scene, parameters, values, *, target=None, cells: int | None = 12, replicates=2, **options
 ) -> Best:
-    """A design given by hand, as if a search had found it."""
+    """A design as if a search had found it."""
     search = Search(
         scene,
         parameters,
@@ -38,10 +37,14 @@ def best(
         method="sobol",
         **options,
     )
-    point = search.objective.space.point(values)
+    point = search.objective.task.space.point(values)
     found = search.objective.evaluate(point[None])
     return Best(
-        search, search.objective.space.values(point), point, float(found.loss[0]), found.losses[0]
+        search,
+        search.objective.task.space.values(point),
+        point,
+        float(found.loss[0]),
+        found.losses[0],
     )
 
 
@@ -63,7 +66,7 @@ def test_fresh_seeds_are_those_right_after_the_searched_ones(spare, held):
     assert not set(held.losses) & set(held.searched)
 
 
-def test_what_is_told_of_the_losses(held):
+def test_statistics_of_the_losses(held):
     assert held.mean == pytest.approx(np.mean(held.losses), rel=1e-15)
     ordered = sorted(held.losses)
     assert held.median == pytest.approx(0.5 * (ordered[2] + ordered[3]), rel=1e-15)
@@ -77,10 +80,10 @@ def test_what_is_told_of_the_losses(held):
 def test_another_size_is_the_objective_of_that_size(held, place, share, cells):
     found = held.sizes[place]
     assert (found.share, found.cells, found.until) == (share, cells, None)
-    direct = Objective(
+    direct = objective_of(
         spared, [MAKE, Parameter("nothing", 0, 1)], Level(wanted=1.0), cells=cells, replicates=2
     )
-    point = direct.space.point(held.values)
+    point = direct.task.space.point(held.values)
     assert np.array_equal(
         found.losses, direct.evaluate(point[None], streams=held.streams).losses[0]
     )
@@ -92,10 +95,10 @@ def test_a_change_is_compared_on_the_same_seeds(spare, held):
     assert change.value == pytest.approx(2.4, rel=1e-12)
     objective = spare.search.objective
     moved = objective.evaluate(
-        objective.space.point({"make": change.value, "nothing": 0.5})[None], streams=held.streams
+        objective.task.space.point({"make": change.value, "nothing": 0.5})[None],
+        streams=held.streams,
     ).losses[0]
-    # the value's coordinate is rounded on its way back, and that changes float32 levels by their
-    # last bits at most
+    # the coordinate of the value is rounded, which changes at most the last bits of float32 levels
     assert np.allclose(change.losses, moved, rtol=1e-6, atol=1e-6)
     gained = change.losses - held.losses
     assert change.difference == pytest.approx(gained.mean(), rel=1e-12)
@@ -113,8 +116,8 @@ def test_a_parameter_without_effect_has_none(held):
     assert held.indices.colonies == 8 * (2 + 2) * 2
 
 
-@pytest.mark.parametrize("most, pieces", [(3, 1), (None, 4)])
-def test_nothing_depends_on_how_it_is_divided(held, spare, most, pieces):
+@pytest.mark.parametrize("most, work_items", [(3, 1), (None, 4)])
+def test_results_do_not_depend_on_the_work_items(held, spare, most, work_items):
     search = Search(
         spared,
         [MAKE, Parameter("nothing", 0, 1)],
@@ -125,12 +128,12 @@ def test_nothing_depends_on_how_it_is_divided(held, spare, most, pieces):
         most=most,
     )
     with ThreadPoolExecutor(2) as pool:
-        other = robustness(
+        other = check_robustness(
             Best(search, spare.values, spare.point, spare.loss, spare.losses),
             seeds=6,
             samples=8,
             executor=pool,
-            pieces=pieces,
+            work_items=work_items,
             progress=False,
         )
     assert np.array_equal(other.losses, held.losses)
@@ -164,26 +167,26 @@ def test_values_that_are_tried(parameter, value, wanted, used):
 
 
 @pytest.mark.parametrize(
-    "low, high, value, told",
+    "low, high, value, changed",
     [
         (0.1, 2.0, 2.0, [True, False]),
         (0.0, 2.0, 0.0, [False, False]),
         (2.0, 9.0, 2.0, [False, True]),
     ],
 )
-def test_a_value_that_cannot_be_changed_says_nothing(low, high, value, told):
-    """At a bound, or 0: the value used is the design's own, and no difference is made up."""
+def test_a_value_that_cannot_be_changed_has_no_difference(low, high, value, changed):
+    """At a bound or at 0 the value used is that of the design, and the difference is NaN."""
     found = best(lit, [Parameter("make", low, high)], {"make": value}, cells=2, replicates=1).check(
         seeds=2, sizes=(), progress=False
     )
-    assert [math.isfinite(c.difference) for c in found.changes] == told
-    assert [c.value for c, t in zip(found.changes, told, strict=True) if not t] == [
+    assert [math.isfinite(c.difference) for c in found.changes] == changed
+    assert [c.value for c, t in zip(found.changes, changed, strict=True) if not t] == [
         value
-    ] * told.count(False)
+    ] * changed.count(False)
 
 
 def test_failures_count_with_the_loss_of_a_failure():
-    """Rates are not finite in mid-run above 5: 20 % beyond 4.5 fails on every seed."""
+    """Rates are not finite above 5 during the run: 4.5 plus 20 % fails on every seed."""
     design = best(fragile, [Parameter("make", 0.1, 10)], {"make": 4.5}, cells=20)
     held = design.check(seeds=3, sizes=(), progress=False)
     assert held.failed == 0.0
@@ -199,7 +202,7 @@ def steady(u, s, p, cell):
 
 
 def still(x=0.0, y=0.0, z=0.0, rest=0.0):
-    """One cell that stays as it is, and holds its three parameters after an hour."""
+    """One cell that does not change; after an hour its levels are its three parameters."""
     circuit = tf.Circuit(steady, species=("held_x", "held_y", "held_z"), x=x, y=y, z=z)
     return tf.Scene(tf.Growth(rate=1e-9), circuit, dt=1.0)
 
@@ -263,22 +266,22 @@ def test_one_parameter_explains_everything_or_there_is_nothing_to_explain(scale,
     assert found.first[0] == pytest.approx(index, abs=0.1)
 
 
-def test_the_file_says_what_was_found(held, tmp_path):
-    told = json.loads(held.save(tmp_path / "held.json").read_text())
-    assert told["losses"] == held.losses.tolist() and told["streams"] == list(held.streams)
-    assert told["values"] == held.values and told["searched"] == held.searched.tolist()
-    assert (told["mean"], told["median"], told["high"], told["reached"]) == (
+def test_the_file_holds_the_results(held, tmp_path):
+    saved = json.loads(held.save(tmp_path / "held.json").read_text())
+    assert saved["losses"] == held.losses.tolist() and saved["streams"] == list(held.streams)
+    assert saved["values"] == held.values and saved["searched"] == held.searched.tolist()
+    assert (saved["mean"], saved["median"], saved["high"], saved["reached"]) == (
         held.mean,
         held.median,
         held.high,
         held.reached,
     )
-    assert [c["difference"] for c in told["changes"]] == [c.difference for c in held.changes]
-    assert [s["cells"] for s in told["sizes"]] == [6, 24]
-    assert told["indices"]["total"] == held.indices.total.tolist()
+    assert [c["difference"] for c in saved["changes"]] == [c.difference for c in held.changes]
+    assert [s["cells"] for s in saved["sizes"]] == [6, 24]
+    assert saved["indices"]["total"] == held.indices.total.tolist()
 
 
-def test_what_is_no_number_is_null(tmp_path):
+def test_nan_is_null_in_the_file(tmp_path):
     found = best(lit, [Parameter("make", 0, 2.0)], {"make": 0.0}, cells=2, replicates=1).check(
         seeds=1, sizes=(), progress=False
     )
@@ -306,7 +309,7 @@ def test_the_table_names_everything(held):
         assert words in table
 
 
-def test_the_table_says_where_a_bound_was_in_the_way():
+def test_the_table_shows_values_clipped_at_a_bound():
     found = best(lit, [Parameter("make", 0.1, 2.1)], {"make": 2.0}, cells=2, replicates=1).check(
         seeds=1, sizes=(), progress=False
     )
@@ -348,6 +351,6 @@ def test_bad_input_is_refused_before_anything_grows(spare, options, words):
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, math.inf])
-def test_an_objective_is_not_resized_to_nothing(spare, factor):
+def test_a_task_is_not_resized_to_nothing(spare, factor):
     with pytest.raises(tf.InputError, match="factor"):
-        spare.search.objective.resized(factor)
+        spare.search.objective.task.resized(factor)

@@ -1,0 +1,168 @@
+"""The scenes that a function builds from the values of the searched parameters, and a trial of them
+before a search begins."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+import torchfilm as tf
+from design import colonies
+from design.parameters import Parameter, Space, Value
+from design.targets.base import Target
+from torchfilm import checks
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFamily:
+    """All scenes of a task.
+
+    function: from parameters to a `tf.Scene`; fixed: its further arguments; device: of the values
+    that it receives.
+    """
+
+    function: Callable[..., tf.Scene]
+    space: Space
+    fixed: Mapping[str, Any]
+    device: str
+
+    @property
+    def name(self) -> str:
+        return getattr(self.function, "__name__", "the scene")
+
+    def scene(self, values: Sequence[Mapping[str, Value]], repeat: int = 1) -> tf.Scene:
+        """One scene for several designs whose structure is the same. A number becomes one value per
+        colony; each design has `repeat` colonies."""
+        arguments = dict(self.fixed)
+        for parameter in self.space.parameters:
+            column = [design[parameter.name] for design in values]
+            structural = parameter.levels is not None
+            arguments[parameter.name] = (
+                column[0]
+                if structural
+                else torch.tensor(
+                    column, dtype=torch.float64, device=self.device
+                ).repeat_interleave(repeat)
+            )
+        made = self.function(**arguments)
+        if not isinstance(made, tf.Scene):
+            raise checks.input_error("scene", made, "a function that returns a tf.Scene")
+        return made
+
+    def check_names(self) -> None:
+        """Raises InputError for a parameter or fixed argument that the function does not have."""
+        allowed = inspect.signature(self.function).parameters
+        if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in allowed.values()):
+            self.space.check(list(allowed), self.name)
+            for given in self.fixed:
+                if given not in allowed:
+                    raise checks.input_error(
+                        "fixed", given, f"a parameter of {self.name}: {', '.join(allowed)}"
+                    )
+        both = [name for name in self.fixed if name in self.space.names]
+        if both:
+            raise checks.input_error("fixed", both[0], "a parameter that is not searched as well")
+
+
+def scene_function(scene: Callable[..., tf.Scene] | str) -> Callable[..., tf.Scene]:
+    """The function of a scene that is given as a function or as the name of a ready scene."""
+    if isinstance(scene, str):
+        if scene not in tf.scenes.READY:
+            raise checks.input_error(
+                "scene",
+                scene,
+                "one of "
+                + ", ".join(tf.scenes.READY)
+                + ", or a function from parameters to a tf.Scene",
+            )
+        return tf.scenes.READY[scene]
+    if isinstance(scene, tf.Scene) or not callable(scene):
+        raise checks.input_error(
+            "scene",
+            scene,
+            "a function from parameters to a tf.Scene",
+            "Give the function itself, not the scene that it returns: def scene(k3=1.0): …",
+        )
+    return scene
+
+
+@dataclass(frozen=True)
+class TriedScenes:
+    """What the trial of a family's scenes found.
+
+    founders: cells at the start of a colony; placed: whether the founders of each colony are given;
+    dt (h): of the scene. recipe: name and arguments of a ready scene, or None. listing: its effects
+    as text. digest: of what a listing does not show, the founders and the code of functions.
+    why_regrown: the reason why colonies cannot follow recorded growth, or "".
+    """
+
+    founders: int
+    placed: bool
+    dt: float
+    recipe: tuple[str, Any] | None
+    listing: list[str]
+    digest: str
+    why_regrown: str
+
+
+def try_scenes(
+    family: SceneFamily,
+    target: Target,
+    *,
+    cells: int | None,
+    seed: int,
+    dtype: torch.dtype,
+    replay: bool,
+) -> TriedScenes:
+    """Build the scene in the middle of the space, at both bounds of every number and with every
+    option; check the target on each first state.
+
+    cells: the number that must be reachable, or None. Raises InputError where a scene cannot be
+    built, where the target does not suit it, and where no scene can reach `cells` cells.
+    """
+    middle = {p.name: p.value(0.5) for p in family.space.parameters}
+    made_of, endless = [], []
+    for values in _trial_values(family.space, middle):
+        try:
+            # two colonies: a tensor with one number would pass for a plain number
+            scene = family.scene([values], repeat=2)
+            first = colonies.first_state(scene, 2, seed=seed, dtype=dtype, device=family.device)
+        except Exception as error:
+            changed = {n: v for n, v in values.items() if v != middle[n]} or values
+            raise tf.InputError(
+                f"{type(error).__name__}: {str(error).rstrip('.')}. So the scene cannot be built"
+                f" with {changed}. Narrow the bounds. If the scene takes a plain number or a name"
+                " there, use whole=True or a Choice: a Parameter arrives as a tensor with one value"
+                " per colony."
+            ) from error
+        target.check(first)
+        made_of.append((scene.listed, scene.founders))
+        endless.append("" if cells is None else colonies.why_endless(scene, first, cells))
+    # one design that does not grow is scored as such; a search in which none grows is a mistake
+    if all(endless):
+        raise tf.InputError(endless[0])
+    scene = family.scene([middle])
+    # a function that calls a ready scene has parameters of its own, so it is not that scene
+    ready = scene.recipe and family.function is tf.scenes.READY.get(scene.recipe[0])
+    return TriedScenes(
+        founders=int(scene.founders.count),
+        placed=scene.founders.colony is not None,
+        dt=scene.dt,
+        recipe=scene.recipe if ready else None,
+        listing=scene.listing(),
+        digest=tf.digest(made_of),
+        why_regrown=colonies.why_regrown(scene, replay),
+    )
+
+
+def _trial_values(space: Space, middle: dict[str, Value]) -> list[dict[str, Value]]:
+    trials = [middle]
+    for p in space.parameters:
+        ends = (p.low, p.high) if isinstance(p, Parameter) else p.options
+        whole = isinstance(p, Parameter) and p.whole
+        trials += [{**middle, p.name: int(v) if whole else v} for v in ends]
+    return trials

@@ -1,0 +1,97 @@
+"""Coordinates of cells from a centre, soft edges, and how they are drawn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from torchfilm import checks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Centre = Literal["colony"] | tuple[float, float]
+ALONG = ("x", "y", "radius")
+COLOURS = ("#c2185b", "#1976d2", "#388e3c", "#f57c00", "#7b1fa2", "#5d4037")  # of the species
+
+
+def check_profile(kind: str, floor: object, edge_width: object = 1.0) -> None:
+    """Raises `tf.InputError` for a floor or an edge width that is not allowed."""
+    checks.number(f"{kind}.floor", floor, least=0.0)
+    checks.number(f"{kind}.edge_width", edge_width, above=0.0, hint="For a sharp edge give 0.01.")
+
+
+def checked_centre(name: str, given: object) -> Centre:
+    """A centre: "colony" or (x, y) µm. Raises `tf.InputError` for anything else."""
+    if isinstance(given, str):
+        checks.choice(name, given, ("colony",))
+        return "colony"
+    x, y = checks.vector(name, given, 2)
+    return x, y
+
+
+def between(x: Tensor, low: float, high: float, edge_width: float) -> Tensor:
+    """1 between the edges and 0 beyond: σ((x − low)/edge_width) − σ((x − high)/edge_width), with
+    the logistic function σ, so that adjacent bands add up to 1."""
+    # tanh, because the last bit of torch's sigmoid depends on the place in the tensor
+    return 0.5 * (
+        torch.tanh((x - low) / (2 * edge_width)) - torch.tanh((x - high) / (2 * edge_width))
+    )
+
+
+def half(width: float, edge_width: float) -> float:
+    """Half of the greatest value of `between` for a band of this width."""
+    return 0.5 * math.tanh(width / (4 * edge_width))
+
+
+def offset(state: tf.State, centre: Centre) -> Tensor:
+    """The position of each cell relative to the centre, (N, 2) float64 µm, without gradient."""
+    place = state.position.detach()[:, :2]
+    if centre == "colony":
+        return place - tf.measure.colony_centre(state)[:, :2].index_select(0, state.colony)
+    return place - place.new_tensor(centre)
+
+
+def coordinate(state: tf.State, along: str, centre: Centre) -> Tensor:
+    """The coordinate of each cell along "x", "y" or "radius", from the centre, (N,) float64 µm."""
+    x, y = offset(state, centre).unbind(1)
+    return x if along == "x" else y if along == "y" else (x * x + y * y).sqrt()
+
+
+def centre_at(state: tf.State, centre: Centre, place: int) -> tuple[float, float]:
+    """The centre of the colony at `place` of the batch, µm."""
+    if centre == "colony":
+        x, y = tf.measure.colony_centre(state)[place, :2].tolist()
+        return x, y
+    return centre  # type: ignore[return-value]
+
+
+def lines(
+    ax: Axes,
+    along: str,
+    centre: tuple[float, float],
+    edges: Sequence[float],
+    colour: str,
+    style: str = "--",
+) -> None:
+    """Draw lines, or circles, at the edges, µm from the centre, and keep the limits of the axes."""
+    from matplotlib.patches import Circle
+
+    window = ax.get_xlim(), ax.get_ylim()
+    for edge in (e for e in edges if math.isfinite(e)):
+        if along == "radius":
+            ax.add_patch(
+                Circle(
+                    centre, edge, fill=False, color=colour, linestyle=style, linewidth=1.0, zorder=3
+                )
+            )
+        elif along == "x":
+            ax.axvline(centre[0] + edge, color=colour, linestyle=style, linewidth=1.0, zorder=3)
+        else:
+            ax.axhline(centre[1] + edge, color=colour, linestyle=style, linewidth=1.0, zorder=3)
+    ax.set(xlim=window[0], ylim=window[1])

@@ -1,0 +1,139 @@
+"""A target that is an image."""
+
+from __future__ import annotations
+
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.base import species_name
+from design.targets.geometry import (
+    COLOURS,
+    Centre,
+    centre_at,
+    check_profile,
+    checked_centre,
+    offset,
+)
+from design.targets.profiles import ProfileTarget
+from torchfilm import checks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True)
+class Image(ProfileTarget):
+    """An image: the target level of a cell is the brightness of the image at its place, and 0
+    outside the image.
+
+    mask: rows of numbers from 0 to 1, the first row at the top. Each is the level in the middle of
+    its pixel; levels between the middles are bilinear. size: width and height of the image, µm.
+    centre: of the image, (x, y) µm, or "colony" for the centre of the colony. floor: as for
+    `Bands`.
+    """
+
+    species: str
+    mask: tuple[tuple[float, ...], ...]
+    size: tuple[float, float]
+    _: KW_ONLY
+    centre: Centre = (0.0, 0.0)
+    floor: float = 0.0
+
+    def __post_init__(self) -> None:
+        species_name("Image.species", self.species)
+        rule = "rows of numbers from 0 to 1, all equally long, not all 0"
+        try:
+            pixels = np.array(self.mask, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise checks.input_error("Image.mask", self.mask, rule) from error
+        if (
+            pixels.ndim != 2
+            or not pixels.size
+            or not ((pixels >= 0) & (pixels <= 1)).all()
+            or not pixels.any()
+        ):
+            raise checks.input_error(
+                "Image.mask", pixels.tolist(), rule, "Divide a picture of bytes by 255."
+            )
+        object.__setattr__(self, "mask", tuple(map(tuple, pixels.tolist())))
+        size = checks.vector("Image.size", self.size, 2)
+        for side, length in zip("01", size, strict=True):
+            checks.number(f"Image.size[{side}]", length, above=0.0)
+        object.__setattr__(self, "size", size)
+        object.__setattr__(self, "centre", checked_centre("Image.centre", self.centre))
+        check_profile("Image", self.floor)
+
+    @staticmethod
+    def load(
+        path: str | Path,
+        species: str,
+        size: tuple[float, float],
+        *,
+        centre: Centre = (0.0, 0.0),
+        floor: float = 0.0,
+    ) -> Image:
+        """The image in a CSV file: each line is a row of pixels, numbers from 0 to 1. Raises
+        `tf.InputError` if the file cannot be read."""
+        try:
+            pixels = np.loadtxt(path, delimiter=",", ndmin=2)
+        except (OSError, ValueError) as error:
+            raise checks.input_error(
+                "Image.load(path)",
+                str(path),
+                "a CSV file with one row of numbers a line",
+                str(error),
+            ) from error
+        return Image(species, pixels, size, centre=centre, floor=floor)  # type: ignore[arg-type]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.species,)
+
+    @cached_property
+    def pixels(self) -> np.ndarray:
+        """(rows, columns), the first row at the bottom."""
+        return np.array(self.mask)[::-1].copy()
+
+    def target_profile(self, state: tf.State) -> Tensor:
+        at = offset(state, self.centre)
+        pixels = torch.as_tensor(self.pixels, device=state.device)
+        inside = torch.ones_like(state.colony, dtype=torch.bool)
+        before, after, share = [], [], []
+        for k, count in enumerate(pixels.shape[::-1]):
+            inside &= at[:, k].abs() <= 0.5 * self.size[k]
+            # in pixels, from the middle of the first; the outermost level continues to the rim
+            x = ((at[:, k] / self.size[k] + 0.5) * count - 0.5).clamp(0.0, count - 1.0)
+            low = x.floor().long().clamp(max=max(count - 2, 0))
+            before.append(low)
+            after.append((low + 1).clamp(max=count - 1))
+            share.append(x - low)
+        (i0, j0), (i1, j1), (u, v) = before, after, share
+        below = (1 - u) * pixels[j0, i0] + u * pixels[j0, i1]
+        above = (1 - u) * pixels[j1, i0] + u * pixels[j1, i1]
+        return torch.where(inside, (1 - v) * below + v * above, 0.0).unsqueeze(1)
+
+    def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
+        # a frame of dark pixels closes the outline where the rim is lit
+        padded = np.pad(self.pixels, 1)
+        x, y = (
+            middle + ((np.arange(count) - 0.5) / (count - 2) - 0.5) * side
+            for middle, count, side in zip(
+                centre_at(state, self.centre, place), padded.shape[::-1], self.size, strict=True
+            )
+        )
+        window = ax.get_xlim(), ax.get_ylim()
+        ax.contour(x, y, padded, levels=[0.5 * padded.max()], colors=COLOURS[0], linewidths=1.0)
+        ax.set(xlim=window[0], ylim=window[1])
+
+    def describe(self) -> str:
+        return (
+            f"{self.species} as in an image of {len(self.mask[0])} × {len(self.mask)} pixels,"
+            f" {self.size[0]:g} × {self.size[1]:g} µm"
+        )

@@ -1,0 +1,206 @@
+"""A task: which scene, which parameters, which target, and how a design is grown and scored."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+import torchfilm as tf
+from design.colonies import RunSettings
+from design.parameters import Choice, Parameter, Space
+from design.scene_family import SceneFamily, TriedScenes, scene_function, try_scenes
+from design.targets.base import Target
+from torchfilm import checks
+
+REDUCE = ("mean", "worst")
+
+
+@dataclass(frozen=True, eq=False)
+class TaskOptions:
+    """The arguments that describe a task; `Task` and `Search` take the same ones.
+
+    scene: a function from parameters to a `tf.Scene`, or the name of a ready scene. parameters:
+    those that are searched. target: the pattern that is scored. fixed: further arguments of the
+    scene function. cells, until: a colony ends at `cells` cells or at `until` h, whichever comes
+    first. replicates: colonies of each design. Replicate k of every design follows stream k of
+    random numbers, so that designs are compared on equal terms. reduce: how the losses of the
+    replicates become one loss: "mean", "worst", or a quantile such as 0.75. seed, dt (h, by default
+    the scene's), dtype, device: as for `tf.simulate`. replay: run circuits on recorded growth where
+    the scene allows it. most: the greatest number of colonies in one batch; by default as many as
+    fit into memory.
+    """
+
+    scene: Callable[..., tf.Scene] | str
+    parameters: Sequence[Parameter | Choice]
+    target: Target
+    _: KW_ONLY
+    cells: int | None = None
+    until: float | None = None
+    replicates: int = 4
+    reduce: str | float = "mean"
+    fixed: Mapping[str, Any] | None = None
+    seed: int = 0
+    dt: float | None = None
+    dtype: torch.dtype = torch.float32
+    device: str = "cpu"
+    replay: bool = True
+    most: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Task(TaskOptions):
+    """A checked task. The arguments are those of `TaskOptions`.
+
+    family: the scenes of the task; tried: what a trial of them found. `dt` is the step that is
+    used. Raises InputError for an argument that is not allowed, for a parameter that the scene does
+    not have, for bounds at which the scene cannot be built, and for a target that does not suit the
+    first state of the scene.
+    """
+
+    family: SceneFamily = field(init=False, repr=False)
+    tried: TriedScenes = field(init=False, repr=False)
+
+    @classmethod
+    def of(cls, options: TaskOptions) -> Task:
+        """The task that some options describe."""
+        names = (f.name for f in dataclasses.fields(TaskOptions))
+        return cls(**{name: getattr(options, name) for name in names})
+
+    def __post_init__(self) -> None:
+        function, fixed = scene_function(self.scene), dict(self.fixed or {})
+        family = SceneFamily(function, Space(self.parameters), fixed, self.device)
+        until = _check_options(self)
+        family.check_names()
+        tried = try_scenes(
+            family,
+            self.target,
+            cells=self.cells if until is None else None,
+            seed=self.seed,
+            dtype=self.dtype,
+            replay=self.replay,
+        )
+        if self.cells is not None and self.cells <= tried.founders and not tried.placed:
+            raise checks.input_error(
+                "cells", self.cells, f"above the {tried.founders} that a colony starts from"
+            )
+        dt = tried.dt if self.dt is None else checks.number("dt", self.dt, above=0.0)
+        steps = 1.0 if until is None else until / dt
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
+            raise checks.input_error("until", until, f"a whole number of steps of dt = {dt:g} h")
+        self._set(fixed=fixed, until=until, dt=dt, family=family, tried=tried)
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def space(self) -> Space:
+        """The searched parameters and the unit cube that they span."""
+        return self.family.space
+
+    @property
+    def settings(self) -> RunSettings:
+        """How the colonies are run."""
+        dt = cast(float, self.dt)
+        return RunSettings(
+            self.seed, dt, self.dtype, self.device, self.replicates, self.cells, self.replay
+        )
+
+    def end(self, size: float) -> tuple[int | None, float | None]:
+        """Cells and hours at which colonies of a share of the full size end."""
+        cells, until, dt = self.cells, self.until, cast(float, self.dt)
+        if cells is not None:
+            cells = max(self.tried.founders + 1, round(cells * size))
+        if until is not None:
+            until = max(1, round(until * size / dt)) * dt
+        return cells, until
+
+    def resized(self, factor: float) -> Task:
+        """The same task with colonies `factor` times as large, or `factor` times as many hours; the
+        factor may exceed 1."""
+        cells, until = self.end(checks.number("factor", factor, above=0.0))
+        other = copy.copy(self)
+        other._set(cells=cells, until=until)
+        return other
+
+    def streams(self, given: Sequence[int] | None) -> tuple[int, ...]:
+        """Checked streams of random numbers; by default those of the replicates."""
+        found = tuple(range(self.replicates)) if given is None else tuple(int(s) for s in given)
+        if not found or len(set(found)) != len(found) or not all(0 <= s < 2**32 for s in found):
+            raise checks.input_error(
+                "streams", given, "different whole numbers from 0 to 2³² − 1, at least one"
+            )
+        return found
+
+    def reduced(self, losses: np.ndarray) -> np.ndarray:
+        """One loss for each design, (n,), from the losses of its replicates (n, R)."""
+        if self.reduce == "mean":
+            return losses.mean(1)
+        if self.reduce == "worst":
+            return losses.max(1)
+        return np.quantile(losses, float(self.reduce), axis=1)
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that the losses depend on, as plain data. A study can be resumed only by a
+        task with the same description."""
+        recipe = self.tried.recipe
+        return {
+            "scene": recipe[0] if recipe else getattr(self.family.function, "__name__", "scene"),
+            "fixed": {n: _without_addresses(v) for n, v in self.family.fixed.items()},
+            "effects": self.tried.listing,
+            "founders and functions": self.tried.digest,
+            "parameters": self.space.describe(),
+            "code of the target": tf.digest(self.target),
+            "target": describe_target(self.target),
+            "cells": self.cells,
+            "until": self.until,
+            "replicates": self.replicates,
+            "reduce": self.reduce,
+            "seed": self.seed,
+            "dt": self.dt,
+            "dtype": str(self.dtype)[6:],
+        }
+
+
+def describe_target(target: Target) -> str:
+    """A target with all its settings, the same in every process."""
+    if dataclasses.is_dataclass(target):
+        return _without_addresses(target)
+    return target.describe()
+
+
+def _without_addresses(value: Any) -> str:
+    """The text of a value, without its address in the memory of this process."""
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
+
+def _check_options(options: TaskOptions) -> float | None:
+    """Check what needs no scene; returns `until` as a float."""
+    if not isinstance(options.target, Target):
+        raise checks.input_error("target", options.target, "a Target, such as Stripe(…)")
+    if options.cells is None and options.until is None:
+        raise checks.InputError("a colony needs an end: give cells=… or until=… (hours).")
+    for name, least in (("cells", 2), ("replicates", 1), ("most", 1), ("seed", 0)):
+        value = getattr(options, name)
+        if value is not None or name in ("replicates", "seed"):
+            _check_whole(name, value, least)
+    reduce = options.reduce
+    if reduce not in REDUCE and (
+        isinstance(reduce, bool) or not isinstance(reduce, (int, float)) or not 0 < reduce <= 1
+    ):
+        raise checks.input_error(
+            "reduce", reduce, '"mean", "worst" or a quantile above 0 and at most 1'
+        )
+    return None if options.until is None else checks.number("until", options.until, above=0.0)
+
+
+def _check_whole(name: str, value: Any, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise checks.input_error(name, value, f"a whole number from {least}")
