@@ -113,8 +113,8 @@ def _tune(record: dict[str, Any]) -> list[str]:
         rows = list(csv.reader(file))
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     lines.insert(1, "|---" * len(rows[0]) + "|")
-    asked = f"Requested error: {record['facts']['error']}. {_measured(record['measured'])}"
-    return [_wrapped(asked), "\n".join(lines)]
+    heading = f"Requested error: {record['facts']['error']}. {_measured(record['measured'])}"
+    return [_wrapped(heading), "\n".join(lines)]
 
 
 def _wrapped(block: str) -> str:

@@ -23,7 +23,7 @@ KNOBS = ("stiffness", "alpha", "passes", "tolerance", "overlap", "unilateral")
 
 
 @dataclass(frozen=True)
-class Choice:
+class ContactSetting:
     """One setting of the contact solve; `series` is the knob that it changes."""
 
     series: str
@@ -34,7 +34,7 @@ class Choice:
     preset: str = ""
 
     @classmethod
-    def of_preset(cls, name: str, scene: tf.Scene) -> Choice:
+    def of_preset(cls, name: str, scene: tf.Scene) -> ContactSetting:
         """Returns the mechanics of `tf.preset(name, scene)`."""
         tuned = tf.preset(name, scene).apply(scene)
         return cls("preset", mechanics_of(tuned), tuned.dt, preset=name)
@@ -86,7 +86,7 @@ def mechanics_of(scene: tf.Scene) -> tf.Mechanics:
 
 
 def followed(
-    choice: Choice, like: tf.Scene, first: tf.State, hours: float
+    choice: ContactSetting, like: tf.Scene, first: tf.State, hours: float
 ) -> tuple[tf.State, float, float]:
     """Returns the state `hours` later, the seconds (a median if short) and the rows read."""
     scene, start = choice.scene(like), choice.start(first)

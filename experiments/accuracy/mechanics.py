@@ -13,7 +13,16 @@ import math
 from collections.abc import Sequence
 
 import torch
-from contact_settings import DIAMETER, DT, SHORT, TOLERANCES, WORK, Choice, followed, mechanics_of
+from contact_settings import (
+    DIAMETER,
+    DT,
+    SHORT,
+    TOLERANCES,
+    WORK,
+    ContactSetting,
+    followed,
+    mechanics_of,
+)
 from growth import RowCounter
 from scipy import stats
 from soft_cells import LENGTH_DRAG, order
@@ -38,7 +47,7 @@ def colonies(dim: int, quick: bool) -> tuple[tf.Scene, tf.State]:
     return scene, state
 
 
-def tight(plain: tf.Mechanics, quick: bool) -> tuple[Choice, Choice]:
+def tight(plain: tf.Mechanics, quick: bool) -> tuple[ContactSetting, ContactSetting]:
     """Returns the reference and a looser one, whose difference shows the reference's own error.
 
     Both use unilateral contacts, unlike the default.
@@ -50,18 +59,18 @@ def tight(plain: tf.Mechanics, quick: bool) -> tuple[Choice, Choice]:
     fine, loose = (
         dataclasses.replace(base, tolerance=t, overlap=t) for t in (tolerance, 3 * tolerance)
     )
-    return Choice("reference", fine, dt, torch.float64), Choice(
+    return ContactSetting("reference", fine, dt, torch.float64), ContactSetting(
         "reference", loose, 2 * dt, torch.float64
     )
 
 
-def one_by_one(plain: tf.Mechanics, quick: bool) -> list[Choice]:
+def one_by_one(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
     """Returns settings with one knob changed.
 
     The series of steps, α, passes and tolerances include the default.
     """
     steps = (0.05, 0.025, 0.0125) if quick else (0.1, 0.05, 0.025, 0.0125, 0.00625)
-    found = [Choice("Δt", plain, dt, default=dt == DT) for dt in steps]
+    found = [ContactSetting("Δt", plain, dt, default=dt == DT) for dt in steps]
     for series, knob, usual, values in (
         (
             "α",
@@ -73,7 +82,7 @@ def one_by_one(plain: tf.Mechanics, quick: bool) -> list[Choice]:
         ("tolerance", "tolerance", TOLERANCE, (0.2, 0.05, 0.02) if quick else TOLERANCES),
     ):
         found += [
-            Choice(
+            ContactSetting(
                 series,
                 plain if v == usual else dataclasses.replace(plain, **{knob: v}),
                 default=v == usual,
@@ -81,22 +90,22 @@ def one_by_one(plain: tf.Mechanics, quick: bool) -> list[Choice]:
             for v in values
         ]
     found += [
-        Choice("unilateral", dataclasses.replace(plain, unilateral=True, passes=n))
+        ContactSetting("unilateral", dataclasses.replace(plain, unilateral=True, passes=n))
         for n in (None, 1)
     ]
-    return [*found, Choice("float64", plain, dtype=torch.float64)]
+    return [*found, ContactSetting("float64", plain, dtype=torch.float64)]
 
 
-def together(plain: tf.Mechanics, quick: bool) -> list[Choice]:
+def together(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
     """Returns settings with several knobs changed."""
     if quick:
         return [
-            Choice(
+            ContactSetting(
                 "several", dataclasses.replace(plain, alpha=0.003, tolerance=0.02, passes=2), 0.0125
             )
         ]
     return [
-        Choice(
+        ContactSetting(
             "several",
             dataclasses.replace(plain, alpha=alpha, passes=passes, tolerance=tolerance),
             dt,
@@ -109,7 +118,7 @@ def together(plain: tf.Mechanics, quick: bool) -> list[Choice]:
 
 
 def measured(
-    choice: Choice, like: tf.Scene, first: tf.State
+    choice: ContactSetting, like: tf.Scene, first: tf.State
 ) -> tuple[dict[str, Tensor], float, float]:
     """Returns the observables of each colony over the window, (B,) each, seconds and rows."""
     scene, start, walls = choice.scene(like), choice.start(first), choice.mechanics.walls
@@ -171,7 +180,7 @@ def window(dim: int, quick: bool) -> Study:
     for choice in [
         *one_by_one(plain, quick),
         *together(plain, quick),
-        Choice.of_preset("draft", like),
+        ContactSetting.of_preset("draft", like),
     ]:
         if choice.label not in runs:
             runs[choice.label] = measured(choice, like, first)
@@ -246,25 +255,29 @@ def difference(a: Tensor, b: Tensor) -> tuple[float, float]:
     return float(a.mean() - b.mean()), float(stats.t.ppf(0.975, freedom)) * math.sqrt(sum(shares))
 
 
-def run_settings(like: tf.Scene, quick: bool) -> list[Choice]:
+def run_settings(like: tf.Scene, quick: bool) -> list[ContactSetting]:
     """Returns the settings that whole runs compare."""
-    plain, draft = mechanics_of(like), Choice.of_preset("draft", like)
+    plain, draft = mechanics_of(like), ContactSetting.of_preset("draft", like)
     change = lambda **knobs: dataclasses.replace(plain, **knobs)
-    found = [Choice("Δt", plain, default=True), draft, Choice("α", change(alpha=0.1))]
+    found = [
+        ContactSetting("Δt", plain, default=True),
+        draft,
+        ContactSetting("α", change(alpha=0.1)),
+    ]
     if quick:
         return found
     return [
         *found,
-        Choice("Δt", plain, DT / 2),
-        *(Choice("tolerance", change(tolerance=t)) for t in (0.2, 0.02)),
-        Choice("unilateral", change(unilateral=True)),
-        Choice("float64", plain, dtype=torch.float64),
-        Choice("several", change(tolerance=0.2, alpha=0.1), draft.dt),
+        ContactSetting("Δt", plain, DT / 2),
+        *(ContactSetting("tolerance", change(tolerance=t)) for t in (0.2, 0.02)),
+        ContactSetting("unilateral", change(unilateral=True)),
+        ContactSetting("float64", plain, dtype=torch.float64),
+        ContactSetting("several", change(tolerance=0.2, alpha=0.1), draft.dt),
     ]
 
 
 def whole(
-    choice: Choice, hours: float, streams: Sequence[int]
+    choice: ContactSetting, hours: float, streams: Sequence[int]
 ) -> tuple[dict[str, Tensor], float, float]:
     """Returns statistics of colonies from one cell, one stream each; seconds and rows."""
     scene = choice.scene(tf.scenes.microcolony(dim=choice.mechanics.dim))
@@ -282,7 +295,7 @@ def long(dim: int, quick: bool) -> Study:
     like = tf.scenes.microcolony(dim=dim)
     # multiples of the steps of all settings
     hours, count = (3.0, 3) if quick else (8.4 if dim == 2 else 7.4, 12)
-    fine = Choice(
+    fine = ContactSetting(
         "reference",
         dataclasses.replace(
             mechanics_of(like), alpha=0.003, passes=4, tolerance=0.005, overlap=0.02

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from contact_settings import DIAMETER, DT, TOLERANCES, WORK, Choice, followed, mechanics_of
+from contact_settings import DIAMETER, DT, TOLERANCES, WORK, ContactSetting, followed, mechanics_of
 from numpy import ndarray
 from scipy.integrate import solve_ivp
 from study import Point, Study
@@ -224,7 +224,7 @@ def cluster(dim: int, quick: bool) -> tuple[tf.Scene, tuple[tuple[float, float, 
     )
 
 
-def refinements(plain: tf.Mechanics, hours: float, quick: bool) -> list[Choice]:
+def refinements(plain: tf.Mechanics, hours: float, quick: bool) -> list[ContactSetting]:
     """Returns the settings: steps Δt for several solves; in the plane also other knobs at one
     step."""
     tight = dataclasses.replace(plain, tolerance=1e-8)
@@ -244,7 +244,7 @@ def refinements(plain: tf.Mechanics, hours: float, quick: bool) -> list[Choice]:
             2, ("Δt, float32", dataclasses.replace(plain, tolerance=1e-4), torch.float32)
         )
     found = [
-        Choice(name, mechanics, dt, dtype, mechanics is plain and dt == DT)
+        ContactSetting(name, mechanics, dt, dtype, mechanics is plain and dt == DT)
         for name, mechanics, dtype in several
         for dt in steps
     ]
@@ -253,10 +253,11 @@ def refinements(plain: tf.Mechanics, hours: float, quick: bool) -> list[Choice]:
     if plain.dim == 3:
         return found
     found += [
-        Choice("tolerance", dataclasses.replace(plain, tolerance=t), hours / 64) for t in TOLERANCES
+        ContactSetting("tolerance", dataclasses.replace(plain, tolerance=t), hours / 64)
+        for t in TOLERANCES
     ]
     return found + [
-        Choice("passes", dataclasses.replace(tight, passes=n), hours / 64, torch.float64)
+        ContactSetting("passes", dataclasses.replace(tight, passes=n), hours / 64, torch.float64)
         for n in (1, 2, 4)
     ]
 
@@ -268,7 +269,7 @@ def order(dim: int, quick: bool) -> Study:
     first = like.bind(dtype=torch.float64).start()
     # the lattice first relaxes its overlaps, which is not measured
     *_, first = tf.simulate(
-        Choice("", dataclasses.replace(mechanics_of(like), tolerance=1e-6)).scene(like),
+        ContactSetting("", dataclasses.replace(mechanics_of(like), tolerance=1e-6)).scene(like),
         first,
         until=0.1,
         dt=0.005,
