@@ -55,11 +55,8 @@ class ContactSetting:
 
     def scene(self, like: tf.Scene) -> tf.Scene:
         """Returns the scene `like` with these mechanics and this step."""
-        return tf.Scene(
-            *(self.mechanics if isinstance(e, tf.Mechanics) else e for e in like.listed),
-            dt=self.dt,
-            founders=like.founders,
-        )
+        effects = (self.mechanics if isinstance(e, tf.Mechanics) else e for e in like.effects)
+        return like.replace(*effects, dt=self.dt)
 
     def start(self, state: tf.State) -> tf.State:
         """Returns the state in this precision."""
@@ -82,7 +79,7 @@ class ContactSetting:
 
 def mechanics_of(scene: tf.Scene) -> tf.Mechanics:
     """Returns the contact mechanics of a scene."""
-    return next(e for e in scene.listed if isinstance(e, tf.Mechanics))
+    return next(e for e in scene.effects if isinstance(e, tf.Mechanics))
 
 
 def followed(

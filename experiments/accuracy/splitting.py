@@ -206,7 +206,7 @@ def detector(splitting: str, rtol: float) -> tf.Scene:
     """Returns the boundary detector in a channel 16 µm wide, with the given splitting."""
     ready = tf.scenes.boundary_detector(width=16.0, rtol=rtol, **STRIPE)
     effects: list[tf.Effect] = []
-    for effect in ready.listed:
+    for effect in ready.effects:
         if isinstance(effect, tf.Medium):
             box, spacing = effect.box, effect.spacing
             effect = tf.Medium(
@@ -218,7 +218,7 @@ def detector(splitting: str, rtol: float) -> tf.Scene:
                 splitting=splitting,
             )
         effects.append(effect)
-    return tf.Scene(*effects, founders=ready.founders, dt=ready.dt)
+    return ready.replace(*effects)
 
 
 def ensemble(

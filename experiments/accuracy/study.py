@@ -103,9 +103,9 @@ def timed(run: Callable[[], Any], repeats: int = REPEATS) -> tuple[Any, float]:
     """
     seconds = []
     for _ in range(repeats):
-        begun = process_time()
+        start = process_time()
         found = run()
-        seconds.append(process_time() - begun)
+        seconds.append(process_time() - start)
     return found, statistics.median(seconds)
 
 
