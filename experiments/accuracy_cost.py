@@ -1,14 +1,19 @@
-"""What accuracy costs: work–precision studies of mechanics, circuits, signals and their splitting,
-each knob alone and then several together.
+"""What accuracy costs: work–precision studies of mechanics, circuits, signals and splitting.
 
-    OMP_NUM_THREADS=1 python experiments/accuracy_cost.py                    # all; writes docs/accuracy.md, its pictures and CSV
-    OMP_NUM_THREADS=1 python experiments/accuracy_cost.py --study circuits --quick --out runs/accuracy
+    OMP_NUM_THREADS=1 python experiments/accuracy_cost.py                   # all studies
+    OMP_NUM_THREADS=1 python experiments/accuracy_cost.py --study circuits  # one group
+    OMP_NUM_THREADS=1 python experiments/accuracy_cost.py --quick --out runs/accuracy
+    python experiments/accuracy_cost.py --write-only                        # no studies
 
-Each study measures its errors against a tighter and independent reference. Where topology stays
-(short runs) orders are measured; where runs are long and chaotic, statistics over seeds with their
-confidence bands. Costs are seconds of this machine and, free of hardware, applications of
-operators. The studies are in experiments/accuracy, one file each; the words around their tables in
-docs/accuracy.md are written by hand.
+Each study changes one knob at a time, then several together. It measures errors against a tighter
+and independent reference. Short runs, in which the cells stay the same, give orders of convergence.
+Long runs are chaotic; there the study compares statistics over seeds, with confidence bands.
+Costs are seconds on this machine and counts of operations, which do not depend on hardware.
+
+The script writes CSV files and records.json to experiments/benchmarks/accuracy, and from them
+docs/accuracy_appendix.md with its pictures. `--write-only` writes the page and the pictures from
+the existing records. The studies are in experiments/accuracy. The prose of the appendix is in
+experiments/accuracy/appendix_template.md. docs/accuracy.md is written by hand.
 """
 
 from __future__ import annotations
@@ -25,11 +30,12 @@ import torchfilm as tf
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "accuracy"), str(HERE / "benchmarks")]
+import appendix  # noqa: E402
 import circuits  # noqa: E402
 import mechanics  # noqa: E402
 import signals  # noqa: E402
 import splitting  # noqa: E402
-from record import machine, write_page  # noqa: E402
+from record import machine  # noqa: E402
 from study import Study, plot, table, write_csv  # noqa: E402
 
 STUDIES: dict[str, Callable[[bool], list[Study]]] = {
@@ -40,20 +46,15 @@ STUDIES: dict[str, Callable[[bool], list[Study]]] = {
 }
 
 
-def told(study: Study, picture: str) -> str:
-    """A study's part of the page, in Markdown."""
-    noted = machine()
-    how = (
-        f"Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']},"
-        f" {noted['threads']} thread(s), {noted['processor']}."
-    )
-    return "\n\n".join(
-        [
-            f"{study.words} Errors are {study.reference}. {how}",
-            f"![{study.title}]({picture})",
-            table(study),
-        ]
-    )
+def store(study: Study, folder: Path | None) -> None:
+    """Writes a study's CSV file and picture: to `folder`, or to the records of the appendix."""
+    if folder is None:
+        appendix.add_study(study, machine())
+        plot(study, appendix.picture(study.name))
+        appendix.write()
+    else:
+        write_csv(study, folder / f"{study.name}.csv")
+        plot(study, folder / f"accuracy_{study.name}.png")
 
 
 def main() -> None:
@@ -64,39 +65,36 @@ def main() -> None:
         "--study",
         action="append",
         choices=tuple(STUDIES),
-        help="one group of studies; may be given again",
+        help="one group of studies; may be repeated",
     )
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="few settings on small colonies, to see that it runs; writes no page",
+        help="few settings on small colonies, as a test; writes to runs/accuracy, not to the page",
     )
     parser.add_argument(
-        "--out",
-        type=Path,
-        help="folder for CSV and pictures instead of those of the page, which is then not written",
+        "--out", type=Path, help="folder for CSV files and pictures; leaves the page unchanged"
     )
-    chosen = parser.parse_args()
+    parser.add_argument(
+        "--write-only",
+        action="store_true",
+        help="write the appendix and its pictures from the existing records; run no study",
+    )
+    options = parser.parse_args()
+    if options.write_only:
+        if options.study or options.quick or options.out:
+            parser.error("--write-only takes no other option")
+        print(appendix.write(pictures=True))
+        return
     tf.keep_memory()
     torch.set_grad_enabled(False)
-    out = chosen.out or (Path("runs/accuracy") if chosen.quick else None)
-    for group in chosen.study or STUDIES:
-        begun = time.perf_counter()
-        for study in STUDIES[group](chosen.quick):
-            write_csv(study, (out or HERE / "benchmarks" / "accuracy") / f"{study.name}.csv")
-            picture = (out or HERE.parent / "docs" / "pictures") / f"accuracy_{study.name}.png"
-            plot(study, picture)
-            print(
-                f"\n{study.title} ({time.perf_counter() - begun:.0f} s since the group"
-                f" began)\n{table(study)}",
-                flush=True,
-            )
-            if out is None:
-                write_page(
-                    HERE.parent / "docs" / "accuracy.md",
-                    told(study, f"pictures/{picture.name}"),
-                    f"{study.name}: experiments/accuracy_cost.py",
-                )
+    folder = options.out or (Path("runs/accuracy") if options.quick else None)
+    for group in options.study or STUDIES:
+        start = time.perf_counter()
+        for study in STUDIES[group](options.quick):
+            store(study, folder)
+            seconds = time.perf_counter() - start
+            print(f"\n{study.title} ({seconds:.0f} s of {group})\n{table(study)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""A French flag: three genes read one gradient, and each should light its own third of the colony.
+"""A French flag: three genes read one gradient, and each should light one third of the colony.
 
     python experiments/bands.py --colonies 1000
 
-A morphogen enters at the left face and decays on its way. Blue is switched on where there is much
-of it, red where there is little, and green, by one promoter that needs it and one that it shuts, in
-between. Searched: the four thresholds and how sharp they are.
+A morphogen enters at the left face and decays. A high concentration switches blue on and a low
+concentration red. Green has one promoter that the morphogen activates and one that it represses; it
+is on between the two. The search varies the four thresholds and their sharpness.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import torchfilm as tf
 from design import CMAES, Bands, Parameter, Search
 
 REACH = 10.0  # µm over which the morphogen falls to 1/e
-SIDE = 32.0  # µm from the middle to each face
+SIDE = 32.0  # µm from the centre to each face
 
 
 def genes(u, s, p, cell):
-    """Three fluorescent proteins and what the morphogen does to each: Hill functions."""
+    """Three fluorescent proteins, controlled by the morphogen through Hill functions."""
     m = s.morphogen
     on = lambda threshold: m**p.n / (threshold**p.n + m**p.n)
     return {
@@ -33,8 +33,10 @@ def genes(u, s, p, cell):
 
 
 def flag(blue_above=0.5, green_above=0.2, green_below=0.5, red_below=0.2, n=4.0) -> tf.Scene:
-    """A colony that grows in a gradient; the thresholds are shares of the morphogen's level at the
-    left face."""
+    """Returns a colony that grows in a gradient.
+
+    The thresholds are fractions of the concentration of the morphogen at the left face.
+    """
     steady = lambda places: torch.exp(-(places[:, 0] + SIDE) / REACH)
     return tf.Scene(
         tf.Growth(rate=1.0),
@@ -77,9 +79,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--colonies", type=int, default=1000)
+    parser.add_argument("--colonies", type=int, default=1000, help="number to simulate")
     parser.add_argument(
-        "--out", type=Path, default=Path("bands"), help="stem of the files that are written"
+        "--out", type=Path, default=Path("bands"), help="path of the files to write, without suffix"
     )
     options = parser.parse_args()
     tf.keep_memory()

@@ -1,14 +1,13 @@
-"""The band of Fig. 5: where it stands, how wide and how strong it is, what AiiA does to it, and
-what flow does.
+"""The band of Fig. 5: its place, width and strength, and the effects of AiiA and flow.
 
-    python experiments/boundary_band.py                     # 8 seeds of 5,000 cells in 8 conditions, about half an hour on two cores
+    python experiments/boundary_band.py     # 8 seeds of 5,000 cells in 8 conditions
     python experiments/boundary_band.py --cells 500 --seeds 2
 
-Each condition is one batch of colonies. For every colony the sink cells are put into strips along
-the channel by their distance from the border, which is the place with the fewest cells on the wrong
-side of it; the profile of mean YFP over these strips gives the band's peak, its place, its full
-width at half maximum and the middle of that, and its contrast: the peak over the mean of sinks far
-inside (farther than 40 µm from the border).
+The full run takes about half an hour on two cores. Each condition is one batch of colonies. The
+border of a colony is the place along the channel with the fewest cells on the wrong side. The sink
+cells are binned into strips by their distance from the border. The profile of mean YFP over these
+strips gives the band's peak, its place, its full width at half maximum and the middle of that. The
+contrast is the peak over the mean of sinks farther than 40 µm from the border.
 """
 
 from __future__ import annotations
@@ -40,8 +39,10 @@ CONDITIONS = {
 
 
 def border(x: np.ndarray, sink: np.ndarray) -> float:
-    """The place along the channel with the fewest cells on the wrong side: sinks before it, sources
-    after it. µm."""
+    """Returns the place along the channel with the fewest cells on the wrong side, µm.
+
+    Sinks before it and sources after it are on the wrong side.
+    """
     order = np.argsort(x)
     sinks = sink[order]
     wrong = np.cumsum(sinks) + (~sinks).sum() - np.cumsum(~sinks)
@@ -49,10 +50,10 @@ def border(x: np.ndarray, sink: np.ndarray) -> float:
 
 
 def band(state: tf.State, place: int) -> dict[str, float]:
-    """What the band of one colony of the batch is like."""
-    mine = state.colony == place
-    x, yfp = state.position[mine, 0].numpy(), state.yfp[mine].double().numpy()
-    cfp, sink = state.cfp[mine].double().numpy(), (state.cell_type[mine] == 1).numpy()
+    """Returns the measures of the band of one colony of the batch."""
+    cells = state.colony == place
+    x, yfp = state.position[cells, 0].numpy(), state.yfp[cells].double().numpy()
+    cfp, sink = state.cfp[cells].double().numpy(), (state.cell_type[cells] == 1).numpy()
     at = x - border(x, sink)
     strip = np.floor(at[sink] / STRIP).astype(int)
     low = strip.min()
@@ -70,7 +71,7 @@ def band(state: tf.State, place: int) -> dict[str, float]:
         right += 1
     inside, sources = at[sink] > FAR, at[~sink] < -FAR
     return {
-        "cells": float(mine.sum()),
+        "cells": float(cells.sum()),
         "place_um": float(centres[top]),
         "middle_um": float(0.5 * (centres[left] + centres[right])),
         "width_um": float(centres[right] - centres[left] + STRIP),
@@ -86,11 +87,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--cells", type=int, default=5000)
-    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--cells", type=int, default=5000, help="in each colony")
+    parser.add_argument("--seeds", type=int, default=8, help="colonies in each condition")
     parser.add_argument("--only", nargs="*", choices=list(CONDITIONS), default=list(CONDITIONS))
     parser.add_argument("--out", type=Path, default=Path("boundary_band.json"))
-    parser.add_argument("--record", type=Path, help="folder for results files, one a condition")
+    parser.add_argument("--record", type=Path, help="folder for results files, one per condition")
     options = parser.parse_args()
     tf.keep_memory()
     found = json.loads(options.out.read_text()) if options.out.exists() else {}
@@ -110,16 +111,14 @@ def main() -> None:
                 overwrite=True,
             )
         )
-        begun = time.perf_counter()
+        start = time.perf_counter()
         state = deque(
-            tf.simulate(
-                scene, scene.seed(options.seeds, seed=0), cells=options.cells, record=record
-            ),
+            tf.simulate(scene, colonies=options.seeds, seed=0, cells=options.cells, record=record),
             maxlen=1,
         ).pop()
         bands = [band(state, k) for k in range(options.seeds)]
         row = {key: [b[key] for b in bands] for key in bands[0]}
-        found[name] = row | {"seconds": time.perf_counter() - begun, "time_h": state.time}
+        found[name] = row | {"seconds": time.perf_counter() - start, "time_h": state.time}
         options.out.write_text(json.dumps(found, indent=1))
         shown = {k: f"{np.mean(v):.4g} ± {np.std(v):.2g}" for k, v in row.items()}
         columns = [

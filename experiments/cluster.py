@@ -1,11 +1,11 @@
-"""A worker of a cluster is killed half way through an evaluation, and nothing is lost.
+"""Tests that a cluster loses nothing if one worker is killed during an evaluation.
 
     python experiments/cluster.py                           # two workers on this machine
-    python experiments/cluster.py --scheduler tcp://…:8786  # workers of one's own, one of which is killed
+    python experiments/cluster.py --scheduler tcp://…:8786  # your workers; one of them is killed
 
-Designs of the boundary detector are scored for a stripe at the border three times: in this process,
-by the workers, and by the workers while one of them is killed. All losses must be the same to the
-bit. Needs distributed (the `cluster` extra).
+The script scores designs of the boundary detector for a stripe at the border three times: in this
+process, on the workers, and on the workers while it kills one of them. All losses must be identical
+to the last bit. It requires distributed (the `cluster` extra).
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from distributed import Client, LocalCluster
 from design import Objective, Parameter, Stripe, Task
 
 
-def end(pid: int) -> None:
+def kill(pid: int) -> None:
+    """Kills a process without warning."""
     os.kill(pid, signal.SIGKILL)
 
 
@@ -31,8 +32,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--scheduler",
-        help="address of a running scheduler; by default a cluster of two workers here",
+        "--scheduler", help="address of a running scheduler; default: two workers on this machine"
     )
     parser.add_argument("--cells", type=int, default=60)
     parser.add_argument("--designs", type=int, default=32)
@@ -56,26 +56,30 @@ def main() -> None:
     )
     with Client(cluster) as client:
         executor = client.get_executor(pure=False)
-        objective.evaluate(points[:2], executor=executor, work_items=2)  # workers import torch once
-        calm = objective.evaluate(points, executor=executor, work_items=options.work_items)
+        objective.evaluate(
+            points[:2], executor=executor, pieces=2
+        )  # each worker imports torch once
+        undisturbed = objective.evaluate(points, executor=executor, pieces=options.pieces)
         print(
-            f"{len(client.run(os.getpid))} workers: {calm.seconds:.1f} s, the same bits:"
-            f" {np.array_equal(calm.losses, here.losses)}",
+            f"{len(client.run(os.getpid))} workers: {undisturbed.seconds:.1f} s, identical:"
+            f" {np.array_equal(undisturbed.losses, here.losses)}",
             flush=True,
         )
         address, pid = next(iter(client.run(os.getpid).items()))
         killer = threading.Timer(
-            0.5 * calm.seconds, lambda: client.run(end, pid, workers=[address], on_error="ignore")
+            0.5 * undisturbed.seconds,
+            lambda: client.run(kill, pid, workers=[address], on_error="ignore"),
         )
         killer.start()
-        struck = objective.evaluate(points, executor=executor, work_items=options.work_items)
+        disturbed = objective.evaluate(points, executor=executor, pieces=options.pieces)
         print(
-            f"worker {pid} killed after {0.5 * calm.seconds:.1f} s of {struck.seconds:.1f} s;"
+            f"worker {pid} killed after {0.5 * undisturbed.seconds:.1f} s"
+            f" of {disturbed.seconds:.1f} s;"
             f" workers now {list(client.run(os.getpid).values())}"
         )
         print(
-            f"{np.isnan(struck.losses).sum()} colonies lost, the same bits:"
-            f" {np.array_equal(struck.losses, here.losses)}"
+            f"{np.isnan(disturbed.losses).sum()} colonies lost, identical:"
+            f" {np.array_equal(disturbed.losses, here.losses)}"
         )
         killer.join()
     if not options.scheduler:

@@ -1,12 +1,11 @@
-"""How large are the patches into which a colony of toggle switches falls? Find switches that make
-them as large as wanted.
+"""Searches toggle switches that divide a colony into patches of a given size.
 
     python experiments/domain_size.py --size 12 --colonies 400
 
-Two genes repress each other, molecule by molecule. Founders start at the tipping point; a cell that
-has fallen to one side takes its descendants along. How early they fall, and whether they fall back,
-is up to the switch: its strength, how fast it turns over, where it starts, and how many molecules
-it has.
+Two genes repress each other; the circuit simulates single molecules. Founders start at the tipping
+point. A cell that has switched to one side passes this state to its descendants. The strength of
+the switch, its turnover and its number of molecules decide how early cells switch and whether they
+switch back.
 """
 
 from __future__ import annotations
@@ -29,10 +28,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--size", type=float, default=12.0, help="wanted, µm")
-    parser.add_argument("--colonies", type=int, default=400)
+    parser.add_argument("--size", type=float, default=12.0, help="target size of the patches, µm")
+    parser.add_argument("--colonies", type=int, default=400, help="number to simulate")
     parser.add_argument(
-        "--out", type=Path, default=Path("domain_size"), help="stem of the files that are written"
+        "--out",
+        type=Path,
+        default=Path("domain_size"),
+        help="path of the files to write, without suffix",
     )
     options = parser.parse_args()
     tf.keep_memory()

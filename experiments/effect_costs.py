@@ -1,15 +1,18 @@
-"""What each effect costs, in every ready-made scene: time, operators and bytes of a step; and that
-an effect which is not listed costs nothing.
+"""Measures the cost of each effect in every ready-made scene: time, operators and bytes per step.
 
-    OMP_NUM_THREADS=1 python experiments/effect_costs.py                     # five to ten minutes; writes its part of docs/effects.md and a JSON record
+    OMP_NUM_THREADS=1 python experiments/effect_costs.py          # five to ten minutes
     OMP_NUM_THREADS=1 python experiments/effect_costs.py --cells 50 --out costs.json --page ''
 
-Each scene is grown from its founders to 200 cells in each of 4 colonies, or as many as it has after
-12 h. From there 20 steps are taken twice: once timed, once with every operator counted that they
-dispatch, and the bytes allocated for its results. Operators and bytes are the same whatever else
-the machine does; times are told as shares of one run. Then growth, division and mechanics are taken
-alone and beside other effects that do not act on them: the same cells, the same operators, the same
-bytes.
+The first command writes its part of docs/effects.md and a JSON record.
+
+Each scene grows from its founders to 200 cells in each of 4 colonies, or for 12 h. From there the
+script runs 20 steps twice. One run is timed. The other counts the dispatched operators and the
+bytes allocated for their results. Operators and bytes do not depend on other work on the machine.
+Times are given as shares of one run.
+
+The script then tests that an effect which a scene does not list costs nothing. It runs growth,
+division and mechanics alone and together with effects that do not act on them. Cells, operators and
+bytes must be the same.
 """
 
 from __future__ import annotations
@@ -32,46 +35,46 @@ from record import machine, write_page
 
 HERE = Path(__file__).parent
 STEPS, HOURS = 20, 12.0
-# What a ready scene is given where by default it holds fewer cells than are wanted.
+# Sizes of the ready-made scenes whose default size holds too few cells.
 SETTINGS = {"channel": {"width": 16.0, "length": 80.0}, "programmed_growth": {"edge": 20.0}}
 MARK = "tables: experiments/effect_costs.py"
 BODY = ("growth", "mechanics", "division")
 
 
 def grown(scene: tf.Scene, cells: int, colonies: int) -> tf.State:
-    """The scene's colonies at so many cells each, or after HOURS."""
-    run = tf.simulate(
-        scene, scene.seed(colonies, seed=0), cells=cells, until=round(HOURS / scene.dt) * scene.dt
-    )
+    """Returns the colonies of a scene with `cells` cells each, or after HOURS."""
+    until = round(HOURS / scene.dt) * scene.dt
+    run = tf.simulate(scene, colonies=colonies, seed=0, cells=cells, until=until)
     return deque(run, maxlen=1).pop()
 
 
-def counted(scene: tf.Scene, state: tf.State, steps: int) -> list[Spending]:
-    """What each of the next steps asks of torch."""
+def counted(model: tf.Model, state: tf.State, steps: int) -> list[Spending]:
+    """Returns the operators and bytes of each of the next steps."""
     found = []
     for _ in range(steps):
         found.append(Spending())
-        state = scene.step(state, scene.dt, found[-1])
+        state = model.step(state, model.scene.dt, found[-1])
     return found
 
 
-def timed(scene: tf.Scene, state: tf.State, steps: int) -> dict[str, float]:
-    """Median ms of a step, by effect."""
-    taken: dict[str, list[float]] = {}
+def timed(model: tf.Model, state: tf.State, steps: int) -> dict[str, float]:
+    """Returns the median time of a step, ms, by effect."""
+    times: dict[str, list[float]] = {}
     for _ in range(steps):
         timings = tf.Timings()
-        state = scene.step(state, scene.dt, timings)
+        state = model.step(state, model.scene.dt, timings)
         for title, seconds in timings.seconds.items():
-            taken.setdefault(title, []).append(1e3 * seconds)
-    return {title: statistics.median(ms) for title, ms in taken.items()}
+            times.setdefault(title, []).append(1e3 * seconds)
+    return {title: statistics.median(ms) for title, ms in times.items()}
 
 
 def of_scene(name: str, cells: int, colonies: int) -> dict:
-    """What a ready scene's effects cost in a step."""
+    """Returns the cost per step of the effects of a ready-made scene."""
     scene = tf.scenes.build(name, SETTINGS.get(name))
     state = grown(scene, cells, colonies)
-    timed(scene, state, 3)  # what is made once is made now
-    ms, spent = timed(scene, state, STEPS), counted(scene, state, STEPS)
+    model = scene.bind(state=state)
+    timed(model, state, 3)  # warm up
+    ms, spent = timed(model, state, STEPS), counted(model, state, STEPS)
     effects = {
         title: {
             "ms": round(ms[title], 4),
@@ -92,23 +95,23 @@ def of_scene(name: str, cells: int, colonies: int) -> dict:
     }
 
 
-def _watching(cells: tf.State) -> None:
+def _set_mark(cells: tf.State) -> None:
     cells.mark = cells.length * 2.0
 
 
-def _made(u, s, p, cell):
+def _synthesis(u, s, p, cell):
     return {"m": 1.0 - u.m}
 
 
 def additions() -> dict[str, Sequence[tf.Effect]]:
-    """Effects that leave growth, division and mechanics what they are."""
+    """Returns effects that do not act on growth, division and mechanics."""
     medium = tf.Medium(
         ahl=tf.Signal(diffusion=10.0),
         box=((-64.0, -64.0), (64.0, 64.0)),
         spacing=4.0,
         outside="grow",
     )
-    smooth = tf.Circuit(_made, species=("m",))
+    smooth = tf.Circuit(_synthesis, species=("m",))
     molecules = tf.Circuit(
         [tf.parts.constitutive("m", 1.0), tf.parts.degradation("m", 1.0)],
         species=("m",),
@@ -120,14 +123,16 @@ def additions() -> dict[str, Sequence[tf.Effect]]:
         "a circuit, molecule by molecule": (molecules,),
         "a medium": (medium,),
         "a circuit and a medium": (smooth, medium),
-        "rules": (tf.Rules(_watching),),
+        "rules": (tf.Rules(_set_mark),),
         "removal": (tf.Removal((-500.0, -500.0), (500.0, 500.0)),),
     }
 
 
 def beside(cells: int, colonies: int) -> list[dict]:
-    """Operators and bytes of STEPS steps of growth, division and mechanics, alone and beside other
-    effects."""
+    """Returns operators and bytes of growth, division and mechanics, alone and with other effects.
+
+    They are totals of STEPS steps. Raises SystemExit if growth or mechanics differ.
+    """
     records = []
     for name, more in additions().items():
         scene = tf.Scene(
@@ -137,7 +142,7 @@ def beside(cells: int, colonies: int) -> list[dict]:
             *more,
         )
         state = grown(scene, cells, colonies)
-        spent = counted(scene, state, STEPS)
+        spent = counted(scene.bind(state=state), state, STEPS)
         record: dict = {
             "case": "beside",
             "beside": name,
@@ -162,15 +167,14 @@ def beside(cells: int, colonies: int) -> list[dict]:
         for title in ("growth", "mechanics"):
             if record[title] != alone[title] or state.cells != alone["cells"]:
                 raise SystemExit(
-                    f"{title} beside {name} does not cost what it costs alone: {record[title]}"
-                    f" instead of {alone[title]}"
+                    f"{title} with {name} costs {record[title]}, but alone {alone[title]}"
                 )
-        print(f"beside {name}: growth and mechanics the same", flush=True)
+        print(f"with {name}: growth and mechanics cost the same", flush=True)
     return records
 
 
 def scene_rows(record: dict) -> list[str]:
-    """A scene's rows of the table."""
+    """Returns the rows of a scene in the table."""
     effects = record["effects"]
     total = {key: sum(e[key] for e in effects.values()) for key in ("ms", "operators", "bytes")}
     rows = [
@@ -186,7 +190,7 @@ def scene_rows(record: dict) -> list[str]:
 
 
 def tables(noted: dict, records: list[dict]) -> str:
-    """The page's tables in Markdown."""
+    """Returns the tables of the page in Markdown."""
     scenes, body = ([r for r in records if r["case"] == case] for case in ("scene", "beside"))
     lines = [
         (
@@ -200,15 +204,15 @@ def tables(noted: dict, records: list[dict]) -> str:
         "|---|---|---|---|",
         *(row for r in scenes for row in scene_rows(r)),
         "",
-        "### What is not listed costs nothing",
+        "### An effect that is not listed costs nothing",
         "",
         (
-            f"{body[0]['cells']} cells in {body[0]['colonies']} colonies, {STEPS} steps: operators"
-            " dispatched and bytes allocated, in all."
+            f"{body[0]['cells']} cells in {body[0]['colonies']} colonies, {STEPS} steps: total"
+            " operators dispatched and bytes allocated."
         ),
         "",
         (
-            "| growth, division and mechanics beside | growth | mechanics | division | the other"
+            "| growth, division and mechanics with | growth | mechanics | division | the other"
             " effects |"
         ),
         "|---|---|---|---|---|",
@@ -229,7 +233,7 @@ def main() -> None:
         "--scene",
         action="append",
         choices=tuple(tf.scenes.READY),
-        help="one scene; may be given again",
+        help="one scene; may be repeated",
     )
     parser.add_argument("--cells", type=int, default=200, help="in each colony")
     parser.add_argument("--colonies", type=int, default=4)
@@ -237,24 +241,24 @@ def main() -> None:
         "--out",
         type=Path,
         default=HERE / "benchmarks" / "effect_costs.json",
-        help="JSON record, written anew",
+        help="JSON record to write; replaces an existing one",
     )
     parser.add_argument(
         "--page",
         default=str(HERE.parent / "docs" / "effects.md"),
-        help="page whose tables are written anew; '' for none",
+        help="page with the tables to update; '' for none",
     )
-    chosen = parser.parse_args()
+    options = parser.parse_args()
     tf.keep_memory()
     torch.set_grad_enabled(False)
     noted, records = machine(), []
-    for name in chosen.scene or tf.scenes.READY:
-        records.append(of_scene(name, chosen.cells, chosen.colonies))
+    for name in options.scene or tf.scenes.READY:
+        records.append(of_scene(name, options.cells, options.colonies))
         print("\n".join(scene_rows(records[-1])), flush=True)
-    records += beside(chosen.cells, chosen.colonies)
-    chosen.out.write_text(json.dumps([noted | record for record in records], indent=1) + "\n")
-    if chosen.page:
-        write_page(Path(chosen.page), tables(noted, records), MARK)
+    records += beside(options.cells, options.colonies)
+    options.out.write_text(json.dumps([noted | record for record in records], indent=1) + "\n")
+    if options.page:
+        write_page(Path(options.page), tables(noted, records), MARK)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""An open channel at steady state, for as long as one likes: does memory grow, do amounts drift?
+"""Tests memory use and conservation of amounts in a long run of an open channel at steady state.
 
     python experiments/long_run.py --steps 100000 --out runs/long_run.csv
 
-Cells grow, divide and leave a channel at its open end. About the closed end (x < 8 µm) they stand
-in a reservoir and take up AHL; farther on they exchange it with the medium on a grid and carry it
-out at the end, and it switches LuxI on. Nothing makes or takes AHL, so what is in cells and medium,
-what left with cells and what came from the reservoir add up to what there was: the drift of that
-sum is told relative to all that has passed. Writes a line of CSV every 500 steps (in a short run
-every hundredth of it), and prints one for docs/stability.md.
+Cells grow, divide and leave a channel at its open end. Near the closed end (x < 8 µm) they are in a
+reservoir and take up AHL. Farther on they exchange AHL with the medium on a grid and carry it out
+at the end. AHL switches LuxI on. No process produces or degrades AHL. So the AHL in cells and
+medium, that carried out and that from the reservoir add up to a constant. The script reports the
+drift of this sum relative to the AHL that has passed. It writes a CSV line every 500 steps (in a
+short run every hundredth of it) and prints a line for docs/stability.md.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ COLUMNS = (
 
 
 def lux(u, s, p, cell):
+    """AHL crosses the membrane and activates LuxI; no process produces AHL."""
     into = 20.0 * (s.ahl - u.ahl) * cell.area
     return {
         "luxi": 0.01 + 5.0 * tf.kinetics.activation(u.ahl, 0.3, 2) - 2.0 * u.luxi,
@@ -49,7 +50,7 @@ def lux(u, s, p, cell):
 
 @dataclass(frozen=True)
 class Carried(tf.Effect):
-    """Adds up the AHL of cells that are about to leave, in the field `carried` (B,), conc·µm³."""
+    """Sums the AHL of cells that are about to leave, in the field `carried`, (B,), conc·µm³."""
 
     stage = REMOVAL - 1
     title = "carried"
@@ -65,13 +66,20 @@ class Carried(tf.Effect):
             ),
         )
 
-    def step(self, state: tf.State, dt: float) -> tf.State:
+    def reads(self) -> tuple[str, ...]:
+        return ("position", "ahl", "circuit_volume", "carried")
+
+    def writes(self) -> tuple[str, ...]:
+        return ("carried",)
+
+    def step(self, state: tf.State, dt: float, values) -> tf.State:
         leaves = state.position[:, 0] > LENGTH
         amount = torch.where(leaves, state.ahl.double() * state.circuit_volume.double(), 0.0)
         return state.with_fields(carried=state.carried.index_add(0, state.colony, amount))
 
 
 def channel() -> tf.Scene:
+    """Returns the scene: a channel with a reservoir at its closed end."""
     half = WIDTH / 2
     return tf.Scene(
         tf.Growth(rate=tf.Uniform(0.8, 1.2)),
@@ -91,28 +99,31 @@ def channel() -> tf.Scene:
 
 
 def resident() -> float:
-    """Memory that this process holds, MB."""
+    """Returns the resident memory of this process, MB."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def tensors(state: tf.State) -> float:
-    """Memory of a state's own tensors, MB."""
-    every = [
+    """Returns the memory of the tensors of a state, MB."""
+    found = [
         v for v in (*vars(state).values(), *state.fields.values()) if isinstance(v, torch.Tensor)
     ]
-    return sum(v.numel() * v.element_size() for v in every) / 2**20
+    return sum(v.numel() * v.element_size() for v in found) / 2**20
 
 
 def balance(state: tf.State) -> tuple[float, float, float]:
-    """What is held in cells and medium, what has passed (in from the reservoir), and the sum that
-    should stay 0, conc·µm³."""
+    """Returns three amounts of AHL, conc·µm³.
+
+    They are: that in cells and medium, that which has passed in from the reservoir, and the sum
+    that should stay 0.
+    """
     assert state.layout is not None
     held = float(
         (state.ahl.double() * state.circuit_volume.double()).sum()
         + state.signals["ahl"].double().sum() * state.layout.grid.voxel_volume
     )
-    given = float(state.ahl_reservoir.double().sum())
-    return held, -given, held + given + float(state.carried.sum())
+    released = float(state.ahl_reservoir.double().sum())
+    return held, -released, held + released + float(state.carried.sum())
 
 
 def main() -> None:
@@ -121,24 +132,24 @@ def main() -> None:
     )
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument(
-        "--minutes", type=float, default=float("inf"), help="stop earlier, after as long"
+        "--minutes", type=float, default=float("inf"), help="stop after this time at the latest"
     )
     parser.add_argument("--dtype", choices=("float32", "float64"), default="float32")
     parser.add_argument("--out", type=Path, default=Path("runs/long_run.csv"))
-    chosen = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
     tf.keep_memory()
-    scene, begun, rows = channel(), time.perf_counter(), []
-    start = scene.seed(seed=1, dtype=getattr(torch, chosen.dtype))
-    every = max(1, min(500, chosen.steps // 100))
-    chosen.out.parent.mkdir(parents=True, exist_ok=True)
-    with chosen.out.open("w", newline="") as file:
+    scene, begin, rows = channel(), time.perf_counter(), []
+    dtype = getattr(torch, options.dtype)
+    every = max(1, min(500, options.steps // 100))
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with options.out.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(COLUMNS)
-        for state in tf.simulate(scene, start, until=chosen.steps * scene.dt):
-            seconds = time.perf_counter() - begun
+        for state in tf.simulate(scene, seed=1, dtype=dtype, until=options.steps * scene.dt):
+            seconds = time.perf_counter() - begin
             if state.step % every == 0:
-                held, passed, left = balance(state)
+                held, passed, drift = balance(state)
                 row = (
                     state.step,
                     state.time,
@@ -147,23 +158,24 @@ def main() -> None:
                     tensors(state),
                     held,
                     passed,
-                    left / passed,
+                    drift / passed,
                     float(state.luxi.mean()),
                     seconds,
                 )
                 rows.append(row)
                 table.writerow(row)
                 file.flush()
-            if seconds > 60 * chosen.minutes:
+            if seconds > 60 * options.minutes:
                 break
     settled = [r for r in rows if r[0] >= rows[-1][0] / 5]
     memory, count, luxi = ([r[k] for r in settled] for k in (2, 3, 8))
     print(
-        f"{state.step:,} steps ({state.time:.0f} h, {settled[-1][9]:.0f} s) in {chosen.dtype}: from"
-        f" a fifth of the run on {min(count)}-{max(count)} cells, LuxI"
-        f" {min(luxi):.3g}-{max(luxi):.3g}, memory {memory[0]:.1f} MB then and {memory[-1]:.1f} MB"
-        f" at the end ({min(memory):.1f}-{max(memory):.1f}); {settled[-1][6]:.4g} conc·µm³ passed,"
-        f" of which {max(abs(r[7]) for r in rows):.2g} at most is not accounted for."
+        f"{state.step:,} steps ({state.time:.0f} h, {settled[-1][9]:.0f} s) in {options.dtype}."
+        f" After a fifth of the run: {min(count)}-{max(count)} cells, LuxI"
+        f" {min(luxi):.3g}-{max(luxi):.3g}, memory {memory[0]:.1f} MB, at the end"
+        f" {memory[-1]:.1f} MB (range {min(memory):.1f}-{max(memory):.1f}). AHL passed:"
+        f" {settled[-1][6]:.4g} conc·µm³; largest relative drift:"
+        f" {max(abs(r[7]) for r in rows):.2g}."
     )
 
 

@@ -1,10 +1,10 @@
-"""A ring: cells light up at some distance from a source in the middle (Basu et al. 2005), where
-there is neither too much nor too little of a signal.
+"""A ring: cells light up at some distance from a source in the centre (Basu et al. 2005), where
+the signal is neither too high nor too low.
 
     python experiments/ring.py --colonies 1000
 
-The choice of promoter is searched along with its constants: "steep" ones bind four molecules of the
-signal, "shallow" ones two.
+The search chooses a promoter and its constants. A "steep" promoter binds four molecules of the
+signal, a "shallow" one two.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ POWERS = {"shallow": 2.0, "steep": 4.0}
 
 
 def detector(u, s, p, cell):
-    """GFP where the signal is above one threshold and below another; the repressor takes time to be
-    made."""
+    """GFP where the signal is above one threshold and below another.
+
+    A repressor, whose production takes time, switches GFP off at high signal.
+    """
     low, high = (
         s.signal**p.n / (p.above**p.n + s.signal**p.n),
         s.signal**p.n / (p.below**p.n + s.signal**p.n),
@@ -31,13 +33,13 @@ def detector(u, s, p, cell):
     }
 
 
-def middle(places):
-    """1 within 3 µm of the middle."""
+def centre(places):
+    """Returns 1 within 3 µm of the centre, else 0."""
     return (places[:, :2].square().sum(1) < 9.0).to(places.dtype)
 
 
 def band_detector(above=0.05, below=0.3, make=10.0, decay=2.0, promoter="steep") -> tf.Scene:
-    """A colony of band detectors about a source."""
+    """Returns a colony of band detectors around a source."""
     return tf.Scene(
         tf.Growth(rate=1.0),
         tf.Division(length=tf.Uniform(3.5, 4.5)),
@@ -53,7 +55,7 @@ def band_detector(above=0.05, below=0.3, make=10.0, decay=2.0, promoter="steep")
             rtol=1e-2,
         ),
         tf.Medium(
-            signal=tf.Signal(diffusion=250.0, decay=10.0, source=middle),
+            signal=tf.Signal(diffusion=250.0, decay=10.0, source=centre),
             box=((-34, -34), (34, 34)),
             spacing=4.0,
         ),
@@ -76,9 +78,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--colonies", type=int, default=1000)
+    parser.add_argument("--colonies", type=int, default=1000, help="number to simulate")
     parser.add_argument(
-        "--out", type=Path, default=Path("ring"), help="stem of the files that are written"
+        "--out", type=Path, default=Path("ring"), help="path of the files to write, without suffix"
     )
     options = parser.parse_args()
     tf.keep_memory()

@@ -1,12 +1,11 @@
-"""Writes the table of docs/stability.md: every hard case with its criterion and what its tests
-measured.
+"""Writes the table of docs/stability.md: every hard case, its criterion and its measured values.
 
-    python experiments/stability.py                                      # on a machine with a GPU the CUDA columns too
-    python experiments/stability.py --values runs/values.json            # keep the values, or, with --with, add another machine's
-    python experiments/stability.py --with runs/cuda.json
+    python experiments/stability.py                             # with a GPU also the CUDA columns
+    python experiments/stability.py --values runs/values.json   # also write the values to a file
+    python experiments/stability.py --with runs/cuda.json       # add the values of another machine
 
-Runs the tests of tests/laws, which note with the fixture `measured` the very values that they
-assert on; of several of one case the worst is shown. The text around the table is written by hand.
+The script runs the tests of tests/laws. The fixture `measured` records the values that the tests
+assert on. The table has the worst value of each case. The text around the table is written by hand.
 """
 
 from __future__ import annotations
@@ -35,14 +34,17 @@ HEADS = {
     "cuda float64": "float64, CUDA",
 }
 
-# by case: what was measured -> column -> worst value, under "criterion" what it must be
+# by case: measured quantity -> column -> worst value; the column "criterion" has the criterion
 Values = dict[str, dict[str, dict[str, float | str]]]
 
 
 @dataclass
-class Noting:
-    """A pytest plugin: `cases`, the first sentence of each case's first test; `values`; and tests
-    that failed."""
+class Collector:
+    """A pytest plugin that collects the measured values.
+
+    cases: first paragraph of the docstring of each case's first test. tests: its name. values: the
+    worst values. failed: tests that failed. passed: number of tests that passed.
+    """
 
     cases: dict[str, str] = field(default_factory=dict)
     tests: dict[str, str] = field(default_factory=dict)
@@ -54,8 +56,8 @@ class Noting:
         for item in items:
             found = CASE.match(item.name)
             if found:
-                said = " ".join((item.function.__doc__ or "").split("\n\n")[0].split())
-                self.cases.setdefault(found[1], said)
+                summary = " ".join((item.function.__doc__ or "").split("\n\n")[0].split())
+                self.cases.setdefault(found[1], summary)
                 self.tests.setdefault(found[1], item.originalname)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -71,33 +73,36 @@ class Noting:
         )
         if found is None or column is None:
             return
-        for key, noted in report.user_properties:
+        for key, value in report.user_properties:
             if key == "measured":
-                worse(self.values.setdefault(found[1], {}), *noted, column)
+                keep_worse(self.values.setdefault(found[1], {}), *value, column)
 
 
-def worse(
+def keep_worse(
     case: dict[str, dict[str, float | str]], what: str, value: float, criterion: str, column: str
 ) -> None:
-    """Keep the worse of what a case has and `value`."""
+    """Keeps the worse of `value` and the value that the case has."""
     row = case.setdefault(what, {"criterion": criterion})
     pick = min if criterion.startswith("≥") else max
     row[column] = pick(value, float(row.get(column, value)))
 
 
 def shown(value: float | str | None) -> str:
+    """Returns a value as text for the table."""
     return "-" if value is None else "0" if value == 0 else f"{float(value):.2g}".replace("-", "−")
 
 
-def table(noting: Noting, extra: Values) -> str:
-    """The table in Markdown: a line for each thing measured, or for a case that notes none the name
-    of its test."""
-    values = {case: {**noting.values.get(case, {})} for case in noting.cases}
+def table(collector: Collector, extra: Values) -> str:
+    """Returns the table in Markdown: one line per measured quantity.
+
+    A case without values has one line with the name of its test.
+    """
+    values = {case: {**collector.values.get(case, {})} for case in collector.cases}
     for case, rows in extra.items():
         for what, row in rows.items():
             for column in COLUMNS:
                 if column in row:
-                    worse(
+                    keep_worse(
                         values.setdefault(case, {}),
                         what,
                         float(row[column]),
@@ -105,15 +110,17 @@ def table(noting: Noting, extra: Values) -> str:
                         column,
                     )
     lines = [
-        "| case | what is set up, and what must hold | measured | criterion | "
+        "| case | setup and law | measured | criterion | "
         + " | ".join(HEADS[c] for c in COLUMNS)
         + " |",
         "|" + "---|" * 8,
     ]
-    for case in sorted(noting.cases, key=int):
-        about = noting.cases[case].replace("|", "\\|")
+    for case in sorted(collector.cases, key=int):
+        about = collector.cases[case].replace("|", "\\|")
         if not values[case]:
-            lines.append(f"| {int(case)} | {about} | no value: `{noting.tests[case]}` | | | | | |")
+            lines.append(
+                f"| {int(case)} | {about} | no value: `{collector.tests[case]}` | | | | | |"
+            )
         for number, (what, row) in enumerate(values[case].items()):
             head = f"{int(case)} | {about}" if number == 0 else " | "
             lines.append(
@@ -128,25 +135,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--values", type=Path, help="write the values here, as JSON")
-    parser.add_argument(
-        "--with", dest="extra", type=Path, help="add the values that another run wrote"
-    )
-    chosen = parser.parse_args()
-    noting = Noting()
+    parser.add_argument("--values", type=Path, help="JSON file for the values")
+    parser.add_argument("--with", dest="extra", type=Path, help="add the values of another run")
+    options = parser.parse_args()
+    collector = Collector()
     pytest.main(
-        ["-q", "-p", "no:cacheprovider", "-n", "0", str(ROOT / "tests" / "laws")], plugins=[noting]
+        ["-q", "-p", "no:cacheprovider", "-n", "0", str(ROOT / "tests" / "laws")],
+        plugins=[collector],
     )
-    if chosen.values:
-        chosen.values.write_text(json.dumps(noting.values, ensure_ascii=False, indent=1))
-    extra: Values = json.loads(chosen.extra.read_text()) if chosen.extra else {}
+    if options.values:
+        options.values.write_text(json.dumps(collector.values, ensure_ascii=False, indent=1))
+    extra: Values = json.loads(options.extra.read_text()) if options.extra else {}
     write_page(
         PAGE,
-        f"{table(noting, extra)}\n\n{noting.passed} tests passed, {len(noting.failed)} failed.",
+        f"{table(collector, extra)}\n\n{collector.passed} tests passed,"
+        f" {len(collector.failed)} failed.",
         MARK,
     )
-    if noting.failed:
-        sys.exit("failed, and the page says so: " + ", ".join(noting.failed))
+    if collector.failed:
+        sys.exit("failed tests, noted on the page: " + ", ".join(collector.failed))
 
 
 if __name__ == "__main__":

@@ -1,18 +1,20 @@
-"""Does `tune` hold what it promises? On every ready-made scene: the error of the chosen settings in
-a run that it has not seen, and what a wider sweep finds.
+"""Tests whether `tune` holds its promise on every ready-made scene.
 
-    OMP_NUM_THREADS=1 python experiments/tune_check.py                         # some twenty minutes; writes its part of docs/accuracy.md, and a CSV
+    OMP_NUM_THREADS=1 python experiments/tune_check.py       # all scenes, some twenty minutes
     OMP_NUM_THREADS=1 python experiments/tune_check.py --scene channel --error 3%
-    OMP_NUM_THREADS=1 python experiments/tune_check.py --scene channel --out channel.csv       # one after another, or side by side, and then
-    python experiments/tune_check.py --gather channel.csv microcolony.csv …                    # the page of what was found
+    OMP_NUM_THREADS=1 python experiments/tune_check.py --scene channel --out channel.csv
+    python experiments/tune_check.py --gather channel.csv microcolony.csv   # join such files
 
-The runs that it has not seen have other seeds: 24 colonies that begin with 100 cells, and 48 that
-begin with half as many again. A sweep of six steps (and three finer ones, where none of those holds
-the error) with eight settings of contacts and two tolerances of circuits is made in the first. From
-the one that took the least time on, those that hold the error there are tried in the second as
-well, until one holds it in both: of so many settings some hold it by luck, and some at one size
-only. It is timed beside the chosen one, and what that one takes over what the sweep's takes is the
-last column.
+The first and the last command write tune.csv in experiments/benchmarks/accuracy and its table in
+docs/accuracy_appendix.md.
+
+The script measures the error of the chosen settings in two runs that `tune` has not used: 24
+colonies that begin with 100 cells, and 48 that begin with half as many again. A sweep in the first
+run gives a comparison: six steps (and three finer ones, if none of those holds the error), eight
+settings of contacts and two tolerances of circuits. The settings that hold the error there are run
+in the second run as well, in order of their time, until one holds the error in both. Of so many
+settings some hold the error by chance, and some at one size only. The last column is the time of
+the chosen settings over that of the cheapest ones.
 """
 
 from __future__ import annotations
@@ -33,11 +35,12 @@ from torchfilm.tuning.observables import AccuracyProbe, Error, Seen, begin
 from torchfilm.tuning.tuner import TIGHT_CONTACTS, Search
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE / "benchmarks"))
-from record import machine, write_page  # noqa: E402
+sys.path[:0] = [str(HERE / "accuracy"), str(HERE / "benchmarks")]
+import appendix  # noqa: E402
+from record import machine  # noqa: E402
 
 STEPS = (12, 18, 24, 30, 40, 54)
-FINER = (72, 96, 128)  # where none of those holds the error
+FINER = (72, 96, 128)  # if none of STEPS holds the error
 SWEPT = (
     (0.3, 0, 0.05),
     (0.1, 0, 0.2),
@@ -63,37 +66,38 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run that `tune` has not seen, and what is right there."""
+class TestRun:
+    """A run that `tune` has not used, and its reference."""
 
     probe: AccuracyProbe
     search: Search
     reference: Seen
 
     @staticmethod
-    def of(scene: tf.Scene, cells: int, colonies: int, seed: int, finest: int) -> Run:
+    def of(scene: tf.Scene, cells: int, colonies: int, seed: int, finest: int) -> TestRun:
+        """Grows the probe and runs the reference with `finest` steps."""
         probe = begin(scene, cells, colonies, seed=seed)
         search = Search(probe, probe, 0.01)
-        return Run(
+        return TestRun(
             probe,
             search,
             probe.observed(search.settings(finest, TIGHT_CONTACTS, search.tight)).found,
         )
 
     def worst(self, settings: tf.Settings, names: Sequence[str]) -> tuple[Error, str, float]:
-        """The greatest error, of which observable, and the seconds that the window took."""
+        """Returns the largest error, its observable and the seconds of the window."""
         run = self.probe.observed(settings)
         errors = self.probe.errors(run.found, {n: self.reference[n] for n in names})
         name = max(errors, key=lambda n: errors[n].value)
         return errors[name], name, run.seconds
 
     def seconds(self, settings: tf.Settings) -> float:
-        """The least of three."""
+        """Returns the shortest of three times."""
         return min(self.probe.observed(settings).seconds for _ in range(3))
 
 
-def sweep(run: Run, steps: Sequence[int]) -> list[tf.Settings]:
-    """All combinations with these steps."""
+def sweep(run: TestRun, steps: Sequence[int]) -> list[tf.Settings]:
+    """Returns all settings of the sweep with these steps."""
     search = run.search
     contacts = SWEPT if search.mechanics is not None else (TIGHT_CONTACTS,)
     rtols = RTOLS if search.circuit is not None else (search.tight,)
@@ -104,12 +108,13 @@ def sweep(run: Run, steps: Sequence[int]) -> list[tf.Settings]:
 
 
 def check(name: str, error: float) -> dict[str, str]:
-    """One scene's row."""
+    """Returns the row of one scene."""
     scene = tf.scenes.build(name)
     tuned = tf.tune(scene, error)
     names = tuple(tuned.chosen.errors)
-    few, many = Run.of(scene, 100, 24, 5, tuned.finest), Run.of(scene, 150, 48, 6, tuned.finest)
-    worst, of, _ = max(
+    few = TestRun.of(scene, 100, 24, 5, tuned.finest)
+    many = TestRun.of(scene, 150, 48, 6, tuned.finest)
+    worst, observable, _ = max(
         (run.worst(tuned.settings, names) for run in (few, many)), key=lambda found: found[0].value
     )
     found: dict[tf.Settings, tuple[Error, str, float]] = {}
@@ -120,12 +125,12 @@ def check(name: str, error: float) -> dict[str, str]:
             (s for s, (e, _, _) in found.items() if e.value <= error), key=lambda s: found[s][2]
         )
         both = ((s, its) for s in holding if (its := many.worst(s, names)[0]).value <= error)
-        of_best = next(both, None)
-        if of_best is not None:
+        best = next(both, None)
+        if best is not None:
             break
     swept = ("none", "", str(len(found)), str(len(holding)), "")
-    if of_best is not None:
-        s, its = of_best
+    if best is not None:
+        s, its = best
         over = few.seconds(tuned.settings) / few.seconds(s)
         swept = (
             words(s),
@@ -134,8 +139,8 @@ def check(name: str, error: float) -> dict[str, str]:
             str(len(holding)),
             f"{over:.2f}",
         )
-    told = (name, words(tuned.settings), str(worst), of, *swept)
-    return dict(zip(COLUMNS, told, strict=True))
+    row = (name, words(tuned.settings), str(worst), observable, *swept)
+    return dict(zip(COLUMNS, row, strict=True))
 
 
 def main() -> None:
@@ -146,60 +151,41 @@ def main() -> None:
         "--scene",
         action="append",
         choices=tuple(tf.scenes.READY),
-        help="one scene; may be given again",
+        help="one scene; may be repeated",
     )
-    parser.add_argument("--error", default="1%")
+    parser.add_argument("--error", default="1%", help="error to request")
     parser.add_argument(
-        "--out",
-        type=Path,
-        help="CSV; by default the one beside the benchmarks, and with --scene none",
-    )
-    parser.add_argument(
-        "--page",
-        type=Path,
-        help="page whose table is written anew; by default docs/accuracy.md, and with --scene none",
+        "--out", type=Path, help="CSV file; default: that of the records, or none with --scene"
     )
     parser.add_argument(
         "--gather",
         nargs="+",
         type=Path,
         default=[],
-        help="CSV of scenes that were checked by themselves, for the page",
+        help="CSV files of scenes that were checked separately",
     )
-    chosen = parser.parse_args()
+    options = parser.parse_args()
     tf.keep_memory()
     torch.set_grad_enabled(False)
     rows, error = (
-        [row for path in chosen.gather for row in csv.DictReader(path.open(newline=""))],
-        parse_error(chosen.error),
+        [row for path in options.gather for row in csv.DictReader(path.open(newline=""))],
+        parse_error(options.error),
     )
-    for name in () if rows else chosen.scene or tf.scenes.READY:
+    for name in () if rows else options.scene or tf.scenes.READY:
         rows.append(check(name, error))
         print(rows[-1], flush=True)
-    out, page = chosen.out, chosen.page
-    if not chosen.scene:
-        out, page = (
-            out or HERE / "benchmarks" / "accuracy" / "tune.csv",
-            page or HERE.parent / "docs" / "accuracy.md",
-        )
+    out, write_page = options.out, not options.scene and options.out is None
+    if write_page:
+        out = appendix.RECORDS / "tune.csv"
     if out:
         out.parent.mkdir(parents=True, exist_ok=True)
         with out.open("w", newline="") as file:
             table = csv.DictWriter(file, COLUMNS)
             table.writeheader()
             table.writerows(rows)
-    if page:
-        noted = machine()
-        lines = [
-            "| " + " | ".join(COLUMNS) + " |",
-            "|---" * len(COLUMNS) + "|",
-            *("| " + " | ".join(r.values()) + " |" for r in rows),
-        ]
-        how = (
-            f"Asked for {chosen.error}. Measured {noted['date'][:10]} at commit {noted['commit']},"
-            f" torch {noted['torch']}, {noted['threads']} thread(s)."
-        )
-        write_page(page, "\n".join([how, "", *lines]), "tune: experiments/tune_check.py")
+    if write_page:
+        appendix.add_record("tune", machine(), facts={"error": options.error})
+        print(appendix.write())
 
 
 if __name__ == "__main__":

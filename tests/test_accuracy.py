@@ -161,11 +161,12 @@ def test_from_an_even_medium_lie_and_strang_are_one_course(rooms):
     ends = []
     for kind in ("lie", "strang"):
         scene = room.scene_of(case, kind, 1e-4)
-        state = scene.bind(dtype=torch.float64).start()
+        model = scene.bind(dtype=torch.float64)
+        state = model.start()
         state = state.with_fields(
             **{tf.state.OUTSIDE + "ahl": torch.zeros_like(state.signals["ahl"])}
         )
-        ends.append(rooms["circuits"].advance(scene, state, 0.1, 5))
+        ends.append(rooms["circuits"].advance(model, state, 0.1, 5))
     assert ends[0].luxi.tolist() == pytest.approx(ends[1].luxi.tolist(), rel=1e-12)
     assert float((ends[0].signals["ahl"] - ends[1].signals["ahl"]).abs().max()) > 1e-3 * float(
         ends[1].signals["ahl"].max()
@@ -203,7 +204,8 @@ def test_equations_are_those_of_the_scene(rooms):
     )
     ours = tf.Circuit(problem.rates, species=ready.species, initial=starts, **problem.parameters)
     ends = [tf.Scene(c, founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])) for c in (same, ours)]
-    last = [room.advance(s, s.bind(dtype=torch.float64).start(), 0.05, 4) for s in ends]
+    models = [scene.bind(dtype=torch.float64) for scene in ends]
+    last = [room.advance(model, model.start(), 0.05, 4) for model in models]
     for name in ready.species:
         assert float(last[0].fields[name]) == pytest.approx(float(last[1].fields[name]), rel=1e-8)
 

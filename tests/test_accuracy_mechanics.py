@@ -18,7 +18,9 @@ import torchfilm as tf
 
 HERE = Path(__file__).parent.parent / "experiments"
 sys.path += [str(HERE / "accuracy"), str(HERE / "benchmarks")]
+import contact_settings  # noqa: E402
 import mechanics  # noqa: E402
+import soft_cells  # noqa: E402
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
 
@@ -85,7 +87,7 @@ def test_a_window_shows_what_each_knob_is_for(dim):
     )
     assert by["dt=0.0125"].work > by["dt=0.025"].work
     fine, loose = mechanics.tight(tf.Mechanics(dim=dim), True)
-    assert not {fine.words, loose.words} & set(by) and fine.mechanics.unilateral
+    assert not {fine.label, loose.label} & set(by) and fine.mechanics.unilateral
 
 
 @pytest.mark.slow
@@ -106,9 +108,9 @@ def test_the_motion_by_numpy_obeys_action_and_reaction():
     rng = np.random.default_rng(1)
     axis = rng.normal(size=(30, 3))
     axis /= np.linalg.norm(axis, axis=1)[:, None]
-    motion = mechanics.Motion(rng.uniform(-2, 2, (30, 3)), axis, rng.uniform(0.5, 2, 30), ())
+    motion = soft_cells.Motion(rng.uniform(-2, 2, (30, 3)), axis, rng.uniform(0.5, 2, 30), ())
     move, turn = motion.velocity()[:180].reshape(2, 30, 3)
-    whole = (motion.length + mechanics.DIAMETER)[:, None]
+    whole = (motion.length + contact_settings.DIAMETER)[:, None]
     force, torque = move * whole, np.cross(motion.axis, turn) * whole**3 / 12
     assert np.abs(force).max() > 1.0
     # sums of some hundred forces of size 100 in float64
@@ -141,30 +143,33 @@ def test_local_order(dim):
     assert mechanics.local_order(state).tolist() == pytest.approx([1.0, -1.0 if dim == 2 else -0.5])
 
 
-def test_a_choice_says_what_a_user_would_type():
+def test_a_label_says_what_a_user_would_type():
     plain = tf.Mechanics(dim=2)
-    assert mechanics.Choice("", plain).words == "dt=0.025"
-    turned = mechanics.Choice(
+    assert contact_settings.ContactSetting("", plain).label == "dt=0.025"
+    turned = contact_settings.ContactSetting(
         "",
         dataclasses.replace(plain, alpha=0.003, tolerance=0.02, unilateral=True),
         0.05,
         torch.float64,
     )
-    assert turned.words == "dt=0.05, alpha=0.003, tolerance=0.02, unilateral=True, float64"
+    assert turned.label == "dt=0.05, alpha=0.003, tolerance=0.02, unilateral=True, float64"
     scene = tf.scenes.microcolony(dim=2)
-    draft, settings = mechanics.Choice.of_preset("draft", scene), tf.preset("draft", scene)
+    draft, settings = (
+        contact_settings.ContactSetting.of_preset("draft", scene),
+        tf.preset("draft", scene),
+    )
     assert (
-        draft.words
+        draft.label
         == f"preset draft: dt={settings.dt:g}, alpha=0.01, tolerance={settings.tolerance:g}"
     )
     assert (
         draft.scene(scene).dt == settings.dt
-        and mechanics.mechanics_of(settings.apply(scene)) == draft.mechanics
+        and contact_settings.mechanics_of(settings.apply(scene)) == draft.mechanics
     )
     made = turned.scene(scene)
     assert (
         made.dt == 0.05
-        and mechanics.mechanics_of(made) == turned.mechanics
+        and contact_settings.mechanics_of(made) == turned.mechanics
         and len(made.effects) == len(scene.effects)
     )
     state = turned.start(scene.bind().start())

@@ -1,9 +1,10 @@
-"""Work and precision of the circuits: cells that neither meet nor exchange, each against its own
-equation solved by SciPy to twelve digits.
+"""Work and precision of the circuits.
 
-The equations are written once, in arithmetic that torch and NumPy share: the library integrates the
-one, SciPy's Radau or DOP853 the other, where the cell's volume is known in closed form. Work is
-what a rate function was asked for, rows over cells: a Jacobian of S species counts S.
+Cells neither touch nor exchange molecules. Each cell is compared with its own equation, which SciPy
+solves to twelve digits. The equations are written once, in arithmetic that torch and NumPy share:
+torchfilm integrates them in torch, SciPy's Radau or DOP853 in NumPy. The volume of a cell is known
+in closed form. Work is the number of rate evaluations per cell; a Jacobian of S species counts as
+S evaluations.
 """
 
 from __future__ import annotations
@@ -25,21 +26,23 @@ from torchfilm.effects.circuit import EXPLICIT
 Columns = dict[str, Any]
 ERROR, WORK = "relative error", "rate evaluations per cell"
 LENGTH, RADIUS = 2.0, 0.5  # µm, of every cell at the start
-DT = 0.025  # h, of a scene that says nothing else
-COARSE = 0.2  # h, the step of the scene that explicit methods divide
+DT = 0.025  # h, the default step of a scene
+COARSE = 0.2  # h, the step of the scene, which explicit methods divide
 CELLS = 8
-SETTLED = 16  # steps in COARSE from which orders are measured
-LONG = 0.1  # s; what takes longer is run once
+SETTLED = 16  # orders use at least this many steps in COARSE
+LONG = 0.1  # s; longer runs are timed once
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Cells to be followed for `until` h. rates: (u, s, p, cell) → dict; starts: (CELLS,) by
-    species; solver: SciPy's, for the reference."""
+    """A circuit in CELLS cells for `until` h.
+
+    rates: (u, s, p, cell) → dict. starts: initial concentrations by species, (CELLS,) each.
+    solver: SciPy's method for the reference.
+    """
 
     name: str
     title: str
-    words: str
     rates: Callable[[Any, Any, Any, Any], Columns]
     starts: Mapping[str, np.ndarray]
     until: float
@@ -49,7 +52,7 @@ class Problem:
 
 
 class Counted:
-    """A rate function that counts the rows it was asked for."""
+    """A rate function that counts the rows that it evaluates."""
 
     def __init__(self, rates: Callable[[Any, Any, Any, Any], Columns], first: str):
         self.rates, self.first, self.rows = rates, first, 0
@@ -60,12 +63,12 @@ class Counted:
 
 
 def ring_of_three(u, s, p, cell):
-    """The equations of tf.scenes.repressilator, an mRNA and a protein a gene."""
-    made = lambda by: p.speed * (p.alpha / (1 + by**2) + p.basal)
+    """The equations of tf.scenes.repressilator: one mRNA and one protein per gene."""
+    transcription = lambda by: p.speed * (p.alpha / (1 + by**2) + p.basal)
     return {
-        "m_laci": made(u.ci) - p.speed * u.m_laci,
-        "m_tetr": made(u.laci) - p.speed * u.m_tetr,
-        "m_ci": made(u.tetr) - p.speed * u.m_ci,
+        "m_laci": transcription(u.ci) - p.speed * u.m_laci,
+        "m_tetr": transcription(u.laci) - p.speed * u.m_tetr,
+        "m_ci": transcription(u.tetr) - p.speed * u.m_ci,
         "laci": p.turnover * (u.m_laci - u.laci),
         "tetr": p.turnover * (u.m_tetr - u.tetr),
         "ci": p.turnover * (u.m_ci - u.ci),
@@ -78,13 +81,13 @@ def toggle(u, s, p, cell):
 
 
 def fast_loop(u, s, p, cell):
-    """A variable that follows another within 1e-8 h, in a bistable loop: the hard case 24."""
+    """A bistable loop in which one variable follows the other within 1e-8 h: the hard case 24."""
     power = u.slow**8
     return {"slow": 0.1 + 2 * u.fast - u.slow, "fast": 1e8 * (power / (1 + power) - u.fast)}
 
 
 def lux(u, s, p, cell):
-    """The paper's Lux circuit, AHL outside held where it is."""
+    """The paper's Lux circuit with a constant concentration of AHL outside."""
     into = p.D1 * (p.outside - u.ahl) * cell.area
     induced = u.ahl * u.ahl
     return {
@@ -94,6 +97,7 @@ def lux(u, s, p, cell):
 
 
 def problems() -> list[Problem]:
+    """Returns the four problems without growth."""
     draw = np.random.default_rng(1)
     some = lambda low, high: draw.uniform(low, high, CELLS)
     genes = ("laci", "tetr", "ci")
@@ -102,8 +106,6 @@ def problems() -> list[Problem]:
         Problem(
             "circuits_repressilator",
             "Circuits: the repressilator",
-            "Eight cells follow the repressilator for 4 h, nearly a period, each from a start of"
-            " its own.",
             ring_of_three,
             {n: some(0.0, 40.0) for n in (*genes, *("m_" + n for n in genes))},
             4.0,
@@ -112,7 +114,6 @@ def problems() -> list[Problem]:
         Problem(
             "circuits_toggle",
             "Circuits: the toggle switch",
-            "Eight cells on both sides of the watershed of a toggle switch, for 6 h.",
             toggle,
             {"red": some(0.5, 4.0), "green": some(0.5, 4.0)},
             6.0,
@@ -120,8 +121,6 @@ def problems() -> list[Problem]:
         Problem(
             "circuits_stiff",
             "Circuits: a stiff, bistable loop",
-            "Eight cells in the loop of the hard case 24, rates of 1e8/h beside rates of 1/h, for 3"
-            " h, while they move.",
             fast_loop,
             {"slow": np.linspace(0.85, 1.2, CELLS), "fast": np.zeros(CELLS)},
             3.0,
@@ -130,7 +129,6 @@ def problems() -> list[Problem]:
         Problem(
             "circuits_lux",
             "Circuits: Lux quorum sensing",
-            "Eight cells switch on by Lux for 4 h; AHL crosses the membrane at 450/h.",
             lux,
             {"luxi": some(0.0, 0.2), "ahl": some(0.0, 0.05)},
             4.0,
@@ -140,15 +138,14 @@ def problems() -> list[Problem]:
 
 
 def geometry(growth: float, t: float) -> SimpleNamespace:
-    """Volume and area of a capsule whose volume has grown by the law V' = g V for t hours,
-    exactly."""
+    """Returns the exact volume and area of a capsule that has grown by V' = g V for t hours."""
     volume = math.pi * RADIUS**2 * (LENGTH + 4 * RADIUS / 3) * math.exp(growth * t)
     length = volume / (math.pi * RADIUS**2) - 4 * RADIUS / 3
     return SimpleNamespace(volume=volume, area=2 * math.pi * RADIUS * (length + 2 * RADIUS))
 
 
 def reference(problem: Problem) -> np.ndarray:
-    """(species, CELLS) at the end: each cell's c' = f(c) − g c by SciPy, to 1e-12."""
+    """Returns the final concentrations, (species, CELLS): c' = f(c) − g c by SciPy, to 1e-12."""
     names, p, growth = tuple(problem.starts), SimpleNamespace(**problem.parameters), problem.growth
 
     def slope(t: float, y: np.ndarray) -> np.ndarray:
@@ -159,17 +156,17 @@ def reference(problem: Problem) -> np.ndarray:
 
     ends = []
     for start in np.stack([problem.starts[n] for n in names], 1):
-        done = solve_ivp(
+        solution = solve_ivp(
             slope, (0.0, problem.until), start, method=problem.solver, rtol=1e-12, atol=1e-14
         )
-        assert done.success, done.message
-        ends.append(done.y[:, -1])
+        assert solution.success, solution.message
+        ends.append(solution.y[:, -1])
     return np.stack(ends, 1)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """How the circuits are stepped; what is not said is the library's own."""
+    """How the circuits are integrated; the defaults are those of torchfilm."""
 
     method: str = "rosenbrock"
     steps: int = 1
@@ -178,7 +175,7 @@ class Setting:
     dtype: torch.dtype = torch.float32
 
     @property
-    def words(self) -> str:
+    def label(self) -> str:
         kind = "float64" if self.dtype == torch.float64 else "float32"
         how = (
             f"{self.method}, rtol {self.rtol:g}"
@@ -192,10 +189,10 @@ class Setting:
         return self == Setting()
 
 
-def advance(scene: tf.Scene, state: tf.State, dt: float, steps: int) -> tf.State | None:
-    """The state `steps` steps later, or None if a circuit fails on the way."""
+def advance(model: tf.Model, state: tf.State, dt: float, steps: int) -> tf.State | None:
+    """Returns the state `steps` steps later, or None if a circuit fails."""
     for _ in range(steps):
-        state = scene.step(state, dt)
+        state = model.step(state, dt)
         if bool(state.reports["circuit"].status.any()):
             return None
     return state
@@ -204,7 +201,7 @@ def advance(scene: tf.Scene, state: tf.State, dt: float, steps: int) -> tf.State
 def point(
     problem: Problem, exact: np.ndarray, series: str, setting: Setting, step: float | None = None
 ) -> Point:
-    """One setting of a problem, run, timed and compared."""
+    """Runs, times and compares one setting of a problem."""
     names = tuple(problem.starts)
     counted = Counted(problem.rates, names[0])
     circuit = tf.Circuit(
@@ -215,7 +212,7 @@ def point(
         rtol=setting.rtol,
         **problem.parameters,
     )
-    # far apart, and without mechanics: nothing but the circuit and the growth
+    # cells far apart and without mechanics: only the circuit and growth act
     cells = tf.Cells(
         [[0.0, 5.0 * k] for k in range(CELLS)],
         [[1.0, 0.0]] * CELLS,
@@ -226,31 +223,35 @@ def point(
     scene = tf.Scene(
         *([tf.Growth(rate=problem.growth)] if problem.growth else []), circuit, founders=cells
     )
-    first = scene.seed(dtype=setting.dtype)
+    model = scene.bind(dtype=setting.dtype)
+    first = model.start()
     steps = round(problem.until / setting.dt)
     counted.rows = 0
-    run = lambda: advance(scene, first, problem.until / steps, steps)
+    run = lambda: advance(model, first, problem.until / steps, steps)
     last, seconds = timed(run, 1)
     work = counted.rows / CELLS
     if seconds < LONG:
         last, seconds = timed(run)
-    words = setting.words + (" (fails)" if last is None else "")
+    label = setting.label + (" (fails)" if last is None else "")
     error = (
         math.nan
         if last is None
         else off(np.stack([last.fields[n].double().numpy() for n in names]), exact)
     )
-    return Point(series, words, {ERROR: error}, seconds, work, setting.is_default, step=step)
+    return Point(series, label, {ERROR: error}, seconds, work, setting.is_default, step=step)
 
 
 def off(found: np.ndarray, exact: np.ndarray) -> float:
-    """Relative error of (species, cells): of each species its root mean square over cells, relative
-    to that of the species; of these the same over species."""
+    """Returns the relative error of concentrations, (species, cells).
+
+    It is the root mean square over species of each species' relative error. That is the root mean
+    square of the error over cells, relative to the root mean square of the species.
+    """
     return float(np.sqrt((((found - exact) ** 2).mean(1) / (exact**2).mean(1)).mean()))
 
 
 def sweep(problem: Problem, quick: bool) -> Study:
-    """All settings of a problem, cells that do not grow."""
+    """Returns the study of all settings of a problem, in cells that do not grow."""
     exact = reference(problem)
     tolerances = (1e-2, 1e-4, 1e-6) if quick else tuple(10.0**-k for k in range(1, 9))
     wide, whole = torch.float64, problem.until
@@ -285,40 +286,26 @@ def sweep(problem: Problem, quick: bool) -> Study:
                     COARSE / steps if steps >= SETTLED else None,
                 )
             )
-    more = (
-        " Explicit methods divide a step of 0.2 h into 1 to 64; where rates push a concentration"
-        f" below zero or past all numbers they fail, and say so. Orders are of {SETTLED} and more."
-    )
-    return Study(
-        problem.name,
-        problem.title,
-        problem.words + more,
-        f"relative, root mean square over species and cells, against SciPy's {problem.solver} to"
-        " 1e-12",
-        WORK,
-        (ERROR,),
-        points,
-    )
+    return Study(problem.name, problem.title, WORK, (ERROR,), points)
 
 
 def growing(quick: bool) -> Study:
-    """Dilution and rates taken in turns, in cells that grow."""
-    lux_like = Problem(
+    """Returns the study of the splitting of dilution and rates, in cells that grow."""
+    problem = Problem(
         "circuits_growth",
         "Circuits in cells that grow",
-        "",
         lux,
         {"luxi": np.linspace(0.0, 0.2, CELLS), "ahl": np.linspace(0.0, 0.05, CELLS)},
         1.0,
         {"D1": 2.0, "outside": 0.005},
         growth=1.0,
     )
-    exact, wide = reference(lux_like), torch.float64
+    exact, wide = reference(problem), torch.float64
     steps = (0.2, 0.1, DT) if quick else (0.5, 0.25, 0.125, 0.1, 0.05, DT, 0.0125, 0.00625)
     tight = 1e-5 if quick else 1e-7
     points = [
         point(
-            lux_like,
+            problem,
             exact,
             f"Δt at rtol {tight:g}, float64",
             Setting(rtol=tight, dt=dt, dtype=wide),
@@ -326,38 +313,27 @@ def growing(quick: bool) -> Study:
         )
         for dt in steps
     ]
-    points += [point(lux_like, exact, "Δt", Setting(dt=dt), dt) for dt in steps]
+    points += [point(problem, exact, "Δt", Setting(dt=dt), dt) for dt in steps]
     points += [
-        point(lux_like, exact, "rtol", Setting(rtol=r))
+        point(problem, exact, "rtol", Setting(rtol=r))
         for r in ((1e-2,) if quick else (1e-1, 1e-2, 1e-3, 1e-5, 1e-6, 1e-7))
     ]
     if not quick:
         points += [
-            point(lux_like, exact, "several", Setting(rtol=r, dt=dt))
+            point(problem, exact, "several", Setting(rtol=r, dt=dt))
             for r in (1e-1, 1e-2)
             for dt in (0.25, 0.1, 0.05)
         ]
         points += [
-            point(lux_like, exact, "several", Setting("rk4", n, dt=dt), None)
+            point(problem, exact, "several", Setting("rk4", n, dt=dt), None)
             for n in (1, 4)
             for dt in (0.1, DT)
         ]
-    return Study(
-        lux_like.name,
-        lux_like.title,
-        "Eight isolated cells grow by e in 1 h while Lux switches on in them; what passes the"
-        " membrane depends on volume and surface, which change.",
-        "relative, root mean square over species and cells, against SciPy's DOP853 to 1e-12 of c' ="
-        " f(c, V(t), A(t)) − g c",
-        WORK,
-        (ERROR,),
-        points,
-    )
+    return Study(problem.name, problem.title, WORK, (ERROR,), points)
 
 
 def studies(quick: bool) -> list[Study]:
-    """Work–precision of the integrators in cells that stand still, a problem each, and of Δt in
-    cells that grow."""
+    """Returns all studies of the circuits: one per problem without growth, and one with growth."""
     if quick:
         return [
             *(

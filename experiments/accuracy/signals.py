@@ -1,11 +1,11 @@
-"""Work and precision of transport: methods and Δt on a fixed grid, the grid's spacing, and what a
-point-like cell reads at its own place.
+"""Work and precision of transport: methods and Δt on a fixed grid, the spacing, and the reading of
+a cell at its own place.
 
-Time is judged by the exponential of a matrix that is assembled here, by finite volumes, from the
-fluxes' formula alone; space by a spreading Gaussian, integrated over each voxel. Work is
-multiplications: for each voxel an application of the operator has two for each of three axes and
-one for decay, a tridiagonal solve six, a dense factor of n voxels n; what Krylov methods add up
-beside their applications is not counted.
+The reference in time is the exponential of a matrix. This module assembles the matrix by finite
+volumes, from the formula of the fluxes alone. The reference in space is a spreading Gaussian,
+integrated over each voxel. Work is the number of multiplications. For each voxel, one application
+of the operator has two for each of three axes and one for decay, a tridiagonal solve has six, and a
+dense factor of n voxels has n. Vector operations of Krylov methods are not included.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from torchfilm.signals.operator import operator
 from torchfilm.signals.transport import prepare
 
 ERROR, BELOW, WORK = "relative error", "below zero", "multiplications"
-APPLY = 7  # multiplications of one application of the operator, a voxel
-SOLVE = 6  # of a tridiagonal solve, a voxel: hand up, keep (two), hand down, settle (two)
+APPLY = 7  # multiplications per voxel of one application of the operator
+SOLVE = 6  # of a tridiagonal solve: forward sweep three, backward sweep three
 STEPS = (0.2, 0.1, 0.05, 0.025, 0.0125, 0.00625)
-DT = 0.025  # h, of a scene that says nothing else
-SETTLED = 0.05  # h, up to which orders are measured
+DT = 0.025  # h, the default step of a scene
+SETTLED = 0.05  # h; orders use steps up to this length
 UNTIL = 0.4  # h
 SPACING, DIFFUSION, DECAY = 4.0, 400.0, 0.2  # µm, µm²/h, 1/h
 VOXELS = (32, 16)
-RADIUS = 0.5  # µm, of the sphere that a cell's reading is compared with
+RADIUS = 0.5  # µm, of the sphere that the reading of a cell is compared with
 Velocity = Callable[[np.ndarray], np.ndarray]  # places (M, 2) µm to velocities (M, 2) µm/h
 
 
 def bernoulli(x: np.ndarray) -> np.ndarray:
-    """x/(eˣ − 1)."""
+    """Returns x/(eˣ − 1)."""
     return np.where(x == 0, 1.0, x / np.where(x == 0, 1.0, np.expm1(x)))
 
 
@@ -56,10 +56,11 @@ def assembled(
     open_faces: bool = False,
     solid: np.ndarray | None = None,
 ) -> sparse.csr_matrix:
-    """The matrix of ds/dt in a plane box centred on the origin, (nx ny, nx ny), 1/h, face by face.
+    """Returns the matrix of ds/dt in a plane box centred on the origin, (nx ny, nx ny), 1/h.
 
-    Between two voxels passes (K/h)[B(−vh/K) s_left − B(vh/K) s_right]; at faces of the box nothing,
-    or, if open, what the flow carries out. solid: (nx, ny) bool, voxels whose faces are shut.
+    The flux between two voxels is (K/h)[B(−vh/K) s_left − B(vh/K) s_right]. The flux through a face
+    of the box is 0, or what the flow carries out if `open_faces`. solid: (nx, ny) bool, voxels with
+    closed faces.
     """
     number = np.arange(voxels[0] * voxels[1]).reshape(voxels)
     corner = [-0.5 * n * spacing for n in voxels]
@@ -103,43 +104,43 @@ def assembled(
 
 @dataclass(frozen=True)
 class Case:
-    """Transport alone. flow: as `Medium` takes it, and as velocities of places; solid: where an
-    obstacle is, of places (M, 2 or more)."""
+    """A scene of transport alone.
+
+    flow: the argument of `Medium`. velocity: the same flow as a function of places. solid: whether
+    places (M, 2 or more) are in the obstacle.
+    """
 
     name: str
     title: str
-    words: str
     flow: tuple[float, float] | Callable | None = None
     velocity: Velocity | None = None
     solid: Callable | None = None
 
 
 def pillar(places):
+    """Whether places are in the obstacle, a disc of radius 10 µm."""
     return (places[:, 0] - 6.0) ** 2 + places[:, 1] ** 2 < 100.0
 
 
 def shear(places: torch.Tensor) -> torch.Tensor:
-    """Along x, the faster the farther from y = 0: free of divergence, and slow where the pillar
-    is."""
+    """A flow along x that grows with the distance from y = 0.
+
+    It has no divergence and is slow at the pillar.
+    """
     return torch.stack([3.0 * places[:, 1].abs(), torch.zeros_like(places[:, 1])], 1)
 
 
 CASES = (
-    Case(
-        "signals_still", "Transport in time: diffusion", "A drop in one voxel spreads and decays."
-    ),
+    Case("signals_still", "Transport in time: diffusion"),
     Case(
         "signals_flow",
         "Transport in time: uniform flow",
-        "The same in a uniform flow that carries it out of open faces.",
         (80.0, 20.0),
         lambda x: np.broadcast_to([80.0, 20.0], x.shape),
     ),
     Case(
         "signals_obstacle",
         "Transport in time: an obstacle and a flow that varies",
-        "The same beside a pillar and in a shear flow, where no factor of one axis exists and the"
-        " default is the implicit method.",
         shear,
         lambda x: np.stack([3.0 * np.abs(x[:, 1]), 0 * x[:, 1]], 1),
         pillar,
@@ -158,26 +159,25 @@ def drop(places: torch.Tensor) -> torch.Tensor:
 
 @dataclass
 class Applied:
-    """How often the spatial operator was applied within `watched`."""
+    """The number of applications of the spatial operator within `count_applications`."""
 
     times: int = 0
 
 
 @contextmanager
-def watched() -> Iterator[Applied]:
-    """Counts what the methods that go by the operator itself, Euler and Crank–Nicolson, ask of
-    it."""
-    seen, usual = Applied(), iterative.apply
+def count_applications() -> Iterator[Applied]:
+    """Counts applications of the operator by Euler and Crank–Nicolson, which use it directly."""
+    applied, original = Applied(), iterative.apply
 
     def counting(*args, **options):
-        seen.times += 1
-        return usual(*args, **options)
+        applied.times += 1
+        return original(*args, **options)
 
     iterative.apply = counting
     try:
-        yield seen
+        yield applied
     finally:
-        iterative.apply = usual
+        iterative.apply = original
 
 
 def point(
@@ -189,8 +189,10 @@ def point(
     dtype: torch.dtype = torch.float64,
     splitting: str = "strang",
 ) -> Point:
-    """A scene of transport alone over UNTIL hours; method None is the library's choice, and in
-    float32 its default."""
+    """Runs, times and compares one setting of transport alone over UNTIL hours.
+
+    method None is torchfilm's own choice. In float32 this setting is the default.
+    """
     half = [0.5 * n * SPACING for n in VOXELS]
     medium = tf.Medium(
         ahl=tf.Signal(diffusion=DIFFUSION, decay=DECAY, initial=drop),
@@ -202,18 +204,19 @@ def point(
         splitting=splitting,
     )
     scene = tf.Scene(medium, founders=tf.Cells([[-26.0, 2.0]], [[1.0, 0.0]]))
-    first, steps = scene.seed(dtype=dtype), round(UNTIL / dt)
+    model, steps = scene.bind(dtype=dtype), round(UNTIL / dt)
+    first = model.start()
 
     def run(worst: list[float]) -> tf.State:
         state = first
         for _ in range(steps):
-            state = scene.step(state, dt)
+            state = model.step(state, dt)
             if worst:
                 worst.append(-float(state.signals["ahl"].min() / state.signals["ahl"].max()))
         return state
 
     below = [0.0]
-    with watched() as seen:
+    with count_applications() as applied:
         run(below)
     last, seconds = timed(lambda: run([]))
     chosen = method or ("exponential" if case.solid is None else "implicit")
@@ -221,21 +224,21 @@ def point(
     work = (
         VOXELS[0]
         * VOXELS[1]
-        * (steps * (1 if splitting == "lie" else 2) * factors + APPLY * seen.times)
+        * (steps * (1 if splitting == "lie" else 2) * factors + APPLY * applied.times)
     )
     found = last.signals["ahl"].double().numpy()
-    words = f"{chosen}, Δt {dt:g} h, {'float64' if dtype == torch.float64 else 'float32'}" + (
+    label = f"{chosen}, Δt {dt:g} h, {'float64' if dtype == torch.float64 else 'float32'}" + (
         ", lie" if splitting == "lie" else ""
     )
     errors = {
         ERROR: float(np.linalg.norm(found - exact) / np.linalg.norm(exact)),
         BELOW: max(below),
     }
-    # Euler's own sub-steps, and rounding, have no order in Δt
+    # Euler takes its own sub-steps, and rounding has no order in Δt
     ordered = chosen in ("implicit", "crank_nicolson") and dt <= SETTLED
     return Point(
         series,
-        words,
+        label,
         errors,
         seconds,
         work,
@@ -245,7 +248,7 @@ def point(
 
 
 def in_time(case: Case, quick: bool) -> Study:
-    """Methods and Δt on one grid."""
+    """Returns the study of methods and Δt on one grid."""
     half = [0.5 * n * SPACING for n in VOXELS]
     centres = [(np.arange(n) + 0.5) * SPACING - h for n, h in zip(VOXELS, half, strict=True)]
     places = torch.tensor(np.stack(np.meshgrid(*centres, indexing="ij"), -1).reshape(-1, 2))
@@ -267,50 +270,28 @@ def in_time(case: Case, quick: bool) -> Study:
     points += [
         point(case, exact, "Δt, implicit, lie", "implicit", dt, splitting="lie") for dt in steps
     ]
-    return Study(
-        case.name,
-        case.title,
-        f"{case.words} {VOXELS[0]} × {VOXELS[1]} voxels of {SPACING:g} µm, K = {DIFFUSION:g} µm²/h,"
-        f" {UNTIL:g} h. Each step is two of Δt/2, but for those marked lie. Below zero: the most"
-        " negative value of any step over the greatest then. Orders are of Δt up to"
-        f" {SETTLED:g} h.",
-        "relative, over voxels, against the exponential of a matrix assembled apart",
-        WORK,
-        (ERROR,),
-        points,
-    )
+    return Study(case.name, case.title, WORK, (ERROR,), points)
 
 
 def spread(voxels: int, spacing: float, centre: float, deviation: float) -> np.ndarray:
-    """A Gaussian's mean over each voxel of an axis centred on 0, (voxels,), 1/µm."""
+    """Returns the mean of a Gaussian over each voxel of an axis centred on 0, (voxels,), 1/µm."""
     edges = (np.arange(voxels + 1) - 0.5 * voxels) * spacing
     return np.diff(special.ndtr((edges - centre) / deviation)) / spacing
 
 
-# name, words, diffusion, µm²/h, and flow, µm/h
+# name, diffusion (µm²/h), flow (µm/h)
 DRIFTS = (
-    ("signals_space", "Nothing flows.", 50.0, 0.0),
-    (
-        "signals_space_flow",
-        "It drifts by 10 µm, slowly beside diffusion across a voxel.",
-        50.0,
-        10.0,
-    ),
-    (
-        "signals_space_fast",
-        (
-            "It drifts by 40 µm, and hardly diffuses: across a voxel of 4 µm flow is 320 times as"
-            " fast as diffusion."
-        ),
-        0.5,
-        40.0,
-    ),
+    ("signals_space", 50.0, 0.0),
+    ("signals_space_flow", 50.0, 10.0),
+    ("signals_space_fast", 0.5, 40.0),
 )
 
 
-def in_space(name: str, words: str, diffusion: float, speed: float, quick: bool) -> Study:
-    """A Gaussian that spreads and drifts, on ever finer grids; the step is exact in time, so that
-    spacing alone matters."""
+def in_space(name: str, diffusion: float, speed: float, quick: bool) -> Study:
+    """Returns the study of the spacing: a Gaussian that spreads and drifts.
+
+    The default step is exact in time, so only the spacing causes errors.
+    """
     width, start, until = 128.0, 10.0, 1.0  # µm, µm, h
     end = math.sqrt(start**2 + 2 * diffusion * until)
     points = []
@@ -320,7 +301,7 @@ def in_space(name: str, words: str, diffusion: float, speed: float, quick: bool)
             np.outer(spread(n, spacing, x, s), spread(n, spacing, 0.0, s))
             for x, s in ((-0.5 * speed * until, start), (0.5 * speed * until, end))
         )
-        made = operator(
+        transport = operator(
             (n, n, 1),
             (spacing,) * 3,
             diffusion=diffusion,
@@ -333,16 +314,16 @@ def in_space(name: str, words: str, diffusion: float, speed: float, quick: bool)
             ("exponential", DT),
             *(() if quick else (("exponential", 1.0), ("implicit", DT), ("implicit", 0.1))),
         ):
-            stepper, steps = prepare(made, dt, method), round(until / dt)
+            stepper, steps = prepare(transport, dt, method), round(until / dt)
             found, seconds = timed(lambda s=stepper, k=steps, u=u: _repeated(s, u, k))
             error = float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
             usual = (method, dt) == ("exponential", DT)
             work = 2 * (aligned(n) if method == "exponential" else SOLVE) * steps * n * n
-            said = f"{spacing:g} µm, {method}, Δt {dt:g} h"
+            label = f"{spacing:g} µm, {method}, Δt {dt:g} h"
             points.append(
                 Point(
                     "spacing" if usual else "several",
-                    said,
+                    label,
                     {ERROR: error},
                     seconds,
                     work,
@@ -350,16 +331,8 @@ def in_space(name: str, words: str, diffusion: float, speed: float, quick: bool)
                     step=spacing if usual else None,
                 )
             )
-    return Study(
-        name,
-        "Transport in space: the spacing" + (f", flow {speed:g} µm/h" if speed else ""),
-        f"A Gaussian, 10 µm wide at first, spreads for 1 h in a box 128 µm wide. {words} The ready"
-        " scenes' spacing, 4 µm, is marked.",
-        "relative, over voxels, against the Gaussian integrated over each voxel",
-        WORK,
-        (ERROR,),
-        points,
-    )
+    title = "Transport in space: the spacing" + (f", flow {speed:g} µm/h" if speed else "")
+    return Study(name, title, WORK, (ERROR,), points)
 
 
 def _repeated(stepper, u: torch.Tensor, times: int) -> np.ndarray:
@@ -369,8 +342,10 @@ def _repeated(stepper, u: torch.Tensor, times: int) -> np.ndarray:
 
 
 def at_a_cell(quick: bool) -> Study:
-    """What a cell that gives off a signal reads of it where it is and a few µm off, in the steady
-    state, by spacing."""
+    """Returns the study of the reading of a cell that releases a signal, by spacing.
+
+    The readings are those at its own place and a few µm away, in the steady state.
+    """
     width, diffusion, decay, away = 32.0, 48.0, 3.0, 6.0  # µm, µm²/h, 1/h, µm
     reach, places = math.sqrt(diffusion / decay), 2 if quick else 8
     at = lambda r: math.exp(-r / reach) / (4 * math.pi * diffusion * r)
@@ -389,25 +364,25 @@ def at_a_cell(quick: bool) -> Study:
                 stencil(grid, x, torch.zeros(1, dtype=torch.int64))
                 for x in (here, here + torch.tensor([away, 0.0, 0.0], dtype=torch.float64))
             )
-            given = write(
+            source = write(
                 torch.zeros(grid.nodes, dtype=torch.float64),
                 torch.ones(1, dtype=torch.float64),
                 cell,
             ).reshape(n, n, n)
 
             def steady(
-                given: torch.Tensor = given, n: int = n, spacing: float = spacing
+                source: torch.Tensor = source, n: int = n, spacing: float = spacing
             ) -> torch.Tensor:
-                made = operator(
+                transport = operator(
                     (n, n, n),
                     (spacing,) * 3,
                     diffusion=diffusion,
                     decay=decay,
-                    source=given,
+                    source=source,
                     dtype=torch.float64,
                 )
                 return (
-                    prepare(made, 8.0)
+                    prepare(transport, 8.0)
                     .step(torch.zeros(1, n, n, n, dtype=torch.float64))
                     .reshape(-1)
                 )
@@ -431,23 +406,12 @@ def at_a_cell(quick: bool) -> Study:
                 step=spacing,
             )
         )
-    return Study(
-        "signals_cell",
-        "What a cell reads of its own signal",
-        "A cell gives off a signal at its one point, in three dimensions, until nothing changes."
-        " Own reading: at its own place, over what a sphere of 0.5 µm that gives off as much has at"
-        " its surface: no error that falls to 0, since the reading has no limit. Off, 6 µm away:"
-        " what another cell reads there.",
-        "relative to exp(−r/λ)/(4πKr) with λ = √(K/k) = 4 µm; root mean square, and for the own"
-        " reading mean, over places of the cell in its voxel",
-        WORK,
-        ("off, 6 µm away", "own reading"),
-        points,
-    )
+    shown = ("off, 6 µm away", "own reading")
+    return Study("signals_cell", "What a cell reads of its own signal", WORK, shown, points)
 
 
 def studies(quick: bool) -> list[Study]:
-    """Work–precision of transport."""
+    """Returns all studies of transport."""
     cases = [c for c in CASES if not quick or c.name != "signals_still"]
     return [
         *(in_time(c, quick) for c in cases),

@@ -1,10 +1,11 @@
-"""What it costs that cells and medium take turns: Lie and Strang splitting, Δt and the circuits'
-tolerance, against the whole coupled system; and what the same settings do to the statistics of a
-colony that grows for hours.
+"""Work and precision of the splitting of cells and medium.
 
-The coupled system is every cell and every voxel as one ordinary differential equation, solved by
-SciPy to 1e-10: transport as `signals` assembles it, reading and giving by the weights of the
-stencil that defines them, nothing taken in turns and no pools.
+The studies compare Lie and Strang splitting, Δt and the tolerance of the circuits with the whole
+coupled system. A further study compares the statistics of a colony that grows for hours.
+
+The coupled system is one ordinary differential equation of all cells and all voxels, solved by
+SciPy to 1e-10. `signals` assembles its transport. Cells read and release by the weights of the
+stencil. It has neither splitting nor pools.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ import torchfilm as tf
 from design import Stripe
 
 SPECIES, SIGNAL, WORK = "species", "signal", "applications"
-DT = 0.025  # h, of a scene that says nothing else
+DT = 0.025  # h, the default step of a scene
 SPACING, VOXELS, DIFFUSION, DECAY = 4.0, (16, 16), 50.0, 0.2  # µm, –, µm²/h, 1/h
 UNTIL = 1.0  # h
 MEMBRANE = SimpleNamespace(D1=5.0)  # µm/h
 
 
 def lux(u, s, p, cell):
-    """Lux-like: AHL crosses the membrane at 20/h, and fills a voxel of its own at 1/h."""
+    """A circuit like Lux: AHL crosses the membrane at 20/h and fills a voxel at 1/h."""
     into = p.D1 * (s.ahl - u.ahl) * cell.area
     induced = u.ahl * u.ahl
     return {
@@ -44,49 +45,33 @@ def lux(u, s, p, cell):
 
 @dataclass(frozen=True)
 class Case:
-    """Cells at `places` (N, 2) µm that neither move nor meet; growth, 1/h, of their volumes."""
+    """Cells at `places`, (N, 2) µm, that neither move nor touch. growth: 1/h, of their volumes."""
 
     name: str
     title: str
-    words: str
     places: np.ndarray
     growth: float = 0.0
 
 
 def cases() -> list[Case]:
+    """Returns the three arrangements of cells."""
     anywhere = np.random.default_rng(3).uniform(-16.0, 16.0, (24, 2))
     middle = (np.arange(-2, 3, 2) + 0.5) * SPACING
     apart = np.stack(np.meshgrid(middle, middle, indexing="ij"), -1).reshape(-1, 2)
     return [
-        Case(
-            "splitting_fixed",
-            "Splitting: cells anywhere",
-            "24 cells at random places exchange AHL with a layer of 16 × 16 voxels.",
-            anywhere,
-        ),
-        Case(
-            "splitting_alone",
-            "Splitting: each cell in the middle of a voxel of its own",
-            "Nine cells whose pools are their voxels themselves.",
-            apart,
-        ),
-        Case(
-            "splitting_growing",
-            "Splitting: cells that grow",
-            "Nine cells off the middles of their voxels grow by e.",
-            apart + np.array([0.7, -1.1]),
-            1.0,
-        ),
+        Case("splitting_fixed", "Splitting: cells anywhere", anywhere),
+        Case("splitting_alone", "Splitting: each cell in the middle of a voxel of its own", apart),
+        Case("splitting_growing", "Splitting: cells that grow", apart + np.array([0.7, -1.1]), 1.0),
     ]
 
 
 def drop(places: torch.Tensor) -> torch.Tensor:
-    """The signal at the start: an uneven one, or Lie and Strang would differ in the signal
-    alone."""
+    """The initial signal. With a uniform one Lie and Strang would differ only in the signal."""
     return 0.1 * torch.exp(-((places[:, 0] + 8.0) ** 2 + places[:, 1] ** 2) / 128.0)
 
 
 def scene_of(case: Case, splitting: str, rtol: float, rates: Callable = lux) -> tf.Scene:
+    """Returns the scene of a case."""
     half = 0.5 * VOXELS[0] * SPACING
     count = len(case.places)
     grows = [tf.Growth(rate=case.growth)] if case.growth else []
@@ -104,8 +89,8 @@ def scene_of(case: Case, splitting: str, rtol: float, rates: Callable = lux) -> 
 
 
 def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
-    """Species (2, N) and signal (voxels,) at the end, from the whole system at once."""
-    state = scene_of(case, "strang", 1e-4).seed(dtype=torch.float64)
+    """Returns the final species (2, N) and signal (voxels,) of the coupled system."""
+    state = scene_of(case, "strang", 1e-4).bind(dtype=torch.float64).start()
     where = state.layout.stencil(state.position, state.colony, torch.float64)
     count, voxels = len(case.places), where.nodes
     rows = np.repeat(np.arange(count), where.node.shape[1])
@@ -117,24 +102,24 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray]:
     def slope(t: float, y: np.ndarray) -> np.ndarray:
         luxi, inside, outside = y[:count], y[count : 2 * count], y[2 * count :]
         there, cell = weights @ outside, geometry(case.growth, t)
-        rates, given = lux(
+        rates, released = lux(
             SimpleNamespace(luxi=luxi, ahl=inside), SimpleNamespace(ahl=there), MEMBRANE, cell
         )
-        amount = given["ahl"]
-        # given by the weights; taken from each voxel in proportion to what it holds
-        taken = np.maximum(-amount, 0.0) / np.where(there > 0, there, 1.0)
+        amount = released["ahl"]
+        # release by the weights; uptake from each voxel in proportion to its content
+        uptake = np.maximum(-amount, 0.0) / np.where(there > 0, there, 1.0)
         change = (
             transport @ outside
-            + (back @ np.maximum(amount, 0.0) - outside * (back @ taken)) / SPACING**3
+            + (back @ np.maximum(amount, 0.0) - outside * (back @ uptake)) / SPACING**3
         )
         return np.concatenate(
             [rates["luxi"] - case.growth * luxi, rates["ahl"] - case.growth * inside, change]
         )
 
     start = np.concatenate([np.zeros(2 * count), state.signals["ahl"].numpy()])
-    done = solve_ivp(slope, (0.0, UNTIL), start, method="DOP853", rtol=1e-10, atol=1e-13)
-    assert done.success, done.message
-    end = done.y[:, -1]
+    solution = solve_ivp(slope, (0.0, UNTIL), start, method="DOP853", rtol=1e-10, atol=1e-13)
+    assert solution.success, solution.message
+    end = solution.y[:, -1]
     return end[: 2 * count].reshape(2, count), end[2 * count :]
 
 
@@ -147,16 +132,20 @@ def point(
     rtol: float = 1e-4,
     wide: bool = False,
 ) -> Point:
-    """One setting; wide: float64. Its work: applications of the rates to all cells and of a
-    transport to all voxels, together."""
+    """Runs, times and compares one setting; wide: float64.
+
+    Work is the number of applications of the rates to all cells plus those of a transport to all
+    voxels.
+    """
     counted = Counted(lux, "luxi")
     scene = scene_of(case, splitting, rtol, counted)
-    first, steps = scene.seed(dtype=torch.float64 if wide else torch.float32), round(UNTIL / dt)
+    model, steps = scene.bind(dtype=torch.float64 if wide else torch.float32), round(UNTIL / dt)
+    first = model.start()
     counted.rows = 0
-    last, seconds = timed(lambda: advance(scene, first, dt, steps), 1)
+    last, seconds = timed(lambda: advance(model, first, dt, steps), 1)
     work = counted.rows / len(case.places) + steps * (1 if splitting == "lie" else 2)
     if seconds < LONG:
-        _, seconds = timed(lambda: advance(scene, first, dt, steps))
+        _, seconds = timed(lambda: advance(model, first, dt, steps))
     assert last is not None
     species = np.stack([last.fields[n].double().numpy() for n in ("luxi", "ahl")])
     signal = last.signals["ahl"].double().numpy()
@@ -164,15 +153,15 @@ def point(
         SPECIES: off(species, exact[0]),
         SIGNAL: float(np.linalg.norm(signal - exact[1]) / np.linalg.norm(exact[1])),
     }
-    words = f"{splitting}, Δt {dt:g} h, rtol {rtol:g}, float{64 if wide else 32}"
+    label = f"{splitting}, Δt {dt:g} h, rtol {rtol:g}, float{64 if wide else 32}"
     default = (splitting, dt, rtol, wide) == ("strang", DT, 1e-4, False)
     return Point(
-        series, words, errors, seconds, work, default, step=dt if series != "several" else None
+        series, label, errors, seconds, work, default, step=dt if series != "several" else None
     )
 
 
-def taken_in_turns(case: Case, quick: bool) -> Study:
-    """Δt, tolerance and splitting."""
+def split_steps(case: Case, quick: bool) -> Study:
+    """Returns the study of Δt, tolerance and splitting for one case."""
     exact = reference(case)
     steps, tight = ((0.1, 0.05, DT), 1e-5) if quick else ((0.2, 0.1, 0.05, DT, 0.0125), 1e-7)
     points = [
@@ -192,23 +181,13 @@ def taken_in_turns(case: Case, quick: bool) -> Study:
             for dt in (0.2, 0.1, 0.05, 0.0125)
             for r in (1e-1, 1e-2)
         ]
-    return Study(
-        case.name,
-        case.title,
-        case.words + " 1 h. Species: LuxI and AHL in the cells; signal: AHL in the voxels. "
-        "Applications: of the rates to all cells, and of a transport to all voxels.",
-        "relative, root mean square over species and cells, and over voxels, against all cells and"
-        " voxels as one equation",
-        WORK,
-        (SPECIES, SIGNAL),
-        points,
-    )
+    return Study(case.name, case.title, WORK, (SPECIES, SIGNAL), points)
 
 
 # --- statistics of a colony -----------------------------------------------------------------------
 
 
-# constants that experiments/boundary_stripe.py found
+# the constants that experiments/boundary_stripe.py found
 STRIPE = {
     "d1": 0.535,
     "k1": 66.5,
@@ -224,10 +203,10 @@ MEASURES = ("band width", "band peak", "cells", "mean yfp", "mean ahl", "peak ah
 
 
 def detector(splitting: str, rtol: float) -> tf.Scene:
-    """The boundary detector in a channel 16 µm wide, with the splitting that is asked for."""
+    """Returns the boundary detector in a channel 16 µm wide, with the given splitting."""
     ready = tf.scenes.boundary_detector(width=16.0, rtol=rtol, **STRIPE)
     effects: list[tf.Effect] = []
-    for effect in ready.listed:
+    for effect in ready.effects:
         if isinstance(effect, tf.Medium):
             box, spacing = effect.box, effect.spacing
             effect = tf.Medium(
@@ -239,26 +218,26 @@ def detector(splitting: str, rtol: float) -> tf.Scene:
                 splitting=splitting,
             )
         effects.append(effect)
-    return tf.Scene(*effects, founders=ready.founders, dt=ready.dt)
+    return ready.replace(*effects)
 
 
 def ensemble(
     splitting: str, rtol: float, dt: float, until: float, streams: range
 ) -> tuple[dict[str, np.ndarray], float, float]:
-    """Each measure of each colony, (streams,); what circuits took, steps over all cells;
-    seconds."""
+    """Returns each measure of each colony, (streams,); the circuit steps of all cells; seconds."""
     scene = detector(splitting, rtol)
-    first = scene.seed(len(streams), streams=list(streams))
+    model = scene.bind(colonies=len(streams), streams=list(streams))
+    first = model.start()
 
     def run() -> tuple[tf.State, float]:
-        state, taken = first, 0.0
+        state, steps = first, 0.0
         for _ in range(round(until / dt)):
-            state = scene.step(state, dt)
+            state = model.step(state, dt)
             assert not tf.failures(state)
-            taken += float(state.reports["circuit"].steps.sum())
-        return state, taken
+            steps += float(state.reports["circuit"].steps.sum())
+        return state, steps
 
-    (state, taken), seconds = timed(run, 1)
+    (state, steps), seconds = timed(run, 1)
     found = TARGET.measures(state)
     mean = lambda x: state.groups.sum(x.double().unsqueeze(1)).squeeze(1) / state.counts
     sinks = (state.cell_type == 1).double()
@@ -272,26 +251,29 @@ def ensemble(
         mean(state.ahl),
         highest,
     )
-    return {n: v.double().numpy() for n, v in zip(MEASURES, values, strict=True)}, taken, seconds
+    return {n: v.double().numpy() for n, v in zip(MEASURES, values, strict=True)}, steps, seconds
 
 
-def apart(mine: np.ndarray, theirs: np.ndarray) -> tuple[float, float]:
-    """How far two means are apart, and the half-width of Welch's 95 % confidence band, both
-    relative to the second; colonies without the measure left out."""
-    mine, theirs = (x[np.isfinite(x)] for x in (mine, theirs))
-    parts = [x.var(ddof=1) / x.size for x in (mine, theirs)]
+def distance(found: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
+    """Returns the distance of two means and the half-width of Welch's 95 % confidence band.
+
+    Both are relative to the second mean. Colonies without the measure are left out.
+    """
+    found, reference = (x[np.isfinite(x)] for x in (found, reference))
+    parts = [x.var(ddof=1) / x.size for x in (found, reference)]
     freedom = sum(parts) ** 2 / max(
-        sum(v**2 / (x.size - 1) for v, x in zip(parts, (mine, theirs), strict=True)), 1e-300
+        sum(v**2 / (x.size - 1) for v, x in zip(parts, (found, reference), strict=True)), 1e-300
     )
     band = stats.t.ppf(0.975, freedom) * math.sqrt(sum(parts)) if sum(parts) > 0 else 0.0
-    return float(abs(mine.mean() - theirs.mean()) / theirs.mean()), float(band / theirs.mean())
+    scale = float(reference.mean())
+    return abs(float(found.mean()) - scale) / scale, float(band) / scale
 
 
 def boundary(quick: bool) -> Study:
-    """The stripe of the boundary detector, by settings."""
+    """Returns the study of the stripe of the boundary detector."""
     until, streams, tight = (0.5, range(2), 1) if quick else (4.0, range(12), 8)
     others = range(1000, 1000 + 2 * len(streams))
-    theirs, _, _ = ensemble("strang", 1e-4 if quick else 1e-6, DT / tight, until, others)
+    expected, _, _ = ensemble("strang", 1e-4 if quick else 1e-6, DT / tight, until, others)
     settings = [
         ("Δt", "Δt 0.05 h", "strang", 1e-4, 2 * DT),
         ("Δt", "default", "strang", 1e-4, DT),
@@ -308,32 +290,23 @@ def boundary(quick: bool) -> Study:
             ("several", "rtol 0.1, Δt 0.1 h, lie", "lie", 1e-1, 4 * DT),
         ]
     points = []
-    for series, words, splitting, rtol, dt in settings:
-        found, taken, seconds = ensemble(splitting, rtol, dt, until, streams)
-        distance = {
-            n: apart(found[n], theirs[n])
+    for series, label, splitting, rtol, dt in settings:
+        found, steps, seconds = ensemble(splitting, rtol, dt, until, streams)
+        distances = {
+            n: distance(found[n], expected[n])
             for n in MEASURES
-            if np.isfinite(theirs[n]).sum() > 1 and np.isfinite(found[n]).sum() > 1
+            if np.isfinite(expected[n]).sum() > 1 and np.isfinite(found[n]).sum() > 1
         }
-        errors, band = ({n: d[k] for n, d in distance.items()} for k in (0, 1))
-        points.append(Point(series, words, errors, seconds, taken, words == "default", band))
-    return Study(
-        "splitting_boundary",
-        "Statistics: the boundary detector",
-        f"{len(streams)} colonies a setting, {until:g} h in a channel 16 µm wide, with constants"
-        " that draw a stripe: measures of `design.Stripe`, and means over cells (of YFP over"
-        " sinks). Within its band a setting cannot be told from the reference.",
-        f"relative distances of means from {len(others)} colonies of other seeds at Δt/{tight},"
-        f" rtol {1e-4 if quick else 1e-6:g}; ± Welch's 95 % confidence",
-        "circuit steps, all cells",
-        ("mean yfp", "mean ahl") if quick else ("band width", "mean yfp", "peak ahl outside"),
-        points,
-    )
+        errors, band = ({n: d[k] for n, d in distances.items()} for k in (0, 1))
+        points.append(Point(series, label, errors, seconds, steps, label == "default", band))
+    shown = ("mean yfp", "mean ahl") if quick else ("band width", "mean yfp", "peak ahl outside")
+    work = "circuit steps, all cells"
+    return Study("splitting_boundary", "Statistics: the boundary detector", work, shown, points)
 
 
 def studies(quick: bool) -> list[Study]:
-    """Splitting on small, still systems, and statistics of growing ones."""
+    """Returns all studies of the splitting: small systems at rest and a growing colony."""
     return [
-        *(taken_in_turns(c, quick) for c in cases() if not quick or c.name != "splitting_fixed"),
+        *(split_steps(c, quick) for c in cases() if not quick or c.name != "splitting_fixed"),
         boundary(quick),
     ]

@@ -1,16 +1,16 @@
-"""How long growth takes: one colony to N cells, and B colonies to N cells each, in 2-D and in 3-D
-between agarose and coverslip.
+"""Measures the time of growth: one colony to N cells, and B colonies to N cells each.
 
     python experiments/benchmarks/growth.py                     # the full set, some minutes
     python experiments/benchmarks/growth.py --quick             # small sizes
     python experiments/benchmarks/growth.py --case 2d-32000 --device cuda
-    python experiments/benchmarks/growth.py --case 2d-32x1000 --processes 2     # its colonies in batches, one on each core
-    python experiments/benchmarks/growth.py --case 2d-32x1000 --tolerance 0.2   # the contact solve of the draft preset
+    python experiments/benchmarks/growth.py --case 2d-32x1000 --processes 2     # one per core
+    python experiments/benchmarks/growth.py --case 2d-32x1000 --tolerance 0.2   # as in draft
 
-Growth 1/h by the length law, Δt 0.025 h, division at 3.5–4.0 µm, μ = 1, γ = 10, α = 0.1/γ;
-everything else is the default. Each case is appended to a JSON file with its machine, versions and
-commit. `floor_seconds` is the least that the solver could take: the contact rows read once for
-every product with J or its transpose, at the speed at which this machine copies memory.
+Colonies grow in 2-D and in 3-D between agarose and coverslip. Growth 1/h by the length law,
+Δt 0.025 h, division at 3.5–4.0 µm, μ = 1, γ = 10, α = 0.1/γ; other settings are the defaults. The
+script appends each case to a JSON file with its machine, versions and commit. `floor_seconds` is a
+lower bound of the solver's time: the time to read the contact rows once for every product with J or
+its transpose, at the speed at which this machine copies memory.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ QUICK = ("2d-3000", "3d-3000")
 
 
 def scene(dim: int) -> tf.Scene:
+    """Returns the scene in the plane or in space."""
     walls = (
         []
         if dim == 2
@@ -53,7 +54,7 @@ def scene(dim: int) -> tf.Scene:
 
 
 class RowCounter:
-    """Counts bytes of contact rows that products with J and its transpose read."""
+    """Counts the bytes of contact rows that products with J and its transpose read."""
 
     def __init__(self) -> None:
         self.bytes, self.products = 0, 0
@@ -79,33 +80,31 @@ class RowCounter:
 
 
 def copy_speed(device: str) -> float:
-    """Bytes read per second by a plain copy of 16 MB, best of 20."""
+    """Returns the speed of a copy of 16 MB, bytes read per second, best of 20."""
     source = torch.ones(4_000_000, device=device)
     target, best = torch.empty_like(source), float("inf")
     for _ in range(20):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         target.copy_(source)
         if source.is_cuda:
             torch.cuda.synchronize()
-        best = min(best, time.perf_counter() - begun)
+        best = min(best, time.perf_counter() - start)
     return source.nbytes / best
 
 
 def grow(
     name: str, device: str, seed: int, tolerance: float | None, part: tuple[int, int] = (0, 1)
 ) -> dict:
-    """The case, or of its colonies the k-th of n parts, to the end: what it took and what came of
-    it."""
+    """Runs a case, or part k of n of its colonies. Returns costs and results."""
     dim, colonies, cells = CASES[name]
-    made = tf.Settings(tolerance=tolerance).apply(scene(dim))
+    tuned = tf.Settings(tolerance=tolerance).apply(scene(dim))
     k, parts = part
-    start = made.seed(colonies, seed=seed, device=device).select(
-        range(k * colonies // parts, (k + 1) * colonies // parts)
-    )
+    model = tuned.bind(colonies=colonies, seed=seed, device=device)
+    start = model.start().select(range(k * colonies // parts, (k + 1) * colonies // parts))
     timings, marks, iterations, passes, cell_steps = tf.Timings(), [], 0, 0, 0
-    begun = time.perf_counter()
+    begin = time.perf_counter()
     with RowCounter() as counter:
-        for state in tf.simulate(made, start, cells=cells, timings=timings):
+        for state in tf.simulate(tuned, start, cells=cells, timings=timings):
             report = state.reports["mechanics"]
             iterations += int(report.iterations.max())
             passes += int(report.passes.max())
@@ -114,11 +113,11 @@ def grow(
                 marks.append(
                     {
                         "cells": state.cells,
-                        "seconds": round(time.perf_counter() - begun, 2),
+                        "seconds": round(time.perf_counter() - begin, 2),
                         "time_h": round(state.time, 3),
                     }
                 )
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - begin
     found = tf.measure.overlaps(state)
     return {
         "cells": state.cells,
@@ -142,55 +141,58 @@ def grow(
 
 
 def one_thread() -> None:
+    """Prepares a worker process."""
     torch.set_num_threads(1)
     tf.keep_memory()
 
 
-def side_by_side(
+def in_processes(
     name: str, device: str, seed: int, tolerance: float | None, processes: int
 ) -> list[dict]:
-    """The case in as many processes of one thread, each with its own colonies; the first of them
-    says how long all took."""
+    """Runs a case in several processes of one thread, each with its own colonies.
+
+    Returns the results of each; the first has the total time.
+    """
     with ProcessPoolExecutor(processes, get_context("spawn"), one_thread) as pool:
-        list(pool.map(time.sleep, [1.0] * processes))  # till all have started
-        begun = time.perf_counter()
+        list(pool.map(time.sleep, [1.0] * processes))  # until all have started
+        begin = time.perf_counter()
         parts = list(
             pool.map(
                 partial(grow, name, device, seed, tolerance),
                 [(k, processes) for k in range(processes)],
             )
         )
-    return [parts[0] | {"seconds": time.perf_counter() - begun}, *parts[1:]]
+    return [parts[0] | {"seconds": time.perf_counter() - begin}, *parts[1:]]
 
 
 def run(name: str, device: str, seed: int, tolerance: float | None, processes: int) -> dict:
-    """What all parts come to together, and how it went in the one with most to do."""
+    """Returns the totals of all parts and the details of the part with most work."""
     parts = (
         [grow(name, device, seed, tolerance)]
         if processes == 1
-        else side_by_side(name, device, seed, tolerance, processes)
+        else in_processes(name, device, seed, tolerance, processes)
     )
-    all_of = lambda what: sum(p[what] for p in parts)
+    total = lambda name: sum(p[name] for p in parts)
     seconds = parts[0]["seconds"]
-    together = {
+    totals = {
         "case": name,
         "device": device,
         "processes": processes,
         "tolerance": tolerance,
-        "cells": all_of("cells"),
-        "colonies": all_of("colonies"),
+        "cells": total("cells"),
+        "colonies": total("colonies"),
         "seconds": round(seconds, 2),
-        "cell_steps": all_of("cell_steps"),
-        "us_per_cell_step": round(1e6 * seconds / all_of("cell_steps"), 2),
-        "overlap_mean_um": round(all_of("overlap_sum_um") / max(1, all_of("contacts")), 5),
+        "cell_steps": total("cell_steps"),
+        "us_per_cell_step": round(1e6 * seconds / total("cell_steps"), 2),
+        "overlap_mean_um": round(total("overlap_sum_um") / max(1, total("contacts")), 5),
         "overlap_worst_um": max(p["overlap_worst_um"] for p in parts),
-        "floor_seconds": round(all_of("bytes") / copy_speed(device), 3),
+        "floor_seconds": round(total("bytes") / copy_speed(device), 3),
     }
     longest = max(parts, key=lambda p: p["cell_steps"])
-    return together | {
+    return totals | {
         k: v
         for k, v in longest.items()
-        if k not in (*together, "overlap_sum_um", "contacts", "bytes")
+        if k not in (*totals, "overlap_sum_um", "contacts", "bytes")
     }
 
 
@@ -199,33 +201,31 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--case", action="append", choices=sorted(CASES), help="one case; may be given again"
+        "--case", action="append", choices=sorted(CASES), help="one case; may be repeated"
     )
     parser.add_argument("--quick", action="store_true", help="small sizes only")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
-        "--tolerance",
-        type=float,
-        help="of the contact solve, by default what Mechanics takes, 0.05",
+        "--tolerance", type=float, help="of the contact solve; default: that of Mechanics, 0.05"
     )
     parser.add_argument(
         "--processes",
         type=int,
         default=1,
-        help="to share a case's colonies among, each on one thread",
+        help="number of processes that share the colonies, one thread each",
     )
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("growth.json"))
-    chosen = parser.parse_args()
+    options = parser.parse_args()
     tf.keep_memory()
-    records = json.loads(chosen.out.read_text()) if chosen.out.exists() else []
-    for name in chosen.case or (QUICK if chosen.quick else CASES):
+    records = json.loads(options.out.read_text()) if options.out.exists() else []
+    for name in options.case or (QUICK if options.quick else CASES):
         result = run(
             name,
-            chosen.device,
-            chosen.seed,
-            chosen.tolerance,
-            min(chosen.processes, CASES[name][1]),
+            options.device,
+            options.seed,
+            options.tolerance,
+            min(options.processes, CASES[name][1]),
         )
         print(
             f"{name:<12} {result['seconds']:>7.1f} s  {result['cells']:>6} cells "
@@ -236,7 +236,7 @@ def main() -> None:
             flush=True,
         )
         records.append(machine() | result)
-        chosen.out.write_text(json.dumps(records, indent=1) + "\n")
+        options.out.write_text(json.dumps(records, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,4 @@
-"""What every benchmark notes beside its times, the machine, versions and commit; and how its tables
-get into a page of the documentation."""
+"""The machine, versions and commit that every benchmark records, and how tables enter a page."""
 
 from __future__ import annotations
 
@@ -12,8 +11,10 @@ import torch
 
 
 def machine() -> dict:
-    """Date, commit, versions, threads, and the devices there are, `processor` and `gpu`; which of
-    them a case ran on is the case's to say."""
+    """Returns date, commit, versions, threads, `processor` and `gpu`.
+
+    Each case records on which of the two devices it ran.
+    """
     try:
         commit = subprocess.run(
             ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True
@@ -33,10 +34,13 @@ def machine() -> dict:
 
 
 def write_page(page: Path, text: str, what: str) -> None:
-    """Put `text` between a page's two marks, `<!-- what -->` and the next `<!-- to here -->`."""
+    """Replaces the text of a page between `<!-- what -->` and the next `<!-- to here -->`.
+
+    Raises SystemExit if the page lacks these marks.
+    """
     begin, end = f"<!-- {what} -->", "<!-- to here -->"
     before, found, rest = page.read_text().partition(begin)
     _, closed, after = rest.partition(end)
     if not found or not closed:
-        raise SystemExit(f"{page} has no place for what is written, from {begin} to {end}")
+        raise SystemExit(f"{page} lacks the marks {begin} and {end}")
     page.write_text(f"{before}{begin}\n\n{text}\n\n{end}{after}")

@@ -1,15 +1,19 @@
-"""Which search finds a design with the fewest colonies, and how many designs an hour there are.
+"""Compares search methods by the colonies that they need, and measures designs per hour.
 
-    python experiments/benchmarks/search.py methods            # every method on every target at equal numbers of colonies: about an hour on two cores
-    python experiments/benchmarks/search.py methods --targets stripe --methods sobol cmaes --seeds 3 --colonies 500
-    python experiments/benchmarks/search.py rate               # one design at a time, in batches, and on recorded growth
-    python experiments/benchmarks/search.py unseen             # the winners that `methods` found, on 32 seeds that no search has seen
+    python experiments/benchmarks/search.py methods    # about an hour on two cores
+    python experiments/benchmarks/search.py methods --targets stripe --methods sobol cmaes --seeds 3
+    python experiments/benchmarks/search.py rate
+    python experiments/benchmarks/search.py unseen
 
-The searches of one method differ by the method's own seed and share the colonies' four seeds; those
-of all seeds are evaluated side by side in one batch, so that seconds are a share of a common batch.
-A search succeeds when a design's mean loss over its four replicates is at most the target's
-threshold. Colonies grown to part of the full size count by that part. Each run is appended to a
-JSON file with its machine, versions and commit.
+`methods` runs every method on every target with equal numbers of colonies. `rate` measures designs
+per hour: one design at a time, in batches, and on recorded growth. `unseen` scores the designs that
+`methods` found on 32 seeds that no search has used.
+
+The searches of one method differ by the seed of the method and share four seeds of the colonies.
+One batch evaluates all of them together, so their seconds are shares of a common batch. A search
+succeeds when the mean loss of a design over its four replicates is at most the threshold of the
+target. A colony grown to a fraction of the full size counts as that fraction. The script appends
+each run to a JSON file with its machine, versions and commit.
 """
 
 from __future__ import annotations
@@ -32,7 +36,7 @@ import boundary_stripe
 import domain_size
 import ring
 
-# scene, parameters, target, colony; the loss that counts as found; searches and colonies each
+# scene, parameters, target, colony, threshold of the loss, searches, colonies of each
 TARGETS = {
     "stripe": (
         "boundary_detector",
@@ -55,8 +59,8 @@ TARGETS = {
         100,
     ),
 }
-# batches of 24, since a large one costs less a colony; a wide first cloud, since these landscapes
-# have more than one valley
+# Batches of 24, because a large batch costs less per colony; a wide initial distribution, because
+# the losses have several minima.
 CLOUD = {"population": 24, "sigma": 0.5}
 METHODS = {
     "sobol": Sobol,
@@ -69,39 +73,40 @@ REPLICATES = 4
 
 
 class Run:
-    """One search among those that are evaluated side by side."""
+    """One search of those that share batches."""
 
     def __init__(self, objective: Objective, name: str, seed: int):
         self.method, self.objective = METHODS[name](), objective
         self.method.start(objective.task.space, seed, objective.task.replicates)
         self.colonies, self.seconds, self.loss, self.point = 0.0, 0.0, float("inf"), None
-        self.course: list[tuple[float, float, float]] = []
+        self.history: list[tuple[float, float, float]] = []
 
     def tell(self, batch, loss: np.ndarray, seconds: float) -> None:
+        """Passes the losses of a batch to the method and notes the best design."""
         self.method.tell(batch, loss)
         count = batch.replicates or self.objective.task.replicates
         self.colonies += len(loss) * count * batch.size
         self.seconds += seconds
         if batch.size == 1.0 and count == self.objective.task.replicates and loss.min() < self.loss:
             self.loss, self.point = float(loss.min()), batch.points[loss.argmin()]
-        self.course.append((self.colonies, self.seconds, self.loss))
+        self.history.append((self.colonies, self.seconds, self.loss))
 
 
 def together(objective: Objective, runs: list[Run], colonies: int) -> None:
-    """Every search until its colonies are spent, the batches of all in one."""
+    """Runs all searches until each has used its colonies, with joint batches."""
     while open_runs := [r for r in runs if r.colonies < colonies]:
         groups: dict[tuple[float, int], list] = {}
         for run in open_runs:
             batch = run.method.ask()
-            groups.setdefault(
-                (batch.size, batch.replicates or objective.task.replicates), []
-            ).append((run, batch))
-        for (size, count), mine in groups.items():
-            found = objective.evaluate(
-                np.concatenate([b.points for _, b in mine]), streams=range(count), size=size
+            groups.setdefault((batch.size, batch.replicates or objective.task.replicates), []).append(
+                (run, batch)
             )
-            parts = np.split(found.loss, np.cumsum([len(b.points) for _, b in mine])[:-1])
-            for (run, batch), loss in zip(mine, parts, strict=True):
+        for (size, count), members in groups.items():
+            found = objective.evaluate(
+                np.concatenate([b.points for _, b in members]), streams=range(count), size=size
+            )
+            parts = np.split(found.loss, np.cumsum([len(b.points) for _, b in members])[:-1])
+            for (run, batch), loss in zip(members, parts, strict=True):
                 run.tell(batch, loss, found.seconds * len(loss) / len(found.loss))
         print(
             f"\r{min(r.colonies for r in open_runs):6.0f} of {colonies} colonies, best"
@@ -113,16 +118,18 @@ def together(objective: Objective, runs: list[Run], colonies: int) -> None:
     print("\r" + " " * 60 + "\r", end="", file=sys.stderr)
 
 
-def objective_of(target: str, **options) -> Objective:
-    scene, parameters, wanted, colony, *_ = TARGETS[target]
-    return Objective(Task(scene, parameters, wanted, **colony, replicates=REPLICATES, **options))
+def objective_of(name: str) -> Objective:
+    """Returns the objective of a target."""
+    scene, parameters, target, colony, *_ = TARGETS[name]
+    return Objective(Task(scene, parameters, target, **colony, replicates=REPLICATES))
 
 
 def methods(options: argparse.Namespace) -> dict:
-    """Success, loss and colonies of every method on every target."""
+    """Returns success, loss and colonies of every method on every target."""
     out: dict = {}
     print(
-        f"{'target':<9}{'method':<19}{'found':>7}{'colonies to it':>17}{'loss: median':>14}{'worst':>8}{'seconds a search':>18}"
+        f"{'target':<9}{'method':<19}{'found':>7}{'colonies':>17}{'median loss':>14}"
+        f"{'worst':>8}{'s per search':>18}"
     )
     for target in options.targets:
         *_, threshold, seeds, colonies = TARGETS[target]
@@ -131,7 +138,9 @@ def methods(options: argparse.Namespace) -> dict:
         for name in options.methods:
             runs = [Run(objective, name, seed) for seed in range(seeds)]
             together(objective, runs, colonies)
-            needed = [next((c for c, _, loss in r.course if loss <= threshold), None) for r in runs]
+            needed = [
+                next((c for c, _, loss in r.history if loss <= threshold), None) for r in runs
+            ]
             reached = sorted(n for n in needed if n is not None)
             out.setdefault(target, {})[name] = {
                 "threshold": threshold,
@@ -140,7 +149,7 @@ def methods(options: argparse.Namespace) -> dict:
                 "loss": [r.loss for r in runs],
                 "seconds": [r.seconds for r in runs],
                 "best": [objective.task.space.values(r.point) for r in runs],
-                "course": [r.course for r in runs],
+                "course": [r.history for r in runs],
             }
             middle = f"{np.median([n if n is not None else np.inf for n in needed]):.0f}"
             losses = [r.loss for r in runs]
@@ -154,7 +163,7 @@ def methods(options: argparse.Namespace) -> dict:
 
 
 def unseen(options: argparse.Namespace) -> dict:
-    """The best design of each search on record on 32 seeds that it was not searched on."""
+    """Scores the best design of each recorded search on 32 seeds that the search did not use."""
     known: dict = {}
     for record in json.loads(options.out.read_text()):
         for target, found in record.get("methods", {}).items():
@@ -168,7 +177,7 @@ def unseen(options: argparse.Namespace) -> dict:
             out.setdefault(target, {})[name] = losses.mean(1).tolist()
             held = int((losses.mean(1) <= record["threshold"]).sum())
             print(
-                f"{target:<9}{name:<19}searched {np.median(record['loss']):.4f}, unseen"
+                f"{target:<9}{name:<19}search seeds {np.median(record['loss']):.4f}, new seeds"
                 f" {np.median(losses.mean(1)):.4f}, {held} of {len(points)} hold",
                 flush=True,
             )
@@ -176,7 +185,7 @@ def unseen(options: argparse.Namespace) -> dict:
 
 
 def rate(options: argparse.Namespace) -> dict:
-    """Designs an hour: one at a time, in batches, and in batches on recorded growth."""
+    """Returns designs per hour: one at a time, in batches, and in batches on recorded growth."""
     out: dict = {}
     for cells in options.cells:
         for title, count, replay in (
@@ -184,11 +193,11 @@ def rate(options: argparse.Namespace) -> dict:
             ("batch", options.designs, False),
             ("batch on recorded growth", options.designs, True),
         ):
-            scene, parameters, wanted, colony, *_ = TARGETS["stripe"]
+            scene, parameters, target, colony, *_ = TARGETS["stripe"]
             task = Task(
                 scene,
                 parameters,
-                wanted,
+                target,
                 **{**colony, "cells": cells},
                 replicates=REPLICATES,
                 replay=replay,
@@ -196,10 +205,10 @@ def rate(options: argparse.Namespace) -> dict:
             objective = Objective(task)
             points = np.random.default_rng(0).random((count, objective.task.space.size))
             if replay:
-                objective.evaluate(points[:1])  # grow the course: once for a whole search
-            begun = time.perf_counter()
+                objective.evaluate(points[:1])  # records the growth, once for a whole search
+            begin = time.perf_counter()
             objective.evaluate(points)
-            seconds = time.perf_counter() - begun
+            seconds = time.perf_counter() - begin
             out.setdefault(str(cells), {})[title] = {
                 "designs": count,
                 "seconds": seconds,
@@ -207,7 +216,7 @@ def rate(options: argparse.Namespace) -> dict:
             }
             print(
                 f"{cells:>5} cells, {title:<26}{count:>4} designs × {REPLICATES} in {seconds:7.2f}"
-                f" s: {3600 * count / seconds:9.0f} designs an hour",
+                f" s: {3600 * count / seconds:9.0f} designs per hour",
                 flush=True,
             )
     return out

@@ -1,13 +1,14 @@
-"""How long a step of transport takes, and how far each method is from the exact lattice solution.
+"""Measures the time of a step of transport and the error of each method.
 
-    OMP_NUM_THREADS=2 python experiments/benchmarks/signals.py               # 32³, 64³ and 128³, a minute or so
+    OMP_NUM_THREADS=2 python experiments/benchmarks/signals.py      # about a minute
     python experiments/benchmarks/signals.py --size 64 --method exponential --device cuda
 
-A unit amount is set free in the middle voxel of n³, K = 1 µm²/h, h = 1 µm, no flux through the
-faces. A step is r = K Δt/h² = 1/4; the error is the greatest after 4 steps (τ = 1), over the exact
-value at the centre, 0.0293630. `implicit, mask` has one voxel in ten blocked, and no exact
-solution. Times are of one step of one signal in one colony: the least and the median of many. Each
-run is appended to a JSON file with its machine, versions and commit.
+The grids have 32³, 64³ and 128³ voxels. A unit amount starts in the centre voxel of n³,
+K = 1 µm²/h, h = 1 µm, no flux through the faces. A step is r = K Δt/h² = 1/4. The error against the
+exact lattice solution is the maximum after 4 steps (τ = 1), over the exact value at the centre,
+0.0293630. `implicit, mask` blocks one voxel in ten and has no exact solution. Times are those of
+one step of one signal in one colony: minimum and median of many. The script appends each run to a
+JSON file with its machine, versions and commit.
 """
 
 from __future__ import annotations
@@ -36,26 +37,27 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def exact(n: int) -> np.ndarray:
-    """Π e^{−2τ} I_k(2τ) at τ = R·STEPS, (n, n, n); far walls do not matter yet."""
+    """Returns Π e^{−2τ} I_k(2τ) at τ = R·STEPS, (n, n, n); distant faces have no effect yet."""
     one = ive(np.abs(np.arange(n) - n // 2), 2 * R * STEPS)
     return one[:, None, None] * one[None, :, None] * one[None, None, :]
 
 
-def timed(act, device: str, seconds: float) -> tuple[float, float, int]:
-    """Least and median ms of `act`, repeated for about so long, and how often."""
-    act()
-    taken: list[float] = []
+def timed(action, device: str, seconds: float) -> tuple[float, float, int]:
+    """Repeats `action` for about `seconds`. Returns minimum and median ms and the repeats."""
+    action()
+    times: list[float] = []
     end = time.perf_counter() + seconds
-    while len(taken) < 5 or (time.perf_counter() < end and len(taken) < 500):
-        begun = time.perf_counter()
-        act()
+    while len(times) < 5 or (time.perf_counter() < end and len(times) < 500):
+        begin = time.perf_counter()
+        action()
         if device == "cuda":
             torch.cuda.synchronize()
-        taken.append(1e3 * (time.perf_counter() - begun))
-    return min(taken), statistics.median(taken), len(taken)
+        times.append(1e3 * (time.perf_counter() - begin))
+    return min(times), statistics.median(times), len(times)
 
 
 def box(n: int, case: str, dtype: torch.dtype, device: str) -> Operator:
+    """Returns the transport operator of a case."""
     mask = None
     if case.endswith("mask"):
         mask = (torch.rand(n, n, n, generator=torch.Generator().manual_seed(1)) > 0.1).to(device)
@@ -65,7 +67,8 @@ def box(n: int, case: str, dtype: torch.dtype, device: str) -> Operator:
 
 
 def run(n: int, case: str, dtype: torch.dtype, device: str, seconds: float) -> dict:
-    made = box(n, case, dtype, device)
+    """Runs one method at one size. Returns its record."""
+    transport_operator = box(n, case, dtype, device)
     u = torch.zeros(1, n, n, n, dtype=dtype, device=device)
     u[0, n // 2, n // 2, n // 2] = 1.0
     spread = torch.rand(1, n, n, n, generator=torch.Generator().manual_seed(2)).to(device, dtype)
@@ -79,28 +82,29 @@ def run(n: int, case: str, dtype: torch.dtype, device: str, seconds: float) -> d
     }
     if case in ("apply", "conv3d"):
         rate = apply if case == "apply" else convolve
-        least, median, count = timed(lambda: rate(made, spread), device, seconds)
+        least, median, count = timed(lambda: rate(transport_operator, spread), device, seconds)
         return record | {
             "least_ms": round(least, 4),
             "median_ms": round(median, 4),
             "repeats": count,
         }
-    begun = time.perf_counter()
-    stepper = prepare(made, R, case.split(",")[0])
-    record["prepare_ms"] = round(1e3 * (time.perf_counter() - begun), 2)
+    begin = time.perf_counter()
+    stepper = prepare(transport_operator, R, case.split(",")[0])
+    record["prepare_ms"] = round(1e3 * (time.perf_counter() - begin), 2)
     least, median, count = timed(lambda: stepper.step(spread), device, seconds)
     record |= {"least_ms": round(least, 4), "median_ms": round(median, 4), "repeats": count}
     for _ in range(STEPS):
         u = stepper.step(u)
     found = u[0].double().cpu().numpy()
     record |= {"lowest": float(found.min()), "amount_error": float(found.sum() - 1)}
-    if made.mask is None:
+    if transport_operator.mask is None:
         expected = exact(n)
         record["error"] = float(np.abs(found - expected).max() / expected.max())
     return record
 
 
 def row(record: dict) -> str:
+    """Returns a line of the printed table."""
     error = f"{record['error']:.1e}" if "error" in record else "-"
     lowest, amount = (
         f"{record[k]:.1e}" if k in record else "-" for k in ("lowest", "amount_error")
@@ -111,28 +115,34 @@ def row(record: dict) -> str:
     )
 
 
-def transport(chosen: argparse.Namespace) -> list[dict]:
-    """Every method at every size."""
+def transport(options: argparse.Namespace) -> list[dict]:
+    """Runs every method at every size."""
     records = []
     print(
         f"     {'method':<15} {'least ms':>9} {'median':>9} {'error':>9} {'lowest':>9}"
-        f" {'amount':>9}   {chosen.dtype}, {torch.get_num_threads()} threads"
+        f" {'amount':>9}   {options.dtype}, {torch.get_num_threads()} threads"
     )
-    for n in chosen.size or SIZES:
-        for case in chosen.method or CASES:
-            records.append(run(n, case, DTYPES[chosen.dtype], chosen.device, chosen.seconds))
+    for n in options.size or SIZES:
+        for case in options.method or CASES:
+            records.append(run(n, case, DTYPES[options.dtype], options.device, options.seconds))
             print(row(records[-1]), flush=True)
     return records
 
 
-def band(chosen: argparse.Namespace) -> list[dict]:
-    """The paper's Fig. 5 from two founders: circuits in every cell, AHL on a grid, contacts in a
-    channel."""
+def band(options: argparse.Namespace) -> list[dict]:
+    """Runs the paper's Fig. 5 from two founders: circuits, AHL on a grid, contacts in a channel."""
     scene, timings = tf.scenes.boundary_detector(), tf.Timings()
-    begun = time.perf_counter()
-    start = scene.seed(1, seed=0, dtype=DTYPES[chosen.dtype], device=chosen.device)
-    state = deque(tf.simulate(scene, start, cells=chosen.cells, timings=timings), maxlen=1).pop()
-    seconds = time.perf_counter() - begun
+    begin = time.perf_counter()
+    run = tf.simulate(
+        scene,
+        seed=0,
+        dtype=DTYPES[options.dtype],
+        device=options.device,
+        cells=options.cells,
+        timings=timings,
+    )
+    state = deque(run, maxlen=1).pop()
+    seconds = time.perf_counter() - begin
     shares = {k: round(v, 2) for k, v in timings.seconds.items()}
     print(
         f"Fig. 5 to {state.cells} cells: {seconds:.1f} s, {state.step} steps, {state.time:g} h;"
@@ -158,25 +168,25 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--size", action="append", type=int, help="voxels along an edge; may be given again"
+        "--size", action="append", type=int, help="voxels along an edge; may be repeated"
     )
     parser.add_argument(
-        "--method", action="append", choices=CASES, help="one method; may be given again"
+        "--method", action="append", choices=CASES, help="one method; may be repeated"
     )
     parser.add_argument("--dtype", default="float32", choices=sorted(DTYPES))
     parser.add_argument(
-        "--part", action="append", choices=sorted(PARTS), help="one part; may be given again"
+        "--part", action="append", choices=sorted(PARTS), help="one part; may be repeated"
     )
-    parser.add_argument("--cells", type=int, default=5000, help="of Fig. 5")
-    parser.add_argument("--seconds", type=float, default=2.0, help="how long to repeat each")
+    parser.add_argument("--cells", type=int, default=5000, help="size of the colony of Fig. 5")
+    parser.add_argument("--seconds", type=float, default=2.0, help="time to repeat each case")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("signals.json"))
-    chosen = parser.parse_args()
+    options = parser.parse_args()
     tf.keep_memory()
-    records = json.loads(chosen.out.read_text()) if chosen.out.exists() else []
-    for name in chosen.part or PARTS:
-        records += [machine() | record for record in PARTS[name](chosen)]
-        chosen.out.write_text(json.dumps(records, indent=1) + "\n")
+    records = json.loads(options.out.read_text()) if options.out.exists() else []
+    for name in options.part or PARTS:
+        records += [machine() | record for record in PARTS[name](options)]
+        options.out.write_text(json.dumps(records, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,99 @@
+"""Settings of the contact mechanics that the studies compare, and how they run one setting.
+
+Work is the number of contact rows that products with J and its transpose read. It does not include
+finding the contacts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from growth import RowCounter
+from study import timed
+
+import torchfilm as tf
+
+WORK = "contact rows read"
+DT = 0.025  # h, the default step of a scene
+DIAMETER = 1.0  # µm, of all cells in these studies
+SHORT = 0.1  # s; longer runs are timed once
+TOLERANCES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 1e-3)
+KNOBS = ("stiffness", "alpha", "passes", "tolerance", "overlap", "unilateral")
+
+
+@dataclass(frozen=True)
+class ContactSetting:
+    """One setting of the contact solve; `series` is the knob that it changes."""
+
+    series: str
+    mechanics: tf.Mechanics
+    dt: float = DT
+    dtype: torch.dtype = torch.float32
+    default: bool = False
+    preset: str = ""
+
+    @classmethod
+    def of_preset(cls, name: str, scene: tf.Scene) -> ContactSetting:
+        """Returns the mechanics of `tf.preset(name, scene)`."""
+        tuned = tf.preset(name, scene).apply(scene)
+        return cls("preset", mechanics_of(tuned), tuned.dt, preset=name)
+
+    @property
+    def label(self) -> str:
+        """The setting as a user would give it: only the values that differ from the default."""
+        plain = tf.Mechanics(dim=self.mechanics.dim)
+        changed = [
+            f"{n}={value if isinstance(value, bool) else f'{value:g}'}"
+            for n in KNOBS
+            if (value := getattr(self.mechanics, n)) != getattr(plain, n)
+        ]
+        knobs = ", ".join(
+            [f"dt={self.dt:g}", *changed, *(["float64"] if self.dtype == torch.float64 else [])]
+        )
+        return f"preset {self.preset}: {knobs}" if self.preset else knobs
+
+    def scene(self, like: tf.Scene) -> tf.Scene:
+        """Returns the scene `like` with these mechanics and this step."""
+        effects = (self.mechanics if isinstance(e, tf.Mechanics) else e for e in like.effects)
+        return like.replace(*effects, dt=self.dt)
+
+    def start(self, state: tf.State) -> tf.State:
+        """Returns the state in this precision."""
+        cast = lambda x: x.to(self.dtype) if x.is_floating_point() else x
+        fields = {name: cast(value) for name, value in state.fields.items()}
+        return state.replace(
+            axis=cast(state.axis),
+            length=cast(state.length),
+            radius=cast(state.radius),
+            fields=fields,
+        )
+
+    def rows(self, counter: RowCounter) -> float:
+        """Returns the number of contact rows that products read.
+
+        A row of a wall has half the entries of a row between two cells and counts half.
+        """
+        return counter.bytes / (2 * self.mechanics.degrees * torch.finfo(self.dtype).bits // 8)
+
+
+def mechanics_of(scene: tf.Scene) -> tf.Mechanics:
+    """Returns the contact mechanics of a scene."""
+    return next(e for e in scene.effects if isinstance(e, tf.Mechanics))
+
+
+def followed(
+    choice: ContactSetting, like: tf.Scene, first: tf.State, hours: float
+) -> tuple[tf.State, float, float]:
+    """Returns the state `hours` later, the seconds (a median if short) and the rows read."""
+    scene, start = choice.scene(like), choice.start(first)
+
+    def run() -> tf.State:
+        *_, state = tf.simulate(scene, start, until=start.time + hours)
+        return state
+
+    with RowCounter() as counter:
+        state, seconds = timed(run, 1)
+    if seconds < SHORT:
+        _, seconds = timed(run)
+    return state, seconds, choice.rows(counter)

@@ -1,0 +1,215 @@
+"""The random scenes of experiments/fuzz.py as data: what a draw has, and how it is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from hypothesis import strategies as st
+
+import torchfilm as tf
+
+FLOATS = {"float32": torch.float32, "float64": torch.float64}
+
+
+@dataclass(frozen=True)
+class Capsules:
+    """Cells at the start.
+
+    counts: in each colony. within: half the side of the cube that contains the centres, µm.
+    lengths: lower and upper bound, µm. radius: µm. place: seed of the positions.
+    """
+
+    counts: tuple[int, ...]
+    within: float
+    lengths: tuple[float, float]
+    radius: float
+    dim: int
+    place: int
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Mechanics.
+
+    give: α, or minus the stiffness, or None for the default. wall: kind of wall. margin: distance
+    of the wall from the cube of centres, µm. wall_stiffness: None for a hard wall.
+    """
+
+    give: float | None
+    length_drag: float
+    viscosity: float
+    unilateral: bool
+    passes: int | None
+    wall: str | None
+    margin: float
+    wall_stiffness: float | None
+
+
+@dataclass(frozen=True)
+class Growing:
+    """Growth and division.
+
+    rate: 1/h. varied: draw the rate of each cell between a third of `rate` and `rate`. criterion:
+    quantity that triggers division. multiple: its threshold over the smallest allowed one.
+    """
+
+    rate: float
+    law: str
+    varied: bool
+    criterion: str | None
+    multiple: float
+    fraction: float
+
+
+@dataclass(frozen=True)
+class Outside:
+    """A medium with one signal.
+
+    shape: voxels per axis. boundary: condition of the faces of each axis. flow: µm/h along x.
+    outside: policy for cells outside. obstacle: whether a corner is solid.
+    """
+
+    shape: tuple[int, ...]
+    spacing: tuple[float, ...]
+    diffusion: float
+    decay: float
+    start: float
+    boundary: tuple[str, ...]
+    flow: float
+    outside: str
+    method: str | None
+    obstacle: bool
+    splitting: str
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Other effects.
+
+    eating: cells grow on the signal, if there is one and growth is by volume. rule: action of a
+    user rule. leaving: remove cells outside 0.7 of the cube in which they start.
+    """
+
+    eating: bool
+    rule: str | None
+    leaving: bool
+
+
+@dataclass(frozen=True)
+class Inside:
+    """A circuit.
+
+    kind: "hill" (one species represses another, both decay), "exchange" (a species and the signal
+    through the membrane only) or "reactions". fast: rate of the fastest process, 1/h. power: Hill
+    coefficient n. half: K. daughters, method: as in tf.Circuit.
+    """
+
+    kind: str
+    fast: float
+    power: float
+    half: float
+    daughters: str
+    method: str
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One example."""
+
+    capsules: Capsules
+    contacts: Contacts | None
+    growing: Growing | None
+    outside: Outside | None
+    inside: Inside | None
+    beside: Beside
+    dt: float
+    steps: int
+    dtype: str
+    seed: int
+
+
+def powers(low: int, high: int) -> st.SearchStrategy[float]:
+    """Powers of ten, from 10^low to 10^high."""
+    return st.integers(low, high).map(lambda k: 10.0**k)
+
+
+CAPSULES = st.builds(
+    Capsules,
+    counts=st.lists(st.sampled_from([1, 2, 0, 3, 7, 12]), min_size=1, max_size=3).map(tuple),
+    within=st.sampled_from([5.0, 20.0, 2.0, 1.0, 1e4]),
+    lengths=st.sampled_from([(2.0, 3.0), (0.0, 0.0), (0.0, 4.0), (1.0, 12.0)]),
+    radius=st.sampled_from([0.5, 0.05, 2.0]),
+    dim=st.sampled_from([2, 3]),
+    place=st.integers(0, 99),
+)
+CONTACTS = st.builds(
+    Contacts,
+    give=st.sampled_from([None, 0.1, 1e-6, 10.0, -1.0, -1e6]),
+    length_drag=powers(-3, 5),
+    viscosity=powers(-3, 3),
+    unilateral=st.booleans(),
+    passes=st.sampled_from([None, 1, 4]),
+    wall=st.sampled_from([None, "plane", "box", "channel", "inside a sphere", "outside a sphere"]),
+    margin=st.sampled_from([1.0, 0.3, 1e-3, 10.0]),
+    wall_stiffness=st.sampled_from([None, 1.0, 1e4]),
+)
+GROWING = st.builds(
+    Growing,
+    rate=st.sampled_from([1.0, 0.0, 1e-6, 20.0, 1e3]),
+    law=st.sampled_from(["volume", "length", "linear"]),
+    varied=st.booleans(),
+    criterion=st.sampled_from([None, "length", "volume", "added"]),
+    multiple=st.sampled_from([1.5, 1.0001, 10.0]),
+    fraction=st.sampled_from([0.5, 0.01, 0.999]),
+)
+BOUNDARIES = {
+    "closed": tf.NoFlux(),
+    "periodic": tf.Periodic(),
+    "open": tf.Open(0.5),
+    "fixed": tf.Dirichlet(2.0),
+}
+OUTSIDE = st.integers(2, 3).flatmap(
+    lambda dim: st.builds(
+        Outside,
+        shape=st.tuples(*[st.sampled_from([4, 1, 2, 3, 7, 13])] * dim),
+        spacing=st.tuples(*[st.sampled_from([2.0, 0.3, 9.0])] * dim),
+        diffusion=st.sampled_from([0.0, 1.0, 1e-3, 1e3, 1e6]),
+        decay=st.sampled_from([0.0, 1.0, 1e8]),
+        start=st.sampled_from([0.0, 1.0, 1e-12, 1e6]),
+        boundary=st.tuples(*[st.sampled_from(list(BOUNDARIES))] * 3),
+        flow=st.sampled_from([0.0, 10.0, -1e4]),
+        outside=st.sampled_from(["reservoir", "grow", "error"]),
+        method=st.sampled_from([None, "implicit"]),
+        obstacle=st.booleans(),
+        splitting=st.sampled_from(["strang", "lie"]),
+    )
+)
+INSIDE = st.builds(
+    Inside,
+    kind=st.sampled_from(["exchange", "hill", "reactions"]),
+    fast=powers(-3, 8),
+    power=st.sampled_from([1.0, 1.5, 8.0]),
+    half=powers(-6, 3),
+    daughters=st.sampled_from(["amount", "concentration"]),
+    method=st.sampled_from(["rosenbrock", "tau_leap", "direct"]),
+)
+BESIDE = st.builds(
+    Beside,
+    eating=st.booleans(),
+    rule=st.sampled_from([None, "grow", "divide", "remove", "read"]),
+    leaving=st.sampled_from([False, False, True]),
+)
+DRAWS = st.builds(
+    Draw,
+    capsules=CAPSULES,
+    contacts=st.none() | CONTACTS,
+    growing=st.none() | GROWING,
+    outside=st.none() | OUTSIDE,
+    inside=st.none() | INSIDE,
+    beside=BESIDE,
+    dt=st.sampled_from([0.01, 1e-4, 0.1, 1.0, 10.0]),
+    steps=st.integers(1, 4),
+    dtype=st.sampled_from(list(FLOATS)),
+    seed=st.integers(0, 2**40),
+).filter(lambda d: any(x is not None for x in (d.contacts, d.growing, d.outside, d.inside)))
