@@ -159,11 +159,11 @@ def main() -> None:
     settled = [r for r in rows if r[0] >= rows[-1][0] / 5]
     memory, count, luxi = ([r[k] for r in settled] for k in (2, 3, 8))
     print(
-        f"{state.step:,} steps ({state.time:.0f} h, {settled[-1][9]:.0f} s) in {chosen.dtype}: from"
-        f" a fifth of the run on {min(count)}-{max(count)} cells, LuxI"
+        f"{state.step:,} steps ({state.time:.0f} h, {settled[-1][9]:.0f} s) in {chosen.dtype}. From"
+        f" a fifth of the run on: {min(count)}-{max(count)} cells, LuxI"
         f" {min(luxi):.3g}-{max(luxi):.3g}, memory {memory[0]:.1f} MB then and {memory[-1]:.1f} MB"
-        f" at the end ({min(memory):.1f}-{max(memory):.1f}); {settled[-1][6]:.4g} conc·µm³ passed,"
-        f" of which {max(abs(r[7]) for r in rows):.2g} at most is not accounted for."
+        f" at the end ({min(memory):.1f}-{max(memory):.1f}). {settled[-1][6]:.4g} conc·µm³ passed;"
+        f" at most {max(abs(r[7]) for r in rows):.2g} of it is not accounted for."
     )
 
 
