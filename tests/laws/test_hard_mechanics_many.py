@@ -54,7 +54,7 @@ ACCURACY = {
 )
 def test_case_08_closed_channel(device, dtype, measured, unilateral, dim, accuracy):
     """Closed channel 3 µm wide, 200 cells: nothing escapes, overlap ≤ 3·g·l_max·Δt (given), with
-    l_max the longest cell of the moment.
+    l_max the longest cell at that time.
 
     70 steps, in 3-D 100: the channel is then full, and most of growth held back. Nothing escapes:
     every centreline stays inside.
@@ -280,7 +280,7 @@ def test_case_20_colonies_of_any_size(device, dtype, measured, unilateral, dim):
         *(v for v in vars(state.reports["mechanics"]).values() if v.is_floating_point()),
     ):
         assert torch.isfinite(value).all()
-        measured("numbers that are none", (~torch.isfinite(value)).sum(), "= 0")
+        measured("values that are not finite", (~torch.isfinite(value)).sum(), "= 0")
     small = run(scene, start.select([0, 1, 2]), 3, 0.2)
     assert torch.equal(state.select([0, 1, 2]).position, small.position)
 

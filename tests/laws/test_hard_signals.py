@@ -178,7 +178,7 @@ def test_case_37_cells_on_nodes_faces_and_corners(device, dtype, measured, shape
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_case_38_a_cell_outside_the_grid(device, dtype, measured, by, axis, side):
-    """Outside by 1e-3 h and by 10 h: it is said which cell is, and nothing is lost: it writes to
+    """Outside by 1e-3 h and by 10 h: the report names the cell, and nothing is lost: it writes to
     and reads from the nearest voxels.
 
     A periodic axis has no outside.
@@ -281,7 +281,7 @@ def test_case_40_flat_grids(device, dtype, measured, method, shape):
     stepper = prepare(op, 1.0, method)
     zero = torch.zeros(1, *shape, dtype=dtype, device=device)
     assert torch.equal(stepper.step(zero), zero)
-    measured("of an all-zero field", stepper.step(zero).abs().max(), "= 0")
+    measured("largest value of an all-zero field", stepper.step(zero).abs().max(), "= 0")
     wave = torch.cos(
         math.pi * 3 * (torch.arange(64, dtype=torch.float64, device=device) + 0.5) / 64
     )
