@@ -174,6 +174,10 @@ class Mechanics(Effect):
         place is too."""
         return [s for wall in self.walls for s in wall.surfaces(self.dim)]
 
+    def wall_surfaces(self) -> list[Surface]:
+        """The surfaces that cells cannot pass."""
+        return self.surfaces()
+
     @property
     def degrees(self) -> int:
         """Degrees of freedom of a cell: 4 in strict 2-D, 7 in 3-D."""
