@@ -81,6 +81,11 @@ class Rules(Effect):
             self, "noted", {"reads": (), "writes": (), "divide reads": (), "divide writes": ()}
         )
 
+    @property
+    def hot_reload(self) -> HotReload:
+        """The functions, and the file that they come from."""
+        return self.source
+
     def parts(self) -> tuple[Effect, ...]:
         return (
             (self, DivisionRule(self))
