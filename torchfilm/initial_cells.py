@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,8 @@ from torchfilm.tools import checks
 
 # What a column of a table may be called.
 POSITION, AXIS = ("x", "y", "z"), ("axis_x", "axis_y", "axis_z")
+# Columns by which segmentation programs number cells and frames; any other column becomes a field.
+BOOKKEEPING = ("label", "frame", "id", "cell_id", "track", "track_id", "index")
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,10 @@ class Cells:
         for name in self.extra:
             if not name.isidentifier() or name in RESERVED:
                 raise checks.input_error(
-                    "Cells column", name, "a name that the state does not use itself"
+                    "Cells column",
+                    name,
+                    "a name that the state does not use itself",
+                    "Rename or delete it.",
                 )
         parts["extra"] = {name: _column(name, values, count) for name, values in self.extra.items()}
         for name, values in parts.items():
@@ -214,6 +220,7 @@ class Cells:
         position = np.stack([np.asarray(left.pop(n), dtype=np.float64) for n in POSITION[:dim]], 1)
         if "angle" in left:
             angle = np.asarray(left.pop("angle"), dtype=np.float64)
+            _warn_of_degrees(angle, source)
             axis = np.stack([np.cos(angle), np.sin(angle)] + [np.zeros_like(angle)] * (dim - 2), 1)
         elif all(n in left for n in AXIS[:dim]):
             axis = np.stack([np.asarray(left.pop(n), dtype=np.float64) for n in AXIS[:dim]], 1)
@@ -223,6 +230,7 @@ class Cells:
                 f" {', '.join(AXIS[:dim])}."
             )
         known = {n: left.pop(n) for n in ("length", "radius", "cell_type", "colony") if n in left}
+        _warn_of_bookkeeping(left, source)
         return Cells(position, axis, **known, extra=left)
 
     @staticmethod
@@ -270,6 +278,41 @@ class Cells:
                 n: np.asarray(d) for n, d in file[group].items() if isinstance(d, h5py.Dataset)
             }
         return Cells.from_table(columns, str(path))
+
+
+def _warn_of_degrees(angle: np.ndarray, source: str) -> None:
+    """Warn of angles beyond a full turn: in radians they would be strange, in degrees usual."""
+    beyond = np.abs(angle) > 2 * np.pi
+    if beyond.any():
+        warnings.warn(
+            f"{source}: the column 'angle' reaches {float(np.abs(angle[beyond]).max()):g}, and"
+            f" torchfilm reads it in radians ({int(beyond.sum())} of {angle.size} values are over a"
+            " full turn, 2π). If they are degrees, convert them: angle = numpy.deg2rad(angle).",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+
+
+def _warn_of_bookkeeping(extra: Mapping[str, Any], source: str) -> None:
+    """Warn of columns that number cells or frames: they would become fields of the cells."""
+    found = [name for name in extra if name.lower() in BOOKKEEPING]
+    if not found:
+        return
+    frames = {len(np.unique(np.asarray(extra[n]))) for n in found if n.lower() == "frame"}
+    several = (
+        f" The table has {max(frames)} frames, and the cells of all of them would start together:"
+        " keep the rows of one frame."
+        if max(frames, default=1) > 1
+        else ""
+    )
+    warnings.warn(
+        f"{source}: {', '.join(map(repr, found))} {'is' if len(found) == 1 else 'are'} no"
+        " propert" + ("y" if len(found) == 1 else "ies") + " of a cell, and would become"
+        f" {'a field' if len(found) == 1 else 'fields'} that daughters inherit.{several} Delete the"
+        f" column{'' if len(found) == 1 else 's'}.",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 def _read_csv(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:

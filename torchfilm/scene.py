@@ -43,6 +43,11 @@ class Scene:
         recipe: tuple[str, dict[str, Any]] | None = None,
     ):
         for effect in effects:
+            if isinstance(effect, (list, tuple)):
+                raise checks.InputError(
+                    f"Scene got a {type(effect).__name__} of {len(effect)} effects: it takes the"
+                    " effects themselves. Unpack it: Scene(*effects)."
+                )
             if not isinstance(effect, Effect):
                 raise checks.input_error(
                     "Scene",

@@ -19,6 +19,7 @@ from torchfilm.physics.contacts import (
     contact_gaps,
     contacts_of,
 )
+from torchfilm.physics.initial_overlaps import check_apart
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.solve import (
@@ -225,6 +226,15 @@ class Mechanics(Effect):
                     f" {-float(distance[k]):.3g} µm behind it (cells behind it: {beyond.numel()})."
                     " Is the wall inside out? Turn it (facing, normal, inside), or move the cells."
                 )
+        check_apart(
+            state.position,
+            state.axis,
+            state.length,
+            state.radius,
+            state.colony,
+            state.colony_id,
+            state.uid,
+        )
 
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:

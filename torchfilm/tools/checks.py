@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -30,6 +31,17 @@ def input_error(name: str, value: object, allowed: str, hint: str = "") -> Input
     shown = repr(value) if len(repr(value)) < 120 else repr(value)[:117] + "..."
     return InputError(
         f"{name} = {shown} is not allowed: it must be {allowed}." + (f" {hint}" if hint else "")
+    )
+
+
+def unknown_keyword(name: str, given: str, allowed: Sequence[str]) -> InputError:
+    """The error for a keyword that a function or class does not have, with the nearest one that it
+    has; raise what this returns. name: of the function or class, such as "Growth"."""
+    near = difflib.get_close_matches(given, allowed, n=1)
+    return InputError(
+        f"{name} has no parameter {given!r}."
+        + (f" Did you mean {near[0]}?" if near else "")
+        + f" It has: {', '.join(allowed) or 'none'}."
     )
 
 
