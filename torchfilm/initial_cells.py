@@ -188,8 +188,13 @@ class Cells:
     def from_table(
         columns: Mapping[str, Sequence[float] | np.ndarray], source: str = "table"
     ) -> Cells:
-        """From columns x, y (, z), and either axis_x, axis_y (, axis_z) or angle (rad, in the
-        plane), length, radius; optional cell_type, colony; any other column becomes a field.
+        """Cells from columns of equal length, one row per cell.
+
+        Columns: x, y and, in space, z (µm); length (µm, of the centreline, without caps); angle
+        (rad, in the plane), or axis_x, axis_y and, in space, axis_z; optional radius (µm),
+        cell_type, colony. Any other column becomes a field of the cells. Raises InputError if a
+        column is missing or has bad values; warns of angles that look like degrees, and of columns
+        that number cells or frames, such as label and frame.
         """
         left = dict(columns)
         dim = 3 if "z" in left else 2
@@ -294,22 +299,20 @@ def _warn_of_degrees(angle: np.ndarray, source: str) -> None:
 
 
 def _warn_of_bookkeeping(extra: Mapping[str, Any], source: str) -> None:
-    """Warn of columns that number cells or frames: they would become fields of the cells."""
+    """Warn of columns that number cells or frames: they become fields of the cells."""
     found = [name for name in extra if name.lower() in BOOKKEEPING]
     if not found:
         return
     frames = {len(np.unique(np.asarray(extra[n]))) for n in found if n.lower() == "frame"}
     several = (
-        f" The table has {max(frames)} frames, and the cells of all of them would start together:"
-        " keep the rows of one frame."
+        f" The table has {max(frames)} frames, and the cells of all frames start together: keep the"
+        " rows of one frame."
         if max(frames, default=1) > 1
         else ""
     )
     warnings.warn(
-        f"{source}: {', '.join(map(repr, found))} {'is' if len(found) == 1 else 'are'} no"
-        " propert" + ("y" if len(found) == 1 else "ies") + " of a cell, and would become"
-        f" {'a field' if len(found) == 1 else 'fields'} that daughters inherit.{several} Delete the"
-        f" column{'' if len(found) == 1 else 's'}.",
+        f"{source}: these columns number cells or frames, and become fields that daughters inherit:"
+        f" {', '.join(map(repr, found))}. Delete them from the table.{several}",
         RuntimeWarning,
         stacklevel=3,
     )
