@@ -193,8 +193,9 @@ class Cells:
         Columns: x, y and, in space, z (µm); length (µm, of the centreline, without caps); angle
         (rad, in the plane), or axis_x, axis_y and, in space, axis_z; optional radius (µm),
         cell_type, colony. Any other column becomes a field of the cells. Raises InputError if a
-        column is missing or has bad values; warns of angles that look like degrees, and of columns
-        that number cells or frames, such as label and frame.
+        column is missing or has bad values, or if two cells of a colony have one position. Warns
+        of angles that look like degrees, and of columns that number cells or frames, such as label
+        and frame.
         """
         left = dict(columns)
         dim = 3 if "z" in left else 2
@@ -234,6 +235,7 @@ class Cells:
                 f"{source} lacks the cells' direction: give the column 'angle' (rad), or"
                 f" {', '.join(AXIS[:dim])}."
             )
+        _check_places(position, left.get("colony"), source)
         known = {n: left.pop(n) for n in ("length", "radius", "cell_type", "colony") if n in left}
         _warn_of_bookkeeping(left, source)
         return Cells(position, axis, **known, extra=left)
@@ -283,6 +285,24 @@ class Cells:
                 n: np.asarray(d) for n, d in file[group].items() if isinstance(d, h5py.Dataset)
             }
         return Cells.from_table(columns, str(path))
+
+
+def _check_places(
+    position: np.ndarray, colony: Sequence[float] | np.ndarray | None, source: str
+) -> None:
+    """Raise InputError if two rows of a table have the same centre in one colony."""
+    of = np.zeros(len(position)) if colony is None else np.asarray(colony, dtype=np.float64)
+    places, first, counts = np.unique(
+        np.column_stack([of, position]), axis=0, return_index=True, return_counts=True
+    )
+    again = np.flatnonzero(counts > 1)
+    if again.size:
+        at = again[np.argmin(first[again])]
+        raise checks.InputError(
+            f"{source}: {counts[at]} cells have the same position, {places[at, 1:].tolist()}, the"
+            f" first of them cell {first[at]} (counted from 0; such positions: {again.size}). Is a"
+            " cell listed twice, or are there several frames in one table? Keep one cell of each."
+        )
 
 
 def _warn_of_degrees(angle: np.ndarray, source: str) -> None:

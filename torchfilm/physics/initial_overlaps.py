@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
-from torchfilm.tools.checks import InputError
 
-# Centres nearer than this share of a radius count as one place: contacts have no direction there.
+# Centres nearer than this share of a radius count as one place.
 SAME_PLACE = 1e-6
 
 
@@ -24,8 +23,8 @@ def check_apart(
     colony_id: Tensor,
     uid: Tensor,
 ) -> None:
-    """Raise InputError if two cells of a colony have the same centre; warn, once for all, if two
-    overlap by more than a radius (the smaller one of the two).
+    """Warn, once for all pairs, if two cells of a colony have the same centre, or overlap by more
+    than a radius (the smaller one of the two).
 
     position, axis (N, d); length, radius (N,) µm; colony (N,) int64, place in the batch; colony_id
     (B,); uid (N,). Messages name cells by uid and colonies by id.
@@ -35,7 +34,6 @@ def check_apart(
     i, j, gap = gaps_nearby(position, axis, length, radius, colony, len(colony_id))
     between = (position.index_select(0, i) - position.index_select(0, j)).double()
     least = torch.minimum(radius.index_select(0, i), radius.index_select(0, j)).double()
-    same = torch.nonzero((between * between).sum(1) <= (SAME_PLACE * least) ** 2).squeeze(1)
 
     def name(pair: Tensor) -> str:
         first, second = int(i[pair]), int(j[pair])
@@ -44,21 +42,22 @@ def check_apart(
             f" {int(colony_id[int(colony[first])])}"
         )
 
+    deep = torch.nonzero(-gap > least).squeeze(1)
+    if not deep.numel():
+        return
+    same = deep[(between * between).sum(1)[deep] <= (SAME_PLACE * least[deep]) ** 2]
     if same.numel():
         at = [round(x, 3) for x in position[int(i[same[0]])].tolist()]
-        raise InputError(
-            f"{name(same[0])} start at the same place, {at} (such pairs: {same.numel()}): contacts"
-            " cannot separate them. Is a cell listed twice, or are the cells of several frames in"
-            " one table? Delete one of each pair, or move it."
+        found = (
+            f"{name(same[0])} start at the same place, {at} (such pairs: {same.numel()}). Is a cell"
+            " listed twice? Delete one of each pair, or move it."
         )
-    deep = torch.nonzero(-gap > least).squeeze(1)
-    if deep.numel():
+    else:
         worst = deep[torch.argmin(gap[deep])]
-        warnings.warn(
+        found = (
             f"{name(worst)} start {-float(gap[worst]):.3g} µm deep in one another (pairs that"
-            f" overlap by over a radius: {deep.numel()}). The first steps may push them through"
-            " one another. Move the cells apart; or check the unit of the table (µm) and its"
-            " lengths (of the centreline, without caps).",
-            RuntimeWarning,
-            stacklevel=2,
+            f" overlap by over a radius: {deep.numel()}). The first steps may push them through one"
+            " another. Move the cells apart; or check the unit of the table (µm) and its lengths"
+            " (of the centreline, without caps)."
         )
+    warnings.warn(found, RuntimeWarning, stacklevel=2)
