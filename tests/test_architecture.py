@@ -43,7 +43,7 @@ ROOMS = {
     "effects": Room(4, ("torchfilm.effects",), talk=False),
     "scene": Room(5, ("torchfilm.scene", "torchfilm.initial_cells")),
     # simulate takes a path to record to, so results lie below it
-    "results": Room(6, ("torchfilm.io.results", "torchfilm.io.recorder")),
+    "results": Room(6, ("torchfilm.io",)),
     "simulate": Room(7, ("torchfilm.simulation",)),
     "the rest": Room(8, ("torchfilm",)),
 }

@@ -41,6 +41,7 @@ def spoilt(tmp_path_factory) -> Path:
         "import torchfilm as tf\ndef update(cells):\n    cells.growth_rate = cells.volumee\nscene ="
         " tf.Scene(tf.Rules(update), tf.Growth())\n"
     )
+    (folder / "toggle.xml").write_text("<sbml/>\n")
     (folder / "imports.py").write_text("import no_such_module\n")
     scene = tf.scenes.microcolony()
     for _ in tf.simulate(scene, scene.seed(), until=0.5, record=folder / "good.h5"):
@@ -54,6 +55,8 @@ def spoilt(tmp_path_factory) -> Path:
 ERRORS = {
     "run unknown": ("nothing_like_it", "microcolony, programmed_growth, channel"),
     "run no_such_file.py": (r"no_such_file\.py", "No such file"),
+    "run toggle.xml --until 1": (r"toggle\.xml", r"reads no \.xml files", "Circuit"),
+    "run good.h5 --until 1": (r"good\.h5", "results file", "torchfilm resume"),
     "run empty.py": (r"empty\.py", "scene"),
     "run number.py": (r"number\.py", "Scene"),
     "run syntax.py --until 1": (r"syntax\.py", "line 1"),
@@ -251,3 +254,22 @@ def test_a_file_whose_every_colony_has_cells_needs_no_note(command, capsys):
         "copies.h5",
     )
     assert "note" not in capsys.readouterr().out
+
+
+def test_columns_that_no_effect_uses_are_noted(command, capsys):
+    Path("cells.csv").write_text("x,y,angle,length,gfp,size\n0,0,0,2,0.5,3\n")
+    command("run", "microcolony", "--start", "cells.csv", "--until", 0.5)
+    assert (
+        "note: cells.csv: gfp, size are recorded as quantities per cell, which no effect uses."
+        " Delete the columns that you do not need." in capsys.readouterr().out.splitlines()
+    )
+
+
+def test_a_warning_in_the_shell_is_one_line_without_code(tmp_path):
+    (tmp_path / "cells.csv").write_text("x,y,angle,length\n0,0,45,2\n")
+    arguments = ("run", "microcolony", "--start", "cells.csv", "--until", 0.5, "--no-picture")
+    done = shell(*arguments, folder=tmp_path)
+    lines = [line for line in done.stderr.splitlines() if "warning" in line.lower()]
+    assert done.returncode == 0 and len(lines) == 1, done.stderr
+    assert lines[0].startswith("warning: cells.csv: the column 'angle' reaches 45")
+    assert "warnings.warn" not in done.stderr

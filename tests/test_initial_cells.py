@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import h5py
 import numpy as np
@@ -125,7 +126,11 @@ def test_no_cell_no_overlap():
 
 # --- CSV and HDF5 ---------------------------------------------------------------------------------
 
-CSV = "x,y,angle,length,radius,cell_type,colony,gfp\n0,1,0,2.0,0.5,1,0,0.25\n10,1,1.5707963267948966,3.0,0.4,0,1,0.75\n"
+CSV = """\
+x,y,angle,length,radius,cell_type,colony,gfp
+0,1,0,2.0,0.5,1,0,0.25
+10,1,1.5707963267948966,3.0,0.4,0,1,0.75
+"""
 
 
 def test_csv(tmp_path):
@@ -357,3 +362,108 @@ def test_a_data_set_of_text_is_told(tmp_path):
         file["strain"] = ["K12"]
     with pytest.raises(tf.InputError, match="strain"):
         tf.Cells.from_hdf5(path)
+
+
+# --- tables of segmentation programs --------------------------------------------------------------
+
+
+def table(**columns) -> dict:
+    return {"x": [0.0, 5.0], "y": [0.0, 0.0], "angle": [0.0, 1.0], "length": [2.0, 2.0], **columns}
+
+
+@pytest.mark.parametrize("kind", ["table", "csv", "hdf5"])
+def test_degrees_are_noticed(tmp_path, kind):
+    columns = table(angle=[0.5, -87.5])
+    with pytest.warns(RuntimeWarning, match=r"'angle' reaches 87\.5.*radians.*1 of 2.*deg2rad"):
+        if kind == "table":
+            tf.Cells.from_table(columns)
+        elif kind == "csv":
+            rows = zip(*columns.values(), strict=True)
+            lines = [",".join(columns), *(",".join(map(str, row)) for row in rows)]
+            (tmp_path / "cells.csv").write_text("\n".join(lines))
+            tf.Cells.from_csv(tmp_path / "cells.csv")
+        else:
+            with h5py.File(tmp_path / "cells.h5", "w") as file:
+                for name, values in columns.items():
+                    file[name] = values
+            tf.Cells.from_hdf5(tmp_path / "cells.h5")
+
+
+def test_a_full_turn_in_radians_is_no_degrees():
+    """Any warning would be an error here."""
+    tf.Cells.from_table(table(angle=[2 * math.pi, -2 * math.pi]))
+
+
+@pytest.mark.parametrize("name", ["label", "Label", "frame", "track_id"])
+def test_columns_that_number_cells_are_noticed(name):
+    with pytest.warns(RuntimeWarning, match=rf"number cells.*: '{name}'\. Delete") as found:
+        cells = tf.Cells.from_table(table(**{name: [1.0, 1.0], "gfp": [0.5, 1.5]}))
+    assert "start together" not in str(found[0].message) and "gfp" not in str(found[0].message)
+    assert set(cells.extra) == {name, "gfp"}
+
+
+def test_the_cells_of_several_frames_in_one_table_are_noticed():
+    with pytest.warns(RuntimeWarning, match=r"'label', 'frame'\..*2 frames.*keep the rows of one"):
+        tf.Cells.from_table(table(label=[1.0, 2.0], frame=[0.0, 1.0]))
+
+
+# --- cells in one another -------------------------------------------------------------------------
+
+
+def on_a_plane(*places, **options) -> tf.State:
+    cells = tf.Cells([list(p) for p in places], [1.0, 0.0], **options)
+    return tf.Scene(tf.Growth(), tf.Mechanics(dim=2), founders=cells).seed()
+
+
+def test_two_cells_at_one_place_are_noticed():
+    """They can be separated (tests/laws), but one is likely to be listed twice."""
+    with pytest.warns(
+        RuntimeWarning,
+        match=r"cells 0 and 2 of colony 0 start at the same place, \[1\.5, 0\.0\] \(.*pairs: 1\)",
+    ):
+        on_a_plane((1.5, 0.0), (9.0, 0.0), (1.5, 0.0), (9.0, 5.0))
+
+
+def test_two_cells_at_one_place_in_a_table_are_refused():
+    columns = {"x": [4.0, 1.0, 4.0], "y": [0.0] * 3, "angle": [0.0, 0.0, 1.0], "length": [2.0] * 3}
+    with pytest.raises(
+        tf.InputError, match=r"table: 2 cells.*\[4\.0, 0\.0\].*cell 0 .*positions: 1.*listed twice"
+    ):
+        tf.Cells.from_table(columns)
+    assert tf.Cells.from_table({**columns, "colony": [0, 0, 1]}).count == 3
+
+
+def test_cells_deep_in_one_another_are_noticed():
+    """Parallel rods of radius 0.5 µm, 0.4 µm apart: they overlap by 0.6 µm."""
+    with pytest.warns(
+        RuntimeWarning, match=r"cells 1 and 2 of colony 0 start 0\.6 µm deep.*a radius: 1\)"
+    ):
+        on_a_plane((9.0, 9.0), (0.0, 0.0), (0.0, 0.4))
+
+
+def test_less_than_a_radius_or_other_colonies_are_no_matter():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        on_a_plane((0.0, 0.0), (0.0, 0.6))
+        on_a_plane((0.0, 0.0), (0.0, 0.0), colony=[0, 1])
+
+
+def test_without_mechanics_cells_may_be_anywhere():
+    assert seed(tf.Cells([[0.0, 0.0]] * 3, [1.0, 0.0])).cells == 3
+
+
+# --- lengths in pixels ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "division, length, pixels",
+    [({"length": 4.2}, 39.6, True), ({"volume": 3.0}, 39.6, True), ({"length": 4.2}, 4.5, False)],
+)
+def test_lengths_in_pixels_are_noticed(division, length, pixels):
+    scene = tf.Scene(tf.Division(**division), founders=tf.Cells([[0.0, 0.0]], [1.0, 0.0], length))
+    with pytest.raises(tf.InputError, match=r"threshold .* is not above its .* at birth") as caught:
+        scene.seed()
+    said = str(caught.value)
+    assert ("look like pixels" in said) == pixels and "Raise the threshold" in said
+    if pixels:
+        assert "length 39.6" in said and "multiply" in said

@@ -299,6 +299,13 @@ def test_missing_brackets_are_told(made):
         tf.Scene(made)
 
 
+@pytest.mark.parametrize("kind", [list, tuple])
+def test_a_list_of_effects_is_to_be_unpacked(kind):
+    with pytest.raises(tf.InputError, match=rf"{kind.__name__} of 2.*Scene\(\*effects\)") as caught:
+        tf.Scene(kind([tf.Growth(rate=1.0), tf.Mechanics(dim=2)]))
+    assert "brackets" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     "effect", [lambda: tf.Growth(rate=1.0), lambda: tf.Division(), lambda: tf.Mechanics(dim=2)]
 )

@@ -15,7 +15,8 @@ OWN = """
 import torchfilm as tf
 
 def lamp(rate=1.0, longest=4.0):
-    return tf.Scene(tf.Growth(rate=rate), tf.Division(length=tf.Uniform(3.0, longest)), tf.Mechanics(dim=2), dt=0.05)
+    division = tf.Division(length=tf.Uniform(3.0, longest))
+    return tf.Scene(tf.Growth(rate=rate), division, tf.Mechanics(dim=2), dt=0.05)
 
 def scene(rate=1.0):
     return lamp(rate)
@@ -143,14 +144,21 @@ def test_a_bad_design_is_refused_in_words(folder, told, words):
 @pytest.mark.parametrize(
     "what, words",
     [
-        ("none.json", "the path of a design that was saved. No such file"),
+        ("none.json", "the path of a saved design. No such file"),
         ("colony", "scene = 'colony'.*one of microcolony"),
         ("none.py", "No such file"),
         ("mine.txt", "No such file"),
-        (".", "scene = '.'"),
+        (".", "scene = '.'.*folder"),
+        (
+            "toggle.xml",
+            r"scene = 'toggle.xml'.*\.py.*\.json.*reads no \.xml files.*Scene.*reactions.*Circuit",
+        ),
+        ("run.h5", "No such file.*results file.*torchfilm resume"),
+        ("cells.csv", "No such file.*table of cells.*--start"),
     ],
 )
 def test_what_is_no_scene_is_refused_in_words(folder, what, words):
+    (folder / "toggle.xml").write_text("<sbml/>")
     with pytest.raises(tf.InputError, match=words):
         load_scene(what, {})
 

@@ -183,11 +183,6 @@ class Effect:
         """Surfaces that confine cells."""
         return ()
 
-    @property
-    def hot_reload(self) -> HotReload | None:
-        """The user's functions that may be edited during a run."""
-        return None
-
 
 def _new_with_known_keywords(cls: type, *args: Any, **given: Any) -> Any:
     known = (
@@ -299,6 +294,11 @@ class BoundEffect:
     @property
     def works_on_grid(self) -> bool:
         return self.effect.works_on_grid
+
+    @property
+    def hot_reload(self) -> HotReload | None:
+        """The user's functions that may be edited during a run."""
+        return None
 
     def summary(self) -> str:
         """The effect with the parameters that differ from their defaults, in a line."""

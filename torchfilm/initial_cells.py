@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,8 @@ from torchfilm.tools import checks
 
 # What a column of a table may be called.
 POSITION, AXIS = ("x", "y", "z"), ("axis_x", "axis_y", "axis_z")
+# Columns by which segmentation programs number cells and frames; any other column becomes a field.
+BOOKKEEPING = ("label", "frame", "id", "cell_id", "track", "track_id", "index")
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,10 @@ class Cells:
         for name in self.extra:
             if not name.isidentifier() or name in RESERVED:
                 raise checks.input_error(
-                    "Cells column", name, "a name that the state does not use itself"
+                    "Cells column",
+                    name,
+                    "a name that the state does not use itself",
+                    "Rename or delete it.",
                 )
         parts["extra"] = {name: _column(name, values, count) for name, values in self.extra.items()}
         for name, values in parts.items():
@@ -182,8 +188,14 @@ class Cells:
     def from_table(
         columns: Mapping[str, Sequence[float] | np.ndarray], source: str = "table"
     ) -> Cells:
-        """From columns x, y (, z), and either axis_x, axis_y (, axis_z) or angle (rad, in the
-        plane), length, radius; optional cell_type, colony; any other column becomes a field.
+        """Cells from columns of equal length, one row per cell.
+
+        Columns: x, y and, in space, z (µm); length (µm, of the centreline, without caps); angle
+        (rad, in the plane), or axis_x, axis_y and, in space, axis_z; optional radius (µm),
+        cell_type, colony. Any other column becomes a field of the cells. Raises InputError if a
+        column is missing or has bad values, or if two cells of a colony have one position. Warns
+        of angles that look like degrees, and of columns that number cells or frames, such as label
+        and frame.
         """
         left = dict(columns)
         dim = 3 if "z" in left else 2
@@ -214,6 +226,7 @@ class Cells:
         position = np.stack([np.asarray(left.pop(n), dtype=np.float64) for n in POSITION[:dim]], 1)
         if "angle" in left:
             angle = np.asarray(left.pop("angle"), dtype=np.float64)
+            _warn_of_degrees(angle, source)
             axis = np.stack([np.cos(angle), np.sin(angle)] + [np.zeros_like(angle)] * (dim - 2), 1)
         elif all(n in left for n in AXIS[:dim]):
             axis = np.stack([np.asarray(left.pop(n), dtype=np.float64) for n in AXIS[:dim]], 1)
@@ -222,7 +235,9 @@ class Cells:
                 f"{source} lacks the cells' direction: give the column 'angle' (rad), or"
                 f" {', '.join(AXIS[:dim])}."
             )
+        _check_places(position, left.get("colony"), source)
         known = {n: left.pop(n) for n in ("length", "radius", "cell_type", "colony") if n in left}
+        _warn_of_bookkeeping(left, source)
         return Cells(position, axis, **known, extra=left)
 
     @staticmethod
@@ -270,6 +285,57 @@ class Cells:
                 n: np.asarray(d) for n, d in file[group].items() if isinstance(d, h5py.Dataset)
             }
         return Cells.from_table(columns, str(path))
+
+
+def _check_places(
+    position: np.ndarray, colony: Sequence[float] | np.ndarray | None, source: str
+) -> None:
+    """Raise InputError if two rows of a table have the same centre in one colony."""
+    of = np.zeros(len(position)) if colony is None else np.asarray(colony, dtype=np.float64)
+    places, first, counts = np.unique(
+        np.column_stack([of, position]), axis=0, return_index=True, return_counts=True
+    )
+    again = np.flatnonzero(counts > 1)
+    if again.size:
+        at = again[np.argmin(first[again])]
+        raise checks.InputError(
+            f"{source}: {counts[at]} cells have the same position, {places[at, 1:].tolist()}, the"
+            f" first of them cell {first[at]} (counted from 0; such positions: {again.size}). Is a"
+            " cell listed twice, or are there several frames in one table? Keep one cell of each."
+        )
+
+
+def _warn_of_degrees(angle: np.ndarray, source: str) -> None:
+    """Warn of angles beyond a full turn: in radians they would be strange, in degrees usual."""
+    beyond = np.abs(angle) > 2 * np.pi
+    if beyond.any():
+        warnings.warn(
+            f"{source}: the column 'angle' reaches {float(np.abs(angle[beyond]).max()):g}, and"
+            f" torchfilm reads it in radians ({int(beyond.sum())} of {angle.size} values are over a"
+            " full turn, 2π). If they are degrees, convert them: angle = numpy.deg2rad(angle).",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+
+
+def _warn_of_bookkeeping(extra: Mapping[str, Any], source: str) -> None:
+    """Warn of columns that number cells or frames: they become fields of the cells."""
+    found = [name for name in extra if name.lower() in BOOKKEEPING]
+    if not found:
+        return
+    frames = {len(np.unique(np.asarray(extra[n]))) for n in found if n.lower() == "frame"}
+    several = (
+        f" The table has {max(frames)} frames, and the cells of all frames start together: keep the"
+        " rows of one frame."
+        if max(frames, default=1) > 1
+        else ""
+    )
+    warnings.warn(
+        f"{source}: these columns number cells or frames, and become fields that daughters inherit:"
+        f" {', '.join(map(repr, found))}. Delete them from the table.{several}",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 def _read_csv(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:

@@ -233,7 +233,11 @@ def step(
 
 
 def _molecules(
-    circuit: CircuitCells, concentrations: Tensor, dt: float, settings: IntegrationSettings, draw: Draw
+    circuit: CircuitCells,
+    concentrations: Tensor,
+    dt: float,
+    settings: IntegrationSettings,
+    draw: Draw,
 ) -> CircuitOutcome:
     """The same molecule by molecule. A reservoir is a pool so large that what is given to it or
     taken does not show."""
@@ -311,7 +315,12 @@ MOLECULES = 100
 
 
 def words(
-    circuit: CircuitCells, outcome: CircuitOutcome, concentrations: Tensor, k: int, method: str, dt: float
+    circuit: CircuitCells,
+    outcome: CircuitOutcome,
+    concentrations: Tensor,
+    k: int,
+    method: str,
+    dt: float,
 ) -> str:
     """What went wrong in the k-th of the M cells, from concentrations (M, S) on."""
     code = int(outcome.code[k])
@@ -369,7 +378,9 @@ def _not_finite(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float
     return []
 
 
-def trial(circuit: CircuitCells, concentrations: Tensor, derivatives: bool = False) -> tuple[str, ...]:
+def trial(
+    circuit: CircuitCells, concentrations: Tensor, derivatives: bool = False
+) -> tuple[str, ...]:
     """Try the circuit once at concentrations (M, S), with derivatives where its method asks for
     them: raise InputError for what it returns wrongly; the signals that it exchanges."""
     try:

@@ -1,1 +1,1 @@
-"""The command line; `torchfilm.cli.main:main` is the entry point."""
+"""The command line. Its entry point is `torchfilm.cli.main:main`."""

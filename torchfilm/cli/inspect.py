@@ -1,4 +1,5 @@
-"""The commands that only look: `torchfilm info SCENE-or-FILE`, `explain SCENE`, `tune SCENE`."""
+"""The commands that report and record nothing: `torchfilm info SCENE-or-FILE`, `explain SCENE`,
+`tune SCENE`."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ from torchfilm.tuning.tuner import tune
 
 @dataclass
 class Info:
-    """Say what a scene simulates, field by field, and who drives whom, or what a results file
-    holds."""
+    """Print what a scene simulates, field by field, and which effect drives which; or what a
+    results file contains."""
 
     what: Annotated[str, tyro.conf.Positional]
     """Scene name, Python file, saved design, or results file."""
@@ -35,9 +36,8 @@ class Info:
         ):
             return self._of_results()
         scene = load_scene(self.what, dict(map(parse_setting, self.set)))
-        # rules are tried on a first state, so that what they read and write is known
-        scene.unchecked(1)
-        print(scene.explain())
+        # binding tries the rules and circuits, which shows what they read and write
+        print(scene.bind(per_colony=True).describe())
 
     def _of_results(self) -> None:
         with Results(self.what) as results:
@@ -60,26 +60,26 @@ class Info:
 
 @dataclass
 class Explain:
-    """Say how a scene will be simulated: methods and tolerances, who drives whom, what is left out,
-    and an estimate of what it costs."""
+    """Print how a scene will be simulated: methods and tolerances, which effect drives which, what
+    is not simulated, and an estimate of time and memory."""
 
     scene: Annotated[str, tyro.conf.Positional]
     """Scene name, Python file or saved design."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE."""
     cells: int = 1000
-    """Cells in each colony, for which to estimate."""
+    """Cells in each colony, for the estimate."""
     colonies: int | None = None
-    """Colonies for which to estimate; by default as many as the scene's parameters are for, else
+    """Colonies, for the estimate; by default the number that the scene's parameters give, else
     1."""
     device: str = "cpu"
     """cpu or cuda."""
     preset: str | None = None
-    """How accurately, as of `run`: draft, standard or reference."""
+    """Accuracy, as for `run`: draft, standard or reference."""
     settings: Path | None = None
-    """How accurately: a file of settings, as `torchfilm tune SCENE --out` writes it."""
+    """Accuracy: a file of settings, as `torchfilm tune SCENE --out` writes it."""
     seconds: float = 2.0
-    """About how long to measure, by running the scene's first steps; 0 leaves the estimate out."""
+    """About how long to measure the scene's first steps, s; 0 omits the estimate."""
 
     def __call__(self) -> None:
         scene = accurate(
@@ -98,24 +98,24 @@ class Explain:
 
 @dataclass
 class Tune:
-    """Find the cheapest settings that hold an error: a window of the scene is run by many settings,
-    and compared with a far tighter run. Takes some minutes."""
+    """Find the cheapest settings with an error below a limit. The command runs a part of the scene
+    with many settings, and compares each with a far more accurate run. It takes some minutes."""
 
     scene: Annotated[str, tyro.conf.Positional]
     """Scene name, Python file or saved design."""
     error: str = "1%"
-    """Greatest relative error of what is read off, such as 1% or 0.01."""
+    """Greatest relative error of the observed quantities, such as 1% or 0.01."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE."""
     of: list[str] = field(default_factory=list)
-    """What must be right: cells, volume, radius, overlap, species by name, "signal NAME"; by
-    default all of them."""
+    """The observed quantities: cells, volume, radius, overlap, species by name, "signal NAME"; by
+    default all."""
     cells: int = 100
-    """Cells in each colony of what you will run; it is looked at there, and with half as many
-    again."""
+    """Cells in each colony of the run that you plan. Settings are tested at this size, and at one
+    and a half times this size."""
     colonies: int = 24
-    """Colonies of the probe, if the scene's parameters leave it open; where chance would hide the
-    error, two to twelve times as many."""
+    """Colonies of the probe, unless the scene's parameters give a number. Where chance would hide
+    the error, two to twelve times as many."""
     seed: int = 0
     """Seed of the probe."""
     device: str = "cpu"
@@ -127,7 +127,7 @@ class Tune:
         if self.out is not None:
             Settings.check_new(self.out)
         scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
-        with _doing() as watch:
+        with _status_line() as watch:
             tuned = tune(
                 scene,
                 parse_error(self.error),
@@ -144,8 +144,8 @@ class Tune:
 
 
 @contextmanager
-def _doing() -> Iterator[Callable[[str], None]]:
-    """What to tell in words what is being done, which is shown on a terminal, with the time."""
+def _status_line() -> Iterator[Callable[[str], None]]:
+    """A function that shows a line of text and the elapsed time, on a terminal only."""
     from tqdm import tqdm  # part of the `app` extra, as is tyro
 
     with tqdm(bar_format="[{elapsed}] {desc}", disable=None, leave=False) as line:
@@ -153,7 +153,7 @@ def _doing() -> Iterator[Callable[[str], None]]:
 
 
 def parse_error(text: str) -> float:
-    """A share: 1% or 0.01."""
+    """A share, from 1% or 0.01. Raises InputError unless it is below 1."""
     try:
         share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
     except ValueError as error:

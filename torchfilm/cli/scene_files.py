@@ -1,5 +1,4 @@
-"""Scenes by what a user types: the name of a ready one, a Python file, or a design that a search
-has saved."""
+"""Scenes as a user names them: a ready-made scene by name, a Python file, or a saved design."""
 
 from __future__ import annotations
 
@@ -8,6 +7,7 @@ import inspect
 import json
 import sys
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,46 +17,36 @@ from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.load_module import run_file
 
+# What a file with this suffix probably is, and how to use it.
+KNOWN_SUFFIXES = {
+    ".h5": "This looks like a results file: use `torchfilm resume`, `show` or `info`.",
+    ".csv": "This looks like a table of cells: give it with --start.",
+}
+KNOWN_SUFFIXES[".hdf5"] = KNOWN_SUFFIXES[".h5"]
+OTHER_SUFFIX = (
+    "torchfilm reads no {} files. Write a Python file that defines `scene = torchfilm.Scene(…)`;"
+    " the reactions of a model in another format become a Circuit there."
+)
+
 
 def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -> Scene:
-    """A ready-made scene by name, the `function` or Scene of that name of a Python file, or the
-    scene of a saved design (.json), with its parameters but for those given."""
+    """A ready-made scene by name; or the `function` or Scene of that name in a Python file; or the
+    scene of a saved design (.json). `parameters` replace those of the design. Raises InputError for
+    anything else."""
     path = Path(what)
     if path.suffix == ".json":
-        plan = design(what)
-        home = str(plan.get("file") or plan["scene"])
-        if Path(home).suffix == ".json":
-            raise checks.input_error(
-                f"scene in {what}", home, "the name of a ready scene, or the path of a Python file"
-            )
-        made = load_scene(
-            home, {**plan["parameters"], **parameters}, str(plan.get("function") or "scene")
-        )
-        made.dt = checks.number(f"dt in {what}", plan.get("dt", made.dt), above=0.0)
-        return made
+        return _scene_of_design(what, parameters)
     if not path.suffix and path.name == what:
         return scenes.build(what, parameters)
     if not path.is_file() or path.suffix != ".py":
-        hint = "" if path.exists() else "No such file."
         raise checks.input_error(
             "scene",
             what,
-            "the name of a ready scene, or the path of a Python file or of a design that was saved",
-            hint,
+            "the name of a ready scene, or the path of a Python file (.py) or of a saved design"
+            " (.json)",
+            _hint(path),
         )
-    sys.path.insert(0, str(path.parent.resolve()))
-    try:
-        names = run_file(path)
-    except InputError:
-        raise
-    except Exception as error:
-        lines = [
-            frame.lineno
-            for frame in traceback.extract_tb(error.__traceback__)
-            if frame.filename == str(path)
-        ]
-        at = f" (line {lines[-1]})" if lines else ""
-        raise InputError(f"{what} cannot be run: {type(error).__name__}: {error}{at}") from error
+    names = _run_scene_file(path, what)
     if function not in names:
         raise InputError(
             f"{what} does not define `{function}`: write `{function} = torchfilm.Scene(…)`, or a"
@@ -64,14 +54,7 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
         )
     made = names[function]
     if callable(made) and not isinstance(made, Scene):
-        try:
-            inspect.signature(made).bind(**parameters)
-        except TypeError as error:
-            raise InputError(
-                f"{function}(…) in {what}: {error}. Its parameters are {inspect.signature(made)};"
-                " give them with --set."
-            ) from error
-        made = made(**parameters)
+        made = _call(made, f"{function}(…) in {what}", parameters)
     elif parameters:
         raise checks.input_error(
             "--set",
@@ -82,29 +65,77 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
         raise checks.input_error(
             f"{function} in {what}", made, "a Scene, or a function that returns one"
         )
-    if made.name == "scene":
-        made.name = path.stem
-    made.settings = parameters
-    return made
+    name = path.stem if made.name == "scene" else made.name
+    return made.replace(name=name, settings=parameters)
+
+
+def _hint(path: Path) -> str:
+    """What to do where a path is no scene."""
+    if path.is_dir():
+        return "This is a folder."
+    hints = [] if path.exists() else ["No such file."]
+    if path.suffix not in ("", ".py"):
+        hints.append(KNOWN_SUFFIXES.get(path.suffix, OTHER_SUFFIX.format(path.suffix)))
+    return " ".join(hints)
+
+
+def _scene_of_design(what: str, parameters: dict[str, Any]) -> Scene:
+    plan = design(what)
+    home = str(plan.get("file") or plan["scene"])
+    if Path(home).suffix == ".json":
+        raise checks.input_error(
+            f"scene in {what}", home, "the name of a ready scene, or the path of a Python file"
+        )
+    made = load_scene(
+        home, {**plan["parameters"], **parameters}, str(plan.get("function") or "scene")
+    )
+    return made.replace(dt=checks.number(f"dt in {what}", plan.get("dt", made.dt), above=0.0))
+
+
+def _run_scene_file(path: Path, what: str) -> dict[str, Any]:
+    """The names that a Python file defines. Raises InputError, with the line, if it fails."""
+    sys.path.insert(0, str(path.parent.resolve()))
+    try:
+        return run_file(path)
+    except InputError:
+        raise
+    except Exception as error:
+        lines = [
+            frame.lineno
+            for frame in traceback.extract_tb(error.__traceback__)
+            if frame.filename == str(path)
+        ]
+        at = f" (line {lines[-1]})" if lines else ""
+        raise InputError(f"{what} cannot be run: {type(error).__name__}: {error}{at}") from error
+
+
+def _call(make: Callable[..., Any], name: str, parameters: dict[str, Any]) -> Any:
+    """What a scene function returns. Raises InputError for parameters that it does not have."""
+    try:
+        inspect.signature(make).bind(**parameters)
+    except TypeError as error:
+        raise InputError(
+            f"{name}: {error}. Its parameters are {inspect.signature(make)}; give them with --set."
+        ) from error
+    return make(**parameters)
 
 
 def design(what: str) -> dict[str, Any]:
-    """What a saved design says, if `what` is the path of one; else nothing."""
+    """The content of a saved design; empty if `what` is not the path of one. Raises InputError if
+    the file is missing or is no design."""
     path = Path(what)
     if path.suffix != ".json":
         return {}
     if not path.is_file():
-        raise checks.input_error(
-            "scene", what, "the path of a design that was saved", "No such file."
-        )
+        raise checks.input_error("scene", what, "the path of a saved design", "No such file.")
     try:
-        told = json.loads(path.read_text())
+        content = json.loads(path.read_text())
     except ValueError as error:
         raise InputError(f"{what} cannot be read as JSON: {error}.") from error
     if (
-        not isinstance(told, dict)
-        or not isinstance(told.get("parameters"), dict)
-        or not isinstance(told.get("scene"), str)
+        not isinstance(content, dict)
+        or not isinstance(content.get("parameters"), dict)
+        or not isinstance(content.get("scene"), str)
     ):
         raise InputError(
             f"{what} is no saved design: it must have a `scene` and its `parameters`, as Best.save"
@@ -115,16 +146,16 @@ def design(what: str) -> dict[str, Any]:
         ("seed", int, "a whole number"),
         ("until", (int, float), "a number"),
     ):
-        value = told.get(name)
+        value = content.get(name)
         if value is not None and (isinstance(value, bool) or not isinstance(value, kind)):
             raise checks.input_error(
-                f"{name} in {what}", value, allowed, "Leave it out for the usual one."
+                f"{name} in {what}", value, allowed, "Leave it out for the default."
             )
-    return told
+    return content
 
 
 def parse_setting(text: str) -> tuple[str, Any]:
-    """NAME=VALUE; a value that is no Python literal is taken as text."""
+    """Name and value from NAME=VALUE. A value that is no Python literal is text."""
     name, equals, value = text.partition("=")
     if not equals or not name.isidentifier():
         raise checks.input_error("--set", text, "NAME=VALUE")

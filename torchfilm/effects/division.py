@@ -28,6 +28,7 @@ from torchfilm.values import (
 CRITERIA = ("length", "volume", "added")
 
 TOO_SHORT = 1
+PIXELS = 10.0  # µm; a message about a longer first cell says that its length may be in pixels
 
 
 @dataclass(frozen=True)
@@ -161,8 +162,9 @@ class Division(Effect):
             raise checks.InputError(
                 f"Division.{self.criterion}: threshold {float(state.division_threshold[k]):g} of"
                 f" cell {int(state.uid[k])} in colony {int(state.own_colony_id[k])} is not above"
-                f" its {self.criterion} at birth, {float(start[k]):g}. Raise the threshold or start"
-                " from smaller cells."
+                f" its {self.criterion} at birth, {float(start[k]):g}."
+                + _pixels_hint(float(state.length[k]), float(state.radius[k]))
+                + " Raise the threshold or start from smaller cells."
             )
         least = smallest(given)
         radius = float(state.radius.max())
@@ -203,6 +205,16 @@ class Division(Effect):
                 if not bool(due.any()):
                     return state
         return divide(state, due, values.fraction, values.axis_noise)
+
+
+def _pixels_hint(length: float, radius: float) -> str:
+    """What to do where a first cell is tens of µm long."""
+    if length < PIXELS:
+        return ""
+    return (
+        f" Lengths of tens of µm look like pixels (this cell: length {length:g}, radius"
+        f" {radius:g}): multiply x, y, z, length and radius by the size of a pixel in µm."
+    )
 
 
 def _too_short(state: State, short: Tensor) -> DivisionReport:

@@ -23,6 +23,7 @@ from torchfilm.physics.contact_step import (
     Moved,
     contact_step,
 )
+from torchfilm.physics.initial_overlaps import check_apart
 from torchfilm.physics.solve import CONVERGED, NOT_FINITE, STATUS, TOO_FAST
 from torchfilm.physics.walls import Surface, Wall
 from torchfilm.state import Field, State
@@ -207,6 +208,15 @@ class Mechanics(Effect):
                     f" {-float(distance[k]):.3g} µm behind it (cells behind it: {behind.numel()})."
                     " Is the wall inside out? Turn it (facing, normal, inside), or move the cells."
                 )
+        check_apart(
+            state.position,
+            state.axis,
+            state.length,
+            state.radius,
+            state.colony,
+            state.colony_id,
+            state.uid,
+        )
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (_BoundMechanics(self, binding),)

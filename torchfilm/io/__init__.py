@@ -1,1 +1,1 @@
-"""Results files: writing a run, reading it back, resuming from it."""
+"""Results files: writing a run, reading it, resuming from it."""

@@ -38,10 +38,14 @@ def input_error(name: str, value: object, allowed: str, hint: str = "") -> Input
 
 
 def unknown_keyword(name: str, given: str, allowed: Sequence[str]) -> InputError:
-    """The error for a keyword that nothing takes, with the nearest one that is."""
-    near = difflib.get_close_matches(given, allowed, 1)
-    hint = f" Did you mean {near[0]}?" if near else ""
-    return InputError(f"{name} has no keyword {given!r}: it has {', '.join(allowed)}.{hint}")
+    """The error for a keyword that a function or class does not have, with the nearest one that it
+    has; raise what this returns. name: of the function or class, such as "Growth"."""
+    near = difflib.get_close_matches(given, allowed, n=1)
+    return InputError(
+        f"{name} has no parameter {given!r}."
+        + (f" Did you mean {near[0]}?" if near else "")
+        + f" It has: {', '.join(allowed) or 'none'}."
+    )
 
 
 def known_keywords(function: F) -> F:

@@ -1,0 +1,102 @@
+"""What the commands print about a run: the summary at its end, and notes on the cells that it
+starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from torchfilm import measure
+from torchfilm.initial_cells import Cells
+from torchfilm.model import Model
+from torchfilm.physics.walls import Wall
+from torchfilm.scene import Scene
+from torchfilm.state import State
+from torchfilm.tools.timing import Timings
+
+
+def summary_table(scene: Scene, state: State, timings: Timings, seconds: float) -> str:
+    """The last state of a run in lines: cells, size, overlaps; and where the computing time
+    went."""
+    walls = _walls(scene)
+    found = measure.overlaps(state, walls)
+    pairs = found.count.sum().clamp(min=1)
+    counts = state.counts
+    radius = (
+        f"{float(measure.colony_radius(state).nanmean()):.1f} µm (mean)"
+        if state.cells
+        else "-: no cell is left (the lineage says why)"
+    )
+    lines = [
+        f"{'colonies':<28}{state.colonies}",
+        f"{'cells':<28}{state.cells} ({int(counts.min())} to {int(counts.max())} a colony)",
+        f"{'time':<28}{state.time:g} h in {state.step} steps, {seconds:.1f} s",
+        f"{'colony radius':<28}{radius}",
+        (
+            f"{'overlap':<28}mean {float((found.mean * found.count).sum() / pairs):.4f} µm, worst"
+            f" {float(found.worst.max()):.3f} µm"
+        ),
+    ]
+    if walls:
+        lines.append(
+            f"{'overlap with walls':<28}(soft ones yield) worst {float(found.walls.max()):.3f} µm"
+        )
+    total = sum(timings.seconds.values()) or 1.0
+    lines += [
+        f"{'time for ' + name:<28}{s:.2f} s ({100 * s / total:.0f} %)"
+        for name, s in timings.seconds.items()
+    ]
+    return "\n".join(lines)
+
+
+def _walls(scene: Scene) -> list[Wall]:
+    """The walls of all effects, each once. One wall may have several surfaces."""
+    surfaces = [s for e in scene.effects for s in e.wall_surfaces()]
+    return list({id(surface.wall): surface.wall for surface in surfaces}.values())
+
+
+def overlaps_note(cells: Cells) -> str:
+    """Which of the given cells overlap; empty if none does by over 0.01 µm."""
+    found = cells.overlaps(0.01)
+    if not found:
+        return ""
+    i, j, deep = found[0]
+    return (
+        f"{len(found)} pairs of the given cells overlap by over 0.01 µm, worst cells {i} and {j} by"
+        f" {deep:.3g} µm; the first steps separate them."
+    )
+
+
+def empty_colonies_note(path: str, cells: Cells, state: State) -> str:
+    """Which colonies have no cell to start from, and why; empty if all have cells."""
+    empty = torch.nonzero(state.counts == 0).squeeze(1).tolist()
+    if not empty:
+        return ""
+    there = sorted(set(cells.colony.tolist()))
+    return (
+        f"{_colonies(empty)} of {state.colonies} {'stays' if len(empty) == 1 else 'stay'} empty:"
+        f" {path} has cells for {_colonies(there)} only."
+    )
+
+
+def extra_columns_note(path: str, cells: Cells, model: Model) -> str:
+    """Which columns of the table become fields that no effect of the scene uses; empty if there is
+    none."""
+    used = {f.name for e in model.effects for f in e.declares()}
+    used |= {name for e in model.effects for name in (*e.reads(), *e.effect.needs())}
+    extra = [name for name in cells.extra if name not in used]
+    if not extra:
+        return ""
+    return (
+        f"{path}: {', '.join(extra)} {'is' if len(extra) == 1 else 'are'} recorded as"
+        f" {'a quantity' if len(extra) == 1 else 'quantities'} per cell, which no effect uses."
+        " Delete the columns that you do not need."
+    )
+
+
+def _colonies(numbers: Sequence[int], most: int = 12) -> str:
+    listed = ", ".join(map(str, numbers[:most])) + (
+        f", … ({len(numbers)} in all)" if len(numbers) > most else ""
+    )
+    return f"{'colony' if len(numbers) == 1 else 'colonies'} {listed}"

@@ -1,0 +1,283 @@
+"""The commands that simulate: `torchfilm run SCENE`, `torchfilm resume FILE`."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from tqdm import tqdm
+
+from torchfilm import pictures, scenes
+from torchfilm.cli.report import (
+    empty_colonies_note,
+    extra_columns_note,
+    overlaps_note,
+    summary_table,
+)
+from torchfilm.cli.scene_files import design, load_scene, parse_setting
+from torchfilm.cli.show import check_new, own_picture
+from torchfilm.initial_cells import Cells
+from torchfilm.io.recorder import Recorder
+from torchfilm.io.results import Results
+from torchfilm.model import Model
+from torchfilm.scene import Scene
+from torchfilm.simulation import simulate
+from torchfilm.state import State
+from torchfilm.tools import checks
+from torchfilm.tools.checks import InputError
+from torchfilm.tools.timing import Timings
+from torchfilm.tuning.settings import Settings, accurate
+
+
+@dataclass
+class Run:
+    """Run a scene: a ready-made one by name, your own Python file that defines `scene` (a Scene, or
+    a function that returns one), or a saved design."""
+
+    scene: Annotated[str, tyro.conf.Positional]
+    """microcolony, programmed_growth, channel, …; or the path of a Python file; or the path of a
+    saved design (.json), which also gives the step, the seed and the end of the run."""
+    set: list[str] = field(default_factory=list)
+    """Parameters of the scene, as NAME=VALUE, such as --set dim=3 rate=0.8."""
+    colonies: int = 1
+    """Independent colonies in the batch."""
+    cells: int | None = None
+    """Stop once every colony has this many cells. Without an end: 500, or the number of the
+    design."""
+    until: float | None = None
+    """Stop at this time, h."""
+    dt: float | None = None
+    """Step, h; by default the scene's."""
+    preset: str | None = None
+    """Accuracy: draft for a first look, standard (the defaults), or reference to compare others
+    with."""
+    settings: Path | None = None
+    """Accuracy: a file of settings, as `torchfilm tune SCENE --out` writes it."""
+    seed: int | None = None
+    """Seed of all random numbers; by default 0, or the seed of the design."""
+    start: Path | None = None
+    """CSV or HDF5 file of cells to start from."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    double: bool = False
+    """Compute in float64. A design that was searched in float64 always runs in float64."""
+    out: Path | None = None
+    """Results file; by default SCENE.h5 in this folder, or NAME_run.h5 for a saved design."""
+    every: int = 10
+    """Record every this many steps."""
+    overwrite: bool = False
+    """Replace the results file, and the picture beside it, if they exist. The old results stay
+    until the first frame of the new ones is on the disk."""
+    watch: bool = False
+    """Reload the rules file (Rules("file.py")) when it is edited during the run."""
+    picture: bool = True
+    """Draw the last frame beside the results."""
+
+    def __call__(self) -> None:
+        scene = accurate(
+            load_scene(self.scene, dict(map(parse_setting, self.set))), self.preset, self.settings
+        )
+        plan = design(self.scene)
+        cells, until = self.cells, self.until
+        if cells is None and until is None:
+            cells, until = plan.get("cells"), plan.get("until")
+            if cells is None and until is None:
+                cells = 500
+        double = self.double or plan.get("dtype") == "float64"
+        start = None if self.start is None else read_cells(self.start)
+        model = scene.bind(
+            self.colonies,
+            seed=plan.get("seed", 0) if self.seed is None else self.seed,
+            cells=start,
+            device=self.device,
+            dtype=torch.float64 if double else torch.float32,
+        )
+        state = model.start()
+        recorder = Recorder(
+            self._results_file(scene, bool(plan)), scene, every=self.every, overwrite=self.overwrite
+        )
+        if self.picture:
+            check_new(
+                "picture",
+                own_picture(recorder.path),
+                self.overwrite,
+                "Choose another --out, replace it (--overwrite), or draw none (--no-picture).",
+            )
+        if start is not None:
+            print_notes(str(self.start), start, model, state)
+        colour = next((n for n in plan.get("species", ()) if n in state.fields), None)
+        go(
+            model,
+            state,
+            recorder,
+            cells=cells,
+            until=until,
+            dt=self.dt,
+            watch=self.watch,
+            picture=self.picture,
+            colour=colour,
+        )
+
+    def _results_file(self, scene: Scene, is_design: bool) -> Path:
+        """The path of the results, in a folder that exists: it is made if necessary."""
+        # SCENE.h5 is the usual name of the study that found a design
+        own = Path(f"{Path(self.scene).stem}_run.h5" if is_design else f"{scene.name}.h5")
+        out = self.out if self.out is not None else own
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise checks.input_error(
+                "--out", str(out), "in a folder that can be made", f"{error.strerror}."
+            ) from error
+        return out
+
+
+@dataclass
+class Resume:
+    """Resume a run from the last frame of its results file, bit for bit, and draw its picture
+    again."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """Results file."""
+    scene: Path | None = None
+    """The Python file of the scene, or the saved design; not needed for a ready-made scene. (A
+    results file contains data only, not the code of a scene.)"""
+    cells: int | None = None
+    """Stop once every colony has this many cells."""
+    until: float | None = None
+    """Stop at this time, h."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    watch: bool = False
+    """Reload the rules file when it is edited during the run."""
+    picture: bool = True
+    """Draw the last frame beside the results."""
+    changed: bool = False
+    """Resume although the scene differs from the recorded one."""
+
+    def __call__(self) -> None:
+        if self.cells is None and self.until is None:
+            raise InputError("resume needs an end: --cells or --until.")
+        with Results(self.file) as results:
+            if self.scene is not None:
+                scene = load_scene(str(self.scene), results.settings)
+            elif results.recipe is not None:
+                scene = scenes.build(*results.recipe)
+            else:
+                raise InputError(
+                    f"{self.file} was made by a scene of your own: give its file, or the saved"
+                    " design, with --scene."
+                )
+            scene = Settings.named(results.accuracy, str(self.file)).apply(scene)
+            state = results.state(scene, device=self.device, changed=self.changed)
+            dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
+        if self.picture:
+            own_picture(self.file)
+        recorder = Recorder(self.file, scene, every=every, append=True, changed=self.changed)
+        go(
+            scene.bind(state=state, per_colony=True),
+            state,
+            recorder,
+            cells=self.cells,
+            until=self.until,
+            dt=dt,
+            watch=self.watch,
+            picture=self.picture,
+        )
+
+
+def read_cells(path: Path) -> Cells:
+    """The cells of a CSV file, or of an HDF5 file (any other suffix)."""
+    return Cells.from_csv(path) if path.suffix == ".csv" else Cells.from_hdf5(path)
+
+
+def print_notes(path: str, cells: Cells, model: Model, state: State) -> None:
+    """Print what a user should know of the cells that a run starts from."""
+    for note in (
+        empty_colonies_note(path, cells, state),
+        extra_columns_note(path, cells, model),
+        overlaps_note(cells),
+    ):
+        if note:
+            print(f"note: {note}")
+
+
+def go(
+    model: Model,
+    start: State,
+    recorder: Recorder,
+    *,
+    cells: int | None,
+    until: float | None,
+    dt: float | None,
+    watch: bool,
+    picture: bool,
+    colour: str | None = None,
+) -> None:
+    """Run with a progress bar; then print where the results are, and a summary."""
+    sources = [effect.hot_reload for effect in model.effects]
+    reloads = [source for source in sources if source is not None]
+    for reload in reloads:
+        reload.watching = watch
+    timings, begun = Timings(), time.perf_counter()
+    interrupted = catch_interrupt()
+    form = "{desc} |{bar}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}"
+    with tqdm(
+        total=_size(start, cells, until), bar_format=form, disable=None, mininterval=0.3
+    ) as bar:
+        bar.set_description(f"{model.scene.name}: {start.colonies} colonies")
+        bar.update(_done(start, cells, until))
+        state = start
+        for state in simulate(
+            model, start, until=until, cells=cells, dt=dt, record=recorder, timings=timings
+        ):
+            bar.update(_done(state, cells, until) - bar.n)
+            seconds = time.perf_counter() - begun
+            bar.set_postfix_str(
+                f"{state.cells} cells, t = {state.time:.2f} h,"
+                f" {(state.step - start.step) / seconds:.0f} steps/s",
+                refresh=False,
+            )
+            for reload in reloads:
+                while reload.messages:
+                    bar.write(reload.messages.pop(0))
+            if interrupted.is_set():
+                raise KeyboardInterrupt
+    seconds = time.perf_counter() - begun
+    print(f"results  {recorder.path}")
+    if picture and state.cells:
+        print(f"picture  {pictures.show(recorder.path, colour=colour)}")
+    print(summary_table(model.scene, state, timings, seconds))
+
+
+def catch_interrupt() -> threading.Event:
+    """Ctrl-C sets the event, which the loop reads between two steps. An exception at any other
+    place may be swallowed, or interrupt the writing of a frame. A second Ctrl-C raises at once."""
+    event = threading.Event()
+
+    def note(*_: object) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, note)
+    return event
+
+
+def _size(state: State, cells: int | None, until: float | None) -> float:
+    """The full length of the progress bar: doublings, or hours."""
+    return float(torch.log2(torch.tensor(float(cells)))) if cells is not None else float(until or 0)
+
+
+def _done(state: State, cells: int | None, until: float | None) -> float:
+    """The progress: doublings of the smallest colony that has cells, or hours."""
+    if cells is not None:
+        smallest = int(state.counts[state.counts > 0].min()) if state.cells else cells
+        return min(float(torch.log2(torch.tensor(float(smallest)))), _size(state, cells, until))
+    return state.time

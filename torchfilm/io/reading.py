@@ -1,0 +1,132 @@
+"""Opening results files and reading their datasets: complete files, growing files, and files that a
+killed run left."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from types import EllipsisType
+from typing import Any
+
+import h5py
+
+from torchfilm.io.layout import FORMAT, VERSION
+from torchfilm.tools import checks
+from torchfilm.tools.checks import InputError
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+@contextmanager
+def blaming_file(file: h5py.File, name: str) -> Iterator[None]:
+    """Raise InputError, which names the damaged dataset, for any failure of HDF5 inside."""
+    try:
+        yield
+    except (OSError, KeyError, RuntimeError) as error:
+        raise InputError(
+            f"{file.filename} is damaged: its {name!r} cannot be read ({error}). Use another copy"
+            " of it, or other frames."
+        ) from error
+
+
+def read_dataset(file: h5py.File, name: str, at: int | slice | EllipsisType = ...) -> Any:
+    """The rows `at` of a dataset. Raises InputError if they cannot be read."""
+    with blaming_file(file, name):
+        return file[name][at]
+
+
+def frame_count(file: h5py.File) -> int:
+    """Number of complete frames. Steps increase from frame to frame; a last step that does not was
+    interrupted while it was written, and its frame is not counted."""
+    steps = read_dataset(file, "frames/step")
+    count = len(steps)
+    while count > 1 and steps[count - 1] <= steps[count - 2]:
+        count -= 1
+    return count
+
+
+def committed(file: h5py.File) -> dict[str, int]:
+    """The sizes of the complete part of the file: frames, rows, voxels, births, ends."""
+    frames = frame_count(file)
+    if frames == 0:
+        return {"frames": 0, "rows": 0, "voxels": 0, "births": 0, "ends": 0}
+    last = partial(read_dataset, file, at=frames - 1)
+    rows = int(last("frames/first_row")) + int(last("frames/counts").sum())
+    voxels = 0
+    if "grid" in file["frames"]:
+        voxels = int(last("frames/grid/first_voxel")) + int(last("frames/grid/shape").prod(1).sum())
+    return {
+        "frames": frames,
+        "rows": rows,
+        "voxels": voxels,
+        "births": int(last("frames/births")),
+        "ends": int(last("frames/ends")),
+    }
+
+
+def inode_of_open(file: h5py.File) -> int:
+    """The inode of the open file, also after another file took its path."""
+    return os.fstat(file.id.get_vfd_handle()).st_ino
+
+
+def open_results(path: Path) -> h5py.File:
+    """Open a torchfilm results file with at least one complete frame. Raises InputError for any
+    other file."""
+    file = _open_hdf5(path)
+    try:
+        with blaming_file(file, "frames/step"):
+            ours = file.attrs.get("format") == FORMAT and "frames/step" in file
+        if not ours:
+            raise InputError(
+                f"{path} is not a torchfilm results file (its format is"
+                f" {file.attrs.get('format')!r})."
+            )
+        if int(file.attrs["version"]) > VERSION:
+            raise InputError(
+                f"{path} has format version {file.attrs['version']}, newer than this torchfilm"
+                f" reads ({VERSION}). Update torchfilm."
+            )
+        if frame_count(file) == 0:
+            raise InputError(f"{path} holds no finished frame.")
+    except InputError:
+        file.close()
+        raise
+    return file
+
+
+def _open_hdf5(path: Path) -> h5py.File:
+    """Open an HDF5 file to read: complete, growing, or left by a killed run."""
+    if not path.is_file():
+        raise checks.input_error("results", str(path), "a results file", "No such file.")
+    error: Exception | None = None
+    with open(path, "rb") as raw:
+        head = raw.read(48)
+    # A single-writer open of a truncated file waits without end for the missing bytes. Its
+    # superblock gives the length that the file should have.
+    size = path.stat().st_size
+    if head.startswith(SIGNATURE[: len(head)]) and (
+        len(head) < 48 or (head[8] >= 2 and int.from_bytes(head[28:36], "little") > size)
+    ):
+        of = f" of {int.from_bytes(head[28:36], 'little')}" if len(head) == 48 else ""
+        raise InputError(
+            f"{path} is truncated: it has {size}{of} bytes. Use a complete copy of it. If its run"
+            " has just started, try again."
+        )
+    # If no process writes the file (or the writer was killed), unreadable bytes stay unreadable. A
+    # single-writer open would retry for minutes.
+    finished = len(head) == 48 and head[8] >= 3 and head[11] == 0
+    ways: tuple[dict[str, Any], ...] = ({"swmr": True, "libver": "latest"}, {})
+    for options in reversed(ways) if finished else ways:
+        try:
+            return h5py.File(path, "r", **options)
+        except OSError as found:
+            error = found
+            # "match": this process still has the file open with the options of its writer
+            if finished and "match" not in str(found):
+                break
+    raise InputError(
+        f"{path} cannot be read as HDF5: it is truncated or not a results file ({error})."
+    ) from error

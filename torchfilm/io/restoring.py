@@ -1,0 +1,89 @@
+"""From a recorded frame back to a state that `simulate` can continue."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.io.identity import check_fields, check_same_scene, declared_fields
+from torchfilm.model import bind
+from torchfilm.scene import Scene
+from torchfilm.signals.grid import Grid
+from torchfilm.state import OUTSIDE, PER_CELL, Field, State
+from torchfilm.tools import checks
+
+if TYPE_CHECKING:
+    from torchfilm.io.results import Results
+
+
+def restore_state(
+    results: Results, scene: Scene, frame: int, device: str | torch.device | None, changed: bool
+) -> State:
+    """The state at a frame; see `Results.state`."""
+    device = torch.device(device if device is not None else "cpu")
+    template = _template(results, scene, device, changed)
+
+    def tensor(value: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(value)).to(device)
+
+    recorded = results.frame(frame)
+    layout = template.layout
+    if layout is not None:
+        origin, shape, spacing = results.grid(frame)
+        x, y, z = map(float, spacing)
+        layout = layout.on(Grid(tensor(origin), tensor(shape), (x, y, z)))
+        recorded |= {
+            OUTSIDE + n: np.concatenate([x.reshape(-1) for x in results.signal(n, frame)])
+            for n in results.signal_names
+        }
+    recorded |= results.colony_fields(frame)
+    declared = dict(template.declared)
+    for name, about in declared_fields(results.attributes).items():
+        if name not in declared:
+            declared[name] = _field(name, about, recorded[name])
+    return template.replace(
+        **{n: tensor(recorded[n]) for n in PER_CELL},
+        colony_id=tensor(results.colony_id),
+        stream=tensor(results.stream),
+        next_uid=tensor(results.next_uid(frame)),
+        step=int(results.steps[frame]),
+        time=float(results.times[frame]),
+        fields={n: tensor(recorded[n]) for n in declared},
+        declared=declared,
+        layout=layout,
+    )
+
+
+def _template(results: Results, scene: Scene, device: torch.device, changed: bool) -> State:
+    """A first state of the scene, for its declared fields and layout. Raises InputError if the file
+    is of another scene."""
+    about = results.attributes
+    model = bind(
+        scene,
+        int(results.colony_id.max()) + 1,
+        seed=int(about["seed"]),
+        dtype=getattr(torch, str(about["dtype"])),
+        device=device,
+        per_colony=True,
+        check_first=False,
+    )
+    template = model.start()
+    if template.dim != int(about["dim"]):
+        raise checks.input_error(
+            "scene", f"{template.dim}-D", f"{about['dim']}-D, as {results.path} is"
+        )
+    check_fields(results.file, results.path, template)
+    if not changed:
+        check_same_scene(about, results.path, scene)
+    return template
+
+
+def _field(name: str, about: list, values: np.ndarray) -> Field:
+    """A field that the file holds and the scene does not declare, such as a column of the initial
+    cells."""
+    meaning, unit, scope, shape, at_division = about
+    dtype = torch.from_numpy(np.atleast_1d(values)).dtype
+    return Field(name, meaning, unit, scope, tuple(shape), dtype, at_division=at_division)
