@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 
@@ -53,29 +54,36 @@ def prepare(scene: tf.Scene, streams: Sequence[int], settings: RunSettings) -> P
 
     The colonies follow recorded growth where the scene allows it.
     """
-    tiled = torch.tensor(tuple(streams))
-    why = why_regrown(scene, settings.replay)
+    model = _bind(scene, len(streams), settings.seed, settings.dtype, settings.device, streams)
+    why = model.why_not_replayable if settings.replay else REPLAY_IS_OFF
     if not why:
-        replay = tf.Replay(scene, _recording(scene, tuple(dict.fromkeys(streams)), settings))
-        return PreparedColonies(replay.seed(tiled.numel(), streams=tiled), replay.step, "")
-    first = scene.seed(
-        tiled.numel(),
-        seed=settings.seed,
-        streams=tiled,
-        dtype=settings.dtype,
-        device=settings.device,
+        replay = tf.Replay(model, _recording(model, tuple(dict.fromkeys(streams)), settings))
+        return PreparedColonies(replay.start(), replay.step, "")
+    return PreparedColonies(model.start(), partial(model.step, dt=settings.dt), why)
+
+
+def _bind(
+    scene: tf.Scene,
+    colonies: int,
+    seed: int,
+    dtype: torch.dtype,
+    device: str,
+    streams: Sequence[int] | None = None,
+) -> tf.Model:
+    # every list of numbers is one value per design, also where there are as many cell types
+    return scene.bind(
+        colonies, seed=seed, streams=streams, dtype=dtype, device=device, per_colony=True
     )
-    return PreparedColonies(first, lambda state: scene.step(state, settings.dt), why)
 
 
 def _recording(
-    scene: tf.Scene, streams: tuple[int, ...], settings: RunSettings
+    model: tf.Model, streams: tuple[int, ...], settings: RunSettings
 ) -> tf.GrowthRecording:
     # one recording serves all replicates, also where a first look grows fewer
     usual = tuple(range(settings.replicates))
     recorded = usual if set(streams) <= set(usual) else streams
     key = (
-        tf.GrowthRecording.made_of(scene),
+        model.growth_fingerprint,
         settings.seed,
         settings.dt,
         settings.dtype,
@@ -86,7 +94,7 @@ def _recording(
         recorded,
         settings.cells,
         lambda: tf.GrowthRecording(
-            scene,
+            model.scene,
             streams=recorded,
             seed=settings.seed,
             dt=settings.dt,
@@ -97,22 +105,37 @@ def _recording(
     )
 
 
-def why_regrown(scene: tf.Scene, replay: bool) -> str:
-    """The reason why colonies of a scene cannot follow recorded growth, or ""."""
-    return tf.GrowthRecording.obstacle(scene) if replay else REPLAY_IS_OFF
+@dataclass(frozen=True)
+class TriedScene:
+    """What binding a scene once has found. first: its first state. why_regrown: the reason why
+    colonies cannot follow recorded growth, or "". why_endless: the reason why no run can reach
+    `cells` cells, or ""."""
+
+    first: tf.State
+    why_regrown: str
+    why_endless: str
 
 
-def first_state(
-    scene: tf.Scene, colonies: int, *, seed: int, dtype: torch.dtype, device: str
-) -> tf.State:
-    """The first state of a batch of colonies."""
-    return scene.seed(colonies, seed=seed, dtype=dtype, device=device)
+def try_scene(
+    scene: tf.Scene,
+    colonies: int,
+    *,
+    seed: int,
+    dtype: torch.dtype,
+    device: str,
+    replay: bool,
+    cells: int | None,
+) -> TriedScene:
+    """Bind a scene, and find out whether it can be replayed, and whether it can reach `cells`."""
+    model = _bind(scene, colonies, seed, dtype, device)
+    first = model.start()
+    why = model.why_not_replayable if replay else REPLAY_IS_OFF
+    return TriedScene(first, why, "" if cells is None else _why_endless(model, first, cells))
 
 
-def why_endless(scene: tf.Scene, first: tf.State, cells: int) -> str:
-    """The reason why no run of a scene can reach this number of cells, or ""."""
+def _why_endless(model: tf.Model, first: tf.State, cells: int) -> str:
     try:
-        scene.check_moves(first, cells)
+        model.check_end(first, cells)
     except tf.InputError as error:
         return str(error)
     return ""
@@ -120,8 +143,8 @@ def why_endless(scene: tf.Scene, first: tf.State, cells: int) -> str:
 
 def grid_nodes(scene: tf.Scene, dtype: torch.dtype) -> int:
     """The number of grid nodes of one colony; 0 without a medium."""
-    layout = scene.seed(1, dtype=dtype, device="cpu").layout
-    return 0 if layout is None else layout.grid.nodes
+    first = scene.bind(dtype=dtype, device="cpu", per_colony=True).start()
+    return 0 if first.layout is None else first.layout.grid.nodes // first.colonies
 
 
 def failures(state: tf.State) -> dict[int, tuple[int, str]]:

@@ -130,7 +130,15 @@ def try_scenes(
         try:
             # two colonies: a tensor with one number would pass for a plain number
             scene = family.scene([values], repeat=2)
-            first = colonies.first_state(scene, 2, seed=seed, dtype=dtype, device=family.device)
+            tried = colonies.try_scene(
+                scene,
+                2,
+                seed=seed,
+                dtype=dtype,
+                device=family.device,
+                replay=replay,
+                cells=cells,
+            )
         except Exception as error:
             changed = {n: v for n, v in values.items() if v != middle[n]} or values
             raise tf.InputError(
@@ -139,13 +147,16 @@ def try_scenes(
                 " there, use whole=True or a Choice: a Parameter arrives as a tensor with one value"
                 " per colony."
             ) from error
-        target.check(first)
-        made_of.append((scene.listed, scene.founders))
-        endless.append("" if cells is None else colonies.why_endless(scene, first, cells))
+        target.check(tried.first)
+        made_of.append((scene.effects, scene.founders))
+        endless.append(tried.why_endless)
     # one design that does not grow is scored as such; a search in which none grows is a mistake
     if all(endless):
         raise tf.InputError(endless[0])
     scene = family.scene([middle])
+    why_regrown = colonies.try_scene(
+        scene, 1, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=None
+    ).why_regrown
     # a function that calls a ready scene has parameters of its own, so it is not that scene
     ready = scene.recipe and family.function is tf.scenes.READY.get(scene.recipe[0])
     return TriedScenes(
@@ -155,7 +166,7 @@ def try_scenes(
         recipe=scene.recipe if ready else None,
         listing=scene.listing(),
         digest=tf.digest(made_of),
-        why_regrown=colonies.why_regrown(scene, replay),
+        why_regrown=why_regrown,
     )
 
 

@@ -119,7 +119,7 @@ def test_a_setting_for_each_colony(command):
 def test_the_same_as_the_library(command):
     command("run", "microcolony", "--colonies", 2, "--until", 3, "--seed", 5, "--out", "a.h5")
     scene = tf.scenes.microcolony()
-    state = list(tf.simulate(scene, scene.seed(2, seed=5), until=3.0))[-1]
+    state = list(tf.simulate(scene, scene.bind(2, seed=5).start(), until=3.0))[-1]
     found = frames("a.h5")
     assert np.array_equal(found["position"], state.position.numpy()) and np.array_equal(
         found["uid"], state.uid.numpy()

@@ -44,10 +44,10 @@ def spoilt(tmp_path_factory) -> Path:
     (folder / "toggle.xml").write_text("<sbml/>\n")
     (folder / "imports.py").write_text("import no_such_module\n")
     scene = tf.scenes.microcolony()
-    for _ in tf.simulate(scene, scene.seed(), until=0.5, record=folder / "good.h5"):
+    for _ in tf.simulate(scene, scene.bind().start(), until=0.5, record=folder / "good.h5"):
         pass
     own = tf.Scene(tf.Growth(rate=1.0))
-    for _ in tf.simulate(own, own.seed(), until=0.5, record=folder / "own.h5"):
+    for _ in tf.simulate(own, own.bind().start(), until=0.5, record=folder / "own.h5"):
         pass
     return folder
 

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import torch
 
+from helpers import step
+
 import torchfilm as tf
 
 
 def seed(cells: tf.Cells, colonies: int = 1, **options) -> tf.State:
-    return tf.Scene(tf.Growth(), founders=cells).seed(colonies, **options)
+    return tf.Scene(tf.Growth(), founders=cells).bind(colonies, **options).start()
 
 
 # --- arrays ---------------------------------------------------------------------------------------
@@ -90,7 +92,7 @@ def test_arrays_given_are_not_shared():
 
 def test_cells_given_at_seeding_replace_the_founders():
     scene = tf.Scene(tf.Growth(rate=1.0), founders=tf.Cells.single(2))
-    assert scene.seed(cells=tf.Cells([[7.0, 0.0]], [1.0, 0.0])).position.tolist() == [[7.0, 0.0]]
+    assert scene.bind(cells=tf.Cells([[7.0, 0.0]], [1.0, 0.0])).start().position.tolist() == [[7.0, 0.0]]
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -184,9 +186,9 @@ def test_a_run_from_a_csv_file(tmp_path):
     path = tmp_path / "cells.csv"
     path.write_text("x,y,angle,length\n0,0,0,2\n0,1.1,0.1,2.5\n")
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Mechanics(dim=2))
-    state = scene.seed(2, cells=tf.Cells.from_csv(path))
+    state = scene.bind(2, cells=tf.Cells.from_csv(path)).start()
     for _ in range(10):
-        state = scene.step(state, 0.1)
+        state = step(scene, state, 0.1)
     assert state.counts.tolist()[0] > 2
 
 
@@ -412,7 +414,7 @@ def test_the_cells_of_several_frames_in_one_table_are_noticed():
 
 def on_a_plane(*places, **options) -> tf.State:
     cells = tf.Cells([list(p) for p in places], [1.0, 0.0], **options)
-    return tf.Scene(tf.Growth(), tf.Mechanics(dim=2), founders=cells).seed()
+    return tf.Scene(tf.Growth(), tf.Mechanics(dim=2), founders=cells).bind().start()
 
 
 def test_two_cells_at_one_place_are_noticed():
@@ -462,7 +464,7 @@ def test_without_mechanics_cells_may_be_anywhere():
 def test_lengths_in_pixels_are_noticed(division, length, pixels):
     scene = tf.Scene(tf.Division(**division), founders=tf.Cells([[0.0, 0.0]], [1.0, 0.0], length))
     with pytest.raises(tf.InputError, match=r"threshold .* is not above its .* at birth") as caught:
-        scene.seed()
+        scene.bind().start()
     said = str(caught.value)
     assert ("look like pixels" in said) == pixels and "Raise the threshold" in said
     if pixels:

@@ -52,7 +52,7 @@ class Designs:
 
 def stepped(scene, state, steps):
     for _ in range(steps):
-        state = step(scene, state, DT) if isinstance(scene, tf.Scene) else scene.step(state)
+        state = step(scene, state, DT) if isinstance(scene, tf.Scene) else step(scene, state)
     return state
 
 

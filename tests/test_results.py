@@ -15,6 +15,8 @@ import pytest
 import torch
 from recorded import DT, EVERY, UNTIL, assert_same_state, make_scene, record
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.effect import Effect
 from torchfilm.state import PER_CELL
@@ -54,7 +56,7 @@ def test_a_frame_that_is_not_there_is_told(whole, frame):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_states_come_back_whole(tmp_path, dtype):
     scene = make_scene()
-    states = record(scene, scene.seed(2, dtype=dtype), tmp_path / "run.h5", until=1.0)
+    states = record(scene, scene.bind(2, dtype=dtype).start(), tmp_path / "run.h5", until=1.0)
     with tf.Results(tmp_path / "run.h5") as results:
         for k, step in enumerate(results.steps):
             assert_same_state(results.state(make_scene(), k), states[step])
@@ -71,7 +73,7 @@ def test_what_a_file_says_of_itself(whole):
 def test_the_step_that_was_used_is_the_step_that_is_told(tmp_path):
     """`simulate(dt=…)` may differ from the scene's own step: a resumed run must know."""
     scene = make_scene()
-    for _ in tf.simulate(scene, scene.seed(), until=0.4, dt=0.1, record=tmp_path / "run.h5"):
+    for _ in tf.simulate(scene, scene.bind().start(), until=0.4, dt=0.1, record=tmp_path / "run.h5"):
         pass
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.attributes["dt"] == 0.1
@@ -129,7 +131,7 @@ def test_the_table_has_a_row_for_each_cell(whole):
 
 def test_colonies_of_a_selection_keep_their_ids(tmp_path):
     scene = make_scene()
-    record(scene, scene.seed(4).select([3, 1]), tmp_path / "run.h5", until=1.0)
+    record(scene, scene.bind(4).start().select([3, 1]), tmp_path / "run.h5", until=1.0)
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.colony_id.tolist() == [3, 1]
         assert set(results.table()["colony"].tolist()) == {1, 3}
@@ -180,9 +182,9 @@ def test_lineage_of_a_run_that_starts_in_the_middle_of_another(tmp_path):
     """The state of a run's last step still carries that step's births; a new file must not count
     them again."""
     scene = make_scene()
-    state = scene.seed(2, seed=1)
+    state = scene.bind(2, seed=1).start()
     while not state.births:
-        state = scene.step(state, DT)
+        state = step(scene, state, DT)
     record(scene, state, tmp_path / "run.h5", until=state.time + 1.0)
     with tf.Results(tmp_path / "run.h5") as results:
         found, first = results.lineage(), results.frame(0)
@@ -227,7 +229,7 @@ def test_reading_while_the_writer_is_open(tmp_path):
     """From this process, from an open reader that refreshes, and from another process."""
     path = tmp_path / "run.h5"
     scene = make_scene()
-    run = tf.simulate(scene, scene.seed(2), until=2.0, record=tf.Recorder(path, scene, every=5))
+    run = tf.simulate(scene, scene.bind(2).start(), until=2.0, record=tf.Recorder(path, scene, every=5))
     for _ in range(10):
         state = next(run)
     with tf.Results(path) as results:
@@ -266,7 +268,7 @@ class Plate(Effect):
 def test_fields_of_colonies_are_recorded_and_come_back(tmp_path):
     path, scene = tmp_path / "run.h5", tf.Scene(tf.Growth(rate=1.0), Plate())
     run = tf.simulate(
-        scene, scene.seed(3), until=0.5, dt=0.1, record=tf.Recorder(path, scene, every=1)
+        scene, scene.bind(3).start(), until=0.5, dt=0.1, record=tf.Recorder(path, scene, every=1)
     )
     next(run)
     with tf.Results(path) as results:
@@ -283,10 +285,10 @@ def test_fields_of_colonies_are_recorded_and_come_back(tmp_path):
 def test_observers_and_the_recorder_may_be_used_by_hand(tmp_path):
     """A Recorder is an observer: called with states, closed at the end."""
     scene = make_scene()
-    recorder, state = tf.Recorder(tmp_path / "run.h5", scene, every=2), scene.seed()
+    recorder, state = tf.Recorder(tmp_path / "run.h5", scene, every=2), scene.bind().start()
     recorder(state)
     for _ in range(5):
-        state = scene.step(state, DT)
+        state = step(scene, state, DT)
         recorder(state)
     recorder.close()
     recorder.close()
@@ -298,7 +300,7 @@ def test_a_run_that_is_given_up_is_closed_and_complete(tmp_path):
     """Leaving the loop early writes the last state."""
     scene = make_scene()
     for state in tf.simulate(
-        scene, scene.seed(), until=1.0, record=tf.Recorder(tmp_path / "run.h5", scene, every=10)
+        scene, scene.bind().start(), until=1.0, record=tf.Recorder(tmp_path / "run.h5", scene, every=10)
     ):
         if state.step == 13:
             break
@@ -319,7 +321,7 @@ def test_colonies_without_cells_are_recorded(tmp_path):
     scene = tf.Scene(
         tf.Rules(update), tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=cells, dt=DT
     )
-    states = record(scene, scene.seed(3), tmp_path / "run.h5", until=0.5, every=1)
+    states = record(scene, scene.bind(3).start(), tmp_path / "run.h5", until=0.5, every=1)
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.counts[0].tolist() == [0, 1, 0] and results.counts[-1].tolist() == [0, 0, 0]
         assert_same_state(results.state(scene), states[-1])
@@ -338,7 +340,7 @@ def test_a_reader_sees_what_a_resumption_adds(tmp_path, since):
     file, and it goes on."""
     path, scene = tmp_path / "run.h5", make_scene()
     run = tf.simulate(
-        scene, scene.seed(2, seed=1), until=1.0, record=tf.Recorder(path, scene, every=5)
+        scene, scene.bind(2, seed=1).start(), until=1.0, record=tf.Recorder(path, scene, every=5)
     )
     for _ in range(12):
         next(run)
@@ -359,7 +361,7 @@ def test_a_reader_sees_what_a_resumption_adds(tmp_path, since):
 
 def test_a_reader_survives_a_file_that_is_away_for_a_moment(tmp_path):
     path, scene = tmp_path / "run.h5", make_scene()
-    record(scene, scene.seed(2, seed=1), path, until=0.5)
+    record(scene, scene.bind(2, seed=1).start(), path, until=0.5)
     with tf.Results(path) as results:
         path.rename(tmp_path / "away.h5")
         with pytest.raises(tf.InputError, match="No such file"):

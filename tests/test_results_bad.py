@@ -11,6 +11,8 @@ import h5py
 import pytest
 from recorded import DT, UNTIL, assert_same_file, assert_same_state, make_scene, record
 
+from helpers import step
+
 import torchfilm as tf
 
 # --- bad files ------------------------------------------------------------------------------------
@@ -90,7 +92,7 @@ def test_a_truncated_file_left_by_a_kill_is_told(tmp_path):
     part."""
     path, scene = tmp_path / "open.h5", make_scene()
     run = tf.simulate(
-        scene, scene.seed(3, seed=11), until=UNTIL, record=tf.Recorder(path, scene, every=1)
+        scene, scene.bind(3, seed=11).start(), until=UNTIL, record=tf.Recorder(path, scene, every=1)
     )
     for _ in range(50):
         next(run)
@@ -179,9 +181,9 @@ def test_an_existing_file_is_not_overwritten_unasked(whole, tmp_path):
     with pytest.raises(tf.InputError, match="overwrite"):
         tf.Recorder(path, scene)
     with pytest.raises(tf.InputError, match="overwrite"):
-        tf.simulate(scene, scene.seed(), until=1.0, record=path)
+        tf.simulate(scene, scene.bind().start(), until=1.0, record=path)
     assert_same_file(whole[0], path)
-    record(scene, scene.seed(), path, until=0.1, overwrite=True)
+    record(scene, scene.bind().start(), path, until=0.1, overwrite=True)
     with tf.Results(path) as results:
         assert results.steps.tolist() == [0, 2]
 
@@ -193,7 +195,7 @@ def test_a_run_that_cannot_start_leaves_the_old_file_alone(whole, tmp_path):
     shutil.copy(whole[0], path)
     recorder = tf.Recorder(path, scene, overwrite=True)
     with pytest.raises(tf.InputError):
-        list(tf.simulate(scene, scene.seed(), until=-1.0, record=recorder))
+        list(tf.simulate(scene, scene.bind().start(), until=-1.0, record=recorder))
     assert_same_file(whole[0], path)
 
 
@@ -214,7 +216,7 @@ def test_a_folder_in_the_place_of_the_file_is_told(tmp_path):
     with pytest.raises(tf.InputError, match=r"folder\.h5"):
         scene = make_scene()
         (tmp_path / "folder.h5").mkdir()
-        record(scene, scene.seed(), tmp_path / "folder.h5", until=0.1, overwrite=True)
+        record(scene, scene.bind().start(), tmp_path / "folder.h5", until=0.1, overwrite=True)
 
 
 def test_a_full_disk_is_told_and_loses_no_frame(tmp_path, monkeypatch, every_step):
@@ -229,7 +231,7 @@ def test_a_full_disk_is_told_and_loses_no_frame(tmp_path, monkeypatch, every_ste
 
     monkeypatch.setattr(h5py.Dataset, "__setitem__", write)
     run = tf.simulate(
-        scene, scene.seed(3, seed=11), until=UNTIL, record=tf.Recorder(path, scene, every=1)
+        scene, scene.bind(3, seed=11).start(), until=UNTIL, record=tf.Recorder(path, scene, every=1)
     )
     for _ in range(20):
         next(run)
@@ -275,12 +277,12 @@ def test_a_frame_broken_off_at_any_column_is_no_frame(
 
     monkeypatch.setattr(h5py.Dataset, "__setitem__", write)
     run = tf.simulate(
-        scene, scene.seed(3, seed=11), until=UNTIL, record=tf.Recorder(path, scene, every=1)
+        scene, scene.bind(3, seed=11).start(), until=UNTIL, record=tf.Recorder(path, scene, every=1)
     )
     state = None
     while state is None or state.step < 19:
         state = next(run)
-    while not scene.step(state, DT).births:  # a step with births, so that lineage is written too
+    while not step(scene, state, DT).births:  # a step with births, so that lineage is written too
         state = next(run)
     armed.append(True)
     with pytest.raises((tf.SimulationError, KeyboardInterrupt)):
@@ -302,7 +304,7 @@ import torchfilm as tf
 from recorded import make_scene
 scene = make_scene()
 try:
-    for _ in tf.simulate(scene, scene.seed(3, seed=11), until=3.0, record=tf.Recorder(sys.argv[1], scene, every=1)):
+    for _ in tf.simulate(scene, scene.bind(3, seed=11).start(), until=3.0, record=tf.Recorder(sys.argv[1], scene, every=1)):
         pass
 except tf.SimulationError as error:
     print(error)
@@ -342,7 +344,7 @@ disk, out = sys.argv[1:]
 subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", disk], check=True)
 path, scene, done = os.path.join(disk, "run.h5"), make_scene(), 0
 try:
-    for state in tf.simulate(scene, scene.seed(3, seed=11), until=3.0, record=tf.Recorder(path, scene, every=1)):
+    for state in tf.simulate(scene, scene.bind(3, seed=11).start(), until=3.0, record=tf.Recorder(path, scene, every=1)):
         done = state.step
     print("the run ended as if nothing had happened")
 except tf.SimulationError as error:

@@ -32,7 +32,7 @@ from recorded import make_scene, record
 from torchfilm.io import replacing
 replacing.put_in_place = lambda *_: os._exit(9)
 scene = make_scene()
-record(scene, scene.seed(3, seed=11), sys.argv[1], overwrite=True)
+record(scene, scene.bind(3, seed=11).start(), sys.argv[1], overwrite=True)
 """
 
 # Holds the lock of HDF5 on a file, as a process that writes other data than results does.
@@ -90,7 +90,7 @@ def test_a_reader_in_another_process_keeps_the_old_file_and_then_finds_the_new_o
     reader, scene = process(READER, old), make_scene()
     assert ask(reader) == before
     run = tf.simulate(
-        scene, scene.seed(3, seed=5), until=0.5, record=tf.Recorder(old, scene, overwrite=True)
+        scene, scene.bind(3, seed=5).start(), until=0.5, record=tf.Recorder(old, scene, overwrite=True)
     )
     next(run)
     assert ask(reader) == before, "the first refresh came before the run"
@@ -105,7 +105,7 @@ def test_a_reader_of_this_process_follows_too(old):
     scene = make_scene()
     with tf.Results(old) as results:
         frames = len(results)
-        states = record(scene, scene.seed(3, seed=5), old, until=0.5, overwrite=True)
+        states = record(scene, scene.bind(3, seed=5).start(), old, until=0.5, overwrite=True)
         assert len(results) == frames
         results.refresh()
         assert results.steps[-1] == states[-1].step and len(results) == 3
@@ -113,7 +113,7 @@ def test_a_reader_of_this_process_follows_too(old):
 
 def test_resuming_beside_a_reader_in_another_process(tmp_path, whole, process):
     path, scene = tmp_path / "run.h5", make_scene()
-    record(scene, scene.seed(3, seed=11), path, until=1.3)
+    record(scene, scene.bind(3, seed=11).start(), path, until=1.3)
     reader = process(READER, path)
     begun = ask(reader)
     with tf.Results(path) as results:
@@ -142,7 +142,7 @@ def test_a_run_that_fails_before_its_first_frame_leaves_the_old_file(
     with monkeypatch.context() as broken:
         broken.setattr(h5py.Dataset, "__setitem__", write)
         with pytest.raises((tf.SimulationError, KeyboardInterrupt)) as caught:
-            record(scene, scene.seed(), old, overwrite=True)
+            record(scene, scene.bind().start(), old, overwrite=True)
     if isinstance(failure, OSError):
         assert "No frame was written" in str(caught.value)
     assert_same_file(whole[0], old)
@@ -153,7 +153,7 @@ def test_a_run_that_fails_before_its_first_frame_leaves_no_file(tmp_path, monkey
     scene = make_scene()
     monkeypatch.setattr(replacing, "put_in_place", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        record(scene, scene.seed(), tmp_path / "run.h5", until=0.1)
+        record(scene, scene.bind().start(), tmp_path / "run.h5", until=0.1)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -164,7 +164,7 @@ def test_a_run_killed_before_its_first_frame_leaves_the_old_file_and_blocks_no_o
     assert_same_file(whole[0], old)
     assert replacing.beside(old).exists(), "the kill came too early; the test would prove nothing"
     scene = make_scene()
-    record(scene, scene.seed(3, seed=11), old, overwrite=True)
+    record(scene, scene.bind(3, seed=11).start(), old, overwrite=True)
     assert_same_file(whole[0], old)
     only(old)
 
@@ -173,7 +173,7 @@ def test_a_run_killed_before_its_first_frame_leaves_the_old_file_and_blocks_no_o
 def test_a_broken_file_of_an_earlier_run_is_no_hindrance(tmp_path, left):
     path, scene = tmp_path / "run.h5", make_scene()
     replacing.beside(path).write_bytes(left)
-    record(scene, scene.seed(), path, until=0.1)
+    record(scene, scene.bind().start(), path, until=0.1)
     with tf.Results(path) as results:
         assert results.steps.tolist() == [0, 2]
     only(path)
@@ -184,7 +184,7 @@ def test_another_file_in_the_place_of_the_new_one_is_kept(old, whole):
     with h5py.File(replacing.beside(old), "w") as file:
         file.attrs["format"] = "a study"
     with pytest.raises(tf.InputError, match=r"run\.h5\.new.*another kind of file"):
-        record(scene, scene.seed(), old, overwrite=True)
+        record(scene, scene.bind().start(), old, overwrite=True)
     assert_same_file(whole[0], old)
 
 
@@ -201,10 +201,10 @@ def test_a_file_that_another_process_writes_is_not_replaced(old, whole, process)
 def test_a_run_whose_file_goes_away_stops(tmp_path, how):
     """Its frames would be lost without a word."""
     path, scene = tmp_path / "run.h5", make_scene()
-    run = tf.simulate(scene, scene.seed(3), until=UNTIL, record=tf.Recorder(path, scene, every=1))
+    run = tf.simulate(scene, scene.bind(3).start(), until=UNTIL, record=tf.Recorder(path, scene, every=1))
     next(run)
     if how == "replaced":
-        record(scene, scene.seed(3, seed=5), path, until=DT, overwrite=True)
+        record(scene, scene.bind(3, seed=5).start(), path, until=DT, overwrite=True)
     else:
         path.unlink()
     with pytest.raises(tf.SimulationError, match=r"run\.h5 was deleted or replaced.*step 1"):
@@ -217,7 +217,7 @@ def test_the_file_behind_a_link_is_replaced_and_the_link_stays(old, tmp_path):
     link, scene = tmp_path / "here" / "link.h5", make_scene()
     link.symlink_to(old)
     old.chmod(0o640)
-    record(scene, scene.seed(), link, until=0.1, overwrite=True)
+    record(scene, scene.bind().start(), link, until=0.1, overwrite=True)
     assert link.is_symlink() and old.stat().st_mode & 0o777 == 0o640
     with tf.Results(old) as results:
         assert results.steps.tolist() == [0, 2]
@@ -227,7 +227,7 @@ def test_where_an_open_file_cannot_be_renamed(old, whole, monkeypatch):
     """As on Windows: the file is closed, renamed and opened again."""
     monkeypatch.setattr(replacing, "RENAMES_OPEN_FILES", False)
     scene = make_scene()
-    record(scene, scene.seed(3, seed=11), old, overwrite=True)
+    record(scene, scene.bind(3, seed=11).start(), old, overwrite=True)
     assert_same_file(whole[0], old)
     only(old)
 
@@ -240,4 +240,4 @@ def test_a_place_where_hdf5_cannot_create_a_file_is_named(tmp_path, monkeypatch)
     recorder = tf.Recorder(tmp_path / "run.h5", scene)
     monkeypatch.setattr(replacing.h5py, "File", locked)
     with pytest.raises(tf.InputError, match=r"run\.h5.*unable to lock.*HDF5_USE_FILE_LOCKING"):
-        recorder(scene.seed())
+        recorder(scene.bind().start())

@@ -41,7 +41,7 @@ def test_resume_bit_for_bit(tmp_path, whole, stop):
     """Stopped and resumed, the file holds what the uninterrupted run's file holds, and the lineage
     is the same."""
     path, scene = tmp_path / "run.h5", make_scene()
-    record(scene, scene.seed(3, seed=11), path, until=stop)
+    record(scene, scene.bind(3, seed=11).start(), path, until=stop)
     scene = make_scene()
     with tf.Results(path) as results:
         state = results.state(scene)
@@ -54,7 +54,7 @@ def test_resume_bit_for_bit(tmp_path, whole, stop):
 def test_every_step_can_be_resumed_from(tmp_path):
     """Also those in which a cell is due to divide but has not done so yet."""
     scene = make_scene()
-    record(scene, scene.seed(3, seed=11), tmp_path / "run.h5", until=2.0, every=1)
+    record(scene, scene.bind(3, seed=11).start(), tmp_path / "run.h5", until=2.0, every=1)
     with tf.Results(tmp_path / "run.h5") as results:
         due = 0
         for k in range(len(results)):
@@ -79,7 +79,7 @@ def test_a_run_from_given_cells_can_be_resumed_where_the_founders_could_not_stan
     path, scene = tmp_path / "run.h5", scene_of()
     states = record(
         scene,
-        scene.seed(2, cells=tf.Cells([[8.0, 0.0]], [[1.0, 0.0]], extra={"gfp": [0.5]})),
+        scene.bind(2, cells=tf.Cells([[8.0, 0.0]], [[1.0, 0.0]], extra={"gfp": [0.5]})).start(),
         path,
         until=1.0,
     )
@@ -97,7 +97,7 @@ def test_a_colony_that_has_sunk_into_a_soft_wall_can_be_resumed(tmp_path):
         ),
         dt=DT,
     )
-    states = record(scene, scene.seed(), tmp_path / "run.h5", until=0.5)
+    states = record(scene, scene.bind().start(), tmp_path / "run.h5", until=0.5)
     sunk = states[-1].replace(
         position=states[-1].position - torch.tensor([0.0, 0.0, 0.6], dtype=torch.float64)
     )
@@ -126,7 +126,7 @@ def test_a_function_that_was_edited_is_another_scene(tmp_path):
     path = tmp_path / "run.h5"
     first, edited = ruled(0.5), ruled(0.6)
     assert first.listing() == edited.listing()
-    record(first, first.seed(2), path, until=2 * DT)
+    record(first, first.bind(2).start(), path, until=2 * DT)
     with tf.Results(path) as results:
         state = results.state(ruled(0.5))
         with pytest.raises(
@@ -159,7 +159,7 @@ def test_a_rule_that_keeps_a_diary_is_not_taken_for_edited(tmp_path):
         diary.append(len(cells.uid))
 
     scene = tf.Scene(tf.Rules(update), tf.Growth(), tf.Division(length=3.0), dt=DT)
-    last = record(scene, scene.seed(2), path, until=2 * DT)[-1]
+    last = record(scene, scene.bind(2).start(), path, until=2 * DT)[-1]
     assert len(diary) > 1
     record(scene, last, path, until=4 * DT, append=True)
     with tf.Results(path) as results:
@@ -168,7 +168,7 @@ def test_a_rule_that_keeps_a_diary_is_not_taken_for_edited(tmp_path):
 
 def test_going_on_by_other_settings_is_told_in_the_file(tmp_path):
     path, base = tmp_path / "run.h5", tf.scenes.microcolony()
-    last = record(base, base.seed(2), path, until=2 * base.dt)[-1]
+    last = record(base, base.bind(2).start(), path, until=2 * base.dt)[-1]
     finer = tf.Settings(tolerance=0.01).apply(base)
     for _ in tf.simulate(
         finer, last, until=4 * base.dt, record=tf.Recorder(path, finer, append=True, changed=True)
@@ -184,7 +184,7 @@ def test_going_on_by_other_settings_is_told_in_the_file(tmp_path):
 def test_a_file_of_another_python_is_not_refused_for_its_code(tmp_path):
     """Versions of Python compile one function in two ways."""
     path = tmp_path / "run.h5"
-    record(ruled(0.5), ruled(0.5).seed(2), path, until=2 * DT)
+    record(ruled(0.5), ruled(0.5).bind(2).start(), path, until=2 * DT)
     with h5py.File(path, "r+") as file:
         file.attrs["code"] = json.dumps(["3.99", *json.loads(file.attrs["code"])[1:2], "another"])
     with tf.Results(path) as results:
@@ -205,7 +205,7 @@ def test_numbers_of_a_ready_scene_come_back_as_its_recipe(tmp_path):
     for given in (1.0, [1.0, 0.5], torch.tensor([1.0, 0.5]), np.array([1.0, 0.5])):
         scene = tf.scenes.microcolony(rate=given)
         path = tmp_path / f"{type(given).__name__}.h5"
-        states = record(scene, scene.seed(2), path, until=0.2, every=1)
+        states = record(scene, scene.bind(2).start(), path, until=0.2, every=1)
         with tf.Results(path) as results:
             name, parameters = results.recipe
             again = tf.scenes.build(name, parameters)
@@ -217,7 +217,7 @@ WRITE = """
 import sys, torchfilm as tf
 from recorded import make_scene
 scene = make_scene()
-for _ in tf.simulate(scene, scene.seed(3, seed=11), until=3.0, record=tf.Recorder(sys.argv[1], scene, every=1)):
+for _ in tf.simulate(scene, scene.bind(3, seed=11).start(), until=3.0, record=tf.Recorder(sys.argv[1], scene, every=1)):
     pass
 """
 

@@ -9,6 +9,8 @@ import pytest
 import torch
 from recorded import assert_same_state
 
+from helpers import step
+
 import torchfilm as tf
 from torchfilm.tools.checks import InputError
 
@@ -152,7 +154,7 @@ def assert_same(a: tf.State, b: tf.State) -> None:
 
 def test_a_run_goes_on_from_any_frame_bit_for_bit(make, dtype, tmp_path):
     scene = make()
-    states = record(scene, scene.seed(3, seed=7, dtype=dtype), tmp_path / "run.h5")
+    states = record(scene, scene.bind(3, seed=7, dtype=dtype).start(), tmp_path / "run.h5")
     assert int(states[-1].counts.max()) >= 4
     again = make()
     with tf.Results(tmp_path / "run.h5") as results:
@@ -166,7 +168,7 @@ def test_a_run_goes_on_from_any_frame_bit_for_bit(make, dtype, tmp_path):
 def test_a_colony_alone_and_in_another_order_is_the_same(make):
     """From the start, and from the middle of a run."""
     scene = make()
-    first = scene.seed(3, seed=7)
+    first = scene.bind(3, seed=7).start()
     states = [first, *tf.simulate(scene, first, until=UNTIL)]
     for step, places in ((0, [1]), (0, [2, 0]), (12, [2, 1, 0]), (12, [0])):
         part = list(tf.simulate(scene, states[step].select(places), until=UNTIL))[-1]
@@ -175,7 +177,7 @@ def test_a_colony_alone_and_in_another_order_is_the_same(make):
 
 def test_appending_is_as_if_never_stopped(tmp_path):
     scene = smooth()
-    state = scene.seed(3, seed=7)
+    state = scene.bind(3, seed=7).start()
     record(scene, state, tmp_path / "whole.h5")
     record(scene, state, tmp_path / "two.h5", until=EVERY * 2 * DT)
     with tf.Results(tmp_path / "two.h5") as results:
@@ -195,7 +197,7 @@ def test_appending_is_as_if_never_stopped(tmp_path):
 def test_a_half_written_frame_is_not_there(tmp_path):
     """Rows of signals that no frame counts, as a kill leaves them, are gone when a run goes on."""
     scene = smooth()
-    states = record(scene, scene.seed(2 + 1, seed=7), tmp_path / "run.h5", until=EVERY * 2 * DT)
+    states = record(scene, scene.bind(2 + 1, seed=7).start(), tmp_path / "run.h5", until=EVERY * 2 * DT)
     with h5py.File(tmp_path / "run.h5", "r+") as file:
         for name in ("signals/ahl", "frames/grid/first_voxel"):
             table = file[name]
@@ -205,7 +207,7 @@ def test_a_half_written_frame_is_not_there(tmp_path):
         middle = results.state(scene)
     assert_same(middle, states[-1])
     record(scene, middle, tmp_path / "run.h5", append=True)
-    record(scene, scene.seed(3, seed=7), tmp_path / "whole.h5")
+    record(scene, scene.bind(3, seed=7).start(), tmp_path / "whole.h5")
     with tf.Results(tmp_path / "whole.h5") as a, tf.Results(tmp_path / "run.h5") as b:
         for k in range(len(a)):
             assert all(
@@ -216,7 +218,7 @@ def test_a_half_written_frame_is_not_there(tmp_path):
 
 def test_what_a_file_tells_of_signals(tmp_path):
     scene = smooth()
-    states = record(scene, scene.seed(3, seed=7), tmp_path / "run.h5")
+    states = record(scene, scene.bind(3, seed=7).start(), tmp_path / "run.h5")
     last, grid = states[-1], states[-1].layout.grid
     assert len({*grid.shapes}) > 1, "grids of one shape prove little"
     with tf.Results(tmp_path / "run.h5") as results:
@@ -242,7 +244,7 @@ def test_what_a_file_tells_of_signals(tmp_path):
 
 def test_files_without_a_medium_say_so_and_hold_nothing_of_it(tmp_path):
     scene = tf.Scene(tf.Growth(rate=1.0), *body())
-    record(scene, scene.seed(), tmp_path / "run.h5", until=0.3)
+    record(scene, scene.bind().start(), tmp_path / "run.h5", until=0.3)
     with h5py.File(tmp_path / "run.h5") as file:
         assert (
             "signals" not in file and "grid" not in file["frames"] and "spacing" not in file.attrs
@@ -259,7 +261,7 @@ def test_files_without_a_medium_say_so_and_hold_nothing_of_it(tmp_path):
 
 def test_a_file_with_a_medium_is_not_of_a_scene_without(tmp_path):
     scene = smooth()
-    record(scene, scene.seed(3), tmp_path / "run.h5", until=0.3)
+    record(scene, scene.bind(3).start(), tmp_path / "run.h5", until=0.3)
     with tf.Results(tmp_path / "run.h5") as results:
         with pytest.raises(InputError, match=r"with a Medium \(ahl\)"):
             results.state(tf.Scene(tf.Growth(rate=[1.0] * 3), *body()))
@@ -269,7 +271,7 @@ def test_a_file_with_a_medium_is_not_of_a_scene_without(tmp_path):
 
 def test_a_state_moves_to_another_device_with_its_grids(device):
     scene = smooth()
-    state = scene.seed(3, device=device)
-    back = scene.step(state, DT).to("cpu")
+    state = scene.bind(3, device=device).start()
+    back = step(scene, state, DT).to("cpu")
     assert back.layout.grid.origin.device.type == "cpu" and back.signals["ahl"].device.type == "cpu"
-    assert scene.step(back, DT).signals["ahl"].shape == back.signals["ahl"].shape
+    assert step(scene, back, DT).signals["ahl"].shape == back.signals["ahl"].shape

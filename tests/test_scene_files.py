@@ -87,8 +87,8 @@ def test_only_a_json_file_is_a_design(folder):
 
 def test_a_design_of_one_colony_starts_as_the_ready_scene_does(folder):
     one, other = (
-        load_scene(saved(folder, READY), {}).seed(2, seed=3),
-        tf.scenes.microcolony(rate=0.5).seed(2, seed=3),
+        load_scene(saved(folder, READY), {}).bind(2, seed=3).start(),
+        tf.scenes.microcolony(rate=0.5).bind(2, seed=3).start(),
     )
     assert (
         one.position.tolist() == other.position.tolist()
@@ -215,7 +215,7 @@ def test_a_scene_file_may_define_dataclasses(tmp_path, future):
         f"{future}from dataclasses import dataclass\nimport torchfilm as tf\n\n@dataclass\nclass"
         " P:\n    rate: float = 0.7\n\nscene = tf.Scene(tf.Growth(rate=P().rate))\n"
     )
-    assert load_scene(str(path), {}).listed[0].rate == 0.7
+    assert load_scene(str(path), {}).effects[0].rate == 0.7
 
 
 def test_an_error_in_a_scene_file_says_where(tmp_path):
@@ -249,9 +249,9 @@ def test_scene_files_do_not_come_upon_one_another(tmp_path):
     (tmp_path / "b" / "main.py").write_text(
         "import torchfilm as tf\nfrom common import RATE\nscene = tf.Scene(tf.Growth(rate=RATE))\n"
     )
-    assert load_scene(str(tmp_path / "a" / "common.py"), {}).listed[0].rate == 0.5
+    assert load_scene(str(tmp_path / "a" / "common.py"), {}).effects[0].rate == 0.5
     try:
-        assert load_scene(str(tmp_path / "b" / "main.py"), {}).listed[0].rate == 1.5
+        assert load_scene(str(tmp_path / "b" / "main.py"), {}).effects[0].rate == 1.5
     finally:
         sys.modules.pop("common", None)
     (tmp_path / "bad_one.py").write_text("x = 1 / 0\n")

@@ -23,6 +23,7 @@ from torchfilm.effect import BUILT_IN, Binding, BoundEffect, parameters
 from torchfilm.initial_cells import Cells
 from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.hashing import digest
 from torchfilm.tools.timing import Timings
 from torchfilm.values import Batch
 
@@ -245,6 +246,12 @@ class Model:
             # what is declared has a first value, and whoever reads that needs it
             writes[e.place] |= {*e.writes(), *(f.name for f in e.declares())}
         return reads, writes
+
+    @cached_property
+    def growth_fingerprint(self) -> str:
+        """A word that is equal for models that grow alike, and for no others."""
+        recorded = [self.scene.effects[k] for k in self.recorded]
+        return digest(recorded, self.scene.founders, self.dim)
 
     @cached_property
     def why_not_replayable(self) -> str:

@@ -23,7 +23,6 @@ from torchfilm.model import Model, advanced, bind
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, Births, State
 from torchfilm.tools import checks
-from torchfilm.tools.hashing import digest
 from torchfilm.tools.ragged import expand_ranges, offsets
 
 FIRST = -1  # the part of what happens before all effects
@@ -82,7 +81,7 @@ class GrowthRecording:
     ):
         design = scene.bind(seed=seed, dtype=dtype, device=device, per_colony=True)
         _check_replayable(design)
-        self.fingerprint = fingerprint(design)
+        self.fingerprint = design.growth_fingerprint
         self.grown_by = _listing(design)
         self.dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
         self.streams, self.cells = tuple(streams), cells
@@ -143,13 +142,6 @@ class GrowthRecording:
                 self.failed.setdefault(self.streams[place], (state.step, report.reason(place)))
         self.steps.append(noted)
         return advanced(state, self.dt)
-
-
-def fingerprint(model: Model) -> str:
-    """A word that is equal for models that grow alike, and for no others."""
-    _check_replayable(model)
-    scene = model.scene
-    return digest([scene.effects[k] for k in model.recorded], scene.founders, scene.dim)
 
 
 def _listing(model: Model) -> list[str]:
@@ -222,7 +214,8 @@ class Replay:
 
     def __init__(self, model: Model, recording: GrowthRecording):
         self.model, self.recording, self.dt = model, recording, recording.dt
-        if fingerprint(model) != recording.fingerprint:
+        _check_replayable(model)
+        if model.growth_fingerprint != recording.fingerprint:
             mine = ", ".join(_listing(model))
             raise checks.InputError(
                 f"this scene does not grow as the recording did: {mine} and its founders, instead"

@@ -22,7 +22,7 @@ def placed(
     }
     axis = np.eye(position.shape[1])[0]
     cells = tf.Cells(position, axis, length, 0.5, cell_type=cell_type, colony=colony, extra=levels)
-    return tf.Scene(tf.Growth(), founders=cells).seed(colonies, dtype=dtype)
+    return tf.Scene(tf.Growth(), founders=cells).bind(colonies, dtype=dtype).start()
 
 
 def row(x, **levels) -> tf.State:

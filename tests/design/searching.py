@@ -135,7 +135,7 @@ def mean(state, name):
 
 def alone(scene, target, stream, *, seed=0, **end) -> tuple[float, tf.State]:
     """The loss of one colony that runs alone, step by step, and its last state."""
-    *_, state = tf.simulate(scene, scene.seed(1, seed=seed, streams=[stream]), **end)
+    *_, state = tf.simulate(scene, scene.bind(1, seed=seed, streams=[stream]).start(), **end)
     return float(target.loss(state)[0]), state
 
 

@@ -127,7 +127,7 @@ def test_a_colony_is_measured_at_its_own_first_step_of_that_size():
         assert np.array_equal(made.evaluate(points[[row]]).losses[0], found.losses[row])
         for stream in range(2):
             scene = made.task.family.function(**made.task.space.values(point))
-            *_, before, last = tf.simulate(scene, scene.seed(1, streams=[stream]), cells=5)
+            *_, before, last = tf.simulate(scene, scene.bind(1, streams=[stream]).start(), cells=5)
             assert before.cells < 5 <= last.cells == found.cells[row, stream]
 
 
@@ -348,7 +348,7 @@ def test_patience_is_longer_than_slow_cells_need(rate):
     """The law of volume takes ln(4.67/2.67)/rate from 2 µm to division at 4 µm: 28 h at 0.02/h. The
     counts are checked after every hour."""
     steps = np.arange(0, 90, 1.0)
-    state = tf.Scene(tf.Growth(rate=rate)).seed(1)
+    state = tf.Scene(tf.Growth(rate=rate)).bind(1).start()
     most, since = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.float64)
     assert not any(bool(rollout._stuck(state.replace(time=t), most, since).any()) for t in steps)
     assert bool(rollout._stuck(state.replace(time=100.1), most, since).all())
@@ -406,7 +406,7 @@ def test_notes_belong_to_their_colony_though_others_end_at_other_times(kind):
     assert len(set(found.losses.ravel())) > 1 and not found.reasons
     for stream in range(2):
         scene = made.task.family.function(**made.task.space.values(spots(3, 2)[1]))
-        *_, state = tf.simulate(scene, scene.seed(1, streams=[stream]), cells=6)
+        *_, state = tf.simulate(scene, scene.bind(1, streams=[stream]).start(), cells=6)
         assert found.losses[1, stream] == pytest.approx(state.time, abs=1e-9)
 
 

@@ -382,7 +382,7 @@ def test_hidden_parameters_are_found_again(hidden):
     """A pattern has constants that the search does not know, and random numbers of its own. The
     difference from them is that between seeds."""
     scene = two(**hidden)
-    *_, state = tf.simulate(scene, scene.seed(8, seed=99), until=1.0)
+    *_, state = tf.simulate(scene, scene.bind(8, seed=99).start(), until=1.0)
     measured = {n: float(mean(state, n).mean()) for n in ("a", "b")}
     target = Levels(**measured)
     parameters = [Parameter("feed", 0.1, 10, log=True), Parameter("leak", 0.1, 10, log=True)]

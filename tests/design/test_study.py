@@ -229,7 +229,7 @@ def brighter(make=1.0, decay=1.0):
 
 def moved(make=1.0, decay=1.0):
     scene = lit(make, decay)
-    return tf.Scene(*scene.listed, dt=scene.dt, founders=tf.Cells([[0.0, 3.0]], [[1.0, 0.0]]))
+    return tf.Scene(*scene.effects, dt=scene.dt, founders=tf.Cells([[0.0, 3.0]], [[1.0, 0.0]]))
 
 
 def faster(u, s, p, cell):
@@ -242,7 +242,7 @@ def quicker(make=1.0, decay=1.0):
     scene = lit(make, decay)
     circuit = tf.Circuit(faster, species=("gfp",), make=make, decay=decay)
     return tf.Scene(
-        *(circuit if isinstance(e, tf.Circuit) else e for e in scene.listed), dt=scene.dt
+        *(circuit if isinstance(e, tf.Circuit) else e for e in scene.effects), dt=scene.dt
     )
 
 
@@ -349,7 +349,7 @@ def test_a_spoiled_file_is_refused(kept, tmp_path, what):
 def test_foreign_files_are_refused(tmp_path, kept):
     (tmp_path / "a.h5").write_text("make,decay\n1,2\n")
     scene = grown(2.0)
-    list(tf.simulate(scene, scene.seed(1), until=0.2, record=tmp_path / "b.h5"))
+    list(tf.simulate(scene, scene.bind(1).start(), until=0.2, record=tmp_path / "b.h5"))
     shutil.copy(kept, tmp_path / "c.h5")
     with h5py.File(tmp_path / "c.h5", "r+") as file:
         file.attrs["version"] = 99

@@ -298,7 +298,7 @@ def test_a_signal_is_seen_where_the_cells_are():
         tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=0.5), box=((-8, -8), (8, 8)), spacing=4.0),
         founders=tf.Cells([[-3.0, 0.0], [-1.0, 0.0], [3.0, 0.0]], [1.0, 0.0], 0.0),
     )
-    state = scene.seed(dtype=torch.float64)
+    state = scene.bind(dtype=torch.float64).start()
     target = Bands(("out.ahl",), (-math.inf, 0.0), edge_width=SHARP)
     target.check(state)
     values = state.fields["out.ahl"].clone().requires_grad_()

@@ -242,7 +242,7 @@ def test_a_first_state_without_the_types_is_refused(kinds, options, words):
 
 
 def test_a_first_state_with_what_is_needed_passes():
-    Stripe("yfp", width=4.0).check(tf.scenes.boundary_detector().seed(3))
+    Stripe("yfp", width=4.0).check(tf.scenes.boundary_detector().bind(3).start())
     Stripe("yfp", at=0.0, width=4.0).check(row([0.0], yfp=1.0))
 
 
