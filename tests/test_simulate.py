@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import torchfilm as tf
-from torchfilm.physics.solve import CONVERGED
+from torchfilm.physics.problem import CONVERGED
 from torchfilm.state import PER_CELL
 
 

@@ -12,8 +12,8 @@ from helpers import crowd, run, seeded
 
 import torchfilm as tf
 from torchfilm.physics.capsule import rotate
-from torchfilm.physics.solve import CONVERGED
-from torchfilm.physics.walls import share_to_walls
+from torchfilm.physics.problem import CONVERGED
+from torchfilm.physics.wall_contacts import share_to_walls
 
 X, Y = [1.0, 0.0], [0.0, 1.0]
 

@@ -11,7 +11,7 @@ from helpers import run, seeded
 import torchfilm as tf
 from torchfilm.effects.mechanics import _Run
 from torchfilm.physics.contacts import gaps_nearby
-from torchfilm.physics.solve import CONVERGED
+from torchfilm.physics.problem import CONVERGED
 
 # Sixty short rods thrown into a box of 5 µm: the first moves would turn some of them by far more
 # than MAX_TURN, as in the middle of a large colony.

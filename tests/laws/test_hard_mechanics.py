@@ -31,7 +31,7 @@ from helpers import (
 
 import torchfilm as tf
 from torchfilm.physics.contacts import LINE_CONTACT_SINE, Capsules, closest_points, contact_gaps
-from torchfilm.physics.walls import find_wall_contacts
+from torchfilm.physics.wall_contacts import find_wall_contacts
 
 MODES = pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
 DT = 0.01

@@ -180,8 +180,8 @@ def test_rows_of_a_line_of_contact(dim, tilt):
 
 
 @DIMS
-@pytest.mark.parametrize("push", [False, True])
-def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, push):
+@pytest.mark.parametrize("unilateral", [False, True])
+def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, unilateral):
     """All rows that `contact_points` has for every pair, wherever it overlaps or is held, and no
     other: gaps and weights to rounding, order exactly."""
     rng, count = np.random.default_rng(4), 8000
@@ -208,7 +208,7 @@ def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, push):
         deep[1].sum() > 500 and (~deep[0]).sum() > 500 and (line & (deep[0] != deep[1])).sum() > 3
     )
     weight = torch.where(line, 0.5, 1.0).expand(2, -1).clone()
-    if push:
+    if unilateral:
         deep = deep | (line & deep.any(0))
     else:  # the end that does not overlap is held, the less the farther it is
         held = line & (deep[0] != deep[1]) & (gap.sum(0) < 0)
@@ -216,7 +216,7 @@ def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, push):
         deep = deep | held
         assert held.sum() > 3
         gap = gap.clamp(max=0.0)
-    found = rows_of(cells, first, second, push)
+    found = rows_of(cells, first, second, unilateral)
     assert torch.equal(found.first, torch.cat([first[d] for d in deep])) and torch.equal(
         found.second, torch.cat([second[d] for d in deep])
     )

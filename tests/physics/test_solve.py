@@ -13,7 +13,8 @@ from scipy.optimize import minimize
 
 import torchfilm as tf
 from torchfilm.physics.jacobian import ContactJacobian
-from torchfilm.physics.solve import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem, solve
+from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
+from torchfilm.physics.solve import solve_contacts
 from torchfilm.tools.ragged import Groups
 
 MODES = pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
@@ -79,7 +80,7 @@ class Problem:
         return out.reshape(len(self.gap), -1)
 
     def problem(
-        self, unilateral: bool, dtype=torch.float64, device="cpu", held=None, **other
+        self, unilateral: bool, dtype=torch.float64, device="cpu", applied_force=None, **other
     ) -> ContactProblem:
         t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)
         i = lambda x: torch.as_tensor(x, dtype=torch.int64, device=device)
@@ -93,13 +94,13 @@ class Problem:
             len(self.scale),
         )
         gap = t(other.get("gap", self.gap))
-        held = torch.zeros_like(gap) if held is None else t(held)
+        applied_force = torch.zeros_like(gap) if applied_force is None else t(applied_force)
         colonies = Groups(i(self.colony), self.colonies)
         rigid = torch.as_tensor(other.get("rigid", np.zeros(len(self.scale), bool)), device=device)
         return ContactProblem(
             rows,
             gap,
-            held,
+            applied_force,
             t(self.weight).reshape(self.scale.shape),
             t(self.lower),
             t(self.scale),
@@ -110,7 +111,7 @@ class Problem:
 
     def solved(self, unilateral: bool, tolerance: float | torch.Tensor = 1e-12, **options):
         """The solve's y = x / M^(−½), (N, D), and its report."""
-        x, report = solve(self.problem(unilateral, **options), None, tolerance, 5000)
+        x, report = solve_contacts(self.problem(unilateral, **options), None, tolerance, 5000)
         return array(x) / self.scale, report
 
     @property
@@ -164,10 +165,11 @@ def test_bilateral_solve_within_bounds(seed):
     assert 3 <= bound.sum() < len(y) and slope[bound].max() > 1e-3
 
 
-def pushing_energy(p: Problem, held: np.ndarray | None = None):
-    """½ ‖min(0, g − Jy)‖² + ½ α ‖y‖² + held · Jy, and its gradient: what a unilateral solve
+def pushing_energy(p: Problem, applied_force: np.ndarray | None = None):
+    """½ ‖min(0, g − Jy)‖² + ½ α ‖y‖² + f · Jy (f: applied force), and its gradient: what a
+    solve
     minimises, written out."""
-    j, spent = p.dense, np.zeros(len(p.gap)) if held is None else held
+    j, spent = p.dense, np.zeros(len(p.gap)) if applied_force is None else applied_force
 
     def energy(y):
         left = np.minimum(0.0, p.gap - j @ y)
@@ -231,17 +233,17 @@ def test_contacts_that_just_touch_do_not_take_turns(seed, degrees, lower, dtype,
 
 @MODES
 def test_force_already_spent_is_not_spent_again(unilateral):
-    """Rows whose force `held` has acted in an earlier pass: the minimum is that of the function
+    """Rows whose `applied_force` acted in an earlier pass: the minimum is that of the function
     with their work added."""
     p = Problem.random(5, [15], 7)
-    held = np.where(np.arange(len(p.gap)) % 3 == 0, 0.5 * p.gap, 0.0)
-    y, report = p.solved(unilateral, held=held)
+    applied_force = np.where(np.arange(len(p.gap)) % 3 == 0, 0.5 * p.gap, 0.0)
+    y, report = p.solved(unilateral, applied_force=applied_force)
     assert (report.status == CONVERGED).all()
     if unilateral:
-        slope = pushing_energy(p, held)(y.ravel())[1]
+        slope = pushing_energy(p, applied_force)(y.ravel())[1]
     else:
         j = p.dense
-        slope = p.weight * y.ravel() - j.T @ (p.gap - j @ y.ravel() - held)
+        slope = p.weight * y.ravel() - j.T @ (p.gap - j @ y.ravel() - applied_force)
     assert np.abs(slope).max() <= 1e-9
 
 
@@ -313,7 +315,7 @@ def test_each_colony_converges_by_itself(unilateral, dtype, device):
 @MODES
 def test_a_solve_cut_short_says_so(unilateral):
     p = Problem.random(8, [30, 2], 7)
-    x, report = solve(p.problem(unilateral), None, 1e-12, 3)
+    x, report = solve_contacts(p.problem(unilateral), None, 1e-12, 3)
     assert int(report.status[0]) == ITERATION_LIMIT and float(report.residual[0]) > 1e-12
     assert bool(torch.isfinite(x).all())
 
@@ -322,8 +324,8 @@ def test_a_solve_cut_short_says_so(unilateral):
 def test_a_start_from_the_answer_costs_nothing(unilateral):
     p = Problem.random(9, [20], 7)
     problem = p.problem(unilateral)
-    x, report = solve(problem, None, 1e-8, 5000)
-    again, second = solve(problem, x, 1e-6, 5000)
+    x, report = solve_contacts(problem, None, 1e-8, 5000)
+    again, second = solve_contacts(problem, x, 1e-6, 5000)
     assert int(report.iterations[0]) > 5 and int(second.iterations[0]) == 0
     # x is kept scaled, so the answer comes back but for a multiplication and a division
     assert float((again - x).abs().max()) <= 1e-15

@@ -11,7 +11,7 @@ from helpers import array, growth, mechanics, run, seeded, unit
 
 import torchfilm as tf
 from torchfilm.physics import capsule
-from torchfilm.physics.walls import find_wall_contacts
+from torchfilm.physics.wall_contacts import find_wall_contacts
 
 INF = math.inf
 WALLS_3D = {

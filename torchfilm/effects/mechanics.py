@@ -21,16 +21,18 @@ from torchfilm.physics.contacts import (
 )
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.neighbours import Neighbourhood
-from torchfilm.physics.solve import (
+from torchfilm.physics.problem import (
     CONVERGED,
     NOT_FINITE,
     STATUS,
     TOO_FAST,
     ContactProblem,
     SolveReport,
-    solve,
 )
-from torchfilm.physics.walls import Surface, Wall, WallContacts, find_wall_contacts, share_to_walls
+from torchfilm.physics.solve import solve_contacts
+from torchfilm.physics.surfaces import Surface
+from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts, share_to_walls
+from torchfilm.physics.walls import Wall
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
@@ -532,8 +534,8 @@ class _Run:
         )
         start = state.displacement if number == 0 else None
         if bool(moving.all()):
-            return solve(problem, start, self._tolerance(), settings.max_iterations)
-        move, report = solve(
+            return solve_contacts(problem, start, self._tolerance(), settings.max_iterations)
+        move, report = solve_contacts(
             problem.among(moving),
             None if start is None else start[moving],
             self._tolerance(),

@@ -27,7 +27,7 @@ from torchfilm.io.results import (
     Results,
     committed,
 )
-from torchfilm.physics.walls import as_data
+from torchfilm.physics.surfaces import as_data
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, COLONY, PER_CELL, State
 from torchfilm.tools import checks
