@@ -13,7 +13,7 @@ from helpers import array
 import torchfilm as tf
 from torchfilm.circuits.draws import keyed_draws
 from torchfilm.circuits.names import Names
-from torchfilm.circuits.network import network
+from torchfilm.circuits.network import build_network
 from torchfilm.circuits.parts import (
     activated,
     constitutive,
@@ -23,7 +23,7 @@ from torchfilm.circuits.parts import (
     repressed,
 )
 from torchfilm.circuits.reactions import Reaction
-from torchfilm.circuits.rosenbrock import rosenbrock
+from torchfilm.circuits.rosenbrock import rodas3
 from torchfilm.circuits.stochastic import DONE, direct
 
 SPECIES, SIGNALS = ("luxi", "ahl", "yfp"), ("ahl",)
@@ -58,7 +58,7 @@ def world(n=7, dtype=torch.float64, device="cpu"):
 def test_rates_are_the_formulas(device, dtype):
     """Against NumPy: a few roundings."""
     u, s, p, cell = world(dtype=dtype, device=device)
-    net = network(parts(), SPECIES, SIGNALS)
+    net = build_network(parts(), SPECIES, SIGNALS)
     found = net.concentration_rates(u, s, p, cell)
     luxi, ahl = array(u.luxi), array(u.ahl)
     per_volume = array(p.D1) * array(cell.area) / array(cell.volume)
@@ -87,7 +87,7 @@ def test_rates_are_the_formulas(device, dtype):
 
 
 def test_stoichiometry():
-    net = network(parts(), SPECIES, SIGNALS)
+    net = build_network(parts(), SPECIES, SIGNALS)
     assert net.names == ("luxi", "ahl", "yfp", "out.ahl")
     assert net.stoichiometry.tolist() == [
         [1, 0, 0, 0],
@@ -143,16 +143,22 @@ def test_equations_are_read():
         (lambda: activated("a", "b", 1.0, 0.0), "above 0"),
         (lambda: repressed("a", "b", -1.0, 1.0), "at least 0"),
         (lambda: conversion("a", enzyme="e", rate=1.0, half=0.0), "above 0"),
-        (lambda: network([], ["a"]), "at least one"),
+        (lambda: build_network([], ["a"]), "at least one"),
         (
-            lambda: network([degradation("lux1", 1.0)], ["luxi"]),
+            lambda: build_network([degradation("lux1", 1.0)], ["luxi"]),
             "unknown name 'lux1'; known are luxi. Did you mean 'luxi'",
         ),
-        (lambda: network([activated("a", "bee", 1.0, 1.0)], ["a", "be"]), "Did you mean 'be'"),
-        (lambda: network([exchange("a", 1.0)], ["a"], ["b"]), "unknown name 'out.a'"),
-        (lambda: network([degradation("a", 1.0), degradation("a", 2.0)], ["a"]), "only once"),
-        (lambda: network([degradation("a", 1.0)], ["a", "a"]), "different names"),
-        (lambda: network([degradation("a", 1.0)], "a"), "sequence of names"),
+        (
+            lambda: build_network([activated("a", "bee", 1.0, 1.0)], ["a", "be"]),
+            "Did you mean 'be'",
+        ),
+        (lambda: build_network([exchange("a", 1.0)], ["a"], ["b"]), "unknown name 'out.a'"),
+        (
+            lambda: build_network([degradation("a", 1.0), degradation("a", 2.0)], ["a"]),
+            "used only once",
+        ),
+        (lambda: build_network([degradation("a", 1.0)], ["a", "a"]), "different names"),
+        (lambda: build_network([degradation("a", 1.0)], "a"), "sequence of names"),
     ],
 )
 def test_what_makes_no_sense_is_refused(make, words):
@@ -163,12 +169,12 @@ def test_what_makes_no_sense_is_refused(make, words):
 def test_missing_parameters_are_named():
     u, s, p, cell = world()
     with pytest.raises(tf.InputError, match=r"p has no 'k4'; known are k3, K, D1"):
-        network([constitutive("luxi", "k4")], SPECIES).concentration_rates(u, s, p, cell)
+        build_network([constitutive("luxi", "k4")], SPECIES).concentration_rates(u, s, p, cell)
 
 
 def test_gradient_of_rates():
     u, s, p, cell = world(3)
-    net = network(parts(), SPECIES, SIGNALS)
+    net = build_network(parts(), SPECIES, SIGNALS)
 
     def rates(x, outside, k3):
         return torch.stack(
@@ -194,7 +200,7 @@ def test_gradient_of_rates():
 def test_propensities_count_combinations(device, dtype):
     """k Ω n(n − 1)/Ω² for 2 a; rate times Ω for functions; whole molecules only; a signal by its
     own pool."""
-    net = network(
+    net = build_network(
         [
             Reaction.of("2 a -> b", 0.5),
             Reaction.of("-> a", 3.0),
@@ -232,7 +238,7 @@ def test_both_ways_of_running_agree():
     1,000 molecules: fluctuations shift the mean by a few molecules, 1 % is 10 of them; the sample's
     standard error is 1.
     """
-    net = network(
+    net = build_network(
         [
             constitutive("a", 5.0),
             Reaction.of("2 a -> b", 0.3),
@@ -250,7 +256,7 @@ def test_both_ways_of_running_agree():
             1,
         )
 
-    u, _ = rosenbrock(smooth, torch.tensor([[0.0, 0.0]], dtype=torch.float64), 1.0, rtol=1e-6)
+    u, _ = rodas3(smooth, torch.tensor([[0.0, 0.0]], dtype=torch.float64), 1.0, rtol=1e-6)
     rows = torch.arange(cells)
     draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
     counts, report = direct(

@@ -10,7 +10,7 @@ from helpers import array
 from scipy.integrate import solve_ivp
 
 from torchfilm.circuits import kinetics, linear
-from torchfilm.circuits.rosenbrock import BELOW_ZERO, DONE, NOT_FINITE, TOO_MANY_STEPS, rosenbrock
+from torchfilm.circuits.rosenbrock import BELOW_ZERO, DONE, NOT_FINITE, TOO_MANY_STEPS, rodas3
 from torchfilm.tools.deterministic_math import deterministic_functions
 
 F64 = torch.float64
@@ -73,7 +73,7 @@ def test_order_three():
     for steps in (8, 16, 32, 64):
         u = torch.tensor([start], dtype=F64)
         for _ in range(steps):
-            u, report = rosenbrock(toggle, u, 2.0 / steps, rtol=1e9)
+            u, report = rodas3(toggle, u, 2.0 / steps, rtol=1e9)
             assert int(report.accepted) == 1
         errors.append(np.abs(array(u)[0] - reference).max())
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
@@ -85,7 +85,7 @@ def test_error_estimate_is_of_order_two_results():
     embedded result, h³."""
     start, counts = torch.tensor([[0.3, 1.4]], dtype=F64), []
     for rtol in (1e-6, 1e-9):
-        counts.append(int(rosenbrock(toggle, start, 2.0, rtol=rtol, atol=0.0)[1].accepted))
+        counts.append(int(rodas3(toggle, start, 2.0, rtol=rtol, atol=0.0)[1].accepted))
     assert counts[1] / counts[0] == pytest.approx(10, rel=0.15)
 
 
@@ -96,7 +96,7 @@ def test_error_estimate_is_of_order_two_results():
 def test_against_lsoda(device, dtype, rates, start, t):
     """Stable circuits: the error at the end is a few times what a step is allowed, rtol (1e-4 by
     default); ten times that is the bound."""
-    u, report = rosenbrock(rates, torch.tensor([start], dtype=dtype, device=device), t, atol=1e-10)
+    u, report = rodas3(rates, torch.tensor([start], dtype=dtype, device=device), t, atol=1e-10)
     assert (report.status == DONE).all()
     assert u.dtype == dtype
     assert array(u)[0] == pytest.approx(exact(rates, start, t), rel=1e-3, abs=1e-9)
@@ -104,14 +104,14 @@ def test_against_lsoda(device, dtype, rates, start, t):
 
 @pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-7])
 def test_error_follows_the_tolerance(rtol):
-    u, _ = rosenbrock(toggle, torch.tensor([[0.3, 1.4]], dtype=F64), 3.0, rtol=rtol)
+    u, _ = rodas3(toggle, torch.tensor([[0.3, 1.4]], dtype=F64), 3.0, rtol=rtol)
     assert np.abs(array(u)[0] / exact(toggle, [0.3, 1.4], 3.0) - 1).max() <= 10 * rtol
 
 
 def test_one_step_where_one_is_enough(device, dtype):
     """The whole of dt is tried at once: near a fixed point that is all, however fast the decay."""
     rates = lambda u, rows: 1e8 * (1.0 - u)
-    u, report = rosenbrock(rates, torch.ones(4, 2, dtype=dtype, device=device), 1.0)
+    u, report = rodas3(rates, torch.ones(4, 2, dtype=dtype, device=device), 1.0)
     assert (report.accepted == 1).all() and (report.rejected == 0).all()
     assert torch.equal(u, torch.ones_like(u))
 
@@ -122,9 +122,7 @@ def test_a_fast_decay_to_zero_does_not_stall(device, dtype, size, t):
     """Rates of 1e8 and 3e7 in a row beside slow ones: nothing below zero, the slow ones right, and
     steps as many as the accuracy of a decay over the decades down to atol asks for (some 20 each),
     not t · 1e8."""
-    u, report = rosenbrock(
-        chain, torch.tensor([[size, 0.0, 1.0, 2.0]], dtype=dtype, device=device), t
-    )
+    u, report = rodas3(chain, torch.tensor([[size, 0.0, 1.0, 2.0]], dtype=dtype, device=device), t)
     assert int(report.status) == DONE
     assert int(report.accepted + report.rejected) <= 250
     assert float(u.min()) >= 0
@@ -141,12 +139,12 @@ def test_rates_are_not_asked_below_zero(device, dtype):
         x, y = u.unbind(1)
         return columns(-1e6 * x, x * x.sqrt() - y)
 
-    u, report = rosenbrock(rates, torch.tensor([[1e-13, 1e-3]], dtype=dtype, device=device), 0.025)
+    u, report = rodas3(rates, torch.tensor([[1e-13, 1e-3]], dtype=dtype, device=device), 0.025)
     assert int(report.status) == DONE and int(report.accepted + report.rejected) <= 3
     assert min(seen) >= 0
     assert float(u[0, 1]) == pytest.approx(1e-3 * np.exp(-0.025), rel=1e-4)
     # where values may be negative they are asked as they are
-    rosenbrock(
+    rodas3(
         rates,
         torch.tensor([[1e-13, 1e-3]], dtype=dtype, device=device),
         0.025,
@@ -160,7 +158,7 @@ def test_rates_are_not_asked_below_zero(device, dtype):
 def test_what_the_rates_conserve_is_conserved(device, dtype, t):
     """Robertson's a + b + c = 1: kept to rounding, a unit of the dtype for each of 150 steps adding
     up at random and one more for f in it."""
-    u, report = rosenbrock(
+    u, report = rodas3(
         robertson, torch.tensor([[1.0, 0.0, 0.0]], dtype=dtype, device=device), t, atol=1e-10
     )
     assert int(report.status) == DONE
@@ -182,7 +180,7 @@ def test_conserved_where_results_are_raised_to_zero():
         [[1.0, 1e-3, 0.0], [1.0, 1.0, 0.0], [1e-6, 5.0, 0.0], [1e-12, 1.0, 0.3]], dtype=F64
     )
     for t in (1e-4, 1e-3, 0.1, 10.0):
-        u, report = rosenbrock(rates, start, t)
+        u, report = rodas3(rates, start, t)
         assert (report.status == DONE).all() and float(u.min()) >= 0
         for k in (0, 1):
             assert torch.allclose(
@@ -213,7 +211,7 @@ def test_nonnegative_over_random_networks(device, dtype, fastest):
         meet = (pair[rows] * u[:, 0] * u[:, 1]).unsqueeze(1)
         return flow.sum(1) - flow.sum(2) + torch.cat([-meet, -meet, meet, meet], 1)
 
-    u, report = rosenbrock(rates, start, 0.025)
+    u, report = rodas3(rates, start, 0.025)
     assert (report.status == DONE).all()
     assert float(u.min()) >= 0
     if dtype == F64 or fastest < 8:
@@ -223,7 +221,7 @@ def test_nonnegative_over_random_networks(device, dtype, fastest):
 
 
 def test_negative_values_are_free_where_asked_for(device, dtype):
-    u, report = rosenbrock(
+    u, report = rodas3(
         lambda u, rows: -torch.ones_like(u),
         torch.ones(1, 1, dtype=dtype, device=device),
         3.0,
@@ -245,7 +243,7 @@ def test_failures_stay_with_their_cell(device, dtype):
 
     start = torch.ones(6, 1, dtype=dtype, device=device)
     # a decay over the nine decades down to atol takes some 20 steps each
-    u, report = rosenbrock(rates, start, 2.0, max_steps=120)
+    u, report = rodas3(rates, start, 2.0, max_steps=120)
     assert report.status.tolist()[:2] == [DONE, NOT_FINITE]
     assert int(report.status[2]) in (NOT_FINITE, TOO_MANY_STEPS)  # x' = x² is infinite at t = 1
     assert report.status.tolist()[3:] == [BELOW_ZERO, TOO_MANY_STEPS, DONE]
@@ -255,13 +253,13 @@ def test_failures_stay_with_their_cell(device, dtype):
 
 
 def test_nothing_to_do(device, dtype):
-    empty, _ = rosenbrock(toggle, torch.empty(0, 2, dtype=dtype, device=device), 1.0)
+    empty, _ = rodas3(toggle, torch.empty(0, 2, dtype=dtype, device=device), 1.0)
     assert empty.shape == (0, 2)
     start = torch.rand(3, 2, dtype=dtype, device=device)
-    same, report = rosenbrock(toggle, start, 0.0)
+    same, report = rodas3(toggle, start, 0.0)
     assert torch.equal(same, start) and (report.status == DONE).all()
     # a rate that does not depend on what there is has no Jacobian
-    grown, _ = rosenbrock(
+    grown, _ = rodas3(
         lambda u, rows: torch.full_like(u, 2.0).detach(),
         torch.zeros(2, 1, dtype=dtype, device=device),
         0.5,
@@ -278,19 +276,19 @@ def test_a_row_is_its_own(dtype, count):
     speed = (10 ** (torch.rand(count, generator=g, dtype=F64) * 6 - 1)).to(dtype)
     start = (torch.rand(count, 6, generator=g, dtype=F64) ** 3).to(dtype)
     of = lambda k: lambda u, rows: speed[k][rows].unsqueeze(1) * ring(u, rows)
-    whole, report = rosenbrock(of(torch.arange(count)), start, 0.5)
+    whole, report = rodas3(of(torch.arange(count)), start, 0.5)
     for k in (
         torch.arange(1),
         torch.arange(count).flip(0),
         torch.randperm(count, generator=g)[: count // 2],
         torch.arange(count - 1, count),
     ):
-        part, own = rosenbrock(of(k), start[k], 0.5)
+        part, own = rodas3(of(k), start[k], 0.5)
         assert torch.equal(part, whole[k])
         assert torch.equal(own.accepted, report.accepted[k]) and torch.equal(
             own.rejected, report.rejected[k]
         )
-    traced, _ = rosenbrock(of(torch.arange(count)), start.clone().requires_grad_(), 0.5)
+    traced, _ = rodas3(of(torch.arange(count)), start.clone().requires_grad_(), 0.5)
     # of the Jacobian's last bits, which change a result by no more than that share of the error
     # that is allowed
     assert torch.allclose(
@@ -309,7 +307,7 @@ def test_gradient_of_one_step():
             k[0] * kinetics.repression(y[:, 1], 1.0, 2) - y[:, 0],
             k[1] * kinetics.repression(y[:, 0], 1.0, 2) - y[:, 1],
         )
-        return rosenbrock(rates, u, 0.4, rtol=1e9)[0]
+        return rodas3(rates, u, 0.4, rtol=1e9)[0]
 
     assert torch.autograd.gradcheck(run, (u, k))
 
@@ -328,7 +326,7 @@ def test_gradient_through_many_steps(dtype):
             return columns(-one, one - two, two)
 
         start = torch.tensor([[1.0, 0.0, 0.0]], dtype=k.dtype).expand(k.shape[0], 3)
-        return rosenbrock(rates, start, 4.0, rtol=rtol, atol=1e-10)[0][:, 0]
+        return rodas3(rates, start, 4.0, rtol=rtol, atol=1e-10)[0][:, 0]
 
     k0 = torch.tensor([[0.04, 1e4, 3e7]], dtype=F64)
     k = k0.to(dtype).requires_grad_()
@@ -349,7 +347,7 @@ def test_gradient_where_results_are_raised_and_steps_rejected():
     u = torch.tensor(
         [[1.0, 0.0, 0.5], [1e-9, 1e-12, 1.0], [0.0, 0.0, 0.0]], dtype=F64, requires_grad=True
     )
-    out, report = rosenbrock(rates, u, 1e-6)
+    out, report = rodas3(rates, u, 1e-6)
     assert int(report.rejected.max()) > 0
     grad = torch.autograd.grad(out.sum(), u)[0]
     assert grad == pytest.approx(torch.ones(3, 3), abs=1e-6)
@@ -361,7 +359,7 @@ def test_gradient_where_a_rejected_step_is_not_finite():
     rates = lambda u, rows: u - 1e-30 * torch.exp(u)
     x = torch.full((3, 1), 10.0, dtype=F64) + torch.tensor([[0.0], [1e-3], [-1e-3]], dtype=F64)
     x.requires_grad_()
-    u, report = rosenbrock(rates, x, 1.98, rtol=1e-7)
+    u, report = rodas3(rates, x, 1.98, rtol=1e-7)
     assert int(report.rejected.min()) > 0 and (report.status == DONE).all()
     grad = torch.autograd.grad(u[0].sum(), x)[0].reshape(-1)
     u = u.detach().reshape(-1)
@@ -370,10 +368,10 @@ def test_gradient_where_a_rejected_step_is_not_finite():
 
 
 def test_no_graph_without_need():
-    out, _ = rosenbrock(toggle, torch.rand(3, 2), 1.0)
+    out, _ = rodas3(toggle, torch.rand(3, 2), 1.0)
     assert not out.requires_grad
     with torch.no_grad():
-        assert not rosenbrock(toggle, torch.rand(3, 2, requires_grad=True), 1.0)[0].requires_grad
+        assert not rodas3(toggle, torch.rand(3, 2, requires_grad=True), 1.0)[0].requires_grad
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 12])
@@ -415,6 +413,6 @@ def test_pivots_that_vanish_are_noticed():
     size."""
     matrix = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=F64).unsqueeze(2)
     assert not bool(linear.factor(matrix, torch.ones(2, 1, dtype=F64))[1])
-    u, report = rosenbrock(lambda u, rows: 2.0 * u, torch.ones(1, 1, dtype=F64), 1.0)
+    u, report = rodas3(lambda u, rows: 2.0 * u, torch.ones(1, 1, dtype=F64), 1.0)
     assert int(report.status) == DONE and int(report.rejected) > 0
     assert float(u) == pytest.approx(np.exp(2), rel=1e-3)

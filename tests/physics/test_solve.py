@@ -166,9 +166,8 @@ def test_bilateral_solve_within_bounds(seed):
 
 
 def pushing_energy(p: Problem, applied_force: np.ndarray | None = None):
-    """½ ‖min(0, g − Jy)‖² + ½ α ‖y‖² + f · Jy (f: applied force), and its gradient: what a
-    solve
-    minimises, written out."""
+    """½ ‖min(0, g − Jy)‖² + ½ α ‖y‖² + f · Jy and its gradient, with the applied force f: what a
+    unilateral solve minimises, written out."""
     j, spent = p.dense, np.zeros(len(p.gap)) if applied_force is None else applied_force
 
     def energy(y):

@@ -19,7 +19,7 @@ from torchfilm.circuits import integrators, run
 from torchfilm.circuits.columns import Lazy
 from torchfilm.circuits.draws import keyed_draws
 from torchfilm.circuits.names import unknown
-from torchfilm.circuits.network import network
+from torchfilm.circuits.network import build_network
 from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.effect import CIRCUIT, Distribution, Effect, draw, parameter, per_cell
@@ -286,7 +286,7 @@ class Circuit(Effect):
         and given."""
         signals = tuple(state.signals)
         self.noted.networks = {
-            kind: network(part, self.species, signals)
+            kind: build_network(part, self.species, signals)
             for kind, part in self.rates.items()
             if not callable(part)
         }

@@ -91,11 +91,11 @@ class HotReload:
             return self.call(name, act, otherwise)
         if not self._proven:
             self._proven = True
-            self._say("taken up")
+            self._say("reloaded")
         return result
 
     def _report(self, error: Any) -> None:
-        self._say(f"is broken, still running the last good rules: {type(error).__name__}: {error}")
+        self._say(f"is broken, the last good rules stay in use: {type(error).__name__}: {error}")
 
     def _say(self, what: str) -> None:
         name = self.path.name if self.path is not None else "the rules"
