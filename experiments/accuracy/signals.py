@@ -23,10 +23,10 @@ from study import Point, Study, timed
 
 import torchfilm as tf
 from torchfilm.signals import iterative
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.exchange import read, stencil, write
 from torchfilm.signals.exponential import aligned
 from torchfilm.signals.grid import Grid
-from torchfilm.signals.operator import operator
 from torchfilm.signals.transport import prepare
 
 ERROR, BELOW, WORK = "relative error", "below zero", "multiplications"
@@ -320,7 +320,7 @@ def in_space(name: str, words: str, diffusion: float, speed: float, quick: bool)
             np.outer(spread(n, spacing, x, s), spread(n, spacing, 0.0, s))
             for x, s in ((-0.5 * speed * until, start), (0.5 * speed * until, end))
         )
-        made = operator(
+        made = build_operator(
             (n, n, 1),
             (spacing,) * 3,
             diffusion=diffusion,
@@ -398,7 +398,7 @@ def at_a_cell(quick: bool) -> Study:
             def steady(
                 given: torch.Tensor = given, n: int = n, spacing: float = spacing
             ) -> torch.Tensor:
-                made = operator(
+                made = build_operator(
                     (n, n, n),
                     (spacing,) * 3,
                     diffusion=diffusion,

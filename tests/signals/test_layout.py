@@ -82,7 +82,7 @@ def test_the_mask_is_asked_for_once_and_without_obstacles_not_at_all():
         (lambda at: at > 0, r"bool tensor of shape \(15,\)"),
         (lambda at: (at[:, 0] > 0).float(), r"float32.*bool"),
         (lambda at: True, "bool tensor"),
-        (lambda at: at[:, 0] < 1e9, "nothing is left of the medium"),
+        (lambda at: at[:, 0] < 1e9, "no medium remains"),
     ],
     ids=["shape", "dtype", "no tensor", "everywhere"],
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchfilm.signals.assembly import build_operator, fitted_rates
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
@@ -16,7 +17,7 @@ from torchfilm.signals.boundary_conditions import (
     Periodic,
 )
 from torchfilm.signals.iterative import convolve
-from torchfilm.signals.operator import Operator, apply, fitted, operator
+from torchfilm.signals.operator import Operator, apply
 from torchfilm.tools.checks import InputError
 
 SPACING = (1.0, 2.0, 1.5)
@@ -131,7 +132,7 @@ def make(
     chosen = BOUNDARIES[faces]
     if isinstance(velocity, tuple) and isinstance(velocity[0], torch.Tensor):
         velocity = tuple(v.to(device) for v in velocity)
-    made = operator(
+    made = build_operator(
         shape,
         SPACING,
         diffusion=diffusion,
@@ -239,7 +240,7 @@ def test_fitted_rates(diffusion, speed):
     for sign in (1, -1):
         up, down = (
             float(x)
-            for x in fitted(
+            for x in fitted_rates(
                 torch.tensor(diffusion, dtype=torch.float64),
                 torch.tensor(sign * speed, dtype=torch.float64),
             )
@@ -260,7 +261,7 @@ def test_the_slope_of_fitted_rates(speed):
         torch.tensor(1.3, dtype=torch.float64, requires_grad=True),
         torch.tensor(1.3 * speed, dtype=torch.float64, requires_grad=True),
     )
-    assert torch.autograd.gradcheck(fitted, (d, v), eps=1e-6, atol=1e-7)
+    assert torch.autograd.gradcheck(fitted_rates, (d, v), eps=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -271,7 +272,7 @@ def test_no_slope_is_nan(diffusion, speed):
         torch.tensor(diffusion, dtype=torch.float64, requires_grad=True),
         torch.tensor(speed, dtype=torch.float64, requires_grad=True),
     )
-    up, down = fitted(d, v)
+    up, down = fitted_rates(d, v)
     grads = torch.autograd.grad(up + 2 * down, (d, v))
     assert all(bool(torch.isfinite(g)) for g in grads)
 
@@ -293,7 +294,7 @@ def test_each_colony_has_its_own_numbers(device, dtype):
     u = t(3, *shape).to(dtype)
 
     def of(k):
-        return operator(
+        return build_operator(
             shape,
             SPACING,
             diffusion=diffusion[k],
@@ -350,7 +351,7 @@ def test_each_colony_has_its_own_numbers(device, dtype):
 def test_what_is_not_allowed_is_refused(change, name):
     given = {"shape": (4, 4, 3), "spacing": SPACING, "diffusion": 1.0, "colonies": 2} | change
     with pytest.raises(InputError, match=name):
-        operator(given.pop("shape"), given.pop("spacing"), **given)
+        build_operator(given.pop("shape"), given.pop("spacing"), **given)
 
 
 def test_one_periodic_face_has_one_velocity():
@@ -360,7 +361,7 @@ def test_one_periodic_face_has_one_velocity():
         torch.zeros(4, 4, 4),
     )
     with pytest.raises(InputError, match="velocity along x"):
-        operator(
+        build_operator(
             (4, 4, 3),
             SPACING,
             diffusion=1.0,

@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.special import ive
 
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
@@ -18,7 +19,7 @@ from torchfilm.signals.boundary_conditions import (
     Open,
     Periodic,
 )
-from torchfilm.signals.operator import apply, operator
+from torchfilm.signals.operator import apply
 from torchfilm.signals.transport import prepare
 
 D = torch.float64
@@ -56,7 +57,7 @@ def test_exponential_gives_the_lattice_point_source(device, dtype, steps):
     """h = 1.5, K = 2: exact but for what has come to the walls, 16 voxels away, e^−2 I_16(2) =
     3e-15; roundings of a value of 0.03/h³ at most."""
     n, h, k = 33, 1.5, 2.0
-    op = operator((n, n, n), (h, h, h), diffusion=k, dtype=dtype, device=device)
+    op = build_operator((n, n, n), (h, h, h), diffusion=k, dtype=dtype, device=device)
     found = (
         run(op, h * h / k / steps, "exponential", point_source(n, h, dtype, device), steps)[0]
         .cpu()
@@ -73,7 +74,7 @@ def test_order_in_time_for_the_lattice_point_source(method, order):
     not ring, r = 1/24): 2^−order within 0.15."""
     n, error = 17, []
     for steps in (24, 48):
-        op = operator((n, n, n), (1.0, 1.0, 1.0), diffusion=1.0, dtype=D)
+        op = build_operator((n, n, n), (1.0, 1.0, 1.0), diffusion=1.0, dtype=D)
         found = run(op, 1.0 / steps, method, point_source(n, 1.0), steps)
         error.append(abs(float(found[0, 8, 8, 8]) - 0.0293630))
     assert math.log2(error[0] / error[1]) == pytest.approx(order, abs=0.15)
@@ -88,7 +89,7 @@ def test_order_in_space():
         h = length / n
         x = (torch.arange(n, dtype=D) + 0.5) * h
         u = torch.cos(math.pi * x / length).reshape(1, n, 1, 1)
-        op = operator((n, 1, 1), (h, 1.0, 1.0), diffusion=2.0, dtype=D)
+        op = build_operator((n, 1, 1), (h, 1.0, 1.0), diffusion=2.0, dtype=D)
         found = prepare(op, 3.0, "exponential").step(u)
         error.append(
             float((found - u * math.exp(-2.0 * (math.pi / length) ** 2 * 3.0)).abs().max())
@@ -108,7 +109,7 @@ def test_steady_profile_between_fixed_walls(dtype, device, peclet, axis):
     velocity[axis] = peclet * k / length
     faces: list[Face | tuple[Face, Face]] = [NoFlux(), NoFlux(), NoFlux()]
     faces[axis] = (Dirichlet(0.0), Dirichlet(1.0))
-    op = operator(
+    op = build_operator(
         tuple(shape),
         tuple(spacing),
         diffusion=k,
@@ -134,7 +135,7 @@ def test_a_sink_everywhere_has_its_decay_length():
     k, decay, error = 3.0, 0.5, []
     for h in (1.0, 0.5):
         n = round(200 / h)
-        op = operator(
+        op = build_operator(
             (n, 1, 1),
             (h, 1.0, 1.0),
             diffusion=k,
@@ -170,7 +171,7 @@ def test_a_steady_point_source():
         m = n // 2
         source = torch.zeros(n, n, n, dtype=D)
         source[m, m, m] = rate / h**3
-        op = operator(
+        op = build_operator(
             (n, n, n),
             (h, h, h),
             diffusion=k,
@@ -190,7 +191,7 @@ def test_an_open_box_is_washed_out(method, dtype, device):
     """Flow from −x through open ends, nothing else: a clean medium pushes what is there out, and
     `outside` comes in; n voxels fill one after another."""
     n, v = 12, 3.0
-    op = operator(
+    op = build_operator(
         (n, 1, 1),
         (1.0, 1.0, 1.0),
         diffusion=0.0,
@@ -215,7 +216,7 @@ def test_a_wave_on_a_ring_is_carried_around():
     n, h, v, k, t = 200, 0.5, 2.0, 1.0, 4.0
     x = (torch.arange(n, dtype=D) + 0.5) * h
     u = torch.exp(-((x - 40.0) ** 2) / 4).reshape(1, n, 1, 1)
-    op = operator(
+    op = build_operator(
         (n, 1, 1),
         (h, 1.0, 1.0),
         diffusion=k,
@@ -236,7 +237,7 @@ def test_a_wave_on_a_ring_is_carried_around():
 
 def test_a_field_at_rest_has_no_rate():
     """The steady profile put in: du/dt is rounding, rates of 4/h² = 16 and values of 1."""
-    op = operator(
+    op = build_operator(
         (10, 1, 1),
         (0.5, 1.0, 1.0),
         diffusion=1.0,

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_operator import BOUNDARIES, FLOWS, SHAPES, SPACING, every, make
 
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
@@ -21,7 +22,6 @@ from torchfilm.signals.boundary_conditions import (
     Periodic,
 )
 from torchfilm.signals.iterative import CrankNicolson
-from torchfilm.signals.operator import operator
 from torchfilm.signals.transport import METHODS, choose, prepare
 from torchfilm.tools.checks import InputError
 
@@ -156,7 +156,7 @@ def test_order_in_time(method, order, masked):
 def test_implicit_at_rest_is_at_rest():
     """A flat field between faces fixed at its value, whatever the step: each axis takes its own
     faces in. Some roundings of 5."""
-    op = operator(
+    op = build_operator(
         (6, 5, 4),
         SPACING,
         diffusion=1.0,
@@ -207,7 +207,7 @@ def random_operator(seed, shape, power, masked, kind, single, method, faces, dec
             velocity = tuple(torch.as_tensor(a) for a in arrays)
     mask = rng.uniform(size=shape) < 0.7 if masked else np.ones(shape, dtype=bool)
     dtype = torch.float32 if single else torch.float64
-    op = operator(
+    op = build_operator(
         shape,
         tuple(h),
         diffusion=k,
@@ -292,7 +292,7 @@ def test_slopes(method, periodic, masked):
             x=Periodic() if periodic else (Dirichlet(value), NoFlux()),
             y=(Open(value), Dirichlet(0.5)),
         )
-        op = operator(
+        op = build_operator(
             shape,
             SPACING,
             diffusion=diffusion,
@@ -328,7 +328,7 @@ def test_slopes_by_a_velocity_on_faces(method):
 
     def run(*v):
         return prepare(
-            operator(
+            build_operator(
                 shape,
                 SPACING,
                 diffusion=1.0,
@@ -374,7 +374,7 @@ def test_a_colony_does_not_see_the_others(device, dtype, method, shape, own, det
     def of(k: slice):
         size = len(range(*k.indices(count)))
         part = k if own else slice(0, 1)
-        op = operator(
+        op = build_operator(
             shape,
             SPACING,
             diffusion=diffusion[part],
@@ -415,7 +415,7 @@ def test_the_method_that_suits():
 
 def test_a_failed_solve_is_its_own_colonys():
     """A colony with a NaN is reported, and is NaN; the other goes on as if alone."""
-    op = operator(
+    op = build_operator(
         (4, 3, 2), SPACING, diffusion=1.0, velocity=(1.0, 0.0, 0.0), colonies=2, dtype=torch.float64
     )
     u = torch.as_tensor(start((2, 4, 3, 2)))

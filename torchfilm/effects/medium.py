@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import BEFORE_CELLS, GRID_COVERAGE, TRANSPORT, Effect, per_colony
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.signals.layout import Layout
-from torchfilm.signals.operator import operator
 from torchfilm.signals.space import MOST_VOXELS, checked_box, checked_flow
 from torchfilm.signals.transport import METHODS, Stepper, choose, prepare
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
@@ -413,7 +413,7 @@ class Medium(Effect):
             if callable(getattr(signal, x))
             else own(getattr(signal, x))
         )
-        made = operator(
+        made = build_operator(
             batch.shape,
             layout.grid.spacing,
             diffusion=own(signal.diffusion),

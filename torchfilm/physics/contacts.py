@@ -294,21 +294,7 @@ def contacts_of(
         )
         deep0[flat] |= either
         keep0, keep1 = torch.nonzero(deep0).squeeze(1), torch.nonzero(deep1 | either).squeeze(1)
-    share = torch.full_like(ends[0], 0.5) if unilateral else 0.5 * _weight_of_held_end(*ends)
-    whole = torch.ones_like(s)
-    if include_near and not unilateral:
-        whole, of_each = (
-            _weight_near(point, margin),
-            [0.5 * _weight_near(end, margin.index_select(0, flat)) for end in ends],
-        )
-    else:
-        of_each = [torch.where(end < 0, 0.5, 0.0) for end in ends]
-    of_ends = [
-        whole.index_copy(
-            0, flat, torch.where(line, torch.maximum(each, share), whole.index_select(0, flat))
-        )
-        for each in of_each
-    ]
+    of_ends = _end_weights(ends, line, flat, point, margin, unilateral, include_near)
     weight = torch.cat(
         [of_ends[0].index_select(0, keep0), of_ends[1].index_select(0, flat).index_select(0, keep1)]
     )
@@ -322,6 +308,37 @@ def contacts_of(
     gap = gap if unilateral else gap.clamp(max=0.0)
     pick = lambda x: x.index_select(0, keep)
     return Contacts(pick(first), pick(second), gap, weight, row_first, row_second, normal)
+
+
+def _end_weights(
+    ends: list[Tensor],
+    line: Tensor,
+    flat: Tensor,
+    point: Tensor,
+    margin: Tensor,
+    unilateral: bool,
+    include_near: bool,
+) -> list[Tensor]:
+    """D² of the two rows that each pair may have, (K,) each.
+
+    ends: the gaps at the two ends of the lines, which are the pairs `flat` where `line` is set.
+    point: (K,) the gap of the first row. margin: (K,) see NEAR.
+    """
+    share = torch.full_like(ends[0], 0.5) if unilateral else 0.5 * _weight_of_held_end(*ends)
+    whole = torch.ones_like(point)
+    if include_near and not unilateral:
+        whole, of_each = (
+            _weight_near(point, margin),
+            [0.5 * _weight_near(end, margin.index_select(0, flat)) for end in ends],
+        )
+    else:
+        of_each = [torch.where(end < 0, 0.5, 0.0) for end in ends]
+    return [
+        whole.index_copy(
+            0, flat, torch.where(line, torch.maximum(each, share), whole.index_select(0, flat))
+        )
+        for each in of_each
+    ]
 
 
 def _weight_near(gap: Tensor, margin: Tensor) -> Tensor:
