@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import torchfilm as tf
 from torchfilm.pictures import Frame, frame_of, outlines, scale_bar, sheet
 from torchfilm.pictures.draw import WALL, add_walls, set_window
-from torchfilm.pictures.frames import Recorded
+from torchfilm.pictures.frames import RecordedFrames
 
 
 def outline(axis, length=2.0, radius=0.5, position=(0.0, 0.0)) -> np.ndarray:
@@ -274,7 +274,7 @@ def walls_drawn(tmp_path, walls, view: str, dim: int = 3, colonies: int = 1) -> 
     for _ in tf.simulate(scene, scene.seed(colonies), until=0.05, record=path):
         pass
     with tf.Results(path) as results:
-        frame = Recorded(results, [-1])[0]
+        frame = RecordedFrames(results, [-1])[0]
         panels = []
         for place in range(colonies):
             ax = Figure().add_subplot()

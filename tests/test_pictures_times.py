@@ -13,10 +13,10 @@ from PIL import Image
 import torchfilm as tf
 from torchfilm.pictures import figures, movies
 from torchfilm.pictures.colours import PlotStyle, paint_cells
-from torchfilm.pictures.figures import picked
-from torchfilm.pictures.frames import Recorded
+from torchfilm.pictures.figures import choose_frames
+from torchfilm.pictures.frames import RecordedFrames
 from torchfilm.pictures.movies import Film, _nearest, clock
-from torchfilm.pictures.page import survey
+from torchfilm.pictures.page import plan_layout
 
 UNTIL = 2.0
 
@@ -63,9 +63,9 @@ def pixels(path) -> np.ndarray:
 def test_ranges_and_windows_are_those_of_all_frames(run):
     """The first frame is the darkest in yfp and the richest in ahl; all share the ends of both."""
     with tf.Results(run) as results:
-        look = PlotStyle(colour="yfp", background="ahl")
-        frames = Recorded(results, range(len(results)), "ahl")
-        made = survey(frames, [0, 1], look)
+        style = PlotStyle(colour="yfp", background="ahl")
+        frames = RecordedFrames(results, range(len(results)), "ahl")
+        made = plan_layout(frames, [0, 1], style)
         every = [results.frame(k)["yfp"] for k in range(len(results))]
         signal = [x for k in range(len(results)) for x in results.signal("ahl", k)]
         assert made.scales[0].limits == pytest.approx(
@@ -83,18 +83,17 @@ def test_ranges_and_windows_are_those_of_all_frames(run):
 
 def test_a_frame_is_read_when_it_is_asked_for(run):
     with tf.Results(run) as results:
-        frames = Recorded(results, [0, -1], None)
+        frames = RecordedFrames(results, [0, -1], None)
         assert (
             len(frames) == 2
             and frames[0].signals == {}
             and len(frames[1].cells["uid"]) == results.counts[-1].sum()
         )
-        assert len(Recorded(results, [0, 1, 2], "ahl")[1:]) == 2 and frames.present.tolist() == [
-            True,
-            True,
-        ]
+        assert len(
+            RecordedFrames(results, [0, 1, 2], "ahl")[1:]
+        ) == 2 and frames.present.tolist() == [True, True]
         with pytest.raises(tf.InputError, match=r"background = 'lactose'.*ahl"):
-            Recorded(results, [0], "lactose")
+            RecordedFrames(results, [0], "lactose")
 
 
 # --- strips ---------------------------------------------------------------------------------------
@@ -102,23 +101,25 @@ def test_a_frame_is_read_when_it_is_asked_for(run):
 
 def test_frames_of_a_strip():
     times = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.1])
-    assert picked(times, None, None) == [0, 1, 3, 5]  # 0, 0.7, 1.4, 2.1
+    assert choose_frames(times, None, None) == [0, 1, 3, 5]  # 0, 0.7, 1.4, 2.1
     assert (
-        picked(times, None, 1) == [5]
-        and picked(times, None, 2) == [0, 5]
-        and picked(times, None, 99) == [0, 1, 2, 3, 4, 5]
+        choose_frames(times, None, 1) == [5]
+        and choose_frames(times, None, 2) == [0, 5]
+        and choose_frames(times, None, 99) == [0, 1, 2, 3, 4, 5]
     )
-    assert picked(times, [1.1, 0.2], None) == [2, 0] and picked(times, [2.3], None) == [5]
+    assert choose_frames(times, [1.1, 0.2], None) == [2, 0] and choose_frames(
+        times, [2.3], None
+    ) == [5]
     for bad in ([2.5], [-0.3], [0.0, 99.0]):
         with pytest.raises(tf.InputError, match=r"times = .*0 to 2.1 h"):
-            picked(times, bad, None)
+            choose_frames(times, bad, None)
     for wrong in (0, True, 2.5):
         with pytest.raises(tf.InputError, match="frames"):
-            picked(times, None, wrong)
+            choose_frames(times, None, wrong)
     with pytest.raises(tf.InputError, match="one of them"):
-        picked(times, [1.0], 3)
+        choose_frames(times, [1.0], 3)
     with pytest.raises(tf.InputError, match="at least one"):
-        picked(times, [], None)
+        choose_frames(times, [], None)
 
 
 def test_a_strip_writes_its_times(run, tmp_path):
@@ -139,21 +140,21 @@ def test_a_strip_writes_its_times(run, tmp_path):
 
 @pytest.fixture
 def laid_out(monkeypatch) -> dict:
-    """What strips are made of: the (rows, columns) of the page, and (time, place, survey, axes) of
+    """What strips are made of: the (rows, columns) of the page, and (time, place, layout, axes) of
     each panel."""
     seen: dict = {"panels": []}
-    page, fill = figures.page, figures.fill
+    make_page, fill = figures.make_page, figures.fill
 
     def noted_page(rows, columns, made, title, *, dpi):
         seen["shape"], seen["title"] = (rows, columns), title
-        seen["figure"], seen["axes"] = page(rows, columns, made, title, dpi=dpi)
+        seen["figure"], seen["axes"] = make_page(rows, columns, made, title, dpi=dpi)
         return seen["figure"], seen["axes"]
 
     def noted_fill(ax, frame, place, made, titles):
         seen["panels"].append((seen["axes"].index(ax), frame.time, place, made))
         fill(ax, frame, place, made, titles)
 
-    monkeypatch.setattr(figures, "page", noted_page)
+    monkeypatch.setattr(figures, "make_page", noted_page)
     monkeypatch.setattr(figures, "fill", noted_fill)
     return seen
 
@@ -296,8 +297,8 @@ def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
     """
     made = tf.pictures.movie(run, tmp_path / "a.gif", **film_options)
     with tf.Results(run) as results, Image.open(made) as film:
-        frames = Recorded(results, range(len(results)), "ahl")
-        shared = survey(
+        frames = RecordedFrames(results, range(len(results)), "ahl")
+        shared = plan_layout(
             frames, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")
         )
         drawn = Film(frames, shared, "", 50)
@@ -309,7 +310,7 @@ def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
             assert grey.any() and difference[grey].max() <= 2
             cells = np.unique(
                 np.round(
-                    255 * paint_cells(frames[k].cells, shared.scales, shared.look)[:, :3]
+                    255 * paint_cells(frames[k].cells, shared.scales, shared.style)[:, :3]
                 ).astype(int),
                 axis=0,
             )
@@ -330,8 +331,8 @@ def test_the_nearest_colour_is_the_nearest():
 def test_a_film_moves_neither_its_window_nor_its_legend(run, film_options):
     """What is outside the panels and the titles is the same in every frame."""
     with tf.Results(run) as results:
-        frames = Recorded(results, range(len(results)), None)
-        film = Film(frames, survey(frames, [0], PlotStyle(colour="yfp")), "", 60)
+        frames = RecordedFrames(results, range(len(results)), None)
+        film = Film(frames, plan_layout(frames, [0], PlotStyle(colour="yfp")), "", 60)
         first, last = film[0], film[5]
     assert first.shape == last.shape
     panel = film.axes[0].get_window_extent()
@@ -394,10 +395,12 @@ def test_an_mp4_has_every_frame(run, tmp_path, film_options):
     frames = [np.frombuffer(raw, np.uint8).reshape(*facts["size"][::-1], 3) for raw in stream]
     assert facts["fps"] == 5
     with tf.Results(run) as results:
-        shown = Recorded(results, range(len(results)), "ahl")
+        shown = RecordedFrames(results, range(len(results)), "ahl")
         drawn = Film(
             shown,
-            survey(shown, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")),
+            plan_layout(
+                shown, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")
+            ),
             "",
             50,
         )

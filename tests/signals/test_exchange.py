@@ -67,7 +67,7 @@ def interpolated(
 @pytest.mark.parametrize("periodic", [(False,) * 3, (True,) * 3])
 def test_reading_is_trilinear_interpolation(device, dtype, shape, periodic):
     g = grid([shape], device)
-    position, colony = scattered(g, 200, reservoir=0.6)
+    position, colony = scattered(g, 200, beyond=0.6)
     values = random_values(g, dtype)
     found = stencil(g, position, colony, periodic=periodic, dtype=dtype)
     assert found.node.shape == (200, 2 ** sum(n > 1 for n in shape))

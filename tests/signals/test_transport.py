@@ -185,7 +185,7 @@ common = {
 }
 
 
-def random_operator(seed, shape, power, masked, kind, single, method, faces, decay=0.0):
+def random_operator(seed, shape, power, masked, kind, single, method, boundary, decay=0.0):
     """An operator of which the most that diffuses in a step of 1 h is r = KΔt/h² = 10^power, its
     velocity of a Péclet number up to 100."""
     rng = np.random.default_rng(seed)
@@ -213,7 +213,7 @@ def random_operator(seed, shape, power, masked, kind, single, method, faces, dec
         diffusion=k,
         decay=decay,
         velocity=velocity,
-        boundary=faces,
+        boundary=boundary,
         dtype=dtype,
         mask=torch.as_tensor(mask) if masked else None,
     )
