@@ -402,7 +402,7 @@ def test_the_method_that_suits():
     assert choose(make((3, 2, 2))[0]) == "exponential"
     assert choose(make((3, 2, 2), kind="varying")[0]) == "implicit"
     assert choose(make((3, 2, 2), masked=True)[0]) == "implicit"
-    with pytest.raises(InputError, match=r"exponential.*velocity varies.*implicit"):
+    with pytest.raises(InputError, match=r"exponential.*velocity is not uniform.*implicit"):
         prepare(make((3, 2, 2), kind="varying")[0], 0.1, "exponential")
     with pytest.raises(InputError, match=r"exponential.*obstacle.*implicit"):
         prepare(make((3, 2, 2), masked=True)[0], 0.1, "exponential")

@@ -106,14 +106,14 @@ def minimise(problem: ContactProblem, start: Tensor | None, tolerance: Tensor, m
         unknown,
         torch.zeros_like(scale, dtype=torch.int64),
     )
-    end = _newton(problem, begun, tolerance, max_iterations, 0)
+    end = _newton_rounds(problem, begun, tolerance, max_iterations, 0)
     status = torch.where(end.worst <= tolerance * end.scale, CONVERGED, ITERATION_LIMIT)
     status = torch.where(end.worst < torch.inf, status, NOT_FINITE)
     residual = end.worst / torch.where(still, 1.0, end.scale)
     return end, SolveReport(status, end.iterations, residual)
 
 
-def _newton(
+def _newton_rounds(
     problem: ContactProblem, at: Iterate, tolerance: Tensor, max_iterations: int, rounds: int
 ) -> Iterate:
     """Rounds of Newton's method from the iterate `at` until every colony has converged.
@@ -151,7 +151,7 @@ def _newton(
         which = _minority(problem, going)
         if which is not None:  # a few colonies go on without the cost of the others
             part = replace(here.part(which), worst=previous.index_select(0, which.colonies))
-            end = _newton(
+            end = _newton_rounds(
                 problem.part(which),
                 part,
                 tolerance.index_select(0, which.colonies),

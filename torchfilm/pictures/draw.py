@@ -164,7 +164,7 @@ def add_cells(
 
     u, v = VIEWS[style.view]
     if cells["position"].shape[1] == 3:
-        # seen against y in "xz", since x, z and what comes towards the eye turn like x, y and z
+        # In "xz" the viewer looks along +y, since x, z and −y are right-handed.
         order = np.argsort(
             cells["position"][:, along(style.view)] * (-1 if style.view == "xz" else 1),
             kind="stable",
