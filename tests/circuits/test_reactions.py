@@ -1,5 +1,4 @@
-"""Reactions, parts and networks: what they say, what they input_error, and their rates against the
-formulas written out."""
+"""Reactions, parts and networks: their texts, their errors, and their rates against formulas."""
 
 from __future__ import annotations
 
@@ -82,7 +81,7 @@ def test_rates_are_the_formulas(device, dtype):
         assert array(change[k]) == pytest.approx(
             product[:, k], rel=1e-5 if dtype == torch.float32 else 1e-12
         )
-    # what leaves the cell enters the medium: amounts are both times the volume
+    # an amount that leaves the cell enters the medium: both are multiplied by the volume
     assert array(change[3]) == pytest.approx(array(found[5] - found[6]), rel=1e-6)
 
 
@@ -199,7 +198,8 @@ def test_gradient_of_rates():
 
 def test_propensities_count_combinations(device, dtype):
     """k Ω n(n − 1)/Ω² for 2 a; rate times Ω for functions; whole molecules only; a signal by its
-    own pool."""
+    pool.
+    """
     net = build_network(
         [
             Reaction.of("2 a -> b", 0.5),
@@ -234,9 +234,10 @@ def test_propensities_count_combinations(device, dtype):
 
 
 def test_both_ways_of_running_agree():
-    """Many molecules: the mean of the stochastic run is the smooth solution. Dimerisation among
-    1,000 molecules: fluctuations shift the mean by a few molecules, 1 % is 10 of them; the sample's
-    standard error is 1.
+    """With many molecules, the mean of the stochastic run is the deterministic solution.
+
+    For dimerisation among 1,000 molecules, fluctuations shift the mean by a few molecules; 1 % is
+    10 of them. The sample's standard error is 1.
     """
     net = build_network(
         [

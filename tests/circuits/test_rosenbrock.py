@@ -1,5 +1,6 @@
-"""The stiff integrator: order, oracle, positivity, what is conserved, failures, gradients, and that
-a cell's result is its own."""
+"""The stiff integrator: order, references, positivity, conservation, failures, gradients,
+independence of cells.
+"""
 
 from __future__ import annotations
 
@@ -48,8 +49,9 @@ def lux(u, rows):
 
 
 def ring(u, rows):
-    """Six species, each activated by the one before; written as a user would, with a broken
-    power."""
+    """Six species, each activated by the one before, written as by a user, with a fractional
+    power.
+    """
     with deterministic_functions():
         x = u.unbind(1)
         return torch.stack(
@@ -66,7 +68,10 @@ def exact(rates, start, t, **options) -> np.ndarray:
 
 def test_order_three():
     """Equal steps (every error allowed) on a nonlinear circuit: halving the step divides the error
-    by 2³, measured over three halvings within 10 %."""
+    by 2³.
+
+    Measured over three halvings, within 10 %.
+    """
     start = [0.3, 1.4]
     reference = exact(toggle, start, 2.0)
     errors = []
@@ -81,8 +86,9 @@ def test_order_three():
 
 
 def test_error_estimate_is_of_order_two_results():
-    """The step that is chosen shrinks with the cube root of rtol: the estimate is that of the
-    embedded result, h³."""
+    """The chosen step shrinks with the cube root of rtol: the estimate is that of the embedded
+    result, h³.
+    """
     start, counts = torch.tensor([[0.3, 1.4]], dtype=F64), []
     for rtol in (1e-6, 1e-9):
         counts.append(int(rodas3(toggle, start, 2.0, rtol=rtol, atol=0.0)[1].accepted))
@@ -94,8 +100,10 @@ def test_error_estimate_is_of_order_two_results():
     [(toggle, [0.3, 1.4], 5.0), (lux, [0.0, 0.0, 0.0], 20.0), (robertson, [1.0, 0.0, 0.0], 40.0)],
 )
 def test_against_lsoda(device, dtype, rates, start, t):
-    """Stable circuits: the error at the end is a few times what a step is allowed, rtol (1e-4 by
-    default); ten times that is the bound."""
+    """Stable circuits: the error at the end is a few times the allowed error of a step, rtol.
+
+    rtol is 1e-4 by default; the bound is ten times that.
+    """
     u, report = rodas3(rates, torch.tensor([start], dtype=dtype, device=device), t, atol=1e-10)
     assert (report.status == DONE).all()
     assert u.dtype == dtype
@@ -109,7 +117,7 @@ def test_error_follows_the_tolerance(rtol):
 
 
 def test_one_step_where_one_is_enough(device, dtype):
-    """The whole of dt is tried at once: near a fixed point that is all, however fast the decay."""
+    """The first step is the whole dt. Near a fixed point it is enough, however fast the decay."""
     rates = lambda u, rows: 1e8 * (1.0 - u)
     u, report = rodas3(rates, torch.ones(4, 2, dtype=dtype, device=device), 1.0)
     assert (report.accepted == 1).all() and (report.rejected == 0).all()
@@ -119,9 +127,12 @@ def test_one_step_where_one_is_enough(device, dtype):
 @pytest.mark.parametrize("size", [1.0, 1e-3, 1e-6, 1e-12, 1e-25])
 @pytest.mark.parametrize("t", [0.025, 1e-6, 3e-8])
 def test_a_fast_decay_to_zero_does_not_stall(device, dtype, size, t):
-    """Rates of 1e8 and 3e7 in a row beside slow ones: nothing below zero, the slow ones right, and
-    steps as many as the accuracy of a decay over the decades down to atol asks for (some 20 each),
-    not t · 1e8."""
+    """Rates of 1e8 and 3e7 in a row with slow ones: nothing is below zero, and the slow ones are
+    right.
+
+    The number of steps follows from the accuracy of a decay over the decades down to atol (some 20
+    each), not from t · 1e8.
+    """
     u, report = rodas3(chain, torch.tensor([[size, 0.0, 1.0, 2.0]], dtype=dtype, device=device), t)
     assert int(report.status) == DONE
     assert int(report.accepted + report.rejected) <= 250
@@ -130,8 +141,10 @@ def test_a_fast_decay_to_zero_does_not_stall(device, dtype, size, t):
 
 
 def test_rates_are_not_asked_below_zero(device, dtype):
-    """x' = −1e6 x from below atol: stages of a long step lie at −x, where x^1.5 is no number. The
-    rates are continued linearly there, so one step will do."""
+    """x' = −1e6 x from below atol: stages of a long step lie at −x, where x^1.5 is NaN.
+
+    The rates are continued linearly there, so one step is enough.
+    """
     seen = []
 
     def rates(u, rows):
@@ -143,7 +156,7 @@ def test_rates_are_not_asked_below_zero(device, dtype):
     assert int(report.status) == DONE and int(report.accepted + report.rejected) <= 3
     assert min(seen) >= 0
     assert float(u[0, 1]) == pytest.approx(1e-3 * np.exp(-0.025), rel=1e-4)
-    # where values may be negative they are asked as they are
+    # where values may be negative, the rates are evaluated there
     rodas3(
         rates,
         torch.tensor([[1e-13, 1e-3]], dtype=dtype, device=device),
@@ -156,8 +169,10 @@ def test_rates_are_not_asked_below_zero(device, dtype):
 
 @pytest.mark.parametrize("t", [0.4, 40.0, 4e9])
 def test_what_the_rates_conserve_is_conserved(device, dtype, t):
-    """Robertson's a + b + c = 1: kept to rounding, a unit of the dtype for each of 150 steps adding
-    up at random and one more for f in it."""
+    """Robertson's a + b + c = 1 is conserved to rounding.
+
+    The bound is a unit of the dtype for each of 150 steps, adding up at random, and one more for f.
+    """
     u, report = rodas3(
         robertson, torch.tensor([[1.0, 0.0, 0.0]], dtype=dtype, device=device), t, atol=1e-10
     )
@@ -167,9 +182,11 @@ def test_what_the_rates_conserve_is_conserved(device, dtype, t):
 
 
 def test_conserved_where_results_are_raised_to_zero():
-    """a + b -> c has two conserved sums; over steps so long that plain results would be below zero
-    still nothing is lost: rounding of W's entries, up to 1e4 · 5, against 2/h in it, is 1e-16 · h ·
-    5e4 of what moves, at most 5."""
+    """a + b -> c has two conserved sums, which hold even where plain results would be below zero.
+
+    The rounding of W's entries, up to 1e4 · 5, relative to 2/h, is 1e-16 · h · 5e4 of the converted
+    amount, at most 5.
+    """
 
     def rates(u, rows):
         a, b, _ = u.unbind(1)
@@ -193,11 +210,11 @@ def test_conserved_where_results_are_raised_to_zero():
 
 @pytest.mark.parametrize("fastest", [4, 8])
 def test_nonnegative_over_random_networks(device, dtype, fastest):
-    """200 cells of random first- and second-order reactions with constants from 1e-3 to 10^fastest,
-    from random starts, some at 0: never below 0, all done.
+    """200 cells of random first- and second-order reactions: never below 0, and all are done.
 
-    The sum is conserved but for the rates' own rounding, which adds up to eps · rate · time for
-    what moves: 0.025 · 1e4 · 6e-8 = 1.5e-5 in float32, where 1e8 asks for float64.
+    Constants are from 1e-3 to 10^fastest, starts are random, some at 0. The sum is conserved except
+    for the rounding of the rates, which adds up to eps · rate · time of the converted amount: 0.025
+    · 1e4 · 6e-8 = 1.5e-5 in float32, where 1e8 requires float64.
     """
     g = torch.Generator().manual_seed(7)
     pick = lambda *shape: 10 ** (torch.rand(*shape, generator=g, dtype=F64) * (fastest + 3) - 3)
@@ -231,8 +248,9 @@ def test_negative_values_are_free_where_asked_for(device, dtype):
 
 
 def test_failures_stay_with_their_cell(device, dtype):
-    """A rate that is NaN, one that becomes infinite on the way, one that pushes below zero, and one
-    that needs more steps than it may; the others go on."""
+    """Four failures: a NaN rate, a rate that becomes infinite, one that makes a concentration
+    negative, and one that requires too many steps. The other cells continue.
+    """
 
     def rates(u, rows):
         x = u[:, 0]
@@ -248,7 +266,7 @@ def test_failures_stay_with_their_cell(device, dtype):
     assert int(report.status[2]) in (NOT_FINITE, TOO_MANY_STEPS)  # x' = x² is infinite at t = 1
     assert report.status.tolist()[3:] == [BELOW_ZERO, TOO_MANY_STEPS, DONE]
     assert torch.isfinite(u).all()
-    assert float(u[1]) == 1.0 and int(report.rejected[1]) == 1  # given up at once
+    assert float(u[1]) == 1.0 and int(report.rejected[1]) == 1  # fails at once
     assert float(u[0]) == pytest.approx(np.exp(-2), rel=1e-3) and float(u[5]) == float(u[0])
 
 
@@ -258,7 +276,7 @@ def test_nothing_to_do(device, dtype):
     start = torch.rand(3, 2, dtype=dtype, device=device)
     same, report = rodas3(toggle, start, 0.0)
     assert torch.equal(same, start) and (report.status == DONE).all()
-    # a rate that does not depend on what there is has no Jacobian
+    # a constant rate has no Jacobian
     grown, _ = rodas3(
         lambda u, rows: torch.full_like(u, 2.0).detach(),
         torch.zeros(2, 1, dtype=dtype, device=device),
@@ -269,9 +287,11 @@ def test_nothing_to_do(device, dtype):
 
 @pytest.mark.parametrize("count", [2, 7, 33, 200])
 def test_a_row_is_its_own(dtype, count):
-    """Bit by bit the same alone, in any batch and at any place: easy and stiff rows, results and
-    step counts. With a gradient, the Jacobian is worked out the other way, so the same but for
-    rounding."""
+    """Bitwise the same alone, in any batch and at any position, for easy and stiff rows.
+
+    This covers results and step counts. With a gradient the Jacobian is computed in the other way,
+    so results agree to rounding.
+    """
     g = torch.Generator().manual_seed(count)
     speed = (10 ** (torch.rand(count, generator=g, dtype=F64) * 6 - 1)).to(dtype)
     start = (torch.rand(count, 6, generator=g, dtype=F64) ** 3).to(dtype)
@@ -297,8 +317,9 @@ def test_a_row_is_its_own(dtype, count):
 
 
 def test_gradient_of_one_step():
-    """Exact derivative of what is computed, through the Jacobian and both solves: gradcheck,
-    float64."""
+    """The exact derivative of the step, through the Jacobian and both solves: gradcheck,
+    float64.
+    """
     u = torch.tensor([[0.3, 1.4], [2.0, 0.1]], dtype=F64, requires_grad=True)
     k = torch.tensor([4.0, 3.0], dtype=F64, requires_grad=True)
 
@@ -313,9 +334,10 @@ def test_gradient_of_one_step():
 
 
 def test_gradient_through_many_steps(dtype):
-    """Robertson's rate constants over 4 h, by central differences of runs with rtol 1e-7 (float64),
-    whose own steps then do not matter: 1e-3 relative leaves truncation 1e-6 and noise 1e-4. The
-    gradient's own error is that of the steps it goes through, some 10 rtol = 1e-3 of the answer.
+    """Robertson's rate constants over 4 h, by central differences of runs with rtol 1e-7 (float64).
+
+    At that rtol the steps of these runs have no effect: 1e-3 relative has a truncation of 1e-6 and
+    noise of 1e-4. The gradient's own error is that of its steps, some 10 rtol = 1e-3 of the result.
     """
 
     def run(k, rtol):
@@ -337,8 +359,11 @@ def test_gradient_through_many_steps(dtype):
 
 
 def test_gradient_where_results_are_raised_and_steps_rejected():
-    """Rejected steps and steps drawn to zero leave no NaN behind, and what is conserved has its
-    exact gradient: ∂(a + b + c + …)/∂start = 1."""
+    """Rejected steps and steps moved to zero give no NaN, and conserved sums have their exact
+    gradient.
+
+    ∂(a + b + c + …)/∂start = 1.
+    """
 
     def rates(u, rows):
         a, b, _ = u.unbind(1)
@@ -354,8 +379,10 @@ def test_gradient_where_results_are_raised_and_steps_rejected():
 
 
 def test_gradient_where_a_rejected_step_is_not_finite():
-    """x' = x − 1e-30 eˣ from 10 over 1.98 h: the first trial overflows (2/h − J is 0.01), the steps
-    taken do not. Against central differences."""
+    """x' = x − 1e-30 eˣ from 10 over 1.98 h, against central differences.
+
+    The first trial step overflows (2/h − J is 0.01), the accepted steps do not.
+    """
     rates = lambda u, rows: u - 1e-30 * torch.exp(u)
     x = torch.full((3, 1), 10.0, dtype=F64) + torch.tensor([[0.0], [1e-3], [-1e-3]], dtype=F64)
     x.requires_grad_()
@@ -376,8 +403,10 @@ def test_no_graph_without_need():
 
 @pytest.mark.parametrize("size", [1, 2, 5, 12])
 def test_linear_systems(device, dtype, size):
-    """Against torch.linalg in float64; the transposed solve and the gradients too. Diagonally
-    dominant: errors of a few units of rounding."""
+    """Against torch.linalg in float64, with the transposed solve and the gradients.
+
+    The matrices are diagonally dominant: errors are a few units of rounding.
+    """
     g = torch.Generator().manual_seed(size)
     matrix = (
         torch.rand(size, size, 9, generator=g, dtype=F64)
@@ -409,8 +438,9 @@ def test_linear_systems(device, dtype, size):
 
 
 def test_pivots_that_vanish_are_noticed():
-    """J = 2/h makes W singular at its first pivot: reported, and the step is taken again at another
-    size."""
+    """J = 2/h makes W singular at its first pivot: this is reported, and the step is repeated with
+    another size.
+    """
     matrix = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=F64).unsqueeze(2)
     assert not bool(linear.factor(matrix, torch.ones(2, 1, dtype=F64))[1])
     u, report = rodas3(lambda u, rows: 2.0 * u, torch.ones(1, 1, dtype=F64), 1.0)

@@ -1,4 +1,4 @@
-"""BoundaryConditions: what may be asked for, and which colonies get which value."""
+"""BoundaryConditions: valid arguments, and the value of each colony."""
 
 from __future__ import annotations
 
