@@ -1,5 +1,4 @@
-"""Pictures: what colour a cell or a place of the medium gets, which part of it is seen, and what
-the legend says of it."""
+"""Pictures: colours of cells and medium, sections and windows, and legends."""
 
 from __future__ import annotations
 
@@ -34,8 +33,10 @@ def frame(
     height=None,
     **fields,
 ) -> Frame:
-    """Round cells of radius 1 at (N, d), with any fields; signals (nx, ny, nz) are the same for all
-    colonies."""
+    """Round cells of radius 1 at (N, d), with any fields.
+
+    signals: (nx, ny, nz), the same for all colonies.
+    """
     position = np.asarray(position, dtype=float)
     n, dim = position.shape
     colony = np.zeros(n, dtype=int) if colony is None else np.asarray(colony)
@@ -69,7 +70,7 @@ def frame(
 
 
 class Drawn:
-    """A sheet as pixels, to be asked what colour is where."""
+    """A sheet as pixels, to read colours at positions."""
 
     def __init__(self, what: Frame, **options):
         style = PlotStyle(**options)
@@ -82,7 +83,7 @@ class Drawn:
         self.pixels = np.asarray(canvas.buffer_rgba())[..., :3] / 255.0
 
     def at(self, x: float, y: float, panel: int = 0) -> np.ndarray:
-        """The colour at a place, µm."""
+        """The colour at a position, µm."""
         u, v = self.axes[panel].transData.transform((x, y))
         return self.pixels[len(self.pixels) - 1 - int(v), int(u)]
 
@@ -122,8 +123,7 @@ def test_one_range_for_all_colonies():
 
 
 def test_lights_of_channels_add_up():
-    """cyan + yellow is white; a cell that gives off no light is dark, but not as dark as the
-    paper."""
+    """Cyan + yellow is white; a cell without light is dark, but not as dark as the paper."""
     drawn = Drawn(
         frame([[0, 0], [4, 0], [8, 0], [12, 0]], cfp=[2.0, 0, 2.0, 0], yfp=[0, 0.5, 0.5, 0]),
         channels={"cfp": "cyan", "yfp": "yellow"},
@@ -183,8 +183,10 @@ def test_kinds_of_cells_have_a_colour_each():
 
 @pytest.mark.parametrize("view, nearest", [("xy", 2), ("xz", 1), ("yz", 0)])
 def test_the_cell_nearest_to_the_eye_hides_the_others(view, nearest):
-    """x, y, z turn right: one looks down on xy from above, at xz from the side where y is low, at
-    yz from that where x is high."""
+    """x, y, z are right-handed.
+
+    So one looks at xy from above, at xz from the side of low y, and at yz from the side of high x.
+    """
     position = np.zeros((2, 3))
     position[0, nearest] = -3.0 if view == "xz" else 3.0
     drawn = Drawn(frame(position, yfp=[1.0, 0.0]), colour="yfp", view=view)
@@ -207,7 +209,7 @@ def ramp(axis: int, shape=(16, 16, 8)) -> np.ndarray:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_white_is_lowest_and_black_highest_at_the_right_places(axis):
-    """Voxel centres stand at −7.5 … 7.5 µm, so at place p the ramp is (p + 7.5)/15."""
+    """Voxel centres are at −7.5 … 7.5 µm, so at position p the ramp is (p + 7.5)/15."""
     drawn = Drawn(frame([[0.0, 0.0]], signals={"ahl": ramp(axis)}), background="ahl", whole=True)
     for p in (-7.0, -3.3, 2.0, 6.5):
         place = (p, 5.0) if axis == 0 else (5.0, p)
@@ -249,8 +251,9 @@ def test_the_mean_is_that_along_the_line_of_sight():
 
 
 def test_a_section_is_at_the_height_of_the_cells():
-    """Cells of three dimensions: their mean. Those of two: their plane, if it is known. The legend
-    says where."""
+    """For 3-D cells at their mean, for 2-D cells at their plane, if known. The legend gives the
+    height.
+    """
     values = ramp(2)  # centres at −3.5 … 3.5 µm: at z it is (z + 3.5)/7
     deep = frame([[0, 0, 1.0], [0, 4, 2.0]], signals={"ahl": values})
     flat = frame([[0, 0]], signals={"ahl": values}, height=-2.0)
@@ -271,7 +274,7 @@ def test_a_section_is_at_the_height_of_the_cells():
 
 
 def test_a_plane_of_cells_that_is_not_known_is_asked_for():
-    """2-D cells stand at z = 0 unless told; where that is not in the box, nothing is guessed."""
+    """2-D cells are at z = 0 by default; if that is outside the box, an error is raised."""
     what = frame([[0, 0]], signals={"ahl": ramp(2)}, origin=(-8, -8, 10))
     with pytest.raises(tf.InputError, match=r"section.*10 to 18"):
         plan_layout([what], [0], PlotStyle(background="ahl"))
@@ -316,7 +319,7 @@ def test_the_whole_box():
 
 
 def test_what_is_beyond_the_box_is_no_concentration():
-    """Cells that reach far beyond an open box: there the picture is of a colour that is no grey."""
+    """Outside the box, where cells extend far, the picture's colour is not grey."""
     what = frame([[0.0, 0.0], [12.0, 0.0]], signals={"ahl": np.zeros((16, 16, 1))})
     from matplotlib.colors import to_rgb
 
@@ -327,20 +330,21 @@ def test_what_is_beyond_the_box_is_no_concentration():
 
 @pytest.mark.parametrize("dpi", [72, 101, 150, 163.7])
 def test_pages_have_even_numbers_of_pixels(dpi):
-    """Films need it."""
+    """Films require it."""
     what = frame([[0.0, 0.0], [7.0, 2.0]], yfp=[1, 2])
     figure = sheet_figure(what, [0], PlotStyle(colour="yfp"), "a title", dpi)
     assert all(n % 2 == 0 for n in FigureCanvasAgg(figure).get_width_height())
 
 
 def boxes(figure: Figure) -> list:
-    """Where everything on a page is, pixels: panels, legends with their numbers, titles, scale
-    bar."""
+    """The position of everything on a page, pixels: panels, legends with numbers, titles, scale
+    bar.
+    """
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     renderer = canvas.get_renderer()
     panels = [ax for ax in figure.axes if ax.get_visible()]
-    # what stands outside the frame of its axes
+    # artists outside the frame of their axes
     outside = [
         t
         for ax in panels
@@ -443,7 +447,7 @@ def test_a_range_is_never_empty(values):
 
 
 def test_a_figure_of_ones_own():
-    """The parts go together on any axes: the cells' window shows the signal behind them."""
+    """The functions work together on any axes: the cells' window shows the signal behind them."""
     figure = Figure(dpi=100)
     ax, below = figure.subplots(2, 1)
     what = frame([[-2.0, 0.0], [2.0, 0.0]], yfp=[0.0, 1.0])
@@ -519,7 +523,7 @@ def test_a_scene_without_a_medium_has_no_box_and_no_background():
 
 
 def test_a_state_is_a_frame(dtype, device):
-    """Signals of grids of several colonies each find their own, and know where they are."""
+    """Signals on grids of several colonies: each colony gets its own values and positions."""
     medium = tf.Medium(
         ahl=tf.Signal(diffusion=1.0, initial=lambda x: 20 + x[:, 0] + 0.1 * x[:, 2]),
         box=((-8, -4, -2), (8, 4, 6)),

@@ -22,15 +22,17 @@ UNTIL = 2.0
 
 
 def brighter(cells):
-    """yfp is the time, cfp the number of the cell."""
+    """yfp is the time; cfp is the number of the cell."""
     cells.yfp = 0 * cells.yfp + cells.time
     cells.cfp = cells.uid.to(cells.yfp)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
-    """Two colonies of a few cells that shine brighter with time, in a medium from which a signal
-    fades. Six frames. To be read only."""
+    """Two colonies of a few cells that become brighter with time, in a medium whose signal decays.
+
+    Six frames, read-only.
+    """
     path = tmp_path_factory.mktemp("times") / "run.h5"
     medium = tf.Medium(
         ahl=tf.Signal(diffusion=1.0, decay=1.0, initial=1.0),
@@ -61,7 +63,7 @@ def pixels(path) -> np.ndarray:
 
 
 def test_ranges_and_windows_are_those_of_all_frames(run):
-    """The first frame is the darkest in yfp and the richest in ahl; all share the ends of both."""
+    """The first frame has the lowest yfp and the highest ahl; all frames share both ranges."""
     with tf.Results(run) as results:
         style = PlotStyle(colour="yfp", background="ahl")
         frames = RecordedFrames(results, range(len(results)), "ahl")
@@ -71,7 +73,7 @@ def test_ranges_and_windows_are_those_of_all_frames(run):
         assert made.scales[0].limits == pytest.approx(
             (min(v.min() for v in every), max(v.max() for v in every))
         )
-        # cut at z = 0, between two layers that are alike
+        # cut at z = 0, between two equal layers
         assert made.behind.limits == pytest.approx(
             (min(v.min() for v in signal), max(v.max() for v in signal)), rel=1e-5
         )
@@ -123,7 +125,7 @@ def test_frames_of_a_strip():
 
 
 def test_a_strip_writes_its_times(run, tmp_path):
-    """The times that were recorded, not those that were asked for."""
+    """The recorded times, not the given ones."""
     made = tf.pictures.strip(
         run,
         times=[0.1, 1.1, 2.0],
@@ -132,7 +134,7 @@ def test_a_strip_writes_its_times(run, tmp_path):
         colonies=[1],
         out=tmp_path / "a.svg",
     )
-    text = made.read_text()  # matplotlib writes each text as a comment beside its shapes
+    text = made.read_text()  # matplotlib writes each text as a comment next to its shapes
     for time in ("0 h", "1.2 h", "2 h", "colony 1", "yfp", "ahl outside", "z = 0 µm", "µm"):
         assert time in text, time
     assert "0.1 h" not in text and "1.1 h" not in text
@@ -140,8 +142,7 @@ def test_a_strip_writes_its_times(run, tmp_path):
 
 @pytest.fixture
 def laid_out(monkeypatch) -> dict:
-    """What strips are made of: the (rows, columns) of the page, and (time, place, layout, axes) of
-    each panel."""
+    """The (rows, columns) of a strip's page, and (time, place, layout, axes) of each panel."""
     seen: dict = {"panels": []}
     make_page, fill = figures.make_page, figures.fill
 
@@ -184,8 +185,9 @@ def test_a_colony_is_a_row_and_time_runs_along_it(run, tmp_path, laid_out):
 
 
 def test_wide_panels_stand_one_below_the_other(run, tmp_path, laid_out):
-    """Cells in a row seen without the box: more than twice as wide as high. A colony is a column
-    then."""
+    """Cells in a row without the box are more than twice as wide as high, so a colony is a
+    column.
+    """
     tf.pictures.strip(run, times=[0.0, 0.4], out=tmp_path / "a.png")
     width, height = laid_out["panels"][0][3].size
     assert width > 2 * height and laid_out["shape"] == (2, 2)
@@ -211,7 +213,7 @@ def test_a_strip_stands_beside_the_results(run):
 
 
 def test_a_colony_that_has_no_cells_yet_or_any_more_is_drawn_empty(tmp_path):
-    """Removed in mid-run: its panel stays, with the signal in it."""
+    """After its cells are removed, a colony's panel stays, with the signal."""
     medium = tf.Medium(
         ahl=tf.Signal(diffusion=1.0, initial=1.0), box=((-16, -8, -4), (16, 8, 4)), spacing=4.0
     )
@@ -235,8 +237,10 @@ def test_a_colony_that_has_no_cells_yet_or_any_more_is_drawn_empty(tmp_path):
 
 
 def test_show_draws_the_signal(run, tmp_path):
-    """The signal is uniform, and so in the middle of its range, which is that of the frame: paper
-    of one colour about the cells, white lowest."""
+    """The uniform signal is in the middle of its range, that of the frame, with white lowest.
+
+    So the paper around the cells has one colour.
+    """
     low = pixels(tf.show(run, background="ahl", limits={"ahl": (0, 10)}, out=tmp_path / "low.png"))
     high = pixels(
         tf.show(run, background="ahl", limits={"ahl": (0, 1e-3)}, out=tmp_path / "high.png")
@@ -249,7 +253,7 @@ def test_show_draws_the_signal(run, tmp_path):
     "draw", [tf.show, tf.pictures.strip, lambda path, out: tf.pictures.movie(path, out)]
 )
 def test_no_picture_replaces_the_results(run, tmp_path, draw):
-    """Not even where the results are called like a picture."""
+    """Not even if the results have the name of a picture."""
     own = tmp_path / "run.gif"
     own.write_bytes(run.read_bytes())
     with pytest.raises(tf.InputError, match="another file than the results"):
@@ -290,9 +294,10 @@ def test_every_other_frame_and_the_last(run, tmp_path, film_options):
 
 
 def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
-    """Greys are 255/103 apart, so a grey pixel is off by 1.3 at most, rounded 2. The 151 other
-    colours serve two maps, each a line of length 310 in the space of colours, and a few cells
-    between them: about 4 apart, and so no cell's is off by more than 8. What blends at an edge is
+    """Greys are 255/103 apart, so the error of a grey pixel is 1.3 at most, rounded to 2.
+
+    The 151 other colours serve two maps, each a line of length 310 in colour space, and a few cells
+    between them. They are about 4 apart, so no cell's error exceeds 8. Blended pixels at edges are
     in no legend.
     """
     made = tf.pictures.movie(run, tmp_path / "a.gif", **film_options)
@@ -329,7 +334,7 @@ def test_the_nearest_colour_is_the_nearest():
 
 
 def test_a_film_moves_neither_its_window_nor_its_legend(run, film_options):
-    """What is outside the panels and the titles is the same in every frame."""
+    """Outside the panels and the titles every frame is the same."""
     with tf.Results(run) as results:
         frames = RecordedFrames(results, range(len(results)), None)
         film = Film(frames, plan_layout(frames, [0], PlotStyle(colour="yfp")), "", 60)
@@ -367,8 +372,9 @@ def test_mp4_names_what_it_needs(run, tmp_path, monkeypatch):
 
 
 def test_a_film_that_breaks_off_leaves_the_old_one(run, tmp_path, monkeypatch, film_options):
-    """A full disk in the middle of it: told, nothing half written stays, and a film of that name
-    that was there is still whole."""
+    """A full disk in the middle of a film raises an error, leaves no partial file, and keeps an
+    older film of that name.
+    """
     old = tmp_path / "a.gif"
     old.write_bytes(b"an old film")
 
@@ -382,7 +388,7 @@ def test_a_film_that_breaks_off_leaves_the_old_one(run, tmp_path, monkeypatch, f
     assert [p.name for p in tmp_path.iterdir()] == ["a.gif"] and old.read_bytes() == b"an old film"
 
 
-# the reader of imageio-ffmpeg leaves its pipes to the collector
+# the reader of imageio-ffmpeg closes its pipes only at garbage collection
 @pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
 )
