@@ -125,7 +125,10 @@ def test_no_cell_no_overlap():
 
 # --- CSV and HDF5 ---------------------------------------------------------------------------------
 
-CSV = "x,y,angle,length,radius,cell_type,colony,gfp\n0,1,0,2.0,0.5,1,0,0.25\n10,1,1.5707963267948966,3.0,0.4,0,1,0.75\n"
+CSV = (
+    "x,y,angle,length,radius,cell_type,colony,gfp\n0,1,0,2.0,0.5,1,0,0.25\n"
+    "10,1,1.5707963267948966,3.0,0.4,0,1,0.75\n"
+)
 
 
 def test_csv(tmp_path):

@@ -9,8 +9,7 @@ from torch import Tensor
 
 @torch.no_grad()
 def binomial(count: Tensor, share: Tensor, uniform: Tensor) -> Tensor:
-    """The number of `count` (M,) molecules in the first daughter, each there with probability
-    `share` (M,).
+    """The molecules of `count` (M,) in the first daughter, each with probability `share` (M,).
 
     It is the least k with P(X ≤ k) ≥ uniform (M,).
     """

@@ -28,8 +28,7 @@ TERM = re.compile(r"(?:(\d+)\s*\*?\s*)?((?:out\.)?[A-Za-z_]\w*)")
 
 @dataclass(frozen=True, eq=False)
 class Reaction:
-    """Molecules `consumes` turn into `produces` at `rate`; both map a name to a number of
-    molecules.
+    """Molecules `consumes` turn into `produces` at `rate`; both map names to numbers of molecules.
 
     rate: a constant (a number, one per colony, or a parameter's name) gives mass action, rate × Π
     concentration^order over the consumed species. A function (u, s, p, cell) -> (n,) gives conc/h.

@@ -249,8 +249,7 @@ class _Tableau:
         lu: Tensor,
         jacobian: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Results that are not below zero, and how much this changes them (M,), in units of the
-        allowed error.
+        """Results that are not below zero, and the change (M,), in units of the allowed error.
 
         A result that is negative by more than rounding is moved towards v, two steps of backward
         Euler over h/2 with the same W, which cannot go below zero in a linear circuit: new = v + θ

@@ -55,8 +55,7 @@ def tau_leap(
     orders: Tensor | None = None,
     max_steps: int = 100_000,
 ) -> tuple[Tensor, StochasticReport]:
-    """Molecule numbers (N, S) after dt hours by tau-leaping, with single events where leaps do not
-    pay.
+    """Molecule numbers (N, S) after dt hours by tau-leaping, or single events if they cost less.
 
     A reaction must be limited by a species that it consumes. So a gene that switches from "off" to
     "on" is two species, on and off; otherwise a leap could switch it on twice.

@@ -1,6 +1,4 @@
-"""The capsule: a cylinder of centreline length l with hemispherical caps of radius r; lengths in
-µm.
-"""
+"""The capsule: a cylinder of length l with hemispherical caps of radius r; lengths in µm."""
 
 from __future__ import annotations
 
@@ -28,8 +26,9 @@ def area(length: Tensor, radius: Tensor) -> Tensor:
 def drag(
     length: Tensor, radius: Tensor, viscosity: Tensor | float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Overdamped drag of one cell: μL for translation, μL³/12 for rotation across its axis, μLr²/2
-    about it.
+    """Overdamped drag of one cell, in translation and in rotation across and about its axis.
+
+    They are μL, μL³/12 and μLr²/2.
 
     The slender rod has no resistance about its own axis. The last term is that of a rod of finite
     radius; it makes the tensor positive definite. Each (N,), in units of μ times µm, µm³ and µm³.

@@ -221,9 +221,7 @@ class CandidateContacts:
     def among(
         capsules: Capsules, first: Tensor, second: Tensor, include_near: bool = False
     ) -> CandidateContacts:
-        """The pairs (first, second), each (P,), that overlap; with include_near also those within
-        NEAR.
-        """
+        """The given pairs, each (P,), that overlap; with include_near also those within NEAR."""
         a, b = capsules.take(first), capsules.take(second)
         found = CandidateContacts(first, second, a, b, *closest_points(a, b))
         with torch.no_grad():

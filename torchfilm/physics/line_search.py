@@ -17,7 +17,7 @@ DOWNHILL, MAX_HALVINGS = 0.01, 30
 
 
 def search_line(problem: ContactProblem, y, after, gradient, direction, going):
-    """Take the full step, with lengths stopped at their bounds, or shorten it where the energy
+    """Take the full step with lengths stopped at their bounds, or a shorter one if the energy
     rises.
 
     In colonies where the energy would rise again along the step, the step ends where the energy is

@@ -85,8 +85,8 @@ class Neighbourhood:
 
     @torch.no_grad()
     def pairs_of(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Every pair that contains at least one of `cells` (M,), once; that cell is the first of
-        the pair.
+        """Every pair with at least one of `cells` (M,), once; that cell is the first of the
+        pair.
         """
         selected = torch.zeros(
             self.reach.numel(), dtype=torch.bool, device=self.reach.device

@@ -10,7 +10,7 @@
 | J M⁻¹ Δp + d = ε, eq. 4      | `rows` = D J M^(−½), a `ContactJacobian`; x = M^(−½) y       |
 | ‖Dε‖² + α Δpᵀ M⁻¹ Δp → min   | (JᵀJ + α) y = Jᵀ g with the scaled J and g; Δp = M x         |
 
-Three things are not in the paper:
+Where the solve goes beyond the paper:
 
 - Rotational drag differs about the cell's axis. A contact on a centreline exerts no torque about
   that axis, so this direction is never entered, and M stays diagonal.

@@ -26,9 +26,7 @@ class FlatSurface:
     offset: float | Tensor  # µm; one number or one per colony
 
     def gap_of_points(self, points: Tensor, colony: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (P,) of points (P, d), float64, and the unit direction to the wall, (d,
-        P).
-        """
+        """Signed distance (P,) of points (P, d), float64, and the direction to the wall, (d, P)."""
         normal = _vectors(self.normal, colony, points)
         distance = (points * normal).sum(1) - _per_cell(self.offset, colony, points)
         return distance, (-normal).expand(points.shape).T
@@ -76,8 +74,8 @@ class RoundSurface:
         )
 
     def foot(self, position: Tensor, axis: Tensor, colony: Tensor) -> Tensor:
-        """Where each cell's axis line is nearest to the sphere's centre, from the cell's centre,
-        (P,) µm.
+        """Where each cell's axis is nearest to the sphere's centre, from the cell's centre, (P,)
+        µm.
         """
         return ((_vectors(self.center, colony, position) - position) * axis).sum(1)
 

@@ -99,9 +99,7 @@ class PlotStyle:
 
     @property
     def signal(self) -> str | None:
-        """The background signal as "out.NAME", which differs from a quantity of the cells; or
-        None.
-        """
+        """The background signal as "out.NAME", unlike a quantity of the cells; or None."""
         return None if self.background is None else OUTSIDE + self.background
 
     def given_limits(self, name: str) -> tuple[float, float] | None:

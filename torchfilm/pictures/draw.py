@@ -42,8 +42,7 @@ def draw_cells(
     view: str = "xy",
     window: Window | None = None,
 ) -> list[Scale]:
-    """Draw cells, as `Results.frame` gives them; returns the scales of their colours, for
-    `colour_bar`.
+    """Draw cells, as `Results.frame` gives them; returns their scales, for `colour_bar`.
 
     colour, channels, limits, view: as for `show`; the default range is that of these cells. window:
     the range of the axes; default all cells.

@@ -109,8 +109,7 @@ def strip(
     out: str | Path | None = None,
     dpi: float = 200,
 ) -> Path:
-    """Draw one or more colonies at several times, all panels with one scale and one range of
-    colours.
+    """Draw one or more colonies at several times, with one scale and one range of colours.
 
     times: h; the recorded frame nearest to each time is drawn, with its own time as title. frames:
     instead, at most this many frames, evenly spaced from first to last; default 4. A colony is a

@@ -1,6 +1,4 @@
-"""The data of pictures: cells and signals at one time, as arrays, from a state or a results
-file.
-"""
+"""The data of pictures: cells and signals at one time, from a state or a results file."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Films of a run: MP4 with imageio-ffmpeg, or animated GIF with pillow, which matplotlib
-requires.
+"""Films of a run: MP4 with imageio-ffmpeg, or animated GIF with pillow.
+
+Pillow is installed with matplotlib.
 """
 
 from __future__ import annotations

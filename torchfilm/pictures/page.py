@@ -1,6 +1,4 @@
-"""The page: panels of one size and one scale, with titles, a scale bar and legends below, in
-inches.
-"""
+"""The page: panels of one size and scale, with titles, a scale bar and legends; in inches."""
 
 from __future__ import annotations
 
@@ -71,8 +69,7 @@ class PanelLayout:
 
 
 def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle) -> PanelLayout:
-    """The layout for some frames: one window per colony and one range per quantity over all of
-    them.
+    """The layout for some frames: one window per colony, and one range per quantity.
 
     It reads the frames once.
     """

@@ -56,8 +56,7 @@ def repressilator(
     noise: bool = True,
     rate: float = 0.7,
 ) -> Scene:
-    """Three genes that repress each other in a ring (Elowitz and Leibler 2000), in a growing
-    colony.
+    """Three genes that repress each other in a ring (Elowitz and Leibler 2000), as cells grow.
 
     The oscillations of related cells lose their phase relation. alpha, basal, beta, power: of the
     dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ − pᵢ). speed: the unit of time is

@@ -178,9 +178,7 @@ def fitted_rates(diffusion: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _OperatorInput:
-    """Converts a user's values into float64 tensors (B or 1, …); raises InputError if they do not
-    fit.
-    """
+    """Converts a user's values into float64 tensors (B or 1, …), or raises InputError."""
 
     shape: Shape
     spacing: tuple[float, ...]
@@ -266,9 +264,9 @@ class _OperatorInput:
             and all(isinstance(v, Tensor) and v.dim() >= 3 for v in given)
         ):
             return [
-                self.grid(f"velocity along {AXES[axis]}", v, more=axis)
+                self.grid(f"velocity along {AXES[axis]}", v, more=axis)  # type: ignore[arg-type]
                 for axis, v in enumerate(given)
-            ]  # type: ignore[arg-type]
+            ]
         uniform = torch.as_tensor(given, dtype=torch.float64, device=self.device)
         if tuple(uniform.shape) not in ((3,), (1, 3), (self.colonies, 3)):
             raise checks.input_error(

@@ -195,8 +195,9 @@ def _normalised(factor: Tensor) -> Tensor:
 
 
 def _rounded(factor: Tensor, dtype: torch.dtype) -> Tensor:
-    """The factor in `dtype`, with the two largest entries of each row corrected to keep the row's
-    sum.
+    """The factor in `dtype`, with two entries of each row corrected to keep the row's sum.
+
+    The corrected entries are the two largest.
 
     A sum with a rounding error would be wrong at every step in the same direction, and over time
     would show as amount gained or lost.

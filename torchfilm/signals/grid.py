@@ -167,9 +167,7 @@ class Grid:
         return tuple(out)
 
     def join(self, parts: Sequence[Tensor]) -> Tensor:
-        """Values (nodes,) from those of each of the `batches`, (b, nx, ny, nz) each, in their
-        order.
-        """
+        """Values (nodes,) from those of the `batches`, (b, nx, ny, nz) each, in their order."""
         if len(parts) == 1:
             return parts[0].reshape(-1)
         return torch.cat([part.reshape(-1) for part in parts]).index_select(0, self._join_index)
@@ -190,8 +188,7 @@ class Grid:
         block: int = 8,
         fill: Sequence[float | Tensor] | None = None,
     ) -> tuple[Grid, list[Tensor]]:
-        """The grid enlarged by whole blocks of `block` voxels to cover a box, and the signals on
-        it.
+        """The grid enlarged by blocks of `block` voxels to cover a box, and the signals on it.
 
         values: signals (nodes,) each. low, high: (B, 3) float64, µm, the box; low = inf and high =
         −inf require nothing along that axis. fill: the value of new voxels for each signal, one

@@ -175,9 +175,7 @@ class Layout:
         return self if grid is self.grid else replace(self, grid=grid, work={})
 
     def take(self, places: Tensor) -> tuple[Layout, Tensor]:
-        """The layout of some colonies (b,), and the indices (nodes,) of their voxels in this
-        one.
-        """
+        """The layout of some colonies (b,), and the indices (nodes,) of their voxels here."""
         grid = Grid(
             self.grid.origin.index_select(0, places),
             self.grid.shape.index_select(0, places),

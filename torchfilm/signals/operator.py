@@ -114,9 +114,7 @@ class Operator:
 
     @cached_property
     def loss(self) -> Tensor:
-        """Minus the diagonal, 1/h: (B or 1, …) float64, the rate at which each voxel loses its
-        content.
-        """
+        """Minus the diagonal, 1/h, (B or 1, …) float64: the relative loss rate of each voxel."""
         out = self._decay
         for axis in self.axes:
             out = out if axis.own_neighbour else out + axis.out()

@@ -65,8 +65,7 @@ def conjugate_gradients(
     target: Tensor,
     max_iterations: int,
 ) -> CGResult:
-    """Solve A x = b from x = 0 for symmetric positive definite A; each group is a system of its
-    own.
+    """Solve A x = b from x = 0 for symmetric positive definite A, one system per group.
 
     b: (N, D). `apply` and `precondition` map (N, D) to (N, D) and keep groups apart. A system stops
     when its greatest preconditioned residual is at most target (B,), or is not finite, or after

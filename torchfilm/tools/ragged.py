@@ -56,8 +56,9 @@ def expand_ranges(start: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Groups:
-    """Rows 0 … K − 1 that belong to groups 0 … size − 1, in any order, for sums and maxima per
-    group.
+    """Sums and maxima over groups of rows; rows may have any order.
+
+    Rows 0 … K − 1 belong to groups 0 … size − 1.
 
     `owner`: (K,) int64, the group of each row.
     """
@@ -168,9 +169,7 @@ class WeightedRows:
 
 
 class Blocks:
-    """Symmetric blocks `value` (N, D, D), for repeated products with rows of (N, D). No
-    gradient.
-    """
+    """Symmetric blocks `value` (N, D, D), for repeated products with rows (N, D). No gradient."""
 
     def __init__(self, value: Tensor):
         self.value, self.fast = value, _bags_are_fast(value)
