@@ -82,13 +82,7 @@ def _recording(
     # one recording serves all replicates, also where a first look grows fewer
     usual = tuple(range(settings.replicates))
     recorded = usual if set(streams) <= set(usual) else streams
-    key = (
-        model.growth_fingerprint,
-        settings.seed,
-        settings.dt,
-        settings.dtype,
-        settings.device,
-    )
+    key = (model.growth_fingerprint, settings.seed, settings.dt, settings.dtype, settings.device)
     return growth_cache.find_or_record(
         key,
         recorded,

@@ -131,13 +131,7 @@ def try_scenes(
             # two colonies: a tensor with one number would pass for a plain number
             scene = family.scene([values], repeat=2)
             tried = colonies.try_scene(
-                scene,
-                2,
-                seed=seed,
-                dtype=dtype,
-                device=family.device,
-                replay=replay,
-                cells=cells,
+                scene, 2, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=cells
             )
         except Exception as error:
             changed = {n: v for n, v in values.items() if v != middle[n]} or values

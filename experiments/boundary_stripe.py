@@ -51,7 +51,9 @@ def on_new_seeds(
     objective: Objective, values: dict[str, float], seeds: int = 8
 ) -> dict[str, float]:
     """Returns the measures of a design's stripe, means over seeds that the search did not use."""
-    finished = objective.colonies(objective.task.space.point(values), streams=range(100, 100 + seeds))
+    finished = objective.colonies(
+        objective.task.space.point(values), streams=range(100, 100 + seeds)
+    )
     losses = [loss for d in finished for loss in objective.task.target.loss(d.state).tolist()]
     return measured(objective.task.target, finished) | {"loss": float(np.mean(losses))}
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from torchfilm.physics.contacts import CandidateContacts, Capsules, Contacts, contacts_of
-from torchfilm.physics.solve import CONVERGED
+from torchfilm.physics.problem import CONVERGED
 
 # (normal to the side of the cells, normal · x at the wall)
 Flat = tuple[Sequence[float], float]
@@ -183,9 +183,9 @@ def bodies(c, a, length, radius=0.5, *, dtype=torch.float64, device="cpu") -> Ca
     )
 
 
-def rows_of(cells: Capsules, first: Tensor, second: Tensor, push: bool = False) -> Contacts:
+def rows_of(cells: Capsules, first: Tensor, second: Tensor, unilateral: bool = False) -> Contacts:
     """All rows that overlap among the given pairs (P,), (P,)."""
-    return contacts_of(CandidateContacts.among(cells, first, second), push)
+    return contacts_of(CandidateContacts.among(cells, first, second), unilateral)
 
 
 def unit(rng: np.random.Generator, count: int, dim: int) -> np.ndarray:

@@ -136,7 +136,9 @@ def test_presets_are_ordered_by_what_they_cost_and_by_overlap():
 def test_results_say_how_accurately_and_go_on_so(tmp_path):
     first = tf.scenes.microcolony()
     drafted = tf.preset("draft", first).apply(first)
-    *_, last = tf.simulate(drafted, drafted.bind(2, seed=1).start(), until=0.4, record=tmp_path / "a.h5")
+    *_, last = tf.simulate(
+        drafted, drafted.bind(2, seed=1).start(), until=0.4, record=tmp_path / "a.h5"
+    )
     with tf.Results(tmp_path / "a.h5") as results:
         assert results.accuracy == {
             "dt": pytest.approx(0.04),

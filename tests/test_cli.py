@@ -300,7 +300,7 @@ def test_watch_takes_up_an_edit_while_running(tmp_path):
     out, errors = child.communicate(timeout=60)
     assert child.returncode == 0, errors
     said = out + errors
-    assert said.index("rules.py is broken") < said.index("rules.py taken up")
+    assert said.index("rules.py is broken") < said.index("rules.py reloaded")
     times = [float(t) for t in re.findall(r"t = (\S+) h: rules\.py", said)]
     assert len(times) == 2 and 0 < times[0] < times[1] < 1.5, "the simulated time of each edit"
     with tf.Results(tmp_path / "mine.h5") as results:

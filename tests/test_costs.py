@@ -16,7 +16,6 @@ import sys
 
 import pytest
 import torch
-
 from helpers import step
 
 import torchfilm as tf
@@ -146,7 +145,10 @@ def test_on_the_same_cells_nutrition_leaves_the_others_costs_alone():
             [],
         )
     )
-    state, bare = fed.bind(seed=5, dtype=torch.float64).start(), unfed.bind(seed=5, dtype=torch.float64).start()
+    state, bare = (
+        fed.bind(seed=5, dtype=torch.float64).start(),
+        unfed.bind(seed=5, dtype=torch.float64).start(),
+    )
     compared = 0
     for _ in range(30):
         same = {
@@ -184,7 +186,9 @@ def test_many_colonies_ask_for_no_more_operators_than_two(listed):
     nine: the same operators by name in every step. (Not than one, which goes without what tells
     colonies apart.)"""
     scene = tf.Scene(*body(), *LISTED[listed]())
-    two, nine = (scene.bind(n, seed=5, streams=[3] * n, dtype=torch.float64).start() for n in (2, 9))
+    two, nine = (
+        scene.bind(n, seed=5, streams=[3] * n, dtype=torch.float64).start() for n in (2, 9)
+    )
     for _ in range(30):
         (here, two), (there, nine) = spend(scene, two), spend(scene, nine)
         assert {title: calls for title, (calls, _) in here.items()} == {

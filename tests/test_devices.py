@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from mock_cuda import pretended_cuda  # noqa: F401
-
 from helpers import step
+from mock_cuda import pretended_cuda  # noqa: F401
 
 import torchfilm as tf
 

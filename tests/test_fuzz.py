@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-
 from helpers import step
+from hypothesis import HealthCheck, given, settings
 
 import torchfilm as tf
 
@@ -124,9 +123,11 @@ def test_the_fuzzer_notices_a_number_that_is_none(name):
 
 
 def test_the_fuzzer_notices_cells_that_do_not_add_up():
-    state = tf.Scene(
-        tf.Growth(rate=1.0), founders=tf.Cells([[0.0, 0.0], [9.0, 0.0]], [1.0, 0.0])
-    ).bind(1).start()
+    state = (
+        tf.Scene(tf.Growth(rate=1.0), founders=tf.Cells([[0.0, 0.0], [9.0, 0.0]], [1.0, 0.0]))
+        .bind(1)
+        .start()
+    )
     fuzz.counted(state, state)
     with pytest.raises(AssertionError, match="unique"):
         fuzz.counted(state, state.replace(uid=torch.zeros_like(state.uid)))

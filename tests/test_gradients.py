@@ -17,9 +17,8 @@ from functools import partial
 
 import pytest
 import torch
-from torch import Tensor
-
 from helpers import step
+from torch import Tensor
 
 import torchfilm as tf
 from torchfilm.tools.checks import SimulationError

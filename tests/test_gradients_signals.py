@@ -13,10 +13,9 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from helpers import step
 from test_gradients import F64, compare, weights
 from torch import Tensor
-
-from helpers import step
 
 import torchfilm as tf
 

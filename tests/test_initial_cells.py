@@ -1,4 +1,4 @@
-"""Cells to start from: arrays, CSV, HDF5, overlaps, and every kind of bad input."""
+"""Initial cells: arrays, CSV, HDF5, overlaps, and invalid input."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import h5py
 import numpy as np
 import pytest
 import torch
-
 from helpers import step
 
 import torchfilm as tf
@@ -83,7 +82,7 @@ def test_types_and_extra_columns_become_fields():
 
 
 def test_arrays_given_are_not_shared():
-    """A state is frozen: changing the array afterwards must not reach it."""
+    """A state is frozen: a later change of the array has no effect on it."""
     position = np.zeros((1, 2))
     state = seed(tf.Cells(position, [1.0, 0.0]))
     position[0, 0] = 9.0
@@ -92,7 +91,9 @@ def test_arrays_given_are_not_shared():
 
 def test_cells_given_at_seeding_replace_the_founders():
     scene = tf.Scene(tf.Growth(rate=1.0), founders=tf.Cells.single(2))
-    assert scene.bind(cells=tf.Cells([[7.0, 0.0]], [1.0, 0.0])).start().position.tolist() == [[7.0, 0.0]]
+    assert scene.bind(cells=tf.Cells([[7.0, 0.0]], [1.0, 0.0])).start().position.tolist() == [
+        [7.0, 0.0]
+    ]
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -107,7 +108,7 @@ def test_single(dim):
 
 
 def test_overlaps_are_reported_deepest_first():
-    """Parallel rods side by side: the overlap is 1 − distance."""
+    """For parallel rods in a row the overlap is 1 − distance."""
     cells = tf.Cells([[0.0, 0.0], [0.0, 0.9], [0.0, 1.5], [0.0, 9.0]], [1.0, 0.0])
     found = cells.overlaps()
     assert [(sorted(f[:2]), pytest.approx(f[2], abs=1e-12)) for f in found] == [
@@ -329,7 +330,7 @@ def test_a_table_without_cells_is_told():
 
 
 def test_csv_lines_are_counted_as_an_editor_does(tmp_path):
-    """Blank lines count: the bad number stands in the fifth line of the file."""
+    """Blank lines count: the bad number is in the fifth line of the file."""
     path = tmp_path / "cells.csv"
     path.write_text("x,y,angle,length\n0,0,0,2\n\n\n1,zero,0,2\n")
     with pytest.raises(tf.InputError, match="line 5"):

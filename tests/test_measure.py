@@ -1,5 +1,4 @@
-"""What is measured on a state: overlaps with walls, wherever along a cell they are deepest, and
-neighbours."""
+"""Measures of a state: overlaps with walls at the deepest point, and neighbours."""
 
 from __future__ import annotations
 
@@ -44,7 +43,7 @@ def _above(p: np.ndarray, at: float, normal: np.ndarray) -> np.ndarray:
 
 
 def cells(dim: int, count: int = 400) -> tf.Cells:
-    """A colony for each rod, near the origin and every way round."""
+    """One colony per rod, near the origin, in all directions."""
     rng = np.random.default_rng(3)
     return tf.Cells(
         rng.uniform(-2, 2, (count, dim)),
@@ -58,9 +57,10 @@ def cells(dim: int, count: int = 400) -> tf.Cells:
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("kind", list(WALLS))
 def test_overlap_with_a_wall_is_the_deepest_along_the_cell(device, dtype, dim, kind):
-    """Against 4,001 points along each rod of up to 4 µm. A distance changes no faster than its
-    point moves, so between two samples, 1e-3 µm apart, at most 5e-4 µm are missed; float32 rounds
-    lengths, radii and axes, 3e-7 µm each and a few of them.
+    """Against 4,001 points along each rod of up to 4 µm.
+
+    A distance changes no faster than its point moves. So between two samples, 1e-3 µm apart, at
+    most 5e-4 µm are missed. float32 rounds lengths, radii and axes by 3e-7 µm each.
     """
     wall, distance = WALLS[kind]
     given = cells(dim)
@@ -77,19 +77,23 @@ def test_overlap_with_a_wall_is_the_deepest_along_the_cell(device, dtype, dim, k
 
 
 def test_a_ball_under_the_middle_of_a_rod_is_seen(device, dtype):
-    """Neither end touches; the middle is 0.25 µm deep, exactly in binary."""
-    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).bind(
-        2, device=device, dtype=dtype
-    ).start()
+    """Neither end touches; the middle is 0.25 µm deep, which is exact in binary."""
+    state = (
+        tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0))
+        .bind(2, device=device, dtype=dtype)
+        .start()
+    )
     found = tf.measure.overlaps(state, [tf.Sphere((0.5, -0.75), 0.5, inside=False)])
     assert found.walls.tolist() == [0.25, 0.25] and found.walls.dtype == torch.float64
 
 
 def test_a_wall_for_each_colony_is_measured_in_its_own(device):
-    """Colonies taken out of their batch too: a wall goes by the colony's id."""
-    state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0)).bind(
-        3, device=device
-    ).start()
+    """Also for colonies selected from their batch: a wall's value goes by the colony's id."""
+    state = (
+        tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 4.0))
+        .bind(3, device=device)
+        .start()
+    )
     ball = tf.Sphere([[0.5, -0.75], [0.5, -0.875], [0.5, -5.0]], 0.5, inside=False)
     assert tf.measure.overlaps(state, [ball]).walls.tolist() == [0.25, 0.125, 0.0]
     assert tf.measure.overlaps(state.select([2, 1]), [ball]).walls.tolist() == [0.0, 0.125]
@@ -98,8 +102,10 @@ def test_a_wall_for_each_colony_is_measured_in_its_own(device):
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("gap", [0.0, 0.5, 3.0])
 def test_neighbours_are_all_pairs_of_a_colony_within_the_gap(device, dtype, dim, gap):
-    """Against every pair whose centres are near enough, both from the state's own numbers; two
-    colonies in one place see nothing of each other."""
+    """Against every pair with near centres, both from the state's own numbers.
+
+    Two colonies at one position have no common pairs.
+    """
     scene = tf.Scene(tf.Growth(), founders=crowd(np.random.default_rng(7), 150, dim))
     state = scene.bind(2, device=device, dtype=dtype).start()
     i, j, distance = tf.measure.neighbours(state, gap)

@@ -1,4 +1,4 @@
-"""Pictures: outlines of capsules, sheets of colonies, and what cannot be drawn."""
+"""Pictures: outlines of capsules, sheets of colonies, and input errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import torchfilm as tf
 from torchfilm.pictures import Frame, frame_of, outlines, scale_bar, sheet
 from torchfilm.pictures.draw import WALL, add_walls, set_window
-from torchfilm.pictures.frames import Recorded
+from torchfilm.pictures.frames import RecordedFrames
 
 
 def outline(axis, length=2.0, radius=0.5, position=(0.0, 0.0)) -> np.ndarray:
@@ -25,7 +25,7 @@ def outline(axis, length=2.0, radius=0.5, position=(0.0, 0.0)) -> np.ndarray:
 
 
 def area(polygon: np.ndarray) -> float:
-    """Signed, by the shoelace formula."""
+    """Signed area by the shoelace formula."""
     x, y = polygon.T
     return 0.5 * float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
 
@@ -39,8 +39,9 @@ def distance_to_segment(points: np.ndarray, half: float, axis: np.ndarray) -> np
 
 
 def test_an_upright_cell_is_a_circle():
-    """Seen end on: every point of the outline lies at the radius, whatever the length, and all
-    around."""
+    """In end view every point of the outline is at the radius, for any length, and all directions
+    occur.
+    """
     polygon = outline((0.0, 0.0), length=7.0, radius=0.4, position=(3.0, -2.0))
     from_centre = polygon - (3.0, -2.0)
     assert np.allclose(np.linalg.norm(from_centre, axis=1), 0.4, rtol=1e-12)
@@ -66,8 +67,7 @@ def test_a_lying_cell_is_a_capsule(angle):
 
 
 def test_a_tilted_cell_is_foreshortened():
-    """Half out of the plane: the projection of the centreline is half as long, the caps are as
-    round as ever."""
+    """The centreline's projection has half its length, and the caps stay round."""
     assert abs(area(outline((0.5, 0.0), 3.0, 0.5))) == pytest.approx(
         2 * 0.5 * 1.5 + 3 * 0.25, rel=1e-12
     )
@@ -107,7 +107,7 @@ def grown() -> tf.State:
 
 
 def coloured(path) -> float:
-    """The share of the picture's pixels that are coloured, which only cells are."""
+    """The share of coloured pixels in a picture; only cells are coloured."""
     image = matplotlib.image.imread(path)[..., :3]
     return float(((image.max(2) - image.min(2)) > 0.15).mean())
 
@@ -137,12 +137,13 @@ def test_a_frame_of_a_state_is_that_of_its_file(grown, tmp_path):
 
 
 def test_one_cell_is_as_large_as_it_should_be(tmp_path):
-    """A rod of 4 × 1 µm in a picture of its own: about its share of a square around it, and four
-    times as wide as high."""
+    """A rod of 4 × 1 µm has about its share of a square around it, and is four times as wide as
+    high.
+    """
     state = tf.Scene(tf.Growth(), founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 3.0)).bind().start()
     path = sheet(cells_of(state), tmp_path / "one.png")
     image = matplotlib.image.imread(path)[..., :3]
-    image = image[: int(0.8 * len(image))]  # below stands the legend
+    image = image[: int(0.8 * len(image))]  # the legend is below
     y, x = np.nonzero((image.max(2) - image.min(2)) > 0.15)
     assert (np.ptp(x) + 1) / (np.ptp(y) + 1) == pytest.approx(4.0, rel=0.05), (
         "the scale differs along x and y"
@@ -267,14 +268,13 @@ def test_a_kind_of_picture_that_is_not_known_is_told(recorded, tmp_path):
 
 
 def walls_drawn(tmp_path, walls, view: str, dim: int = 3, colonies: int = 1) -> list[list]:
-    """The walls in each colony's panel, drawn twice over as in a film, of a run that is read back
-    from its file."""
+    """The walls in each colony's panel, drawn twice as in a film, of a run read from its file."""
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=dim, walls=walls), dt=0.05)
     path = tmp_path / "run.h5"
     for _ in tf.simulate(scene, scene.bind(colonies).start(), until=0.05, record=path):
         pass
     with tf.Results(path) as results:
-        frame = Recorded(results, [-1])[0]
+        frame = RecordedFrames(results, [-1])[0]
         panels = []
         for place in range(colonies):
             ax = Figure().add_subplot()
@@ -291,8 +291,10 @@ def walls_drawn(tmp_path, walls, view: str, dim: int = 3, colonies: int = 1) -> 
 
 
 def test_walls_are_drawn_where_they_stand(tmp_path):
-    """A hard floor and a soft lid are lines from the side and nothing from above; a wall askew is a
-    line nowhere but seen along it."""
+    """A hard floor and a soft lid are lines in side view and invisible from above.
+
+    An oblique wall is a line only in the view along it.
+    """
     floor, lid = tf.Plane(z=-0.5, facing="+z"), tf.Plane(z=2.0, facing="-z", stiffness=30.0)
     askew = tf.Plane(point=(3.0, 0.0, 0.0), normal=(-0.6, 0.8, 0.0))
     (above,) = walls_drawn(tmp_path, [floor, lid, askew], "xy")

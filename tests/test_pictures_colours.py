@@ -1,5 +1,4 @@
-"""Pictures: what colour a cell or a place of the medium gets, which part of it is seen, and what
-the legend says of it."""
+"""Pictures: colours of cells and medium, sections and windows, and legends."""
 
 from __future__ import annotations
 
@@ -12,10 +11,10 @@ from matplotlib.text import Text
 
 import torchfilm as tf
 from torchfilm.pictures import Frame, colour_bar, draw_cells, draw_signal, frame_of, scale_bar
-from torchfilm.pictures.colours import FLOOR, NOTHING, PlotStyle, Seen, scale_of
-from torchfilm.pictures.draw import BEYOND, numbers
-from torchfilm.pictures.figures import chosen, fill_sheet, sheet_figure
-from torchfilm.pictures.page import page, signal_seen, survey
+from torchfilm.pictures.colours import FLOOR, NO_VALUE, PlotStyle, ValueRange, scale_of
+from torchfilm.pictures.draw import OUTSIDE_BOX, numbers
+from torchfilm.pictures.figures import choose_colonies, fill_sheet, sheet_figure
+from torchfilm.pictures.page import make_page, plan_layout, signal_section
 from torchfilm.pictures.shapes import section
 from torchfilm.signals.exchange import read, stencil
 from torchfilm.signals.grid import Grid
@@ -34,8 +33,10 @@ def frame(
     height=None,
     **fields,
 ) -> Frame:
-    """Round cells of radius 1 at (N, d), with any fields; signals (nx, ny, nz) are the same for all
-    colonies."""
+    """Round cells of radius 1 at (N, d), with any fields.
+
+    signals: (nx, ny, nz), the same for all colonies.
+    """
     position = np.asarray(position, dtype=float)
     n, dim = position.shape
     colony = np.zeros(n, dtype=int) if colony is None else np.asarray(colony)
@@ -69,20 +70,20 @@ def frame(
 
 
 class Drawn:
-    """A sheet as pixels, to be asked what colour is where."""
+    """A sheet as pixels, to read colours at positions."""
 
     def __init__(self, what: Frame, **options):
-        look = PlotStyle(**options)
-        places, _ = chosen(what.counts > 0, what.colony_id, None, 36)
-        self.survey = survey([what], places, look)
-        self.figure, self.axes = page(1, len(places), self.survey, "", dpi=100)
-        fill_sheet(self.axes, what, self.survey)
+        style = PlotStyle(**options)
+        places, _ = choose_colonies(what.counts > 0, what.colony_id, None, 36)
+        self.layout = plan_layout([what], places, style)
+        self.figure, self.axes = make_page(1, len(places), self.layout, "", dpi=100)
+        fill_sheet(self.axes, what, self.layout)
         canvas = FigureCanvasAgg(self.figure)
         canvas.draw()
         self.pixels = np.asarray(canvas.buffer_rgba())[..., :3] / 255.0
 
     def at(self, x: float, y: float, panel: int = 0) -> np.ndarray:
-        """The colour at a place, µm."""
+        """The colour at a position, µm."""
         u, v = self.axes[panel].transData.transform((x, y))
         return self.pixels[len(self.pixels) - 1 - int(v), int(u)]
 
@@ -109,7 +110,7 @@ def test_given_limits_hold_whatever_the_cells_have():
         a.at(0, 0), b.at(0, 0)
     )
     assert b.at(4, 0) == pytest.approx(viridis(1.0), abs=NEAR)
-    assert [x.survey.scales[0].beyond for x in (a, b)] == ["neither", "max"], (
+    assert [x.layout.scales[0].beyond for x in (a, b)] == ["neither", "max"], (
         "the legend must tell that a cell is beyond it"
     )
 
@@ -122,8 +123,7 @@ def test_one_range_for_all_colonies():
 
 
 def test_lights_of_channels_add_up():
-    """cyan + yellow is white; a cell that gives off no light is dark, but not as dark as the
-    paper."""
+    """Cyan + yellow is white; a cell without light is dark, but not as dark as the paper."""
     drawn = Drawn(
         frame([[0, 0], [4, 0], [8, 0], [12, 0]], cfp=[2.0, 0, 2.0, 0], yfp=[0, 0.5, 0.5, 0]),
         channels={"cfp": "cyan", "yfp": "yellow"},
@@ -144,7 +144,7 @@ def test_each_channel_has_its_own_range_from_zero():
     made = Drawn(
         frame([[0, 0], [4, 0]], cfp=[100.0, 200.0], yfp=[0.1, 0.2]),
         channels={"cfp": "cyan", "yfp": "#ffff00"},
-    ).survey
+    ).layout
     assert [s.limits for s in made.scales] == [(0.0, 200.0), (0.0, 0.2)] and [
         s.name for s in made.scales
     ] == ["cfp", "yfp"]
@@ -153,7 +153,7 @@ def test_each_channel_has_its_own_range_from_zero():
 def test_the_legend_of_a_channel_shows_the_colours_of_its_cells():
     drawn = Drawn(frame([[0, 0], [4, 0]], cfp=[0.5, 1.0]), channels={"cfp": "cyan"})
     # the map has 256 steps
-    assert drawn.survey.scales[0].paint(np.array([0.5]))[0, :3] == pytest.approx(
+    assert drawn.layout.scales[0].paint(np.array([0.5]))[0, :3] == pytest.approx(
         drawn.at(0, 0), abs=1 / 255 + NEAR
     )
 
@@ -161,13 +161,13 @@ def test_the_legend_of_a_channel_shows_the_colours_of_its_cells():
 @pytest.mark.parametrize("options", [{"colour": "yfp"}, {"channels": {"yfp": "yellow"}}])
 def test_what_is_not_a_number_is_grey_and_spoils_no_range(options):
     drawn = Drawn(frame([[0, 0], [4, 0], [8, 0]], yfp=[np.nan, 0.0, 1.0]), **options)
-    assert drawn.at(0, 0) == pytest.approx(NOTHING[:3], abs=NEAR)
-    assert drawn.survey.scales[0].limits == (0.0, 1.0)
+    assert drawn.at(0, 0) == pytest.approx(NO_VALUE[:3], abs=NEAR)
+    assert drawn.layout.scales[0].limits == (0.0, 1.0)
 
 
 def test_kinds_of_cells_have_a_colour_each():
     drawn = Drawn(frame([[0, 0], [4, 0], [8, 0]], cell_type=[0, 7, 3]), colour="cell_type")
-    assert drawn.survey.scales[0].kinds == (0, 3, 7)
+    assert drawn.layout.scales[0].kinds == (0, 3, 7)
     colours = {tuple(drawn.at(x, 0)) for x in (0, 4, 8)}
     assert len(colours) == 3
     with_limits = Drawn(
@@ -177,14 +177,16 @@ def test_kinds_of_cells_have_a_colour_each():
     )
     assert with_limits.at(4, 0) == pytest.approx(viridis(1.0), abs=NEAR)
     assert (
-        Drawn(frame(np.arange(24).reshape(12, 2) * 3.0), colour="uid").survey.scales[0].kinds == ()
+        Drawn(frame(np.arange(24).reshape(12, 2) * 3.0), colour="uid").layout.scales[0].kinds == ()
     ), "twelve are no kinds"
 
 
 @pytest.mark.parametrize("view, nearest", [("xy", 2), ("xz", 1), ("yz", 0)])
 def test_the_cell_nearest_to_the_eye_hides_the_others(view, nearest):
-    """x, y, z turn right: one looks down on xy from above, at xz from the side where y is low, at
-    yz from that where x is high."""
+    """x, y, z are right-handed.
+
+    So one looks at xy from above, at xz from the side of low y, and at yz from the side of high x.
+    """
     position = np.zeros((2, 3))
     position[0, nearest] = -3.0 if view == "xz" else 3.0
     drawn = Drawn(frame(position, yfp=[1.0, 0.0]), colour="yfp", view=view)
@@ -207,7 +209,7 @@ def ramp(axis: int, shape=(16, 16, 8)) -> np.ndarray:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_white_is_lowest_and_black_highest_at_the_right_places(axis):
-    """Voxel centres stand at −7.5 … 7.5 µm, so at place p the ramp is (p + 7.5)/15."""
+    """Voxel centres are at −7.5 … 7.5 µm, so at position p the ramp is (p + 7.5)/15."""
     drawn = Drawn(frame([[0.0, 0.0]], signals={"ahl": ramp(axis)}), background="ahl", whole=True)
     for p in (-7.0, -3.3, 2.0, 6.5):
         place = (p, 5.0) if axis == 0 else (5.0, p)
@@ -249,8 +251,9 @@ def test_the_mean_is_that_along_the_line_of_sight():
 
 
 def test_a_section_is_at_the_height_of_the_cells():
-    """Cells of three dimensions: their mean. Those of two: their plane, if it is known. The legend
-    says where."""
+    """For 3-D cells at their mean, for 2-D cells at their plane, if known. The legend gives the
+    height.
+    """
     values = ramp(2)  # centres at −3.5 … 3.5 µm: at z it is (z + 3.5)/7
     deep = frame([[0, 0, 1.0], [0, 4, 2.0]], signals={"ahl": values})
     flat = frame([[0, 0]], signals={"ahl": values}, height=-2.0)
@@ -260,33 +263,37 @@ def test_a_section_is_at_the_height_of_the_cells():
         (deep, {"section": 3.0}, (3 + 3.5) / 7, "z = 3 µm"),
         (deep, {"section": "mean"}, 0.5, "mean over z"),
     ):
-        look = PlotStyle(background="ahl", **options)
-        assert signal_seen(what, 0, look, what.colony(0)) == pytest.approx(np.full((16, 16), level))
-        behind = survey([what], [0], look).behind
+        style = PlotStyle(background="ahl", **options)
+        assert signal_section(what, 0, style, what.colony(0)) == pytest.approx(
+            np.full((16, 16), level)
+        )
+        behind = plan_layout([what], [0], style).behind
         assert behind is not None and said in behind.title
     layer = frame([[0, 0]], signals={"ahl": ramp(0, (16, 16, 1))})
-    assert survey([layer], [0], PlotStyle(background="ahl")).behind.title == "ahl outside"
+    assert plan_layout([layer], [0], PlotStyle(background="ahl")).behind.title == "ahl outside"
 
 
 def test_a_plane_of_cells_that_is_not_known_is_asked_for():
-    """2-D cells stand at z = 0 unless told; where that is not in the box, nothing is guessed."""
+    """2-D cells are at z = 0 by default; if that is outside the box, an error is raised."""
     what = frame([[0, 0]], signals={"ahl": ramp(2)}, origin=(-8, -8, 10))
     with pytest.raises(tf.InputError, match=r"section.*10 to 18"):
-        survey([what], [0], PlotStyle(background="ahl"))
-    assert survey([what], [0], PlotStyle(background="ahl", section=12.0)).behind is not None
+        plan_layout([what], [0], PlotStyle(background="ahl"))
+    assert plan_layout([what], [0], PlotStyle(background="ahl", section=12.0)).behind is not None
 
 
 def test_cells_and_signal_of_one_name_keep_their_own_limits():
     what = frame([[0, 0]], signals={"ahl": ramp(0)}, ahl=[0.3])
-    both = survey(
+    both = plan_layout(
         [what],
         [0],
         PlotStyle(colour="ahl", background="ahl", limits={"ahl": (0, 5), "out.ahl": (0, 7)}),
     )
     assert both.scales[0].limits == (0, 5) and both.behind.limits == (0, 7)
-    bare = survey([what], [0], PlotStyle(colour="ahl", background="ahl", limits={"ahl": (0, 5)}))
+    bare = plan_layout(
+        [what], [0], PlotStyle(colour="ahl", background="ahl", limits={"ahl": (0, 5)})
+    )
     assert bare.scales[0].limits == (0, 5) and bare.behind.limits == (0, 1)
-    alone = survey([what], [0], PlotStyle(background="ahl", limits={"ahl": (0, 5)}))
+    alone = plan_layout([what], [0], PlotStyle(background="ahl", limits={"ahl": (0, 5)}))
     assert alone.behind.limits == (0, 5) and alone.behind.title == "ahl outside, z = 0 µm"
 
 
@@ -295,7 +302,7 @@ def test_cells_and_signal_of_one_name_keep_their_own_limits():
 
 def test_a_window_is_cropped_to_the_cells_and_stays_in_the_box():
     what = frame([[6.5, 0.0], [-4.0, 0.0]], colony=[0, 1], signals={"ahl": ramp(0)})
-    made = survey([what], [0, 1], PlotStyle(background="ahl"))
+    made = plan_layout([what], [0, 1], PlotStyle(background="ahl"))
     sizes = {(round(r - l, 9), round(t - b, 9)) for l, r, b, t in made.windows.values()}  # noqa: E741
     assert len(sizes) == 1 and 2.0 < made.size[0] < 8.0, (
         "panels of one size, about the cell of 2 µm with some room"
@@ -306,37 +313,38 @@ def test_a_window_is_cropped_to_the_cells_and_stays_in_the_box():
 
 def test_the_whole_box():
     what = frame([[6.5, 0.0]], signals={"ahl": ramp(0)})
-    assert survey([what], [0], PlotStyle(background="ahl", whole=True)).windows[0] == pytest.approx(
-        (-8, 8, -8, 8)
-    )
+    assert plan_layout([what], [0], PlotStyle(background="ahl", whole=True)).windows[
+        0
+    ] == pytest.approx((-8, 8, -8, 8))
 
 
 def test_what_is_beyond_the_box_is_no_concentration():
-    """Cells that reach far beyond an open box: there the picture is of a colour that is no grey."""
+    """Outside the box, where cells extend far, the picture's colour is not grey."""
     what = frame([[0.0, 0.0], [12.0, 0.0]], signals={"ahl": np.zeros((16, 16, 1))})
     from matplotlib.colors import to_rgb
 
     drawn = Drawn(what, background="ahl")
-    assert drawn.at(10.0, 0.0) == pytest.approx(to_rgb(BEYOND), abs=NEAR)
+    assert drawn.at(10.0, 0.0) == pytest.approx(to_rgb(OUTSIDE_BOX), abs=NEAR)
     assert drawn.at(4.0, 0.0) == pytest.approx((1, 1, 1), abs=NEAR)
 
 
 @pytest.mark.parametrize("dpi", [72, 101, 150, 163.7])
 def test_pages_have_even_numbers_of_pixels(dpi):
-    """Films need it."""
+    """Films require it."""
     what = frame([[0.0, 0.0], [7.0, 2.0]], yfp=[1, 2])
     figure = sheet_figure(what, [0], PlotStyle(colour="yfp"), "a title", dpi)
     assert all(n % 2 == 0 for n in FigureCanvasAgg(figure).get_width_height())
 
 
 def boxes(figure: Figure) -> list:
-    """Where everything on a page is, pixels: panels, legends with their numbers, titles, scale
-    bar."""
+    """The position of everything on a page, pixels: panels, legends with numbers, titles, scale
+    bar.
+    """
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     renderer = canvas.get_renderer()
     panels = [ax for ax in figure.axes if ax.get_visible()]
-    # what stands outside the frame of its axes
+    # artists outside the frame of their axes
     outside = [
         t
         for ax in panels
@@ -412,8 +420,8 @@ def test_numbers_of_a_legend(values, words):
     [(2.0, "yfp (nM)"), (2e-5, "yfp (10⁻⁵ nM)"), (3e7, "yfp (10⁷ nM)"), (0.5, "yfp (nM)")],
 )
 def test_a_legend_takes_out_the_power_of_ten(high, title):
-    seen = Seen()
-    seen.note(np.array([0.0, high]))
+    seen = ValueRange()
+    seen.add(np.array([0.0, high]))
     scale = scale_of("yfp", seen, PlotStyle(colour="yfp"), {"yfp": "nM"})
     assert scale.title == title
     ax = Figure().add_subplot()
@@ -424,10 +432,10 @@ def test_a_legend_takes_out_the_power_of_ten(high, title):
 
 @pytest.mark.parametrize("values", [[], [np.nan], [0.0], [5.0, 5.0], [-2.0]])
 def test_a_range_is_never_empty(values):
-    for look in (PlotStyle(colour="yfp"), PlotStyle(channels={"yfp": "red"})):
-        seen = Seen()
-        seen.note(np.array(values, dtype=float))
-        scale = scale_of("yfp", seen, look, {})
+    for style in (PlotStyle(colour="yfp"), PlotStyle(channels={"yfp": "red"})):
+        seen = ValueRange()
+        seen.add(np.array(values, dtype=float))
+        scale = scale_of("yfp", seen, style, {})
         assert (
             scale.limits[0] < scale.limits[1]
             and np.isfinite(scale.paint(np.array([0.0, 5.0]))).all()
@@ -439,7 +447,7 @@ def test_a_range_is_never_empty(values):
 
 
 def test_a_figure_of_ones_own():
-    """The parts go together on any axes: the cells' window shows the signal behind them."""
+    """The functions work together on any axes: the cells' window shows the signal behind them."""
     figure = Figure(dpi=100)
     ax, below = figure.subplots(2, 1)
     what = frame([[-2.0, 0.0], [2.0, 0.0]], yfp=[0.0, 1.0])
@@ -503,17 +511,19 @@ def test_a_bar_is_as_long_as_it_says():
 )
 def test_what_cannot_be_drawn_is_told(options, message):
     with pytest.raises(tf.InputError, match=message):
-        survey([frame([[0, 0]], signals={"ahl": ramp(0)}, yfp=[1.0])], [0], PlotStyle(**options))
+        plan_layout(
+            [frame([[0, 0]], signals={"ahl": ramp(0)}, yfp=[1.0])], [0], PlotStyle(**options)
+        )
 
 
 def test_a_scene_without_a_medium_has_no_box_and_no_background():
     for options in ({"whole": True}, {"background": "ahl"}):
         with pytest.raises(tf.InputError, match="medium"):
-            survey([frame([[0, 0]])], [0], PlotStyle(**options))
+            plan_layout([frame([[0, 0]])], [0], PlotStyle(**options))
 
 
 def test_a_state_is_a_frame(dtype, device):
-    """Signals of grids of several colonies each find their own, and know where they are."""
+    """Signals on grids of several colonies: each colony gets its own values and positions."""
     medium = tf.Medium(
         ahl=tf.Signal(diffusion=1.0, initial=lambda x: 20 + x[:, 0] + 0.1 * x[:, 2]),
         box=((-8, -4, -2), (8, 4, 6)),

@@ -13,24 +13,26 @@ from PIL import Image
 import torchfilm as tf
 from torchfilm.pictures import figures, movies
 from torchfilm.pictures.colours import PlotStyle, paint_cells
-from torchfilm.pictures.figures import picked
-from torchfilm.pictures.frames import Recorded
+from torchfilm.pictures.figures import choose_frames
+from torchfilm.pictures.frames import RecordedFrames
 from torchfilm.pictures.movies import Film, _nearest, clock
-from torchfilm.pictures.page import survey
+from torchfilm.pictures.page import plan_layout
 
 UNTIL = 2.0
 
 
 def brighter(cells):
-    """yfp is the time, cfp the number of the cell."""
+    """yfp is the time; cfp is the number of the cell."""
     cells.yfp = 0 * cells.yfp + cells.time
     cells.cfp = cells.uid.to(cells.yfp)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
-    """Two colonies of a few cells that shine brighter with time, in a medium from which a signal
-    fades. Six frames. To be read only."""
+    """Two colonies of a few cells that become brighter with time, in a medium whose signal decays.
+
+    Six frames, read-only.
+    """
     path = tmp_path_factory.mktemp("times") / "run.h5"
     medium = tf.Medium(
         ahl=tf.Signal(diffusion=1.0, decay=1.0, initial=1.0),
@@ -61,17 +63,17 @@ def pixels(path) -> np.ndarray:
 
 
 def test_ranges_and_windows_are_those_of_all_frames(run):
-    """The first frame is the darkest in yfp and the richest in ahl; all share the ends of both."""
+    """The first frame has the lowest yfp and the highest ahl; all frames share both ranges."""
     with tf.Results(run) as results:
-        look = PlotStyle(colour="yfp", background="ahl")
-        frames = Recorded(results, range(len(results)), "ahl")
-        made = survey(frames, [0, 1], look)
+        style = PlotStyle(colour="yfp", background="ahl")
+        frames = RecordedFrames(results, range(len(results)), "ahl")
+        made = plan_layout(frames, [0, 1], style)
         every = [results.frame(k)["yfp"] for k in range(len(results))]
         signal = [x for k in range(len(results)) for x in results.signal("ahl", k)]
         assert made.scales[0].limits == pytest.approx(
             (min(v.min() for v in every), max(v.max() for v in every))
         )
-        # cut at z = 0, between two layers that are alike
+        # cut at z = 0, between two equal layers
         assert made.behind.limits == pytest.approx(
             (min(v.min() for v in signal), max(v.max() for v in signal)), rel=1e-5
         )
@@ -83,18 +85,17 @@ def test_ranges_and_windows_are_those_of_all_frames(run):
 
 def test_a_frame_is_read_when_it_is_asked_for(run):
     with tf.Results(run) as results:
-        frames = Recorded(results, [0, -1], None)
+        frames = RecordedFrames(results, [0, -1], None)
         assert (
             len(frames) == 2
             and frames[0].signals == {}
             and len(frames[1].cells["uid"]) == results.counts[-1].sum()
         )
-        assert len(Recorded(results, [0, 1, 2], "ahl")[1:]) == 2 and frames.present.tolist() == [
-            True,
-            True,
-        ]
+        assert len(
+            RecordedFrames(results, [0, 1, 2], "ahl")[1:]
+        ) == 2 and frames.present.tolist() == [True, True]
         with pytest.raises(tf.InputError, match=r"background = 'lactose'.*ahl"):
-            Recorded(results, [0], "lactose")
+            RecordedFrames(results, [0], "lactose")
 
 
 # --- strips ---------------------------------------------------------------------------------------
@@ -102,27 +103,29 @@ def test_a_frame_is_read_when_it_is_asked_for(run):
 
 def test_frames_of_a_strip():
     times = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.1])
-    assert picked(times, None, None) == [0, 1, 3, 5]  # 0, 0.7, 1.4, 2.1
+    assert choose_frames(times, None, None) == [0, 1, 3, 5]  # 0, 0.7, 1.4, 2.1
     assert (
-        picked(times, None, 1) == [5]
-        and picked(times, None, 2) == [0, 5]
-        and picked(times, None, 99) == [0, 1, 2, 3, 4, 5]
+        choose_frames(times, None, 1) == [5]
+        and choose_frames(times, None, 2) == [0, 5]
+        and choose_frames(times, None, 99) == [0, 1, 2, 3, 4, 5]
     )
-    assert picked(times, [1.1, 0.2], None) == [2, 0] and picked(times, [2.3], None) == [5]
+    assert choose_frames(times, [1.1, 0.2], None) == [2, 0] and choose_frames(
+        times, [2.3], None
+    ) == [5]
     for bad in ([2.5], [-0.3], [0.0, 99.0]):
         with pytest.raises(tf.InputError, match=r"times = .*0 to 2.1 h"):
-            picked(times, bad, None)
+            choose_frames(times, bad, None)
     for wrong in (0, True, 2.5):
         with pytest.raises(tf.InputError, match="frames"):
-            picked(times, None, wrong)
+            choose_frames(times, None, wrong)
     with pytest.raises(tf.InputError, match="one of them"):
-        picked(times, [1.0], 3)
+        choose_frames(times, [1.0], 3)
     with pytest.raises(tf.InputError, match="at least one"):
-        picked(times, [], None)
+        choose_frames(times, [], None)
 
 
 def test_a_strip_writes_its_times(run, tmp_path):
-    """The times that were recorded, not those that were asked for."""
+    """The recorded times, not the given ones."""
     made = tf.pictures.strip(
         run,
         times=[0.1, 1.1, 2.0],
@@ -131,7 +134,7 @@ def test_a_strip_writes_its_times(run, tmp_path):
         colonies=[1],
         out=tmp_path / "a.svg",
     )
-    text = made.read_text()  # matplotlib writes each text as a comment beside its shapes
+    text = made.read_text()  # matplotlib writes each text as a comment next to its shapes
     for time in ("0 h", "1.2 h", "2 h", "colony 1", "yfp", "ahl outside", "z = 0 µm", "µm"):
         assert time in text, time
     assert "0.1 h" not in text and "1.1 h" not in text
@@ -139,21 +142,20 @@ def test_a_strip_writes_its_times(run, tmp_path):
 
 @pytest.fixture
 def laid_out(monkeypatch) -> dict:
-    """What strips are made of: the (rows, columns) of the page, and (time, place, survey, axes) of
-    each panel."""
+    """The (rows, columns) of a strip's page, and (time, place, layout, axes) of each panel."""
     seen: dict = {"panels": []}
-    page, fill = figures.page, figures.fill
+    make_page, fill = figures.make_page, figures.fill
 
     def noted_page(rows, columns, made, title, *, dpi):
         seen["shape"], seen["title"] = (rows, columns), title
-        seen["figure"], seen["axes"] = page(rows, columns, made, title, dpi=dpi)
+        seen["figure"], seen["axes"] = make_page(rows, columns, made, title, dpi=dpi)
         return seen["figure"], seen["axes"]
 
     def noted_fill(ax, frame, place, made, titles):
         seen["panels"].append((seen["axes"].index(ax), frame.time, place, made))
         fill(ax, frame, place, made, titles)
 
-    monkeypatch.setattr(figures, "page", noted_page)
+    monkeypatch.setattr(figures, "make_page", noted_page)
     monkeypatch.setattr(figures, "fill", noted_fill)
     return seen
 
@@ -183,8 +185,9 @@ def test_a_colony_is_a_row_and_time_runs_along_it(run, tmp_path, laid_out):
 
 
 def test_wide_panels_stand_one_below_the_other(run, tmp_path, laid_out):
-    """Cells in a row seen without the box: more than twice as wide as high. A colony is a column
-    then."""
+    """Cells in a row without the box are more than twice as wide as high, so a colony is a
+    column.
+    """
     tf.pictures.strip(run, times=[0.0, 0.4], out=tmp_path / "a.png")
     width, height = laid_out["panels"][0][3].size
     assert width > 2 * height and laid_out["shape"] == (2, 2)
@@ -210,7 +213,7 @@ def test_a_strip_stands_beside_the_results(run):
 
 
 def test_a_colony_that_has_no_cells_yet_or_any_more_is_drawn_empty(tmp_path):
-    """Removed in mid-run: its panel stays, with the signal in it."""
+    """After its cells are removed, a colony's panel stays, with the signal."""
     medium = tf.Medium(
         ahl=tf.Signal(diffusion=1.0, initial=1.0), box=((-16, -8, -4), (16, 8, 4)), spacing=4.0
     )
@@ -220,7 +223,9 @@ def test_a_colony_that_has_no_cells_yet_or_any_more_is_drawn_empty(tmp_path):
 
     scene = tf.Scene(tf.Rules(end), tf.Growth(rate=1.0), tf.Mechanics(dim=2), medium, dt=0.1)
     path = tmp_path / "run.h5"
-    for _ in tf.simulate(scene, scene.bind(2).start(), until=1.0, record=tf.Recorder(path, scene, every=5)):
+    for _ in tf.simulate(
+        scene, scene.bind(2).start(), until=1.0, record=tf.Recorder(path, scene, every=5)
+    ):
         pass
     with tf.Results(path) as results:
         assert results.counts[-1].tolist() == [1, 0]
@@ -234,8 +239,10 @@ def test_a_colony_that_has_no_cells_yet_or_any_more_is_drawn_empty(tmp_path):
 
 
 def test_show_draws_the_signal(run, tmp_path):
-    """The signal is uniform, and so in the middle of its range, which is that of the frame: paper
-    of one colour about the cells, white lowest."""
+    """The uniform signal is in the middle of its range, that of the frame, with white lowest.
+
+    So the paper around the cells has one colour.
+    """
     low = pixels(tf.show(run, background="ahl", limits={"ahl": (0, 10)}, out=tmp_path / "low.png"))
     high = pixels(
         tf.show(run, background="ahl", limits={"ahl": (0, 1e-3)}, out=tmp_path / "high.png")
@@ -248,7 +255,7 @@ def test_show_draws_the_signal(run, tmp_path):
     "draw", [tf.show, tf.pictures.strip, lambda path, out: tf.pictures.movie(path, out)]
 )
 def test_no_picture_replaces_the_results(run, tmp_path, draw):
-    """Not even where the results are called like a picture."""
+    """Not even if the results have the name of a picture."""
     own = tmp_path / "run.gif"
     own.write_bytes(run.read_bytes())
     with pytest.raises(tf.InputError, match="another file than the results"):
@@ -289,15 +296,16 @@ def test_every_other_frame_and_the_last(run, tmp_path, film_options):
 
 
 def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
-    """Greys are 255/103 apart, so a grey pixel is off by 1.3 at most, rounded 2. The 151 other
-    colours serve two maps, each a line of length 310 in the space of colours, and a few cells
-    between them: about 4 apart, and so no cell's is off by more than 8. What blends at an edge is
+    """Greys are 255/103 apart, so the error of a grey pixel is 1.3 at most, rounded to 2.
+
+    The 151 other colours serve two maps, each a line of length 310 in colour space, and a few cells
+    between them. They are about 4 apart, so no cell's error exceeds 8. Blended pixels at edges are
     in no legend.
     """
     made = tf.pictures.movie(run, tmp_path / "a.gif", **film_options)
     with tf.Results(run) as results, Image.open(made) as film:
-        frames = Recorded(results, range(len(results)), "ahl")
-        shared = survey(
+        frames = RecordedFrames(results, range(len(results)), "ahl")
+        shared = plan_layout(
             frames, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")
         )
         drawn = Film(frames, shared, "", 50)
@@ -309,7 +317,7 @@ def test_a_gif_shows_what_was_drawn(run, tmp_path, film_options):
             assert grey.any() and difference[grey].max() <= 2
             cells = np.unique(
                 np.round(
-                    255 * paint_cells(frames[k].cells, shared.scales, shared.look)[:, :3]
+                    255 * paint_cells(frames[k].cells, shared.scales, shared.style)[:, :3]
                 ).astype(int),
                 axis=0,
             )
@@ -328,10 +336,10 @@ def test_the_nearest_colour_is_the_nearest():
 
 
 def test_a_film_moves_neither_its_window_nor_its_legend(run, film_options):
-    """What is outside the panels and the titles is the same in every frame."""
+    """Outside the panels and the titles every frame is the same."""
     with tf.Results(run) as results:
-        frames = Recorded(results, range(len(results)), None)
-        film = Film(frames, survey(frames, [0], PlotStyle(colour="yfp")), "", 60)
+        frames = RecordedFrames(results, range(len(results)), None)
+        film = Film(frames, plan_layout(frames, [0], PlotStyle(colour="yfp")), "", 60)
         first, last = film[0], film[5]
     assert first.shape == last.shape
     panel = film.axes[0].get_window_extent()
@@ -366,8 +374,9 @@ def test_mp4_names_what_it_needs(run, tmp_path, monkeypatch):
 
 
 def test_a_film_that_breaks_off_leaves_the_old_one(run, tmp_path, monkeypatch, film_options):
-    """A full disk in the middle of it: told, nothing half written stays, and a film of that name
-    that was there is still whole."""
+    """A full disk in the middle of a film raises an error, leaves no partial file, and keeps an
+    older film of that name.
+    """
     old = tmp_path / "a.gif"
     old.write_bytes(b"an old film")
 
@@ -381,7 +390,7 @@ def test_a_film_that_breaks_off_leaves_the_old_one(run, tmp_path, monkeypatch, f
     assert [p.name for p in tmp_path.iterdir()] == ["a.gif"] and old.read_bytes() == b"an old film"
 
 
-# the reader of imageio-ffmpeg leaves its pipes to the collector
+# the reader of imageio-ffmpeg closes its pipes only at garbage collection
 @pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
 )
@@ -394,10 +403,12 @@ def test_an_mp4_has_every_frame(run, tmp_path, film_options):
     frames = [np.frombuffer(raw, np.uint8).reshape(*facts["size"][::-1], 3) for raw in stream]
     assert facts["fps"] == 5
     with tf.Results(run) as results:
-        shown = Recorded(results, range(len(results)), "ahl")
+        shown = RecordedFrames(results, range(len(results)), "ahl")
         drawn = Film(
             shown,
-            survey(shown, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")),
+            plan_layout(
+                shown, [0, 1], PlotStyle(channels=film_options["channels"], background="ahl")
+            ),
             "",
             50,
         )

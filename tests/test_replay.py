@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-
 from helpers import step
 
 import torchfilm as tf

@@ -13,9 +13,8 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from recorded import DT, EVERY, UNTIL, assert_same_state, make_scene, record
-
 from helpers import step
+from recorded import DT, EVERY, UNTIL, assert_same_state, make_scene, record
 
 import torchfilm as tf
 from torchfilm.effect import Effect
@@ -73,7 +72,9 @@ def test_what_a_file_says_of_itself(whole):
 def test_the_step_that_was_used_is_the_step_that_is_told(tmp_path):
     """`simulate(dt=…)` may differ from the scene's own step: a resumed run must know."""
     scene = make_scene()
-    for _ in tf.simulate(scene, scene.bind().start(), until=0.4, dt=0.1, record=tmp_path / "run.h5"):
+    for _ in tf.simulate(
+        scene, scene.bind().start(), until=0.4, dt=0.1, record=tmp_path / "run.h5"
+    ):
         pass
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.attributes["dt"] == 0.1
@@ -229,7 +230,9 @@ def test_reading_while_the_writer_is_open(tmp_path):
     """From this process, from an open reader that refreshes, and from another process."""
     path = tmp_path / "run.h5"
     scene = make_scene()
-    run = tf.simulate(scene, scene.bind(2).start(), until=2.0, record=tf.Recorder(path, scene, every=5))
+    run = tf.simulate(
+        scene, scene.bind(2).start(), until=2.0, record=tf.Recorder(path, scene, every=5)
+    )
     for _ in range(10):
         state = next(run)
     with tf.Results(path) as results:
@@ -300,7 +303,10 @@ def test_a_run_that_is_given_up_is_closed_and_complete(tmp_path):
     """Leaving the loop early writes the last state."""
     scene = make_scene()
     for state in tf.simulate(
-        scene, scene.bind().start(), until=1.0, record=tf.Recorder(tmp_path / "run.h5", scene, every=10)
+        scene,
+        scene.bind().start(),
+        until=1.0,
+        record=tf.Recorder(tmp_path / "run.h5", scene, every=10),
     ):
         if state.step == 13:
             break

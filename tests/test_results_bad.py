@@ -9,9 +9,8 @@ import sys
 
 import h5py
 import pytest
-from recorded import DT, UNTIL, assert_same_file, assert_same_state, make_scene, record
-
 from helpers import step
+from recorded import DT, UNTIL, assert_same_file, assert_same_state, make_scene, record
 
 import torchfilm as tf
 

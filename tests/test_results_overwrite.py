@@ -90,7 +90,10 @@ def test_a_reader_in_another_process_keeps_the_old_file_and_then_finds_the_new_o
     reader, scene = process(READER, old), make_scene()
     assert ask(reader) == before
     run = tf.simulate(
-        scene, scene.bind(3, seed=5).start(), until=0.5, record=tf.Recorder(old, scene, overwrite=True)
+        scene,
+        scene.bind(3, seed=5).start(),
+        until=0.5,
+        record=tf.Recorder(old, scene, overwrite=True),
     )
     next(run)
     assert ask(reader) == before, "the first refresh came before the run"
@@ -201,7 +204,9 @@ def test_a_file_that_another_process_writes_is_not_replaced(old, whole, process)
 def test_a_run_whose_file_goes_away_stops(tmp_path, how):
     """Its frames would be lost without a word."""
     path, scene = tmp_path / "run.h5", make_scene()
-    run = tf.simulate(scene, scene.bind(3).start(), until=UNTIL, record=tf.Recorder(path, scene, every=1))
+    run = tf.simulate(
+        scene, scene.bind(3).start(), until=UNTIL, record=tf.Recorder(path, scene, every=1)
+    )
     next(run)
     if how == "replaced":
         record(scene, scene.bind(3, seed=5).start(), path, until=DT, overwrite=True)

@@ -7,9 +7,8 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from recorded import assert_same_state
-
 from helpers import step
+from recorded import assert_same_state
 
 import torchfilm as tf
 from torchfilm.tools.checks import InputError
@@ -197,7 +196,9 @@ def test_appending_is_as_if_never_stopped(tmp_path):
 def test_a_half_written_frame_is_not_there(tmp_path):
     """Rows of signals that no frame counts, as a kill leaves them, are gone when a run goes on."""
     scene = smooth()
-    states = record(scene, scene.bind(2 + 1, seed=7).start(), tmp_path / "run.h5", until=EVERY * 2 * DT)
+    states = record(
+        scene, scene.bind(2 + 1, seed=7).start(), tmp_path / "run.h5", until=EVERY * 2 * DT
+    )
     with h5py.File(tmp_path / "run.h5", "r+") as file:
         for name in ("signals/ahl", "frames/grid/first_voxel"):
             table = file[name]

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
-
 from helpers import step
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchfilm as tf
 from torchfilm.effect import Effect

@@ -1,4 +1,4 @@
-"""The ready scenes: each runs, is built again by its recipe, and shows what it is for."""
+"""The ready scenes: each runs, can be rebuilt from its recipe, and shows its behaviour."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 import torch
-
 from helpers import step
 
 import torchfilm as tf
@@ -47,8 +46,7 @@ def test_every_ready_scene_is_tested_here():
 
 @pytest.mark.parametrize("kind", list(SMALL))
 def test_it_runs_and_its_recipe_builds_it_again(kind):
-    """The recipe, after a journey through JSON as in a results file, gives the same course bit for
-    bit."""
+    """The recipe, through JSON as in a results file, gives the same run bit for bit."""
     scene = small(kind)
     again = build(*json.loads(json.dumps(scene.recipe)))
     assert scene.name == again.name == kind.split()[0]
@@ -95,8 +93,7 @@ def test_a_microcolony_in_the_plane_is_round():
 
 
 def test_volume_doubles_in_ln2_over_rate():
-    """Free growth: the cells' volume before the first division, which a free cell's mechanics does
-    not hold back."""
+    """Free growth: the volume before the first division, where mechanics does not limit growth."""
     scene = tf.scenes.microcolony(rate=1.3)
     first = scene.bind(dtype=torch.float64).start()
     # ln 2 / 1.3 = 0.533 h; the founder, l = 2, is then 4.67 long in all and would have divided, so
@@ -140,7 +137,7 @@ def test_softer_agarose_gives_way_more():
 
 
 def row(length: float) -> tf.Cells:
-    """Upright rods side by side along x, just not touching."""
+    """Upright rods in a row along x, just not touching."""
     x = np.arange(0.0, length, 1.01)
     return tf.Cells(np.stack([x, 0 * x], 1), [0.0, 1.0], 2.0)
 
@@ -159,8 +156,10 @@ def test_only_cells_near_the_right_edge_grow():
 
 @pytest.mark.slow
 def test_the_tip_moves_right():
-    """From the default founder: the right edge runs away from the left one, which hardly moves once
-    growth has left it behind."""
+    """From the default founder: the right edge moves away from the left edge.
+
+    The left edge hardly moves once it is outside the growing zone.
+    """
     scene = tf.scenes.programmed_growth(edge=3.0)
     early = run(scene, scene.bind(2).start(), 4.0)
     late = run(scene, early, 8.0)
@@ -219,7 +218,7 @@ def test_a_closed_channel_loses_none_and_pressure_stops_growth():
         and (last.position[:, 1].abs() < 2).all()
     )
     wanted = 0.025 * (last.length + 2 / 3)
-    # full: cells get little of the growth that they want, where they had all of it at first
+    # full: cells grow much less than they would freely; at first they grew fully
     assert float((last.elongation / wanted).mean()) < 0.3
     assert float((states[0].elongation / (0.025 * (states[0].length + 2 / 3))).mean()) > 0.9
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import torchfilm as tf
-from torchfilm.physics.solve import CONVERGED
+from torchfilm.physics.problem import CONVERGED
 from torchfilm.state import PER_CELL
 
 
@@ -153,7 +153,9 @@ def test_a_number_of_cells_that_no_growth_leads_to_is_refused():
     assert not list(tf.simulate(scene, scene.bind(3).start(), cells=1))
     assert len(list(tf.simulate(scene, scene.bind(3).start(), until=0.1))) == 4
     with pytest.raises(tf.InputError, match=r"growth_rate', which is 0 and which nothing"):
-        tf.simulate(tf.Scene(tf.Growth(rate=0.0)), tf.Scene(tf.Growth(rate=0.0)).bind(2).start(), cells=4)
+        tf.simulate(
+            tf.Scene(tf.Growth(rate=0.0)), tf.Scene(tf.Growth(rate=0.0)).bind(2).start(), cells=4
+        )
 
 
 def test_cells_that_divide_or_lengthen_in_a_way_of_their_own_are_no_mistake():
@@ -180,7 +182,10 @@ def test_cells_that_divide_or_lengthen_in_a_way_of_their_own_are_no_mistake():
 def test_observers_may_come_one_by_one():
     scene, seen = alone(), []
     for _ in tf.simulate(
-        scene, scene.bind().start(), until=0.1, observers=(o for o in [lambda s: seen.append(s.step)])
+        scene,
+        scene.bind().start(),
+        until=0.1,
+        observers=(o for o in [lambda s: seen.append(s.step)]),
     ):
         pass
     assert len(seen) > 1
@@ -435,7 +440,11 @@ def test_an_observers_error_closes_the_file(tmp_path):
 
 def test_timings_are_filled(tmp_path):
     timings, scene = tf.Timings(), scene_of()
-    list(tf.simulate(scene, scene.bind().start(), until=0.5, timings=timings, record=tmp_path / "run.h5"))
+    list(
+        tf.simulate(
+            scene, scene.bind().start(), until=0.5, timings=timings, record=tmp_path / "run.h5"
+        )
+    )
     assert set(timings.seconds) == {"division", "growth", "mechanics", "recording"}
     assert all(0 < s < 60 for s in timings.seconds.values())
 
@@ -503,13 +512,17 @@ def test_the_order_of_colonies_does_not_matter():
 def test_a_smaller_batch_is_the_beginning_of_a_larger_one():
     """Colony 0 … 2 of a batch of 5 are those of a batch of 3 with the same seed."""
     scene = scene_of()
-    few, many = (list(tf.simulate(scene, scene.bind(n, seed=3).start(), until=2.0))[-1] for n in (3, 5))
+    few, many = (
+        list(tf.simulate(scene, scene.bind(n, seed=3).start(), until=2.0))[-1] for n in (3, 5)
+    )
     assert_same(many.select([0, 1, 2]), few.select([0, 1, 2]))
 
 
 def test_the_same_seed_twice_and_another_seed():
     scene = scene_of()
-    a, b, c = (list(tf.simulate(scene, scene.bind(2, seed=s).start(), until=2.0))[-1] for s in (1, 1, 2))
+    a, b, c = (
+        list(tf.simulate(scene, scene.bind(2, seed=s).start(), until=2.0))[-1] for s in (1, 1, 2)
+    )
     assert_same(a, b)
     assert not torch.equal(a.length[:2], c.length[:2])
 

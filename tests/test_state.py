@@ -7,7 +7,6 @@ import math
 
 import pytest
 import torch
-
 from helpers import step
 
 import torchfilm as tf

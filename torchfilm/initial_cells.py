@@ -1,4 +1,4 @@
-"""Cells to start from: by hand, from arrays, or from files of segmented micrographs (CSV, HDF5)."""
+"""Initial cells: given directly, from arrays, or from files of segmented images (CSV, HDF5)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks
 
-# What a column of a table may be called.
+# The names of columns for position and axis.
 POSITION, AXIS = ("x", "y", "z"), ("axis_x", "axis_y", "axis_z")
 # Columns by which segmentation programs number cells and frames; any other column becomes a field.
 BOOKKEEPING = ("label", "frame", "id", "cell_id", "track", "track_id", "index")
@@ -25,12 +25,13 @@ BOOKKEEPING = ("label", "frame", "id", "cell_id", "track", "track_id", "index")
 
 @dataclass(frozen=True)
 class Cells:
-    """Cells as given: position (N, d) µm, axis (N, d), any length but not zero, length (N,) µm of
-    the centreline, radius (N,) µm, cell_type (N,) whole numbers or None, colony (N,) or None, and
-    extra fields by name (N,).
+    """Initial cells.
 
-    With a colony for each cell, a batch has as many colonies as the greatest number says; without,
-    every colony starts from a copy of them all.
+    position: (N, d) µm. axis: (N, d), of any length above 0. length: (N,) µm of the centreline.
+    radius: (N,) µm. cell_type: (N,) integers or None. colony: (N,) or None. extra: further fields
+    by name, (N,) each. With a colony for each cell, a batch has as many colonies as the greatest
+    number requires. Without it, every colony starts from a copy of all cells. Raises InputError for
+    invalid values.
     """
 
     position: Any
@@ -112,7 +113,7 @@ class Cells:
 
     @property
     def colonies(self) -> int:
-        """How many colonies the cells name, at least; 1 if they name none."""
+        """The least number of colonies that the cells require; 1 without colony numbers."""
         return int(self.colony.max()) + 1 if self.colony is not None and self.count else 1
 
     @property
@@ -120,7 +121,7 @@ class Cells:
         return self.position.shape[1]
 
     def state(self, colonies: int, seed: int, device: torch.device, dtype: torch.dtype) -> State:
-        """The bare state of these cells, with no fields but cell_type and the extra columns."""
+        """The state of these cells, with no fields except cell_type and the extra columns."""
         if self.colony is None:
             index = np.tile(np.arange(self.count), colonies)
             colony = np.repeat(np.arange(colonies), self.count)
@@ -130,7 +131,7 @@ class Cells:
                 raise checks.input_error(
                     "colonies",
                     colonies,
-                    f"at least {greatest}, since the cells name colony {greatest - 1}",
+                    f"at least {greatest}, since a cell has colony {greatest - 1}",
                 )
             colonies = max(colonies, greatest)
             index = np.argsort(self.colony, kind="stable")
@@ -209,19 +210,18 @@ class Cells:
         sizes = {n: len(v) for n, v in left.items()}
         if len(set(sizes.values())) > 1:
             raise checks.InputError(
-                f"{source}: all columns must be equally long; they are"
+                f"{source}: all columns must have the same length; they have"
                 f" {', '.join(f'{n} {k}' for n, k in sizes.items())}."
             )
         if sizes["x"] == 0:
             raise checks.InputError(
-                f"{source} has no cell, only the names of its columns (a header). Give a line for"
-                " each cell, at least one."
+                f"{source} has no cell, only a header. Give one line per cell, at least one."
             )
         given = [n for n in AXIS if n in left]
         if "angle" in left and given:
             raise checks.InputError(
-                f"{source} has the columns 'angle' and {', '.join(map(repr, given))}: the direction"
-                " is told twice. Give one of the two."
+                f"{source} has the columns 'angle' and {', '.join(map(repr, given))}, which both"
+                " give the direction. Give only one of the two."
             )
         position = np.stack([np.asarray(left.pop(n), dtype=np.float64) for n in POSITION[:dim]], 1)
         if "angle" in left:
@@ -242,7 +242,9 @@ class Cells:
 
     @staticmethod
     def from_csv(path: str | Path) -> Cells:
-        """From a CSV file with a header line; columns as in `from_table`, separated by commas."""
+        """Cells from a CSV file with a header line; columns as in `from_table`, separated by
+        commas.
+        """
         names, rows = _read_csv(path)
         columns: dict[str, list[float]] = {name: [] for name in names}
         for number, row in rows:
@@ -269,7 +271,7 @@ class Cells:
 
     @staticmethod
     def from_hdf5(path: str | Path, group: str = "/") -> Cells:
-        """From an HDF5 file with one data set a column (as in `from_table`) in `group`."""
+        """Cells from an HDF5 file with one data set per column (as in `from_table`) in `group`."""
         import h5py
 
         with _readable(path, "rb"):
@@ -339,8 +341,10 @@ def _warn_of_bookkeeping(extra: Mapping[str, Any], source: str) -> None:
 
 
 def _read_csv(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The names in a CSV file's header, and its other lines with their numbers, as an editor counts
-    them; blank lines are left out."""
+    """The names in a CSV file's header, and its other lines with their line numbers.
+
+    Blank lines are skipped.
+    """
     with _readable(path, "r", encoding="utf-8-sig", newline="") as file:
         reader = csv.reader(file, skipinitialspace=True)
         try:
@@ -351,7 +355,7 @@ def _read_csv(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]
             ) from error
     if not rows:
         raise checks.InputError(
-            f"{path} is empty: it needs a header, such as x,y,angle,length, and a line for each"
+            f"{path} is empty: it requires a header, such as x,y,angle,length, and one line per"
             " cell."
         )
     line, names = rows[0][0], [name.strip() for name in rows[0][1]]
@@ -362,15 +366,16 @@ def _read_csv(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]
                 " and decimal points."
             )
     for name in names:
-        # a line of numbers is no header at all, which is told better elsewhere
+        # a line of numbers is not a header; another check reports that more clearly
         if names.count(name) > 1 and "x" in names:
             raise checks.InputError(
-                f"{path}, line {line}: the header has the column {name!r} twice. Leave one out."
+                f"{path}, line {line}: the header has the column {name!r} twice. Remove one."
             )
     return names, rows[1:]
 
 
 def _readable(path: str | Path, mode: str, **options: Any) -> Any:
+    """An open file. Raises InputError if the file cannot be read."""
     try:
         return open(path, mode, **options)
     except OSError as error:
@@ -378,6 +383,7 @@ def _readable(path: str | Path, mode: str, **options: Any) -> Any:
 
 
 def _array(name: str, given: Any, dtype: type) -> np.ndarray:
+    """An array of finite numbers, or InputError."""
     try:
         values: np.ndarray = np.asarray(
             given.detach().cpu() if isinstance(given, Tensor) else given, dtype=dtype
@@ -394,6 +400,7 @@ def _array(name: str, given: Any, dtype: type) -> np.ndarray:
 
 
 def _column(name: str, given: Any, count: int) -> np.ndarray:
+    """An array of shape (count,), or InputError."""
     values = _array(name, given, np.float64)
     if values.shape != (count,):
         raise checks.input_error(

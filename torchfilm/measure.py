@@ -1,5 +1,4 @@
-"""What one measures on a state: overlaps, radius, depth, alignment, per colony, and who is whose
-neighbour."""
+"""Measures of a state: overlaps, radius, depth and alignment per colony, and neighbour pairs."""
 
 from __future__ import annotations
 
@@ -19,8 +18,11 @@ from torchfilm.tools.vectors import safe_norm
 
 @dataclass(frozen=True)
 class Overlap:
-    """For each colony, (B,): `mean` and `worst` overlap of the pairs that overlap, µm (0 where none
-    does), `count` of such pairs, and `walls`, the worst overlap with a wall."""
+    """The overlaps in each colony; every field is (B,).
+
+    mean, worst: overlap of the pairs that overlap, µm (0 without such pairs). count: the number of
+    such pairs. walls: the worst overlap with a wall, µm.
+    """
 
     mean: Tensor
     worst: Tensor
@@ -30,8 +32,10 @@ class Overlap:
 
 @torch.no_grad()
 def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
-    """Overlaps between cells, and with the given walls wherever along a cell they are deepest, in
-    float64."""
+    """Overlaps between cells and with the given walls, in float64.
+
+    An overlap with a wall is measured where the cell is deepest.
+    """
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
     i, _, gap = gaps_nearby(state.position, axis, length, radius, state.colony, state.colonies)
     depth = -gap
@@ -49,15 +53,17 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
 
 @torch.no_grad()
 def colony_centre(state: State) -> Tensor:
-    """Centre of volume of each colony, (B, d) µm; NaN where it has no cell."""
+    """Centre of volume of each colony, (B, d) µm; NaN for a colony without cells."""
     volume = state.volume.double().unsqueeze(1)
     return state.groups.sum(state.position * volume) / state.groups.sum(volume)
 
 
 @torch.no_grad()
 def colony_radius(state: State) -> Tensor:
-    """Radius of the disc (2-D, or seen from above) with the same second moment as the cells, (B,)
-    µm: √2 · RMS distance from the centre."""
+    """Radius of the disc with the same second moment as the cells, (B,) µm: √2 · RMS distance.
+
+    The distance is from the colony's centre in the x–y plane.
+    """
     from_centre = (state.position - colony_centre(state).index_select(0, state.colony))[:, :2]
     square = (from_centre * from_centre).sum(1, keepdim=True)
     return (2.0 * state.groups.sum(square).squeeze(1) / state.counts).sqrt()
@@ -75,7 +81,7 @@ def depth(state: State) -> Tensor:
 
 @torch.no_grad()
 def nematic_order(state: State) -> Tensor:
-    """How well the axes of each colony agree in the plane, (B,): 0 at random, 1 all parallel."""
+    """Alignment of the axes of each colony in the plane, (B,): 0 for random, 1 for parallel."""
     x, y = state.axis[:, 0].double(), state.axis[:, 1].double()
     q = torch.stack([x * x - y * y, 2 * x * y, x * x + y * y], 1)
     total = state.groups.sum(q)
@@ -84,7 +90,7 @@ def nematic_order(state: State) -> Tensor:
 
 @torch.no_grad()
 def tilt(state: State) -> Tensor:
-    """Angle of each cell's axis out of the plane, (N,) rad, 0 … π/2."""
+    """Angle between each cell's axis and the x–y plane, (N,) rad, 0 … π/2."""
     if state.dim == 2:
         return torch.zeros_like(state.length)
     return torch.asin(state.axis[:, 2].abs().clamp(max=1))
@@ -92,9 +98,11 @@ def tilt(state: State) -> Tensor:
 
 @torch.no_grad()
 def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of cells of one colony whose surfaces are less than `gap` µm apart, each once: first
-    and second (P,) int64, and the distance of their centres, (P,) float64 µm. A colony's pairs and
-    their order do not depend on what else is in the batch."""
+    """Pairs of cells of one colony whose surfaces are less than `gap` µm apart, each pair once.
+
+    Returns first and second, (P,) int64, and the distance of their centres, (P,) float64 µm. A
+    colony's pairs and their order do not depend on the rest of the batch.
+    """
     checks.number("neighbours(gap)", gap, least=0.0)
     i, j, apart = gaps_nearby(
         state.position,

@@ -1,5 +1,7 @@
-"""What the user's rules see of the cells: Table 1's names, each a whole tensor, that may be read
-and, where the model allows, written."""
+"""Views of cells for the user's rules: Table 1's names, each a tensor over all cells.
+
+Rules may read every name, and write those that the model allows.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from torchfilm.state import CELL, CELL_TYPE, COLONY, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import unchanged
 
-# The paper's spellings (Table 1) beside ours.
+# The paper's names (Table 1) and ours.
 PAPER_NAMES = {
     "pos": "position",
     "dir": "axis",
@@ -25,7 +27,7 @@ PAPER_NAMES = {
     "divideFlag": "divide_flag",
 }
 GEOMETRY = ("position", "axis", "length", "radius", "volume", "area")
-# What reading a name means in terms of what other effects write.
+# The fields of other effects that a read of a name depends on.
 MEANS = {
     "volume": ("length", "radius"),
     "area": ("length", "radius"),
@@ -41,14 +43,17 @@ KNOWN_FIELDS = {
 
 
 def _quantity(state: State, name: str) -> Tensor:
-    """A quantity by the name that rules use; a colony goes by its id, which does not depend on the
-    batch."""
+    """A quantity by its name in rules.
+
+    A colony is given by its id, which does not depend on the batch.
+    """
     if name in state.declared and state.declared[name].scope == COLONY:
         return state.fields[name].index_select(0, state.colony)
     return state.own_colony_id if name == "colony" else getattr(state, name)
 
 
-def _check_whole(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
+def _check_integers(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
+    """Raises RuleError if an integer field would get non-integers."""
     if (
         tensor.is_floating_point()
         and not dtype.is_floating_point
@@ -56,22 +61,22 @@ def _check_whole(name: str, tensor: Tensor, dtype: torch.dtype) -> None:
         and not bool((tensor == tensor.round()).all())
     ):
         raise RuleError(
-            f"{name} holds whole numbers, and was set to broken ones. Give it a first value such as"
-            " 0.0 if it is to hold any number."
+            f"{name} is an integer field; got non-integers. Give it a first value such as 0.0 if it"
+            " should take any number."
         )
 
 
 class RuleError(checks.InputError, AttributeError):
-    """A rule asked for something that is not there, or set something to what it cannot be."""
+    """A rule read an unknown name, or wrote an invalid value."""
 
 
 class CellsView:
-    """What a rule sees: every name a tensor over all cells, (N,) or (N, d); `for cell in cells`
-    gives them one by one (slow).
+    """The cells as a rule sees them: every name is a tensor over all cells, (N,) or (N, d).
 
-    Read position (pos), axis (dir), length, radius, volume, area, uid, parent, colony, signals, and
-    every field of the scene; write fields, `divide_flag`, `remove_flag`, and new names, which
-    become variables of the cell. A tensor that was read may be changed in place.
+    `for cell in cells` gives them one by one (slow). A rule may read position (pos), axis (dir),
+    length, radius, volume, area, uid, parent, colony, signals, and every field of the scene. It may
+    write fields, `divide_flag`, `remove_flag`, and new names, which become variables of the cell. A
+    tensor that was read may be changed in place.
     """
 
     _state: State
@@ -85,7 +90,7 @@ class CellsView:
     _draws: int
 
     def __init__(self, state: State, dt: float, label: str, declaring: bool = False):
-        # past __setattr__, which is the rule's
+        # bypasses __setattr__, which is for rules
         self.__dict__.update(
             _state=state,
             _label=label,
@@ -128,16 +133,14 @@ class CellsView:
         if name in GEOMETRY or name in IDENTITY:
             self._read.update(MEANS.get(name, (name,)))
             if name not in self._shown:
-                # a copy, so that a rule that writes into it is found out and the state stays as it
-                # was
+                # a copy: a write into it is detected, and the state stays unchanged
                 self._shown[name] = _quantity(state, name).clone()
             return self._shown[name]
         if name == "remove_flag":
             self._work[name] = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
         elif name in state.fields and state.declared[name].scope == COLONY:
             self._read.add(name)
-            # of the colony's own, each cell gets its colony's; what is written into it is found out
-            # as for geometry
+            # each cell gets the value of its colony; writes into it are detected as for geometry
             if name not in self._shown:
                 self._shown[name] = _quantity(state, name)
             return self._shown[name]
@@ -162,10 +165,10 @@ class CellsView:
         return self._work[name]
 
     def _signals(self) -> Names:
-        """What each cell finds outside, (N,) by name: `cells.signals.ahl`."""
+        """The concentration of each signal at each cell, (N,) by name: `cells.signals.ahl`."""
         state = self._state
         if state.layout is None:
-            raise RuleError("cells have no signals: there is no Medium in this scene.")
+            raise RuleError("cells have no signals: this scene has no Medium.")
         self._read.update(("position", *(n for n in state.fields if n.startswith(OUTSIDE))))
         contact = state.contact()
         assert contact is not None
@@ -197,7 +200,7 @@ class CellsView:
         tensor = _as_tensor(f"cells.{name}", value, state.device)
         if dtype is None:
             known = state.fields.get(name)
-            # a plain number makes a variable that can hold any number
+            # a Python number makes a variable of floating-point type
             plain = tensor.is_floating_point() or (
                 not isinstance(value, (bool, Tensor)) and tensor.dtype != torch.bool
             )
@@ -215,14 +218,16 @@ class CellsView:
         shape = (
             state.fields[name].shape if name in state.fields else (state.cells, *tensor.shape[1:])
         )
-        self._work[name] = _fitted(f"cells.{name}", tensor.to(state.device), dtype, shape)
+        self._work[name] = _broadcast_copy(f"cells.{name}", tensor.to(state.device), dtype, shape)
 
     def __iter__(self):
         return (CellView(self, k) for k in range(self._state.cells))
 
     def random(self) -> Tensor:
-        """A draw from (0, 1) for each cell, (N,), keyed by seed, colony, cell and step: the same
-        whatever the batch. Each call draws anew."""
+        """One draw from (0, 1) for each cell, (N,), keyed by seed, colony, cell and step.
+
+        It does not depend on the batch. Each call gives new numbers.
+        """
         self.__dict__["_draws"] += 1
         return self._state.uniform(
             torch.arange(self._state.cells, device=self._state.device),
@@ -246,8 +251,10 @@ class CellsView:
         )
 
     def contacts(self, within: float = 0.05) -> tuple[Tensor, Tensor]:
-        """Pairs of cells whose surfaces are at most `within` µm apart: two (P,) index tensors, each
-        pair once. Found only when asked for."""
+        """Pairs of cells whose surfaces are at most `within` µm apart: two (P,) index tensors.
+
+        Each pair occurs once. The search runs only when a rule calls this.
+        """
         self._read.update(("position", "axis", "length", "radius"))
         s = self._state
         i, j, gap = gaps_nearby(
@@ -257,7 +264,7 @@ class CellsView:
         return i.index_select(0, keep), j.index_select(0, keep)
 
     def check_unharmed(self) -> None:
-        """Raise if a rule wrote into something that can only be read."""
+        """Raises RuleError if a rule wrote into a read-only name."""
         for name, shown in self._shown.items():
             if not unchanged(shown, _quantity(self._state, name)):
                 raise RuleError(
@@ -266,14 +273,16 @@ class CellsView:
                 )
 
     def contact_count(self, within: float = 0.05) -> Tensor:
-        """How many cells each cell touches, (N,) int64."""
+        """The number of cells that each cell touches, (N,) int64."""
         i, j = self.contacts(within)
         return torch.bincount(torch.cat([i, j]), minlength=self._state.cells)
 
 
 class CellView:
-    """One cell of a CellsView: the same names, one value each. For loops as in the paper; whole
-    tensors are a thousand times faster."""
+    """One cell of a CellsView: the same names, one value each.
+
+    It serves loops as in the paper; whole tensors are a thousand times faster.
+    """
 
     _cells: CellsView
     _index: int
@@ -298,23 +307,25 @@ class CellView:
             or name in cells._work
         ):
             column = getattr(cells, name)
-            _check_whole(f"cell.{name}", torch.as_tensor(value), column.dtype)
+            _check_integers(f"cell.{name}", torch.as_tensor(value), column.dtype)
             column[self._index] = value
             cells._written.add(name)
         elif cells._declaring:
             setattr(cells, name, False if isinstance(value, bool) else 0.0)
             getattr(cells, name)[self._index] = value
         else:
-            setattr(cells, name, value)  # raises, with the reason
+            setattr(cells, name, value)  # raises RuleError with the reason
 
 
 class DivisionView:
-    """The parents or daughters of one step's divisions, M of each: names as in CellsView;
-    daughters' fields may be written, or changed in place."""
+    """The parents or the daughters of one step's divisions, M of each.
+
+    The names are those of CellsView. Fields of daughters may be written, or changed in place.
+    """
 
     _state: State
     _rows: Tensor | None
-    _called: str
+    _name: str
     _purpose: str
     _set: set[str]
     _work: dict[str, Tensor]
@@ -322,13 +333,7 @@ class DivisionView:
 
     def __init__(self, state: State, rows: Tensor | None, called: str, purpose: str):
         self.__dict__.update(
-            _state=state,
-            _rows=rows,
-            _called=called,
-            _purpose=purpose,
-            _set=set(),
-            _work={},
-            _draws=0,
+            _state=state, _rows=rows, _name=called, _purpose=purpose, _set=set(), _work={}, _draws=0
         )
 
     def __getattr__(self, name: str) -> Tensor:
@@ -345,12 +350,15 @@ class DivisionView:
         return self._work[name]
 
     def _copy(self, name: str) -> Tensor:
-        """The quantity as the state has it, a row for each division; of the colony's own, each
-        division gets its colony's."""
+        """A copy of the quantity, one row per division.
+
+        For a field of the colony each division gets its colony's value.
+        """
         value = _quantity(self._state, name)
         return value.clone() if self._rows is None else value.index_select(0, self._rows)
 
     def _writable(self, name: str) -> bool:
+        """Whether rules may write the name: a field per cell, of a daughter."""
         return (
             self._rows is not None
             and name in self._state.fields
@@ -358,11 +366,11 @@ class DivisionView:
         )
 
     def check_unharmed(self) -> None:
-        """Raise if a rule wrote into something that can only be read."""
+        """Raises RuleError if a rule wrote into a read-only name."""
         for name, shown in self._work.items():
             if not self._writable(name) and not unchanged(shown, self._copy(name)):
                 raise RuleError(
-                    f"the rule changed {self._called}.{name} in place, which can only be read:"
+                    f"the rule changed {self._name}.{name} in place, which can only be read:"
                     " rules set daughters' fields."
                 )
 
@@ -370,13 +378,13 @@ class DivisionView:
         name = PAPER_NAMES.get(name, name)
         if self._rows is None:
             raise RuleError(
-                f"parent.{name} can only be read: the parent is gone; set daughter1.{name} and"
-                f" daughter2.{name}."
+                f"parent.{name} can only be read, since the parent no longer exists. Set"
+                f" daughter1.{name} and daughter2.{name}."
             )
         if name in GEOMETRY or name in IDENTITY:
             raise RuleError(
-                f"{self._called}.{name} can only be read: Division places the daughters (its"
-                " `fraction` shares the length); rules set fields."
+                f"{self._name}.{name} can only be read: Division places the daughters (its"
+                " `fraction` divides the length); rules set fields."
             )
         if not self._writable(name):
             own = ", ".join(filter(self._writable, self._state.fields))
@@ -385,8 +393,8 @@ class DivisionView:
                 f" have {own}"
             )
         like = getattr(self, name)
-        tensor = _as_tensor(f"{self._called}.{name}", value, like.device)
-        self._work[name] = _fitted(f"{self._called}.{name}", tensor, like.dtype, like.shape)
+        tensor = _as_tensor(f"{self._name}.{name}", value, like.device)
+        self._work[name] = _broadcast_copy(f"{self._name}.{name}", tensor, like.dtype, like.shape)
         self._set.add(name)
 
     def random(self) -> Tensor:
@@ -401,15 +409,16 @@ class DivisionView:
 
 
 def _as_tensor(name: str, value: Any, device: torch.device) -> Tensor:
+    """The value as a tensor, or RuleError."""
     try:
         return value if isinstance(value, Tensor) else torch.as_tensor(value, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise RuleError(f"{name} was set to {value!r}: it must be a number or a tensor.") from error
 
 
-def _fitted(name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequence[int]) -> Tensor:
-    """A copy of that type and shape."""
-    _check_whole(name, tensor, dtype)
+def _broadcast_copy(name: str, tensor: Tensor, dtype: torch.dtype, shape: Sequence[int]) -> Tensor:
+    """A copy with the given type and shape. Raises RuleError if it does not fit."""
+    _check_integers(name, tensor, dtype)
     try:
         return tensor.to(dtype).broadcast_to(shape).clone()
     except RuntimeError as error:

@@ -23,10 +23,10 @@ from study import Point, Study, timed
 
 import torchfilm as tf
 from torchfilm.signals import iterative
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.exchange import read, stencil, write
 from torchfilm.signals.exponential import aligned
 from torchfilm.signals.grid import Grid
-from torchfilm.signals.operator import operator
 from torchfilm.signals.transport import prepare
 
 ERROR, BELOW, WORK = "relative error", "below zero", "multiplications"
@@ -301,7 +301,7 @@ def in_space(name: str, diffusion: float, speed: float, quick: bool) -> Study:
             np.outer(spread(n, spacing, x, s), spread(n, spacing, 0.0, s))
             for x, s in ((-0.5 * speed * until, start), (0.5 * speed * until, end))
         )
-        transport = operator(
+        transport = build_operator(
             (n, n, 1),
             (spacing,) * 3,
             diffusion=diffusion,
@@ -373,7 +373,7 @@ def at_a_cell(quick: bool) -> Study:
             def steady(
                 source: torch.Tensor = source, n: int = n, spacing: float = spacing
             ) -> torch.Tensor:
-                transport = operator(
+                transport = build_operator(
                     (n, n, n),
                     (spacing,) * 3,
                     diffusion=diffusion,

@@ -98,9 +98,9 @@ def together(objective: Objective, runs: list[Run], colonies: int) -> None:
         groups: dict[tuple[float, int], list] = {}
         for run in open_runs:
             batch = run.method.ask()
-            groups.setdefault((batch.size, batch.replicates or objective.task.replicates), []).append(
-                (run, batch)
-            )
+            groups.setdefault(
+                (batch.size, batch.replicates or objective.task.replicates), []
+            ).append((run, batch))
         for (size, count), members in groups.items():
             found = objective.evaluate(
                 np.concatenate([b.points for _, b in members]), streams=range(count), size=size

@@ -26,8 +26,9 @@ from record import machine
 from scipy.special import ive
 
 import torchfilm as tf
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.iterative import convolve
-from torchfilm.signals.operator import Operator, apply, operator
+from torchfilm.signals.operator import Operator, apply
 from torchfilm.signals.transport import METHODS, prepare
 
 SIZES = (32, 64, 128)
@@ -61,7 +62,7 @@ def box(n: int, case: str, dtype: torch.dtype, device: str) -> Operator:
     mask = None
     if case.endswith("mask"):
         mask = (torch.rand(n, n, n, generator=torch.Generator().manual_seed(1)) > 0.1).to(device)
-    return operator(
+    return build_operator(
         (n, n, n), (1.0, 1.0, 1.0), diffusion=1.0, mask=mask, dtype=dtype, device=device
     )
 

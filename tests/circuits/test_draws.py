@@ -19,8 +19,10 @@ def cells(count: int, device="cpu"):
 
 
 def test_uniforms_are_uniform_and_strangers(device):
-    """Kolmogorov–Smirnov of 100,000 draws (they never change: p below 1e-3 would be a defect), and
-    correlations within 4.5/√n of lanes, events, purposes and cells."""
+    """Kolmogorov–Smirnov of 100,000 draws, and correlations of lanes, events, purposes and cells.
+
+    The draws never change, so p below 1e-3 would be a defect. Correlations are within 4.5/√n.
+    """
     colony, uid = cells(20_000, device)
     draw = keyed_draws(3, colony, uid, 7)
     rows = torch.arange(20_000, device=device)
@@ -44,7 +46,7 @@ def test_uniforms_are_uniform_and_strangers(device):
 
 
 def test_a_draw_is_its_own(device):
-    """The same for a cell alone or in company, and for one number or many."""
+    """The same for a cell alone or in a batch, and for one number or many."""
     colony, uid = cells(3000, device)
     draw = keyed_draws(1, colony, uid, 2)
     whole = draw(torch.arange(3000, device=device), 5, "x", 4)
@@ -61,8 +63,10 @@ def test_a_draw_is_its_own(device):
 
 @pytest.mark.parametrize("mean", [1e-9, 0.01, 0.5, 3.9, 4.1, 12.0, 80.0, 3e3, 1e6, 1e9])
 def test_poisson_inverts_the_distribution(device, mean):
-    """Against scipy's ppf at 3,000 uniforms and the far ends: the very same numbers, except where a
-    uniform lies within rounding of a step."""
+    """Against scipy's ppf at 3,000 uniforms and at both extremes.
+
+    The numbers are equal, except where a uniform lies within rounding of a step.
+    """
     g = torch.Generator().manual_seed(1)
     u = torch.cat(
         [
@@ -74,8 +78,8 @@ def test_poisson_inverts_the_distribution(device, mean):
     expected = stats.poisson.ppf(array(u), mean)
     different = found != expected
     assert np.abs(found - expected).max() <= 1 and different.mean() <= 2e-3
-    # where they differ, the uniform is at the step itself: 1e-12 from the sum's rounding, or what
-    # the law's next correction, 1e-2 of a step, makes of it
+    # where they differ, the uniform is at the step itself: within 1e-12 by the sum's rounding, or
+    # within the law's next correction, 1e-2 of a step
     at = np.minimum(found, expected)[different]
     off = np.abs(stats.poisson.cdf(at, mean) - array(u)[different])
     assert off.max(initial=0.0) <= (
@@ -94,8 +98,10 @@ def test_poisson_at_the_ends(device):
 
 
 def test_poisson_moments():
-    """Mean and variance of 200,000 stratified uniforms: the sums are integrals of the inverse, good
-    to 1e-3 of the standard deviation."""
+    """Mean and variance of 200,000 stratified uniforms.
+
+    The sums are integrals of the inverse, accurate to 1e-3 of the standard deviation.
+    """
     u = (torch.arange(200_000, dtype=F64) + 0.5) / 200_000
     for mean in (0.3, 4.0, 37.0, 1e4):
         k = array(poisson(torch.full_like(u, mean), u))

@@ -1,4 +1,4 @@
-"""Explicit integrators: their orders, and that a cell's result is its own."""
+"""Explicit integrators: their orders, and the independence of cells."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ def logistic(u, rows):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_order(method):
-    """u' = u (1 − u): halving the step divides the error by 2^order, over two halvings within 10 %
-    of the order."""
+    """u' = u (1 − u): halving the step divides the error by 2^order.
+
+    This holds over two halvings, within 10 % of the order.
+    """
     order, step = METHODS[method]
     exact = 1 / (1 + math.exp(-2) * 9)
     errors = [
@@ -69,8 +71,9 @@ def test_gradient(method):
 
 
 def test_equal_steps_in_float32():
-    """A number of steps whose size float32 does not hold: as many calls as steps, no sliver at the
-    end."""
+    """A step size that float32 cannot represent: as many calls as steps, and no tiny step at the
+    end.
+    """
     calls = []
 
     def rates(u, rows):

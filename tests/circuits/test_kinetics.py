@@ -1,4 +1,4 @@
-"""Rate laws: values, and that neither value nor derivative is lost at the ends."""
+"""Rate laws: values, and accuracy of values and derivatives at the extremes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ POWERS = [1.0, 1.5, 2.0, 2.5, 4.0, 8.0]
 @pytest.mark.parametrize("power", POWERS)
 @pytest.mark.parametrize("tensor", [False, True], ids=["number", "tensor"])
 def test_values(device, dtype, power, tensor):
-    """Against NumPy in float64 over nine decades about K = 0.3: a power of n costs n |log x/K|
-    roundings, 8 · 12 at most, and both laws are good relatively."""
+    """Against NumPy in float64 over nine decades around K = 0.3; both laws are relatively accurate.
+
+    A power of n costs n |log x/K| roundings, 8 · 12 at most.
+    """
     x = torch.logspace(-5, 4, 200, dtype=F64).to(device=device, dtype=dtype)
     half, n = (torch.tensor(v, dtype=dtype, device=device) if tensor else v for v in (0.3, power))
     r = array(x) / float(half)
@@ -27,7 +29,7 @@ def test_values(device, dtype, power, tensor):
     ):
         found = law(x, half, n)
         assert found.dtype == dtype
-        # below 1e-37 float32 has no full numbers
+        # below 1e-37 float32 numbers are subnormal
         normal = expected > 1e-36
         assert np.abs(array(found) / expected - 1)[normal].max() <= 100 * torch.finfo(dtype).eps
 
@@ -36,8 +38,10 @@ def test_values(device, dtype, power, tensor):
 @pytest.mark.parametrize("law, low, high", [(activation, 0.0, 1.0), (repression, 1.0, 0.0)])
 @pytest.mark.parametrize("tensor", [False, True], ids=["number", "tensor"])
 def test_the_ends(device, dtype, power, law, low, high, tensor):
-    """x/K from −1e30 to 1e30: the limits, no overflow, and two finite derivatives, by half and
-    power as well."""
+    """x/K from −1e30 to 1e30: the limits, no overflow, and two finite derivatives.
+
+    The derivatives by half and power are finite too.
+    """
     x = torch.tensor(
         [-1e30, -1.0, 0.0, 1e-30, 1e-10, 1.0, 1e10, 1e30],
         dtype=dtype,

@@ -45,12 +45,12 @@ def test_names_can_only_be_read():
 
 
 def test_a_species_may_have_any_name():
-    """Nothing of the class itself is in the way: no method takes a plain name."""
+    """No method of the class has a plain name, so none hides a species."""
     assert [n for n in dir(Names) if not n.startswith("_")] == []
 
 
 def test_copies_do_not_recurse():
-    """Copying asks an object without columns for its attributes."""
+    """copy reads attributes of an object that has no columns yet."""
     u = Names(("a",), torch.ones(2, 1), "u")
     for other in (copy.copy(u), pickle.loads(pickle.dumps(u))):
         assert other.a.tolist() == [1.0, 1.0]

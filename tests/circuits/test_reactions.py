@@ -1,5 +1,4 @@
-"""Reactions, parts and networks: what they say, what they input_error, and their rates against the
-formulas written out."""
+"""Reactions, parts and networks: their texts, their errors, and their rates against formulas."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ from helpers import array
 import torchfilm as tf
 from torchfilm.circuits.draws import keyed_draws
 from torchfilm.circuits.names import Names
-from torchfilm.circuits.network import network
+from torchfilm.circuits.network import build_network
 from torchfilm.circuits.parts import (
     activated,
     constitutive,
@@ -23,7 +22,7 @@ from torchfilm.circuits.parts import (
     repressed,
 )
 from torchfilm.circuits.reactions import Reaction
-from torchfilm.circuits.rosenbrock import rosenbrock
+from torchfilm.circuits.rosenbrock import rodas3
 from torchfilm.circuits.stochastic import DONE, direct
 
 SPECIES, SIGNALS = ("luxi", "ahl", "yfp"), ("ahl",)
@@ -58,7 +57,7 @@ def world(n=7, dtype=torch.float64, device="cpu"):
 def test_rates_are_the_formulas(device, dtype):
     """Against NumPy: a few roundings."""
     u, s, p, cell = world(dtype=dtype, device=device)
-    net = network(parts(), SPECIES, SIGNALS)
+    net = build_network(parts(), SPECIES, SIGNALS)
     found = net.concentration_rates(u, s, p, cell)
     luxi, ahl = array(u.luxi), array(u.ahl)
     per_volume = array(p.D1) * array(cell.area) / array(cell.volume)
@@ -82,12 +81,12 @@ def test_rates_are_the_formulas(device, dtype):
         assert array(change[k]) == pytest.approx(
             product[:, k], rel=1e-5 if dtype == torch.float32 else 1e-12
         )
-    # what leaves the cell enters the medium: amounts are both times the volume
+    # an amount that leaves the cell enters the medium: both are multiplied by the volume
     assert array(change[3]) == pytest.approx(array(found[5] - found[6]), rel=1e-6)
 
 
 def test_stoichiometry():
-    net = network(parts(), SPECIES, SIGNALS)
+    net = build_network(parts(), SPECIES, SIGNALS)
     assert net.names == ("luxi", "ahl", "yfp", "out.ahl")
     assert net.stoichiometry.tolist() == [
         [1, 0, 0, 0],
@@ -143,16 +142,22 @@ def test_equations_are_read():
         (lambda: activated("a", "b", 1.0, 0.0), "above 0"),
         (lambda: repressed("a", "b", -1.0, 1.0), "at least 0"),
         (lambda: conversion("a", enzyme="e", rate=1.0, half=0.0), "above 0"),
-        (lambda: network([], ["a"]), "at least one"),
+        (lambda: build_network([], ["a"]), "at least one"),
         (
-            lambda: network([degradation("lux1", 1.0)], ["luxi"]),
+            lambda: build_network([degradation("lux1", 1.0)], ["luxi"]),
             "unknown name 'lux1'; known are luxi. Did you mean 'luxi'",
         ),
-        (lambda: network([activated("a", "bee", 1.0, 1.0)], ["a", "be"]), "Did you mean 'be'"),
-        (lambda: network([exchange("a", 1.0)], ["a"], ["b"]), "unknown name 'out.a'"),
-        (lambda: network([degradation("a", 1.0), degradation("a", 2.0)], ["a"]), "only once"),
-        (lambda: network([degradation("a", 1.0)], ["a", "a"]), "different names"),
-        (lambda: network([degradation("a", 1.0)], "a"), "sequence of names"),
+        (
+            lambda: build_network([activated("a", "bee", 1.0, 1.0)], ["a", "be"]),
+            "Did you mean 'be'",
+        ),
+        (lambda: build_network([exchange("a", 1.0)], ["a"], ["b"]), "unknown name 'out.a'"),
+        (
+            lambda: build_network([degradation("a", 1.0), degradation("a", 2.0)], ["a"]),
+            "used only once",
+        ),
+        (lambda: build_network([degradation("a", 1.0)], ["a", "a"]), "different names"),
+        (lambda: build_network([degradation("a", 1.0)], "a"), "sequence of names"),
     ],
 )
 def test_what_makes_no_sense_is_refused(make, words):
@@ -163,12 +168,12 @@ def test_what_makes_no_sense_is_refused(make, words):
 def test_missing_parameters_are_named():
     u, s, p, cell = world()
     with pytest.raises(tf.InputError, match=r"p has no 'k4'; known are k3, K, D1"):
-        network([constitutive("luxi", "k4")], SPECIES).concentration_rates(u, s, p, cell)
+        build_network([constitutive("luxi", "k4")], SPECIES).concentration_rates(u, s, p, cell)
 
 
 def test_gradient_of_rates():
     u, s, p, cell = world(3)
-    net = network(parts(), SPECIES, SIGNALS)
+    net = build_network(parts(), SPECIES, SIGNALS)
 
     def rates(x, outside, k3):
         return torch.stack(
@@ -193,8 +198,9 @@ def test_gradient_of_rates():
 
 def test_propensities_count_combinations(device, dtype):
     """k Ω n(n − 1)/Ω² for 2 a; rate times Ω for functions; whole molecules only; a signal by its
-    own pool."""
-    net = network(
+    pool.
+    """
+    net = build_network(
         [
             Reaction.of("2 a -> b", 0.5),
             Reaction.of("-> a", 3.0),
@@ -228,11 +234,12 @@ def test_propensities_count_combinations(device, dtype):
 
 
 def test_both_ways_of_running_agree():
-    """Many molecules: the mean of the stochastic run is the smooth solution. Dimerisation among
-    1,000 molecules: fluctuations shift the mean by a few molecules, 1 % is 10 of them; the sample's
-    standard error is 1.
+    """With many molecules, the mean of the stochastic run is the deterministic solution.
+
+    For dimerisation among 1,000 molecules, fluctuations shift the mean by a few molecules; 1 % is
+    10 of them. The sample's standard error is 1.
     """
-    net = network(
+    net = build_network(
         [
             constitutive("a", 5.0),
             Reaction.of("2 a -> b", 0.3),
@@ -250,7 +257,7 @@ def test_both_ways_of_running_agree():
             1,
         )
 
-    u, _ = rosenbrock(smooth, torch.tensor([[0.0, 0.0]], dtype=torch.float64), 1.0, rtol=1e-6)
+    u, _ = rodas3(smooth, torch.tensor([[0.0, 0.0]], dtype=torch.float64), 1.0, rtol=1e-6)
     rows = torch.arange(cells)
     draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
     counts, report = direct(

@@ -1,5 +1,6 @@
-"""The stiff integrator: order, oracle, positivity, what is conserved, failures, gradients, and that
-a cell's result is its own."""
+"""The stiff integrator: order, references, positivity, conservation, failures, gradients,
+independence of cells.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from helpers import array
 from scipy.integrate import solve_ivp
 
 from torchfilm.circuits import kinetics, linear
-from torchfilm.circuits.rosenbrock import BELOW_ZERO, DONE, NOT_FINITE, TOO_MANY_STEPS, rosenbrock
+from torchfilm.circuits.rosenbrock import BELOW_ZERO, DONE, NOT_FINITE, TOO_MANY_STEPS, rodas3
 from torchfilm.tools.deterministic_math import deterministic_functions
 
 F64 = torch.float64
@@ -48,8 +49,9 @@ def lux(u, rows):
 
 
 def ring(u, rows):
-    """Six species, each activated by the one before; written as a user would, with a broken
-    power."""
+    """Six species, each activated by the one before, written as by a user, with a fractional
+    power.
+    """
     with deterministic_functions():
         x = u.unbind(1)
         return torch.stack(
@@ -66,14 +68,17 @@ def exact(rates, start, t, **options) -> np.ndarray:
 
 def test_order_three():
     """Equal steps (every error allowed) on a nonlinear circuit: halving the step divides the error
-    by 2³, measured over three halvings within 10 %."""
+    by 2³.
+
+    Measured over three halvings, within 10 %.
+    """
     start = [0.3, 1.4]
     reference = exact(toggle, start, 2.0)
     errors = []
     for steps in (8, 16, 32, 64):
         u = torch.tensor([start], dtype=F64)
         for _ in range(steps):
-            u, report = rosenbrock(toggle, u, 2.0 / steps, rtol=1e9)
+            u, report = rodas3(toggle, u, 2.0 / steps, rtol=1e9)
             assert int(report.accepted) == 1
         errors.append(np.abs(array(u)[0] - reference).max())
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
@@ -81,11 +86,12 @@ def test_order_three():
 
 
 def test_error_estimate_is_of_order_two_results():
-    """The step that is chosen shrinks with the cube root of rtol: the estimate is that of the
-    embedded result, h³."""
+    """The chosen step shrinks with the cube root of rtol: the estimate is that of the embedded
+    result, h³.
+    """
     start, counts = torch.tensor([[0.3, 1.4]], dtype=F64), []
     for rtol in (1e-6, 1e-9):
-        counts.append(int(rosenbrock(toggle, start, 2.0, rtol=rtol, atol=0.0)[1].accepted))
+        counts.append(int(rodas3(toggle, start, 2.0, rtol=rtol, atol=0.0)[1].accepted))
     assert counts[1] / counts[0] == pytest.approx(10, rel=0.15)
 
 
@@ -94,9 +100,11 @@ def test_error_estimate_is_of_order_two_results():
     [(toggle, [0.3, 1.4], 5.0), (lux, [0.0, 0.0, 0.0], 20.0), (robertson, [1.0, 0.0, 0.0], 40.0)],
 )
 def test_against_lsoda(device, dtype, rates, start, t):
-    """Stable circuits: the error at the end is a few times what a step is allowed, rtol (1e-4 by
-    default); ten times that is the bound."""
-    u, report = rosenbrock(rates, torch.tensor([start], dtype=dtype, device=device), t, atol=1e-10)
+    """Stable circuits: the error at the end is a few times the allowed error of a step, rtol.
+
+    rtol is 1e-4 by default; the bound is ten times that.
+    """
+    u, report = rodas3(rates, torch.tensor([start], dtype=dtype, device=device), t, atol=1e-10)
     assert (report.status == DONE).all()
     assert u.dtype == dtype
     assert array(u)[0] == pytest.approx(exact(rates, start, t), rel=1e-3, abs=1e-9)
@@ -104,14 +112,14 @@ def test_against_lsoda(device, dtype, rates, start, t):
 
 @pytest.mark.parametrize("rtol", [1e-3, 1e-5, 1e-7])
 def test_error_follows_the_tolerance(rtol):
-    u, _ = rosenbrock(toggle, torch.tensor([[0.3, 1.4]], dtype=F64), 3.0, rtol=rtol)
+    u, _ = rodas3(toggle, torch.tensor([[0.3, 1.4]], dtype=F64), 3.0, rtol=rtol)
     assert np.abs(array(u)[0] / exact(toggle, [0.3, 1.4], 3.0) - 1).max() <= 10 * rtol
 
 
 def test_one_step_where_one_is_enough(device, dtype):
-    """The whole of dt is tried at once: near a fixed point that is all, however fast the decay."""
+    """The first step is the whole dt. Near a fixed point it is enough, however fast the decay."""
     rates = lambda u, rows: 1e8 * (1.0 - u)
-    u, report = rosenbrock(rates, torch.ones(4, 2, dtype=dtype, device=device), 1.0)
+    u, report = rodas3(rates, torch.ones(4, 2, dtype=dtype, device=device), 1.0)
     assert (report.accepted == 1).all() and (report.rejected == 0).all()
     assert torch.equal(u, torch.ones_like(u))
 
@@ -119,12 +127,13 @@ def test_one_step_where_one_is_enough(device, dtype):
 @pytest.mark.parametrize("size", [1.0, 1e-3, 1e-6, 1e-12, 1e-25])
 @pytest.mark.parametrize("t", [0.025, 1e-6, 3e-8])
 def test_a_fast_decay_to_zero_does_not_stall(device, dtype, size, t):
-    """Rates of 1e8 and 3e7 in a row beside slow ones: nothing below zero, the slow ones right, and
-    steps as many as the accuracy of a decay over the decades down to atol asks for (some 20 each),
-    not t · 1e8."""
-    u, report = rosenbrock(
-        chain, torch.tensor([[size, 0.0, 1.0, 2.0]], dtype=dtype, device=device), t
-    )
+    """Rates of 1e8 and 3e7 in a row with slow ones: nothing is below zero, and the slow ones are
+    right.
+
+    The number of steps follows from the accuracy of a decay over the decades down to atol (some 20
+    each), not from t · 1e8.
+    """
+    u, report = rodas3(chain, torch.tensor([[size, 0.0, 1.0, 2.0]], dtype=dtype, device=device), t)
     assert int(report.status) == DONE
     assert int(report.accepted + report.rejected) <= 250
     assert float(u.min()) >= 0
@@ -132,8 +141,10 @@ def test_a_fast_decay_to_zero_does_not_stall(device, dtype, size, t):
 
 
 def test_rates_are_not_asked_below_zero(device, dtype):
-    """x' = −1e6 x from below atol: stages of a long step lie at −x, where x^1.5 is no number. The
-    rates are continued linearly there, so one step will do."""
+    """x' = −1e6 x from below atol: stages of a long step lie at −x, where x^1.5 is NaN.
+
+    The rates are continued linearly there, so one step is enough.
+    """
     seen = []
 
     def rates(u, rows):
@@ -141,12 +152,12 @@ def test_rates_are_not_asked_below_zero(device, dtype):
         x, y = u.unbind(1)
         return columns(-1e6 * x, x * x.sqrt() - y)
 
-    u, report = rosenbrock(rates, torch.tensor([[1e-13, 1e-3]], dtype=dtype, device=device), 0.025)
+    u, report = rodas3(rates, torch.tensor([[1e-13, 1e-3]], dtype=dtype, device=device), 0.025)
     assert int(report.status) == DONE and int(report.accepted + report.rejected) <= 3
     assert min(seen) >= 0
     assert float(u[0, 1]) == pytest.approx(1e-3 * np.exp(-0.025), rel=1e-4)
-    # where values may be negative they are asked as they are
-    rosenbrock(
+    # where values may be negative, the rates are evaluated there
+    rodas3(
         rates,
         torch.tensor([[1e-13, 1e-3]], dtype=dtype, device=device),
         0.025,
@@ -158,9 +169,11 @@ def test_rates_are_not_asked_below_zero(device, dtype):
 
 @pytest.mark.parametrize("t", [0.4, 40.0, 4e9])
 def test_what_the_rates_conserve_is_conserved(device, dtype, t):
-    """Robertson's a + b + c = 1: kept to rounding, a unit of the dtype for each of 150 steps adding
-    up at random and one more for f in it."""
-    u, report = rosenbrock(
+    """Robertson's a + b + c = 1 is conserved to rounding.
+
+    The bound is a unit of the dtype for each of 150 steps, adding up at random, and one more for f.
+    """
+    u, report = rodas3(
         robertson, torch.tensor([[1.0, 0.0, 0.0]], dtype=dtype, device=device), t, atol=1e-10
     )
     assert int(report.status) == DONE
@@ -169,9 +182,11 @@ def test_what_the_rates_conserve_is_conserved(device, dtype, t):
 
 
 def test_conserved_where_results_are_raised_to_zero():
-    """a + b -> c has two conserved sums; over steps so long that plain results would be below zero
-    still nothing is lost: rounding of W's entries, up to 1e4 · 5, against 2/h in it, is 1e-16 · h ·
-    5e4 of what moves, at most 5."""
+    """a + b -> c has two conserved sums, which hold even where plain results would be below zero.
+
+    The rounding of W's entries, up to 1e4 · 5, relative to 2/h, is 1e-16 · h · 5e4 of the converted
+    amount, at most 5.
+    """
 
     def rates(u, rows):
         a, b, _ = u.unbind(1)
@@ -182,7 +197,7 @@ def test_conserved_where_results_are_raised_to_zero():
         [[1.0, 1e-3, 0.0], [1.0, 1.0, 0.0], [1e-6, 5.0, 0.0], [1e-12, 1.0, 0.3]], dtype=F64
     )
     for t in (1e-4, 1e-3, 0.1, 10.0):
-        u, report = rosenbrock(rates, start, t)
+        u, report = rodas3(rates, start, t)
         assert (report.status == DONE).all() and float(u.min()) >= 0
         for k in (0, 1):
             assert torch.allclose(
@@ -195,11 +210,11 @@ def test_conserved_where_results_are_raised_to_zero():
 
 @pytest.mark.parametrize("fastest", [4, 8])
 def test_nonnegative_over_random_networks(device, dtype, fastest):
-    """200 cells of random first- and second-order reactions with constants from 1e-3 to 10^fastest,
-    from random starts, some at 0: never below 0, all done.
+    """200 cells of random first- and second-order reactions: never below 0, and all are done.
 
-    The sum is conserved but for the rates' own rounding, which adds up to eps · rate · time for
-    what moves: 0.025 · 1e4 · 6e-8 = 1.5e-5 in float32, where 1e8 asks for float64.
+    Constants are from 1e-3 to 10^fastest, starts are random, some at 0. The sum is conserved except
+    for the rounding of the rates, which adds up to eps · rate · time of the converted amount: 0.025
+    · 1e4 · 6e-8 = 1.5e-5 in float32, where 1e8 requires float64.
     """
     g = torch.Generator().manual_seed(7)
     pick = lambda *shape: 10 ** (torch.rand(*shape, generator=g, dtype=F64) * (fastest + 3) - 3)
@@ -213,7 +228,7 @@ def test_nonnegative_over_random_networks(device, dtype, fastest):
         meet = (pair[rows] * u[:, 0] * u[:, 1]).unsqueeze(1)
         return flow.sum(1) - flow.sum(2) + torch.cat([-meet, -meet, meet, meet], 1)
 
-    u, report = rosenbrock(rates, start, 0.025)
+    u, report = rodas3(rates, start, 0.025)
     assert (report.status == DONE).all()
     assert float(u.min()) >= 0
     if dtype == F64 or fastest < 8:
@@ -223,7 +238,7 @@ def test_nonnegative_over_random_networks(device, dtype, fastest):
 
 
 def test_negative_values_are_free_where_asked_for(device, dtype):
-    u, report = rosenbrock(
+    u, report = rodas3(
         lambda u, rows: -torch.ones_like(u),
         torch.ones(1, 1, dtype=dtype, device=device),
         3.0,
@@ -233,8 +248,9 @@ def test_negative_values_are_free_where_asked_for(device, dtype):
 
 
 def test_failures_stay_with_their_cell(device, dtype):
-    """A rate that is NaN, one that becomes infinite on the way, one that pushes below zero, and one
-    that needs more steps than it may; the others go on."""
+    """Four failures: a NaN rate, a rate that becomes infinite, one that makes a concentration
+    negative, and one that requires too many steps. The other cells continue.
+    """
 
     def rates(u, rows):
         x = u[:, 0]
@@ -245,23 +261,23 @@ def test_failures_stay_with_their_cell(device, dtype):
 
     start = torch.ones(6, 1, dtype=dtype, device=device)
     # a decay over the nine decades down to atol takes some 20 steps each
-    u, report = rosenbrock(rates, start, 2.0, max_steps=120)
+    u, report = rodas3(rates, start, 2.0, max_steps=120)
     assert report.status.tolist()[:2] == [DONE, NOT_FINITE]
     assert int(report.status[2]) in (NOT_FINITE, TOO_MANY_STEPS)  # x' = x² is infinite at t = 1
     assert report.status.tolist()[3:] == [BELOW_ZERO, TOO_MANY_STEPS, DONE]
     assert torch.isfinite(u).all()
-    assert float(u[1]) == 1.0 and int(report.rejected[1]) == 1  # given up at once
+    assert float(u[1]) == 1.0 and int(report.rejected[1]) == 1  # fails at once
     assert float(u[0]) == pytest.approx(np.exp(-2), rel=1e-3) and float(u[5]) == float(u[0])
 
 
 def test_nothing_to_do(device, dtype):
-    empty, _ = rosenbrock(toggle, torch.empty(0, 2, dtype=dtype, device=device), 1.0)
+    empty, _ = rodas3(toggle, torch.empty(0, 2, dtype=dtype, device=device), 1.0)
     assert empty.shape == (0, 2)
     start = torch.rand(3, 2, dtype=dtype, device=device)
-    same, report = rosenbrock(toggle, start, 0.0)
+    same, report = rodas3(toggle, start, 0.0)
     assert torch.equal(same, start) and (report.status == DONE).all()
-    # a rate that does not depend on what there is has no Jacobian
-    grown, _ = rosenbrock(
+    # a constant rate has no Jacobian
+    grown, _ = rodas3(
         lambda u, rows: torch.full_like(u, 2.0).detach(),
         torch.zeros(2, 1, dtype=dtype, device=device),
         0.5,
@@ -271,26 +287,28 @@ def test_nothing_to_do(device, dtype):
 
 @pytest.mark.parametrize("count", [2, 7, 33, 200])
 def test_a_row_is_its_own(dtype, count):
-    """Bit by bit the same alone, in any batch and at any place: easy and stiff rows, results and
-    step counts. With a gradient, the Jacobian is worked out the other way, so the same but for
-    rounding."""
+    """Bitwise the same alone, in any batch and at any position, for easy and stiff rows.
+
+    This covers results and step counts. With a gradient the Jacobian is computed in the other way,
+    so results agree to rounding.
+    """
     g = torch.Generator().manual_seed(count)
     speed = (10 ** (torch.rand(count, generator=g, dtype=F64) * 6 - 1)).to(dtype)
     start = (torch.rand(count, 6, generator=g, dtype=F64) ** 3).to(dtype)
     of = lambda k: lambda u, rows: speed[k][rows].unsqueeze(1) * ring(u, rows)
-    whole, report = rosenbrock(of(torch.arange(count)), start, 0.5)
+    whole, report = rodas3(of(torch.arange(count)), start, 0.5)
     for k in (
         torch.arange(1),
         torch.arange(count).flip(0),
         torch.randperm(count, generator=g)[: count // 2],
         torch.arange(count - 1, count),
     ):
-        part, own = rosenbrock(of(k), start[k], 0.5)
+        part, own = rodas3(of(k), start[k], 0.5)
         assert torch.equal(part, whole[k])
         assert torch.equal(own.accepted, report.accepted[k]) and torch.equal(
             own.rejected, report.rejected[k]
         )
-    traced, _ = rosenbrock(of(torch.arange(count)), start.clone().requires_grad_(), 0.5)
+    traced, _ = rodas3(of(torch.arange(count)), start.clone().requires_grad_(), 0.5)
     # of the Jacobian's last bits, which change a result by no more than that share of the error
     # that is allowed
     assert torch.allclose(
@@ -299,8 +317,9 @@ def test_a_row_is_its_own(dtype, count):
 
 
 def test_gradient_of_one_step():
-    """Exact derivative of what is computed, through the Jacobian and both solves: gradcheck,
-    float64."""
+    """The exact derivative of the step, through the Jacobian and both solves: gradcheck,
+    float64.
+    """
     u = torch.tensor([[0.3, 1.4], [2.0, 0.1]], dtype=F64, requires_grad=True)
     k = torch.tensor([4.0, 3.0], dtype=F64, requires_grad=True)
 
@@ -309,15 +328,16 @@ def test_gradient_of_one_step():
             k[0] * kinetics.repression(y[:, 1], 1.0, 2) - y[:, 0],
             k[1] * kinetics.repression(y[:, 0], 1.0, 2) - y[:, 1],
         )
-        return rosenbrock(rates, u, 0.4, rtol=1e9)[0]
+        return rodas3(rates, u, 0.4, rtol=1e9)[0]
 
     assert torch.autograd.gradcheck(run, (u, k))
 
 
 def test_gradient_through_many_steps(dtype):
-    """Robertson's rate constants over 4 h, by central differences of runs with rtol 1e-7 (float64),
-    whose own steps then do not matter: 1e-3 relative leaves truncation 1e-6 and noise 1e-4. The
-    gradient's own error is that of the steps it goes through, some 10 rtol = 1e-3 of the answer.
+    """Robertson's rate constants over 4 h, by central differences of runs with rtol 1e-7 (float64).
+
+    At that rtol the steps of these runs have no effect: 1e-3 relative has a truncation of 1e-6 and
+    noise of 1e-4. The gradient's own error is that of its steps, some 10 rtol = 1e-3 of the result.
     """
 
     def run(k, rtol):
@@ -328,7 +348,7 @@ def test_gradient_through_many_steps(dtype):
             return columns(-one, one - two, two)
 
         start = torch.tensor([[1.0, 0.0, 0.0]], dtype=k.dtype).expand(k.shape[0], 3)
-        return rosenbrock(rates, start, 4.0, rtol=rtol, atol=1e-10)[0][:, 0]
+        return rodas3(rates, start, 4.0, rtol=rtol, atol=1e-10)[0][:, 0]
 
     k0 = torch.tensor([[0.04, 1e4, 3e7]], dtype=F64)
     k = k0.to(dtype).requires_grad_()
@@ -339,8 +359,11 @@ def test_gradient_through_many_steps(dtype):
 
 
 def test_gradient_where_results_are_raised_and_steps_rejected():
-    """Rejected steps and steps drawn to zero leave no NaN behind, and what is conserved has its
-    exact gradient: ∂(a + b + c + …)/∂start = 1."""
+    """Rejected steps and steps moved to zero give no NaN, and conserved sums have their exact
+    gradient.
+
+    ∂(a + b + c + …)/∂start = 1.
+    """
 
     def rates(u, rows):
         a, b, _ = u.unbind(1)
@@ -349,19 +372,21 @@ def test_gradient_where_results_are_raised_and_steps_rejected():
     u = torch.tensor(
         [[1.0, 0.0, 0.5], [1e-9, 1e-12, 1.0], [0.0, 0.0, 0.0]], dtype=F64, requires_grad=True
     )
-    out, report = rosenbrock(rates, u, 1e-6)
+    out, report = rodas3(rates, u, 1e-6)
     assert int(report.rejected.max()) > 0
     grad = torch.autograd.grad(out.sum(), u)[0]
     assert grad == pytest.approx(torch.ones(3, 3), abs=1e-6)
 
 
 def test_gradient_where_a_rejected_step_is_not_finite():
-    """x' = x − 1e-30 eˣ from 10 over 1.98 h: the first trial overflows (2/h − J is 0.01), the steps
-    taken do not. Against central differences."""
+    """x' = x − 1e-30 eˣ from 10 over 1.98 h, against central differences.
+
+    The first trial step overflows (2/h − J is 0.01), the accepted steps do not.
+    """
     rates = lambda u, rows: u - 1e-30 * torch.exp(u)
     x = torch.full((3, 1), 10.0, dtype=F64) + torch.tensor([[0.0], [1e-3], [-1e-3]], dtype=F64)
     x.requires_grad_()
-    u, report = rosenbrock(rates, x, 1.98, rtol=1e-7)
+    u, report = rodas3(rates, x, 1.98, rtol=1e-7)
     assert int(report.rejected.min()) > 0 and (report.status == DONE).all()
     grad = torch.autograd.grad(u[0].sum(), x)[0].reshape(-1)
     u = u.detach().reshape(-1)
@@ -370,16 +395,18 @@ def test_gradient_where_a_rejected_step_is_not_finite():
 
 
 def test_no_graph_without_need():
-    out, _ = rosenbrock(toggle, torch.rand(3, 2), 1.0)
+    out, _ = rodas3(toggle, torch.rand(3, 2), 1.0)
     assert not out.requires_grad
     with torch.no_grad():
-        assert not rosenbrock(toggle, torch.rand(3, 2, requires_grad=True), 1.0)[0].requires_grad
+        assert not rodas3(toggle, torch.rand(3, 2, requires_grad=True), 1.0)[0].requires_grad
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 12])
 def test_linear_systems(device, dtype, size):
-    """Against torch.linalg in float64; the transposed solve and the gradients too. Diagonally
-    dominant: errors of a few units of rounding."""
+    """Against torch.linalg in float64, with the transposed solve and the gradients.
+
+    The matrices are diagonally dominant: errors are a few units of rounding.
+    """
     g = torch.Generator().manual_seed(size)
     matrix = (
         torch.rand(size, size, 9, generator=g, dtype=F64)
@@ -411,10 +438,11 @@ def test_linear_systems(device, dtype, size):
 
 
 def test_pivots_that_vanish_are_noticed():
-    """J = 2/h makes W singular at its first pivot: reported, and the step is taken again at another
-    size."""
+    """J = 2/h makes W singular at its first pivot: this is reported, and the step is repeated with
+    another size.
+    """
     matrix = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=F64).unsqueeze(2)
     assert not bool(linear.factor(matrix, torch.ones(2, 1, dtype=F64))[1])
-    u, report = rosenbrock(lambda u, rows: 2.0 * u, torch.ones(1, 1, dtype=F64), 1.0)
+    u, report = rodas3(lambda u, rows: 2.0 * u, torch.ones(1, 1, dtype=F64), 1.0)
     assert int(report.status) == DONE and int(report.rejected) > 0
     assert float(u) == pytest.approx(np.exp(2), rel=1e-3)

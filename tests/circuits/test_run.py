@@ -1,5 +1,4 @@
-"""One circuit over one step, without a scene: its pools, its reservoir, and what it says of what
-went wrong. Also its named columns."""
+"""One circuit over one step, without a scene: its pools, its reservoir, its errors, its columns."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ def circuit(
     dtype=F64,
     D1=3.0,
 ) -> run.CircuitCells:
-    """In some of three cells of 2, 4 and 1 µm³."""
+    """A circuit in some of three cells of 2, 4 and 1 µm³."""
     cell = {"volume": torch.tensor([2.0, 4.0, 1.0], dtype=dtype)}
     return run.CircuitCells(
         part,

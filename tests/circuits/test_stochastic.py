@@ -1,5 +1,4 @@
-"""Reactions molecule by molecule, against what is known exactly; bounds are 5 standard errors of
-the sample at a fixed seed."""
+"""Stochastic reactions against exact results; bounds are 5 standard errors at a fixed seed."""
 
 from __future__ import annotations
 
@@ -48,8 +47,11 @@ def run(
 def check_moments(
     sample: np.ndarray, mean: float, variance: float, fourth: float | None = None, bias: float = 0.0
 ) -> None:
-    """Mean and variance within 5 standard errors, √(σ²/n) and √((μ₄ − σ⁴)/n) (μ₄ of a normal law
-    unless given), and a relative `bias` allowed."""
+    """Mean and variance within 5 standard errors, √(σ²/n) and √((μ₄ − σ⁴)/n), plus a relative
+    `bias`.
+
+    The default μ₄ is that of a normal law.
+    """
     n = len(sample)
     assert abs(sample.mean() - mean) <= 5 * np.sqrt(variance / n) + bias * mean
     spread = np.sqrt(((3 * variance**2 if fourth is None else fourth) - variance**2) / n)
@@ -67,8 +69,10 @@ def birth_death(rate):
     "method, mean", [("direct", 3.0), ("direct", 20.0), ("tau", 3.0), ("tau", 400.0), ("tau", 1e4)]
 )
 def test_birth_and_death(device, method, mean):
-    """∅ → a at λ, a → ∅ at 1/h from 0: Poisson of mean λ (1 − e⁻ᵗ) at any time. Tau-leaping adds
-    ε/2 of bias at most to the variance."""
+    """∅ → a at λ, a → ∅ at 1/h from 0: Poisson of mean λ (1 − e⁻ᵗ) at any time.
+
+    Tau-leaping adds a bias of at most ε/2 to the variance.
+    """
     t = 2.0
     sample, report = run(method, [0.0], birth_death(mean), BIRTH_DEATH, t, device=device)
     expected = mean * (1 - np.exp(-t))
@@ -108,8 +112,10 @@ def master_equation(size, rates, changes, start, t):
 
 @both
 def test_dimerisation(device, method):
-    """Against the master equation of 0 … 120 molecules: moments, and the whole distribution by χ²
-    (p > 1e-3 at the fixed seed)."""
+    """Against the master equation of 0 … 120 molecules: moments, and the whole distribution by χ².
+
+    p > 1e-3 at the fixed seed.
+    """
     p = master_equation(120, lambda n: (8.0, 0.05 * n * (n - 1), 0.1 * n), (1, -2, -1), 30, 1.5)
     n = np.arange(120)
     mean = (p * n).sum()
@@ -121,8 +127,9 @@ def test_dimerisation(device, method):
 
 
 def gene(n, rows):
-    """A gene, off or on, that goes on at 1 and off at 3, makes protein at 40 when on; protein is
-    lost at 1 (all 1/h)."""
+    """A gene that switches on at 1 and off at 3 makes protein at 40 when on; protein decays at 1
+    (all 1/h).
+    """
     off, on, protein = n.unbind(1)
     return columns(1.0 * off, 3.0 * on, 40.0 * on, protein)
 
@@ -133,10 +140,10 @@ GENE = [[-1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
 @both
 def test_two_state_gene(device, method):
     """Stationary mean m = 40 · ¼ and variance m + m² (k_off/k_on) γ/(γ + k_on + k_off) = 10 + 100 ·
-    3/5 = 70; gene on a quarter of the time.
+    3/5 = 70.
 
-    After 8 lifetimes e⁻⁸ = 3e-4 of the start is left. μ₄ is less than 4 σ⁴ for this (beta-mixed)
-    law.
+    The gene is on a quarter of the time. After 8 lifetimes e⁻⁸ = 3e-4 of the start remains. μ₄ is
+    less than 4 σ⁴ for this (beta-mixed) law.
     """
     sample, _ = run(method, [1.0, 0.0, 0.0], gene, GENE, 8.0, device=device)
     assert (sample[:, 0] + sample[:, 1] == 1).all()
@@ -145,8 +152,10 @@ def test_two_state_gene(device, method):
 
 
 def test_tau_leap_is_direct_in_law():
-    """a + b ⇌ c, 3,000 each, half way: leaps and single events give the same means and variances
-    within 5 standard errors of their difference, and ε/2."""
+    """a + b ⇌ c, 3,000 each, half way: leaps and single events have the same means and variances.
+
+    They agree within 5 standard errors of their difference, and ε/2.
+    """
 
     def propensities(n, rows):
         a, b, c = n.unbind(1)
@@ -164,7 +173,7 @@ def test_tau_leap_is_direct_in_law():
         seed=2,
         orders=torch.tensor([2.0, 2.0, 1.0]),
     )
-    # the first molecules of c come one by one, and a leap may change c by 3 % of it
+    # the first molecules of c need single events, since a leap may change c by 3 %
     assert float(fast_report.steps.double().mean()) < 0.4 * float(slow_report.steps.double().mean())
     assert np.abs(fast[:, 0] + fast[:, 2] - 3000).max() == 0
     variance = slow[:, 2].var()
@@ -177,8 +186,10 @@ def test_tau_leap_is_direct_in_law():
 
 @both
 def test_no_number_goes_negative(device, method):
-    """Few molecules, fast two-body loss and stoichiometries of 3: hard on leaps. What is conserved
-    stays: a + 3 c."""
+    """Few molecules, fast two-body loss and stoichiometries of 3, which is hard for leaps.
+
+    The conserved sum a + 3 c is exact.
+    """
 
     def propensities(n, rows):
         a, _ = n.unbind(1)
@@ -197,9 +208,10 @@ def test_no_number_goes_negative(device, method):
 
 
 def test_what_runs_out_fires_alone():
-    """a → ∅ at a steady 12/h, whatever there is, from 9 and from 12: no leap sees the end coming.
-    From 9 it is critical, hence exact: (9 − Poisson(12))⁺ is left after an hour. From 12 leaps may
-    overshoot; they are taken again, half as long.
+    """a → ∅ at a constant 12/h, from 9 and from 12 molecules: a leap does not see the end.
+
+    From 9 the reaction is critical, hence exact: (9 − Poisson(12))⁺ remains after an hour. From 12
+    leaps may go too far; they are repeated at half the length.
     """
     steady = lambda n, rows: torch.full_like(n, 12.0)
     left, _ = run("tau", [9.0], steady, [[-1.0]], 1.0, orders=torch.tensor([0.0]))
@@ -220,8 +232,9 @@ def test_what_runs_out_fires_alone():
 
 @both
 def test_what_is_less_than_a_molecule_stays(device, method):
-    """Remainders given in (0.75 of a molecule of a signal outside) are kept, and are never
-    taken."""
+    """Fractional parts in the input (0.75 of a molecule of a signal outside) are kept and never
+    react.
+    """
     rows = torch.arange(300, device=device)
     draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
     start = torch.tensor([[0.0, 4.75]], device=device).repeat(300, 1)
@@ -269,7 +282,9 @@ def test_failures_stay_with_their_cell(device, dtype, method):
 @both
 @pytest.mark.parametrize("name", ["gene", "birth"])
 def test_a_row_is_its_own(method, name):
-    """Bit by bit the same alone, in any batch, at any place; its own rates and random stream."""
+    """Bitwise the same alone, in any batch, at any position, with its own rates and random
+    stream.
+    """
     rate = torch.linspace(1, 3000, 60, dtype=torch.float64)
     cell = torch.arange(60)
 
@@ -318,6 +333,6 @@ def test_nothing_to_do(device, dtype, method):
         start[:0], nothing, torch.tensor([[-1.0]]), 1.0, keyed_draws(1, rows[:0], rows[:0], 0)
     )
     assert out.shape == (0, 1)
-    # the input is not touched
+    # the input is unchanged
     moved, _ = METHODS[method](start, lambda n, rows: n, torch.tensor([[-1.0]]), 5.0, draw)
     assert not torch.equal(moved, start) and start.tolist() == [[0.0], [5.0], [7.0]]

@@ -8,7 +8,6 @@ import math
 
 import pytest
 import torch
-
 from helpers import step
 
 import torchfilm as tf
@@ -218,7 +217,9 @@ def test_first_concentrations_as_numbers_per_colony_drawn_or_given(dtype, device
     assert state.d.tolist() == [0.25, 0.75] * 3 and state.e.tolist() == [0.0] * 6
     assert all(state.fields[n].dtype == dtype for n in "abcde")
     assert state.declared["d"].meaning == "concentration in the cell"
-    assert torch.equal(scene.bind(3, seed=6, dtype=dtype, device=device).start().c, state.c) is False
+    assert (
+        torch.equal(scene.bind(3, seed=6, dtype=dtype, device=device).start().c, state.c) is False
+    )
 
 
 def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, device):
@@ -263,7 +264,8 @@ def test_cells_without_a_type_are_of_type_0():
     state = resting(tf.Circuit({0: made}, species=("m",), k=1.0, g=0.0), 2).bind().start()
     assert state.cell_type.tolist() == [0, 0]
     assert (
-        "cell_type" not in resting(tf.Circuit(made, species=("m",), k=1.0, g=0.0), 2).bind().start().fields
+        "cell_type"
+        not in resting(tf.Circuit(made, species=("m",), k=1.0, g=0.0), 2).bind().start().fields
     )
 
 

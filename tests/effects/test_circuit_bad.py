@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 import torch
-
 from helpers import step
 
 import torchfilm as tf
@@ -148,9 +147,13 @@ def test_a_misspelt_option_is_not_taken_for_a_parameter(
             ),
         ):
             resting(tf.Circuit(spelt, species=("m",), k=1.0, **{name: 1.0}), 2).bind().start()
-    resting(tf.Circuit(lambda u, s, p, cell: {"m": p.rate}, species=("m",), rate=1.0), 2).bind().start()
+    resting(
+        tf.Circuit(lambda u, s, p, cell: {"m": p.rate}, species=("m",), rate=1.0), 2
+    ).bind().start()
     resting(tf.Circuit(spelt, species=("m",), k=1.0, spare=1.0), 2).bind().start()
-    resting(tf.Circuit([tf.parts.constitutive("m", "rate")], species=("m",), rate=1.0), 2).bind().start()
+    resting(
+        tf.Circuit([tf.parts.constitutive("m", "rate")], species=("m",), rate=1.0), 2
+    ).bind().start()
 
 
 @pytest.mark.parametrize("case", AT_SEED)
@@ -183,7 +186,9 @@ def test_a_signal_is_named_when_its_amount_is_wrong():
                 medium,
             ).bind().start()
     with pytest.raises(InputError, match=r"s has no 'ahi'; known are ahl\. Did you mean 'ahl'"):
-        resting(tf.Circuit(lambda u, s, p, cell: {"m": s.ahi}, species=("m",)), 2, medium).bind().start()
+        resting(
+            tf.Circuit(lambda u, s, p, cell: {"m": s.ahi}, species=("m",)), 2, medium
+        ).bind().start()
 
 
 REACTIONS = {
@@ -267,9 +272,9 @@ def test_a_rate_that_becomes_nan_names_species_type_step_and_colonies(method, ra
 def test_drop_goes_on_without_the_colonies_that_failed():
     circuit = tf.Circuit(breaks, species=("m", "w"), k=torch.tensor([0.1, 3.0, 0.0]), method="rk4")
     scene = resting(circuit, 2)
-    last = list(tf.simulate(scene, scene.bind(3, dtype=F64).start(), until=1.0, dt=0.1, on_failure="drop"))[
-        -1
-    ]
+    last = list(
+        tf.simulate(scene, scene.bind(3, dtype=F64).start(), until=1.0, dt=0.1, on_failure="drop")
+    )[-1]
     assert last.counts.tolist() == [2, 0, 2] and last.m.tolist() == pytest.approx(
         [0.1, 0.1, 0.0, 0.0]
     )

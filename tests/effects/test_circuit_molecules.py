@@ -7,9 +7,8 @@ import math
 
 import pytest
 import torch
-from ruled import same
-
 from helpers import step
+from ruled import same
 
 import torchfilm as tf
 from torchfilm.circuits.partition import binomial
@@ -121,8 +120,8 @@ def divided(
         tf.Division(fraction=fraction), circuit, founders=side_by_side(count, length=4.0)
     )
     state = scene.bind(seed=seed, dtype=F64).start()
-    return state, step(scene, 
-        state.with_fields(divide_flag=torch.ones(count, dtype=torch.bool)), 0.1
+    return state, step(
+        scene, state.with_fields(divide_flag=torch.ones(count, dtype=torch.bool)), 0.1
     )
 
 
@@ -309,9 +308,9 @@ def test_a_negative_propensity_names_reaction_step_and_colonies(method):
     ) as failed:
         list(tf.simulate(scene, scene.bind(3, dtype=F64).start(), until=0.3, dt=0.1))
     assert failed.value.colonies == (1,) and "step 1" in str(failed.value)
-    last = list(tf.simulate(scene, scene.bind(3, dtype=F64).start(), until=0.3, dt=0.1, on_failure="drop"))[
-        -1
-    ]
+    last = list(
+        tf.simulate(scene, scene.bind(3, dtype=F64).start(), until=0.3, dt=0.1, on_failure="drop")
+    )[-1]
     assert last.counts.tolist() == [1, 0, 1]
 
 

@@ -76,8 +76,12 @@ def test_a_hundred_steps_equal_one(law, device, dtype):
 
 def test_volume_law_and_length_law_differ_by_the_caps():
     """With l = 2, r = ½ the volume law lengthens by e^g(l + 4r/3) − 4r/3: more than e^g·l."""
-    by_volume = grown(scene := scene_of(1.0, "volume"), scene.bind(dtype=torch.float64).start(), 1, 1.0)
-    by_length = grown(scene := scene_of(1.0, "length"), scene.bind(dtype=torch.float64).start(), 1, 1.0)
+    by_volume = grown(
+        scene := scene_of(1.0, "volume"), scene.bind(dtype=torch.float64).start(), 1, 1.0
+    )
+    by_length = grown(
+        scene := scene_of(1.0, "length"), scene.bind(dtype=torch.float64).start(), 1, 1.0
+    )
     assert float(by_volume.length) == pytest.approx(math.e * (2 + 2 / 3) - 2 / 3, rel=1e-14)
     assert float(by_length.length) == pytest.approx(math.e * 2, rel=1e-14)
 
@@ -150,9 +154,9 @@ def test_drawn_rates_cover_their_range_and_belong_to_cells():
     assert torch.equal(scene.bind(3, dtype=torch.float64).start().growth_rate, rate[:3]), (
         "a draw depends on the batch"
     )
-    assert not torch.equal(scene.bind(3, seed=1, dtype=torch.float64).start().growth_rate, rate[:3]), (
-        "a draw ignores the seed"
-    )
+    assert not torch.equal(
+        scene.bind(3, seed=1, dtype=torch.float64).start().growth_rate, rate[:3]
+    ), "a draw ignores the seed"
 
 
 def flagged(scene: tf.Scene, colonies: int) -> tf.State:

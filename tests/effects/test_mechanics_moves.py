@@ -1,5 +1,6 @@
-"""What is carried out of a solve's moves: no cell turns too far or goes through a wall in one of
-them; and lengths that are held spoil no solve."""
+"""Moves after a solve: no cell turns too far or passes a wall; solves with fixed lengths
+converge.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ from helpers import crowd, run, seeded, step
 
 import torchfilm as tf
 from torchfilm.physics.capsule import rotate
-from torchfilm.physics.solve import CONVERGED
-from torchfilm.physics.walls import share_to_walls
+from torchfilm.physics.problem import CONVERGED
+from torchfilm.physics.wall_contacts import share_to_walls
 
 X, Y = [1.0, 0.0], [0.0, 1.0]
 
@@ -21,7 +22,7 @@ X, Y = [1.0, 0.0], [0.0, 1.0]
 def share(
     wall: tf.Wall, position, axis, length: float, way, turn: float = 0.0, radius: float = 0.5
 ) -> float:
-    """How much of a move of one cell in the plane it makes."""
+    """The share of its move that one cell in the plane makes."""
     t = lambda x: torch.tensor([x], dtype=torch.float64)
     at = lambda s: (
         t(position) + s * t(way),
@@ -39,8 +40,11 @@ def share(
 
 
 def test_a_move_ends_a_radius_behind_a_wall():
-    """From 2 µm above a floor, 5 µm down: the cell's underside goes 1.5 µm to the floor and 0.5 µm
-    on. One that began 0.2 µm deep goes 0.5 µm on from there."""
+    """From 2 µm above a floor, 5 µm down: the cell's underside stops 0.5 µm behind the floor, after
+    1.5 µm to the floor.
+
+    A cell that began 0.2 µm deep moves 0.5 µm further.
+    """
     floor = tf.Plane(y=0.0, facing="+y")
     assert share(floor, [0.0, 2.0], X, 2.0, [0.0, -5.0]) == pytest.approx(2.0 / 5.0)
     assert share(floor, [0.0, 0.3], X, 2.0, [0.0, -5.0]) == pytest.approx(0.5 / 5.0)
@@ -49,8 +53,10 @@ def test_a_move_ends_a_radius_behind_a_wall():
 
 
 def test_a_move_that_turns_an_end_through_a_wall():
-    """A rod of 6 µm just above a floor turns by 0.49 rad about its centre: its end would be 3 sin
-    0.49 lower, 0.91 µm deeper than a radius behind the floor."""
+    """A rod of 6 µm just above a floor turns by 0.49 rad about its centre.
+
+    Its end would be 3 sin 0.49 lower, 0.91 µm deeper than a radius behind the floor.
+    """
     floor = tf.Plane(y=0.0, facing="+y")
     part = share(floor, [0.0, 0.55], X, 6.0, [0.0, 0.0], turn=0.49)
     assert part == pytest.approx(0.55 / (3 * math.sin(0.49)))
@@ -58,8 +64,7 @@ def test_a_move_that_turns_an_end_through_a_wall():
 
 
 def test_a_move_does_not_jump_over_a_ball():
-    """A post of 1 µm in the way of a cell that would go from one side to the other: it stops behind
-    the surface by a radius or less."""
+    """A cell would cross a ball of 1 µm; it stops at most a radius behind the ball's surface."""
     post = tf.Sphere((0.0, 0.0), 1.0, inside=False)
     part = share(post, [-1.6, 0.0], Y, 0.0, [3.4, 0.0])
     assert -1.6 + 3.4 * part == pytest.approx(-1.0, abs=3.4 / 8)
@@ -67,8 +72,10 @@ def test_a_move_does_not_jump_over_a_ball():
 
 
 def test_a_cell_that_is_thrown_at_a_wall_stays(device, dtype):
-    """Two rods on top of each other, one drag ten thousand times the other's: the light one takes
-    the whole way, and there is a wall in it."""
+    """Two rods at one position, one with ten thousand times the drag of the other.
+
+    The light one makes the whole move, and there is a wall in its way.
+    """
     cells = tf.Cells([[0.0, 0.0], [0.0, 0.02]], [X, X], [4.0, 4.0], extra={"drag": [1e4, 1.0]})
     scene = tf.Scene(tf.Mechanics(dim=2, walls=[tf.Plane(y=0.55, facing="-y")], alpha=1e-4))
     state = run(scene, seeded(scene, cells, device, dtype), 1, dt=0.01)
@@ -80,8 +87,10 @@ def test_a_cell_that_is_thrown_at_a_wall_stays(device, dtype):
     "alpha, viscosity, length_drag", [(1e-7, 0.1, 10.0), (1e-6, 0.01, 1.0), (1e-8, 1.0, 100.0)]
 )
 def test_rods_end_to_end_in_a_full_channel(device, alpha, viscosity, length_drag):
-    """Contacts so hard that float32 rounding alone would make some cells' blocks indefinite: every
-    solve converges."""
+    """Contacts so hard that float32 rounding alone would make some cells' blocks indefinite.
+
+    Every solve converges.
+    """
     rng = np.random.default_rng(0)
     centre = np.stack([1.45 + 2.9 * np.arange(12), 0.02 * rng.normal(size=12)], 1)
     axis = np.stack([np.ones(12), 0.02 * rng.normal(size=12)], 1)
@@ -107,8 +116,10 @@ def test_rods_end_to_end_in_a_full_channel(device, alpha, viscosity, length_drag
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_contacts_do_not_draw_out_a_cell_that_does_not_grow(device, dtype, dim):
-    """In an overlapping crowd bilateral contacts pull on some cells. They may lengthen cells that
-    grow, but a cell whose growth rate is 0 keeps its length to the bit."""
+    """In an overlapping crowd bilateral contacts pull on some cells.
+
+    They may lengthen cells that grow, but a cell with growth rate 0 keeps its length to the bit.
+    """
     cells = crowd(np.random.default_rng(0), 60, dim)
     scene = tf.Scene(tf.Growth(rate=[0.0, 0.1]), tf.Mechanics(dim=dim))
     state = scene.bind(2, cells=cells, device=device, dtype=dtype).start()
@@ -118,6 +129,6 @@ def test_contacts_do_not_draw_out_a_cell_that_does_not_grow(device, dtype, dim):
         assert torch.equal(state.length[still], first[still]) and bool(
             (state.elongation[still] == 0).all()
         )
-        slack = 1 - 4 * torch.finfo(dtype).eps  # the growth of a step is added and taken off again
+        slack = 1 - 4 * torch.finfo(dtype).eps  # the growth of a step is added and then subtracted
         assert bool((state.length[~still] >= slack * before.length[~still]).all())
     assert float((state.position - before.position).abs().max()) > 0

@@ -1,5 +1,4 @@
-"""How many passes a step takes, how finely each is solved, and that neither depends on the
-batch."""
+"""The passes of a step, the accuracy of each, and their independence of the batch."""
 
 from __future__ import annotations
 
@@ -11,15 +10,15 @@ from helpers import run, seeded, step
 import torchfilm as tf
 from torchfilm.effects.mechanics import _Run
 from torchfilm.physics.contacts import gaps_nearby
-from torchfilm.physics.solve import CONVERGED
+from torchfilm.physics.problem import CONVERGED
 
-# Sixty short rods thrown into a box of 5 µm: the first moves would turn some of them by far more
+# Sixty short rods at random in a box of 5 µm: the first moves would turn some of them by far more
 # than MAX_TURN, as in the middle of a large colony.
 RODS, SIDE = 60, 5.0
 
 
 def thrown(*colonies: float) -> tf.Cells:
-    """A colony of such rods for each of the given stretches of the box."""
+    """A colony of such rods for each of the given ranges of the box."""
     parts = []
     for number, stretch in enumerate(colonies):
         rng = np.random.default_rng(number)
@@ -42,13 +41,15 @@ def first_step(device, dtype, **options) -> tf.State:
 
 
 def deepest(state: tf.State) -> float:
-    """Of the crowded colony, µm."""
+    """The greatest overlap in the crowded colony, µm."""
     return float(tf.measure.overlaps(state).worst[0])
 
 
 def test_later_passes_part_what_the_first_left_deep(device, dtype):
-    """Further passes leave the crowd's mean overlap less, until none is deeper than 0.02 µm, which
-    is asked where passes are."""
+    """Further passes reduce the crowd's mean overlap, until none exceeds 0.02 µm.
+
+    That is the limit where `passes` is given.
+    """
     more = [first_step(device, dtype, passes=passes) for passes in (1, 2, 4, 8)]
     mean = [float(tf.measure.overlaps(s).mean[0]) for s in more]
     assert mean[0] > mean[1] > mean[2] > mean[3]
@@ -58,7 +59,7 @@ def test_later_passes_part_what_the_first_left_deep(device, dtype):
 
 
 def test_two_passes_are_the_default_in_space(device, dtype):
-    """Down to a fifth of the radius; those that the crowd has, it needs."""
+    """The crowd needs both, down to a fifth of the radius."""
     state = first_step(device, dtype)
     assert state.reports["mechanics"].passes.tolist()[0] == 2 and deepest(state) > 0.1
     assert torch.equal(state.position, first_step(device, dtype, passes=2, overlap=0.1).position)
@@ -69,9 +70,11 @@ def test_the_overlap_that_is_left_can_be_named(device, dtype):
 
 
 def test_a_later_pass_moves_only_what_is_too_deep(device, dtype):
-    """Beside the crowd, in one colony with it, a pair that the first pass parts to within the
-    limit: the second moves the crowd's cells that are deeper than the limit, or were cut short, and
-    no other."""
+    """A colony with a crowd and a separate pair that the first pass separates to within the limit.
+
+    The second pass moves only those cells of the crowd that are deeper than the limit, or whose
+    move was cut.
+    """
     crowd = thrown(1.0)
     far = np.array([[40, 0, 0], [40, 0.8, 0]]), np.array([[1.0, 0, 0], [1, 0, 0]])
     cells = tf.Cells(
@@ -92,8 +95,10 @@ def test_a_later_pass_moves_only_what_is_too_deep(device, dtype):
 
 
 def every_pair(run_of: _Run, active: torch.Tensor) -> tuple[list, torch.Tensor]:
-    """What a later pass should find, by looking at every pair: those that hold a cell which takes
-    part, and which cells take part, (N,) bool."""
+    """The pairs that a later pass should find, by a search over all pairs.
+
+    These are the pairs with a cell that takes part. Also which cells take part, (N,) bool.
+    """
     pairs, walls = run_of._all_that_touches(active, run_of.sees_near[1])
     of_active = active[run_of.state.colony]
     left = run_of.cut & of_active
@@ -110,8 +115,8 @@ def as_list(first: torch.Tensor, second: torch.Tensor) -> list:
     return sorted((min(p), max(p)) for p in zip(first.tolist(), second.tolist(), strict=True))
 
 
-# By overlap: cells that hardly move are left deep where the limit is small beside what the box
-# leaves, and it goes by the radius where none is given.
+# By overlap: cells that hardly move stay deep where the limit is small compared with the box's
+# overlaps. Without a given limit it depends on the radius.
 LIMITS = {
     "small": {"passes": 6, "overlap": 0.01},
     "by radius": {},
@@ -123,9 +128,11 @@ LIMITS = {
 @pytest.mark.parametrize("limit", LIMITS)
 @pytest.mark.parametrize("unilateral", [False, True])
 def test_what_is_left_deep_is_found_wherever_it_is(dtype, limit, unilateral, monkeypatch):
-    """In each later pass, by the search near what has moved, the same cells and the same contacts,
-    each once, as by looking at every pair: for cells of many sizes, in colonies from loose to
-    jammed, in a hard box with a soft plane in it; some colonies are done before others.
+    """Each later pass finds the same cells and the same contacts, each once, as a search over all
+    pairs.
+
+    The search is only near moved cells. The cells have many sizes, in colonies from loose to
+    jammed, in a hard box with a soft plane in it. Some colonies are done before others.
     """
     found_of, seen = _Run._left_deep, []
 
@@ -168,7 +175,7 @@ def test_what_is_left_deep_is_found_wherever_it_is(dtype, limit, unilateral, mon
     for _ in range(4):
         state = step(scene, state, 0.025)
     assert len(seen) >= 4 and max(n for n, _, _ in seen) > 0
-    if limit == "small":  # all that there is to go wrong went by
+    if limit == "small":  # every kind of case occurred
         assert (
             any(not all_active for _, all_active, _ in seen)
             and max(still for _, _, still in seen) > 0
@@ -185,9 +192,11 @@ def full_channel() -> tf.State:
 
 @pytest.mark.parametrize("unilateral", [False, True])
 def test_more_passes_over_hard_contacts_keep_a_full_channel_apart(full_channel, unilateral):
-    """F6: blind to what the pass before had left a hair apart, each pushed it together again, until
-    cells lay on one another, 0.45 µm deep on average, and grew as if nothing held them. More passes
-    of tighter solves must leave less than the start's overlap, which is of usual settings.
+    """F6: without rows for near pairs each pass pushed together the cells that the one before had
+    separated.
+
+    Cells then lay on one another, 0.45 µm deep on average, and grew as if free. More passes of
+    tighter solves must leave less overlap than the start, which has the usual settings.
     """
     mechanics = tf.Mechanics(
         dim=2,
@@ -217,8 +226,10 @@ def test_more_passes_over_hard_contacts_keep_a_full_channel_apart(full_channel, 
 
 
 def test_a_colony_whose_cells_stay_in_one_another_is_told():
-    """A heap whose contacts are so soft by their alpha that they part nothing; the colony beside it
-    is loose. No solve fails."""
+    """A heap whose contacts are so soft by their alpha that they separate nothing gives a warning.
+
+    The other colony is loose. No solve fails.
+    """
     scene = tf.Scene(tf.Mechanics(dim=3, alpha=1e4), founders=thrown(0.3, 6.0))
     with pytest.warns(RuntimeWarning, match=r"for 20 steps in colony 0 \(\d+ cells\).*alpha"):
         states = list(tf.simulate(scene, scene.bind(2).start(), until=25 * 0.025, dt=0.025))
@@ -226,7 +237,7 @@ def test_a_colony_whose_cells_stay_in_one_another_is_told():
 
 
 def test_a_heap_that_parts_is_no_collapse():
-    """Warnings are errors here."""
+    """In tests warnings are errors."""
     scene = tf.Scene(tf.Mechanics(dim=3), founders=thrown(1.0, 6.0))
     *_, state = tf.simulate(scene, scene.bind(2).start(), until=40 * 0.025, dt=0.025)
     assert int(state.reports["mechanics"].buried.max()) == 0
@@ -235,9 +246,11 @@ def test_a_heap_that_parts_is_no_collapse():
 @pytest.mark.parametrize("unilateral", [False, True])
 @pytest.mark.parametrize("alpha", [1e-6, 1e-7])
 def test_nearly_hard_contacts_converge_in_32_bits(alpha, unilateral):
-    """Rods thrown together, whose blocks are nearly singular: their inverses must stay symmetric,
-    or CG comes to a stand. Four in five seeds, of 20 rods each; at αγ = 1e-6 float32 has no digit
-    to spare."""
+    """Overlapping rods with nearly singular blocks: their inverses must stay symmetric, or CG
+    stagnates.
+
+    Four in five seeds, of 20 rods each; at αγ = 1e-6 float32 has no digit to spare.
+    """
     parts = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -256,15 +269,17 @@ def test_nearly_hard_contacts_converge_in_32_bits(alpha, unilateral):
 
 @pytest.mark.parametrize("passes", [1, 2, 3])
 def test_no_more_passes_than_asked(device, dtype, passes):
-    """Though there is more to do."""
+    """Even if overlaps remain."""
     state = first_step(device, dtype, passes=passes)
     assert int(state.reports["mechanics"].passes.max()) == passes
     assert deepest(state) > 0.1
 
 
 def test_a_pass_is_as_fine_as_asked(device, dtype):
-    """The worst residual is at most the tolerance of that at rest, 0.05 unless another is given,
-    whichever pass it is."""
+    """The worst residual of every pass is at most the tolerance, relative to that at rest.
+
+    The default tolerance is 0.05.
+    """
     assert (
         1e-3
         < float(first_step(device, dtype, passes=1).reports["mechanics"].residual.max())
@@ -279,8 +294,7 @@ def test_a_pass_is_as_fine_as_asked(device, dtype):
 
 
 def test_passes_do_not_depend_on_the_batch(device, dtype):
-    """Colonies that take many passes and few beside each other: each has the bits that it has by
-    itself."""
+    """Colonies with many and with few passes in a batch: each has the bits that it has alone."""
     scene = tf.Scene(tf.Mechanics(dim=3, passes=5))
     start = seeded(scene, thrown(1.0, 1.6, 6.0, 0.9), device, dtype)
     state = run(scene, start, 3, dt=0.025)

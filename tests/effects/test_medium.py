@@ -7,9 +7,8 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
-
 from helpers import step
+from torch import Tensor
 
 import torchfilm as tf
 from torchfilm.tools.checks import InputError, SimulationError
@@ -372,7 +371,9 @@ def test_flat_cells_may_lie_in_a_box_with_three_dimensions():
     after = step(scene, scene.bind(dtype=F64).start(), 1e-6)
     layers = after.signals["ahl"].reshape(4, 4, 4).sum((0, 1))
     assert int(layers.argmax()) == 2  # the layer from 0 to 4 µm, with the plane z = 2 in its middle
-    assert float(totals(after)) == pytest.approx(float(totals(scene.bind(dtype=F64).start())), rel=1e-14)
+    assert float(totals(after)) == pytest.approx(
+        float(totals(scene.bind(dtype=F64).start())), rel=1e-14
+    )
 
 
 # --- what is refused ------------------------------------------------------------------------------

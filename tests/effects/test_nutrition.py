@@ -7,9 +7,8 @@ import math
 
 import pytest
 import torch
-from ruled import same
-
 from helpers import step
+from ruled import same
 
 import torchfilm as tf
 from torchfilm.tools.checks import InputError

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-
 from helpers import step
 
 import torchfilm as tf
@@ -101,7 +100,9 @@ def test_the_results_file_remembers_who_left_and_who_was_removed(tmp_path):
         tf.Removal((-10.0, -10.0), (10.0, 10.0)),
         founders=at(0.0, 1.0, 8.5),
     )
-    for _ in tf.simulate(scene, scene.bind(2).start(), until=4.0, dt=1.0, record=tmp_path / "run.h5"):
+    for _ in tf.simulate(
+        scene, scene.bind(2).start(), until=4.0, dt=1.0, record=tmp_path / "run.h5"
+    ):
         pass
     with tf.Results(tmp_path / "run.h5") as results:
         found = results.lineage()

@@ -6,9 +6,8 @@ import contextlib
 
 import pytest
 import torch
-from ruled import pair_of_cells, run, same, short_update
-
 from helpers import step
+from ruled import pair_of_cells, run, same, short_update
 
 import torchfilm as tf
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from ruled import Species, pair_of_cells
-
 from helpers import step
+from ruled import Species, pair_of_cells
 
 import torchfilm as tf
 from torchfilm.effect import Effect

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from ruled import pair_of_cells, run
-
 from helpers import step
+from ruled import pair_of_cells, run
 
 import torchfilm as tf
 
@@ -47,7 +46,7 @@ def test_an_edit_takes_effect_at_the_next_step(rules_file):
         if state.step == 3:
             rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
     assert rates == [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]
-    assert rules.source.messages == ["t = 0.3 h: my_rules.py taken up"], (
+    assert rules.source.messages == ["t = 0.3 h: my_rules.py reloaded"], (
         "it was the step from 0.3 to 0.4 h that first ran the new rules"
     )
 

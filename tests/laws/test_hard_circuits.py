@@ -15,7 +15,7 @@ import torch
 from helpers import array
 
 from torchfilm.circuits import kinetics
-from torchfilm.circuits.rosenbrock import DONE, rosenbrock
+from torchfilm.circuits.rosenbrock import DONE, rodas3
 
 
 def rtol_of(dtype) -> float:
@@ -23,7 +23,7 @@ def rtol_of(dtype) -> float:
 
 
 def solved(rates, u, t, **options):
-    out, report = rosenbrock(rates, u, t, **options)
+    out, report = rodas3(rates, u, t, **options)
     assert (report.status == DONE).all()
     assert torch.isfinite(out).all()
     return out
@@ -70,7 +70,7 @@ def test_case_26_fast_exchange(device, dtype, measured):
         return torch.stack([-flow, flow], 1)
 
     start = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.25, 0.75]], dtype=dtype, device=device)
-    u, report = rosenbrock(rates, start, 1.0)
+    u, report = rodas3(rates, start, 1.0)
     assert (report.status == DONE).all() and (report.accepted <= 2).all()
     assert array(u)[:, 0] == pytest.approx(1e-8, abs=1e-6) and array(u)[:, 1] == pytest.approx(
         1.0, abs=1e-6
@@ -95,7 +95,7 @@ def test_case_27_hill_at_zero(device, dtype, measured, power):
     first = torch.autograd.grad(rates(zero, None).sum(), zero, create_graph=True)[0]
     second = torch.autograd.grad(first.sum(), zero)[0]
     assert torch.isfinite(first).all() and torch.isfinite(second).all()
-    u, _ = rosenbrock(rates, zero, 1.0)
+    u, _ = rodas3(rates, zero, 1.0)
     assert (u == 0).all()
     assert torch.isfinite(torch.autograd.grad(u.sum(), zero)[0]).all()
     # from within reach of zero, each to its own side: 0.5 is a fixed point only of one of the two

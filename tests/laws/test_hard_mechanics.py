@@ -12,11 +12,27 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import array, bodies, check_always, growth, mechanics, pair_gaps, rotation, rows_of, run, seeded, segment_distance, step, unit, wall_overlap, worst_overlap
+from helpers import (
+    array,
+    bodies,
+    check_always,
+    growth,
+    mechanics,
+    pair_gaps,
+    rotation,
+    rows_of,
+    run,
+    seeded,
+    segment_distance,
+    step,
+    unit,
+    wall_overlap,
+    worst_overlap,
+)
 
 import torchfilm as tf
 from torchfilm.physics.contacts import LINE_CONTACT_SINE, Capsules, closest_points, contact_gaps
-from torchfilm.physics.walls import find_wall_contacts
+from torchfilm.physics.wall_contacts import find_wall_contacts
 
 MODES = pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
 DT = 0.01

@@ -8,7 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from helpers import array, check_always, crowd, ends, growth, mechanics, near_pairs, rotation, rows_of, run, seeded, step, unit, wall_overlap, worst_overlap
+from helpers import (
+    array,
+    check_always,
+    crowd,
+    ends,
+    growth,
+    mechanics,
+    near_pairs,
+    rotation,
+    rows_of,
+    run,
+    seeded,
+    step,
+    unit,
+    wall_overlap,
+    worst_overlap,
+)
 from torch import Tensor
 
 import torchfilm as tf
@@ -207,7 +223,9 @@ def test_case_17_rotated_where_turns_are_cut_short(device, dtype, measured, unil
         np.stack([a, b]),
         {"drag": [1.0, 1e4]},
     )
-    plain = step(scene, seeded(scene, tf.Cells(position, axis, 1.4, extra=heavy), device, dtype), DT)
+    plain = step(
+        scene, seeded(scene, tf.Cells(position, axis, 1.4, extra=heavy), device, dtype), DT
+    )
     wanted = float(plain.displacement[0, 3:6].norm())
     assert wanted > 0.6 and float(plain.axis[0, 0]) > np.cos(0.9 * wanted), (
         "the turn should have been cut short"

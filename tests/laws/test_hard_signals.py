@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet, Periodic
 from torchfilm.signals.exchange import pool_volume, read, stencil, write
 from torchfilm.signals.grid import Grid
-from torchfilm.signals.operator import operator
 from torchfilm.signals.transport import METHODS, prepare
 
 CHOSEN = pytest.mark.parametrize("method", ["exponential", "implicit"])
@@ -23,7 +23,9 @@ CHOSEN = pytest.mark.parametrize("method", ["exponential", "implicit"])
 
 def cube(n: int, r: float, dtype, device, **options):
     """n³ voxels of 1 µm, and K so that a step of 1 h has the r given."""
-    return operator((n, n, n), (1.0, 1.0, 1.0), diffusion=r, dtype=dtype, device=device, **options)
+    return build_operator(
+        (n, n, n), (1.0, 1.0, 1.0), diffusion=r, dtype=dtype, device=device, **options
+    )
 
 
 def delta(n: int, dtype, device) -> torch.Tensor:
@@ -107,7 +109,7 @@ def test_case_35_step_wall(device, dtype, measured, method, r):
         BoundaryConditions(x=(Dirichlet(1.0), Dirichlet(0.0))),
         BoundaryConditions(x=Periodic(), y=(Dirichlet(1.0), Dirichlet(0.0))),
     ):
-        op = operator(
+        op = build_operator(
             (32, 16, 8), (1.0, 1.0, 1.0), diffusion=r, boundary=faces, dtype=dtype, device=device
         )
         stepper, u = prepare(op, 1.0, method), wall
@@ -123,7 +125,7 @@ def test_case_36_spacing_of_its_own_along_each_axis(device, dtype, measured, met
     """Spacing (1, 2, 5): variance grows 2 K t along each axis, 1e-3. Both kernels have that
     variance exactly; the box is 12 widths wide."""
     shape, spacing, k, t, steps = (65, 33, 15), (1.0, 2.0, 5.0), 1.0, 8.0, 8
-    op = operator(shape, spacing, diffusion=k, dtype=dtype, device=device)
+    op = build_operator(shape, spacing, diffusion=k, dtype=dtype, device=device)
     u = torch.zeros(1, *shape, dtype=dtype, device=device)
     u[0, 32, 16, 7] = 1.0
     stepper = prepare(op, t / steps, method)
@@ -273,7 +275,7 @@ def test_case_39_taking_up_everything(device, dtype, measured, cells):
 def test_case_40_flat_grids(device, dtype, measured, method, shape):
     """64×1×1 and 64×64×1: a cosine along the long axis decays as on a long axis alone; an all-zero
     field stays zero."""
-    op = operator(
+    op = build_operator(
         shape, (1.0, 1.0, 0.5), diffusion=2.0, velocity=(0.0, 0.0, 0.0), dtype=dtype, device=device
     )
     axis = shape.index(64)

@@ -1,4 +1,4 @@
-"""The capsule's volume, area and drag, and the turning of axes."""
+"""The capsule's volume, area and drag, and the rotation of axes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIZES = [(0.0, 0.5), (2.0, 0.5), (3.75, 0.4), (40.0, 1.3)]
 
 
 def profile(x: float, length: float, radius: float) -> float:
-    """Radius of the capsule's cross-section at place x along its axis."""
+    """Radius of the capsule's cross-section at position x along its axis."""
     beyond = max(0.0, abs(x) - 0.5 * length)
     return math.sqrt(max(0.0, radius**2 - beyond**2))
 
@@ -43,8 +43,10 @@ def test_volume_is_the_integral_of_the_cross_section(device, dtype, length, radi
 
 @pytest.mark.parametrize("length, radius", SIZES)
 def test_area_is_how_volume_grows_with_radius(device, dtype, length, radius):
-    """dV/dr at a fixed centreline is the surface: central differences, h = 1e-5, whose error is
-    h²/6 V‴ = h² 4π/3."""
+    """dV/dr at a fixed centreline is the surface.
+
+    Central differences with h = 1e-5 have an error of h²/6 V‴ = h² 4π/3.
+    """
     v = lambda r: math.pi * r * r * (length + 4 * r / 3)
     slope = (v(radius + 1e-5) - v(radius - 1e-5)) / 2e-5
     found = capsule.area(
@@ -70,8 +72,9 @@ def test_drag_of_a_sphere_is_positive(dtype):
 
 @pytest.mark.parametrize("size", [0.0, 1e-8, 1e-3, 0.1, 0.5, 1.0])
 def test_rotate_is_the_exact_rotation_in_3d(device, dtype, size):
-    """Against SciPy. The docstring promises 1e-16 for angles up to 1; float32 leaves 1e-7 an
-    operation."""
+    """Against SciPy. The docstring promises 1e-16 for angles up to 1; float32 has 1e-7 per
+    operation.
+    """
     rng = np.random.default_rng(1)
     axis, turn = unit(rng, 50, 3), size * unit(rng, 50, 3)
     t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)
@@ -112,7 +115,7 @@ def test_axis_stays_a_unit_vector_over_many_turns(device, dtype, dim):
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("size", [0.0, 0.3])
 def test_gradient_of_rotate(dim, size):
-    """No singular gradient at a turn of zero."""
+    """The gradient is not singular at an angle of zero."""
     rng = np.random.default_rng(3)
     axis = torch.tensor(unit(rng, 4, dim), requires_grad=True)
     turn = torch.tensor(size * rng.normal(size=(4, 1 if dim == 2 else 3)), requires_grad=True)

@@ -1,4 +1,4 @@
-"""The narrow phase: gaps, and the rows by which they change with each cell's degrees of freedom."""
+"""The narrow phase: gaps, and how they change with each cell's degrees of freedom."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import array, bodies, crowd, growth, mechanics, rows_of, seeded, segment_distance, step, unit
+from helpers import (
+    array,
+    bodies,
+    crowd,
+    growth,
+    mechanics,
+    rows_of,
+    seeded,
+    segment_distance,
+    step,
+    unit,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,7 +30,7 @@ DIMS = pytest.mark.parametrize("dim", [2, 3])
 
 
 def halves(cells: Capsules) -> tuple[torch.Tensor, torch.Tensor]:
-    """The pairs (k, k + half of them)."""
+    """The pairs (k, k + count/2) of the cells."""
     first = torch.arange(cells.half.numel() // 2, device=cells.half.device)
     return first, first + first.numel()
 
@@ -27,8 +38,10 @@ def halves(cells: Capsules) -> tuple[torch.Tensor, torch.Tensor]:
 def side_by_side(
     rng: np.random.Generator, count: int, dim: int, tilt: float, **options
 ) -> Capsules:
-    """Pairs of rods beside one another that overlap all along, up to `tilt` out of parallel, either
-    way round."""
+    """Pairs of parallel rods that overlap along their length, up to `tilt` from parallel.
+
+    The second rod has either direction.
+    """
     axis = unit(rng, count, dim)
     across = (
         np.stack([-axis[:, 1], axis[:, 0]], 1)
@@ -57,12 +70,12 @@ def side_by_side(
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
 def test_distance_is_the_least_and_the_same_when_swapped(seed, dim, lengths, tilt, dtype):
-    """Against the search of the helpers, for any mixture of lengths and angles, parallel and
-    coincident cells included.
+    """Against the search of the helpers, for mixed lengths and angles, with parallel and coincident
+    cells.
 
-    float32 keeps 1.2e-7 of places up to 20 µm out; where centrelines cross at a sine s it knows the
-    crossing to ε/s, at worst √(ε·20) = 1.5e-3. Such pairs are through each other, and only held to
-    that.
+    float32 has an error of 1.2e-7 for positions up to 20 µm. Where centrelines cross at a sine s,
+    the crossing is known to ε/s, at worst √(ε·20) = 1.5e-3. Such pairs penetrate each other, and
+    are tested only to that.
     """
     rng, count = np.random.default_rng(seed), 40
     axis = unit(rng, 2 * count, dim)
@@ -89,7 +102,7 @@ def test_distance_is_the_least_and_the_same_when_swapped(seed, dim, lengths, til
 
 
 def moved(cells: Capsules, which: torch.Tensor, dof: int, by: float) -> Capsules:
-    """The cells `which` moved by `by` in one of their degrees of freedom (place, turn, length)."""
+    """The cells `which`, moved by `by` in one degree of freedom (position, rotation, length)."""
     dim = cells.centre.shape[0]
     turns = 1 if dim == 2 else 3
     centre, axis, half = cells.centre.clone(), cells.axis.clone(), cells.half.clone()
@@ -106,12 +119,12 @@ def moved(cells: Capsules, which: torch.Tensor, dof: int, by: float) -> Capsules
 
 @DIMS
 def test_rows_are_the_derivative_of_the_gap(dim):
-    """The gap after a small move x is gap − row · x, for every degree of freedom of both cells,
-    where contact is in a point.
+    """For point contacts, the gap after a small move x is gap − row · x, for every degree of
+    freedom.
 
-    Central differences in float64, h = 1e-6: rounding leaves 1e-10, curvature h² = 1e-12. At a kink
-    (the closest point arriving at an end) a derivative does not exist: the few pairs where the two
-    one-sided differences disagree are left out, and counted.
+    Central differences in float64 with h = 1e-6: rounding gives 1e-10, curvature h² = 1e-12. At a
+    kink (where the closest point reaches an end) no derivative exists. The few pairs whose two
+    one-sided differences disagree are excluded, and counted.
     """
     rng, count, h = np.random.default_rng(1), 2000, 1e-6
     cells = bodies(
@@ -139,8 +152,7 @@ def test_rows_are_the_derivative_of_the_gap(dim):
 def gap_at(
     cells: Capsules, first, second, s, t, end_a, end_b, from_half: torch.Tensor
 ) -> torch.Tensor:
-    """Gap between two marked points of the cells, which ride along as cells turn, and with the ends
-    as they grow."""
+    """The gap between two marked points, which move with the cells' rotation and growth."""
     grown = cells.half - from_half
     a = cells.centre[:, first] + (s + end_a * grown[first]) * cells.axis[:, first]
     b = cells.centre[:, second] + (t + end_b * grown[second]) * cells.axis[:, second]
@@ -150,8 +162,10 @@ def gap_at(
 @DIMS
 @pytest.mark.parametrize("tilt", [1e-3, 0.09])
 def test_rows_of_a_line_of_contact(dim, tilt):
-    """Two rows for each pair, D² = ½, each the exact derivative of the gap between two marked
-    points. Differences as above."""
+    """Two rows per pair, D² = ½, each the exact derivative of the gap between two marked points.
+
+    Differences as above.
+    """
     cells, h = side_by_side(np.random.default_rng(2), 300, dim, tilt), 1e-6
     first, second = halves(cells)
     s, t, end_a, end_b, line = contact_points(cells.take(first), cells.take(second))
@@ -180,10 +194,12 @@ def test_rows_of_a_line_of_contact(dim, tilt):
 
 
 @DIMS
-@pytest.mark.parametrize("push", [False, True])
-def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, push):
-    """All rows that `contact_points` has for every pair, wherever it overlaps or is held, and no
-    other: gaps and weights to rounding, order exactly."""
+@pytest.mark.parametrize("unilateral", [False, True])
+def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, unilateral):
+    """All rows of `contact_points` for every pair that overlaps or is held, and no others.
+
+    Gaps and weights agree to rounding, and the order is exact.
+    """
     rng, count = np.random.default_rng(4), 8000
     axis = unit(rng, 2 * count, dim)
     tilt = rng.choice([1e-8, 1e-3, 0.08, 0.12], (count // 2, 1))
@@ -200,7 +216,7 @@ def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, push):
     gap = torch.stack(
         [gap_at(cells, first, second, s[k], t[k], end_a[k], end_b[k], cells.half) for k in range(2)]
     )
-    # of the others rounding may say whether they overlap, or are held
+    # for the others rounding may decide whether they overlap, or are held
     clear = (gap.abs() > 1e-5).all(0) & (gap.sum(0).abs() > 1e-5)
     first, second, gap, line = first[clear], second[clear], gap[:, clear], line[clear]
     deep = (gap < 0) & torch.stack([torch.ones_like(line), line])
@@ -208,15 +224,15 @@ def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, push):
         deep[1].sum() > 500 and (~deep[0]).sum() > 500 and (line & (deep[0] != deep[1])).sum() > 3
     )
     weight = torch.where(line, 0.5, 1.0).expand(2, -1).clone()
-    if push:
+    if unilateral:
         deep = deep | (line & deep.any(0))
-    else:  # the end that does not overlap is held, the less the farther it is
+    else:  # the end without overlap is held, with less weight the farther it is
         held = line & (deep[0] != deep[1]) & (gap.sum(0) < 0)
         weight = torch.where(held & (gap > 0), (0.5 * gap.sum(0) / gap.amin(0)).float(), weight)
         deep = deep | held
         assert held.sum() > 3
         gap = gap.clamp(max=0.0)
-    found = rows_of(cells, first, second, push)
+    found = rows_of(cells, first, second, unilateral)
     assert torch.equal(found.first, torch.cat([first[d] for d in deep])) and torch.equal(
         found.second, torch.cat([second[d] for d in deep])
     )
@@ -239,10 +255,11 @@ def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, push):
     [(1.9, 0.02), (1.9, 0.05), (1.9, 0.2), (1.7, 0.02), (1.7, 0.2), (1.5, 0.02), (1.5, 0.05)],
 )
 def test_a_cell_squeezed_between_two_comes_to_rest(apart, tilt):
-    """Between two cells as good as fixed, too near for it at any angle, it overlaps them at
-    opposite ends: a solve that saw these ends alone would turn it as far the other way, step after
-    step. It lies down between them instead, to what is left of a tilt by a tolerance of 0.01 a
-    step.
+    """A cell between two almost fixed cells, which overlaps them at opposite ends at any angle.
+
+    A solve with only these ends would turn it as far to the other side in each step. Instead the
+    cell comes to rest between the two, except for the tilt that a tolerance of 0.01 per step
+    leaves.
     """
     cells = tf.Cells(
         [[0.0, -apart / 2], [0.1, 0.0], [0.0, apart / 2]],
@@ -273,8 +290,11 @@ def forces(cells: Capsules) -> np.ndarray:
 
 
 def sweep(dim: int, angle, shift, apart) -> Capsules:
-    """Pairs that differ by a little from one to the next: an angle, a shift along the axis, a
-    distance; one of them an array."""
+    """Pairs that differ slightly from one to the next, in an angle, a shift along the axis or a
+    distance.
+
+    One of the three is an array.
+    """
     angle, shift, apart = np.broadcast_arrays(*map(np.asarray, (angle, shift, apart)))
     zero, one = np.zeros(angle.shape), np.ones(angle.shape)
     if dim == 2:
@@ -327,12 +347,12 @@ FINE = 5e-5
     ],
 )
 def test_forces_never_jump(dim, name, path):
-    """Force, torque and elongation go on without a jump as a cell turns, slides or comes near: from
-    two rows to one, from end to middle.
+    """Force, torque and elongation are continuous as a cell turns, slides or approaches.
 
-    Jumps ≤ 1e-3, as the guide has it for one row against two. Steps are 5e-5 rad or µm: what
-    changes fastest without a jump is the sliding of a line's ends with the angle, at most 15 a rad
-    for an overlap of 1 and levers of 1 µm, which is 8e-4 a step.
+    This includes the transitions from two rows to one and from end to middle. Jumps are ≤ 1e-3, the
+    guide's limit for one row against two. Steps are 5e-5 rad or µm. The fastest continuous change
+    is the sliding of a line's ends with the angle, at most 15 per rad for an overlap of 1 and
+    levers of 1 µm, which is 8e-4 per step.
     """
     found = forces(sweep(dim, **path))
     jump = np.abs(np.diff(found, axis=0)).max(0)
@@ -342,9 +362,10 @@ def test_forces_never_jump(dim, name, path):
 
 @DIMS
 def test_swapping_a_pair_swaps_its_rows(dtype, device, dim):
-    """The same gaps, weights and rows, with first and second exchanged, but for rounding: where two
-    axes at a sine s are nearest is known to ε/s² times the size of the cells, and s is at least 0.1
-    wherever that place matters. In float32 1e-7 · 100 · 2 µm.
+    """The same gaps, weights and rows, with first and second exchanged, to rounding.
+
+    Where two axes cross at a sine s, the nearest point is known to ε/s² times the size of the
+    cells, and s is at least 0.1 wherever that point matters. In float32 this is 1e-7 · 100 · 2 µm.
     """
     rng = np.random.default_rng(3)
     cells = side_by_side(rng, 200, dim, 0.3, dtype=dtype, device=device)
@@ -352,8 +373,9 @@ def test_swapping_a_pair_swaps_its_rows(dtype, device, dim):
     one, other = rows_of(cells, first, second), rows_of(cells, second, first)
 
     def rows(found, cell, row):
-        """Gap, weight and row, (P, 2, …), of each pair's one or two rows; zeros where there is
-        one."""
+        """Gap, weight and row, (P, 2, …), of each pair's one or two rows; zeros for a missing
+        row.
+        """
         out, seen = np.zeros((len(first), 2, 2 + row.shape[1])), np.zeros(len(first), dtype=int)
         for k, values in zip(
             array(cell) % len(first),
@@ -368,15 +390,16 @@ def test_swapping_a_pair_swaps_its_rows(dtype, device, dim):
         (rows(one, one.first, one.row_first), rows(other, other.second, other.row_second)),
         (rows(one, one.second, one.row_second), rows(other, other.first, other.row_first)),
     ):
-        # the two rows of a line may come in either order
+        # the two rows of a line may have either order
         either = np.minimum(np.abs(x - y).max((1, 2)), np.abs(x - y[:, ::-1]).max((1, 2)))
         assert either.max() <= {torch.float32: 2e-5, torch.float64: 4e-14}[dtype]
 
 
 @DIMS
 def test_action_is_reaction(dtype, device, dim):
-    """The two rows of a contact balance: forces exactly, torques about one common point to
-    rounding."""
+    """The two rows of a contact balance: forces exactly, torques about a common point to
+    rounding.
+    """
     cells = side_by_side(np.random.default_rng(4), 200, dim, 0.5, dtype=dtype, device=device)
     found = rows_of(cells, *halves(cells))
     a, b = found.row_first, found.row_second
@@ -388,7 +411,7 @@ def test_action_is_reaction(dtype, device, dim):
         if dim == 2
         else np.cross(between, n)
     )
-    # b's centre stands `between` from a's, so its force has that arm about a's centre
+    # b's centre is `between` from a's, so its force has that lever arm about a's centre
     assert np.abs(turning - arm).max() <= {torch.float32: 2e-6, torch.float64: 1e-14}[dtype]
     assert np.abs(np.linalg.norm(n, axis=1) - 1).max() <= 1e-6
 
@@ -396,8 +419,9 @@ def test_action_is_reaction(dtype, device, dim):
 @pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
 @DIMS
 def test_a_colony_does_not_push_or_turn_itself(device, dim, unilateral):
-    """Without walls Σ μL Δc = 0 and Σ (μL c × Δc + μL³/12 Δθ) = 0 after one solve, in float64 to
-    what a tolerance of 1e-11 leaves of sixty moves of 0.1 µm, drags of 3 and arms of 20 µm.
+    """Without walls Σ μL Δc = 0 and Σ (μL c × Δc + μL³/12 Δθ) = 0 after one solve, in float64.
+
+    The tolerance of 1e-11 allows an error for sixty moves of 0.1 µm, drags of 3 and arms of 20 µm.
     """
     scene = tf.Scene(growth(), mechanics(dim=dim, unilateral=unilateral, passes=1, tolerance=1e-11))
     start = seeded(scene, crowd(np.random.default_rng(5), 60, dim), device, torch.float64)
@@ -416,8 +440,10 @@ def test_a_colony_does_not_push_or_turn_itself(device, dim, unilateral):
 @DIMS
 @pytest.mark.parametrize("length", [0.0, 2.0])
 def test_cells_in_one_place_still_have_a_normal(dtype, device, dim, length):
-    """Same centre, any angle, spheres too: finite rows and a unit normal across the first axis, or
-    across both."""
+    """Cells with one centre, at any angle, and spheres: finite rows and a unit normal.
+
+    The normal is perpendicular to the first axis, or to both.
+    """
     rng = np.random.default_rng(6)
     axis = unit(rng, 20, dim)
     axis[15:] = axis[5:10]  # five pairs parallel

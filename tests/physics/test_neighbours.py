@@ -1,5 +1,4 @@
-"""The broad phase: no pair that could touch is missing, none stands twice, whatever else is in the
-batch."""
+"""The broad phase: no pair that could touch is missing or repeated, in any batch."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 
 from torchfilm.physics.neighbours import Neighbourhood
 
-# Whatever sizes and densities: all cells in one place, or none near another.
+# Any sizes and densities: all cells at one position, or none near another.
 SCATTERS = {
     "seed": st.integers(0, 2**32 - 1),
     "counts": st.lists(st.integers(0, 25), min_size=1, max_size=4),
@@ -25,8 +24,10 @@ DIMS = pytest.mark.parametrize("dim", [2, 3])
 
 
 class Scatter:
-    """Cells at random in several colonies: position, axis (N, d), length, radius, colony (N,), as
-    arrays."""
+    """Cells at random in several colonies, as arrays.
+
+    position, axis (N, d), length, radius, colony (N,).
+    """
 
     def __init__(
         self,
@@ -79,13 +80,13 @@ class Scatter:
 
 
 def check(cells: Scatter, dtype, margin: float, device="cpu") -> int:
-    """All laws of the pair list; returns how many pairs really are near."""
+    """All laws of the pair list; returns the number of pairs that are near."""
     i, j = cells.pairs(dtype, margin, device)
     found = list(zip(np.minimum(i, j).tolist(), np.maximum(i, j).tolist(), strict=True))
     assert (i != j).all()
     assert len(set(found)) == len(found), "a pair stands twice"
     assert (cells.colony[i] == cells.colony[j]).all()
-    # a gap of 1e-5 under the margin is beyond doubt even in float32 20 µm out
+    # a gap of 1e-5 below the margin is certain even in float32 at 20 µm
     near = cells.near(margin - 1e-5)
     assert near <= set(found), f"missing {sorted(near - set(found))[:5]}"
     return len(near)
@@ -94,8 +95,9 @@ def check(cells: Scatter, dtype, margin: float, device="cpu") -> int:
 @DIMS
 @pytest.mark.parametrize("margin", [0.0, 0.1, 1.0])
 def test_pairs_against_brute_force(device, dtype, dim, margin):
-    """Spheres, rods and filaments of 40 µm in six colonies, of which two are empty and one has a
-    single cell."""
+    """Spheres, rods and filaments of 40 µm in six colonies: two are empty and one has a single
+    cell.
+    """
     cells = Scatter(
         np.random.default_rng(1),
         [60, 0, 1, 150, 0, 90],
@@ -109,7 +111,7 @@ def test_pairs_against_brute_force(device, dtype, dim, margin):
 @settings(deadline=None, derandomize=True, max_examples=60)
 @given(**SCATTERS, margin=st.sampled_from([0.0, 0.2]))
 def test_pairs_of_any_scatter(seed, counts, dim, side, lengths, dtype, margin):
-    """The same for whatever sizes and densities: all cells in one place, or none near another."""
+    """The same for any sizes and densities: all cells at one position, or none near another."""
     check(Scatter(np.random.default_rng(seed), counts, dim, side, lengths), dtype, margin)
 
 
@@ -118,8 +120,9 @@ def test_pairs_of_any_scatter(seed, counts, dim, side, lengths, dtype, margin):
 def test_pairs_of_some_cells_are_those_of_all_that_hold_one(
     seed, counts, dim, side, lengths, share, dtype
 ):
-    """Each once, the cell that was asked for first, whatever its class and its partner's; nothing
-    where nobody is asked for."""
+    """Each pair once, with the selected cell first, for cells of any class; none without selected
+    cells.
+    """
     rng = np.random.default_rng(seed)
     cells = Scatter(rng, counts, dim, side, lengths)
     asked = np.flatnonzero(rng.random(len(cells.colony)) < share)
@@ -133,8 +136,9 @@ def test_pairs_of_some_cells_are_those_of_all_that_hold_one(
 
 @DIMS
 def test_list_is_not_much_longer_than_it_must_be(device, dtype, dim):
-    """What the bounding spheres and boxes let through is a small multiple of what is near, for rods
-    as dense as in a colony."""
+    """The bounding spheres and boxes keep a small multiple of the near pairs, for rods as dense as
+    in a colony.
+    """
     rng = np.random.default_rng(2)
     cells = Scatter(rng, [400], dim, 14.0 if dim == 2 else 6.6, [2.5])
     i, _ = cells.pairs(dtype, 0.0, device)
@@ -143,8 +147,7 @@ def test_list_is_not_much_longer_than_it_must_be(device, dtype, dim):
 
 @DIMS
 def test_one_filament_costs_the_rods_nothing(dtype, dim):
-    """A cell of 200 µm among rods adds at most one pair for each rod: it does not make the rods
-    look at each other."""
+    """A cell of 200 µm among rods adds at most one pair per rod, and no pairs between rods."""
     rng = np.random.default_rng(3)
     cells = Scatter(rng, [800], dim, 40.0, [2.0])
     without, _ = cells.pairs(dtype)
@@ -155,7 +158,7 @@ def test_one_filament_costs_the_rods_nothing(dtype, dim):
 
 @DIMS
 def test_a_colony_has_the_same_list_in_any_batch(device, dtype, dim):
-    """The same pairs in the same order, alone and between others of another size and place."""
+    """The same pairs in the same order, alone and between colonies of other position and size."""
     rng = np.random.default_rng(4)
     batch = Scatter(rng, [30, 70, 0, 20], dim, 6.0, [0.0, 2.0, 12.0])
     batch.position[batch.colony == 0] += 500.0
@@ -176,7 +179,7 @@ def test_too_few_cells_to_have_a_pair(device, dtype, count):
 
 
 def test_cells_that_just_touch_are_a_pair(device, dtype):
-    """Spheres whose surfaces meet exactly, and a hair within the margin."""
+    """Spheres whose surfaces touch exactly, and slightly within the margin."""
     cells = Scatter(np.random.default_rng(6), [2], 3, 1.0, [0.0])
     cells.radius[:] = 0.5
     cells.position[:] = [[0, 0, 0], [1, 0, 0]]

@@ -1,5 +1,4 @@
-"""The contact solve against dense and general-purpose solvers, and what it reports of each
-colony."""
+"""The contact solve against dense and general-purpose solvers, and its report per colony."""
 
 from __future__ import annotations
 
@@ -13,18 +12,20 @@ from scipy.optimize import minimize
 
 import torchfilm as tf
 from torchfilm.physics.jacobian import ContactJacobian
-from torchfilm.physics.solve import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem, solve
+from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
+from torchfilm.physics.solve import solve_contacts
 from torchfilm.tools.ragged import Groups
 
 MODES = pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
-WIDE = -1e9  # a bound that nothing meets
+WIDE = -1e9  # a bound that is never reached
 X, Y, Z = np.eye(3)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A random contact problem, with J written out: cells of the colonies side by side, pairs and
-    walls within each."""
+    """A random contact problem with J as dense arrays: several colonies, each with pairs and
+    walls.
+    """
 
     first: np.ndarray
     second: np.ndarray
@@ -79,7 +80,7 @@ class Problem:
         return out.reshape(len(self.gap), -1)
 
     def problem(
-        self, unilateral: bool, dtype=torch.float64, device="cpu", held=None, **other
+        self, unilateral: bool, dtype=torch.float64, device="cpu", applied_force=None, **other
     ) -> ContactProblem:
         t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)
         i = lambda x: torch.as_tensor(x, dtype=torch.int64, device=device)
@@ -93,13 +94,13 @@ class Problem:
             len(self.scale),
         )
         gap = t(other.get("gap", self.gap))
-        held = torch.zeros_like(gap) if held is None else t(held)
+        applied_force = torch.zeros_like(gap) if applied_force is None else t(applied_force)
         colonies = Groups(i(self.colony), self.colonies)
         rigid = torch.as_tensor(other.get("rigid", np.zeros(len(self.scale), bool)), device=device)
         return ContactProblem(
             rows,
             gap,
-            held,
+            applied_force,
             t(self.weight).reshape(self.scale.shape),
             t(self.lower),
             t(self.scale),
@@ -110,7 +111,7 @@ class Problem:
 
     def solved(self, unilateral: bool, tolerance: float | torch.Tensor = 1e-12, **options):
         """The solve's y = x / M^(−½), (N, D), and its report."""
-        x, report = solve(self.problem(unilateral, **options), None, tolerance, 5000)
+        x, report = solve_contacts(self.problem(unilateral, **options), None, tolerance, 5000)
         return array(x) / self.scale, report
 
     @property
@@ -121,8 +122,11 @@ class Problem:
 @pytest.mark.parametrize("degrees", [4, 7])
 @pytest.mark.parametrize("seed", range(3))
 def test_bilateral_solve_against_dense(seed, degrees):
-    """(JᵀJ + α) y = Jᵀ g by a dense factorisation. At a tolerance of 1e-12 the two agree to the
-    condition of the system, under 1e3, times that."""
+    """(JᵀJ + α) y = Jᵀ g by a dense factorisation.
+
+    At a tolerance of 1e-12 the two agree to 1e-12 times the condition of the system, which is below
+    1e3.
+    """
     p = Problem.random(seed, [12, 1, 7, 0, 20], degrees)
     y, report = p.solved(False)
     j = p.dense
@@ -134,8 +138,9 @@ def test_bilateral_solve_against_dense(seed, degrees):
 
 @MODES
 def test_a_tolerance_for_each_colony(unilateral):
-    """Each colony is solved to its own tolerance, with the bits of a solve in which all have that
-    tolerance."""
+    """Each colony is solved to its own tolerance, with the bits of a solve at that tolerance for
+    all.
+    """
     p, wanted = Problem.random(4, [12, 7, 20], 7), [0.2, 1e-10, 1e-3]
     found, report = p.solved(unilateral, torch.tensor(wanted, dtype=torch.float64))
     assert (report.residual <= torch.tensor(wanted, dtype=torch.float64)).all()
@@ -147,16 +152,18 @@ def test_a_tolerance_for_each_colony(unilateral):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_bilateral_solve_within_bounds(seed):
-    """Some lengths at their bound. The problem is convex, so y is the minimum if and only if the
-    slope is 0 where y is free and not negative where it is bound (Karush, Kuhn and Tucker): to
-    1e-9, with a tolerance of 1e-12 and forces of about 1.
+    """Some lengths are at their bound.
+
+    The problem is convex, so y is the minimum if and only if the slope is 0 where y is free and not
+    negative where y is at its bound (Karush, Kuhn and Tucker). This holds to 1e-9, with a tolerance
+    of 1e-12 and forces of about 1.
     """
     p = Problem.random(seed, [12, 20], 7, lower=-0.05)
     y, report = p.solved(False)
     j = p.dense
     slope = (p.weight * y.ravel() - j.T @ (p.gap - j @ y.ravel())).reshape(y.shape)
     bound = np.zeros(y.shape, dtype=bool)
-    bound[:, -1] = y[:, -1] <= p.lower + 1e-15  # but for the division by M^(−½) here
+    bound[:, -1] = y[:, -1] <= p.lower + 1e-15  # except for the division by M^(−½) here
     assert (report.status == CONVERGED).all()
     assert (y[:, -1] >= p.lower - 1e-15).all()
     assert np.abs(slope[~bound]).max() <= 1e-9
@@ -164,10 +171,10 @@ def test_bilateral_solve_within_bounds(seed):
     assert 3 <= bound.sum() < len(y) and slope[bound].max() > 1e-3
 
 
-def pushing_energy(p: Problem, held: np.ndarray | None = None):
-    """½ ‖min(0, g − Jy)‖² + ½ α ‖y‖² + held · Jy, and its gradient: what a unilateral solve
-    minimises, written out."""
-    j, spent = p.dense, np.zeros(len(p.gap)) if held is None else held
+def pushing_energy(p: Problem, applied_force: np.ndarray | None = None):
+    """½ ‖min(0, g − Jy)‖² + ½ α ‖y‖² + f · Jy and its gradient, with the applied force f: what a
+    unilateral solve minimises, written out."""
+    j, spent = p.dense, np.zeros(len(p.gap)) if applied_force is None else applied_force
 
     def energy(y):
         left = np.minimum(0.0, p.gap - j @ y)
@@ -181,8 +188,11 @@ def pushing_energy(p: Problem, held: np.ndarray | None = None):
 @pytest.mark.parametrize("lower", [WIDE, -0.05])
 @pytest.mark.parametrize("seed", range(3))
 def test_unilateral_solve_against_a_general_minimiser(seed, lower):
-    """Against L-BFGS-B on the exact convex function. It stops at a gradient of 1e-10; curvature is
-    at least α = 0.05, so y is within 2e-9 · √N."""
+    """Against L-BFGS-B on the exact convex function.
+
+    L-BFGS-B stops at a gradient of 1e-10. The curvature is at least α = 0.05, so y is within 2e-9 ·
+    √N.
+    """
     p = Problem.random(seed, [12, 1, 20], 7, lower=lower)
     # some rows apart at first
     gap = p.gap + 0.15 * (np.random.default_rng(seed).uniform(size=len(p.gap)) < 0.5)
@@ -209,13 +219,12 @@ def test_unilateral_solve_against_a_general_minimiser(seed, lower):
 @pytest.mark.parametrize("degrees", [4, 7])
 @pytest.mark.parametrize("seed", range(4))
 def test_contacts_that_just_touch_do_not_take_turns(seed, degrees, lower, dtype, device):
-    """Nearly hard contacts of which many just touch: the overlapping ones, once solved for, drive
-    the others in, and those, once solved for, drive the first ones back. The solve to 0.3 % gets
-    there all the same, within the iterations that any solve has.
+    """Nearly hard contacts of which many just touch converge within the usual number of iterations.
 
-    What is minimised is then within 1e-3 of what it was at rest from its least: (0.3 %)², a hundred
-    times over, since residuals are what cells would move by alone, and contacts a thousand times as
-    stiff as drag make them lean on one another.
+    The solution of one set of contacts drives the other set into overlap, and the reverse. The
+    solve to 0.3 % converges nevertheless. Relative to its value at rest, the minimised function is
+    then within 1e-3 of its minimum: a hundred times (0.3 %)², since residuals are the moves of
+    single cells, and contacts a thousand times as stiff as drag couple the cells.
     """
     p = Problem.random(seed, [30, 12], degrees, lower=lower)
     touching = np.random.default_rng(seed).uniform(size=len(p.gap)) < 0.6
@@ -231,25 +240,27 @@ def test_contacts_that_just_touch_do_not_take_turns(seed, degrees, lower, dtype,
 
 @MODES
 def test_force_already_spent_is_not_spent_again(unilateral):
-    """Rows whose force `held` has acted in an earlier pass: the minimum is that of the function
-    with their work added."""
+    """Rows whose `applied_force` acted in an earlier pass: the minimum is that of the function with
+    their work added.
+    """
     p = Problem.random(5, [15], 7)
-    held = np.where(np.arange(len(p.gap)) % 3 == 0, 0.5 * p.gap, 0.0)
-    y, report = p.solved(unilateral, held=held)
+    applied_force = np.where(np.arange(len(p.gap)) % 3 == 0, 0.5 * p.gap, 0.0)
+    y, report = p.solved(unilateral, applied_force=applied_force)
     assert (report.status == CONVERGED).all()
     if unilateral:
-        slope = pushing_energy(p, held)(y.ravel())[1]
+        slope = pushing_energy(p, applied_force)(y.ravel())[1]
     else:
         j = p.dense
-        slope = p.weight * y.ravel() - j.T @ (p.gap - j @ y.ravel() - held)
+        slope = p.weight * y.ravel() - j.T @ (p.gap - j @ y.ravel() - applied_force)
     assert np.abs(slope).max() <= 1e-9
 
 
 @MODES
 def test_reported_residual_is_the_true_one(unilateral, dtype, device):
-    """Recomputed here: the worst residual of each colony, preconditioned by the rows that act,
-    relative to the worst at rest, over the free degrees of freedom. float32 sums of twenty terms:
-    1e-5 of the start.
+    """Computed here independently: the worst residual of each colony relative to the worst at rest.
+
+    It is preconditioned by the rows that act, over the free degrees of freedom. float32 sums of
+    twenty terms have an error of 1e-5 of the start.
     """
     p = Problem.random(6, [15, 10], 7)
     y, report = p.solved(unilateral, tolerance=1e-3, dtype=dtype, device=device)
@@ -282,8 +293,11 @@ def test_reported_residual_is_the_true_one(unilateral, dtype, device):
 
 @MODES
 def test_each_colony_converges_by_itself(unilateral, dtype, device):
-    """Colonies of very different stiffness: each has, in the batch, the solution and the iterations
-    that it has alone, bitwise."""
+    """Colonies of very different stiffness have the same solution and iterations in a batch and
+    alone.
+
+    The comparison is bitwise.
+    """
     p = Problem.random(7, [10, 25, 4], 7)
     alpha = p.alpha * np.array([1.0, 1e-3, 10.0])[p.colony]
     p = Problem(**{**vars(p), "alpha": alpha})
@@ -313,7 +327,7 @@ def test_each_colony_converges_by_itself(unilateral, dtype, device):
 @MODES
 def test_a_solve_cut_short_says_so(unilateral):
     p = Problem.random(8, [30, 2], 7)
-    x, report = solve(p.problem(unilateral), None, 1e-12, 3)
+    x, report = solve_contacts(p.problem(unilateral), None, 1e-12, 3)
     assert int(report.status[0]) == ITERATION_LIMIT and float(report.residual[0]) > 1e-12
     assert bool(torch.isfinite(x).all())
 
@@ -322,10 +336,10 @@ def test_a_solve_cut_short_says_so(unilateral):
 def test_a_start_from_the_answer_costs_nothing(unilateral):
     p = Problem.random(9, [20], 7)
     problem = p.problem(unilateral)
-    x, report = solve(problem, None, 1e-8, 5000)
-    again, second = solve(problem, x, 1e-6, 5000)
+    x, report = solve_contacts(problem, None, 1e-8, 5000)
+    again, second = solve_contacts(problem, x, 1e-6, 5000)
     assert int(report.iterations[0]) > 5 and int(second.iterations[0]) == 0
-    # x is kept scaled, so the answer comes back but for a multiplication and a division
+    # x is stored scaled, so the answer returns except for a multiplication and a division
     assert float((again - x).abs().max()) <= 1e-15
 
 
@@ -345,11 +359,10 @@ def test_two_capsules_side_by_side(unilateral, dtype, device, alpha):
 @MODES
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_cell_ends_shorter_than_before_it_grew(unilateral, dtype, device, dim):
-    """Mechanics may hold growth back, all of it, but never shorten a cell. Ten steps in a closed
-    box, so that most is held back.
+    """Mechanics may prevent all growth, but never shortens a cell: ten steps in a closed, full box.
 
-    What is held back is length + e − e, which in float32 comes back to within one unit of the last
-    place, 2.4e-7 at 2 to 4 µm.
+    The prevented growth is length + e − e, which in float32 is exact to one unit in the last place,
+    2.4e-7 at 2 to 4 µm.
     """
     walls = [tf.Box(low=(-0.6, -0.6, -0.6)[:dim], high=(17.0, 5.5, 5.5)[:dim])]
     scene = tf.Scene(
@@ -380,8 +393,10 @@ def test_no_cell_ends_shorter_than_before_it_grew(unilateral, dtype, device, dim
     [("position", "nan"), ("position", "inf"), ("axis", "nan"), ("axis", "inf"), ("length", "nan")],
 )
 def test_a_broken_colony_is_reported_and_harms_no_other(unilateral, dtype, device, name, bad):
-    """Coordinates that are not finite: that colony's status is NOT_FINITE, the others converge and
-    are, bitwise, as without it."""
+    """A colony with non-finite coordinates has the status NOT_FINITE.
+
+    The other colonies converge and have the same bits as without it.
+    """
     rng = np.random.default_rng(3)
     parts = [crowd(rng, n, 3) for n in (12, 9, 15)]
     join = lambda what: np.concatenate([getattr(p, what) for p in parts])
@@ -424,10 +439,10 @@ def test_the_driver_names_the_broken_colony(dtype, device):
 
 @MODES
 def test_gradient_through_the_solve(unilateral):
-    """Two overlapping cells and a wall: the gradient of where they end, by the adjoint, against
-    differences of the whole step.
+    """Two overlapping cells and a wall: the gradient of the end positions by the adjoint.
 
-    float64, solved to 1e-12; differences with h = 1e-5 are good to 1e-9.
+    It is compared with differences of the whole step, in float64, solved to 1e-12; differences with
+    h = 1e-5 are accurate to 1e-9.
     """
     scene = tf.Scene(
         mechanics(

@@ -1,4 +1,4 @@
-"""Walls: which side cells are on, how far from the wall, and the rows by which that changes."""
+"""Walls: the side of the cells, the distance to the wall, and the rows of the contact problem."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from helpers import array, growth, mechanics, run, seeded, unit
 
 import torchfilm as tf
 from torchfilm.physics import capsule
-from torchfilm.physics.walls import find_wall_contacts
+from torchfilm.physics.wall_contacts import find_wall_contacts
 
 INF = math.inf
 WALLS_3D = {
@@ -35,8 +35,9 @@ ALL = [pytest.param(3, w, id=f"3-D {n}") for n, w in WALLS_3D.items()] + [
 
 
 def distance(wall: tf.Plane, p: np.ndarray) -> np.ndarray:
-    """Signed distance (..., surfaces) of points (..., d) to each surface of the wall, written out
-    from what the wall says of itself."""
+    """Signed distance (..., surfaces) of points (..., d) to each surface, from the wall's
+    arguments.
+    """
     if isinstance(wall, tf.Sphere):
         away = np.linalg.norm(p - np.array(wall.center), axis=-1)
         return (wall.radius - away if wall.inside else away - wall.radius)[..., None]
@@ -59,7 +60,7 @@ def distance(wall: tf.Plane, p: np.ndarray) -> np.ndarray:
 
 
 class Rods:
-    """Rods at random about the origin, and the rows that a wall gives them."""
+    """Rods at random around the origin, and the rows that a wall gives them."""
 
     def __init__(
         self, dim: int, count: int = 300, dtype=torch.float64, device="cpu", seed: int = 1
@@ -86,16 +87,17 @@ class Rods:
 
 
 def foot(wall: tf.Sphere, rods: Rods) -> np.ndarray:
-    """Where along each rod, −1 at one end and +1 at the other, it comes nearest to the ball's
-    centre."""
+    """The position along each rod, −1 … +1, that is nearest to the ball's centre."""
     along = ((np.array(wall.center) - array(rods.position)) * array(rods.axis)).sum(1)
     return np.clip(along / (0.5 * array(rods.length)), -1, 1)
 
 
 def roots(wall, rods: Rods) -> np.ndarray:
-    """The root of the share that the row of either end has, (2, N): 1, but at a ball, whose nearest
-    point has a row of its own, a half of what the end is away from it; and 1 where the end is the
-    nearest point itself.
+    """The root of the share of each end's row, (2, N).
+
+    It is 1, except at a ball met from outside. There the nearest point has a row of its own, and an
+    end's share is half of its relative distance from the nearest point; 1 where the end is that
+    point.
     """
     if not isinstance(wall, tf.Sphere) or wall.inside:
         return np.ones((2, len(rods.length)))
@@ -107,8 +109,10 @@ def roots(wall, rods: Rods) -> np.ndarray:
 
 @pytest.mark.parametrize("dim, wall", ALL)
 def test_every_overlapping_end_has_a_row(dtype, device, dim, wall):
-    """Gaps of both ends with every surface against the plain formula; rows exactly for those under
-    zero. float32: places of 4 µm to 1e-6."""
+    """The gaps of both ends to every surface against the plain formula; rows exactly where gap < 0.
+
+    float32: positions of 4 µm to 1e-6.
+    """
     rods = Rods(dim, dtype=dtype, device=device)
     found = rods.rows(wall)
     half = (0.5 * array(rods.length))[:, None] * array(rods.axis)
@@ -136,8 +140,10 @@ def test_every_overlapping_end_has_a_row(dtype, device, dim, wall):
 
 
 def marked_gaps(rods: Rods, wall, dof: int, by: float, cell, surface, s, end) -> np.ndarray:
-    """Gap of one marked point of each row's cell (at s from the centre, riding along with an end as
-    the cell grows), after a small move."""
+    """The gap of a marked point of each row's cell after a small move.
+
+    The point is at s from the centre and moves with an end as the cell grows.
+    """
     dim, turns = rods.position.shape[1], 1 if rods.position.shape[1] == 2 else 3
     c, a = rods.position[cell].clone(), rods.axis[cell].clone()
     if dof < dim:
@@ -152,13 +158,15 @@ def marked_gaps(rods: Rods, wall, dof: int, by: float, cell, surface, s, end) ->
 
 @pytest.mark.parametrize("dim, wall", ALL)
 def test_rows_are_the_derivative_of_the_gap(dim, wall):
-    """Gap after a small move x: gap − row · x. Central differences in float64, h = 1e-6: rounding
-    1e-10, curvature 1e-12."""
+    """The gap after a small move x is gap − row · x.
+
+    Central differences in float64, h = 1e-6: rounding 1e-10, curvature 1e-12.
+    """
     rods, h = Rods(dim), 1e-6
     found = rods.rows(wall)
     cell, surface, row = array(found.cell), array(found.surface), array(found.row)
     c, a, half = array(rods.position)[cell], array(rods.axis)[cell], 0.5 * array(rods.length)[cell]
-    # which point of the cell a row is about, told from its gap
+    # the point of the cell that a row belongs to, found from its gap
     places = np.stack([half, -half])
     ends = np.array([1.0, -1.0])
     shares = roots(wall, rods)[:, cell]
@@ -189,8 +197,9 @@ def test_rows_are_the_derivative_of_the_gap(dim, wall):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_ball_in_the_way_is_met_between_the_ends(dtype, device, dim):
-    """A rod lying on a small ball: neither end touches, the middle does, and is pushed straight
-    away without a torque to speak of."""
+    """A rod on a small ball: its middle touches, its ends do not, and it is pushed without a
+    torque.
+    """
     center = (0.1, -0.9, 0.0)[:dim]
     rods = Rods(dim, 1, dtype, device)
     rods.position[:] = 0.0
@@ -200,14 +209,14 @@ def test_a_ball_in_the_way_is_met_between_the_ends(dtype, device, dim):
     assert found.cell.tolist() == [0]
     assert float(found.gap[0]) == pytest.approx(0.9 - 0.5 - 0.5, abs=1e-6)
     row = array(found.row)[0]
-    # the row is the way to the wall; its lever is 0.1 µm along x
+    # the row is the direction to the wall; its lever is 0.1 µm along x
     assert row[:dim] == pytest.approx(np.array([0.0, -1.0, 0.0])[:dim], abs=1e-6)
     assert np.abs(row[dim:-1]).max() == pytest.approx(0.1, abs=1e-6)
     assert row[-1] == 0
 
 
 def force(rods: Rods, wall) -> torch.Tensor:
-    """What the wall's rows push each rod with at rest, gap times row summed, (N, D)."""
+    """The force of the wall's rows on each rod at rest: the sum of gap times row, (N, D)."""
     found = rods.rows(wall)
     total = torch.zeros(
         len(rods.length), found.row.shape[1], dtype=found.row.dtype, device=found.row.device
@@ -219,11 +228,12 @@ def force(rods: Rods, wall) -> torch.Tensor:
 @pytest.mark.parametrize("radius", [0.5, 3.0, 20.0])
 @pytest.mark.parametrize("way", ["shift", "turn"])
 def test_the_force_of_a_ball_never_jumps(dtype, device, dim, radius, way):
-    """A rod of 2 µm, 0.3 µm deep, shifted past a ball end to end and over, or turned, its end near
-    the ball, until the end is nearest: force, torque and push on the length change by at most 1e-3
-    from one of 8,001 places to the next (as in hard case 3). The path itself changes them by half
-    of that: 7.5e-4 µm at slopes up to 0.5 (0.3 µm over the ball's radius), or 1e-4 rad at slopes up
-    to 5 µm² (two ends, levers and depths of 1 µm).
+    """Force, torque and elongation at a ball change by at most 1e-3 between neighbouring positions.
+
+    A rod of 2 µm, 0.3 µm deep, is shifted past a ball along its whole length, or turned with its
+    end near the ball until the end is nearest, in 8,001 positions (as in hard case 3). The path
+    itself causes half of that change: 7.5e-4 µm at slopes up to 0.5 (0.3 µm over the ball's
+    radius), or 1e-4 rad at slopes up to 5 µm² (two ends, levers and depths of 1 µm).
     """
     count, t = 8001, torch.linspace(-1, 1, 8001, dtype=torch.float64, device=device)
     rods = Rods(dim, count, dtype, device)
@@ -251,8 +261,10 @@ def test_the_force_of_a_ball_never_jumps(dtype, device, dim, radius, way):
 
 @pytest.mark.parametrize("length", [0.0, 2.0])
 def test_a_very_large_ball_is_a_plane_to_a_rod_that_stands_askew(dtype, device, length):
-    """Both ends overlap, one is nearest: rows as at a plane. A ball of 1e5 µm differs from one by
-    1e-5 over 1 µm, and its distances by float64's 1e-11."""
+    """Both ends overlap and one is nearest: rows as at a plane.
+
+    A ball of 1e5 µm differs from a plane by 1e-5 over 1 µm, and its distances by float64's 1e-11.
+    """
     rods = Rods(3, 1, dtype, device)
     rods.position[:], rods.length[:] = 0.0, length
     rods.axis[:] = torch.tensor([math.cos(0.1), 0.0, math.sin(0.1)])
@@ -291,7 +303,7 @@ def test_a_wall_may_stand_elsewhere_in_each_colony(dtype, device):
 
 CENTERS = [[0.2, 0.0, 0.1], [-0.3, 0.4, 0.0], [0.1, -0.2, 0.3]]
 NORMALS = [[1.0, 2.0, -0.5], [0.3, -1.0, 0.2], [-3.0, 0.5, 0.1]]
-# a wall from what is given for its vector, one or one per colony
+# a wall from a given vector, one or one per colony
 MOVED = {
     "inside a sphere": lambda v: tf.Sphere(center=v, radius=2.5),
     "outside a sphere": lambda v: tf.Sphere(center=v, radius=1.5, inside=False),
@@ -312,8 +324,10 @@ def vectors(kind: str, dim: int) -> torch.Tensor:
     ids=["tensor", "array", "list"],
 )
 def test_a_vector_for_each_colony_is_each_colonys_own(dtype, device, dim, kind, give):
-    """Each colony's rows are, bit for bit, those at a wall made from its own vector alone, however
-    that is given."""
+    """Each colony's rows equal, bit for bit, those at a wall made from its own vector alone.
+
+    This holds for every form of the vector.
+    """
     rods, given = Rods(dim, 90, dtype, device), vectors(kind, dim)
     rods.colony = torch.arange(90, device=device) // 30
     together = rods.rows(MOVED[kind](give(given)))
@@ -333,8 +347,10 @@ def test_a_vector_for_each_colony_is_each_colonys_own(dtype, device, dim, kind, 
 @pytest.mark.parametrize("kind", list(MOVED))
 @pytest.mark.parametrize("each", [True, False], ids=["per colony", "one"])
 def test_gradients_to_a_walls_vector(kind, each):
-    """Of gaps and rows, by central differences in float64: h = 1e-6 leaves 1e-9 of rounding and
-    curvature; no rod crosses a switch within h."""
+    """Gradients of gaps and rows against central differences in float64.
+
+    h = 1e-6 gives errors of 1e-9 by rounding and curvature; no rod crosses a switch within h.
+    """
     rods = Rods(3, 90)
     rods.colony = torch.arange(90) // 30 if each else torch.zeros(90, dtype=torch.int64)
     mix = torch.linspace(0.5, 1.5, 7, dtype=torch.float64)
@@ -345,7 +361,7 @@ def test_gradients_to_a_walls_vector(kind, each):
 
     given = vectors(kind, 3) if each else vectors(kind, 3)[0]
     given = given.clone().requires_grad_()
-    for _ in range(2):  # a wall serves many backward passes
+    for _ in range(2):  # a wall is used in many backward passes
         (slope,) = torch.autograd.grad(total(given), given)
     for k in range(given.numel()):
         step = torch.zeros_like(given).reshape(-1)
@@ -359,7 +375,7 @@ def test_gradients_to_a_walls_vector(kind, each):
 
 @pytest.mark.parametrize("kind", list(MOVED))
 def test_a_vector_changed_in_place_moves_the_wall(kind):
-    """As an optimiser does, with a gradient asked for or not."""
+    """An in-place change, as by an optimiser, with or without a gradient."""
     rods = Rods(3, 90)
     rods.colony = torch.arange(90) // 30
     for asked in (False, True):
@@ -376,8 +392,9 @@ def test_a_vector_changed_in_place_moves_the_wall(kind):
 
 
 def test_a_scene_counts_a_walls_vectors():
-    """Vectors for two colonies in a batch of three, or of one: refused by name before anything
-    runs."""
+    """Vectors for two colonies in a batch of three, or of one, raise an error with the name at
+    once.
+    """
     scene = tf.Scene(tf.Mechanics(walls=[tf.Sphere(center=[[0.0, 0, 0], [0.1, 0, 0]], radius=5.0)]))
     assert scene.bind(2).start().colonies == 2
     for count in (1, 3):
@@ -389,8 +406,10 @@ def test_a_scene_counts_a_walls_vectors():
 
 @pytest.mark.parametrize("dim, wall", ALL)
 def test_deepest_is_the_least_distance_along_the_cell(dim, wall):
-    """Against 2,001 points along each rod of up to 3 µm: a sample lies within 7.5e-4 µm, and a
-    distance changes no faster than its point moves."""
+    """Against 2,001 points along each rod of up to 3 µm.
+
+    A sample lies within 7.5e-4 µm, and a distance changes no faster than its point moves.
+    """
     rods = Rods(dim)
     half = 0.5 * rods.length
     samples = array(rods.position) + np.linspace(-1, 1, 2001)[:, None, None] * array(half)[
@@ -412,7 +431,7 @@ def test_no_row_where_there_is_room(dim, wall):
     room = (distance(wall, array(rods.position) + steps * half) - 0.5).min((0, 2))
     touched = np.zeros(len(room), dtype=bool)
     touched[array(rods.rows(wall).cell)] = True
-    # sampled every 0.08 µm: a ball met between two samples may be 2e-3 nearer than it looks
+    # sampled every 0.08 µm: a ball met between two samples may be 2e-3 nearer than the samples
     assert not touched[room > 2e-3].any()
     assert touched[room < 0].all()
 
@@ -428,8 +447,10 @@ def test_no_row_where_there_is_room(dim, wall):
 )
 @pytest.mark.slow
 def test_a_growing_cell_stays_inside(dtype, device, wall, start):
-    """One cell of 2 µm grows to fill 6 µm of room and stops; hard walls give way by αγ e, which is
-    e = 0.05 µm at l = 5, over a cosine."""
+    """One cell of 2 µm grows to fill 6 µm of room and stops.
+
+    Hard walls yield by αγ e, which is e = 0.05 µm at l = 5, over a cosine.
+    """
     scene = tf.Scene(growth(), mechanics(walls=[wall]))
     state = run(
         scene, seeded(scene, tf.Cells([start], [[1.0, 0.05, 0.0]], 2.0), device, dtype), 150

@@ -1,4 +1,4 @@
-"""BoundaryConditions: what may be asked for, and which colonies get which value."""
+"""BoundaryConditions: valid arguments, and the value of each colony."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_what_is_no_face_is_refused(given):
         BoundaryConditions(x=given)
 
 
-@pytest.mark.parametrize("make, name", [(Dirichlet, "Fixed.value"), (Open, "Open.outside")])
+@pytest.mark.parametrize("make, name", [(Dirichlet, "Dirichlet.value"), (Open, "Open.outside")])
 @pytest.mark.parametrize("value", [-1.0, float("nan"), "much", torch.tensor([1.0, -1.0])])
 def test_a_concentration_is_a_number_that_is_not_negative(make, name, value):
     with pytest.raises(InputError, match=name):

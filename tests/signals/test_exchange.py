@@ -1,5 +1,4 @@
-"""Reading and writing: interpolation, its adjoint, what may be taken, and what must never be
-lost."""
+"""Reading and writing: interpolation, its adjoint, limits of uptake, and conservation."""
 
 from __future__ import annotations
 
@@ -24,8 +23,11 @@ def grid(shapes, device="cpu") -> Grid:
 
 
 def scattered(g: Grid, each: int, seed: int = 0, beyond: float = 0.0):
-    """`each` cells in every colony, at random in its box (or `beyond` it by that part of its size),
-    in no order of place."""
+    """`each` cells per colony at random positions in its box, or `beyond` it by that part of its
+    size.
+
+    The positions have no order.
+    """
     rng = np.random.default_rng(seed)
     colony = torch.arange(g.colonies, device=g.origin.device).repeat_interleave(each)
     part = torch.as_tensor(
@@ -67,7 +69,7 @@ def interpolated(
 @pytest.mark.parametrize("periodic", [(False,) * 3, (True,) * 3])
 def test_reading_is_trilinear_interpolation(device, dtype, shape, periodic):
     g = grid([shape], device)
-    position, colony = scattered(g, 200, reservoir=0.6)
+    position, colony = scattered(g, 200, beyond=0.6)
     values = random_values(g, dtype)
     found = stencil(g, position, colony, periodic=periodic, dtype=dtype)
     assert found.node.shape == (200, 2 ** sum(n > 1 for n in shape))
@@ -84,14 +86,14 @@ def test_weights_add_up_to_one(device, dtype, shape):
     g = grid([shape], device)
     found = stencil(g, *scattered(g, 500), dtype=dtype)
     assert bool((found.weight >= 0).all())
-    # the heaviest is 1 less the others: one rounding
+    # the greatest weight is 1 minus the others: one rounding
     assert float((found.weight.double().sum(1) - 1).abs().max()) <= torch.finfo(dtype).eps
     assert bool((found.weight[:, 0] >= 1 / found.weight.shape[1] - 1e-6).all())
 
 
 @ALL
 def test_writing_is_the_adjoint_of_reading(device, shape):
-    """⟨write(a), v⟩ · voxel volume = ⟨a, read(v)⟩ for what is secreted; float64."""
+    """⟨write(a), v⟩ · voxel volume = ⟨a, read(v)⟩ for secretion; float64."""
     g = grid([shape, shape], device)
     found = stencil(g, *scattered(g, 100))
     values, amount = (
@@ -103,7 +105,7 @@ def test_writing_is_the_adjoint_of_reading(device, shape):
     right = (amount * read(values, found)).sum()
     # a sum of 200 terms of order 1
     assert float(left - right) == pytest.approx(0.0, abs=1e-12 * float(right))
-    # and in a flat field for what is taken up, too
+    # and in a uniform field for uptake too
     flat = torch.full_like(values, 3.0)
     small = -1e-3 * amount
     assert torch.allclose(
@@ -112,9 +114,11 @@ def test_writing_is_the_adjoint_of_reading(device, shape):
 
 
 def test_a_cell_alone_may_empty_its_voxel_and_a_crowd_shares(device, dtype):
-    """W cells at one centre each have 1/W of the voxel; a cell alone all of its voxel, and between
-    centres, where it reads and shares more than one, as much as leaves the nearest voxel what it
-    has."""
+    """W cells at one centre each get 1/W of the voxel; a single cell gets all of its voxel.
+
+    Between centres a cell reads and shares more than one voxel, and may take what the nearest voxel
+    has.
+    """
     g = grid([(5, 4, 6)], device)
     centre = g.centres()[37].expand(7, 3)
     found = stencil(g, centre, torch.zeros(7, dtype=torch.int64, device=device), dtype=dtype)
@@ -144,11 +148,10 @@ def test_a_cell_alone_may_empty_its_voxel_and_a_crowd_shares(device, dtype):
 def test_however_crowded_nothing_goes_below_zero_and_nothing_is_lost(
     seed, cells, shape, single, spots
 ):
-    """Every cell takes up as much as it may, or secretes: values ≥ 0 exactly; what the grid gains
-    is what the cells give.
+    """Every cell takes up as much as it may, or secretes: values are ≥ 0 exactly.
 
-    Tolerance: each of at most cells × 8 entries is rounded a few times; against all that is moved
-    or there.
+    The gain of the grid equals the amounts of the cells. Tolerance: each of at most cells × 8
+    entries is rounded a few times, relative to all that is moved or present.
     """
     dtype = torch.float32 if single else torch.float64
     rng, g = np.random.default_rng(seed), grid([shape])
@@ -174,7 +177,7 @@ def test_however_crowded_nothing_goes_below_zero_and_nothing_is_lost(
 
 
 def test_taking_more_than_is_there_shows(device, dtype):
-    """Not a silent loss: a value below zero, or NaN where there was nothing."""
+    """Too large an uptake is not silent: a value below zero, or NaN where there was nothing."""
     g = grid([(3, 3, 1)], device)
     found = stencil(
         g, g.centres()[4:5], torch.zeros(1, dtype=torch.int64, device=device), dtype=dtype
@@ -201,7 +204,7 @@ def test_obstacles_take_no_part(device, dtype):
     total = found.weight.double().sum(1)
     assert bool((total[found.outside] == 0).all()) and 0 < int(found.outside.sum()) < 400
     assert float((total[~found.outside] - 1).abs().max()) <= torch.finfo(dtype).eps
-    # wholly inside: told by all corners being obstacles in the stencil without a mask
+    # wholly inside: all corners of the stencil without a mask are in obstacles
     plain = stencil(g, position, colony, dtype=dtype)
     free = (plain.gather(mask.to(dtype)) * plain.weight).sum(1) > 0
     assert torch.equal(found.outside, ~free)
@@ -211,8 +214,10 @@ def test_obstacles_take_no_part(device, dtype):
 
 
 def test_the_slope_of_a_reading(device):
-    """d read / d position and d read / d values against central differences in float64: h = 1e-6 of
-    values of order 1, so 1e-9."""
+    """d read / d position and d read / d values against central differences in float64.
+
+    h = 1e-6 of values of order 1, so 1e-9.
+    """
     g = grid([(5, 4, 6)], device)
     position, colony = scattered(g, 40, seed=3)
     position = position.requires_grad_()
@@ -238,8 +243,9 @@ def test_the_slope_of_a_reading(device):
 
 
 def test_the_slope_of_writing():
-    """Secretion and uptake together, by amount, values and position: finite differences of 1e-6
-    (gradcheck, float64)."""
+    """Secretion and uptake together, by amount, values and position: gradcheck in float64 with
+    differences of 1e-6.
+    """
     g = grid([(3, 2, 2)])
     position, colony = scattered(g, 6, seed=4)
     values = (random_values(g, torch.float64) + 0.5).requires_grad_()
@@ -257,7 +263,7 @@ def test_the_slope_of_writing():
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_colony_does_not_see_the_others(device, dtype, masked, deterministic):
-    """The same bits alone and in a batch of grids of other shapes, flat ones among them."""
+    """The same bits alone and in a batch of grids of other shapes, including flat ones."""
     shapes = [(5, 4, 6), (7, 3, 1), (1, 1, 1), (4, 4, 4)]
     g = grid(shapes, device)
     position, colony = scattered(g, 40, seed=6)

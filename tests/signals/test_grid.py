@@ -1,4 +1,4 @@
-"""Grids: where values stand, gathering colonies by shape, and growing with a colony."""
+"""Grids: the order of values, batches by shape, and growth with a colony."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def grid(shapes, device="cpu", spacing=SPACING) -> Grid:
 
 
 def field(grid: Grid, dtype=torch.float64):
-    """A value for each voxel that tells its colony and its place."""
+    """A value for each voxel that identifies its colony and its indices."""
     x, y, z = grid.centres().unbind(1)
     return (1000.0 * grid.owner + 7 * x + 3 * y + z).to(dtype)
 
@@ -123,8 +123,11 @@ reach = st.floats(-12, 12)
     block=st.integers(1, 9),
 )
 def test_growing_covers_what_is_asked_and_is_a_colonys_own(low, size, block):
-    """Covered to the rounding of places of 100 µm, 1e-13; in whole blocks, none of them idle; the
-    same bits alone and in a batch."""
+    """The box is covered to the rounding of positions of 100 µm, 1e-13, in whole blocks, none of
+    them idle.
+
+    The bits are the same alone and in a batch.
+    """
     g = grid([(3, 2, 4)])
     lows = torch.tensor([low], dtype=torch.float64)
     highs = lows + torch.tensor([size], dtype=torch.float64)
@@ -139,7 +142,7 @@ def test_growing_covers_what_is_asked_and_is_a_colonys_own(low, size, block):
         and (larger.high - step < torch.maximum(highs, g.high) + 1e-13).all()
     )
     assert float(new.sum()) == pytest.approx(float(values.sum()), abs=1e-9)
-    # beside another colony with wishes of its own
+    # together with another colony that grows differently
     both = Grid(torch.cat([g.origin + 50, g.origin]), torch.cat([g.shape + 1, g.shape]), SPACING)
     more, (beside,) = both.extended(
         [torch.cat([torch.ones(int((g.shape + 1).prod()), dtype=torch.float64), values])],

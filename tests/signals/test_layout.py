@@ -1,5 +1,4 @@
-"""The layout: what a state carries of its medium, taken apart by colonies, moved, and put on
-another grid."""
+"""The layout: the medium of a state, split by colonies, moved, and put on another grid."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ F64 = torch.float64
 
 
 def grid(device: str | torch.device = "cpu") -> Grid:
-    """Three colonies with grids of different size and place."""
+    """Three colonies with grids of different size and position."""
     origin = torch.tensor(
         [[0.0, 0.0, 0.0], [-8.0, 4.0, 0.0], [10.0, 0.0, 0.0]], dtype=F64, device=device
     )
@@ -82,7 +81,7 @@ def test_the_mask_is_asked_for_once_and_without_obstacles_not_at_all():
         (lambda at: at > 0, r"bool tensor of shape \(15,\)"),
         (lambda at: (at[:, 0] > 0).float(), r"float32.*bool"),
         (lambda at: True, "bool tensor"),
-        (lambda at: at[:, 0] < 1e9, "nothing is left of the medium"),
+        (lambda at: at[:, 0] < 1e9, "no medium remains"),
     ],
     ids=["shape", "dtype", "no tensor", "everywhere"],
 )

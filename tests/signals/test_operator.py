@@ -1,4 +1,4 @@
-"""The spatial operator against a matrix assembled face by face, and what its flux form promises."""
+"""The spatial operator against a matrix assembled face by face, and its conservation laws."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchfilm.signals.assembly import build_operator, fitted_rates
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
@@ -16,7 +17,7 @@ from torchfilm.signals.boundary_conditions import (
     Periodic,
 )
 from torchfilm.signals.iterative import convolve
-from torchfilm.signals.operator import Operator, apply, fitted, operator
+from torchfilm.signals.operator import Operator, apply
 from torchfilm.tools.checks import InputError
 
 SPACING = (1.0, 2.0, 1.5)
@@ -35,7 +36,7 @@ FLOWS = ["still", "uniform", "varying"]
 
 
 def bernoulli(x: float) -> float:
-    """x/(eˣ − 1) by another road: e^(−x/2)·(x/2)/sinh(x/2)."""
+    """x/(eˣ − 1) in another form: e^(−x/2)·(x/2)/sinh(x/2)."""
     if x == 0:
         return 1.0
     if abs(x) > 600:
@@ -44,8 +45,10 @@ def bernoulli(x: float) -> float:
 
 
 def flux_parts(k: float, v: float, h: float) -> tuple[float, float]:
-    """What a face passes up and down for each unit of concentration: Scharfetter and Gummel, or
-    upwind where nothing diffuses."""
+    """The flux through a face, up and down, per unit of concentration.
+
+    Scharfetter and Gummel, or upwind without diffusion.
+    """
     if k == 0:
         return max(v, 0.0), max(-v, 0.0)
     return k / h * bernoulli(-v * h / k), k / h * bernoulli(v * h / k)
@@ -99,7 +102,7 @@ def assembled(
 
 
 def flow(kind: str, shape, rng) -> tuple[object, list[np.ndarray]]:
-    """A velocity as `operator` takes it, and on faces."""
+    """A velocity as `build_operator` takes it, and on faces."""
     faces = [tuple(n + (k == axis) for k, n in enumerate(shape)) for axis in range(3)]
     if kind == "varying":
         arrays = [3 * rng.normal(size=s) for s in faces]
@@ -124,14 +127,14 @@ def make(
     device="cpu",
     seed=0,
 ):
-    """An operator, and its matrix and gain assembled by `assembled`."""
+    """An operator, with its matrix and gain from `assembled`."""
     rng = np.random.default_rng(seed)
     velocity, arrays = flow(kind, shape, rng)
     mask = rng.uniform(size=shape) < 0.7 if masked else np.ones(shape, dtype=bool)
     chosen = BOUNDARIES[faces]
     if isinstance(velocity, tuple) and isinstance(velocity[0], torch.Tensor):
         velocity = tuple(v.to(device) for v in velocity)
-    made = operator(
+    made = build_operator(
         shape,
         SPACING,
         diffusion=diffusion,
@@ -207,13 +210,13 @@ def test_the_papers_convolution_gives_the_same(device, dtype, shape, faces, kind
 
 def test_a_convolution_needs_one_velocity():
     op = make((5, 4, 3), kind="varying")[0]
-    with pytest.raises(InputError, match="varies from place to place"):
+    with pytest.raises(InputError, match="not uniform"):
         convolve(op, torch.ones(1, 5, 4, 3, dtype=torch.float64))
 
 
 @every
 def test_no_entry_off_the_diagonal_is_negative_and_columns_lose_what_leaves(shape, faces, kind):
-    """An M-matrix: positive; and where nothing leaves the box, columns sum to minus the decay."""
+    """An M-matrix is positive; where nothing leaves the box, columns sum to minus the decay."""
     matrix = dense(make(shape, faces, kind, decay=0.2)[0])
     off = matrix - np.diag(np.diag(matrix))
     assert off.min() >= 0
@@ -234,12 +237,14 @@ def test_symmetric_is_said_only_of_what_is():
 @pytest.mark.parametrize("diffusion", [0.0, 1e-12, 1e-3, 1.0, 1e6])
 @pytest.mark.parametrize("speed", [0.0, 1e-12, 1e-5, 0.05, 0.0999, 0.1001, 3.0, 79.0, 81.0, 1e4])
 def test_fitted_rates(diffusion, speed):
-    """Against the plain formula, worked another way; relative 1e-13 of the larger rate, which is
-    all that rounding leaves of the smaller."""
+    """Against the plain formula in another form, to 1e-13 of the larger rate.
+
+    Rounding leaves no more of the smaller rate.
+    """
     for sign in (1, -1):
         up, down = (
             float(x)
-            for x in fitted(
+            for x in fitted_rates(
                 torch.tensor(diffusion, dtype=torch.float64),
                 torch.tensor(sign * speed, dtype=torch.float64),
             )
@@ -254,13 +259,15 @@ def test_fitted_rates(diffusion, speed):
 
 @pytest.mark.parametrize("speed", [0.0, 1e-4, -0.0999, 0.1001, 2.0, -30.0])
 def test_the_slope_of_fitted_rates(speed):
-    """By diffusion and flow, at rest too, where the parts of the formula have corners but the rates
-    do not: central differences, float64."""
+    """By diffusion and flow, by central differences in float64, also at zero flow.
+
+    There the parts of the formula have kinks but the rates do not.
+    """
     d, v = (
         torch.tensor(1.3, dtype=torch.float64, requires_grad=True),
         torch.tensor(1.3 * speed, dtype=torch.float64, requires_grad=True),
     )
-    assert torch.autograd.gradcheck(fitted, (d, v), eps=1e-6, atol=1e-7)
+    assert torch.autograd.gradcheck(fitted_rates, (d, v), eps=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -271,14 +278,15 @@ def test_no_slope_is_nan(diffusion, speed):
         torch.tensor(diffusion, dtype=torch.float64, requires_grad=True),
         torch.tensor(speed, dtype=torch.float64, requires_grad=True),
     )
-    up, down = fitted(d, v)
+    up, down = fitted_rates(d, v)
     grads = torch.autograd.grad(up + 2 * down, (d, v))
     assert all(bool(torch.isfinite(g)) for g in grads)
 
 
 def test_each_colony_has_its_own_numbers(device, dtype):
-    """Diffusion, decay, velocity, faces, obstacles and source, one for each colony: as each alone,
-    bit for bit."""
+    """Diffusion, decay, velocity, faces, obstacles and source per colony: bitwise as each colony
+    alone.
+    """
     rng, shape = np.random.default_rng(3), (5, 4, 3)
     t = lambda *s: torch.as_tensor(rng.uniform(0.1, 2, s), device=device)
     diffusion, decay, velocity, fixed, outside, source = (
@@ -293,7 +301,7 @@ def test_each_colony_has_its_own_numbers(device, dtype):
     u = t(3, *shape).to(dtype)
 
     def of(k):
-        return operator(
+        return build_operator(
             shape,
             SPACING,
             diffusion=diffusion[k],
@@ -350,7 +358,7 @@ def test_each_colony_has_its_own_numbers(device, dtype):
 def test_what_is_not_allowed_is_refused(change, name):
     given = {"shape": (4, 4, 3), "spacing": SPACING, "diffusion": 1.0, "colonies": 2} | change
     with pytest.raises(InputError, match=name):
-        operator(given.pop("shape"), given.pop("spacing"), **given)
+        build_operator(given.pop("shape"), given.pop("spacing"), **given)
 
 
 def test_one_periodic_face_has_one_velocity():
@@ -360,7 +368,7 @@ def test_one_periodic_face_has_one_velocity():
         torch.zeros(4, 4, 4),
     )
     with pytest.raises(InputError, match="velocity along x"):
-        operator(
+        build_operator(
             (4, 4, 3),
             SPACING,
             diffusion=1.0,

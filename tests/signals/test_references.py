@@ -1,5 +1,4 @@
-"""Transport against solutions known in closed form, and how fast each method and the grid come to
-them."""
+"""Transport against closed-form solutions, and the convergence of each method and of the grid."""
 
 from __future__ import annotations
 
@@ -10,6 +9,7 @@ import pytest
 import torch
 from scipy.special import ive
 
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
@@ -18,15 +18,16 @@ from torchfilm.signals.boundary_conditions import (
     Open,
     Periodic,
 )
-from torchfilm.signals.operator import apply, operator
+from torchfilm.signals.operator import apply
 from torchfilm.signals.transport import prepare
 
 D = torch.float64
 
 
 def lattice_point_source(n: int, tau: float) -> np.ndarray:
-    """h³ u, (n, n, n), of a unit amount set free in the middle voxel at τ = K t/h² ago: Π e^{−2τ}
-    I_k(2τ)."""
+    """h³ u, (n, n, n), of a unit amount released in the middle voxel at τ = K t/h² ago: Π e^{−2τ}
+    I_k(2τ).
+    """
     one = ive(np.abs(np.arange(n) - n // 2), 2 * tau)
     return one[:, None, None] * one[None, :, None] * one[None, None, :]
 
@@ -45,7 +46,7 @@ def run(op, dt, method, u, steps):
 
 
 def test_the_lattice_point_source_itself():
-    """The guide's number at the centre after τ = 1, and all of the amount: the tables are right."""
+    """The guide's value at the centre after τ = 1, and the total amount: the reference is right."""
     u = lattice_point_source(33, 1.0)
     assert u[16, 16, 16] == pytest.approx(0.0293630, abs=5e-8)
     assert u.sum() == pytest.approx(1.0, abs=1e-12)
@@ -53,10 +54,13 @@ def test_the_lattice_point_source_itself():
 
 @pytest.mark.parametrize("steps", [1, 5])
 def test_exponential_gives_the_lattice_point_source(device, dtype, steps):
-    """h = 1.5, K = 2: exact but for what has come to the walls, 16 voxels away, e^−2 I_16(2) =
-    3e-15; roundings of a value of 0.03/h³ at most."""
+    """h = 1.5, K = 2: exact except for the amount at the walls, 16 voxels away, e^−2 I_16(2) =
+    3e-15.
+
+    Rounding is that of a value of 0.03/h³ at most.
+    """
     n, h, k = 33, 1.5, 2.0
-    op = operator((n, n, n), (h, h, h), diffusion=k, dtype=dtype, device=device)
+    op = build_operator((n, n, n), (h, h, h), diffusion=k, dtype=dtype, device=device)
     found = (
         run(op, h * h / k / steps, "exponential", point_source(n, h, dtype, device), steps)[0]
         .cpu()
@@ -69,11 +73,13 @@ def test_exponential_gives_the_lattice_point_source(device, dtype, steps):
 
 @pytest.mark.parametrize("method, order", [("implicit", 1), ("crank_nicolson", 2), ("euler", 1)])
 def test_order_in_time_for_the_lattice_point_source(method, order):
-    """Error at the centre, 24 and 48 steps to τ = 1 (steps short enough that Crank–Nicolson does
-    not ring, r = 1/24): 2^−order within 0.15."""
+    """Error at the centre with 24 and 48 steps to τ = 1: 2^−order within 0.15.
+
+    Steps are short enough that Crank–Nicolson does not oscillate, r = 1/24.
+    """
     n, error = 17, []
     for steps in (24, 48):
-        op = operator((n, n, n), (1.0, 1.0, 1.0), diffusion=1.0, dtype=D)
+        op = build_operator((n, n, n), (1.0, 1.0, 1.0), diffusion=1.0, dtype=D)
         found = run(op, 1.0 / steps, method, point_source(n, 1.0), steps)
         error.append(abs(float(found[0, 8, 8, 8]) - 0.0293630))
     assert math.log2(error[0] / error[1]) == pytest.approx(order, abs=0.15)
@@ -81,14 +87,16 @@ def test_order_in_time_for_the_lattice_point_source(method, order):
 
 
 def test_order_in_space():
-    """A cosine in a closed box decays as e^{−K(π/L)²t}: exact in time, so the error is the grid's,
-    of second order within 0.02."""
+    """A cosine in a closed box decays as e^{−K(π/L)²t}.
+
+    The method is exact in time, so the error is the grid's, of second order within 0.02.
+    """
     length, error = 10.0, []
     for n in (16, 32):
         h = length / n
         x = (torch.arange(n, dtype=D) + 0.5) * h
         u = torch.cos(math.pi * x / length).reshape(1, n, 1, 1)
-        op = operator((n, 1, 1), (h, 1.0, 1.0), diffusion=2.0, dtype=D)
+        op = build_operator((n, 1, 1), (h, 1.0, 1.0), diffusion=2.0, dtype=D)
         found = prepare(op, 3.0, "exponential").step(u)
         error.append(
             float((found - u * math.exp(-2.0 * (math.pi / length) ** 2 * 3.0)).abs().max())
@@ -99,8 +107,10 @@ def test_order_in_space():
 @pytest.mark.parametrize("peclet", [0.0, 1e-6, 1.0, -3.0, 40.0, 400.0])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_steady_profile_between_fixed_walls(dtype, device, peclet, axis):
-    """(e^{Pe·x} − 1)/(e^{Pe} − 1): exact at every centre, however few voxels. One long step leads
-    there; its rest is 1/Δt."""
+    """(e^{Pe·x} − 1)/(e^{Pe} − 1) is exact at every centre, with any number of voxels.
+
+    One long step reaches it; the remaining error is 1/Δt.
+    """
     n, length, k = 10, 5.0, 0.7
     shape, spacing = [1, 1, 1], [1.0, 1.0, 1.0]
     shape[axis], spacing[axis] = n, length / n
@@ -108,7 +118,7 @@ def test_steady_profile_between_fixed_walls(dtype, device, peclet, axis):
     velocity[axis] = peclet * k / length
     faces: list[Face | tuple[Face, Face]] = [NoFlux(), NoFlux(), NoFlux()]
     faces[axis] = (Dirichlet(0.0), Dirichlet(1.0))
-    op = operator(
+    op = build_operator(
         tuple(shape),
         tuple(spacing),
         diffusion=k,
@@ -119,7 +129,7 @@ def test_steady_profile_between_fixed_walls(dtype, device, peclet, axis):
     )
     x = (np.arange(n) + 0.5) / n
     expected = x if peclet == 0 else np.expm1(peclet * x) / np.expm1(peclet)
-    # relative to 1; the rest after 1e13 h of rates of 1/h is under it
+    # relative to 1; the remaining error after 1e13 h with rates of 1/h is below it
     tolerance = 2e-12 if dtype == D else 1e-6
     for method in ("exponential", "implicit"):
         found = prepare(op, 1e13 if method == "implicit" else 1e4, method).step(
@@ -129,12 +139,15 @@ def test_steady_profile_between_fixed_walls(dtype, device, peclet, axis):
 
 
 def test_a_sink_everywhere_has_its_decay_length():
-    """Between one voxel and the next a steady field falls by q = 1 + κ/2 − √(κ + κ²/4), κ = k h²/K,
-    exactly; and as e^{−h√(k/K)} to second order in h."""
+    """Between neighbouring voxels a steady field falls by q = 1 + κ/2 − √(κ + κ²/4), κ = k h²/K,
+    exactly.
+
+    To second order in h this is e^{−h√(k/K)}.
+    """
     k, decay, error = 3.0, 0.5, []
     for h in (1.0, 0.5):
         n = round(200 / h)
-        op = operator(
+        op = build_operator(
             (n, 1, 1),
             (h, 1.0, 1.0),
             diffusion=k,
@@ -158,11 +171,10 @@ def test_a_sink_everywhere_has_its_decay_length():
 
 
 def test_a_steady_point_source():
-    """Q/(4πKr), as the difference between two distances, which the walls of a cubic box hardly
-    change: their images add r⁴ terms only.
+    """Q/(4πKr), as the difference between two distances, with second order in h/r.
 
-    Second order in h/r: at 12 and 24 µm, with voxels of 4 and then 4/3 µm, the error falls about
-    ninefold, to under 1 %.
+    The walls of a cubic box hardly change it: their images add r⁴ terms only. At 12 and 24 µm, with
+    voxels of 4 and then 4/3 µm, the error falls about ninefold, to under 1 %.
     """
     rate, k, error, side = 5.0, 2.0, [], 132.0
     for h in (4.0, 4.0 / 3.0):  # odd numbers of voxels, so that one is in the middle
@@ -170,7 +182,7 @@ def test_a_steady_point_source():
         m = n // 2
         source = torch.zeros(n, n, n, dtype=D)
         source[m, m, m] = rate / h**3
-        op = operator(
+        op = build_operator(
             (n, n, n),
             (h, h, h),
             diffusion=k,
@@ -187,10 +199,12 @@ def test_a_steady_point_source():
 
 @pytest.mark.parametrize("method", ["exponential", "implicit"])
 def test_an_open_box_is_washed_out(method, dtype, device):
-    """Flow from −x through open ends, nothing else: a clean medium pushes what is there out, and
-    `outside` comes in; n voxels fill one after another."""
+    """Flow from −x through open ends, without diffusion: `outside` replaces the content of the box.
+
+    n voxels fill one after another.
+    """
     n, v = 12, 3.0
-    op = operator(
+    op = build_operator(
         (n, 1, 1),
         (1.0, 1.0, 1.0),
         diffusion=0.0,
@@ -202,20 +216,23 @@ def test_an_open_box_is_washed_out(method, dtype, device):
     u = torch.full((1, n, 1, 1), 5.0, dtype=dtype, device=device)
     later = prepare(op, 40.0, method).step(u)
     if method == "exponential":
-        # Erlang: of the first voxels' old content what is left after vt = 120 is e^−120 Σ 120^k/k!
-        # = 1e-36
+        # Erlang: the part of the first voxels' old content that remains after vt = 120 is e^−120 Σ
+        # 120^k/k! = 1e-36
         assert float((later - 2.0).abs().max()) <= 2e-6
     assert bool((later[0, :-1] - later[0, 1:] <= 1e-6).all()) and float(later.min()) >= 2.0 - 1e-6
     assert float(later.max()) <= 5.0
 
 
 def test_a_wave_on_a_ring_is_carried_around():
-    """Periodic: the amount's mean position moves by v t, and its variance grows by 2 K t and what
-    upwinding adds; float64, far from all ends."""
+    """Periodic: the mean position of the amount moves by v t; its variance grows by 2 K t and by
+    upwinding.
+
+    float64, far from all ends.
+    """
     n, h, v, k, t = 200, 0.5, 2.0, 1.0, 4.0
     x = (torch.arange(n, dtype=D) + 0.5) * h
     u = torch.exp(-((x - 40.0) ** 2) / 4).reshape(1, n, 1, 1)
-    op = operator(
+    op = build_operator(
         (n, 1, 1),
         (h, 1.0, 1.0),
         diffusion=k,
@@ -235,8 +252,8 @@ def test_a_wave_on_a_ring_is_carried_around():
 
 
 def test_a_field_at_rest_has_no_rate():
-    """The steady profile put in: du/dt is rounding, rates of 4/h² = 16 and values of 1."""
-    op = operator(
+    """At the steady profile du/dt is rounding, with rates of 4/h² = 16 and values of 1."""
+    op = build_operator(
         (10, 1, 1),
         (0.5, 1.0, 1.0),
         diffusion=1.0,

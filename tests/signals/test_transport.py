@@ -1,5 +1,6 @@
-"""Steps of transport: each method against dense linear algebra, its order, its bounds, its slopes
-and its bits."""
+"""Steps of transport: each method against dense linear algebra, its order, bounds, gradients and
+bits.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_operator import BOUNDARIES, FLOWS, SHAPES, SPACING, every, make
 
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
@@ -21,7 +23,6 @@ from torchfilm.signals.boundary_conditions import (
     Periodic,
 )
 from torchfilm.signals.iterative import CrankNicolson
-from torchfilm.signals.operator import operator
 from torchfilm.signals.transport import METHODS, choose, prepare
 from torchfilm.tools.checks import InputError
 
@@ -55,8 +56,10 @@ def exact(matrix: np.ndarray, gain: np.ndarray, dt: float, u: np.ndarray) -> np.
 @pytest.mark.parametrize("faces", BOUNDARIES)
 @pytest.mark.parametrize("kind", FLOWS[:2])
 def test_exponential_is_exact(device, dtype, shape, faces, kind, dt):
-    """Against scipy's expm, good to some 1e-12 of the values, which reach 10 as source and faces
-    fill the box; float32: 100 roundings."""
+    """Against scipy's expm, accurate to some 1e-12 of the values, which reach 10 as the box fills.
+
+    float32: 100 roundings.
+    """
     op, matrix, gain, _ = make(shape, faces, kind, dtype=dtype, device=device)
     u = start(shape)
     expected = exact(matrix, gain, dt, u)
@@ -68,8 +71,10 @@ def test_exponential_is_exact(device, dtype, shape, faces, kind, dt):
 @every
 @MASKED
 def test_implicit_is_one_solve_an_axis(dtype, shape, faces, kind, masked, dt):
-    """Against three dense solves, each axis's matrix assembled with the others' rates at zero.
-    Rounding: dense solves lose digits as Δt·T grows."""
+    """Against three dense solves, each with the matrix of one axis.
+
+    Rounding: dense solves lose digits as Δt·T grows.
+    """
     op, _, _, mask = make(shape, faces, kind, masked, dtype=dtype)
     u = start(shape, mask)
     expected = u.reshape(-1) + dt * 0.3 * mask.reshape(-1)
@@ -112,8 +117,9 @@ def one_axis(op, axis: int, decay: float, mask: np.ndarray) -> tuple[np.ndarray,
 @every
 @MASKED
 def test_crank_nicolson_solves_its_equation(dtype, shape, faces, kind, masked):
-    """Against a dense solve; the iteration leaves 1e-10 of the right-hand side, which is of order
-    10."""
+    """Against a dense solve; the iteration has an error of 1e-10 of the right-hand side, which is
+    of order 10.
+    """
     op, matrix, gain, mask = make(shape, faces, kind, masked, dtype=dtype)
     u, dt = start(shape, mask), 0.7
     one = np.eye(u.size)
@@ -128,7 +134,7 @@ def test_crank_nicolson_solves_its_equation(dtype, shape, faces, kind, masked):
 @every
 @MASKED
 def test_euler_is_its_power(dtype, shape, faces, kind, masked):
-    """Against the dense (I + δT)^m, m the least with δ·(greatest loss) ≤ 1."""
+    """Against the dense (I + δT)^m, with the least m for which δ·(greatest loss) ≤ 1."""
     op, matrix, gain, mask = make(shape, faces, kind, masked, dtype=dtype)
     u, dt = start(shape, mask), 1.7
     count = max(1, math.ceil(dt * -np.diag(matrix).min()))
@@ -144,8 +150,10 @@ def test_euler_is_its_power(dtype, shape, faces, kind, masked):
 @pytest.mark.parametrize("method, order", [("implicit", 1), ("crank_nicolson", 2), ("euler", 1)])
 @MASKED
 def test_order_in_time(method, order, masked):
-    """Half the step, and the error is 2^−order: measured within 0.15 between Δt = 1/64 and 1/128 of
-    a time over which much happens, float64."""
+    """Half the step gives 2^−order of the error, within 0.15, in float64.
+
+    Measured between Δt = 1/64 and 1/128 of a time over which the field changes much.
+    """
     op, matrix, gain, mask = make((5, 4, 3), "mixed", "varying", masked)
     u = start((5, 4, 3), mask)
     expected = exact(matrix, gain, 1.0, u)
@@ -154,9 +162,12 @@ def test_order_in_time(method, order, masked):
 
 
 def test_implicit_at_rest_is_at_rest():
-    """A flat field between faces fixed at its value, whatever the step: each axis takes its own
-    faces in. Some roundings of 5."""
-    op = operator(
+    """A uniform field between faces fixed at its value stays, for any step: each axis has its own
+    faces.
+
+    Some roundings of 5.
+    """
+    op = build_operator(
         (6, 5, 4),
         SPACING,
         diffusion=1.0,
@@ -185,9 +196,11 @@ common = {
 }
 
 
-def random_operator(seed, shape, power, masked, kind, single, method, faces, decay=0.0):
-    """An operator of which the most that diffuses in a step of 1 h is r = KΔt/h² = 10^power, its
-    velocity of a Péclet number up to 100."""
+def random_operator(seed, shape, power, masked, kind, single, method, boundary, decay=0.0):
+    """An operator with greatest diffusion number r = KΔt/h² = 10^power in a step of 1 h.
+
+    Its velocity has a Péclet number up to 100.
+    """
     rng = np.random.default_rng(seed)
     h = rng.uniform(0.5, 3.0, 3)
     k = 10.0**power * h.min() ** 2
@@ -207,13 +220,13 @@ def random_operator(seed, shape, power, masked, kind, single, method, faces, dec
             velocity = tuple(torch.as_tensor(a) for a in arrays)
     mask = rng.uniform(size=shape) < 0.7 if masked else np.ones(shape, dtype=bool)
     dtype = torch.float32 if single else torch.float64
-    op = operator(
+    op = build_operator(
         shape,
         tuple(h),
         diffusion=k,
         decay=decay,
         velocity=velocity,
-        boundary=faces,
+        boundary=boundary,
         dtype=dtype,
         mask=torch.as_tensor(mask) if masked else None,
     )
@@ -224,15 +237,16 @@ def random_operator(seed, shape, power, masked, kind, single, method, faces, dec
 
 
 def roundings(op) -> float:
-    """The most that a sum of non-negative parts may be off, relative: a few roundings for each
-    voxel along each axis."""
+    """The greatest relative error of a sum of non-negative parts: a few roundings per voxel and
+    axis.
+    """
     return 8 * sum(op.shape) * torch.finfo(op.dtype).eps
 
 
 @settings(max_examples=150, deadline=None)
 @given(**common, decay=st.floats(0, 5), x=pair, y=pair, z=pair)
 def test_nothing_goes_below_zero(x, y, z, decay, **drawn):
-    """Exactly, whatever the box, its faces, the flow and the step."""
+    """Exactly, for any box, faces, flow and step."""
     op, u, mask = random_operator(boundary=BoundaryConditions(x, y, z), decay=decay, **drawn)
     after = prepare(op, 1.0, drawn["method"]).step(u)
     assert bool(torch.isfinite(after).all()) and float(after.min()) >= 0
@@ -253,7 +267,7 @@ def test_nothing_is_lost_in_a_closed_box(x, y, z, **drawn):
 @settings(max_examples=150, deadline=None)
 @given(**common, x=pair, y=pair, z=pair)
 def test_nothing_rises_above_what_is_there_or_beyond_the_faces(x, y, z, **drawn):
-    """Without flow: all values and faces between 0 and 1 stay so."""
+    """Without flow, values between 0 and 1 stay so if all faces are."""
     op, u, _ = random_operator(boundary=BoundaryConditions(x, y, z), **(drawn | {"kind": "still"}))
     after = prepare(op, 1.0, drawn["method"]).step(u)
     assert float(after.max()) <= 1 + roundings(op)
@@ -279,9 +293,11 @@ def params(dtype=torch.float64):
 )
 @pytest.mark.parametrize("periodic", [False, True])
 def test_slopes(method, periodic, masked):
-    """By u, diffusion, velocity, decay, source and a face's value against central differences, over
-    two steps. float64; the differences of an iterative solve that leaves 1e-10 are good to
-    1e-10/1e-4."""
+    """By u, diffusion, velocity, decay, source and a face's value against central differences.
+
+    Two steps in float64. With an iterative solve to 1e-10 the differences are accurate to
+    1e-10/1e-4.
+    """
     shape, dt = (3, 2, 2), 0.4
     mask = torch.as_tensor(np.random.default_rng(2).uniform(size=shape) < 0.8) if masked else None
     rough = method == "crank_nicolson"
@@ -292,7 +308,7 @@ def test_slopes(method, periodic, masked):
             x=Periodic() if periodic else (Dirichlet(value), NoFlux()),
             y=(Open(value), Dirichlet(0.5)),
         )
-        op = operator(
+        op = build_operator(
             shape,
             SPACING,
             diffusion=diffusion,
@@ -328,7 +344,7 @@ def test_slopes_by_a_velocity_on_faces(method):
 
     def run(*v):
         return prepare(
-            operator(
+            build_operator(
                 shape,
                 SPACING,
                 diffusion=1.0,
@@ -357,8 +373,10 @@ def test_slopes_by_a_velocity_on_faces(method):
 @pytest.mark.parametrize("shape", [(9, 8, 7), (33, 1, 1), (12, 11, 1), (1, 1, 1)], ids=str)
 @pytest.mark.parametrize("own", [False, True], ids=["shared", "each its own"])
 def test_a_colony_does_not_see_the_others(device, dtype, method, shape, own, deterministic):
-    """The same bits after three steps alone and in batches of 2 and 17, beside colonies in which
-    all goes a thousand times faster."""
+    """The same bits after three steps alone and in batches of 2 and 17.
+
+    In the other colonies everything is a thousand times faster.
+    """
     rng, count = np.random.default_rng(5), 17
     t = lambda *s: torch.as_tensor(rng.uniform(0.1, 1, s), device=device)
     fast = 10.0 ** torch.as_tensor(rng.uniform(-2, 1, count), device=device)
@@ -374,7 +392,7 @@ def test_a_colony_does_not_see_the_others(device, dtype, method, shape, own, det
     def of(k: slice):
         size = len(range(*k.indices(count)))
         part = k if own else slice(0, 1)
-        op = operator(
+        op = build_operator(
             shape,
             SPACING,
             diffusion=diffusion[part],
@@ -402,7 +420,7 @@ def test_the_method_that_suits():
     assert choose(make((3, 2, 2))[0]) == "exponential"
     assert choose(make((3, 2, 2), kind="varying")[0]) == "implicit"
     assert choose(make((3, 2, 2), masked=True)[0]) == "implicit"
-    with pytest.raises(InputError, match=r"exponential.*velocity varies.*implicit"):
+    with pytest.raises(InputError, match=r"exponential.*velocity is not uniform.*implicit"):
         prepare(make((3, 2, 2), kind="varying")[0], 0.1, "exponential")
     with pytest.raises(InputError, match=r"exponential.*obstacle.*implicit"):
         prepare(make((3, 2, 2), masked=True)[0], 0.1, "exponential")
@@ -414,8 +432,8 @@ def test_the_method_that_suits():
 
 
 def test_a_failed_solve_is_its_own_colonys():
-    """A colony with a NaN is reported, and is NaN; the other goes on as if alone."""
-    op = operator(
+    """A colony with a NaN is reported, and is NaN; the other continues as if alone."""
+    op = build_operator(
         (4, 3, 2), SPACING, diffusion=1.0, velocity=(1.0, 0.0, 0.0), colonies=2, dtype=torch.float64
     )
     u = torch.as_tensor(start((2, 4, 3, 2)))

@@ -1,4 +1,4 @@
-"""Powers and other functions whose bits do not depend on where an element stands."""
+"""Powers and other functions whose bits do not depend on an element's place in a tensor."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from torchfilm.tools.deterministic_math import deterministic_functions, power
 
 EXPONENTS = [0, 1, 2, 3, 4, 7, 8, 13, -1, -2, -3, 0.5, 1.5, 2.7, 0.3, -0.5, -1.5]
 
-# what users may write, each seen unsteady on some build of torch; powers of 0, 1, 2, 3 belong to
-# the family
+# functions that users may write, each found to vary on some build of torch; powers of 0, 1, 2, 3
+# belong to the same family
 WRITTEN = {
     **{f"x ** {n}": lambda x, n=n: x**n for n in EXPONENTS},
     "x ** tensor": lambda x: x ** torch.full_like(x, 1.5),
@@ -37,7 +37,7 @@ WRITTEN = {
     "elu": lambda x: torch.nn.functional.elu(x - 2),
     "logaddexp": lambda x: torch.logaddexp(x, 2 - x),
     "hypot": lambda x: torch.hypot(x, 2 - x),
-    # not replaced: found steady, and must stay so
+    # not replaced: found deterministic, and must stay so
     "exp": torch.exp,
     "expm1": torch.expm1,
     "log": torch.log,
@@ -53,8 +53,7 @@ WRITTEN = {
 
 @pytest.fixture(scope="module", autouse=True)
 def forward_mode():
-    """Torch compiles its forward derivatives on their first use, by a function that it calls
-    deprecated itself."""
+    """Compile torch's forward derivatives, without torch's own deprecation warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.func.jvp(torch.exp, (torch.ones(1),), (torch.ones(1),))
@@ -74,7 +73,8 @@ def backward(f, x):
 @pytest.mark.parametrize("name", WRITTEN)
 def test_bits_do_not_depend_on_place_or_company(dtype, name):
     """An element alone, at any offset of a slice of any length up to 70, in a strided column, in a
-    long tensor: value and both derivatives."""
+    long tensor: value and both derivatives.
+    """
     x = (
         torch.rand(3000, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 4 + 1e-3
     ).to(dtype)
@@ -110,8 +110,11 @@ def test_bits_do_not_depend_on_threads(dtype, name):
 @pytest.mark.parametrize("n", EXPONENTS)
 @pytest.mark.parametrize("tensor", [False, True], ids=["number", "tensor"])
 def test_power_is_exact_to_a_few_units(dtype, device, n, tensor):
-    """Against NumPy's in float64: squaring costs up to n roundings, exp(n log x) up to n |log x|
-    and a few of exp and log themselves."""
+    """Against NumPy in float64.
+
+    Squaring costs up to n roundings, exp(n log x) up to n |log x| and a few of exp and log
+    themselves.
+    """
     x = torch.logspace(-2.5, 2.5, 400, dtype=torch.float64).to(device=device, dtype=dtype)
     found = power(x, torch.full_like(x, n) if tensor else n)
     # 2.7 is another number in float32
@@ -124,8 +127,9 @@ def test_power_is_exact_to_a_few_units(dtype, device, n, tensor):
 
 @pytest.mark.parametrize("tensor", [False, True], ids=["number", "tensor"])
 def test_power_at_zero_and_below(dtype, device, tensor):
-    """0ⁿ and its two derivatives by n; whole exponents of negative numbers; NaN for broken ones, as
-    torch says."""
+    """0ⁿ and its two derivatives by n; integer exponents of negative numbers; NaN for fractional
+    ones, as in torch.
+    """
     cases = [
         (1.0, 0, 1, 0),
         (2.0, 0, 0, 2),
@@ -152,8 +156,7 @@ def test_power_at_zero_and_below(dtype, device, tensor):
 @pytest.mark.parametrize("x", [1e-30, 1e-10, 1.0, 3.0, -2.0])
 @pytest.mark.parametrize("n", [1.0, 1.5, 2.0, 2.5, 8.0])
 def test_no_derivative_is_poisoned_by_a_branch_not_taken(dtype, x, n):
-    """Two derivatives by x and the one by n of a tensor power are numbers wherever the value is
-    one."""
+    """Two derivatives by x and the one by n of a tensor power are finite wherever the value is."""
     if x < 0 and n % 1:
         return
     base, exponent = (
@@ -167,7 +170,7 @@ def test_no_derivative_is_poisoned_by_a_branch_not_taken(dtype, x, n):
 
 
 def test_derivatives_by_finite_differences():
-    """float64, gradcheck's own bounds; first and second, by the base and by the exponent."""
+    """First and second derivatives by base and exponent, float64, with gradcheck's bounds."""
     x = torch.tensor([0.2, 0.9, 1.7, 3.0], dtype=torch.float64, requires_grad=True)
     n = torch.tensor([0.7, 1.5, 2.0, 8.0], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(power, (x, n), check_forward_ad=True)
@@ -205,8 +208,10 @@ OTHERS = {
 
 @pytest.mark.parametrize("mine", OTHERS)
 def test_other_functions_are_torchs(dtype, mine):
-    """Against torch in float64 over ±50, a few units in the last place (softplus: torch gives the
-    straight line beyond 20, wrong by 2e-9)."""
+    """Against torch in float64 over ±50, to a few units in the last place.
+
+    For softplus torch uses the straight line beyond 20, with an error of 2e-9.
+    """
     x = torch.linspace(-50, 50, 2001, dtype=torch.float64).to(dtype)
     expected = OTHERS[mine](x.double())
     assert torch.allclose(
@@ -228,8 +233,10 @@ def test_two_arguments_are_torchs(dtype):
 
 
 def test_what_is_not_replaced_is_left_to_torch():
-    """Whole-number tensors, complex ones and negative bases of a number's power come out as torch
-    has them; nothing is replaced outside."""
+    """Integer and complex tensors, and negative bases of a number's power, are as in torch.
+
+    Outside the context nothing is replaced.
+    """
     whole, complexes = torch.tensor([2, 3]), torch.tensor([1 + 1j])
     with deterministic_functions():
         assert (whole**2).dtype == torch.int64 and (2**whole).dtype == torch.int64

@@ -1,4 +1,4 @@
-"""A digest tells apart what acts in another way, and nothing else."""
+"""A digest differs for objects that act differently, and only for those."""
 
 from __future__ import annotations
 

@@ -29,8 +29,9 @@ def loop(owner: np.ndarray, size: int, value: np.ndarray, what, empty: float = 0
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
 def test_sums_and_maxima_against_loops(owner, more, width, in_order, dtype):
-    """Groups without a row included, at the front, between and at the end. float32: forty terms of
-    1e-7."""
+    """With empty groups at the front, between others and at the end. float32: forty terms of
+    1e-7.
+    """
     owner = np.array(sorted(owner) if in_order else owner, dtype=np.int64)
     value = np.random.default_rng(len(owner)).normal(size=(len(owner), *width))
     groups = Groups(torch.as_tensor(owner), 7 + more)
@@ -66,7 +67,7 @@ def test_no_rows_and_no_groups(device, dtype):
 
 
 def test_maxima_of_negative_numbers_and_infinities(device, dtype):
-    """Zero has no part in it unless it is there; NaN comes out as NaN."""
+    """Zero has no effect unless it is a value; NaN gives NaN."""
     groups = Groups(torch.tensor([0, 0, 1, 2, 2], device=device), 4)
     found = groups.max(
         torch.tensor([-3.0, -1.0, -torch.inf, 1.0, torch.nan], dtype=dtype, device=device)
@@ -83,7 +84,7 @@ def test_maxima_of_negative_numbers_and_infinities(device, dtype):
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
 def test_weighted_sums_against_loops(owner, width, in_order, dtype):
-    """Of the same rows with one set of weights and then another."""
+    """The same rows with one set of weights and then another."""
     owner = np.array(sorted(owner) if in_order else owner, dtype=np.int64)
     rng = np.random.default_rng(len(owner))
     value = rng.normal(size=(len(owner), width))
@@ -100,7 +101,7 @@ def test_weighted_sums_against_loops(owner, width, in_order, dtype):
 
 @pytest.mark.parametrize("width", [1, 4, 7])
 def test_a_group_has_the_same_weighted_sum_in_any_company(device, dtype, width, deterministic):
-    """To the last bit: alone, and first, last or in the midst of many."""
+    """Bitwise: alone, and first, last or in the middle of many groups."""
     rng = np.random.default_rng(1)
     t = lambda x: torch.as_tensor(x, dtype=dtype, device=device)
     value, weight = rng.normal(size=(90, width)), rng.normal(size=90)
@@ -146,8 +147,10 @@ def test_gradient_of_a_sum(width):
 @pytest.mark.parametrize("width", [1, 3, 7, 28])
 @pytest.mark.parametrize("count", [1, 5, 63, 1000])
 def test_a_group_has_the_same_sum_in_any_company(device, dtype, width, count, deterministic):
-    """Bitwise: alone, behind others, in front of others, with its rows scattered among theirs;
-    numbers of all sizes, so order shows."""
+    """Bitwise: alone, behind others, in front of others, and with its rows scattered among theirs.
+
+    The numbers have very different sizes, so the order of the sum has an effect.
+    """
     rng = np.random.default_rng(count + width)
 
     def rows(n):
@@ -190,8 +193,9 @@ def test_a_group_has_the_same_sum_in_any_company(device, dtype, width, count, de
 @pytest.mark.parametrize("width", [1, 4, 7])
 @pytest.mark.parametrize("count", [1, 5, 1000])
 def test_blocks_against_products_and_in_any_company(device, dtype, width, count):
-    """Each block times its row, and bitwise the same whatever stands before it; what is not a
-    number stays in its own."""
+    """Each block times its row, bitwise the same after any other blocks; a NaN stays in its own
+    row.
+    """
     rng = np.random.default_rng(count + width)
     value = rng.normal(size=(count, width, width))
     value, r = value + value.swapaxes(1, 2), rng.normal(size=(count, width))

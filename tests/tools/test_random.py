@@ -1,5 +1,4 @@
-"""Draws that belong to a cell: the generator itself, how evenly it draws, and that nothing but the
-key matters."""
+"""Random draws of cells: the generator, its distributions, and its dependence on the key alone."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from scipy import stats
 from torchfilm.tools import random
 
 # Known answers of the generator's authors (Random123, kat_vectors, philox4x32 10): counter, key,
-# what comes out.
+# output.
 KNOWN = [
     (
         "00000000 00000000 00000000 00000000",
@@ -51,7 +50,7 @@ def test_philox_known_answers(device, counter, key, expected):
 
 
 def philox_by_hand(counter: list[int], key: list[int]) -> list[int]:
-    """The same ten rounds in Python's whole numbers, which never overflow."""
+    """The same ten rounds in Python's integers, which never overflow."""
     c, k = list(counter), list(key)
     for _ in range(10):
         p, q = c[0] * 0xD2511F53, c[2] * 0xCD9E8D57
@@ -66,21 +65,23 @@ WORD = st.integers(0, 2**32 - 1)
 @settings(deadline=None, derandomize=True, max_examples=200)
 @given(counter=st.lists(WORD, min_size=4, max_size=4), key=st.lists(WORD, min_size=2, max_size=2))
 def test_products_that_overflow_do_no_harm(counter, key):
-    """int64 products of two 32-bit words wrap; the 64 bits that are used must be those of the true
-    product."""
+    """int64 products of two 32-bit words wrap; the 64 bits in use must equal those of the true
+    product.
+    """
     found = random.philox(tuple(torch.tensor([c]) for c in counter), tuple(key))
     assert [int(w) for w in found] == philox_by_hand(counter, key)
 
 
 def keys(count: int, device="cpu") -> tuple[torch.Tensor, torch.Tensor]:
-    """Cells as they come: colonies of a thousand, counted through."""
+    """Keys of typical cells: colonies of a thousand, with consecutive numbers."""
     n = torch.arange(count, device=device)
     return n // 1000, n % 1000
 
 
 def test_uniform_is_uniform(device, dtype):
-    """200,000 draws of successive cells: Kolmogorov–Smirnov and χ² over 1,000 bins. The draws never
-    change, so neither do the p-values: below 1e-3 would be a defect, not luck.
+    """200,000 draws of successive cells: Kolmogorov–Smirnov and χ² over 1,000 bins.
+
+    The draws never change, so the p-values do not either: below 1e-3 would be a defect, not chance.
     """
     colony, uid = keys(200_000, device)
     u = random.uniform(1, colony, uid, 3, "test", dtype)
@@ -89,7 +90,7 @@ def test_uniform_is_uniform(device, dtype):
     u = array(u)
     assert stats.kstest(u, "uniform").pvalue > 1e-3
     assert stats.chisquare(np.histogram(u, 1000, (0, 1))[0]).pvalue > 1e-3
-    # neighbours in uid, colony and step are strangers: correlations within 4 of their standard
+    # neighbours in uid, colony and step are independent: correlations within 4 of their standard
     # deviation 1/√n
     later = array(random.uniform(1, colony, uid, 4, "test", dtype))
     other = array(random.uniform(1, colony, uid, 3, "tests", dtype))
@@ -100,8 +101,9 @@ def test_uniform_is_uniform(device, dtype):
 
 @pytest.mark.parametrize("word", [0, 2**32 - 1])
 def test_no_draw_is_zero_or_one(dtype, word, monkeypatch):
-    """The docstring promises the open interval (0, 1): also for the least and the greatest word, in
-    either precision."""
+    """The docstring promises the open interval (0, 1), also for the least and the greatest word, in
+    both precisions.
+    """
     monkeypatch.setattr(random, "words", lambda *key: (torch.tensor([word]),) * 4)
     none = torch.tensor([0])
     assert 0 < float(random.uniform(0, none, none, 0, "test", dtype)) < 1
@@ -109,8 +111,9 @@ def test_no_draw_is_zero_or_one(dtype, word, monkeypatch):
 
 
 def test_normal_is_normal(device, dtype):
-    """Four draws a cell, each standard normal by Kolmogorov–Smirnov, the four uncorrelated, also in
-    size."""
+    """Four draws per cell, each standard normal by Kolmogorov–Smirnov; the four and their sizes are
+    uncorrelated.
+    """
     colony, uid = keys(50_000, device)
     z = random.normal(5, colony, uid, 0, "test", dtype)
     assert z.shape == (50_000, 4) and z.dtype == dtype
@@ -131,7 +134,7 @@ def test_normal_is_normal(device, dtype):
     shift=st.integers(0, 2**40),
 )
 def test_draws_do_not_depend_on_company(seed, order, step, shift):
-    """In any order, alone or together, a cell's draw is its own; bitwise."""
+    """A cell's draw is bitwise the same in any order, alone or in a batch."""
     colony, uid = torch.tensor([0, 0, 1, 1, 2, 5, 5, 7]), torch.arange(8) * 3 + shift
     place = torch.tensor(order)
     for draw in (random.uniform, random.normal):
@@ -145,8 +148,7 @@ def test_draws_do_not_depend_on_company(seed, order, step, shift):
 
 
 def test_every_part_of_the_key_counts():
-    """Change one of seed, colony, uid, step, purpose and the words change; seeds and uids beyond 32
-    bits too."""
+    """A change of seed, colony, uid, step or purpose changes the words, also beyond 32 bits."""
     base = {"seed": 1, "colony": 2, "uid": 3, "step": 4, "purpose": "a"}
     others = [
         {},
@@ -173,6 +175,8 @@ def test_every_part_of_the_key_counts():
 
 
 def test_purposes_have_stable_codes():
-    """A saved run goes on with the same draws in another session: codes are a checksum of the name,
-    not Python's hash."""
+    """A saved run continues with the same draws in another session.
+
+    So codes are a checksum of the name, not Python's hash.
+    """
     assert random.purpose_code("abc") == 0x352441C2

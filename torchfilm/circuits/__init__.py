@@ -1,2 +1,1 @@
-"""Circuits: reactions inside cells and the integrators that carry them forward. Tensors in and out,
-never a State."""
+"""Circuits: reactions inside cells and their integrators. Tensors in and out, never a State."""

@@ -1,4 +1,4 @@
-"""Names whose columns are picked out for some cells only when they are asked for."""
+"""Named columns of some cells, selected on first access."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torchfilm.circuits.names import Names, UnknownName, unknown
 class Columns(Names):
     """Named columns over some of the cells.
 
-    source: per name a tensor over all cells, a number, or a function that gives the tensor. rows:
-    (M,) int64 the cells. seen: collects the names that were asked for, where given.
+    source: per name a tensor over all cells, a number, or a function that returns the tensor. rows:
+    (M,) int64, the cells. seen: if given, it collects the names that were accessed.
     """
 
     __slots__ = ("_rows", "_seen", "_source")
@@ -31,7 +31,7 @@ class Columns(Names):
         object.__setattr__(self, "_seen", seen)
 
     def __getattr__(self, name: str) -> Any:
-        # only called for what was not asked for before
+        # called only on the first access of a name
         if name.startswith("__"):
             raise AttributeError(name)
         if name not in self._source:
@@ -60,7 +60,7 @@ class Columns(Names):
 
 
 class Lazy:
-    """A column that is worked out when it is first asked for."""
+    """A column that is computed on first access."""
 
     def __init__(self, make: Callable[[], Tensor]):
         self.make = make
@@ -73,7 +73,7 @@ class Lazy:
 
 
 def column(value: object, count: int, like: Tensor) -> Tensor | None:
-    """A rate as (count,) of the kind of `like`; None where its shape does not fit."""
+    """A rate as (count,) with dtype and device of `like`, or None if its shape does not fit."""
     if not isinstance(value, Tensor):
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return None

@@ -1,5 +1,4 @@
-"""Random numbers for reactions: keyed uniforms, and whole numbers of Poisson's law made from one
-uniform each."""
+"""Random numbers for reactions: keyed uniforms, and Poisson numbers from one uniform each."""
 
 from __future__ import annotations
 
@@ -10,21 +9,20 @@ from torch import Tensor
 
 from torchfilm.tools.random import MASK, philox, purpose_code
 
-# uniforms in (0, 1), (count, M) float64, for the cells `rows` (M,): draw(rows, event, what, count)
+# draw(rows, event, what, count): uniforms in (0, 1), (count, M) float64, for the cells `rows` (M,)
 Draw = Callable[[Tensor, int, str, int], Tensor]
-# steps of one from the first guess; one or two where the mean is large, up to 60 or so where it is
-# small
-MOST_CORRECTIONS = 400
-# means below which one counts up from 0, and above which the guess is the answer
+# The limit on steps of one from the first guess. One or two are usual where the mean is large, up
+# to 60 or so where it is small.
+MAX_CORRECTIONS = 400
+# Below SMALL the search starts at 0; above LARGE the guess is the answer.
 SMALL, LARGE = 4.0, 1e6
 
 
 def keyed_draws(seed: int, stream: Tensor, uid: Tensor, step: int) -> Draw:
-    """Draws that are a function of (seed, stream, uid, step, event, what, k) only: stream, uid (N,)
-    int64, step of the simulation.
+    """Draws that depend only on (seed, stream, uid, step, event, what, k).
 
-    `stream` is the colony's, which does not depend on the batch. Each pair of uniforms takes one
-    block of the generator, 53 bits each.
+    stream, uid: (N,) int64. step: of the simulation. `stream` belongs to the colony and does not
+    depend on the batch. Each pair of uniforms takes one block of the generator, with 53 bits each.
     """
 
     def draw(rows: Tensor, event: int, what: str, count: int) -> Tensor:
@@ -33,8 +31,8 @@ def keyed_draws(seed: int, stream: Tensor, uid: Tensor, step: int) -> Draw:
         codes = torch.tensor(
             [purpose_code(f"{what} {k}") for k in range(pairs)], device=rows.device
         ).unsqueeze(1)
-        # events share the word of the uid's upper half, apart for cells with uids below 2⁴⁸, and
-        # beyond 65,535 of them the codes
+        # The event number shares a word with the upper half of the uid. They stay apart for uids
+        # below 2⁴⁸. Beyond 65,535 events the code takes the rest of the event number.
         codes = (codes ^ (((event + 1) >> 16) * 0x9E3779B9)) & MASK
         upper = ((cell >> 32) ^ ((event + 1) << 16)) & MASK
         counter = (cell & MASK, upper, own & MASK, torch.full_like(cell, step & MASK))
@@ -56,27 +54,27 @@ def keyed_draws(seed: int, stream: Tensor, uid: Tensor, step: int) -> Draw:
 
 
 def poisson(mean: Tensor, uniform: Tensor) -> Tensor:
-    """The least whole k with P(X ≤ k) ≥ uniform for X of Poisson's law; mean ≥ 0 and uniform in (0,
-    1), float64, any shape.
+    """The least integer k with P(X ≤ k) ≥ uniform, for a Poisson variable X.
 
-    Exact but for the rounding of the sum of probabilities up to a mean of LARGE: from a first guess
-    by the normal law with its corrections, whose probability is found by the incomplete gamma
-    function, one goes up or down by single terms. Beyond, the guess is off by at most one, once in
-    10⁴ times.
+    mean ≥ 0 and uniform in (0, 1), float64, any shape. Up to a mean of LARGE the result is exact
+    except for the rounding of the sum of probabilities. The first guess is the normal law with its
+    corrections. The incomplete gamma function gives its probability, and the search then goes up or
+    down by single terms. Beyond LARGE the guess is off by at most one, once in 10⁴ times.
     """
     safe = mean.clamp(min=1e-300)
     z = torch.special.ndtri(uniform)
     root = safe.sqrt()
-    # Cornish and Fisher: the law's skewness and excess are 1/√λ and 1/λ; half a molecule for the
-    # law's steps
+    # Cornish–Fisher expansion: the law's skewness and excess are 1/√λ and 1/λ; half a molecule
+    # corrects for the discrete steps
     guess = safe + root * z + (z * z - 1) / 6 + (z - z * z * z) / (72 * root) + 0.5
     k = torch.where(safe > SMALL, guess.floor(), 0.0).clamp(min=0.0)
     searched = safe <= LARGE
     log_term = k * torch.log(safe) - safe - torch.lgamma(k + 1.0)
     term = torch.exp(log_term)
     total = torch.where(k > 0, torch.special.gammaincc(k + 1.0, safe), term)
-    for _ in range(MOST_CORRECTIONS):
-        # a term that no longer changes the sum ends the way up: the uniform is in the last bits
+    for _ in range(MAX_CORRECTIONS):
+        # the search upwards ends where a term no longer changes the sum: the uniform is in the last
+        # bits
         up = searched & (total < uniform) & (total + term > total)
         down = searched & (total >= uniform) & (total - term >= uniform) & (k > 0)
         if not bool((up | down).any()):

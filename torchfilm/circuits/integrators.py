@@ -1,5 +1,7 @@
-"""Explicit integrators with equal steps, for circuits that are not stiff: Euler, and Runge–Kutta by
-torchdiffeq."""
+"""Explicit integrators with equal steps for circuits that are not stiff: Euler and Runge–Kutta.
+
+The Runge–Kutta methods are those of torchdiffeq.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,10 @@ METHODS = ("midpoint", "heun2", "heun3", "rk4")
 
 
 def euler(rates: Rates, u: Tensor, dt: float, steps: int = 1) -> Tensor:
-    """Concentrations (N, S) after dt hours in equal steps of Euler's method; order 1. rates: as in
-    `rosenbrock`."""
+    """Concentrations (N, S) after dt hours in equal steps of Euler's method; order 1.
+
+    rates: as in `rodas3`.
+    """
     _check_steps(steps)
     rows = torch.arange(u.shape[0], device=u.device)
     for _ in range(steps):
@@ -24,18 +28,18 @@ def euler(rates: Rates, u: Tensor, dt: float, steps: int = 1) -> Tensor:
 
 
 def runge_kutta(rates: Rates, u: Tensor, dt: float, steps: int = 1, method: str = "rk4") -> Tensor:
-    """Concentrations (N, S) after dt hours in equal steps; method: "midpoint", "heun2" (order 2),
-    "heun3" (3) or "rk4" (4, the ⅜ rule).
+    """Concentrations (N, S) after dt hours in equal steps.
 
-    Only torchdiffeq's methods with fixed steps: its adaptive ones share one step over the batch, so
-    that a stiff cell would change the others' results.
+    method: "midpoint", "heun2" (order 2), "heun3" (3) or "rk4" (4, the ⅜ rule). Only torchdiffeq's
+    methods with fixed steps are used. Its adaptive methods share one step over the batch, so a
+    stiff cell would change the results of the others.
     """
     _check_steps(steps)
     checks.choice("method", method, METHODS)
     if dt == 0 or u.numel() == 0:
         return u.clone()
     rows = torch.arange(u.shape[0], device=u.device)
-    # times in float64 on the host: in float32 the last step could come out as a sliver
+    # times in float64 on the host: in float32 the last step could be tiny
     grid = torch.linspace(0.0, dt, steps + 1, dtype=torch.float64)
     found = torchdiffeq.odeint(
         lambda t, y: rates(y, rows),

@@ -1,7 +1,8 @@
-"""Rate laws that hold everywhere: below zero they are as at zero, far above they do not overflow,
-and at zero their derivatives are finite.
+"""Rate laws that are valid for all concentrations.
 
-x, half and power are tensors that broadcast, or numbers; half > 0, power ≥ 1.
+Below zero they equal their value at zero, at large concentrations they do not overflow, and at zero
+their derivatives are finite. x, half and power are tensors that broadcast, or numbers; half > 0,
+power ≥ 1.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ def activation(x: Tensor, half: float | Tensor, power: float | Tensor = 1.0) -> 
 
 
 def repression(x: Tensor, half: float | Tensor, power: float | Tensor = 1.0) -> Tensor:
-    """Kⁿ/(Kⁿ + xⁿ) = 1 − activation, but exact also where it is small."""
+    """Kⁿ/(Kⁿ + xⁿ) = 1 − activation, but accurate also where it is small."""
     big, p = _ratio(x, half, power)
     return torch.where(big, p, torch.ones_like(p)) / (1.0 + p)
 
@@ -30,8 +31,10 @@ def michaelis_menten(x: Tensor, half: float | Tensor) -> Tensor:
 
 
 def _ratio(x: Tensor, half: float | Tensor, power: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Whether x > K, and (x/K)ⁿ, or (K/x)ⁿ where it is: a number from 0 to 1 that neither overflows
-    nor divides by 0."""
+    """Whether x > K, and (x/K)ⁿ, or (K/x)ⁿ where x > K.
+
+    The ratio is from 0 to 1; it neither overflows nor divides by 0.
+    """
     r = (x / half).clamp(min=0.0)
     big = r.detach() > 1.0
     inner = torch.where(big, torch.where(big, r, 1.0).reciprocal(), r)

@@ -1,9 +1,9 @@
-"""Many small linear systems side by side: W (S, S, M), right-hand sides (S, M), cells last.
+"""Many small linear systems in parallel: W (S, S, M), right-hand sides (S, M), cells last.
 
-Cells last makes every operation of the elimination one pass over contiguous memory for all cells:
-for six species a fifth of the time of a library call for each matrix. There is no pivoting:
-`factor` says where that was not safe. What a circuit gives, 1/(γh) − J, needs none where species
-decay or convert into one another, and at a small enough step h it never does.
+With cells last, every operation of the elimination is one pass over contiguous memory for all
+cells. For six species this takes a fifth of the time of a library call for each matrix. There is no
+pivoting: `factor` reports where that was not safe. A circuit's matrix, 1/(γh) − J, needs none where
+species decay or convert into one another, and it needs none at a small enough step h.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# A pivot this much smaller than what it is the difference of has lost half of its digits.
+# A pivot smaller than this share of its scale has lost half of its digits in a difference.
 LEAST_PIVOT = 1e-8
 
 
 def factor(matrix: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """L and U of (S, S, M) in one tensor of that shape, and whether (M,) all pivots are sound
-    against the diagonal's own `scale` (S, M)."""
+    """L and U of (S, S, M) in one tensor of that shape.
+
+    Also whether (M,) all pivots are safe relative to the diagonal's own `scale` (S, M).
+    """
     lu = matrix.clone()
     size = lu.shape[0]
     for k in range(size - 1):
@@ -53,7 +55,9 @@ def substitute_transposed(lu: Tensor, b: Tensor) -> Tensor:
     return x
 
 
-class _Solve(torch.autograd.Function):
+class _LinearSolve(torch.autograd.Function):
+    """W⁻¹ b with its adjoint."""
+
     @staticmethod
     def forward(ctx, matrix: Tensor, lu: Tensor, b: Tensor) -> Tensor:
         x = substitute(lu, b)
@@ -69,15 +73,17 @@ class _Solve(torch.autograd.Function):
 
 
 def solve(matrix: Tensor, lu: Tensor, b: Tensor) -> Tensor:
-    """W⁻¹ b, with a gradient to the matrix and to b; `lu` from `factor`."""
+    """W⁻¹ b, differentiable in the matrix and in b; `lu` is from `factor`."""
     if torch.is_grad_enabled() and (matrix.requires_grad or b.requires_grad):
-        return _Solve.apply(matrix, lu, b)
+        return _LinearSolve.apply(matrix, lu, b)
     return substitute(lu, b)
 
 
 def multiply(matrix: Tensor, x: Tensor) -> Tensor:
-    """Matrix times vector, (S, S, M), (S, M) -> (S, M), the sum in a fixed order;
-    differentiable."""
+    """Matrix times vector, (S, S, M), (S, M) -> (S, M), differentiable.
+
+    The sum has a fixed order.
+    """
     out = matrix[:, 0] * x[0]
     for k in range(1, x.shape[0]):
         out = out + matrix[:, k] * x[k]

@@ -1,4 +1,4 @@
-"""Names for columns: what a user's rate function gets as u, s, p and cell."""
+"""Names for columns: the arguments u, s, p and cell of a user's rate function."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torchfilm.tools import checks
 
 
 class UnknownName(checks.InputError, AttributeError):
-    """A rate function asked for a name that is not there."""
+    """A rate function used an unknown name."""
 
 
 class Names:
-    """Read-only names for columns: `u.ahl`, or `u["ahl"]` for a name that is made up at run time.
+    """Read-only names for columns: `u.ahl`, or `u["ahl"]` for a name that is computed at run time.
 
-    order: the names. columns: one for each of them, in a tensor (M, K) or a sequence of tensors or
-    numbers. label: what to call this in a message.
+    order: the names. columns: one for each name, as a tensor (M, K) or a sequence of tensors or
+    numbers. label: the name of this object in messages.
     """
 
     __slots__ = ("__dict__", "_label")
@@ -27,14 +27,14 @@ class Names:
 
     def __init__(self, order: Sequence[str], columns: Tensor | Sequence[Any], label: str = "this"):
         object.__setattr__(self, "_label", label)
-        # the columns are the instance's own attributes, so that finding one costs what any
-        # attribute costs
+        # the columns are the instance's own attributes, so access costs as much as for any
+        # attribute
         self.__dict__.update(
             zip(order, columns.unbind(1) if isinstance(columns, Tensor) else columns, strict=True)
         )
 
     def __getattr__(self, name: str) -> Any:
-        # only called for what is not there
+        # called only for unknown names
         if name.startswith("__"):
             raise AttributeError(name)
         raise UnknownName(unknown(f"{self._label} has no {name!r}", name, list(self.__dict__)))
@@ -68,7 +68,7 @@ class Names:
 
 
 def unknown(what: str, name: str, known: Sequence[str]) -> str:
-    """The message for a name that is not there: what is, and what may have been meant."""
+    """The message for an unknown name: the known names, and the closest one."""
     near = difflib.get_close_matches(name, known, 1, cutoff=0.6)
     return f"{what}; known are {', '.join(known) or 'none'}." + (
         f" Did you mean {near[0]!r}?" if near else ""

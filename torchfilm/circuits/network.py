@@ -1,5 +1,4 @@
-"""A list of reactions made ready to run: checked against the species and signals that there are,
-with its stoichiometry as a tensor."""
+"""A network: a list of reactions, checked against species and signals, with its stoichiometry."""
 
 from __future__ import annotations
 
@@ -19,9 +18,9 @@ from torchfilm.tools import checks
 class Network:
     """R reactions over S species and M signals.
 
-    stoichiometry (R, S + M) float64: molecules gained by each event, species before signals. orders
-    (S + M,) float64: the highest order in which a rate depends on each. parameters: the names that
-    constants refer to.
+    stoichiometry: (R, S + M) float64, molecules gained by each event, species before signals.
+    orders: (S + M,) float64, the highest order in which a rate depends on each. parameters: the
+    names that constants refer to.
     """
 
     reactions: tuple[Reaction, ...]
@@ -37,8 +36,10 @@ class Network:
         return (*self.species, *(OUTSIDE + s for s in self.signals))
 
     def concentration_rates(self, u: Names, s: Names, p: Names, cell: Names) -> list[Tensor]:
-        """R rates, each (n,) conc/h in the cell's volume; differentiable. `cell` holds volume, area
-        and colony (the id that constants per colony go by)."""
+        """R rates, each (n,) conc/h in the cell's volume; differentiable.
+
+        `cell` has volume, area and colony (the id that selects constants per colony).
+        """
         out = []
         for reaction in self.reactions:
             if callable(reaction.rate):
@@ -57,13 +58,15 @@ class Network:
         return out
 
     def changes(self, rates: Sequence[Tensor]) -> list[Tensor]:
-        """What R rates (n,) change: S + M tensors (n,), conc/h referred to the cell's volume; a
-        signal's, times the volume, is an amount per hour."""
+        """The changes by R rates (n,): S + M tensors (n,), conc/h relative to the cell's volume.
+
+        A signal's change times the volume is an amount per hour.
+        """
         out = [torch.zeros_like(rates[0]) for _ in self.names]
-        place = {n: k for k, n in enumerate(self.names)}
+        column = {n: k for k, n in enumerate(self.names)}
         for reaction, rate in zip(self.reactions, rates, strict=True):
             for name, count in reaction.change().items():
-                k = place[name]
+                k = column[name]
                 out[k] = out[k] + (rate if count == 1 else -rate if count == -1 else count * rate)
         return out
 
@@ -76,12 +79,13 @@ class Network:
         molecules_per_unit: float | Tensor = 1.0,
         pool: Tensor | None = None,
     ) -> Tensor:
-        """Events per hour, (n, R), at molecule numbers `counts` (n, S + M); molecules_per_unit: molecules in a
-        unit of concentration × µm³.
+        """Events per hour, (n, R), at molecule numbers `counts` (n, S + M).
 
-        pool: µm³ outside that each cell may draw signals from, (n,) or (n, M), where there are
-        signals. Mass action counts combinations, k Ω n (n − 1)/Ω² for 2 a with Ω = volume × molecules_per_unit;
-        a function's rate is used as it is, times Ω.
+        molecules_per_unit: molecules in a unit of concentration × µm³. pool: µm³ outside from which
+        each cell may take signals, (n,) or (n, M); required where there are signals.
+
+        Mass action counts combinations, k Ω n (n − 1)/Ω² for 2 a with Ω = volume ×
+        molecules_per_unit. The rate of a function is multiplied by Ω only.
         """
         volumes = [cell.volume * molecules_per_unit] * len(self.species)
         if self.signals:
@@ -89,7 +93,7 @@ class Network:
                 raise checks.input_error(
                     "pool",
                     pool,
-                    "the volume outside of each cell, for the signals " + ", ".join(self.signals),
+                    "the volume outside each cell, for the signals " + ", ".join(self.signals),
                 )
             volumes += [
                 (pool if pool.dim() == 1 else pool[:, k]) * molecules_per_unit
@@ -99,7 +103,7 @@ class Network:
         density = [n / v for n, v in zip(columns, volumes, strict=True)]
         u = Names(self.species, density[: len(self.species)], "u")
         s = Names(self.signals, density[len(self.species) :], "s")
-        place = {n: k for k, n in enumerate(self.names)}
+        column = {n: k for k, n in enumerate(self.names)}
         size = cell.volume * molecules_per_unit
         out = []
         for reaction in self.reactions:
@@ -108,33 +112,33 @@ class Network:
                 continue
             rate = per_cell(reaction.rate, p, cell, size) * size
             for name, order in reaction.consumes.items():
-                # what is less than a molecule cannot react
-                rate = rate * falling(columns[place[name]].floor(), order)
+                # less than one molecule cannot react
+                rate = rate * falling(columns[column[name]].floor(), order)
                 for _ in range(order):
-                    rate = rate / volumes[place[name]]
+                    rate = rate / volumes[column[name]]
             out.append(rate)
         return torch.stack(out, 1)
 
 
-def network_parts(entry: Sequence[Any]) -> list[Reaction]:
-    """Reactions in a part, or in parts within parts, in order."""
+def _flatten(entry: Sequence[Any]) -> list[Reaction]:
+    """The reactions in a part, or in nested parts, in order."""
     return [
-        r
-        for inner in entry
-        for r in ([inner] if isinstance(inner, Reaction) else network_parts(inner))
+        r for inner in entry for r in ([inner] if isinstance(inner, Reaction) else _flatten(inner))
     ]
 
 
-def network(
+def build_network(
     reactions: Sequence[Reaction | Sequence[Reaction]],
     species: Sequence[str],
     signals: Sequence[str] = (),
 ) -> Network:
-    """Reactions, or parts (lists of reactions), checked and put together over the given species and
-    signals."""
+    """Check reactions, or parts (lists of reactions), and join them over species and signals.
+
+    Raises InputError for unknown or repeated names.
+    """
     flat: list[Reaction] = []
     for entry in reactions:
-        flat += [entry] if isinstance(entry, Reaction) else network_parts(entry)
+        flat += [entry] if isinstance(entry, Reaction) else _flatten(entry)
     if not flat:
         raise checks.input_error("reactions", list(reactions), "at least one reaction")
     names = [*species, *(OUTSIDE + s for s in signals)]
@@ -149,8 +153,8 @@ def network(
             raise checks.input_error(
                 "reaction",
                 reaction.name,
-                "there only once",
-                "Give each reaction a name of its own, or none.",
+                "used only once",
+                "Give each reaction its own name, or none.",
             )
         seen.add(reaction.name)
         for name in (*reaction.consumes, *reaction.produces, *getattr(reaction.rate, "reads", ())):
@@ -171,7 +175,7 @@ def network(
                 )
         for name, count in reaction.change().items():
             stoichiometry[row, names.index(name)] = count
-        # what a user's own function reads is not known, so it may be anything
+        # the names that a user's function reads are unknown, so all names count
         steep = (
             dict.fromkeys(getattr(reaction.rate, "reads", names), reaction.order)
             if callable(reaction.rate)
@@ -191,14 +195,14 @@ def _check_names(species: Sequence[str], signals: Sequence[str]) -> None:
         ):
             raise checks.input_error(what, given, "a sequence of names")
         if len(set(given)) != len(given):
-            raise checks.input_error(
-                what, list(given), "different names", "One stands there twice."
-            )
+            raise checks.input_error(what, list(given), "different names", "One name occurs twice.")
 
 
 def _parameters(reactions: Sequence[Reaction]) -> tuple[str, ...]:
-    """Names of parameters that constants refer to, in order; what a user's own function reads is
-    not known."""
+    """The parameters that constants refer to, in order.
+
+    Parameters that a user's function reads are unknown here.
+    """
     found: list[str] = []
     for reaction in reactions:
         given = (

@@ -1,4 +1,4 @@
-"""Molecules shared between two daughters."""
+"""Partition of molecules between two daughters."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from torch import Tensor
 
 @torch.no_grad()
 def binomial(count: Tensor, share: Tensor, uniform: Tensor) -> Tensor:
-    """How many of `count` (M,) go to the first daughter if each goes there with probability `share`
-    (M,): the least k with P(X ≤ k) ≥ uniform (M,)."""
+    """The molecules of `count` (M,) in the first daughter, each with probability `share` (M,).
+
+    It is the least k with P(X ≤ k) ≥ uniform (M,).
+    """
     found = scipy.stats.binom.ppf(
         uniform.double().cpu().numpy(), count.double().cpu().numpy(), share.double().cpu().numpy()
     )

@@ -1,5 +1,7 @@
-"""Parts: the usual reactions of genetic circuits by name, each a list of reactions. Every constant
-is a number, one per colony, or a parameter's name."""
+"""Parts: the usual reactions of genetic circuits by name, each a list of reactions.
+
+Every constant is a number, one per colony, or a parameter's name.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +78,7 @@ class _Membrane:
 
 
 def _steepness(power: Constant) -> int:
-    """How steeply a promoter answers: the power, rounded up; 4 where it is not known beforehand."""
+    """The order of a promoter's response: the power, rounded up; 4 if it is not a number."""
     return max(1, -int(-power // 1)) if isinstance(power, (int, float)) else 4
 
 
@@ -139,11 +141,11 @@ def conversion(
 
 
 def exchange(species: str, rate: Constant, signal: str | None = None) -> list[Reaction]:
-    """Through the membrane, both ways: D₁ A/V × concentration, rate = D₁ in µm/h; signal: its name
-    outside, default as inside.
+    """Exchange through the membrane, both ways: D₁ A/V × concentration, rate = D₁ in µm/h.
 
-    What leaves the cell enters the medium and the other way round: one reaction each, so that
-    single molecules can make the way too.
+    signal: the name outside; default the same as inside. What leaves the cell enters the medium,
+    and the reverse. Each direction is a reaction of its own, so that single molecules can cross
+    too.
     """
     outside = OUTSIDE + (signal or species)
     rate = constant("exchange.rate", rate)

@@ -1,8 +1,8 @@
-"""Reactions: what turns into what, and how fast. A list of them is a circuit that can run smoothly
-or molecule by molecule.
+"""Reactions: which species turn into which, and at which rate.
 
-Names are the cell's species; "out.ahl" is the signal ahl just outside the cell. Rates are
-concentration per hour, referred to the cell's volume.
+A list of reactions is a circuit. It can run deterministically or molecule by molecule. Names are
+the cell's species; "out.ahl" is the signal ahl just outside the cell. Rates are concentration per
+hour, relative to the cell's volume.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from torchfilm.circuits.names import Names
 from torchfilm.tools import checks
 
 OUTSIDE = "out."
-# of u, s, p, cell: (n,) conc/h, referred to the cell's volume
+# rate(u, s, p, cell): (n,) conc/h, relative to the cell's volume
 RateFunction = Callable[[Names, Names, Names, Names], Tensor]
 # a number, one per colony (B,), or the name of a parameter
 Constant = float | Tensor | str
-PLACE = re.compile(r"(?:(\d+)\s*\*?\s*)?((?:out\.)?[A-Za-z_]\w*)")
+TERM = re.compile(r"(?:(\d+)\s*\*?\s*)?((?:out\.)?[A-Za-z_]\w*)")
 
 
 @dataclass(frozen=True, eq=False)
 class Reaction:
-    """Molecules `consumes` turn into `produces`, name -> how many, at `rate`.
+    """Molecules `consumes` turn into `produces` at `rate`; both map names to numbers of molecules.
 
-    rate: a constant (a number, one per colony, or a parameter's name) for mass action, rate × Π
-    concentration^order over what is consumed; or a function (u, s, p, cell) -> (n,) conc/h. Its
-    arguments are names for columns over cells: species, signals outside, parameters, geometry.
+    rate: a constant (a number, one per colony, or a parameter's name) gives mass action, rate × Π
+    concentration^order over the consumed species. A function (u, s, p, cell) -> (n,) gives conc/h.
+    Its arguments are names for columns over cells: species, signals outside, parameters, geometry.
     """
 
     consumes: Mapping[str, int]
     produces: Mapping[str, int]
     rate: Constant | RateFunction
     name: str = ""
-    # how steeply a function answers to what it reads: the highest power of a concentration in it
+    # the highest power of a concentration in a rate function
     order: int = field(default=2, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -54,15 +54,17 @@ class Reaction:
             raise checks.input_error(f"{label}.order", self.order, "a whole number from 1")
         if not self.change():
             raise checks.input_error(
-                label, str(self), "a reaction that changes something", "Both sides are the same."
+                label, str(self), "a reaction that changes something", "Both sides are equal."
             )
 
     @staticmethod
     def of(
         equation: str, rate: Constant | RateFunction, name: str = "", *, order: int = 2
     ) -> Reaction:
-        """From an equation: `Reaction.of("2 a + b -> c", rate=0.1)`; an empty side or 0 stands for
-        nothing."""
+        """From an equation: `Reaction.of("2 a + b -> c", rate=0.1)`.
+
+        An empty side or 0 means no molecules.
+        """
         sides = equation.split("->")
         if len(sides) != 2:
             raise checks.input_error(
@@ -73,8 +75,7 @@ class Reaction:
         )
 
     def change(self) -> dict[str, int]:
-        """Net change of each species and signal that one event makes; what does not change is left
-        out."""
+        """Net change of each species and signal per event, without those that do not change."""
         names = [*self.consumes, *(n for n in self.produces if n not in self.consumes)]
         net = {n: self.produces.get(n, 0) - self.consumes.get(n, 0) for n in names}
         return {n: k for n, k in net.items() if k}
@@ -87,7 +88,7 @@ class Reaction:
         return " -> ".join(sides)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # read-only mappings do not pickle by themselves
+        # read-only mappings cannot be pickled
         return (
             _restore,
             (dict(self.consumes), dict(self.produces), self.rate, self.name, self.order),
@@ -105,8 +106,7 @@ def _restore(
 
 
 def constant(name: str, given: object, *, positive: bool = False) -> Constant:
-    """A constant as given, checked: at least 0 (above 0 where `positive`), or a parameter's
-    name."""
+    """Returns a checked constant: at least 0 (above 0 with `positive`), or a parameter's name."""
     if isinstance(given, str):
         if not given.isidentifier():
             raise checks.input_error(
@@ -120,7 +120,9 @@ def constant(name: str, given: object, *, positive: bool = False) -> Constant:
 
 def _side(name: str, given: object) -> dict[str, int]:
     if not isinstance(given, Mapping):
-        raise checks.input_error(name, given, 'a mapping from names to how many, such as {"a": 2}')
+        raise checks.input_error(
+            name, given, 'a mapping from names to numbers of molecules, such as {"a": 2}'
+        )
     for key, count in given.items():
         if not isinstance(key, str) or not key.removeprefix(OUTSIDE).isidentifier():
             raise checks.input_error(
@@ -136,7 +138,7 @@ def _parse(side: str, equation: str) -> dict[str, int]:
     if side.strip() in ("", "0", "∅"):
         return out
     for term in side.split("+"):
-        found = PLACE.fullmatch(term.strip())
+        found = TERM.fullmatch(term.strip())
         if not found:
             raise checks.input_error(
                 "equation",
@@ -149,8 +151,10 @@ def _parse(side: str, equation: str) -> dict[str, int]:
 
 
 def per_cell(given: Constant, p: Names, cell: Names, like: Tensor) -> Tensor | float:
-    """A constant for each cell, (n,), or a single value: parameters by name, one per colony by the
-    colony's id, `cell.colony`."""
+    """A constant for each cell, (n,), or a single value.
+
+    Parameters are found by name, constants per colony by the colony's id, `cell.colony`.
+    """
     if isinstance(given, str):
         return p[given]
     if not isinstance(given, Tensor):
@@ -165,8 +169,10 @@ def concentration(name: str, u: Names, s: Names) -> Tensor:
 
 
 def falling(count: Tensor, order: int) -> Tensor:
-    """n (n − 1) … (n − order + 1) for whole n ≥ 0 and an order from 1: 0 where there are too
-    few."""
+    """n (n − 1) … (n − order + 1) for integer n ≥ 0 and order ≥ 1.
+
+    It is 0 where there are too few molecules.
+    """
     out = count
     for k in range(1, order):
         out = out * (count - k).clamp(min=0.0)

@@ -1,17 +1,17 @@
-"""Stiff circuits: a Rosenbrock method that steps every cell by itself, with its own step and error
-control.
+"""Stiff circuits: a Rosenbrock method with a step and an error control for each cell.
 
-Rodas3 (Sandu et al., Atmos. Environ. 31, 3459, 1997): order 3 with an embedded result of order 2,
-L-stable, stiffly accurate, γ = ½. With W = 2/h − J a step from u is
+The method is Rodas3 (Sandu et al., Atmos. Environ. 31, 3459, 1997): order 3 with an embedded result
+of order 2, L-stable, stiffly accurate, γ = ½. With W = 2/h − J a step from u is
 
     W k₁ = f(u)                            y₃ = u + 2 k₁
     W k₂ = f(u) + 4 k₁/h
     W k₃ = f(y₃) + (k₁ − k₂)/h             y₄ = y₃ + k₃
     W k₄ = f(y₄) + (k₁ − k₂ − 8/3 k₃)/h    u' = y₄ + k₄,  error ≈ k₄
 
-Every k lies in the range of f, so what f conserves (w · f = 0) is conserved. All of this is done in
-float64, whatever the cells' own dtype: where a rate of 1e8/h balances another, 2/h would be lost in
-a float32 W and the conserved sum with it, or rounding of rates be magnified by it.
+Every k lies in the range of f, so the method conserves what f conserves (w · f = 0).
+
+All arithmetic is float64, whatever the cells' dtype. Where a rate of 1e8/h balances another, a
+float32 W would lose 2/h, and with it the conserved sum, or it would magnify the rounding of rates.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from torch import Tensor
 
 from torchfilm.circuits import linear
 
-# du/dt (M, S), conc/h, of the cells `rows` (M,) at concentrations u (M, S); row i of the result
-# depends on row i of u only
+# rates(u, rows): du/dt (M, S), conc/h, of the cells `rows` (M,) at concentrations u (M, S). Row i
+# of the result depends on row i of u only.
 Rates = Callable[[Tensor, Tensor], Tensor]
 
 DONE, TOO_MANY_STEPS, NOT_FINITE, BELOW_ZERO = 0, 1, 2, 3
@@ -39,23 +39,25 @@ STATUS = {
     BELOW_ZERO: "the rates push a concentration below zero",
 }
 SAFETY, SHRINK, GROW = 0.9, 0.1, 5.0
-LEAST_STEP = 1e-20  # of the whole; a cell that asks for less has failed
-# steps with a result that is no number, after which a cell that comes upon them again and again is
-# given up
-MOST_SICK = 60
+LEAST_STEP = 1e-20  # as a share of dt; a cell that needs a shorter step has failed
+# A cell fails after this many steps with a non-finite result.
+MAX_NONFINITE_STEPS = 60
 
 
 @dataclass(frozen=True)
 class RosenbrockReport:
-    """For each cell, (N,) int64: steps `accepted` and `rejected`, and `status`, one of STATUS; a
-    failed cell keeps its last good concentrations."""
+    """What the method did for each cell; every field is (N,) int64.
+
+    accepted, rejected: numbers of steps. status: one of STATUS. A failed cell keeps its last good
+    concentrations.
+    """
 
     accepted: Tensor
     rejected: Tensor
     status: Tensor
 
 
-def rosenbrock(
+def rodas3(
     rates: Rates,
     u: Tensor,
     dt: float,
@@ -66,16 +68,19 @@ def rosenbrock(
     first_step: float | None = None,
     nonnegative: bool = True,
 ) -> tuple[Tensor, RosenbrockReport]:
-    """Concentrations (N, S) after dt hours: each cell in steps whose error is at most atol + rtol
-    |u| in every species.
+    """Concentrations (N, S) after dt hours, and the report; each cell takes its own steps.
 
-    rates: plain torch, du/dt (M, S) of the cells `rows` (M,) at float64 concentrations, without a
-    time of its own; differentiable in u. atol: in the unit of u, a number or (S,). rtol below four
-    units in the last place of u's dtype counts as that. first_step: h, default all of dt at once.
-    nonnegative: what starts at or above 0 stays there: the rates are continued linearly below 0,
-    and a step that ends there is drawn towards two steps of backward Euler. Gradients of u and of
-    whatever `rates` holds pass through the accepted steps, with the steps' sizes held fixed. Raises
-    nothing.
+    The error of each step is at most atol + rtol |u| in every species.
+
+    rates: du/dt (M, S) of the cells `rows` (M,) at float64 concentrations. It must be plain torch,
+    differentiable in u, and not depend on time. atol: in the unit of u, a number or (S,). rtol:
+    values below four units in the last place of u's dtype count as four units. first_step: h;
+    default dt. nonnegative: a species that starts at or above 0 stays there. The rates are
+    continued linearly below 0, and a step that ends below 0 is moved towards two steps of backward
+    Euler.
+
+    Gradients with respect to u and the tensors in `rates` pass through the accepted steps, with the
+    step sizes held fixed. The function raises nothing; failures are in the report.
     """
     cells, species = u.shape
     start = u.t().to(torch.float64)
@@ -98,8 +103,10 @@ def rosenbrock(
 
 @cache
 def _prepare_forward_mode() -> None:
-    """Torch compiles its forward derivatives on their first use, by a function that it calls
-    deprecated itself."""
+    """Compile torch's forward derivatives, without torch's own deprecation warning.
+
+    Torch compiles them on first use, with a function that torch itself calls deprecated.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         with forward_ad.dual_level():
@@ -107,8 +114,10 @@ def _prepare_forward_mode() -> None:
 
 
 class _Tableau:
-    """One step of the method for some cells; arrays are (S, M) in float64, species first. tracked:
-    whether a gradient is wanted."""
+    """One step of the method for some cells; arrays are (S, M) in float64, species first.
+
+    tracked: whether a gradient is required.
+    """
 
     def __init__(
         self,
@@ -129,19 +138,20 @@ class _Tableau:
         )
 
     def evaluate(self, u: Tensor, rows: Tensor) -> Tensor:
+        """The rates, (S, M)."""
         return self.rates(u.t(), rows).t().to(torch.float64)
 
     def linearise(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ, in one call on S copies of the cells."""
+        """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ, from one call with S copies of the cells."""
         f, jacobian = self._forward(u, rows) if self.tracked else self._backward(u, rows)
         if not bool(torch.isfinite(jacobian.sum())):
-            # the slope of a root at 0 is infinite; any finite one will do, only the error grows,
-            # and that is watched
+            # the slope of a root at 0 is infinite; any finite value will do, since only the error
+            # grows, and the error is controlled
             jacobian = torch.nan_to_num(jacobian, 0.0, 0.0, 0.0)
         return f, jacobian
 
     def _backward(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """By a backward pass: of the i-th copy only the rate of species i is asked."""
+        """By a backward pass; the i-th copy gives the gradient of species i's rate."""
         size, count = u.shape
         with torch.enable_grad():
             copies = u.repeat(1, size).requires_grad_()
@@ -156,9 +166,11 @@ class _Tableau:
         return f, slope.view(size, size, count).transpose(0, 1).to(torch.float64)
 
     def _forward(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """By forward derivatives, of the k-th copy along species k. Where a gradient is wanted: a
-        backward pass within one that is checkpointed would have every step taken again from the
-        start. Elsewhere it is the slower way: products with constants are worked out in Python.
+        """By forward derivatives; the k-th copy gives the derivative along species k.
+
+        Used where a gradient is required: a backward pass inside a checkpointed one would repeat
+        every step from the start. Otherwise it is the slower way, since Python computes products
+        with constants.
         """
         _prepare_forward_mode()
         size, count = u.shape
@@ -178,8 +190,10 @@ class _Tableau:
         return f, slope.t().to(torch.float64).reshape(size, size, count)
 
     def step(self, u: Tensor, rows: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The concentrations after h (M,), their error (M,) in units of what is allowed (NaN where
-        there is no result), and whether (M,) a species went below zero by more than may be mended.
+        """One step of length h (M,).
+
+        Returns the concentrations, their error (M,) in units of the allowed error (NaN where there
+        is no result), and whether (M,) a species is too far below zero to be corrected.
         """
         f, jacobian = self.linearise(u, rows)
         per_h = 1.0 / h
@@ -217,11 +231,13 @@ class _Tableau:
                 * torch.finfo(self.dtype).eps
                 * (u.abs() + 2 * k1.abs() + k3.abs() + k4.abs()).detach()
             )
-            new, change = self._raise(u, k1, new, noise, allowed, rows, matrix, lu, jacobian)
+            new, change = self._enforce_nonnegative(
+                u, k1, new, noise, allowed, rows, matrix, lu, jacobian
+            )
             broken = change > 1.0
         return new, error, broken
 
-    def _raise(
+    def _enforce_nonnegative(
         self,
         u: Tensor,
         k1: Tensor,
@@ -233,13 +249,12 @@ class _Tableau:
         lu: Tensor,
         jacobian: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Results that no longer lie below zero, and by how much (M,) that changed them, in units
-        of what is allowed.
+        """Results that are not below zero, and the change (M,), in units of the allowed error.
 
-        A result that is negative by more than rounding is drawn towards v, two steps of backward
+        A result that is negative by more than rounding is moved towards v, two steps of backward
         Euler over h/2 with the same W, which cannot go below zero in a linear circuit: new = v + θ
-        (u' − v) with the greatest θ ≤ 1 that does. It lies in the range of f as well, so nothing is
-        lost.
+        (u' − v) with the greatest θ ≤ 1 that is not below zero. The result lies in the range of f
+        as well, so conserved sums are kept.
         """
         low = u.detach().clamp(max=0.0)
         new = torch.where((new < low) & (new >= low - noise), low, new)
@@ -259,24 +274,24 @@ class _Tableau:
         share = torch.where(under, (safe - low) / torch.where(under, safe - worse, 1.0), 1.0).amin(
             0
         )
-        mended = torch.maximum(safe + share * (worse - safe), low)
+        corrected = torch.maximum(safe + share * (worse - safe), low)
         with torch.no_grad():
-            moved = ((mended - worse).abs() / pick(allowed)).amax(0)
-            # where Euler's result itself is below zero there is nothing to be drawn to
+            moved = ((corrected - worse).abs() / pick(allowed)).amax(0)
+            # where Euler's result is below zero too, there is no valid point to move to
             moved = torch.where((safe >= low).all(0), moved, torch.inf)
-        return new.index_copy(1, at, mended), change.index_copy(0, at, moved)
+        return new.index_copy(1, at, corrected), change.index_copy(0, at, moved)
 
 
 def _advance(
     method: _Tableau, u: Tensor, left: Tensor, h: Tensor, max_steps: int
 ) -> tuple[Tensor, RosenbrockReport]:
-    """All cells over their time `left` (N,); cells that are done leave the batch."""
+    """All cells over their remaining time `left` (N,). Finished cells leave the batch."""
     count = left.numel()
     rows = torch.arange(count, device=u.device)
     accepted, rejected = torch.zeros_like(rows), torch.zeros_like(rows)
     status = torch.full_like(rows, TOO_MANY_STEPS)
     out: list[tuple[Tensor, Tensor]] = []
-    shortest, sick = LEAST_STEP * left, torch.zeros_like(rows)
+    shortest, nonfinite = LEAST_STEP * left, torch.zeros_like(rows)
     for _ in range(max_steps):
         new, error, broken = method.step(u, rows, h)
         good = (error <= 1.0) & ~broken
@@ -293,13 +308,13 @@ def _advance(
         factor = torch.where(torch.isfinite(error), factor, 0.25)
         factor = torch.where(broken, factor.clamp(max=0.5), factor)
         h = torch.minimum(h * factor, left)
-        # no sliver of a last step
+        # no tiny last step
         h = torch.where((left - h) < 1e-10 * left, left, h)
         lost = ~good & (h < shortest)
         if bool(error.isnan().any()):
-            sick = sick + error.isnan()
-            lost |= sick > MOST_SICK
-            lost |= ~torch.isfinite(method.evaluate(u.detach(), rows)).all(0)  # no step would help
+            nonfinite = nonfinite + error.isnan()
+            lost |= nonfinite > MAX_NONFINITE_STEPS
+            lost |= ~torch.isfinite(method.evaluate(u.detach(), rows)).all(0)  # no step can help
         failed = torch.where(
             torch.isfinite(error), torch.where(broken, BELOW_ZERO, TOO_MANY_STEPS), NOT_FINITE
         )
@@ -311,7 +326,9 @@ def _advance(
             gone, stay = torch.nonzero(leave).squeeze(1), torch.nonzero(~leave).squeeze(1)
             out.append((rows.index_select(0, gone), u.index_select(1, gone)))
             rows, u = rows.index_select(0, stay), u.index_select(1, stay)
-            left, h, shortest, sick = (x.index_select(0, stay) for x in (left, h, shortest, sick))
+            left, h, shortest, nonfinite = (
+                x.index_select(0, stay) for x in (left, h, shortest, nonfinite)
+            )
         if rows.numel() == 0:
             break
     out.append((rows, u))
@@ -324,11 +341,11 @@ def _advance(
 def _merge(
     method: _Tableau, u: Tensor, new: Tensor, good: Tensor, rows: Tensor, h: Tensor
 ) -> Tensor:
-    """`new` where the step was good, else u."""
+    """`new` where the step was accepted, else u."""
     if not new.requires_grad:
         return torch.where(good, new, u)
-    # the graph must not hold a step that was not taken: where that is not finite, a zero gradient
-    # comes back from it as NaN
+    # the graph must not contain rejected steps: where they are not finite, a zero gradient becomes
+    # NaN
     at = torch.nonzero(good).squeeze(1)
     if at.numel() == 0:
         return u

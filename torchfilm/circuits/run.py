@@ -204,7 +204,7 @@ def step(
     count = start.shape[0]
     steps = torch.full((count,), settings.steps, dtype=torch.int64, device=start.device)
     if settings.method == "rosenbrock":
-        end, report = rosenbrock.rosenbrock(
+        end, report = rosenbrock.rodas3(
             circuit.rates, start, dt, rtol=settings.rtol, atol=settings.atol
         )
         code, steps = report.status, report.accepted + report.rejected

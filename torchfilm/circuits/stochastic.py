@@ -1,10 +1,9 @@
-"""Reactions molecule by molecule: Gillespie's direct method, and tau-leaping with a safe step for
-every cell by itself.
+"""Stochastic reactions: Gillespie's direct method, and tau-leaping with a safe step for each cell.
 
-Tau-leaping after Cao, Gillespie and Petzold, J. Chem. Phys. 124, 044109 (2006): a step that changes
-no propensity by more than about ε of it; reactions that are few events from using up what they
-consume are critical, and fire at most once a step; where steps would hold few events, the exact
-method is used. Cells that have reached the end leave the batch.
+Tau-leaping follows Cao, Gillespie and Petzold, J. Chem. Phys. 124, 044109 (2006). A step changes no
+propensity by more than about ε of it. A reaction that could use up a reactant within few events is
+critical, and fires at most once per step. Where steps would have few events, the direct method is
+used. Cells that have reached the end leave the batch.
 """
 
 from __future__ import annotations
@@ -17,7 +16,8 @@ from torch import Tensor
 
 from torchfilm.circuits.draws import Draw, poisson
 
-# events per hour (M, R) of the cells `rows` (M,) with molecule numbers counts (M, S)
+# propensities(counts, rows): events per hour (M, R) of the cells `rows` (M,) with molecule numbers
+# counts (M, S)
 Propensities = Callable[[Tensor, Tensor], Tensor]
 
 DONE, TOO_MANY_EVENTS, BAD_PROPENSITY = 0, 1, 2
@@ -26,14 +26,17 @@ STATUS = {
     TOO_MANY_EVENTS: "too many events",
     BAD_PROPENSITY: "a propensity is negative or not a finite number",
 }
-FEW_EVENTS = 10.0  # a leap that would hold fewer is not worth it
-MOST_HALVINGS = 60
+FEW_EVENTS = 10.0  # a leap with fewer events costs more than single events
+MAX_LEAP_HALVINGS = 60
 
 
 @dataclass(frozen=True)
 class StochasticReport:
-    """For each cell, (N,) int64: `steps` (leaps and single events), `status`, one of STATUS, and
-    the `reaction` that went wrong, −1 for none."""
+    """What the method did for each cell; every field is (N,) int64.
+
+    steps: leaps and single events. status: one of STATUS. reaction: the index of the reaction that
+    failed, −1 for none.
+    """
 
     steps: Tensor
     status: Tensor
@@ -52,18 +55,18 @@ def tau_leap(
     orders: Tensor | None = None,
     max_steps: int = 100_000,
 ) -> tuple[Tensor, StochasticReport]:
-    """Molecule numbers (N, S) after dt hours by tau-leaping, single events where leaps do not pay.
+    """Molecule numbers (N, S) after dt hours by tau-leaping, or single events if they cost less.
 
-    What limits a reaction must be a species that it takes: a gene that goes on from "off" is two
-    species, on and off, or a leap could turn it on twice.
+    A reaction must be limited by a species that it consumes. So a gene that switches from "off" to
+    "on" is two species, on and off; otherwise a leap could switch it on twice.
 
-    stoichiometry (R, S): molecules gained by each event. draw: see `draws.keyed_draws`. epsilon:
-    relative change of a propensity that a leap may bring. critical: a reaction that could fire
-    fewer times than this fires alone. orders (S,): highest order in which a propensity depends on
-    each species, 0 for none; default 2. Numbers stay whole (a remainder given in stays) and never
-    negative. Not differentiable; raises nothing.
+    stoichiometry: (R, S), molecules gained by each event. draw: see `draws.keyed_draws`. epsilon:
+    the relative change of a propensity that a leap may cause. critical: a reaction that could fire
+    fewer times than this fires alone. orders: (S,), the highest order in which a propensity depends
+    on each species, 0 for none; default 2. Numbers stay integer (a fractional part in the input
+    stays) and never negative. Not differentiable. Raises nothing; failures are in the report.
     """
-    run = _TauLeap(propensities, stoichiometry, draw, counts)
+    run = _Simulator(propensities, stoichiometry, draw, counts)
     leap = _Leap(run, epsilon, critical, orders)
     return run.advance(counts, dt, leap.step, max_steps)
 
@@ -77,14 +80,19 @@ def direct(
     *,
     max_steps: int = 1_000_000,
 ) -> tuple[Tensor, StochasticReport]:
-    """Molecule numbers (N, S) after dt hours, event by event: exact, all cells side by side.
-    Arguments as in `tau_leap`."""
-    run = _TauLeap(propensities, stoichiometry, draw, counts)
+    """Molecule numbers (N, S) after dt hours, event by event: exact, for all cells in parallel.
+
+    The arguments are those of `tau_leap`.
+    """
+    run = _Simulator(propensities, stoichiometry, draw, counts)
     return run.advance(counts, dt, run.single, max_steps)
 
 
 def _total(parts: Tensor) -> Tensor:
-    """Sum over the first axis in its order, (R, M) -> (M,), so that bits do not depend on M."""
+    """Sum over the first axis in its order, (R, M) -> (M,).
+
+    The fixed order makes the bits independent of M.
+    """
     out = parts[0].clone()
     for k in range(1, parts.shape[0]):
         out += parts[k]
@@ -92,21 +100,25 @@ def _total(parts: Tensor) -> Tensor:
 
 
 def _choose(parts: Tensor, u: Tensor) -> Tensor:
-    """Which of R, in proportion to parts (R, M) ≥ 0: (M,) int64; one with parts = 0 is never chosen
-    where another is not."""
+    """The index of one of R, chosen in proportion to parts (R, M) ≥ 0: (M,) int64.
+
+    A part of 0 is never chosen unless all are 0.
+    """
     bounds = parts.clone()
     for k in range(1, parts.shape[0]):
         bounds[k] += bounds[k - 1]
     aim = (u * bounds[-1]).unsqueeze(0)
     chosen = (bounds <= aim).sum(0)
-    # u < 1, but u times the sum may round up to it: then the last that can fire
+    # u < 1, but u times the sum may round up to it: then the last with a part above 0 is taken
     last = parts.shape[0] - 1 - (parts > 0).flip(0).to(torch.uint8).argmax(0)
     return torch.minimum(chosen, last)
 
 
-class _TauLeap:
-    """What both methods share. Within, arrays are float64 with cells last: counts (S, M),
-    propensities (R, M)."""
+class _Simulator:
+    """The parts that both methods share.
+
+    Its arrays are float64 with cells last: counts (S, M), propensities (R, M).
+    """
 
     def __init__(
         self, propensities: Propensities, stoichiometry: Tensor, draw: Draw, counts: Tensor
@@ -117,8 +129,10 @@ class _TauLeap:
         self.takers = torch.nonzero((self.taken > 0).any(1)).squeeze(1).tolist()
 
     def rates(self, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Propensities (R, M), 0 where an event would take more than there is, and for each cell
-        the first that is not allowed or −1."""
+        """Propensities (R, M), 0 where an event needs more molecules than there are.
+
+        Also the first invalid propensity of each cell, or −1.
+        """
         a = self.propensities(x.to(self.dtype).t(), rows).t().to(torch.float64).contiguous()
         good = (a >= 0) & (a < torch.inf)
         bad = torch.where(good.all(0), -1, good.to(torch.uint8).argmin(0))
@@ -142,10 +156,12 @@ class _TauLeap:
     def single(
         self, x: Tensor, a: Tensor, left: Tensor, rows: Tensor, event: int
     ) -> tuple[Tensor, Tensor]:
-        """One event, or the end if it would come after it: molecule numbers, and the time that
-        passed."""
+        """One event, or the end if the event would come after it.
+
+        Returns molecule numbers and the time that passed.
+        """
         u = self.draw(rows, event, "single", 2)
-        wait = -torch.log(u[0]) / _total(a)  # infinite where nothing can happen
+        wait = -torch.log(u[0]) / _total(a)  # infinite where no reaction can fire
         happens = wait < left
         return torch.where(happens, self.after_one(x, _choose(a, u[1])), x), torch.where(
             happens, wait, left
@@ -155,8 +171,10 @@ class _TauLeap:
     def advance(
         self, counts: Tensor, dt: float, step: Callable[..., tuple[Tensor, Tensor]], most: int
     ) -> tuple[Tensor, StochasticReport]:
-        """All cells to the end, each at its own pace: `step` gives a cell's numbers and how much
-        time passed."""
+        """All cells to the end, each with its own steps.
+
+        step: returns a cell's molecule numbers and the time that passed. most: the limit on steps.
+        """
         cells = counts.shape[0]
         rows = torch.arange(cells, device=counts.device)
         steps, status, wrong = (
@@ -200,14 +218,16 @@ class _TauLeap:
 class _Leap:
     """The leaps of `tau_leap`."""
 
-    def __init__(self, run: _TauLeap, epsilon: float, critical: int, orders: Tensor | None):
+    def __init__(self, run: _Simulator, epsilon: float, critical: int, orders: Tensor | None):
         self.run, self.epsilon, self.critical = run, epsilon, critical
         order = torch.full_like(run.gain[0], 2.0) if orders is None else orders.to(run.gain)
         self.read, self.order = (order > 0).unsqueeze(1), order.clamp(min=1.0).unsqueeze(1)
 
     def rare(self, x: Tensor, a: Tensor) -> Tensor:
-        """(R, M): reactions that can happen, and fewer than `critical` times before something that
-        they take is used up."""
+        """The critical reactions, (R, M).
+
+        They can fire, but fewer than `critical` times before a reactant is used up.
+        """
         out = torch.zeros_like(a, dtype=torch.bool)
         whole = x.floor()
         for j in self.run.takers:
@@ -216,15 +236,17 @@ class _Leap:
         return out & (a > 0)
 
     def longest(self, x: Tensor, a: Tensor) -> Tensor:
-        """(M,): the time in which no propensity is expected to change by more than ε of it, for the
-        propensities a (R, M) of what may leap."""
+        """The time in which no propensity is expected to change by more than ε of it, (M,).
+
+        a: (R, M), the propensities of the reactions that may leap.
+        """
         mean, spread = torch.zeros_like(x), torch.zeros_like(x)
         for j in range(a.shape[0]):
             gain = self.run.gain[j].unsqueeze(1)
             mean = torch.addcmul(mean, gain, a[j].unsqueeze(0))
             spread = torch.addcmul(spread, gain * gain, a[j].unsqueeze(0))
-        # g of the paper is the order, and more where few molecules of one kind meet one another: 2
-        # + 1/(x − 1) for a pair
+        # the paper's g is the order, plus a term where few molecules of one kind react with each
+        # other: 2 + 1/(x − 1) for a pair
         steep = self.order + torch.where(
             self.order > 1, (self.order - 1) / (x - 1).clamp(min=1.0), 0.0
         )
@@ -235,12 +257,12 @@ class _Leap:
     def step(
         self, x: Tensor, a: Tensor, left: Tensor, rows: Tensor, event: int
     ) -> tuple[Tensor, Tensor]:
-        """One leap, or one event: molecule numbers, and the time that passed."""
+        """One leap or one event; returns molecule numbers and the time that passed."""
         rare = self.rare(x, a)
-        often, seldom = torch.where(rare, 0.0, a), torch.where(rare, a, 0.0)
-        longest = self.longest(x, often)
-        all_in_all = _total(a)
-        leaps = torch.minimum(longest, left) * all_in_all >= FEW_EVENTS
+        frequent, critical = torch.where(rare, 0.0, a), torch.where(rare, a, 0.0)
+        longest = self.longest(x, frequent)
+        total = _total(a)
+        leaps = torch.minimum(longest, left) * total >= FEW_EVENTS
         after, passed = x, left
         if not bool(leaps.all()):
             after, passed = self.run.single(x, a, left, rows, event)
@@ -250,8 +272,8 @@ class _Leap:
         pick = lambda v: v.index_select(-1, at)
         jumped, took = self.leap(
             pick(x),
-            pick(often),
-            pick(seldom),
+            pick(frequent),
+            pick(critical),
             pick(longest),
             pick(left),
             rows.index_select(0, at),
@@ -262,29 +284,31 @@ class _Leap:
     def leap(
         self,
         x: Tensor,
-        often: Tensor,
-        seldom: Tensor,
+        frequent: Tensor,
+        critical: Tensor,
         longest: Tensor,
         left: Tensor,
         rows: Tensor,
         event: int,
     ) -> tuple[Tensor, Tensor]:
-        """Poisson numbers of what is frequent, and at most one event of what is rare; half as far
-        again where that would leave less than nothing."""
-        size = often.shape[0]
+        """Poisson numbers of the frequent reactions, and at most one event of the critical ones.
+
+        The leap is halved where molecule numbers would become negative.
+        """
+        size = frequent.shape[0]
         u = self.run.draw(rows, event, "rare", 2)
-        until_rare = -torch.log(u[0]) / _total(seldom)
-        which = _choose(seldom, u[1])
+        until_rare = -torch.log(u[0]) / _total(critical)
+        which = _choose(critical, u[1])
         after, took = x, left
         open_ = torch.arange(rows.numel(), device=rows.device)
-        for trial in range(MOST_HALVINGS):
+        for trial in range(MAX_LEAP_HALVINGS):
             pick = lambda v: v.index_select(-1, open_)  # noqa: B023
             far = torch.minimum(pick(longest), pick(left)) * 0.5**trial
             wait = pick(until_rare)
             fires = wait < far
             time = torch.minimum(far, wait)
             uniform = self.run.draw(rows.index_select(0, open_), event, f"leap {trial}", size)
-            ahead = self.run.fire(pick(x), poisson(pick(often) * time, uniform))
+            ahead = self.run.fire(pick(x), poisson(pick(frequent) * time, uniform))
             ahead = torch.where(fires, self.run.after_one(ahead, pick(which)), ahead)
             good = (ahead >= 0).all(0)
             done = torch.nonzero(good).squeeze(1)
@@ -294,5 +318,5 @@ class _Leap:
             open_ = open_.index_select(0, torch.nonzero(~good).squeeze(1))
             if open_.numel() == 0:
                 break
-        # not seen to happen: after 60 halvings hardly an event is left to come
+        # never observed: after 60 halvings almost no event remains
         return after, took.index_fill(0, open_, 0.0)

@@ -17,7 +17,7 @@ from torchfilm.circuits import run
 from torchfilm.circuits.columns import Lazy
 from torchfilm.circuits.draws import keyed_draws
 from torchfilm.circuits.names import unknown
-from torchfilm.circuits.network import network
+from torchfilm.circuits.network import build_network
 from torchfilm.effect import Binding, BoundEffect, number_range
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.state import CELL, OUTSIDE, State
@@ -110,7 +110,9 @@ class BoundCircuit(BoundEffect):
         circuit, signals = self.effect, tuple(state.signals)
         names = tuple(circuit.variables)
         self.networks = {
-            k: network(part, names, signals) for k, part in self.rates.items() if not callable(part)
+            k: build_network(part, names, signals)
+            for k, part in self.rates.items()
+            if not callable(part)
         }
         named = [n for made in self.networks.values() for n in made.parameters]
         for name in named:

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import BEFORE_CELLS, GRID_COVERAGE, Binding, BoundEffect
+from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.signals.layout import Layout
-from torchfilm.signals.operator import operator
 from torchfilm.signals.space import MOST_VOXELS
 from torchfilm.signals.transport import Stepper, choose, prepare
 from torchfilm.state import GRID, OUTSIDE, Field, State
@@ -185,7 +185,7 @@ class Transport:
             if callable(getattr(signal, x))
             else own(getattr(signal, x))
         )
-        made = operator(
+        made = build_operator(
             batch.shape,
             layout.grid.spacing,
             diffusion=own(signal.diffusion),

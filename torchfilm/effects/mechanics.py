@@ -24,8 +24,9 @@ from torchfilm.physics.contact_step import (
     contact_step,
 )
 from torchfilm.physics.initial_overlaps import check_apart
-from torchfilm.physics.solve import CONVERGED, NOT_FINITE, STATUS, TOO_FAST
-from torchfilm.physics.walls import Surface, Wall
+from torchfilm.physics.problem import CONVERGED, NOT_FINITE, STATUS, TOO_FAST
+from torchfilm.physics.surfaces import Surface
+from torchfilm.physics.walls import Wall
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.rosenbrock import rosenbrock
+from torchfilm.circuits.rosenbrock import rodas3
 from torchfilm.effect import NUTRITION, Binding, BoundEffect, Effect
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.state import OUTSIDE, Field, State
@@ -112,7 +112,7 @@ class Monod(Effect):
             eating = rate * (start / y + x[:, 1]) * x[:, 0] / (k + x[:, 0])
             return torch.stack([-eating / pool, eating], 1)
 
-        end, report = rosenbrock(rates, torch.stack([there, torch.zeros_like(there)], 1), dt)
+        end, report = rodas3(rates, torch.stack([there, torch.zeros_like(there)], 1), dt)
         eaten = end[:, 1]
         to_reservoir, inside = None, eaten
         if in_reservoir is not None:  # a reservoir stays as it is

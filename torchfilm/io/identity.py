@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 
 from torchfilm.model import Model
-from torchfilm.physics.walls import as_data
+from torchfilm.physics.surfaces import as_data
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools.checks import InputError

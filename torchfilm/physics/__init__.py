@@ -1,1 +1,1 @@
-"""Kernels: tensors in and out, never a State."""
+"""Kernels of contact mechanics: tensors in and out, never a State."""

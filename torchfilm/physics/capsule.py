@@ -1,5 +1,4 @@
-"""The capsule: a cylinder of centreline length l with hemispherical caps of radius r. Lengths in
-µm."""
+"""The capsule: a cylinder of length l with hemispherical caps of radius r; lengths in µm."""
 
 from __future__ import annotations
 
@@ -27,11 +26,12 @@ def area(length: Tensor, radius: Tensor) -> Tensor:
 def drag(
     length: Tensor, radius: Tensor, viscosity: Tensor | float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Overdamped drag of one cell: translation μL, rotation across the axis μL³/12, rotation about
-    it μLr²/2.
+    """Overdamped drag of one cell, in translation and in rotation across and about its axis.
 
-    The slender rod has no resistance about its own axis; the last term, of a rod of finite radius,
-    makes the tensor positive definite. Each (N,), in units of μ times µm, µm³ and µm³.
+    They are μL, μL³/12 and μLr²/2.
+
+    The slender rod has no resistance about its own axis. The last term is that of a rod of finite
+    radius; it makes the tensor positive definite. Each (N,), in units of μ times µm, µm³ and µm³.
     """
     whole = total_length(length, radius)
     along = viscosity * whole
@@ -39,11 +39,11 @@ def drag(
 
 
 def rotate(axis: Tensor, turn: Tensor) -> Tensor:
-    """Turn unit axes by a rotation vector, exactly: axis (N, d), turn (N, 3) or, in 2-D, (N, 1) rad
-    -> (N, d), unit.
+    """Rotate unit axes (N, d) exactly by a rotation vector, rad: (N, 3), or (N, 1) in 2-D.
 
-    sin θ/θ and (1 − cos θ)/θ² are summed as series in θ² (good to 1e-16 for θ ≤ 1): no singular
-    gradient at zero, and no library sine whose last bit may depend on where an element stands.
+    Returns unit axes, (N, d). sin θ/θ and (1 − cos θ)/θ² are summed as series in θ², accurate to
+    1e-16 for θ ≤ 1. The series have no singular gradient at zero, and they avoid a library sine,
+    whose last bit may depend on an element's place in the tensor.
     """
     t2 = (turn * turn).sum(1, keepdim=True)
     sinc = 1 - t2 / 6 * (

@@ -5,7 +5,7 @@ what is still too deep.
 |---------------------------------------|------------------------------------------------|
 | growth, then displacement (eq. 1–4)   | `contact_step`: one sub-step of all cells      |
 | contacts and their Jacobian           | `find_contacts`, `assemble`                    |
-| (JᵀD²J + αM) x = JᵀD² g               | `torchfilm.physics.solve.solve`                |
+| (JᵀD²J + αM) x = JᵀD² g               | `torchfilm.physics.solve_contacts`             |
 | Δc, Δθ, Δl carried out                | `move_cells`                                   |
 
 All functions take tensors and return tensors; nothing here knows of a state.
@@ -30,8 +30,10 @@ from torchfilm.physics.contacts import (
 )
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.neighbours import Neighbourhood
-from torchfilm.physics.solve import NOT_FINITE, ContactProblem, SolveReport, solve
-from torchfilm.physics.walls import Surface, WallContacts, find_wall_contacts, share_to_walls
+from torchfilm.physics.problem import NOT_FINITE, ContactProblem, SolveReport
+from torchfilm.physics.solve import solve_contacts
+from torchfilm.physics.surfaces import Surface
+from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts, share_to_walls
 from torchfilm.tools.ragged import Groups
 
 # No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing.
@@ -390,9 +392,9 @@ def solve_among(
     are."""
     tolerance, most = _tolerance(cells), cells.settings.max_iterations
     if bool(moving.all()):
-        return solve(problem, start, tolerance, most)
+        return solve_contacts(problem, start, tolerance, most)
     some = None if start is None else start[moving]
-    move, report = solve(problem.among(moving), some, tolerance, most)
+    move, report = solve_contacts(problem.among(moving), some, tolerance, most)
     which = torch.nonzero(moving).squeeze(1)
     return torch.zeros_like(problem.scale).index_copy(0, which, move), report
 

@@ -1,7 +1,7 @@
-"""Narrow phase: where two capsules touch, and how the gap there changes with each cell's seven (or
-four) degrees of freedom.
+"""Narrow phase: where two capsules touch, and how the gap changes with each degree of freedom.
 
-Everything is component first: a vector over P pairs is (d, P).
+A cell has seven degrees of freedom, or four in 2-D. Tensors are component first: a vector over P
+pairs is (d, P).
 """
 
 from __future__ import annotations
@@ -17,15 +17,18 @@ from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_s
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see
 # `contact_points`).
 LINE_CONTACT_SINE = 0.4
-# How near two surfaces are, in radii, that a pass which moves cells again keeps as far apart as
+# Distance of two surfaces, in radii, within which a later pass keeps them at least as far apart as
 # they are (see `contacts_of`).
 NEAR = 0.1
 
 
 @dataclass(frozen=True)
 class Capsules:
-    """Capsules, component first: centre (d, N) µm, axis (d, N) unit, half (N,) half centreline µm,
-    radius (N,) µm."""
+    """Capsules, component first.
+
+    centre: (d, N) µm. axis: (d, N) unit. half: (N,) half the centreline length, µm. radius: (N,)
+    µm.
+    """
 
     centre: Tensor
     axis: Tensor
@@ -33,6 +36,7 @@ class Capsules:
     radius: Tensor
 
     def take(self, index: Tensor) -> Capsules:
+        """The capsules at `index`."""
         return Capsules(
             self.centre.index_select(1, index),
             self.axis.index_select(1, index),
@@ -43,11 +47,11 @@ class Capsules:
 
 @dataclass(frozen=True)
 class Contacts:
-    """Rows of the contact problem, K pairs' rows; first and second cell (K,), gap (K,) µm, weight
-    D² (K,).
+    """K rows of the contact problem, each of a pair of cells.
 
-    `row_first`, `row_second`: (K, 4) in 2-D [n, q×n, ∂] and (K, 7) in 3-D: the gap after moves x is
-    gap − row_first·x_first − row_second·x_second. `normal` (d, K) from first to second.
+    first, second: (K,) the cells. gap: (K,) µm. weight: D², (K,). `row_first`, `row_second`: (K, 4)
+    in 2-D [n, q×n, ∂] and (K, 7) in 3-D. The gap after moves x is gap − row_first·x_first −
+    row_second·x_second. `normal`: (d, K) from first to second.
     """
 
     first: Tensor
@@ -62,9 +66,9 @@ class Contacts:
 def closest_points(a: Capsules, b: Capsules) -> tuple[Tensor, Tensor]:
     """Arc lengths (s, t), each (P,) µm from its centre, of the closest points of two centrelines.
 
-    The least of five candidates: each of the four ends against the other segment, and the common
-    perpendicular of the two lines. The last one alone loses all accuracy as the lines become
-    parallel; the least of the five never does.
+    The result is the nearest of five candidates: each of the four ends against the other segment,
+    and the common perpendicular of the two lines. The common perpendicular alone loses all accuracy
+    as the lines become parallel; the nearest of the five never does.
     """
     between = b.centre - a.centre
     cosine = dot(a.axis, b.axis)
@@ -95,37 +99,43 @@ def closest_points(a: Capsules, b: Capsules) -> tuple[Tensor, Tensor]:
 
 
 def _clamp(x: Tensor, half: Tensor) -> Tensor:
+    """x, limited to −half … half."""
     return torch.minimum(torch.maximum(x, -half), half)
 
 
 def _distance2(between: Tensor, axis_a: Tensor, axis_b: Tensor, s: Tensor, t: Tensor) -> Tensor:
+    """Squared distance of the points s and t of two centrelines."""
     d = between + t * axis_b - s * axis_a
     return dot(d, d)
 
 
 def contact_points(a: Capsules, b: Capsules) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """One or two touching points of each pair: ((2, P) s, (2, P) t, (2, P) end of a, (2, P) end of
-    b, (P,) is a line).
+    """One or two contact points of each pair.
 
-    Two capsules side by side touch along a line, two at an angle at a point. Between the two the
-    ends of the line slide towards the closest point as the sine of the angle grows to
-    `LINE_CONTACT_SINE`, and have met there when the line is given up; each carries half the weight
-    (D = 1/√2), so neither force nor torque jumps. An `end` is −1, 0 or +1, or between while it
-    slides: how much of ½ l the point moves with when the cell grows.
+    Returns s (2, P), t (2, P), end of a (2, P), end of b (2, P), and whether the contact is a line
+    (P,).
+
+    Two parallel capsules touch along a line, two at an angle touch at a point. In between, the ends
+    of the line slide towards the closest point as the sine of the angle grows to
+    `LINE_CONTACT_SINE`, where they meet and the line ends. Each end of the line carries half the
+    weight (D = 1/√2), so neither force nor torque jumps. An `end` is −1, 0 or +1, or in between
+    while it slides: the part of ½ l with which the point moves when the cell grows.
     """
     return _line_points(a, b, *closest_points(a, b))
 
 
 def _slide(turn: Tensor) -> Tensor:
-    """How far the ends of a line of contact are from having met, by the cross product of the axes
-    alone, (P,): 1 where parallel, 0 or less where there is no line."""
+    """How far the ends of a line of contact are from meeting, (P,), from the axes' cross product.
+
+    1 for parallel axes; 0 or less where there is no line.
+    """
     return 1.0 - dot(turn, turn) / LINE_CONTACT_SINE**2
 
 
 def _line_points(
     a: Capsules, b: Capsules, s0: Tensor, t0: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """What `contact_points` gives, from the closest points (s0, t0)."""
+    """The result of `contact_points`, from the closest points (s0, t0)."""
     turn = cross(a.axis, b.axis)
     slide = _slide(turn)
     # the common part of the two segments, measured along the mean axis so that neither cell is
@@ -138,11 +148,11 @@ def _line_points(
     low = torch.maximum(-a.half * project, offset - b.half * project)
     high = torch.minimum(a.half * project, offset + b.half * project)
     line = (slide > 0) & (high > low)
-    # a line shorter than the cells are thick counts as less of one, so that it ends as smoothly as
-    # it turns away
+    # a line shorter than the cells' thickness counts as less of a line, so that it vanishes
+    # smoothly as cells slide apart, as it does when they turn
     share = ((high - low) / (0.5 * (a.radius + b.radius))).clamp(max=1.0)
-    # nor do two that cross, so that the line's ends lie on opposite sides: all of it is near the
-    # crossing
+    # so does the line of two centrelines that cross, whose ends lie on opposite sides: the contact
+    # is near the crossing
     swing = 0.5 * (high - low) * safe_sqrt(dot(turn, turn))
     crossed = swing > 1e-6 * a.radius
     apart = safe_sqrt(_distance2(b.centre - a.centre, a.axis, b.axis, s0, t0))
@@ -151,16 +161,16 @@ def _line_points(
     )
     slide = torch.where(line, slide * slide * share, 0.0)
     cosine, between = dot(a.axis, b.axis), b.centre - a.centre
-    end_a0 = _leaving(s0, cosine * t0 + dot(between, a.axis), a, slide)
-    end_b0 = _leaving(t0, cosine * s0 - dot(between, b.axis), b, slide)
+    end_a0 = _end_while_sliding(s0, cosine * t0 + dot(between, a.axis), a, slide)
+    end_b0 = _end_while_sliding(t0, cosine * s0 - dot(between, b.axis), b, slide)
     s_all, t_all, end_a, end_b = [], [], [], []
     for at, side in ((low, -1.0), (high, 1.0)):
         s1 = _clamp(at / project, a.half)
         t1 = _clamp(sign * (at - offset) / project, b.half)
         s_all.append(s0 + slide * (s1 - s0))
         t_all.append(t0 + slide * (t1 - t0))
-        # the line ends where the first of the two cells does; the farther the other goes on, the
-        # less does its end matter
+        # the line ends where the first of the two cells ends; the further the other cell continues,
+        # the less its own end matters
         beyond = (
             side * (at - a.half * project * side),
             side * (at - offset - b.half * project * side),
@@ -171,10 +181,13 @@ def _line_points(
     return torch.stack(s_all), torch.stack(t_all), torch.stack(end_a), torch.stack(end_b), line
 
 
-def _leaving(s: Tensor, free: Tensor, cell: Capsules, slide: Tensor) -> Tensor:
-    """`_end` of a closest point s that would be at `free` on a line without ends. Where a line's
-    point has slid away from it, the normal there is not across the cell as the end is left: then
-    the less of an end, the less is missing to `free`."""
+def _end_while_sliding(s: Tensor, free: Tensor, cell: Capsules, slide: Tensor) -> Tensor:
+    """`_end` of a closest point s, for contacts that may be lines.
+
+    free: where the point would be on a line without ends. Where the point of a line has slid away
+    from the closest point, the normal there is not perpendicular to the cell when the point leaves
+    the end. So the value of the end falls to 0 with the distance of the end from `free`.
+    """
     missing = (free.abs() - cell.half) / (slide * cell.radius + 1e-9)
     return torch.where(
         slide > 0, torch.sign(free) * missing.clamp(min=0.0, max=1.0), _end(s, cell.half)
@@ -182,16 +195,20 @@ def _leaving(s: Tensor, free: Tensor, cell: Capsules, slide: Tensor) -> Tensor:
 
 
 def _end(s: Tensor, half: Tensor) -> Tensor:
-    """Which end of the centreline a point is: +1, −1, or 0 for neither (or for a sphere, whose ends
-    are one)."""
+    """The end of the centreline at which a point is: +1, −1, or 0 for neither.
+
+    For a sphere the two ends coincide, and the result is 0.
+    """
     slack = 1e-6 * half + 1e-9
     return (s >= half - slack).to(s.dtype) - (s <= slack - half).to(s.dtype)
 
 
 @dataclass(frozen=True)
 class CandidateContacts:
-    """K pairs of cells that overlap at their closest points, or are near there: first and second
-    cell (K,), their bodies a and b, the points s and t of `closest_points`."""
+    """K pairs of cells that overlap at their closest points, or are near there.
+
+    first, second: (K,) the cells. a, b: their capsules. s, t: (K,) the points of `closest_points`.
+    """
 
     first: Tensor
     second: Tensor
@@ -202,22 +219,22 @@ class CandidateContacts:
 
     @staticmethod
     def among(
-        bodies: Capsules, first: Tensor, second: Tensor, near: bool = False
+        capsules: Capsules, first: Tensor, second: Tensor, include_near: bool = False
     ) -> CandidateContacts:
-        """Those of the pairs (P,), (P,); near: with those that come within NEAR."""
-        a, b = bodies.take(first), bodies.take(second)
+        """The given pairs, each (P,), that overlap; with include_near also those within NEAR."""
+        a, b = capsules.take(first), capsules.take(second)
         found = CandidateContacts(first, second, a, b, *closest_points(a, b))
         with torch.no_grad():
-            # no point of a line is nearer than the closest one, but for rounding, of which this is
-            # many times more
+            # no point of a line is nearer than the closest one, except for rounding; this margin is
+            # many times larger
             keep = torch.nonzero(
-                found.gap < max(1e-3, 0.5 * NEAR * near) * (a.radius + b.radius)
+                found.gap < max(1e-3, 0.5 * NEAR * include_near) * (a.radius + b.radius)
             ).squeeze(1)
         return found.take(keep)
 
     @property
     def gap(self) -> Tensor:
-        """(K,) µm, at the closest points."""
+        """The gap at the closest points, (K,) µm."""
         return _gap(self.a, self.b, self.s, self.t)
 
     def take(self, index: Tensor) -> CandidateContacts:
@@ -233,21 +250,27 @@ class CandidateContacts:
         )
 
 
-def contacts_of(pairs: CandidateContacts, push: bool = False, near: bool = False) -> Contacts:
-    """All rows of pairs that overlap (gap < 0), and of a line of contact that overlaps at one end
-    what keeps the other from swinging in: a row of gap 0, whose weight falls from that of the line
-    to nothing as its end parts as far as the first overlaps. Without it a cell that is squeezed
-    between two rocks from step to step, and they close in on it.
+def contacts_of(
+    pairs: CandidateContacts, unilateral: bool = False, include_near: bool = False
+) -> Contacts:
+    """The rows of all pairs that overlap (gap < 0).
 
-    push: for a solve in which contacts only push, which sees by itself what it would push into
-    what: with the gaps as they are, both ends of a line if one of them overlaps. near: for a pass
-    that moves cells again, rows of what is within NEAR too, of gap 0 unless `push`, whose weight
-    falls to nothing on the way there. Half of what a pass has parted is a hair apart: the next one,
-    blind to it, pushed it together again, deeper with every pass where contacts are hard, until a
-    full channel was a heap.
+    A line of contact that overlaps at one end only gets a row at the other end too, with gap 0.
+    This row keeps that end from swinging in. Its weight falls from that of the line to 0, where the
+    other end is as far apart as the first end overlaps. Without it a cell that is squeezed between
+    two others rocks from step to step, and they close in on it.
+
+    unilateral: for a solve with unilateral contacts, which finds by itself which rows act. Gaps are
+    returned as they are, and a line has both ends if one of them overlaps.
+
+    include_near: for a later pass, which moves cells again. It adds rows for pairs within NEAR,
+    with gap 0 unless `unilateral`, and weight that falls to 0 at that distance. Half of the pairs
+    that a pass separates are slightly apart afterwards. A next pass without these rows pushed them
+    together again, deeper with every pass where contacts are hard, until a full channel became a
+    heap.
     """
     first, second, a, b, s, t = pairs.first, pairs.second, pairs.a, pairs.b, pairs.s, pairs.t
-    # only the nearly parallel may have a line; all others touch at the closest point
+    # only nearly parallel pairs may have a line; all others touch at the closest point
     flat = torch.nonzero(_slide(cross(a.axis, b.axis)).detach() > 0).squeeze(1)
     flat_a, flat_b = a.take(flat), b.take(flat)
     *of_lines, line = _line_points(flat_a, flat_b, s.index_select(0, flat), t.index_select(0, flat))
@@ -256,28 +279,20 @@ def contacts_of(pairs: CandidateContacts, push: bool = False, near: bool = False
         for x, ends in zip((s, t, _end(s, a.half), _end(t, b.half)), of_lines, strict=True)
     ]
     ends = [_gap(flat_a, flat_b, of_lines[0][k], of_lines[1][k]) for k in (0, 1)]
-    point, margin = _gap(a, b, points[0], points[1]), 0.5 * NEAR * near * (a.radius + b.radius)
-    # cull again without a gradient: a first row for every pair, a second one where there is a line
+    point, margin = (
+        _gap(a, b, points[0], points[1]),
+        0.5 * NEAR * include_near * (a.radius + b.radius),
+    )
+    # select again without a gradient: a first row for every pair, a second one where there is a
+    # line
     with torch.no_grad():
         deep0, deep1 = point < margin, line & (ends[1] < margin.index_select(0, flat))
-        either = line & (deep0.index_select(0, flat) | deep1) & (push | (ends[0] + ends[1] < 0))
+        either = (
+            line & (deep0.index_select(0, flat) | deep1) & (unilateral | (ends[0] + ends[1] < 0))
+        )
         deep0[flat] |= either
         keep0, keep1 = torch.nonzero(deep0).squeeze(1), torch.nonzero(deep1 | either).squeeze(1)
-    share = torch.full_like(ends[0], 0.5) if push else 0.5 * _held_share(*ends)
-    whole = torch.ones_like(s)
-    if near and not push:
-        whole, of_each = (
-            _near_share(point, margin),
-            [0.5 * _near_share(end, margin.index_select(0, flat)) for end in ends],
-        )
-    else:
-        of_each = [torch.where(end < 0, 0.5, 0.0) for end in ends]
-    of_ends = [
-        whole.index_copy(
-            0, flat, torch.where(line, torch.maximum(each, share), whole.index_select(0, flat))
-        )
-        for each in of_each
-    ]
+    of_ends = _end_weights(ends, line, flat, point, margin, unilateral, include_near)
     weight = torch.cat(
         [of_ends[0].index_select(0, keep0), of_ends[1].index_select(0, flat).index_select(0, keep1)]
     )
@@ -288,31 +303,67 @@ def contacts_of(pairs: CandidateContacts, push: bool = False, near: bool = False
     )
     a, b = a.take(keep), b.take(keep)
     gap, row_first, row_second, normal = _rows(a, b, s, t, end_a, end_b)
-    gap = gap if push else gap.clamp(max=0.0)
+    gap = gap if unilateral else gap.clamp(max=0.0)
     pick = lambda x: x.index_select(0, keep)
     return Contacts(pick(first), pick(second), gap, weight, row_first, row_second, normal)
 
 
-def _near_share(gap: Tensor, margin: Tensor) -> Tensor:
-    """1 for what overlaps, 0 for what is `margin` apart: the weight of a row that keeps a gap,
-    whose root falls evenly."""
+def _end_weights(
+    ends: list[Tensor],
+    line: Tensor,
+    flat: Tensor,
+    point: Tensor,
+    margin: Tensor,
+    unilateral: bool,
+    include_near: bool,
+) -> list[Tensor]:
+    """D² of the two rows that each pair may have, (K,) each.
+
+    ends: the gaps at the two ends of the lines, which are the pairs `flat` where `line` is set.
+    point: (K,) the gap of the first row. margin: (K,) see NEAR.
+    """
+    share = torch.full_like(ends[0], 0.5) if unilateral else 0.5 * _weight_of_held_end(*ends)
+    whole = torch.ones_like(point)
+    if include_near and not unilateral:
+        whole, of_each = (
+            _weight_near(point, margin),
+            [0.5 * _weight_near(end, margin.index_select(0, flat)) for end in ends],
+        )
+    else:
+        of_each = [torch.where(end < 0, 0.5, 0.0) for end in ends]
+    return [
+        whole.index_copy(
+            0, flat, torch.where(line, torch.maximum(each, share), whole.index_select(0, flat))
+        )
+        for each in of_each
+    ]
+
+
+def _weight_near(gap: Tensor, margin: Tensor) -> Tensor:
+    """The weight of a row that keeps a gap: 1 for an overlap, 0 at a distance of `margin`.
+
+    Its root falls linearly.
+    """
     return (1.0 - gap / margin).clamp(min=0.0, max=1.0).square()
 
 
-def _held_share(one: Tensor, other: Tensor) -> Tensor:
-    """Of two ends of a line with gaps of which one is negative: 1 while neither parts, 0 once one
-    parts as far as the other overlaps."""
+def _weight_of_held_end(one: Tensor, other: Tensor) -> Tensor:
+    """The weight of a line's held end, from the gaps of the two ends, of which one is negative.
+
+    1 while neither end is apart; 0 where one end is as far apart as the other overlaps.
+    """
     deepest = torch.minimum(one, other)
     return ((one + other) / torch.where(deepest < 0, deepest, -1.0)).clamp(min=0.0, max=1.0)
 
 
 def _gap(a: Capsules, b: Capsules, s: Tensor, t: Tensor) -> Tensor:
+    """The gap of each pair at the points s and t of the centrelines, (P,) µm."""
     return safe_sqrt(_distance2(b.centre - a.centre, a.axis, b.axis, s, t)) - a.radius - b.radius
 
 
-def contact_gaps(bodies: Capsules, first: Tensor, second: Tensor) -> Tensor:
+def contact_gaps(capsules: Capsules, first: Tensor, second: Tensor) -> Tensor:
     """Signed gap of each pair at its closest points, (P,) µm; negative where they overlap."""
-    a, b = bodies.take(first), bodies.take(second)
+    a, b = capsules.take(first), capsules.take(second)
     return _gap(a, b, *closest_points(a, b))
 
 
@@ -326,10 +377,10 @@ def gaps_nearby(
     colonies: int,
     within: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of one colony that may be within `within` µm, and their gaps, in float64: (first,
-    second, gap), each (P,).
+    """Pairs of one colony that may be within `within` µm, and their gaps, in float64.
 
-    position, axis (N, d); length, radius (N,); colony (N,) int64.
+    position, axis: (N, d). length, radius: (N,). colony: (N,) int64. Returns first, second and gap,
+    each (P,).
     """
     position, axis, length, radius = (
         position.double(),
@@ -338,8 +389,8 @@ def gaps_nearby(
         radius.double(),
     )
     first, second = Neighbourhood(position, axis, length, radius, colony, colonies, within).pairs()
-    bodies = Capsules(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
-    return first, second, contact_gaps(bodies, first, second)
+    capsules = Capsules(position.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
+    return first, second, contact_gaps(capsules, first, second)
 
 
 def _rows(a: Capsules, b: Capsules, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tensor):
@@ -349,11 +400,11 @@ def _rows(a: Capsules, b: Capsules, s: Tensor, t: Tensor, end_a: Tensor, end_b: 
     distance = safe_norm(between)
     touching = distance <= 1e-5 * (a.radius + b.radius)
     normal = between / torch.where(touching, 1.0, distance)
-    if bool(touching.any()):  # rare, and dear to ask of every pair
+    if bool(touching.any()):  # rare, and expensive to compute for every pair
         normal = torch.where(touching, _fallback_normal(a, b), normal)
     gap = distance - a.radius - b.radius
     along_a, along_b = dot(normal, a.axis), dot(normal, b.axis)
-    # a sphere grows from both ends at once: the one nearer the contact counts
+    # a sphere grows at both ends at once: the end nearer to the contact counts
     end_a = torch.where(a.half <= 1e-9, torch.sign(along_a), end_a)
     end_b = torch.where(b.half <= 1e-9, -torch.sign(along_b), end_b)
     row_a = torch.cat([normal, cross(lever_a, normal), (0.5 * end_a * along_a).unsqueeze(0)])
@@ -362,13 +413,15 @@ def _rows(a: Capsules, b: Capsules, s: Tensor, t: Tensor, end_a: Tensor, end_b: 
 
 
 def _fallback_normal(a: Capsules, b: Capsules) -> Tensor:
-    """A direction to part two cells whose centrelines cross: both axes' common perpendicular; any
-    perpendicular when parallel or in 2-D."""
+    """A direction that separates two cells whose centrelines cross.
+
+    It is the common perpendicular of the axes, or any perpendicular if they are parallel or in 2-D.
+    """
     way = perpendicular(a.axis)
     if a.axis.shape[0] == 3:
         common = cross(a.axis, b.axis)
         size = safe_norm(common)
         parallel = size < 1e-6
         way = torch.where(parallel, way, common / torch.where(parallel, 1.0, size))
-    # whichever of the two ways takes the centres apart
+    # the sign that moves the centres apart
     return torch.where(dot(way, b.centre - a.centre) < 0, -way, way)

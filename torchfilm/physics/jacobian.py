@@ -1,4 +1,4 @@
-"""The contact rows of a batch as one linear operator, J, never multiplied out into JᵀJ."""
+"""The contact rows of a batch as one linear operator J; JᵀJ is never formed."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from torchfilm.tools.ragged import Groups, WeightedRows, csr
 
 
 class ContactJacobian:
-    """R rows over N cells with D degrees of freedom: K rows of two cells, then W rows of a cell and
-    a wall.
+    """J: R rows over N cells with D degrees of freedom.
 
-    `first`, `second` (K,), `at_wall` (W,) int64: the cells; `row_first`, `row_second` (K, D),
-    `row_wall` (W, D): J's entries, already scaled by row weights and by drag as the solve wants
-    them.
+    The first K rows are of two cells, the last W rows are of a cell and a wall. `first`, `second`
+    (K,) and `at_wall` (W,) int64 are the cells. `row_first`, `row_second` (K, D) and `row_wall` (W,
+    D) are the entries of J, already scaled by row weights and by drag as the solve requires.
     """
 
     def __init__(
@@ -38,11 +37,14 @@ class ContactJacobian:
 
     @property
     def rows(self) -> int:
+        """R, the number of rows."""
         return self.pairs + self.walls
 
     def part(self, rows: Tensor, number: Tensor, cells: int) -> ContactJacobian:
-        """Some of the rows (M,), in their order, over `cells` cells; number: (N,) the new number of
-        each cell that they touch."""
+        """The given rows (M,), in their order, as an operator over `cells` cells.
+
+        number: (N,) the new index of each cell that these rows touch.
+        """
         pair, wall = rows[rows < self.pairs], rows[rows >= self.pairs] - self.pairs
         of_pairs = [
             x.index_select(0, pair)
@@ -60,8 +62,10 @@ class ContactJacobian:
         )
 
     def among(self, moving: Tensor) -> tuple[ContactJacobian, Tensor]:
-        """The rows of the cells that move, (N,) bool, numbered anew: to them a cell that stays is
-        like a wall. And where each row stands here, (R',)."""
+        """The rows of the moving cells, (N,) bool, with these cells renumbered.
+
+        A cell at rest acts on them like a wall. Also returns the index of each new row here, (R',).
+        """
         number = torch.cumsum(moving, 0) - 1
         one, other = moving.index_select(0, self.first), moving.index_select(0, self.second)
         both, only_one, only_other, wall = (
@@ -112,7 +116,7 @@ class ContactJacobian:
 
     @cached_property
     def _halves(self) -> tuple[WeightedRows, Tensor]:
-        """What each row does to each of its cells, cell by cell, and which row it is of."""
+        """The row entries of each cell, sorted by cell, and the row of each entry."""
         halves = WeightedRows(
             torch.cat([self.row_first, self.row_second, self.row_wall]).detach(), self.half_rows
         )
@@ -147,12 +151,15 @@ class ContactJacobian:
         return torch.stack([halves.sum(of_column) for of_column in weight], 1)
 
     def _needs_grad(self, x: Tensor) -> bool:
+        """Whether a product with x must be differentiable."""
         return torch.is_grad_enabled() and (
             x.requires_grad or self.row_first.requires_grad or self.row_wall.requires_grad
         )
 
     def _assemble(self, width: int) -> Tensor:
-        # 32-bit from the start: what is made and read here is as long as all that a product reads
+        """J as one sparse matrix."""
+        # 32-bit from the start: these indices and values are as much memory traffic as a whole
+        # product
         dof = torch.arange(width, dtype=torch.int32, device=self.first.device)
         columns = torch.empty(
             2 * self.pairs + self.walls, width, dtype=torch.int32, device=dof.device

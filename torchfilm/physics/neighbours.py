@@ -1,12 +1,14 @@
 """Broad phase: pairs of cells near enough to touch, found on the tensors' own device.
 
-Every cell has a reach: half its length plus its radius plus half the margin asked for. Cells are
-sorted into rows (of the plane) or columns of rows (of space), each row about as high as cells
-reach, and by place along the row; the partners that a cell has in one row are then one contiguous
-run, found by bisection. Cells of very different reach go into classes, each with a grid of its own,
-so that one filament among a thousand rods costs the rods nothing. There is no capacity to overflow:
-the list is as long as it must be. All sizes are taken colony by colony, so that a colony's pairs,
-and their order, do not depend on what else is in the batch.
+Every cell has a reach: half its length plus its radius plus half the given margin. Cells are sorted
+into rows (in the plane) or columns of rows (in space), and by position along the row. Each row is
+about as high as the cells' reach. The partners of a cell in one row are then one contiguous range,
+found by bisection.
+
+Cells of very different reach form classes, each with its own grid. So one filament among a thousand
+rods does not slow down the rods. There is no capacity to overflow: the list is as long as needed.
+All sizes are computed for each colony by itself, so the pairs of a colony, and their order, do not
+depend on other colonies in the batch.
 """
 
 from __future__ import annotations
@@ -20,23 +22,25 @@ from torch import Tensor
 
 from torchfilm.tools.ragged import Groups, expand_ranges, offsets
 
-# Slices of a row, to each reach of a cell: finer ones leave fewer strangers to look at, coarser
-# ones make the table of their starts shorter.
+# Slices of a row per reach of a cell. Finer slices leave fewer cells out of reach to test; coarser
+# slices make the table of their starts shorter.
 SLICES = 8
-# A table may have this many entries a cell; cells strewn more thinly are found by bisection.
+# A table may have this many entries per cell. Cells at a lower density are found by bisection.
 TABLE_SHARE = 64
-MOST_ROWS = 2**17
-# Cells whose reach is over this many times the smallest of their colony go into the next class.
+MAX_ROWS = 2**17
+# A cell whose reach exceeds this multiple of the smallest in its colony is in the next class.
 CLASS_RATIO = 4.0
 
 
 class Neighbourhood:
-    """Cells of many colonies where they stand, to be asked who is near whom as often as need be.
+    """The cells of many colonies at fixed positions, for repeated searches of near pairs.
 
-    position, axis (N, d) µm and unit; length, radius (N,) µm; colony (N,) int64. A pair (i, j), i ≠
-    j, is of one colony, and its bounding spheres and bounding boxes come within `margin` µm of each
-    other, one number or the mean of the two cells' own (N,). No pair whose surfaces are within it
-    is missing. Pairs are two (P,) int64 tensors.
+    position, axis: (N, d), µm and unit. length, radius: (N,) µm. colony: (N,) int64. margin: µm,
+    one number, or one per cell (N,), of which a pair uses the mean.
+
+    A pair (i, j), i ≠ j, is in one colony, and its bounding spheres and bounding boxes are within
+    `margin` of each other. No pair whose surfaces are within `margin` is missing. Pairs are two
+    (P,) int64 tensors.
     """
 
     @torch.no_grad()
@@ -51,9 +55,9 @@ class Neighbourhood:
         margin: float | Tensor = 0.0,
     ):
         self.place, self.reach = position.T.contiguous(), 0.5 * length + radius + 0.5 * margin
-        # a hair more, so that rounding loses no pair that touches exactly
+        # slightly larger, so that rounding loses no pair that touches exactly
         self.box = (0.5 * length * axis.abs().T + radius + 0.5 * margin) * (1 + 1e-5)
-        # of each class, with the cells of larger classes
+        # one per class, with the cells of larger classes
         self.grids: list[tuple[_CellGrid, Tensor]] = []
         if colony.numel() < 2:
             return
@@ -74,25 +78,29 @@ class Neighbourhood:
         for grid, larger in self.grids:
             found.append(grid.pairs_within(self.place, self.reach))
             if larger.numel():
-                found.append(_meeting(self.place, self.reach, *grid.pairs_with(larger)))
-        return self._near(found)
+                found.append(
+                    _keep_spheres_that_meet(self.place, self.reach, *grid.pairs_with(larger))
+                )
+        return self._keep_boxes_that_meet(found)
 
     @torch.no_grad()
     def pairs_of(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Every pair of which at least one is among `cells` (M,), once; that one stands first."""
-        asked = torch.zeros(
+        """Every pair with at least one of `cells` (M,), once; that cell is the first of the
+        pair.
+        """
+        selected = torch.zeros(
             self.reach.numel(), dtype=torch.bool, device=self.reach.device
         ).index_fill(0, cells, True)
         found = []
         for grid, _ in self.grids if cells.numel() else ():
-            i, j = _meeting(self.place, self.reach, *grid.pairs_with(cells))
-            # two that were both asked have found each other, and each has found itself
-            once = torch.nonzero((i < j) | ~asked.index_select(0, j)).squeeze(1)
+            i, j = _keep_spheres_that_meet(self.place, self.reach, *grid.pairs_with(cells))
+            # a pair of two selected cells was found twice, and each selected cell has found itself
+            once = torch.nonzero((i < j) | ~selected.index_select(0, j)).squeeze(1)
             found.append((i.index_select(0, once), j.index_select(0, once)))
-        return self._near(found)
+        return self._keep_boxes_that_meet(found)
 
-    def _near(self, found: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-        """Those of the pairs whose bounding boxes, each grown by half the margin, meet."""
+    def _keep_boxes_that_meet(self, found: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+        """The pairs whose bounding boxes meet, each box grown by half the margin."""
         none = self.reach.new_empty(0, dtype=torch.int64)
         i, j = (
             torch.cat([none, *side]) for side in (zip(*found, strict=True) if found else ((), ()))
@@ -108,32 +116,33 @@ class Neighbourhood:
 
 @dataclass(frozen=True)
 class _CellGrid:
-    """Rows of one class of cells, in units of the rows' height."""
+    """The rows of one class of cells, in units of the rows' height."""
 
-    at: Tensor  # (d, N) where each cell is: along the row, then across rows
+    at: Tensor  # (d, N) position of each cell: along the row, then across rows
     shape: Tensor  # (d, B) int64: slices along a row, then numbers of rows
     base: Tensor  # (B,) int64: first key of each colony
-    # (N,) how far a partner of each cell may be: its own reach and the greatest of the members
+    # (N,) the greatest distance of a partner: a cell's own reach plus the members' greatest reach
     window: Tensor
     colony: Tensor
     members: Tensor  # sorted by key
     keys: Tensor
-    slices: int  # to a row's height
-    table: Tensor | None = None  # how many members stand before each key
+    slices: int  # per row height
+    table: Tensor | None = None  # number of members before each key
 
     @staticmethod
     def build(
         position: Tensor, reach: Tensor, colony: Tensor, colonies: int, members: Tensor
     ) -> _CellGrid:
+        """The grid of one class, for its cells `members`."""
         greatest = Groups(colony.index_select(0, members), colonies).max(
             reach.index_select(0, members), empty=1.0
         )
-        # narrow rows leave fewer strangers to look at, but in space there are many more of them
+        # narrow rows leave fewer cells out of reach to test, but in space there are many more rows
         wide = 1 if position.shape[1] == 2 else 2
         groups = Groups(colony, colonies)
         extent = torch.stack([groups.max(x) + groups.max(-x) for x in position.unbind(1)]).amax(0)
-        # rows no lower than this: keys must fit 64 bits even for cells that are strewn over metres
-        height = torch.maximum(wide * greatest, extent / MOST_ROWS).index_select(0, colony)
+        # a lower bound on the row height: keys must fit 64 bits even for cells metres apart
+        height = torch.maximum(wide * greatest, extent / MAX_ROWS).index_select(0, colony)
         slices = wide * SLICES
         at, shape = [], []
         for k in range(position.shape[1]):
@@ -168,6 +177,7 @@ class _CellGrid:
         return replace(grid, members=members.index_select(0, order), keys=keys, table=table)
 
     def _key(self, colony: Tensor, rows: Tensor, along: Tensor) -> Tensor:
+        """The key of a slice: cells are sorted by colony, then row, then slice."""
         row = rows[-1]
         for k in range(rows.shape[0] - 1, 0, -1):
             row = row * self.shape[k].index_select(0, colony) + rows[k - 1]
@@ -175,12 +185,14 @@ class _CellGrid:
             self.base.index_select(0, colony) + row * self.shape[0].index_select(0, colony) + along
         )
 
-    def _run(self, cells: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the possible partners of each of `cells` (Q,) in the row numbered `rows` (d − 1, Q)
-        stand in the sorted list: start and count."""
+    def _range_in_row(self, cells: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """The possible partners of `cells` (Q,) in the rows with indices `rows` (d − 1, Q).
+
+        Returns the start and the length of their range in the sorted list.
+        """
         colony, at = self.colony.index_select(0, cells), self.at.index_select(1, cells)
         window = self.window.index_select(0, cells)
-        # of a row some way off only a part is within the window
+        # only a part of a distant row is within the window
         away = torch.maximum(rows - at[1:], at[1:] - rows - 1).clamp(min=0)
         left = window * window - (away * away).sum(0)
         width = left.clamp(min=0).sqrt()
@@ -188,15 +200,14 @@ class _CellGrid:
         inside = ((rows >= 0) & (rows <= last[1:])).all(0) & (left >= 0)
         low = torch.floor((at[0] - width) * self.slices).long().clamp(min=0)
         high = torch.minimum(torch.floor((at[0] + width) * self.slices).long(), last[0])
-        # a row outside has no key of its own; any that exists will do, since nothing is taken from
-        # it
+        # a row outside has no key; any existing key will do, since nothing is taken from it
         rows = torch.minimum(rows.clamp(min=0), last[1:])
-        start = self._before(self._key(colony, rows, torch.minimum(low, last[0])))
-        stop = self._before(self._key(colony, rows, high.clamp(min=0)) + 1)
+        start = self._members_before(self._key(colony, rows, torch.minimum(low, last[0])))
+        stop = self._members_before(self._key(colony, rows, high.clamp(min=0)) + 1)
         return start, torch.where(inside, (stop - start).clamp(min=0), 0)
 
-    def _before(self, key: Tensor) -> Tensor:
-        """How many members stand before each key."""
+    def _members_before(self, key: Tensor) -> Tensor:
+        """The number of members before each key."""
         return (
             torch.searchsorted(self.keys, key)
             if self.table is None
@@ -204,59 +215,68 @@ class _CellGrid:
         )
 
     def pairs_within(self, place: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """Every pair of members whose bounding spheres meet, once: in the rest of a member's own
-        row, and in the rows after it. place (d, N), reach (N,)."""
-        # asked in their own order, so that neighbours in space are neighbours in memory
+        """Every pair of members whose bounding spheres meet, once.
+
+        The search covers the rest of a member's own row and the rows after it. place: (d, N).
+        reach: (N,).
+        """
+        # in sorted order, so that neighbours in space are neighbours in memory
         members = self.members
         own = torch.floor(self.at[1:].index_select(1, members)).long()
-        # strangers are told apart row by row, from copies in the members' own order: what is read
-        # stands side by side, and fits a cache
+        # pairs out of reach are dropped row by row, from copies in sorted order: the data that is
+        # read is contiguous and fits a cache
         place, reach = place.index_select(1, members), reach.index_select(0, members)
         reaches = 2 if own.shape[0] == 1 else 1
-        most = self.shape[1:].amax(1).tolist()  # a film a row thick has no rows above or below
+        greatest = (
+            self.shape[1:].amax(1).tolist()
+        )  # a film one row thick has no rows above or below
         first, second = [], []
         for step in itertools.product(range(-reaches, reaches + 1), repeat=own.shape[0]):
             if step[::-1] < (0,) * len(step) or any(
-                abs(k) >= rows for k, rows in zip(step, most, strict=True)
+                abs(k) >= rows for k, rows in zip(step, greatest, strict=True)
             ):
                 continue
-            start, count = self._run(
+            start, count = self._range_in_row(
                 members, own + torch.tensor(step, device=own.device).unsqueeze(1)
             )
             if not any(step):
                 stop = start + count
                 start = torch.arange(1, members.numel() + 1, device=members.device)
                 count = (stop - start).clamp(min=0)
-            owner, run = _meeting(place, reach, *expand_ranges(start, count))
+            owner, run = _keep_spheres_that_meet(place, reach, *expand_ranges(start, count))
             first.append(members.index_select(0, owner))
             second.append(members.index_select(0, run))
         return torch.cat(first), torch.cat(second)
 
-    def pairs_with(self, asked: Tensor) -> tuple[Tensor, Tensor]:
-        """Every pair of one of the cells `asked` (M,), of this class or another, and a member:
-        those of this class meet themselves too."""
-        # the hair that windows have been given for rounding is no reason for another row
-        rows_each_way = torch.ceil(self.window.index_select(0, asked) * (1 - 2e-5)).long()
+    def pairs_with(self, queried: Tensor) -> tuple[Tensor, Tensor]:
+        """Every pair of one of the cells `queried` (M,), of this class or another, and a member.
+
+        A queried cell of this class also finds itself.
+        """
+        # the margin of the windows for rounding must not add another row
+        rows_each_way = torch.ceil(self.window.index_select(0, queried) * (1 - 2e-5)).long()
         found: list[Tensor] = []
-        query = torch.arange(asked.numel(), device=asked.device)
-        for own_row in torch.floor(self.at[1:].index_select(1, asked)).long():
+        query = torch.arange(queried.numel(), device=queried.device)
+        for own_row in torch.floor(self.at[1:].index_select(1, queried)).long():
             each = rows_each_way.index_select(0, query)
             owner, row = expand_ranges(own_row.index_select(0, query) - each, 2 * each + 1)
             found = [earlier.index_select(0, owner) for earlier in found] + [row]
             query = query.index_select(0, owner)
-        cells = asked.index_select(0, query)
-        start, count = self._run(cells, torch.stack(found))
+        cells = queried.index_select(0, query)
+        start, count = self._range_in_row(cells, torch.stack(found))
         owner, run = expand_ranges(start, count)
         return cells.index_select(0, owner), self.members.index_select(0, run)
 
 
-def _meeting(place: Tensor, reach: Tensor, i: Tensor, j: Tensor) -> tuple[Tensor, Tensor]:
-    """Those of the pairs (i, j) whose bounding spheres meet. place (d, N), reach (N,)."""
+def _keep_spheres_that_meet(
+    place: Tensor, reach: Tensor, i: Tensor, j: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The pairs (i, j) whose bounding spheres meet. place: (d, N). reach: (N,)."""
     between = [x.index_select(0, j) - x.index_select(0, i) for x in place]
     squared = between[0] * between[0]
     for x in between[1:]:
         squared = squared + x * x
     sum_reach = reach.index_select(0, i) + reach.index_select(0, j)
-    # a hair more than the reach: rounding must not lose a pair that touches exactly
+    # slightly more than the reach: rounding must not lose a pair that touches exactly
     keep = torch.nonzero(squared <= sum_reach * sum_reach * (1 + 1e-5)).squeeze(1)
     return i.index_select(0, keep), j.index_select(0, keep)

@@ -1,9 +1,9 @@
-"""Pictures: cells drawn as the capsules that they are, coloured by what they hold, over the signal
-about them. Needs matplotlib (the `app` extra).
+"""Pictures: cells drawn as capsules, coloured by their quantities, over the signal around them.
 
-`show` draws a frame of a results file, `strip` several times of it, `movie` films it, and `sheet`
-draws a state. For figures of your own, `draw_cells` and `draw_signal` draw on matplotlib axes, and
-`colour_bar` and `scale_bar` say what was drawn.
+They require matplotlib (the `app` extra). `show` draws a frame of a results file, `strip` several
+frames of it, `movie` makes a film of it, and `sheet` draws a state. For figures of your own,
+`draw_cells` and `draw_signal` draw on matplotlib axes, and `colour_bar` and `scale_bar` add the
+legends.
 """
 
 from torchfilm.pictures.colours import Scale

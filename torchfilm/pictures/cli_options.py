@@ -1,4 +1,4 @@
-"""What a picture shows, as a command line says it."""
+"""Picture options from the texts of a command line."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from torchfilm.tools import checks
 
 
 def channels_of(texts: Sequence[str]) -> dict[str, str] | None:
-    """From NAME=COLOUR each; None without any."""
+    """Channels from texts NAME=COLOUR; None without any."""
     return dict(_pair("--channels", text, "NAME=COLOUR") for text in texts) or None
 
 
 def limits_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """From NAME=LOW:HIGH each."""
+    """Limits from texts NAME=LOW:HIGH."""
     limits = {}
     for text in texts:
         name, value = _pair("--limits", text, "NAME=LOW:HIGH")
@@ -26,7 +26,7 @@ def limits_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 def section_of(text: str) -> float | str:
-    """A coordinate, or a word."""
+    """A section: a coordinate, or a word."""
     try:
         return float(text)
     except ValueError:

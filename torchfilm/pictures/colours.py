@@ -1,5 +1,4 @@
-"""Colours: what a picture shows of its cells and of the signal behind them, over which ranges, in
-which colours."""
+"""Colours: the quantities that a picture shows, their ranges and their colour maps."""
 
 from __future__ import annotations
 
@@ -17,10 +16,10 @@ from torchfilm.tools import checks
 
 ANGLE = "angle"
 CELLS, MEAN = "cells", "mean"
-# A dark cell is not quite black, so that it is seen on black; what has no number is grey.
-FLOOR, NOTHING = 0.14, (0.55, 0.55, 0.55, 1.0)
-# Whole numbers with at most this many values are kinds, each with a colour of its own (of Okabe and
-# Ito, distinct to the colour-blind).
+# The darkest cell colour is not black, so that cells are visible on black. Missing values are grey.
+FLOOR, NO_VALUE = 0.14, (0.55, 0.55, 0.55, 1.0)
+# An integer quantity with at most this many values is a category, each value with its own colour
+# (of Okabe and Ito, distinct for colour-blind readers).
 KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C6BB1")
 
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -31,7 +30,10 @@ Limits = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class PlotStyle:
-    """What a picture shows, checked. The options are those of `torchfilm.pictures.show`."""
+    """The options of a picture, checked; they are those of `torchfilm.pictures.show`.
+
+    Raises InputError if options are invalid or contradict each other.
+    """
 
     colour: str | None = None
     channels: Mapping[str, str] | None = None
@@ -48,7 +50,7 @@ class PlotStyle:
         if self.channels is not None:
             if self.colour is not None:
                 raise checks.InputError(
-                    "colour and channels both say what colours the cells: give one of them."
+                    "colour and channels both set the colours of cells: give one of them."
                 )
             if not isinstance(self.channels, Mapping) or not self.channels:
                 raise checks.input_error(
@@ -71,7 +73,7 @@ class PlotStyle:
             raise checks.input_error(
                 "section",
                 self.section,
-                "left out without a background: it says where to cut the signal",
+                "omitted without a background: it sets where to cut the signal",
             )
         for name, pair in (self.limits or {}).items():
             low, high = checks.vector(f"limits[{name!r}]", pair, 2)
@@ -88,21 +90,24 @@ class PlotStyle:
                     )
                     or "nothing that has a range"
                 )
-                raise checks.input_error("limits", name, f"of what is drawn: {drawn}")
+                raise checks.input_error("limits", name, f"the name of a drawn quantity: {drawn}")
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What colours the cells."""
+        """The quantities that colour the cells."""
         return tuple(self.channels) if self.channels is not None else (self.colour or ANGLE,)
 
     @property
     def signal(self) -> str | None:
-        """The background under the name by which it is told from a quantity of the cells."""
+        """The background signal as "out.NAME", unlike a quantity of the cells; or None."""
         return None if self.background is None else OUTSIDE + self.background
 
-    def given(self, name: str) -> tuple[float, float] | None:
-        """The limits that were asked for. A bare name that is both a signal's and drawn in the
-        cells means the cells'."""
+    def given_limits(self, name: str) -> tuple[float, float] | None:
+        """The user's limits for a quantity, or None.
+
+        A name without "out." that is both a signal and a drawn quantity of the cells means the
+        cells'.
+        """
         limits = self.limits or {}
         found = limits.get(name)
         if found is None and name == self.signal and self.background not in self.quantities:
@@ -110,12 +115,12 @@ class PlotStyle:
         return None if found is None else (float(found[0]), float(found[1]))
 
     def check(self, frame: Frame) -> None:
-        """Raise InputError for what this frame does not have."""
+        """Raises InputError if the frame lacks a quantity, a signal or an axis."""
         if max(VIEWS[self.view]) >= frame.dim:
             raise checks.input_error("view", self.view, '"xy" for 2-D cells')
         if self.whole and frame.origin is None:
             raise checks.input_error(
-                "whole", True, "left out where the scene has no medium, and so no box"
+                "whole", True, "omitted for a scene without a medium, which has no box"
             )
         if self.background is not None and self.background not in frame.signals:
             raise checks.input_error(
@@ -135,7 +140,10 @@ class PlotStyle:
 
 
 def values_of(cells: Mapping[str, np.ndarray], name: str, view: str) -> np.ndarray:
-    """A quantity of each cell (N,); "angle" is that of its axis in the view, 0 … 180°."""
+    """A quantity of each cell, (N,).
+
+    "angle" is the angle of the cell's axis in the view, 0 … 180°.
+    """
     if name != ANGLE:
         return cells[name].astype(float)
     u, v = VIEWS[view]
@@ -145,15 +153,18 @@ def values_of(cells: Mapping[str, np.ndarray], name: str, view: str) -> np.ndarr
 
 
 @dataclass
-class Seen:
-    """The values of one quantity met so far: lowest, highest, and each of them while they are few
-    whole numbers."""
+class ValueRange:
+    """The range of one quantity so far: lowest and highest value.
+
+    kinds: the distinct values while they are integers and few, else None.
+    """
 
     low: float = math.inf
     high: float = -math.inf
     kinds: set[int] | None = field(default_factory=set)
 
-    def note(self, values: np.ndarray) -> None:
+    def add(self, values: np.ndarray) -> None:
+        """Extend the range by these values."""
         if self.kinds is not None:
             whole = values.dtype == bool or np.issubdtype(values.dtype, np.integer)
             self.kinds = (
@@ -173,10 +184,11 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """A quantity's colours: its name, what a legend calls it and its unit, its colour map, the
-    range that this spans, and whether some values lie beyond ("min", "max", "both"; "neither").
+    """The colours of a quantity.
 
-    kinds: instead of a range, the values of a quantity that tells kinds of cells apart.
+    name: of the quantity. label, unit: for a legend. cmap: the colour map. limits: the range of the
+    map. beyond: whether values lie outside the limits ("min", "max", "both" or "neither"). kinds:
+    the values of a categorical quantity, instead of a range.
     """
 
     name: str
@@ -189,7 +201,7 @@ class Scale:
 
     @property
     def power(self) -> int:
-        """The power of ten that a legend takes out of very small and very large numbers."""
+        """The power of ten that a legend factors out of very small and very large numbers."""
         power = 0 if self.kinds else math.floor(math.log10(max(map(abs, self.limits))))
         return power if power < -2 or power > 3 else 0
 
@@ -201,7 +213,7 @@ class Scale:
         return f"{self.label} ({unit})" if unit else self.label
 
     def level(self, values: np.ndarray) -> np.ndarray:
-        """Where values are in the range, 0 … 1; NaN stays."""
+        """The position of values in the range, 0 … 1; NaN stays NaN."""
         low, high = self.limits
         return np.clip((np.asarray(values, dtype=float) - low) / (high - low), 0.0, 1.0)
 
@@ -213,16 +225,16 @@ class Scale:
 
 
 def scale_of(
-    name: str, seen: Seen, look: PlotStyle, units: Mapping[str, str], note: str = ""
+    name: str, seen: ValueRange, style: PlotStyle, units: Mapping[str, str], note: str = ""
 ) -> Scale:
-    """The scale of a quantity that has taken these values."""
+    """The scale of a quantity with these values."""
     from matplotlib.colors import ListedColormap
 
-    given, unit = look.given(name), unit_of(name, units)
-    label = name if name != look.signal else f"{look.background} outside{note}"
+    given, unit = style.given_limits(name), unit_of(name, units)
+    label = name if name != style.signal else f"{style.background} outside{note}"
     if name == ANGLE:
         return Scale(name, "angle of the axis", "°", _wheel(), (0.0, 180.0))
-    if given is None and look.channels is None and seen.kinds and name != look.signal:
+    if given is None and style.channels is None and seen.kinds and name != style.signal:
         return Scale(
             name,
             label,
@@ -232,32 +244,35 @@ def scale_of(
             kinds=tuple(sorted(seen.kinds)),
         )
     low, high = (seen.low, seen.high) if seen.low <= seen.high else (0.0, 1.0)
-    if look.channels is not None and name != look.signal:
-        low = min(0.0, low)  # no light means none of it
+    if style.channels is not None and name != style.signal:
+        low = min(0.0, low)  # a dark channel means a value of 0
     limits = given or (low, high if high > low else low + (abs(low) or 1.0))
     under, over = seen.low < limits[0], seen.high > limits[1]
     beyond: Beyond = "both" if under and over else "min" if under else "max" if over else "neither"
-    return Scale(name, label, unit, _colours(name, look), limits, beyond)
+    return Scale(name, label, unit, _colour_map(name, style), limits, beyond)
 
 
-def _colours(name: str, look: PlotStyle) -> Any:
+def _colour_map(name: str, style: PlotStyle) -> Any:
+    """The colour map of a signal, a channel or a quantity."""
     from matplotlib import colormaps
     from matplotlib.colors import LinearSegmentedColormap
 
-    if name == look.signal:
+    if name == style.signal:
         made: Any = LinearSegmentedColormap.from_list("signal", ["white", "black"])
-    elif look.channels is not None:
+    elif style.channels is not None:
         made = LinearSegmentedColormap.from_list(
-            name, [lit(np.zeros(3)), lit(light(look.channels[name]))]
+            name, [lit(np.zeros(3)), lit(light(style.channels[name]))]
         )
     else:
         made = colormaps["viridis"]
-    return made.with_extremes(bad=NOTHING)
+    return made.with_extremes(bad=NO_VALUE)
 
 
 def _wheel() -> Any:
-    """A cyclic colour map of even, muted colours: one that passes through white or black would hide
-    cells of one direction."""
+    """A cyclic colour map of even, muted colours.
+
+    A map through white or black would hide cells of one direction.
+    """
     from matplotlib.colors import ListedColormap, hsv_to_rgb
 
     hue = np.linspace(0, 1, 256, endpoint=False)
@@ -272,20 +287,22 @@ def light(colour: str) -> np.ndarray:
 
 
 def lit(rgb: np.ndarray) -> np.ndarray:
-    """The colour of cells that give off this light, (…, 3)."""
+    """The colour of cells that emit this light, (…, 3)."""
     return FLOOR + (1.0 - FLOOR) * np.clip(rgb, 0.0, 1.0)
 
 
 def paint_cells(
-    cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: PlotStyle
+    cells: Mapping[str, np.ndarray], scales: Sequence[Scale], style: PlotStyle
 ) -> np.ndarray:
-    """The colour of each cell, (N, 4): of its one quantity, or the lights of its channels added up
-    as in a fluorescence picture."""
-    if look.channels is None:
+    """The colour of each cell, (N, 4).
+
+    It shows one quantity, or the sum of the light of its channels, as in fluorescence microscopy.
+    """
+    if style.channels is None:
         (scale,) = scales
-        return scale.paint(values_of(cells, scale.name, look.view))
+        return scale.paint(values_of(cells, scale.name, style.view))
     levels = np.stack([s.level(cells[s.name]) for s in scales], 1)
-    lights = np.stack([light(look.channels[s.name]) for s in scales])
+    lights = np.stack([light(style.channels[s.name]) for s in scales])
     colours = np.concatenate([lit(np.nan_to_num(levels) @ lights), np.ones((len(levels), 1))], 1)
-    colours[np.isnan(levels).any(1)] = NOTHING
+    colours[np.isnan(levels).any(1)] = NO_VALUE
     return colours

@@ -1,5 +1,4 @@
-"""Drawing on matplotlib axes: cells as the capsules that they are, a signal behind them, a scale
-bar, legends. Lengths in µm."""
+"""Drawing on matplotlib axes: cells, a signal behind them, walls, a scale bar, legends; in µm."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ from torchfilm.pictures.colours import (
     MEAN,
     PlotStyle,
     Scale,
-    Seen,
+    ValueRange,
     paint_cells,
     scale_of,
     values_of,
@@ -26,11 +25,11 @@ from torchfilm.tools import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-WALL = "#a0522d"  # no grey either
-# what is outside the box of a signal: no grey, so that it is not read as a concentration
-BEYOND = "#efe4d2"
+WALL = "#a0522d"  # not grey, so that it differs from a signal
+# the colour outside the box of a signal: not grey, so that nobody reads it as a concentration
+OUTSIDE_BOX = "#efe4d2"
 SMALL, TINY = 7.0, 6.0  # points
-ROUND = 0.1  # inches of a µm from which on an outline of few points has corners to be seen
+ROUND = 0.1  # inches per µm above which an outline of few points has visible corners
 
 
 def draw_cells(
@@ -43,24 +42,23 @@ def draw_cells(
     view: str = "xy",
     window: Window | None = None,
 ) -> list[Scale]:
-    """Draw cells, as `Results.frame` gives them, and return the scales of their colours, for
-    `colour_bar`.
+    """Draw cells, as `Results.frame` gives them; returns their scales, for `colour_bar`.
 
-    colour, channels, limits, view: as for `show`; ranges that are not given are those of these
-    cells. window: what the axes show; by default all cells.
+    colour, channels, limits, view: as for `show`; the default range is that of these cells. window:
+    the range of the axes; default all cells.
     """
-    look = PlotStyle(colour=colour, channels=channels, limits=limits, view=view)
+    style = PlotStyle(colour=colour, channels=channels, limits=limits, view=view)
     scales = []
-    for name in look.quantities:
+    for name in style.quantities:
         if (name in cells and cells[name].ndim != 1) or name not in (*cells, "angle"):
             raise checks.input_error(
                 "colour",
                 name,
                 "'angle' or one of " + ", ".join(n for n in cells if cells[n].ndim == 1),
             )
-        seen = Seen()
-        seen.note(cells[name] if name in cells else values_of(cells, name, view))
-        scales.append(scale_of(name, seen, look, {}))
+        seen = ValueRange()
+        seen.add(cells[name] if name in cells else values_of(cells, name, view))
+        scales.append(scale_of(name, seen, style, {}))
     covered = span(cells, view)
     if window is None and covered is not None:
         pad = 0.04 * float((covered[1] - covered[0]).max())
@@ -72,7 +70,7 @@ def draw_cells(
         )
     if window is not None:
         set_window(ax, window)
-    add_cells(ax, cells, scales, look)
+    add_cells(ax, cells, scales, style)
     return scales
 
 
@@ -87,14 +85,14 @@ def draw_signal(
     section: float | str = MEAN,
     limits: tuple[float, float] | None = None,
 ) -> Scale:
-    """Draw a signal (nx, ny, nz) of one colony, as `Results.signal` and `Results.grid` give it, and
-    return its scale, for `colour_bar`.
+    """Draw a signal (nx, ny, nz) of one colony; returns its scale, for `colour_bar`.
 
-    White is lowest and black highest. section: where it is cut, the coordinate along the line of
-    sight, µm, or "mean", its mean along it. limits: the range from white to black; by default that
-    of what is drawn.
+    values, origin, spacing: as `Results.signal` and `Results.grid` give them. White is lowest and
+    black highest. section: where the signal is cut, the coordinate along the line of sight, µm, or
+    "mean" for its mean along it. limits: the range from white to black; default the range of the
+    drawn values.
     """
-    look = PlotStyle(
+    style = PlotStyle(
         background=name,
         view=view,
         section=section,
@@ -102,10 +100,10 @@ def draw_signal(
     )
     if section == CELLS:
         raise checks.input_error("section", section, 'a coordinate in µm, or "mean"')
-    flat = cut(values, np.asarray(origin), np.asarray(spacing), look, None)
-    seen = Seen()
-    seen.note(flat)
-    scale = scale_of(OUTSIDE + name, seen, look, {})
+    flat = cut(values, np.asarray(origin), np.asarray(spacing), style, None)
+    seen = ValueRange()
+    seen.add(flat)
+    scale = scale_of(OUTSIDE + name, seen, style, {})
     low, high = box(np.asarray(origin), np.asarray(spacing), values.shape, view)
     set_window(ax, (low[0], high[0], low[1], high[1]))
     add_signal(ax, flat, (low[0], high[0], low[1], high[1]), scale)
@@ -116,28 +114,37 @@ def cut(
     values: np.ndarray,
     origin: np.ndarray,
     spacing: np.ndarray,
-    look: PlotStyle,
+    style: PlotStyle,
     height: float | None,
 ) -> np.ndarray:
-    """What is seen of a signal, (nu, nv); `height` is where the cells are along the line of sight,
-    for a section there."""
-    at = None if look.section == MEAN else height if look.section == CELLS else float(look.section)
-    if look.section == CELLS and at is not None:
-        # cells beyond the box read what is at its face
-        k = along(look.view)
+    """The section or mean of a signal in the view, (nu, nv).
+
+    height: the coordinate of the cells along the line of sight, for a section there.
+    """
+    at = (
+        None
+        if style.section == MEAN
+        else height
+        if style.section == CELLS
+        else float(style.section)
+    )
+    if style.section == CELLS and at is not None:
+        # cells beyond the box read the value at its face
+        k = along(style.view)
         at = min(max(at, float(origin[k])), float(origin[k] + spacing[k] * values.shape[k]))
-    return section(values, origin, spacing, view=look.view, at=at)
+    return section(values, origin, spacing, view=style.view, at=at)
 
 
 def set_window(ax: Axes, window: Window) -> None:
+    """Set the range of the axes, with equal scales and no ticks."""
     left, right, bottom, top = window
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
 
 
 def add_signal(ax: Axes, flat: np.ndarray, extent: Window, scale: Scale) -> None:
-    """Put a signal as it is seen (nu, nv) behind the cells."""
+    """Draw a section of a signal (nu, nv) behind the cells."""
     window = (*ax.get_xlim(), *ax.get_ylim())
-    ax.set_facecolor(BEYOND)
+    ax.set_facecolor(OUTSIDE_BOX)
     ax.imshow(
         scale.paint(flat).transpose(1, 0, 2),
         origin="lower",
@@ -149,20 +156,21 @@ def add_signal(ax: Axes, flat: np.ndarray, extent: Window, scale: Scale) -> None
 
 
 def add_cells(
-    ax: Axes, cells: Mapping[str, np.ndarray], scales: Sequence[Scale], look: PlotStyle
+    ax: Axes, cells: Mapping[str, np.ndarray], scales: Sequence[Scale], style: PlotStyle
 ) -> Any:
-    """Put cells into the window of the axes, the nearest to the eye last."""
+    """Draw cells into the window of the axes, the nearest to the viewer last."""
     from matplotlib.collections import PolyCollection
 
-    u, v = VIEWS[look.view]
+    u, v = VIEWS[style.view]
     if cells["position"].shape[1] == 3:
-        # seen against y in "xz", since x, z and what comes towards the eye turn like x, y and z
+        # In "xz" the viewer looks along +y, since x, z and −y are right-handed.
         order = np.argsort(
-            cells["position"][:, along(look.view)] * (-1 if look.view == "xz" else 1), kind="stable"
+            cells["position"][:, along(style.view)] * (-1 if style.view == "xz" else 1),
+            kind="stable",
         )
         cells = {name: value[order] for name, value in cells.items()}
     left, right = ax.get_xlim()
-    inch = ax.get_window_extent().width / ax.figure.dpi / abs(right - left)  # of a µm
+    inch = ax.get_window_extent().width / ax.figure.dpi / abs(right - left)  # inches per µm
     points = CAP_POINTS if inch < ROUND else 4 * CAP_POINTS
     shapes = outlines(
         cells["position"][:, [u, v]],
@@ -171,12 +179,13 @@ def add_cells(
         cells["radius"],
         points=points,
     )
-    # an outline helps where a cell is large on paper and drowns the colour where it is small
+    # an outline helps where a cell is large on paper; where a cell is small it would hide the
+    # colour
     width = min(0.4, 1.2 * inch)
-    edge = "black" if look.channels is None else "#d0d0d0"
+    edge = "black" if style.channels is None else "#d0d0d0"
     made = PolyCollection(
         list(shapes),
-        facecolors=paint_cells(cells, scales, look),
+        facecolors=paint_cells(cells, scales, style),
         edgecolors=edge,
         linewidths=width,
         zorder=1,
@@ -186,9 +195,11 @@ def add_cells(
 
 
 def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: str) -> None:
-    """Draw what the cells of the colony with this id cannot pass, as `Results.walls` tells it,
-    behind them: hard walls as lines, soft ones dashed. A flat wall that is not seen edge-on is left
-    out."""
+    """Draw the walls of the colony with this id behind its cells.
+
+    walls: as in `Results.walls`. Hard walls are lines, soft ones dashed lines. A flat wall that is
+    not perpendicular to the view is omitted.
+    """
     from matplotlib.patches import Circle
 
     for artist in [a for a in (*ax.lines, *ax.patches) if a.get_gid() == WALL]:
@@ -220,14 +231,16 @@ def add_walls(ax: Axes, walls: Sequence[Mapping[str, Any]], colony: int, view: s
 
 
 def scale_bar(ax: Axes) -> float:
-    """A bar of a round length just below the axes, at the left, so that it hides nothing. Returns
-    its length, µm."""
+    """A bar of a round length just below the axes, at the left, where it hides nothing.
+
+    Returns its length, µm.
+    """
     from matplotlib.transforms import ScaledTranslation
 
     low, high = sorted(ax.get_xlim())
     rough = 0.3 * (high - low)
     size = max(s for e in range(-2, 6) for s in (10.0**e, 2 * 10.0**e, 5 * 10.0**e) if s <= rough)
-    # in parts of the axes, so that it stays where it is when they are moved to another place
+    # in units of the axes, so that the bar moves with them
     below = ax.transAxes + ScaledTranslation(0, -5 / 72, ax.figure.dpi_scale_trans)
     share = size / (high - low)
     ax.add_line(_line([0, share], below))
@@ -259,8 +272,10 @@ def _line(x: list[float], transform: Any) -> Any:
 
 
 def colour_bar(ax: Axes, scale: Scale) -> None:
-    """Fill axes with the legend of a scale: its colours from left to right, its name above, its
-    range below. Points show where values lie beyond."""
+    """Fill axes with the legend of a scale: colours from left to right, name above, range below.
+
+    Pointed ends mean that values lie outside the range.
+    """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colorbar import Colorbar
     from matplotlib.colors import BoundaryNorm, Normalize
@@ -288,8 +303,7 @@ def colour_bar(ax: Axes, scale: Scale) -> None:
 
 
 def numbers(values: np.ndarray) -> list[str]:
-    """Numbers with the decimals that matter in the range that they span, about three digits of
-    it."""
+    """Numbers as text, with about three digits of the range that they span."""
     decimals = min(17, max(0, 2 - math.floor(math.log10(values.max() - values.min()))))
     words = (f"{x:.{decimals}f}" for x in values)
     words = (w.rstrip("0").rstrip(".") if "." in w else w for w in words)

@@ -1,5 +1,4 @@
-"""What pictures are made from: cells and signals at one time as arrays, taken from a state or read
-from a results file."""
+"""The data of pictures: cells and signals at one time, from a state or a results file."""
 
 from __future__ import annotations
 
@@ -22,10 +21,10 @@ UNITS = {"length": "µm", "radius": "µm"}
 class Frame:
     """Cells and signals of B colonies at one time.
 
-    cells: arrays by name as `Results.frame` gives them, the cells of one colony side by side. time:
+    cells: arrays by name as `Results.frame` gives them, the cells of one colony contiguous. time:
     h. colony_id: (B,). units: by name, signals under "out.NAME". signals: by name, one array (nx,
-    ny, nz) a colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm. height: z
-    of the plane of 2-D cells, µm, where it is known. walls: as `Results.walls` tells them.
+    ny, nz) per colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm. height:
+    z of the plane of 2-D cells, µm, if known. walls: as in `Results.walls`.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -53,13 +52,13 @@ class Frame:
         return np.diff(self._ends)
 
     def colony(self, place: int) -> dict[str, np.ndarray]:
-        """The cells of one colony, by its place in the batch."""
+        """The cells of one colony, by its index in the batch."""
         part = slice(self._ends[place], self._ends[place + 1])
         return {name: value[part] for name, value in self.cells.items()}
 
 
 def frame_of(state: State) -> Frame:
-    """A state as a frame, its cells as `Results.frame` would give them."""
+    """A state as a frame, with cells as `Results.frame` gives them."""
     columns = {n: getattr(state, n) for n in PER_CELL} | {
         n: v for n, v in state.fields.items() if state.declared[n].scope == CELL
     }
@@ -90,8 +89,8 @@ def frame_of(state: State) -> Frame:
     )
 
 
-class Recorded(Sequence[Frame]):
-    """Some frames of a results file, each read when it is asked for, with one signal or none."""
+class RecordedFrames(Sequence[Frame]):
+    """Some frames of a results file, each read on access, with one signal or none."""
 
     def __init__(self, results: Results, places: Sequence[int], signal: str | None = None):
         self.results, self.places, self.signal = (
@@ -114,7 +113,7 @@ class Recorded(Sequence[Frame]):
 
     def __getitem__(self, k):
         if isinstance(k, slice):
-            return Recorded(self.results, self.places[k], self.signal)
+            return RecordedFrames(self.results, self.places[k], self.signal)
         results, place = self.results, self.places[k]
         cells, ids, time = results.frame(place), results.colony_id, float(results.times[place])
         if not results.signal_names:
@@ -155,5 +154,5 @@ class Recorded(Sequence[Frame]):
 
 
 def unit_of(name: str, units: Mapping[str, str]) -> str:
-    """The unit of a quantity per cell, or of a signal under "out.NAME"; empty where it has none."""
+    """The unit of a quantity per cell, or of a signal under "out.NAME"; empty if it has none."""
     return units.get(name, UNITS.get(name, ""))

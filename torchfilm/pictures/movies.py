@@ -1,5 +1,7 @@
-"""Films of a run: MP4 through imageio-ffmpeg, or animated GIF through pillow, which matplotlib
-brings along."""
+"""Films of a run: MP4 with imageio-ffmpeg, or animated GIF with pillow.
+
+Pillow is installed with matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,19 @@ import numpy as np
 
 from torchfilm.io.results import Results
 from torchfilm.pictures.colours import CELLS, Limits, PlotStyle, paint_cells
-from torchfilm.pictures.draw import BEYOND
-from torchfilm.pictures.figures import beside, chosen, fill_sheet, seen_along, square
-from torchfilm.pictures.frames import Recorded
-from torchfilm.pictures.page import PanelLayout, entitle, figure_class, page, survey
+from torchfilm.pictures.draw import OUTSIDE_BOX
+from torchfilm.pictures.figures import choose_colonies, fill_sheet, output_path, square, view_note
+from torchfilm.pictures.frames import RecordedFrames
+from torchfilm.pictures.page import (
+    PanelLayout,
+    figure_class,
+    make_page,
+    plan_layout,
+    set_page_title,
+)
 from torchfilm.tools import checks
 
-FASTEST_GIF = 50.0  # frames a second; viewers slow down what is faster
+FASTEST_GIF = 50.0  # frames per second; viewers slow down faster films
 GREYS = 104  # of the 256 colours of a GIF
 
 
@@ -37,27 +45,27 @@ def movie(
     colonies: Sequence[int] | None = None,
     dpi: float = 150,
 ) -> Path:
-    """Film a results file, a panel a colony, with one window, one scale and one range of colours
-    from beginning to end. Returns the film's path.
+    """Make a film of a results file, with one panel per colony. Returns the film's path.
 
-    out: its name, which ends in .mp4 (needs imageio-ffmpeg) or .gif. every: draw every so many of
-    the recorded frames, and the last. fps: drawn frames a second; a GIF counts hundredths of a
-    second. colonies: their ids; by default the first 9. The other options are those of `show`.
+    The window, the scale and the range of colours are the same from beginning to end. out: its
+    name, which ends in .mp4 (requires imageio-ffmpeg) or .gif. every: draw every n-th recorded
+    frame, and the last. fps: drawn frames per second; a GIF has a resolution of hundredths of a
+    second. colonies: their ids; default the first 9. The other options are those of `show`.
     """
     figure_class()
-    target = beside(path, out, "")
+    target = output_path(path, out, "")
     write = _writer(target, fps)
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise checks.input_error("every", every, "a whole number from 1")
-    look = PlotStyle(colour, channels, background, limits, view, section, whole)
+    style = PlotStyle(colour, channels, background, limits, view, section, whole)
     with Results(path) as results:
         last = len(results) - 1
-        frames = Recorded(results, sorted({*range(0, last + 1, every), last}), background)
-        places, more = chosen(frames.present, results.colony_id, colonies, 9)
-        made = survey(frames, places, look)
+        frames = RecordedFrames(results, sorted({*range(0, last + 1, every), last}), background)
+        places, more = choose_colonies(frames.present, results.colony_id, colonies, 9)
+        layout = plan_layout(frames, places, style)
         part = target.with_name(f".{target.stem}.part{target.suffix}")
         try:
-            write(part, Film(frames, made, f"{seen_along(look)}{more}", dpi), fps)
+            write(part, Film(frames, layout, f"{view_note(style)}{more}", dpi), fps)
             part.replace(target)
         except OSError as error:
             raise checks.InputError(
@@ -70,29 +78,29 @@ def movie(
 
 
 class Film(Sequence[np.ndarray]):
-    """The frames of a film, each drawn when it is asked for: (height, width, 3) uint8."""
+    """The frames of a film, each drawn on access: (height, width, 3) uint8."""
 
-    def __init__(self, frames: Recorded, made: PanelLayout, more: str, dpi: float):
+    def __init__(self, frames: RecordedFrames, layout: PanelLayout, more: str, dpi: float):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        self.frames, self.made = frames, made
+        self.frames, self.layout = frames, layout
         clocks = clock(frames.times)
         self.titles = [f"{frames.title}, t = {c} h{more}" for c in clocks]
-        self.figure, self.axes = page(*square(made), made, self.titles[-1], dpi=dpi)
+        self.figure, self.axes = make_page(*square(layout), layout, self.titles[-1], dpi=dpi)
         self.canvas = FigureCanvasAgg(self.figure)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __getitem__(self, k):
-        fill_sheet(self.axes, self.frames[k], self.made)
-        entitle(self.figure, self.titles[k])
+        fill_sheet(self.axes, self.frames[k], self.layout)
+        set_page_title(self.figure, self.titles[k])
         self.canvas.draw()
         return np.ascontiguousarray(np.asarray(self.canvas.buffer_rgba())[..., :3])
 
 
 def clock(times: np.ndarray) -> list[str]:
-    """Times with as many decimals, all the same, as they need, up to three."""
+    """Times with the decimals that they need, the same for all, at most three."""
     for decimals in range(4):
         words = [f"{t:.{decimals}f}" for t in times]
         if all(abs(float(w) - t) < 1e-6 for w, t in zip(words, times, strict=True)):
@@ -101,7 +109,7 @@ def clock(times: np.ndarray) -> list[str]:
 
 
 def _writer(target: Path, fps: float) -> Callable[[Path, Film, float], None]:
-    """What writes films of this kind, found before anything is drawn."""
+    """The writer for this kind of film; raises InputError before anything is drawn."""
     kind = target.suffix.lower()
     if kind not in (".mp4", ".gif"):
         raise checks.input_error("out", str(target), "a name that ends in .mp4 or .gif")
@@ -113,7 +121,7 @@ def _writer(target: Path, fps: float) -> Callable[[Path, Film, float], None]:
             fps,
             above=0.0,
             most=FASTEST_GIF,
-            hint="Write an .mp4 for more, or draw fewer frames with every=.",
+            hint="For more, write an .mp4, or draw fewer frames with every=.",
         )
         return _gif
     checks.number("fps", fps, above=0.0)
@@ -121,8 +129,8 @@ def _writer(target: Path, fps: float) -> Callable[[Path, Film, float], None]:
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
         raise checks.InputError(
-            'MP4 needs imageio-ffmpeg: pip install "torchfilm[movie]" or imageio-ffmpeg, or give a'
-            " name that ends in .gif."
+            'MP4 requires imageio-ffmpeg: pip install "torchfilm[movie]" or imageio-ffmpeg, or'
+            " give a name that ends in .gif."
         ) from error
     return _mp4
 
@@ -152,15 +160,15 @@ def _mp4(path: Path, film: Film, fps: float) -> None:
 
 
 def _gif(path: Path, film: Film, fps: float) -> None:
-    """All frames have one palette, so that a colour looks the same throughout."""
+    """All frames share one palette, so that a colour looks the same throughout."""
     from PIL import Image
 
     palette = _palette(film)
 
     def image(k: int) -> Any:
-        made = Image.fromarray(_nearest(film[k], palette))
-        made.putpalette(palette.tobytes())
-        return made
+        picture = Image.fromarray(_nearest(film[k], palette))
+        picture.putpalette(palette.tobytes())
+        return picture
 
     frames = (image(k) for k in range(len(film)))
     next(frames).save(
@@ -174,50 +182,54 @@ def _gif(path: Path, film: Film, fps: float) -> None:
 
 
 def _palette(film: Film) -> np.ndarray:
-    """The 256 colours (256, 3) uint8 of a GIF: greys for the signal, lines and letters; the others
-    for those of the legends and of some frames' cells.
+    """The 256 colours (256, 3) uint8 of a GIF.
 
-    A palette from whole pictures would spend itself on the differences that cover most of the
-    paper.
+    It has greys for the signal, lines and letters, and colours of the legends and of some frames'
+    cells. A palette from whole pictures would mostly have the colours that cover most of the paper.
     """
     from matplotlib.colors import to_rgb
 
-    made = film.made
-    colours = [scale.cmap(np.linspace(0, 1, 256))[:, :3] for scale in made.scales]
+    layout = film.layout
+    colours = [scale.cmap(np.linspace(0, 1, 256))[:, :3] for scale in layout.scales]
     for k in np.unique(np.linspace(0, len(film) - 1, 5).astype(int)):
         frame = film.frames[int(k)]
         colours += [
-            paint_cells(frame.colony(place), made.scales, made.look)[:, :3] for place in made.places
+            paint_cells(frame.colony(place), layout.scales, layout.style)[:, :3]
+            for place in layout.places
         ]
     wanted = np.unique(np.round(255 * np.concatenate(colours)).astype(np.uint8), axis=0)
     wanted = _spread(wanted, 256 - GREYS - 1)
     greys = np.round(np.linspace(0, 255, GREYS)).astype(np.uint8)
-    made_up = np.concatenate(
+    colours_used = np.concatenate(
         [
             np.repeat(greys[:, None], 3, 1),
-            np.round(255 * np.array([to_rgb(BEYOND)])).astype(np.uint8),
+            np.round(255 * np.array([to_rgb(OUTSIDE_BOX)])).astype(np.uint8),
             wanted,
         ]
     )
-    return np.concatenate([made_up, np.zeros((256 - len(made_up), 3), dtype=np.uint8)])
+    return np.concatenate([colours_used, np.zeros((256 - len(colours_used), 3), dtype=np.uint8)])
 
 
 def _spread(colours: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of some colours (n, 3), such that none is far from one of them: each next is
-    the one farthest from those before."""
+    """At most `most` of some colours (n, 3), such that none is far from one of them.
+
+    Each next colour is the one farthest from those before.
+    """
     if len(colours) <= most:
         return colours
-    points, chosen = colours.astype(np.float32), [0]
+    points, choose_colonies = colours.astype(np.float32), [0]
     far = ((points - points[0]) ** 2).sum(1)
-    while len(chosen) < most:
-        chosen.append(int(far.argmax()))
-        far = np.minimum(far, ((points - points[chosen[-1]]) ** 2).sum(1))
-    return colours[chosen]
+    while len(choose_colonies) < most:
+        choose_colonies.append(int(far.argmax()))
+        far = np.minimum(far, ((points - points[choose_colonies[-1]]) ** 2).sum(1))
+    return colours[choose_colonies]
 
 
 def _nearest(picture: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """The place in the palette of the colour nearest to each pixel, (height, width) uint8; pillow's
-    own search is coarser than the palette."""
+    """The palette index of the colour nearest to each pixel, (height, width) uint8.
+
+    Pillow's own search is less accurate.
+    """
     shift = np.array([1 << 16, 1 << 8, 1])
     found, where = np.unique(picture @ shift, return_inverse=True)
     colours, there = (

@@ -1,5 +1,4 @@
-"""The page: panels of one size and one scale, their titles, a scale bar and legends below, each
-with a place of its own in inches."""
+"""The page: panels of one size and scale, with titles, a scale bar and legends; in inches."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchfilm.pictures.colours import CELLS, MEAN, PlotStyle, Scale, Seen, scale_of
+from torchfilm.pictures.colours import CELLS, MEAN, PlotStyle, Scale, ValueRange, scale_of
 from torchfilm.pictures.draw import (
     add_cells,
     add_signal,
@@ -30,30 +29,33 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH, HEIGHT, NARROWEST = 7.2, 8.4, 3.2  # inches of the page, at most and at least
+WIDTH, HEIGHT, NARROWEST = 7.2, 8.4, 3.2  # inches: greatest width and height, least width
 EDGE, GAP, HEAD = 0.12, 0.07, 0.19  # margin, between panels, title of a panel
-# height of a legend with its ticks; of the scale bar; between two legends, for numbers at their
-# ends
+# height of a legend with its ticks; of the scale bar; between two legends, for their end numbers
 BAR, BELOW, ROOM = 0.36, 0.24, 0.45
 LETTER = 0.056  # width of a letter of 7 points, about
 
 
 def figure_class() -> Any:
+    """matplotlib's Figure. Raises InputError if matplotlib is not installed."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise checks.InputError(
-            'Pictures need matplotlib: pip install "torchfilm[app]".'
+            'Pictures require matplotlib: pip install "torchfilm[app]".'
         ) from error
     return Figure
 
 
 @dataclass(frozen=True, eq=False)
 class PanelLayout:
-    """What all panels of a picture have in common: the colonies (places in the batch), the window
-    of each, and the scales of cells and signal."""
+    """The common layout of a picture's panels.
 
-    look: PlotStyle
+    places: the indices of the colonies in the batch. windows: the window of each. scales: of the
+    cells. behind: the scale of the signal, or None.
+    """
+
+    style: PlotStyle
     places: Sequence[int]
     windows: Mapping[int, Window]
     scales: tuple[Scale, ...]
@@ -66,43 +68,49 @@ class PanelLayout:
         return right - left, top - bottom
 
 
-def survey(frames: Sequence[Frame], places: Sequence[int], look: PlotStyle) -> PanelLayout:
-    """Go through the frames once, for one window a colony and one range a quantity over all of
-    them."""
-    seen = {name: Seen() for name in (*look.quantities, *([look.signal] if look.signal else []))}
+def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle) -> PanelLayout:
+    """The layout for some frames: one window per colony, and one range per quantity.
+
+    It reads the frames once.
+    """
+    seen = {
+        name: ValueRange()
+        for name in (*style.quantities, *([style.signal] if style.signal else []))
+    }
     covered: dict[int, np.ndarray] = {}
     boxes: dict[int, np.ndarray] = {}
     for frame in frames:
-        look.check(frame)
+        style.check(frame)
         for place in places:
             cells = frame.colony(place)
-            if (new := span(cells, look.view)) is not None:
+            if (new := span(cells, style.view)) is not None:
                 covered[place] = _union(covered.get(place), new)
-            for name in look.quantities:
+            for name in style.quantities:
                 if name in cells:
-                    seen[name].note(cells[name])
+                    seen[name].add(cells[name])
             if (
-                (look.background or look.whole)
+                (style.background or style.whole)
                 and frame.origin is not None
                 and frame.spacing is not None
                 and frame.shape is not None
             ):
                 boxes[place] = _union(
                     boxes.get(place),
-                    box(frame.origin[place], frame.spacing, tuple(frame.shape[place]), look.view),
+                    box(frame.origin[place], frame.spacing, tuple(frame.shape[place]), style.view),
                 )
-            if look.signal is not None:
-                seen[look.signal].note(signal_seen(frame, place, look, cells))
-    scales = tuple(scale_of(name, seen[name], look, frame.units) for name in look.quantities)
+            if style.signal is not None:
+                seen[style.signal].add(signal_section(frame, place, style, cells))
+    scales = tuple(scale_of(name, seen[name], style, frame.units) for name in style.quantities)
     behind = (
         None
-        if look.signal is None
-        else scale_of(look.signal, seen[look.signal], look, frame.units, _where(frame, look))
+        if style.signal is None
+        else scale_of(style.signal, seen[style.signal], style, frame.units, _where(frame, style))
     )
-    return PanelLayout(look, places, _windows(places, covered, boxes, look), scales, behind)
+    return PanelLayout(style, places, _windows(places, covered, boxes, style), scales, behind)
 
 
 def _union(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:
+    """The smallest box around two boxes (2, 2); a may be None."""
     return b if a is None else np.stack([np.minimum(a[0], b[0]), np.maximum(a[1], b[1])])
 
 
@@ -110,22 +118,25 @@ def _windows(
     places: Sequence[int],
     covered: Mapping[int, np.ndarray],
     boxes: Mapping[int, np.ndarray],
-    look: PlotStyle,
+    style: PlotStyle,
 ) -> dict[int, Window]:
-    """Windows of one size: about the cells with some room, within the box of the signal where the
-    cells are; or the whole box."""
+    """Windows of one size, µm.
+
+    A window is around the cells with a margin, within the box of the signal if the cells are in it;
+    or the whole box.
+    """
     shown = (
         {place: _union(covered.get(place), boxes[place]) for place in places}
-        if look.whole
+        if style.whole
         else covered
     )
     sizes = []
     for place in places:
         extent = shown[place][1] - shown[place][0]
-        room = extent if look.whole else extent + 2.0 * (1.0 + 0.04 * extent.max())
+        room = extent if style.whole else extent + 2.0 * (1.0 + 0.04 * extent.max())
         if place in boxes:
             whole = boxes[place][1] - boxes[place][0]
-            # cells that press against a wall which is a face of the box reach a little beyond it
+            # cells that press against a wall at a face of the box extend slightly beyond it
             room = np.where(extent < 1.02 * whole, np.minimum(room, whole), extent)
         sizes.append(room)
     size = np.max(sizes, 0)
@@ -133,103 +144,105 @@ def _windows(
     return {place: window(shown[place], size, boxes.get(place)) for place in places}
 
 
-def signal_seen(
-    frame: Frame, place: int, look: PlotStyle, cells: Mapping[str, np.ndarray]
+def signal_section(
+    frame: Frame, place: int, style: PlotStyle, cells: Mapping[str, np.ndarray]
 ) -> np.ndarray:
     """The background of one colony, (nu, nv)."""
-    assert look.background is not None and frame.origin is not None and frame.spacing is not None
-    height = _height(frame, place, look, cells) if look.section == CELLS else None
+    assert style.background is not None and frame.origin is not None and frame.spacing is not None
+    height = _height(frame, place, style, cells) if style.section == CELLS else None
     return cut(
-        frame.signals[look.background][place], frame.origin[place], frame.spacing, look, height
+        frame.signals[style.background][place], frame.origin[place], frame.spacing, style, height
     )
 
 
-def _height(frame: Frame, place: int, look: PlotStyle, cells: Mapping[str, np.ndarray]) -> float:
-    """Where cells are along the line of sight: their mean, or the plane of 2-D ones; the middle of
-    the box where there are none."""
+def _height(frame: Frame, place: int, style: PlotStyle, cells: Mapping[str, np.ndarray]) -> float:
+    """The position of cells along the line of sight, µm.
+
+    It is their mean, or the plane of 2-D cells; the middle of the box if there are no cells.
+    """
     assert frame.origin is not None and frame.spacing is not None and frame.shape is not None
-    k = along(look.view)
+    k = along(style.view)
     low = float(frame.origin[place, k])
     high = low + float(frame.spacing[k] * frame.shape[place, k])
     if frame.dim == 3:
         return float(cells["position"][:, k].mean()) if len(cells["length"]) else 0.5 * (low + high)
     if frame.height is None and frame.shape[place, k] > 1 and not low <= 0.0 <= high:
-        told = (
-            f"the height of the cells, from {low:g} to {high:g} µm, which this file does not tell"
-        )
-        raise checks.input_error("section", look.section, told, 'Give it, or "mean".')
+        shown = f"the height of the cells, from {low:g} to {high:g} µm, which is not in this file"
+        raise checks.input_error("section", style.section, shown, 'Give it, or "mean".')
     return frame.height or 0.0
 
 
-def _where(frame: Frame, look: PlotStyle) -> str:
-    """Where the signal is cut, for its legend."""
-    k = along(look.view)
+def _where(frame: Frame, style: PlotStyle) -> str:
+    """The place of the section through the signal, for its legend."""
+    k = along(style.view)
     if frame.shape is None or bool((frame.shape[:, k] == 1).all()):
         return ""
     letter = "xyz"[k]
-    if look.section == MEAN:
+    if style.section == MEAN:
         return f", mean over {letter}"
-    if look.section == CELLS and frame.dim == 3:
+    if style.section == CELLS and frame.dim == 3:
         return f", {letter} of the cells"
-    return (
-        f", {letter} = {frame.height or 0.0 if look.section == CELLS else float(look.section):g} µm"
-    )
+    at = frame.height or 0.0 if style.section == CELLS else float(style.section)
+    return f", {letter} = {at:g} µm"
 
 
-def fill(ax: Axes, frame: Frame, place: int, made: PanelLayout, titles: Sequence[str]) -> None:
-    """Draw one colony of one frame in a panel, in place of what was there. titles: from long to
-    short; the longest that fits is written."""
+def fill(ax: Axes, frame: Frame, place: int, layout: PanelLayout, titles: Sequence[str]) -> None:
+    """Draw one colony of one frame in a panel, and replace what the panel showed.
+
+    titles: from long to short; the longest that fits is written.
+    """
     for artist in (*ax.collections, *ax.images):
         artist.remove()
-    set_window(ax, made.windows[place])
+    set_window(ax, layout.windows[place])
     cells = frame.colony(place)
-    if made.behind is not None:
+    if layout.behind is not None:
         assert frame.origin is not None and frame.spacing is not None
         low, high = box(
             frame.origin[place],
             frame.spacing,
-            frame.signals[str(made.look.background)][place].shape,
-            made.look.view,
+            frame.signals[str(layout.style.background)][place].shape,
+            layout.style.view,
         )
         add_signal(
             ax,
-            signal_seen(frame, place, made.look, cells),
+            signal_section(frame, place, layout.style, cells),
             (low[0], high[0], low[1], high[1]),
-            made.behind,
+            layout.behind,
         )
-    elif made.look.channels is not None:
+    elif layout.style.channels is not None:
         ax.set_facecolor("black")
-    add_walls(ax, frame.walls, int(frame.colony_id[place]), made.look.view)
-    add_cells(ax, cells, made.scales, made.look)
+    add_walls(ax, frame.walls, int(frame.colony_id[place]), layout.style.view)
+    add_cells(ax, cells, layout.scales, layout.style)
     inches = ax.get_position().width * ax.figure.get_figwidth() + 0.5 * GAP  # type: ignore[union-attr]
     ax.set_title(next((t for t in titles if LETTER * len(t) <= inches), ""), fontsize=7, pad=2.5)
 
 
-def page(
-    rows: int, columns: int, made: PanelLayout, title: str, *, dpi: float
+def make_page(
+    rows: int, columns: int, layout: PanelLayout, title: str, *, dpi: float
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with a panel for each place of a grid (row by row), its title, a scale bar and
-    legends; panels are empty but have their windows."""
-    width, height = made.size
+    """A figure with a grid of panels (row by row), its title, a scale bar and legends.
+
+    The panels are empty but have their windows.
+    """
+    width, height = layout.size
     room = WIDTH - 2 * EDGE - (columns - 1) * GAP
     panel = min(room / columns, ((HEIGHT - 1.2) / rows - HEAD) * width / height)
     across = columns * panel + (columns - 1) * GAP
-    legends = [*made.scales, *([made.behind] if made.behind is not None else [])]
+    legends = [*layout.scales, *([layout.behind] if layout.behind is not None else [])]
     inches = max(NARROWEST, across + 2 * EDGE, *(_slot(s) + 2 * EDGE for s in legends))
     left = 0.5 * (inches - across)
     top = 0.1 + 0.15 * len(_lines(title, inches))
     tall = panel * height / width
     bars, depth = _legend(legends, inches, left + 0.3 * panel + 0.15)
     total = top + rows * (HEAD + tall) + (rows - 1) * GAP + BELOW + depth + EDGE
-    # whole and even numbers of pixels, as films need them
+    # even numbers of pixels, as films require
     figure = figure_class()(
         figsize=tuple(2 * math.ceil(x * dpi / 2) / dpi for x in (inches, total)), dpi=dpi
     )
     wide, high = figure.get_size_inches()
 
     def place(x: float, y: float, w: float, h: float) -> Axes:
-        """Axes whose upper left corner is x to the right and y down from that of the page,
-        inches."""
+        """Axes with their upper left corner x to the right and y down from the page's, inches."""
         return figure.add_axes((x / wide, 1 - (y + h) / high, w / wide, h / high))
 
     axes = []
@@ -246,12 +259,12 @@ def page(
     under = top + rows * (HEAD + tall) + (rows - 1) * GAP
     for scale, (x, y, w) in zip(legends, bars, strict=True):
         colour_bar(place(x, under + y, w, 0.08), scale)
-    entitle(figure, title)
+    set_page_title(figure, title)
     return figure, axes
 
 
-def entitle(figure: Figure, title: str) -> None:
-    """Write a page's title, in place of the one before."""
+def set_page_title(figure: Figure, title: str) -> None:
+    """Write a page's title, and replace the one before."""
     wide, high = figure.get_size_inches()
     figure.suptitle(
         "\n".join(_lines(title, wide)),
@@ -268,18 +281,17 @@ def _lines(title: str, width: float) -> list[str]:
 
 
 def _slot(scale: Scale) -> float:
-    """Width that a legend takes, inches."""
+    """The width that a legend takes, inches."""
     return max(1.0, LETTER * len(scale.title) - 0.1, 0.2 * len(scale.kinds)) + ROOM
 
 
 def _legend(
     scales: Sequence[Scale], width: float, taken: float
 ) -> tuple[list[tuple[float, float, float]], float]:
-    """Where each colour bar goes: (from the left, down from the panels, width), inches, and how far
-    down they reach below the scale bar.
+    """The place of each colour bar: (from the left, down from the panels, width), inches.
 
-    They stand at the right, beside the scale bar if all fit there, which has `taken` of the width;
-    in rows of their own otherwise.
+    Also how far down they extend below the scale bar. They are at the right of the scale bar if all
+    fit there, where it has `taken` of the width; otherwise in rows of their own.
     """
     slots = [_slot(s) for s in scales]
     beside = sum(slots) + EDGE <= width - max(taken, 0.9)
@@ -301,7 +313,11 @@ def _legend(
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    if not Path(path).suffix:  # matplotlib would write beside it, and perhaps over something
+    """Write a figure to `path`, and return the path.
+
+    Raises InputError if the format or the folder is not valid.
+    """
+    if not Path(path).suffix:  # matplotlib would add a suffix, and perhaps replace another file
         raise checks.input_error("picture", str(path), "a name that ends in .png, .pdf or .svg")
     try:
         figure.savefig(path, dpi=figure.dpi)

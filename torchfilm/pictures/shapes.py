@@ -1,5 +1,4 @@
-"""Geometry of pictures: outlines of capsules, what a view spans, and sections through signals.
-Arrays in and out, µm."""
+"""Geometry of pictures: outlines of capsules, extents in a view, sections of signals; in µm."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from torchfilm.tools import checks
 
-# The axes of space that run to the right and up in each view.
+# The axes of space to the right and up in each view.
 VIEWS = {"xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 CAP_POINTS = 7  # points on each half circle of an outline
 
@@ -18,7 +17,7 @@ Window = tuple[float, float, float, float]  # left, right, bottom, top
 
 
 def along(view: str) -> int:
-    """The axis of space that a view looks along."""
+    """The axis of space along the line of sight."""
     u, v = VIEWS[view]
     return 3 - u - v
 
@@ -31,11 +30,10 @@ def outlines(
     *,
     points: int = CAP_POINTS,
 ) -> np.ndarray:
-    """Outline polygons (N, 2·points, 2) of capsules seen along the line of sight: position, axis
-    (N, 2) of the projection, µm.
+    """Outline polygons (N, 2·points, 2) of capsules in projection.
 
-    The projection of a capsule is a capsule whose centreline is shortened, so an upright cell is a
-    circle.
+    position, axis: (N, 2) of the projection, µm. The projection of a capsule is a capsule with a
+    shorter centreline, so an upright cell is a circle.
     """
     size = np.hypot(axis[:, 0], axis[:, 1])
     way = np.where(size[:, None] > 1e-9, axis / np.maximum(size, 1e-9)[:, None], (1.0, 0.0))
@@ -53,7 +51,7 @@ def outlines(
 
 
 def span(cells: Mapping[str, np.ndarray], view: str) -> np.ndarray | None:
-    """Lower and upper corner (2, 2) of what some cells cover in a view, µm; None without cells."""
+    """Lower and upper corner (2, 2) of some cells in a view, µm; None without cells."""
     if len(cells["length"]) == 0:
         return None
     seen = list(VIEWS[view])
@@ -73,8 +71,10 @@ def box(origin: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], view: s
 
 
 def window(shown: np.ndarray, size: np.ndarray, within: np.ndarray | None) -> Window:
-    """A window of the given size (2,) about what is to be shown, a box (2, 2) that fits into it;
-    moved to lie within another as far as that allows."""
+    """A window of the given size (2,) around `shown`, a box (2, 2) that fits into it.
+
+    It is moved into the box `within` as far as possible.
+    """
     low = shown.mean(0) - 0.5 * size
     if within is not None:
         room = within[1] - within[0] - size
@@ -90,9 +90,9 @@ def window(shown: np.ndarray, size: np.ndarray, within: np.ndarray | None) -> Wi
 def section(
     values: np.ndarray, origin: np.ndarray, spacing: np.ndarray, *, view: str, at: float | None
 ) -> np.ndarray:
-    """A signal (nx, ny, nz) as a view shows it, (nu, nv): cut at the coordinate `at`, µm, along the
-    line of sight, or its mean along it (None).
+    """A signal (nx, ny, nz) in a view, (nu, nv).
 
+    at: the coordinate of the section along the line of sight, µm, or None for the mean along it.
     Between the centres of voxels it is interpolated linearly, as cells read it.
     """
     k = along(view)

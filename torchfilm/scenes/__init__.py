@@ -1,5 +1,4 @@
-"""Ready-made scenes: each a function from parameters to a Scene. `torchfilm info NAME` prints what
-one simulates."""
+"""Ready-made scenes: functions from parameters to a Scene. `torchfilm info NAME` describes one."""
 
 from __future__ import annotations
 
@@ -18,8 +17,8 @@ from torchfilm.tools import checks
 from torchfilm.tuning.settings import Settings
 
 
-def _numbers(given: Any) -> bool:
-    """Whether it is a list with one number per colony."""
+def _is_list_of_numbers(given: Any) -> bool:
+    """Whether the value is a list with one number per colony."""
     return (
         isinstance(given, (list, tuple))
         and bool(given)
@@ -28,24 +27,23 @@ def _numbers(given: Any) -> bool:
 
 
 def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
-    """Note the name and the parameters in the scene, so that a results file can say how to build it
-    again."""
+    """Store the name and the parameters in the scene, so that a results file can rebuild it."""
 
     @functools.wraps(make)
     def build(*args: Any, **parameters: Any) -> Scene:
         bound = inspect.signature(make).bind(*args, **parameters)
         bound.apply_defaults()
-        # a recipe holds lists, and a list times a number is no list of products
+        # a recipe has lists, and a list times a number is not a list of products
         scene = make(
             **{
-                n: torch.tensor(v, dtype=torch.float64) if _numbers(v) else v
+                n: torch.tensor(v, dtype=torch.float64) if _is_list_of_numbers(v) else v
                 for n, v in bound.arguments.items()
             }
         )
         plain = {n: v.tolist() if hasattr(v, "tolist") else v for n, v in bound.arguments.items()}
         return scene.replace(name=make.__name__, recipe=(make.__name__, plain))
 
-    # where it is found by its name, as pickling for another process does
+    # the module where pickle finds it by name, for another process
     build.__module__ = __name__
     return build
 
@@ -77,7 +75,7 @@ READY: dict[str, Callable[..., Scene]] = {
 
 
 def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
-    """The ready-made scene of that name."""
+    """The ready-made scene `name`. Raises InputError for an unknown name or parameter."""
     if name not in READY:
         near = difflib.get_close_matches(name, READY, n=1)
         hint = f"Did you mean {near[0]}?" if near else ""
@@ -91,7 +89,7 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
     for given in parameters or {}:
         if given not in allowed:
             knob = (
-                "It is a knob of accuracy: --settings FILE, or tf.Settings(…)."
+                "It is an accuracy setting: use --settings FILE or tf.Settings(…)."
                 if given in {f.name for f in dataclasses.fields(Settings)}
                 else ""
             )

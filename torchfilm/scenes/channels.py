@@ -1,4 +1,4 @@
-"""Growth channels, closed or open-ended."""
+"""Growth channels, closed or open at one end."""
 
 from __future__ import annotations
 
@@ -20,8 +20,11 @@ def channel(
     shortest: float = 3.5,
     longest: float = 4.5,
 ) -> Scene:
-    """Cells in a channel from x = 0 to `length` µm, `width` µm wide. open_ended: cells that pass
-    the end at x = length are gone; else it is closed and pressure brings growth to a stop."""
+    """Cells in a channel from x = 0 to `length` µm, `width` µm wide.
+
+    open_ended: cells that pass the end at x = length are removed; otherwise the channel is closed
+    and pressure stops growth.
+    """
     walls = Channel(width, low_end=0.0, high_end=None if open_ended else length)
     leave = [Removal(low=(-1.0, -width), high=(length, width))] if open_ended else []
     return Scene(

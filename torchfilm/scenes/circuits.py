@@ -1,5 +1,4 @@
-"""Cells that compute on their own: random partition, an oscillator and a switch, molecule by
-molecule."""
+"""Circuits without signals: random partition, an oscillator and a switch, molecule by molecule."""
 
 from __future__ import annotations
 
@@ -19,29 +18,31 @@ from torchfilm.values import Uniform
 Value = float | Tensor
 
 
-def _nothing(u, s, p, cell):
+def _no_reactions(u, s, p, cell):
     return {}
 
 
-def _share_out(parent: DivisionView, daughter1: DivisionView, daughter2: DivisionView) -> None:
-    """The paper's `divide`: what the parent had is shared at random, and none is lost."""
+def _divide_plasmids(
+    parent: DivisionView, daughter1: DivisionView, daughter2: DivisionView
+) -> None:
+    """The paper's `divide`: random shares of the parent's amount, which is conserved."""
     amount, share = parent.plasmid * parent.volume, parent.random()
     daughter1.plasmid = amount * share / daughter1.volume
     daughter2.plasmid = amount * (1 - share) / daughter2.volume
 
 
 def random_partition(rate: float = 1.0, start: float = 1.0) -> Scene:
-    """A species that nothing makes or destroys, shared between daughters in random parts (the
-    paper's `divide` example).
+    """A species without production or decay, divided between daughters in random parts.
 
-    Its amount stays, and cells differ ever more.
+    It is the paper's `divide` example. The total amount is conserved, and cells differ more and
+    more.
     """
     return Scene(
-        Rules(divide=_share_out),
+        Rules(divide=_divide_plasmids),
         Growth(rate=rate),
         Division(length=Uniform(3.5, 4.5)),
         Mechanics(dim=2),
-        Circuit(_nothing, species=("plasmid",), initial={"plasmid": start}),
+        Circuit(_no_reactions, species=("plasmid",), initial={"plasmid": start}),
     )
 
 
@@ -55,13 +56,12 @@ def repressilator(
     noise: bool = True,
     rate: float = 0.7,
 ) -> Scene:
-    """Three genes that repress each other in a ring (Elowitz and Leibler 2000), in a growing
-    colony: cells of one descent drift out of step.
+    """Three genes that repress each other in a ring (Elowitz and Leibler 2000), as cells grow.
 
-    alpha, basal, beta, power: the dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ −
-    pᵢ); speed: its unit of time is 1/speed h, the mRNA's lifetime. noise: molecule by molecule
-    (tau-leaping), with `molecules_per_unit` of them in a unit of concentration × µm³; else
-    smoothly.
+    The oscillations of related cells lose their phase relation. alpha, basal, beta, power: of the
+    dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ − pᵢ). speed: the unit of time is
+    1/speed h, the mRNA's lifetime. noise: simulate molecule by molecule (tau-leaping), with
+    `molecules_per_unit` molecules in a unit of concentration × µm³; otherwise deterministically.
     """
     names = ("laci", "tetr", "ci")
     reactions = []
@@ -101,13 +101,13 @@ def toggle_switch(
     noise: bool = True,
     rate: float = 0.7,
 ) -> Scene:
-    """Two genes that repress each other (Gardner et al. 2000): cells near the tipping point fall to
-    one side or the other, and their descendants stay there, so that the colony forms sectors.
+    """Two genes that repress each other (Gardner et al. 2000), in a growing colony.
 
-    x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`; founders start at x = y =
-    `start`, by default where decay, dilution and repression balance. noise: molecule by molecule,
-    with `molecules_per_unit` of them in a unit of concentration × µm³. Growth dilutes beside the
-    decay.
+    Cells near the tipping point switch to one side or the other. Their descendants stay there, so
+    the colony forms sectors. x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`.
+    Founders start at x = y = `start`; by default decay, dilution and repression balance there.
+    noise: simulate molecule by molecule, with `molecules_per_unit` molecules in a unit of
+    concentration × µm³. Growth dilutes in addition to decay.
     """
     reactions = []
     for name, by in (("red", "green"), ("green", "red")):

@@ -1,5 +1,7 @@
-"""Microcolonies: free in the plane, between agarose and coverslip, and with growth at one edge only
-(the paper's figures 1, 2 and 4)."""
+"""Microcolonies: in the plane, between agarose and coverslip, and with growth at one edge only.
+
+They follow the paper's figures 1, 2 and 4.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,9 @@ def microcolony(
     agarose: float = 16.0,
     length_drag: float = 10.0,
 ) -> Scene:
-    """A colony from one cell (Fig. 1, 2): growth `rate` (1/h), division at a centreline length
-    between `shortest` and `longest` µm.
+    """A colony from one cell (Fig. 1, 2).
 
+    rate: of growth, 1/h. A cell divides at a centreline length between `shortest` and `longest` µm.
     dim 2: strictly in the plane. dim 3: between a soft agarose below (stiffness `agarose`, μ·µm/h)
     and a hard coverslip above.
     """
@@ -49,8 +51,10 @@ def programmed_growth(
     longest: float = 4.5,
     length_drag: float = 10.0,
 ) -> Scene:
-    """Only cells within `edge` µm of the colony's rightmost point grow (Fig. 4): a tip that is
-    pushed to the right, like a meristem."""
+    """A colony in which only cells within `edge` µm of its rightmost point grow (Fig. 4).
+
+    The growing tip is pushed to the right, like a meristem.
+    """
 
     def update(cells: CellsView) -> None:
         x = cells.position[:, 0]

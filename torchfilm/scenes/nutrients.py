@@ -1,4 +1,4 @@
-"""Colonies that starve from the inside."""
+"""Colonies whose growth is limited by a nutrient."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def nutrient_limited(
     size: float = 240.0,
     spacing: float = 4.0,
 ) -> Scene:
-    """A colony that eats the nutrient about it, which comes by diffusion from the edge of a box
-    `size` µm wide, where it is kept at `supply`: only a rim grows, and where diffusion is slow its
-    bumps get ahead and branch.
+    """A colony that consumes a nutrient, which diffuses from the edge of a box `size` µm wide.
 
-    growth `rate` (1/h) · s/(half + s); growth_yield: µm³ of cell from one unit of concentration ×
-    µm³. The layer is 1 µm deep, as the cells are.
+    At the edge the nutrient is kept at `supply`. Only a rim of the colony grows. Where diffusion is
+    slow, bumps of the rim grow faster and branch. Growth is `rate` (1/h) · s/(half + s).
+    growth_yield: µm³ of cell from one unit of concentration × µm³. The layer is 1 µm deep, like the
+    cells.
     """
     edge = Dirichlet(supply)
     half_size = size / 2

@@ -1,5 +1,7 @@
-"""Cells that talk through the medium: Lux quorum sensing (the paper's Table 2) and detection of the
-boundary of two populations (its Fig. 5)."""
+"""Signalling through the medium: Lux quorum sensing and detection of a boundary.
+
+They follow the paper's Table 2 and Fig. 5.
+"""
 
 from __future__ import annotations
 
@@ -40,13 +42,13 @@ def quorum_sensing(
     size: float = 128.0,
     spacing: float = 4.0,
 ) -> Scene:
-    """Lux quorum sensing (Table 2): cells make AHL, which crosses their membranes and spreads;
-    together they make enough of it to switch LuxI on.
+    """Lux quorum sensing (Table 2): together the cells make enough AHL to switch LuxI on.
 
-    D1 µm/h, membrane; k1, k2 AHL from LuxI; d2, k3, k4 LuxI, basal and induced; g1 its decay, 1/h.
-    The box, `size` µm wide, lets nothing out. With the constants that Table 2 prints (D1 = k1 = k4
-    = 1; d2 without a value, its d1 is 1e-3) LuxI is diluted faster than it can be induced and
-    nothing switches; with these it does, the sooner the smaller the box.
+    AHL crosses the cells' membranes and diffuses. D1: µm/h, membrane. k1, k2: AHL from LuxI. d2,
+    k3, k4: LuxI, basal and induced. g1: its decay, 1/h. The box, `size` µm wide, has no-flux faces.
+    With the constants that Table 2 prints (D1 = k1 = k4 = 1; d2 without a value, its d1 is 1e-3)
+    dilution of LuxI is faster than its induction, and nothing switches. With the constants here it
+    switches, the sooner the smaller the box.
     """
     half = size / 2
     return Scene(
@@ -98,14 +100,14 @@ def boundary_detector(
     width: float = 32.0,
     rtol: float = 1e-4,
 ) -> Scene:
-    """Detection of the boundary between two populations (Fig. 5), in one plane of a channel `width`
-    µm wide, from one founder of each.
+    """Detection of the boundary between two populations (Fig. 5), in one plane of a channel.
 
-    Sources (type 0, on the left) make AHL by LuxI and show it by CFP; sinks (type 1) take it apart
-    by AiiA and show it by YFP: only at the boundary do they see any. Constants as published (hours,
-    µm, arbitrary concentration); d3 = 0 is a strain without AiiA. flow: µm/h along the channel.
-    rtol: relative tolerance of the circuits in a step. The grid, 4 µm wide, starts as the paper's
-    64 × 8 × 12 voxels about the cells' plane and grows along the channel with the colony.
+    Each population starts from one founder; the channel is `width` µm wide. Sources (type 0, on the
+    left) make AHL by LuxI and report it by CFP. Sinks (type 1) degrade AHL by AiiA and report it by
+    YFP: only those at the boundary detect it. Constants are as published (hours, µm, arbitrary
+    concentration); d3 = 0 is a strain without AiiA. flow: µm/h along the channel. rtol: relative
+    tolerance of the circuits in a step. The grid, with voxels of 4 µm, starts as the paper's 64 × 8
+    × 12 voxels around the cells' plane and grows along the channel with the colony.
     """
     half = width / 2
     return Scene(

@@ -1,2 +1,1 @@
-"""Signals: concentrations on one regular grid per colony. Kernels: tensors in and out, never a
-State."""
+"""Signals: concentrations on one regular grid per colony. Tensors in and out, never a State."""

@@ -1,4 +1,4 @@
-"""What happens at the six faces of a box of signal."""
+"""The boundary conditions at the six faces of a box of signal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Face:
-    """What every face has in common."""
+    """The base of all faces."""
 
     def outside_value(self) -> float | Tensor:
         """The concentration beyond the face, one number or one per colony; 0 where none enters."""
@@ -26,23 +26,25 @@ class Face:
 
 @dataclass(frozen=True)
 class NoFlux(Face):
-    """Nothing passes, neither by diffusion nor with the flow."""
+    """No flux, neither by diffusion nor with the flow."""
 
 
 @dataclass(frozen=True)
 class Periodic(Face):
-    """What leaves here enters at the opposite face, which must be periodic too."""
+    """Molecules that leave here enter at the opposite face, which must be periodic too."""
 
 
 @dataclass(frozen=True)
 class Dirichlet(Face):
-    """The concentration at the face itself, half a voxel from the nearest centre, is `value` ≥ 0:
-    one number or one per colony."""
+    """The concentration at the face itself is `value` ≥ 0: one number or one per colony.
+
+    The face is half a voxel from the nearest centre.
+    """
 
     value: float | Tensor
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "value", checks.value("Fixed.value", self.value, least=0.0))
+        object.__setattr__(self, "value", checks.value("Dirichlet.value", self.value, least=0.0))
 
     def outside_value(self) -> float | Tensor:
         return self.value
@@ -53,8 +55,10 @@ class Dirichlet(Face):
 
 @dataclass(frozen=True)
 class Open(Face):
-    """No diffusive flux; the flow carries the local concentration out, and `outside` ≥ 0 (one
-    number or one per colony) in."""
+    """No diffusive flux; the flow carries the local concentration out, and `outside` in.
+
+    outside: ≥ 0, one number or one per colony.
+    """
 
     outside: float | Tensor = 0.0
 
@@ -70,8 +74,10 @@ class Open(Face):
 
 @dataclass(frozen=True)
 class BoundaryConditions:
-    """The six faces of a box: along each axis one face for both ends, or (low, high).
-    `BoundaryConditions(x=(Dirichlet(1.0), Open()), y=Periodic())`."""
+    """The six faces of a box: for each axis one face for both ends, or (low, high).
+
+    Example: `BoundaryConditions(x=(Dirichlet(1.0), Open()), y=Periodic())`.
+    """
 
     x: Face | tuple[Face, Face] = NoFlux()
     y: Face | tuple[Face, Face] = NoFlux()
@@ -90,7 +96,7 @@ class BoundaryConditions:
                     f"BoundaryConditions.{axis}",
                     given,
                     "a face or a pair of faces (low, high)",
-                    "BoundaryConditions are NoFlux(), Periodic(), Dirichlet(value) and Open(outside).",
+                    "Faces are NoFlux(), Periodic(), Dirichlet(value) and Open(outside).",
                 )
             if isinstance(pair[0], Periodic) != isinstance(pair[1], Periodic):
                 raise checks.input_error(

@@ -1,14 +1,13 @@
-"""Exchange between cells and grid: reading a concentration at a cell, and writing what a cell
-secretes or takes up.
+"""Exchange between cells and grid: reading a concentration at a cell, secretion and uptake.
 
-| model                         | here                                                                              |
-|-------------------------------|-----------------------------------------------------------------------------------|
-| trilinear interpolation       | `weight` (N, K) of the K voxels `node` (N, K) about each cell; they sum to 1      |
-| reading                       | Σ_k weight·value                                                                  |
-| secreting an amount a         | weight·a / voxel volume to each voxel: the adjoint of reading                     |
-| taking up an amount a         | shared as weight·value, so that no voxel gives what it does not have              |
+| model                   | here                                                             |
+|-------------------------|------------------------------------------------------------------|
+| trilinear interpolation | `weight` (N, K) of K voxels `node` (N, K) per cell, with sum 1   |
+| reading                 | Σ_k weight·value                                                 |
+| secretion of amount a   | weight·a / voxel volume to each voxel: the adjoint of reading    |
+| uptake of amount a      | shared as weight·value: no voxel gives more than it has          |
 
-In a flat field the two ways to share are one.
+In a uniform field the two ways to share are the same.
 """
 
 from __future__ import annotations
@@ -24,23 +23,24 @@ from torchfilm.signals.grid import Grid
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 
-# A cell this part of a voxel beyond a face still counts as inside. Places are float64: 1e5 µm from
-# the origin they are rounded by 1e-11 µm, and so is the corner of a box that has been extended; a
-# cell that really is outside is so by far more.
+# A cell beyond a face by at most this part of a voxel counts as inside. Positions are float64: 1e5
+# µm from the origin they are rounded by 1e-11 µm, and so is the corner of an extended box. A cell
+# that really is outside is outside by far more.
 SLACK = 1e-6
-# Of a voxel that several cells empty together, the parts add up to 1 but for rounding; this many
-# units in the last place are taken for 1.
+# Where several cells empty a voxel together, their parts add up to 1 except for rounding. A sum
+# within this many units in the last place counts as 1.
 ULPS = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Stencil:
-    """Where N cells meet the grid.
+    """The voxels at which N cells read and write.
 
-    node: (N, K) int64 voxels, the nearest first; weight: (N, K) ≥ 0, with sum 1 (0 for a cell
-    wholly inside an obstacle); outside: (N,) bool, cells beyond the box, which read and write at
-    its edge, or wholly inside an obstacle, which read 0 and whose writing is lost: what to do with
-    either is the caller's to say. blocked: (N,) bool, the latter alone, or None without obstacles.
+    node: (N, K) int64 voxels, the nearest first. weight: (N, K) ≥ 0, with sum 1, or 0 for a cell
+    that is wholly inside an obstacle. outside: (N,) bool, cells beyond the box or wholly inside an
+    obstacle. Beyond the box a cell reads and writes at the edge. Inside an obstacle it reads 0 and
+    its writing is lost. The caller decides what to do with either. blocked: (N,) bool, cells wholly
+    inside an obstacle, or None without obstacles.
     """
 
     node: Tensor
@@ -67,21 +67,26 @@ class Stencil:
 def outside_box(
     grid: Grid, position: Tensor, colony: Tensor, periodic: tuple[bool, bool, bool]
 ) -> Tensor:
-    """Which cells at position (N, 3) are beyond the box of their colony's grid, (N,) bool; a place
-    that is not finite is."""
-    return _beyond(
+    """Which cells at position (N, 3) are beyond the box of their colony's grid, (N,) bool.
+
+    A position that is not finite counts as outside.
+    """
+    return _outside_scaled(
         (position - grid.origin.index_select(0, colony)) / grid.step,
         grid.shape.index_select(0, colony),
         periodic,
     )
 
 
-def _beyond(scaled: Tensor, shape: Tensor, periodic: tuple[bool, bool, bool]) -> Tensor:
-    """The same from places (N, 3) in voxels from the lower corner and numbers of voxels (N, 3)."""
+def _outside_scaled(scaled: Tensor, shape: Tensor, periodic: tuple[bool, bool, bool]) -> Tensor:
+    """As `outside_box`, for positions in voxels from the lower corner (N, 3).
+
+    shape: (N, 3), the numbers of voxels.
+    """
     outside = torch.zeros_like(scaled[:, 0], dtype=torch.bool)
     for axis in range(3):
         at, size = scaled[:, axis], shape[:, axis]
-        # written so that a NaN is outside
+        # this form makes a NaN outside
         outside |= (
             ~torch.isfinite(at) if periodic[axis] else ~((at >= -SLACK) & (at <= size + SLACK))
         )
@@ -97,20 +102,20 @@ def stencil(
     mask: Tensor | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> Stencil:
-    """The stencil of cells at position (N, 3) float64, µm, of colonies (N,) int64; differentiable
-    in the position.
+    """The stencil of cells at position (N, 3) float64, µm, of colonies (N,) int64.
 
-    Between voxel centres the weights are trilinear; within half a voxel of a face that is not
-    periodic, the outermost voxel stands for what is beyond its centre; periodic axes wrap. mask:
-    (nodes,) bool, False where an obstacle is; its voxels get weight 0, and the others are scaled up
-    to a sum of 1. K = 2^(axes with more than one voxel); weights come in `dtype`.
+    It is differentiable in the position. Between voxel centres the weights are trilinear. Within
+    half a voxel of a face that is not periodic, the outermost voxel alone counts. Periodic axes
+    wrap. mask: (nodes,) bool, False in an obstacle. Voxels of an obstacle get weight 0, and the
+    other weights are scaled to a sum of 1. K = 2^(axes with more than one voxel). dtype: of the
+    weights.
     """
     if position.dim() != 2 or position.shape[1] != 3:
         raise checks.input_error(
             "position",
             tuple(position.shape),
             "of shape (cells, 3)",
-            "A 2-D colony has its cells at one height in its layer.",
+            "In a 2-D colony all cells have one height in the layer.",
         )
     if mask is not None and (mask.shape != (grid.nodes,) or mask.dtype != torch.bool):
         raise checks.input_error(
@@ -120,7 +125,46 @@ def stencil(
     # in voxels from the lower corner
     scaled = (position - grid.origin.index_select(0, colony)) / grid.step
     used = [axis for axis in range(3) if any(s[axis] > 1 for s in grid.shapes)]
-    outside = _beyond(scaled, shape, periodic)
+    outside = _outside_scaled(scaled, shape, periodic)
+    node, weight = _corners(grid, scaled, shape, colony, used, periodic, dtype)
+    blocked = None
+    if mask is not None:
+        weight = [w * mask.index_select(0, n).to(dtype) for n, w in zip(node, weight, strict=True)]
+        total = _sum_in_order(weight)
+        blocked = total <= 0
+        outside |= blocked
+        weight = [w / torch.where(total > 0, total, 1.0) for w in weight]
+        node, weight = _heaviest_first(node, weight)
+    # the greatest weight is 1 minus the others, so that the sum is 1 to its last bit
+    weight[0] = (
+        torch.where(weight[0] > 0, 1 - _sum_in_order(weight[1:]), 0.0)
+        if len(weight) > 1
+        else weight[0]
+    )
+    return Stencil(
+        torch.stack(node, 1),
+        torch.stack(weight, 1),
+        outside,
+        grid.voxel_volume,
+        grid.nodes,
+        blocked,
+    )
+
+
+def _corners(
+    grid: Grid,
+    scaled: Tensor,
+    shape: Tensor,
+    colony: Tensor,
+    used: list[int],
+    periodic: tuple[bool, bool, bool],
+    dtype: torch.dtype,
+) -> tuple[list[Tensor], list[Tensor]]:
+    """The 2^len(used) voxels about each cell, (N,) each, the nearest first, and their weights.
+
+    scaled: (N, 3) in voxels from the lower corner. shape: (N, 3). used: axes with more than one
+    voxel.
+    """
     sides: list[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]] = []
     for axis in range(3):
         if axis in used:
@@ -135,33 +179,16 @@ def stencil(
             w = w * pair[side][1]
         node.append(n)
         weight.append(w)
-    blocked = None
-    if mask is not None:
-        weight = [w * mask.index_select(0, n).to(dtype) for n, w in zip(node, weight, strict=True)]
-        total = _add(weight)
-        blocked = total <= 0
-        outside |= blocked
-        weight = [w / torch.where(total > 0, total, 1.0) for w in weight]
-        node, weight = _heaviest_first(node, weight)
-    # the heaviest takes what is left of 1, so that the sum is 1 to its last bit
-    weight[0] = (
-        torch.where(weight[0] > 0, 1 - _add(weight[1:]), 0.0) if len(weight) > 1 else weight[0]
-    )
-    return Stencil(
-        torch.stack(node, 1),
-        torch.stack(weight, 1),
-        outside,
-        grid.voxel_volume,
-        grid.nodes,
-        blocked,
-    )
+    return node, weight
 
 
 def _two_voxels(
     at: Tensor, size: Tensor, periodic: bool, dtype: torch.dtype
 ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """The nearest voxel along one axis and the next one, each with its weight; `at` (N,) in voxels
-    from the centre of the first."""
+    """The nearest voxel along one axis and the next one, each with its weight.
+
+    at: (N,) in voxels from the centre of the first.
+    """
     at = torch.where(torch.isfinite(at), at, 0.0)
     at = torch.remainder(at, size) if periodic else torch.minimum(at, size - 1.0).clamp(min=0.0)
     near = at.detach().round()
@@ -175,8 +202,8 @@ def _two_voxels(
     return (nearest, 1 - far_weight), (other, far_weight)
 
 
-def _add(columns: list[Tensor]) -> Tensor:
-    """Column after column, in an order of its own for every row."""
+def _sum_in_order(columns: list[Tensor]) -> Tensor:
+    """The sum of columns in their order, which fixes the bits of every row."""
     out = columns[0]
     for column in columns[1:]:
         out = out + column
@@ -184,6 +211,7 @@ def _add(columns: list[Tensor]) -> Tensor:
 
 
 def _heaviest_first(node: list[Tensor], weight: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    """Each row with its greatest weight moved to the first column."""
     nodes, weights = torch.stack(node, 1), torch.stack(weight, 1)
     best = weights.detach().argmax(1, keepdim=True)
     order = torch.arange(nodes.shape[1], device=nodes.device).expand(nodes.shape).clone()
@@ -193,11 +221,11 @@ def _heaviest_first(node: list[Tensor], weight: list[Tensor]) -> tuple[list[Tens
 
 
 def read(values: Tensor, stencil: Stencil) -> Tensor:
-    """The concentration at each cell, (N,), from values (nodes,); differentiable in values and
-    position.
+    """The concentration at each cell, (N,), from values (nodes,).
 
-    Summed as differences from the nearest voxel, whose weight is at least 1/K: so a flat field is
-    read exactly, and one that is nowhere negative reads so.
+    It is differentiable in values and position. The sum is of differences from the nearest voxel,
+    whose weight is at least 1/K. So a uniform field is read exactly, and a non-negative field gives
+    a non-negative value.
     """
     found, weight = stencil.gather(values).unbind(1), stencil.weight.to(values.dtype).unbind(1)
     nearest = torch.where(weight[0] > 0, found[0], 0.0)
@@ -208,33 +236,32 @@ def read(values: Tensor, stencil: Stencil) -> Tensor:
 
 
 def pool_volume(stencil: Stencil) -> Tensor:
-    """The volume, µm³, of which each cell may take up all that is there, (N,): voxel volume / W, W
-    the greatest sum of weights at its voxels.
+    """The volume whose whole content a cell may take up, (N,) µm³: voxel volume / W.
 
-    However many cells share a voxel, uptake of at most `read` × this leaves nothing negative: of a
-    voxel each takes at most weight / W of what is there. A cell off the middle of its voxel reads,
-    and shares, more than one: then W is below 1 and its pool is larger than a voxel.
+    W is the greatest sum of weights at the cell's voxels. However many cells share a voxel, uptake
+    of at most `read` × this volume leaves nothing negative: from a voxel each cell takes at most
+    weight / W of the content. A cell away from the middle of its voxel reads, and shares, more than
+    one voxel. Then W may be below 1 and its pool larger than a voxel.
     """
-    crowd = stencil.gather(stencil.sum(stencil.weight))
-    worst = torch.where(stencil.weight > 0, crowd, 0.0).amax(1)
+    weight_sums = stencil.gather(stencil.sum(stencil.weight))
+    worst = torch.where(stencil.weight > 0, weight_sums, 0.0).amax(1)
     return stencil.voxel_volume / torch.where(worst > 0, worst, 1.0)
 
 
 def write(values: Tensor, amount: Tensor, stencil: Stencil) -> Tensor:
-    """Values (nodes,) after each cell has secreted (amount > 0) or taken up (amount < 0) its amount
-    (N,), concentration × µm³.
+    """Values (nodes,) after secretion (amount > 0) or uptake (amount < 0) by each cell.
 
-    Uptake must be at most `read` × `pool_volume`; then every value ≥ 0 stays so exactly. The sum of
-    amounts is conserved to rounding: of a voxel that is emptied, what rounding would leave below 0
-    (a few units in the last place of what it held) is set to 0. Taking more than that shows as a
-    value below 0, or NaN where there was nothing to take. Uptake is taken from the values before
-    anything is secreted.
+    amount: (N,), concentration × µm³. Uptake must be at most `read` × `pool_volume`; then every
+    value ≥ 0 stays ≥ 0 exactly. The sum of amounts is conserved to rounding: in a voxel that is
+    emptied, a negative rounding error (a few units in the last place of its content) is set to 0. A
+    larger uptake shows as a value below 0, or as NaN where the voxel was empty. Uptake is taken
+    from the values before secretion.
     """
     weight = stencil.weight.to(values.dtype)
     volume = stencil.voxel_volume
     there = read(values, stencil)
     wanted = (-amount).clamp(min=0.0)
-    # the part of each voxel's content that a cell with all its weight there takes
+    # the part of a voxel's content that a cell takes if all its weight is there
     part = wanted / (torch.where(there > 0, there, 1.0) * volume)
     part = torch.where((wanted > 0) & (there <= 0), torch.inf, part)
     taken = stencil.sum(weight * part.unsqueeze(1))

@@ -1,10 +1,9 @@
-"""Transport over a step of a separable operator, exact in time: exp(Δt·T) as one dense matrix for
-each axis.
+"""Transport over a step of a separable operator, exact in time: exp(Δt·T) as a matrix per axis.
 
-On a box with constant coefficients T is a sum of one matrix for each axis, and these commute. The
-exponential of each is found with non-negative numbers only (the diagonal is shifted out; scaling
-and squaring), among them what has left the box, so that what stays and what has left always add up
-to 1: no entry is negative and no amount is lost, however long the step.
+On a box with constant coefficients T is a sum of one matrix for each axis, and these commute. Each
+exponential is computed with non-negative numbers only (the diagonal is shifted out; scaling and
+squaring). The amount that has left the box is one of its entries, so the parts inside and outside
+always add up to 1. No entry is negative and no amount is lost, however long the step.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from torch import Tensor
 from torchfilm.signals.operator import Exchange, Operator
 from torchfilm.tools import checks
 
-# exp(t(Q + ρ)) with tρ ≤ ½ by its series: the first term left out is ½¹⁶/16! = 7e-19.
+# exp(t(Q + ρ)) with tρ ≤ ½ by its series: the first omitted term is ½¹⁶/16! = 7e-19.
 TERMS = 15
-# The integral over such a short time by Gauss's rule: its error is under (2·½)¹²·(6!)⁴/(13·(12!)³)
-# = 2e-16 of the integrand.
+# The integral over such a short time by Gauss quadrature: its error is below
+# (2·½)¹²·(6!)⁴/(13·(12!)³) = 2e-16 of the integrand.
 NODES = 6
-# A product's last bits depend on how its matrices lie in memory, and so on the colonies before,
-# unless each begins at a whole 64 bytes.
+# A product's last bits depend on the memory alignment of its matrices, and so on the colonies
+# before, unless each matrix begins at a multiple of 64 bytes.
 ALIGN = 16
 
 
@@ -32,16 +31,16 @@ ALIGN = 16
 class Exponential:
     """u ↦ exp(Δt T) u + ∫ exp(s T) ds · gain.
 
-    factors: for each axis (B or 1, n, n), n filled up with zeros to a multiple of ALIGN, entry [j,
-    i] the part of voxel j that is in voxel i afterwards, or None where nothing changes. gained:
-    None or (B or 1, nx, ny, nz), concentration.
+    factors: for each axis (B or 1, n, n), with n padded by zeros to a multiple of ALIGN, or None
+    where nothing changes. Entry [j, i] is the part of voxel j that is in voxel i afterwards.
+    gained: None or (B or 1, nx, ny, nz), concentration.
     """
 
     factors: tuple[Tensor | None, ...]
     gained: Tensor | None
 
     def step(self, u: Tensor) -> Tensor:
-        """u (B, nx, ny, nz) a step later."""
+        """u (B, nx, ny, nz) one step later."""
         out = multiply(self.factors, u)
         return out if self.gained is None else out + self.gained
 
@@ -49,7 +48,7 @@ class Exponential:
 def multiply(factors: tuple[Tensor | None, ...], u: Tensor) -> Tensor:
     """u (B, nx, ny, nz) with each factor applied along its axis.
 
-    Three times the first axis is multiplied and becomes the last, so that all is back in its place.
+    Three times the first axis is multiplied and becomes the last, which restores the order of axes.
     """
     colonies = u.shape[0]
     for factor in factors:
@@ -60,7 +59,7 @@ def multiply(factors: tuple[Tensor | None, ...], u: Tensor) -> Tensor:
         else:
             full = factor.shape[1]
             product = torch.bmm(
-                filled(turned, full, aligned(a * b)).transpose(1, 2),
+                padded(turned, full, aligned(a * b)).transpose(1, 2),
                 factor.expand(colonies, full, full),
             )
             turned = product[:, : a * b, :n]
@@ -69,11 +68,12 @@ def multiply(factors: tuple[Tensor | None, ...], u: Tensor) -> Tensor:
 
 
 def aligned(size: int) -> int:
+    """The next multiple of ALIGN."""
     return -(-size // ALIGN) * ALIGN
 
 
-def filled(x: Tensor, rows: int, columns: int) -> Tensor:
-    """x (B, r, c) with zeros added up to (B, rows, columns)."""
+def padded(x: Tensor, rows: int, columns: int) -> Tensor:
+    """x (B, r, c), padded with zeros to (B, rows, columns)."""
     return (
         x
         if x.shape[1:] == (rows, columns)
@@ -82,20 +82,20 @@ def filled(x: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def prepare_exponential(operator: Operator, dt: float) -> Exponential:
-    """The factors of a step of `dt` hours; raises where the operator is not separable."""
+    """The factors of a step of `dt` hours. Raises InputError if the operator is not separable."""
     if not operator.separable:
         why = (
             "there is an obstacle (mask)"
             if operator.mask is not None
-            else "the velocity varies from place to place"
+            else "the velocity is not uniform"
         )
         raise checks.input_error(
             "method",
             "exponential",
-            f"another one where {why}",
-            'Use method="implicit", or None to have it chosen.',
+            f"another method, since {why}",
+            'Use method="implicit", or None for the automatic choice.',
         )
-    # decay multiplies the factor of the longest axis, which is always there
+    # decay multiplies the factor of the longest axis, which always exists
     carrier = operator.shape.index(max(operator.shape))
     generators = [
         None if axis.idle and axis.axis != carrier else generator(axis) for axis in operator.axes
@@ -116,17 +116,7 @@ def prepare_exponential(operator: Operator, dt: float) -> Exponential:
             for g, most in zip(generators, fastest, strict=True)
         ]
 
-    def kept(factors: list[Tensor | None], time: Tensor) -> tuple[Tensor | None, ...]:
-        """What stays in the box, with the decay of that time."""
-        left = torch.exp(-operator.decay.reshape(-1, 1, 1) * time.reshape(-1, 1, 1))
-        inside = [
-            None if f is None else filled(f[:, :n, :n], aligned(n), aligned(n))
-            for f, n in zip(factors, operator.shape, strict=True)
-        ]
-        return tuple(
-            left * f if f is not None and k == carrier else f for k, f in enumerate(inside)
-        )
-
+    kept = lambda factors, time: _kept(operator, carrier, factors, time)
     gained = None
     if operator.gain is not None:
         gain = operator.gain.expand(max(rate.numel(), operator.gain.shape[0]), *operator.shape)
@@ -145,7 +135,9 @@ def prepare_exponential(operator: Operator, dt: float) -> Exponential:
                 more.reshape(-1, 1, 1, 1), gained + multiply(kept(now, time), gained), gained
             )
         now = [
-            None if f is None else torch.where(more.reshape(-1, 1, 1), _closed(torch.bmm(f, f)), f)
+            None
+            if f is None
+            else torch.where(more.reshape(-1, 1, 1), _normalised(torch.bmm(f, f)), f)
             for f in now
         ]
         time = torch.where(more, 2 * time, time)
@@ -153,9 +145,24 @@ def prepare_exponential(operator: Operator, dt: float) -> Exponential:
     return Exponential(made, None if gained is None else gained.to(operator.dtype))
 
 
+def _kept(
+    operator: Operator, carrier: int, factors: list[Tensor | None], time: Tensor
+) -> tuple[Tensor | None, ...]:
+    """The parts that stay in the box, with the decay of that time on the axis `carrier`."""
+    left = torch.exp(-operator.decay.reshape(-1, 1, 1) * time.reshape(-1, 1, 1))
+    inside = [
+        None if f is None else padded(f[:, :n, :n], aligned(n), aligned(n))
+        for f, n in zip(factors, operator.shape, strict=True)
+    ]
+    return tuple(left * f if f is not None and k == carrier else f for k, f in enumerate(inside))
+
+
 def generator(axis: Exchange) -> Tensor:
-    """(B or 1, m, m): entry [j, i] the rate at which voxel j gives to voxel i, 1/h; entry [j, n]
-    that to the outside. Rows sum to 0; beyond n are zeros."""
+    """The rate matrix of one axis, (B or 1, m, m), 1/h.
+
+    Entry [j, i] is the rate at which voxel j gives to voxel i; entry [j, n] is the rate to the
+    outside. Rows sum to 0; entries beyond n are 0.
+    """
     n = axis.size
     up, down = axis.up.reshape(-1, n + 1), axis.down.reshape(-1, n + 1)
     inside = torch.diag_embed(up[:, 1:n], 1) + torch.diag_embed(down[:, 1:n], -1)
@@ -167,32 +174,33 @@ def generator(axis: Exchange) -> Tensor:
     elif n > 1:
         inside = inside + leaving[0].unsqueeze(2) * last + leaving[1].unsqueeze(2) * first
     given = inside.sum(2) + lost.squeeze(2)
-    return filled(
+    return padded(
         torch.cat([inside - torch.diag_embed(given), lost], 2), aligned(n + 1), aligned(n + 1)
     )
 
 
 def _short_exponential(generator: Tensor, fastest: Tensor, time: Tensor) -> Tensor:
-    """exp(time · generator) where time · fastest ≤ ½; (B or 1,) both."""
+    """exp(time · generator) where time · fastest ≤ ½; both (B or 1,)."""
     one = torch.eye(generator.shape[1], dtype=generator.dtype, device=generator.device)
     shifted = (generator + fastest.reshape(-1, 1, 1) * one) * time.reshape(-1, 1, 1)
     out = one.expand(shifted.shape)
     for k in range(TERMS, 0, -1):
         out = one + torch.bmm(shifted, out) / k
-    return _closed(out)  # which takes the shift out again
+    return _normalised(out)  # this also removes the shift
 
 
-def _closed(factor: Tensor) -> Tensor:
+def _normalised(factor: Tensor) -> Tensor:
     """Rows scaled to a sum of exactly 1, so that rounding does not double with every squaring."""
     return factor / factor.sum(2, keepdim=True)
 
 
 def _rounded(factor: Tensor, dtype: torch.dtype) -> Tensor:
-    """The factor in `dtype`, with the two largest entries of each row mended so that its sum is
-    what it was.
+    """The factor in `dtype`, with two entries of each row corrected to keep the row's sum.
 
-    A sum that is off, if only by rounding, is so at every step in the same direction, and in time
-    is seen as amount gained or lost.
+    The corrected entries are the two largest.
+
+    A sum with a rounding error would be wrong at every step in the same direction, and over time
+    would show as amount gained or lost.
     """
     if dtype == factor.dtype:
         return factor

@@ -1,10 +1,9 @@
-"""One regular grid of voxels per colony. Grids of a batch may differ in size, so that each can grow
-with its colony.
+"""One regular grid of voxels per colony. Grids of a batch may differ in size and grow.
 
 The values of a signal are one flat tensor (nodes,), colony after colony, x slowest and z fastest:
-voxel (i, j, k) of an (nx, ny, nz) grid stands at (i·ny + j)·nz + k behind the first of its colony.
-A value is the mean concentration of its voxel. There are always three axes; in 2-D the third has
-one voxel, as thick as the layer.
+voxel (i, j, k) of an (nx, ny, nz) grid has index (i·ny + j)·nz + k after the first voxel of its
+colony. A value is the mean concentration of its voxel. There are always three axes; in 2-D the
+third has one voxel, as thick as the layer.
 """
 
 from __future__ import annotations
@@ -24,15 +23,18 @@ Shape = tuple[int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class GridBatch:
-    """Colonies with grids of one shape: their `places` (b,) int64 in the batch, and where their
-    values stand in a flat signal."""
+    """Colonies with grids of one shape.
+
+    places: (b,) int64, their indices in the batch. index: the positions of their values in a flat
+    signal.
+    """
 
     places: Tensor
     shape: Shape
     index: Tensor | slice
 
     def of(self, values: Tensor) -> Tensor:
-        """The values of these colonies, (b, nx, ny, nz); a view where they stand together."""
+        """The values of these colonies, (b, nx, ny, nz); a view where they are contiguous."""
         part = (
             values[self.index]
             if isinstance(self.index, slice)
@@ -43,8 +45,11 @@ class GridBatch:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The grids of B colonies. origin: (B, 3) float64, µm, the lower corner of each box; shape: (B,
-    3) int64 voxels; spacing: µm, of all."""
+    """The grids of B colonies.
+
+    origin: (B, 3) float64, µm, the lower corner of each box. shape: (B, 3) int64, numbers of
+    voxels. spacing: µm, the same for all colonies.
+    """
 
     origin: Tensor
     shape: Tensor
@@ -97,12 +102,12 @@ class Grid:
 
     @cached_property
     def offsets(self) -> Tensor:
-        """(B + 1,) int64, where each colony's values begin, and the end."""
+        """(B + 1,) int64, the start of each colony's values, and the end."""
         return offsets(self.counts)
 
     @cached_property
     def nodes(self) -> int:
-        """Voxels of all colonies."""
+        """The number of voxels of all colonies."""
         return sum(x * y * z for x, y, z in self.shapes)
 
     @cached_property
@@ -126,7 +131,7 @@ class Grid:
 
     @cached_property
     def places(self) -> Tensor:
-        """(nodes, 3) int64, the place (i, j, k) of each voxel in its colony's grid."""
+        """(nodes, 3) int64, the indices (i, j, k) of each voxel in its colony's grid."""
         within = torch.arange(self.nodes, device=self.shape.device) - self.offsets.index_select(
             0, self.owner
         )
@@ -139,7 +144,7 @@ class Grid:
 
     @cached_property
     def batches(self) -> tuple[GridBatch, ...]:
-        """The colonies, gathered by the shape of their grids, each colony in one batch."""
+        """The colonies grouped by the shape of their grids, each colony in one batch."""
         device = self.shape.device
         found: dict[Shape, list[int]] = {}
         for place, shape in enumerate(self.shapes):
@@ -162,14 +167,14 @@ class Grid:
         return tuple(out)
 
     def join(self, parts: Sequence[Tensor]) -> Tensor:
-        """Values (nodes,) from those of each of the `batches`, (b, nx, ny, nz) each and in their
-        order."""
+        """Values (nodes,) from those of the `batches`, (b, nx, ny, nz) each, in their order."""
         if len(parts) == 1:
             return parts[0].reshape(-1)
-        return torch.cat([part.reshape(-1) for part in parts]).index_select(0, self._back)
+        return torch.cat([part.reshape(-1) for part in parts]).index_select(0, self._join_index)
 
     @cached_property
-    def _back(self) -> Tensor:
+    def _join_index(self) -> Tensor:
+        """The index that restores the order of voxels after `join` concatenates the batches."""
         everything = torch.arange(self.nodes, device=self.shape.device)
         order = torch.cat([batch.of(everything).reshape(-1) for batch in self.batches])
         return torch.empty_like(order).index_copy_(0, order, everything)
@@ -183,12 +188,12 @@ class Grid:
         block: int = 8,
         fill: Sequence[float | Tensor] | None = None,
     ) -> tuple[Grid, list[Tensor]]:
-        """The grid enlarged by whole blocks of `block` voxels, on those sides where it must be to
-        cover the box low … high, and the signals on it.
+        """The grid enlarged by blocks of `block` voxels to cover a box, and the signals on it.
 
-        values: signals (nodes,) each. low, high: (B, 3) float64, µm; low = inf and high = −inf ask
-        for nothing along that axis. fill: the value of new voxels for each signal, one number or
-        one per colony; 0 without. Returns self and the same signals when nothing is needed.
+        values: signals (nodes,) each. low, high: (B, 3) float64, µm, the box; low = inf and high =
+        −inf require nothing along that axis. fill: the value of new voxels for each signal, one
+        number or one per colony; default 0. Returns self and the same signals if the grid already
+        covers the box.
         """
         if low.shape != self.origin.shape or high.shape != self.origin.shape:
             raise checks.input_error(

@@ -1,11 +1,11 @@
-"""Transport over a step by backward Euler, one axis after the other: one tridiagonal solve an axis.
+"""Transport over a step by backward Euler along one axis after the other, a tridiagonal solve each.
 
-(I − Δt T_x)(I − Δt T_y)(I − Δt T_z): first order in time, L-stable. The elimination is written as
-what it is for a matrix of exchange, amounts handed on: sweeping up, each voxel keeps one part and
-passes the rest to the next; sweeping down, likewise. Every part is non-negative and the parts add
-up to 1, so nothing becomes negative and amount is conserved to rounding at any step and in any
-precision, where the textbook elimination in float32 would lose digits as KΔt/h² grows. (The idea is
-that of Grassmann, Taksar and Heyman for Markov chains: no subtractions.)
+(I − Δt T_x)(I − Δt T_y)(I − Δt T_z): first order in time, L-stable. A matrix of exchange allows an
+elimination in terms of amounts. In the upward sweep each voxel keeps one part and passes the rest
+to the next voxel; the downward sweep does the same. Every part is non-negative and the parts add up
+to 1. So nothing becomes negative and amount is conserved to rounding at any step and in any
+precision. The textbook elimination in float32 would lose digits as KΔt/h² grows. (The idea, no
+subtractions, is that of Grassmann, Taksar and Heyman for Markov chains.)
 """
 
 from __future__ import annotations
@@ -20,53 +20,55 @@ from torchfilm.signals.operator import Exchange, Operator, entering
 
 @dataclass(frozen=True, eq=False)
 class Share:
-    """A part of an amount: part·y, or, where it is more than half of it, y − rest·y, which with
-    what is handed on adds up to y.
+    """A part of an amount y: part·y, or y − rest·y if the part is more than half.
 
-    whole: 1 where the second form holds, else 0; part: the part or −rest.
+    The second form adds up exactly to y with the amount that is passed on. whole: 1 for the second
+    form, else 0. part: the part or −rest.
     """
 
     whole: Tensor
     part: Tensor
 
     def of(self, y: Tensor) -> Tensor:
+        """The part of the amount y."""
         return torch.addcmul(self.whole * y, self.part, y)
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A factored axis, the axis first: tensors (n − 1 or n, B or 1, …). `solve` gives (I − Δt
-    T_axis)⁻¹.
+    """A factored axis, the axis first: tensors (n − 1 or n, B or 1, …).
 
-    up, down: parts handed from voxel i to i + 1 and from i + 1 to i; kept, settled: the parts that
-    stay in the upward and downward sweeps. On a periodic axis the last voxel stands aside: `ring`
-    is set, and the chain is of the others.
+    `solve` gives (I − Δt T_axis)⁻¹. up, down: the parts passed from voxel i to i + 1 and from i + 1
+    to i. kept, settled: the parts that stay in the upward and downward sweeps. On a periodic axis
+    `closure` treats the last voxel, and the chain has only the others.
     """
 
     up: Tensor
     down: Tensor
     kept: Share
     settled: Share
-    ring: Ring | None
+    closure: PeriodicClosure | None
 
     def solve(self, b: Tensor) -> Tensor:
-        """b (n, B, …) to u, (n, B, …)."""
-        if self.ring is None:
+        """The solution for b (n, B, …), of the same shape."""
+        if self.closure is None:
             return self.settled.of(
                 recurrence(self.kept.of(recurrence(b, self.up, False)), self.down, True)
             )
         head, last = b[:-1], b[-1]
         y = recurrence(head, self.up, False)
-        last = self.ring.settled.of(weighted_sum(y, self.ring.onward, last))
+        last = self.closure.settled.of(weighted_sum(y, self.closure.onward, last))
         head = self.settled.of(recurrence(self.kept.of(y), self.down, True))
-        return torch.cat([torch.addcmul(head, self.ring.back, last), last.unsqueeze(0)])
+        return torch.cat([torch.addcmul(head, self.closure.back, last), last.unsqueeze(0)])
 
 
 @dataclass(frozen=True, eq=False)
-class Ring:
-    """The last voxel of a periodic axis. onward: the part that each other voxel hands to it in the
-    upward sweep, (n − 1, …); settled: the part of what it holds then that stays; back: what is in
-    each other voxel for each unit that stays.
+class PeriodicClosure:
+    """The last voxel of a periodic axis.
+
+    onward: the part that each other voxel passes to it in the upward sweep, (n − 1, …). settled:
+    the part of its content after that sweep that stays. back: the content of each other voxel per
+    unit that stays.
     """
 
     onward: Tensor
@@ -76,11 +78,10 @@ class Ring:
 
 @dataclass(frozen=True, eq=False)
 class Implicit:
-    """u ↦ Π (I − Δt T_axis)⁻¹ (u + Δt source), what enters through an axis's faces added before its
-    solve.
+    """u ↦ Π (I − Δt T_axis)⁻¹ (u + Δt source), with the inflow of an axis added before its solve.
 
-    chains: one for each axis, or None where nothing happens; entered: None or Δt × what enters, for
-    each axis; source: likewise.
+    chains: one per axis, or None where nothing happens. entered: None or Δt × the inflow through
+    the faces, per axis. source: None or Δt × the source.
     """
 
     chains: tuple[Chain | None, ...]
@@ -88,7 +89,7 @@ class Implicit:
     source: Tensor | None
 
     def step(self, u: Tensor) -> Tensor:
-        """u (B, nx, ny, nz) a step later."""
+        """u (B, nx, ny, nz) one step later."""
         if self.source is not None:
             u = u + self.source
         for axis, (chain, entered) in enumerate(zip(self.chains, self.entered, strict=True)):
@@ -101,8 +102,8 @@ class Implicit:
 def prepare_implicit(operator: Operator, dt: float) -> Implicit:
     """The factors of a step of `dt` hours.
 
-    Decay is shared evenly among the axes that have more than one voxel: on one axis a steady field
-    is exact, on several its error is of order Δt.
+    Decay is divided evenly among the axes with more than one voxel. On one axis a steady field is
+    exact; on several its error is of order Δt.
     """
     long = [axis for axis in range(3) if operator.shape[axis] > 1] or [0]
     decay = operator.decay if operator.mask is None else operator.decay * operator.mask
@@ -122,10 +123,11 @@ def prepare_implicit(operator: Operator, dt: float) -> Implicit:
 
 
 def factor(axis: Exchange, decay: Tensor, dt: float, dtype: torch.dtype) -> Chain:
-    """The parts of one axis's solve, worked out in float64 and without subtractions.
+    """The parts of one axis's solve, computed in float64 without subtractions.
 
-    With R and Q what a voxel gives up and down in a step, over what it holds: s_i = 1 + decay + Q_i
-    s_(i−1)/p_(i−1), p_i = s_i + R_i; going up, voxel i keeps s_i/p_i; going down, 1/s_i.
+    R and Q are the rates up and down in a step, relative to a voxel's content: s_i = 1 + decay +
+    Q_i s_(i−1)/p_(i−1), p_i = s_i + R_i. In the upward sweep voxel i keeps s_i/p_i; in the downward
+    sweep, 1/s_i.
     """
     dim, n = axis.dim, axis.size
     shape = torch.broadcast_shapes(axis.up.narrow(dim, 0, 1).shape, decay.narrow(dim, 0, 1).shape)
@@ -138,8 +140,8 @@ def factor(axis: Exchange, decay: Tensor, dt: float, dtype: torch.dtype) -> Chai
     if axis.own_neighbour:
         rise, fall = torch.zeros_like(rise), torch.zeros_like(fall)
     count = n - 1 if axis.periodic and n > 1 else n
-    # what voxel i gives down comes, at last, to the chain below (s/p), back (R/p), or, around a
-    # ring, to the last voxel (c/p)
+    # an amount that voxel i gives down ends in the chain below (s/p), comes back (R/p), or, on a
+    # periodic axis, reaches the last voxel (c/p)
     s: list[Tensor] = []
     p: list[Tensor] = []
     c: list[Tensor] = []
@@ -155,19 +157,21 @@ def factor(axis: Exchange, decay: Tensor, dt: float, dtype: torch.dtype) -> Chai
     held, pivot, aside = torch.stack(s), torch.stack(p), torch.stack(c)
     kept, up_part, around = held / pivot, rise[:count] / pivot, aside / pivot
     down_part, settled = fall[1:count] * kept[:-1] / held[1:], 1 / held
-    ring = (
+    closure = (
         None
         if count == n
-        else _ring(kept, up_part, around, down_part, settled, rise[-1], fall[-1], gone[-1], dtype)
+        else _close_periodic(
+            kept, up_part, around, down_part, settled, rise[-1], fall[-1], gone[-1], dtype
+        )
     )
     keep, hand = _shares(kept[: count - 1], up_part[: count - 1], dtype)
     last, _ = _shares(kept[count - 1 :], up_part[count - 1 :], dtype)
     stay, drop = _shares(settled[1:], down_part, dtype)
     first, _ = _shares(settled[:1], torch.zeros_like(settled[:1]), dtype)
-    return Chain(hand, drop, _joined(keep, last), _joined(first, stay), ring)
+    return Chain(hand, drop, _concatenated(keep, last), _concatenated(first, stay), closure)
 
 
-def _ring(
+def _close_periodic(
     kept: Tensor,
     up: Tensor,
     around: Tensor,
@@ -177,10 +181,12 @@ def _ring(
     fall: Tensor,
     gone: Tensor,
     dtype: torch.dtype,
-) -> Ring:
-    """The last voxel of a ring; everything float64, the others' parts (n − 1, …) and its own rates
-    (…)."""
-    # how much of a unit set free in voxel i does not come back to the last voxel
+) -> PeriodicClosure:
+    """The last voxel of a periodic axis, in float64.
+
+    The other voxels' parts are (n − 1, …), the rates of the last voxel (…).
+    """
+    # the part of a unit released in voxel i that does not return to the last voxel
     stays = recurrence(kept, up[:-1], True)
     held = 1 + gone + rise * stays[0] + fall * kept[-1]
     ends = torch.zeros_like(kept)
@@ -190,12 +196,14 @@ def _ring(
     back = settled * recurrence(kept * recurrence(ends, up[:-1], False), down, True)
     onward = torch.cat([around[:-1], (around[-1] + up[-1]).unsqueeze(0)])
     share, _ = _shares((1 / held).unsqueeze(0), torch.zeros_like(held).unsqueeze(0), dtype)
-    return Ring(onward.to(dtype), Share(share.whole[0], share.part[0]), back.to(dtype))
+    return PeriodicClosure(onward.to(dtype), Share(share.whole[0], share.part[0]), back.to(dtype))
 
 
 def _shares(kept: Tensor, handed: Tensor, dtype: torch.dtype) -> tuple[Share, Tensor]:
-    """The part kept, and the part handed on, rounded to `dtype` so that together they are what they
-    were together before: the smaller is rounded, the larger is what that leaves."""
+    """The kept part and the passed part, rounded to `dtype` with their sum unchanged.
+
+    The smaller part is rounded; the larger is the remainder.
+    """
     small = kept < 0.5
     left = (kept - kept.to(dtype).to(kept.dtype)) + handed
     passed = torch.where(small & (handed > 0.5), left, handed).to(dtype)
@@ -203,13 +211,15 @@ def _shares(kept: Tensor, handed: Tensor, dtype: torch.dtype) -> tuple[Share, Te
     return Share((~small).to(dtype), part), passed
 
 
-def _joined(a: Share, b: Share) -> Share:
+def _concatenated(a: Share, b: Share) -> Share:
     return Share(torch.cat([a.whole, b.whole]), torch.cat([a.part, b.part]))
 
 
 def recurrence(b: Tensor, part: Tensor, downward: bool) -> Tensor:
-    """y_i = b_i + part_(i−1) y_(i−1) along the first dimension, or downward y_i = b_i + part_i
-    y_(i+1); b (n, …), part (n − 1, …) that broadcasts."""
+    """y_i = b_i + part_(i−1) y_(i−1) along the first dimension, or its reverse.
+
+    Downward it is y_i = b_i + part_i y_(i+1). b: (n, …). part: (n − 1, …), which broadcasts.
+    """
     return _Recurrence.apply(b, part, downward)
 
 
@@ -241,8 +251,10 @@ class _Recurrence(torch.autograd.Function):
 
 
 def weighted_sum(y: Tensor, part: Tensor, start: Tensor) -> Tensor:
-    """start + Σ_i part_i y_i over the first dimension, one after the other, so that what stands
-    beside does not change the order."""
+    """start + Σ_i part_i y_i over the first dimension, in order.
+
+    The fixed order makes the result independent of the rest of the batch.
+    """
     for row, p in zip(y.unbind(0), part.unbind(0), strict=True):
         start = torch.addcmul(start, p, row)
     return start

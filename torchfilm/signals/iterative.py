@@ -1,9 +1,8 @@
-"""Transport over a step by repeated application of the operator: the paper's Crank–Nicolson, and
-explicit Euler.
+"""Transport over a step by repeated application of the operator: Crank–Nicolson and explicit Euler.
 
-Both are here to compare with. Crank–Nicolson is second order, but its factor for the shortest waves
-tends to −1: on sharp data it rings for many steps and goes below zero. Euler is first order and
-positive, with as many sub-steps as that needs.
+Both are for comparison. Crank–Nicolson, the paper's method, is second order, but its factor for the
+shortest waves tends to −1: on sharp data it oscillates for many steps and goes below zero. Euler is
+first order and positive, with as many sub-steps as that requires.
 """
 
 from __future__ import annotations
@@ -20,18 +19,18 @@ from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 
 Map = Callable[[Tensor], Tensor]
-# Of the right-hand side's norm, what may be left. The solve is worked in float64, where this is far
-# above rounding.
+# The residual allowed, relative to the norm of the right-hand side. The solve is in float64, where
+# this is far above rounding.
 TOLERANCE = 1e-10
 MAX_ITERATIONS = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class Euler:
-    """u ↦ (I + δT)^m u, in m equal sub-steps δ = Δt/m, for each colony the least m for which δ ×
-    the greatest loss rate is at most 1.
+    """u ↦ (I + δT)^m u, in m equal sub-steps δ = Δt/m.
 
-    substeps: (B or 1,) int64. Then every entry of I + δT is ≥ 0 and no amount can grow.
+    For each colony m is the least number with δ × the greatest loss rate at most 1. substeps: m, (B
+    or 1,) int64. Then every entry of I + δT is ≥ 0 and no amount can grow.
     """
 
     operator: Operator
@@ -39,7 +38,7 @@ class Euler:
     substeps: Tensor
 
     def step(self, u: Tensor) -> Tensor:
-        """u (B, nx, ny, nz) a step later."""
+        """u (B, nx, ny, nz) one step later."""
         part = self.dt / self.substeps.double()
         for k in range(int(self.substeps.max())):
             now = torch.where(self.substeps > k, part, 0.0).to(u.dtype).reshape(-1, 1, 1, 1)
@@ -48,14 +47,17 @@ class Euler:
 
 
 def prepare_euler(operator: Operator, dt: float) -> Euler:
+    """The sub-steps of a step of `dt` hours."""
     worst = operator.loss.detach().flatten(1).amax(1)
     return Euler(operator, dt, torch.ceil(dt * worst).clamp(min=1.0).to(torch.int64))
 
 
 @dataclass(frozen=True, eq=False)
 class TransportSolveReport:
-    """For each colony, (B,): `iterations`, the true relative `residual`, and whether it is
-    `converged` (bool)."""
+    """What a solve did in each colony; every field is (B,).
+
+    iterations: of the Krylov method. residual: the true relative residual. converged: bool.
+    """
 
     iterations: Tensor
     residual: Tensor
@@ -64,19 +66,21 @@ class TransportSolveReport:
 
 @dataclass(frozen=True, eq=False)
 class CrankNicolson:
-    """u ↦ (I − Δt/2 T)⁻¹ [(I + Δt/2 T) u + Δt gain], by conjugate gradients, or BiCGStab where
-    something flows; each colony converged by itself."""
+    """u ↦ (I − Δt/2 T)⁻¹ [(I + Δt/2 T) u + Δt gain], each colony converged by itself.
+
+    The solve uses conjugate gradients, or BiCGStab where there is flow.
+    """
 
     operator: Operator
     dt: float
 
     def step(self, u: Tensor) -> Tensor:
-        """u (B, nx, ny, nz) a step later; NaN in a colony whose solve did not converge."""
+        """u (B, nx, ny, nz) one step later; NaN in a colony whose solve did not converge."""
         out, report = self.solve(u)
         return torch.where(report.converged.reshape(-1, 1, 1, 1), out, torch.nan)
 
     def solve(self, u: Tensor) -> tuple[Tensor, TransportSolveReport]:
-        """u a step later, as far as the solve came, and its report."""
+        """u one step later, as far as the solve came, and its report."""
         wide = u.double()
         linear = lambda x: apply(self.operator, x, gain=False)
         left = lambda x: x - 0.5 * self.dt * linear(x)
@@ -88,13 +92,15 @@ class CrankNicolson:
         if torch.is_grad_enabled():
             remainder = right - left(x)
             if remainder.requires_grad:
-                x = _Attach.apply(remainder, x, left, self.operator.symmetric)
+                x = _KrylovAdjoint.apply(remainder, x, left, self.operator.symmetric)
         return x.to(u.dtype), report
 
 
-class _Attach(torch.autograd.Function):
-    """The solution x of A x = b given with the remainder b − A x ≈ 0, whose derivative is that of
-    the equation: dx = A⁻¹ d(b − A x)."""
+class _KrylovAdjoint(torch.autograd.Function):
+    """The solution x of A x = b, with the derivative of the equation: dx = A⁻¹ d(b − A x).
+
+    Its input is the remainder b − A x ≈ 0.
+    """
 
     @staticmethod
     def forward(ctx, remainder: Tensor, x: Tensor, left: Map, symmetric: bool) -> Tensor:
@@ -123,13 +129,14 @@ class _Attach(torch.autograd.Function):
 
 
 def prepare_crank_nicolson(operator: Operator, dt: float) -> CrankNicolson:
+    """A step of `dt` hours."""
     return CrankNicolson(operator, dt)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """(B, …), (B, …) -> (B, 1, 1, 1)."""
     product = (a * b).reshape(-1, 1)
-    # not .sum(1): with several threads the way it divides long rows depends on how many there are
+    # not .sum(1): with several threads its division of long rows depends on their number
     return _rows(a.shape[0], a[0].numel(), str(a.device)).sum(product).reshape(-1, 1, 1, 1)
 
 
@@ -146,12 +153,14 @@ def _ratio(a: Tensor, b: Tensor) -> Tensor:
 def krylov(
     apply: Map, b: Tensor, start: Tensor, symmetric: bool
 ) -> tuple[Tensor, TransportSolveReport]:
-    """Solve A x = b, (B, nx, ny, nz), one system for each colony, each until it has converged;
-    float64. No gradient."""
+    """Solve A x = b, (B, nx, ny, nz), in float64, one system per colony, each until it converges.
+
+    No gradient.
+    """
     size = _dot(b, b)
     target = TOLERANCE**2 * size
     x, iterations = start.clone(), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
-    # what rounding made of the residual on the way is put right by starting again from the true one
+    # restarts from the true residual correct the rounding errors of the recurred one
     for _ in range(3):
         r = b - apply(x)
         going = _dot(r, r) > target
@@ -161,13 +170,14 @@ def krylov(
         iterations += spent
     r = b - apply(x)
     residual = _ratio(_dot(r, r), size).sqrt().reshape(-1)
-    # a right-hand side of zero has the answer zero, and a NaN has none
+    # a right-hand side of zero has the solution zero; a NaN never converges
     return x, TransportSolveReport(iterations, residual, (_dot(r, r) <= 100 * target).reshape(-1))
 
 
 def _conjugate_gradients(
     apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor
 ) -> tuple[Tensor, Tensor]:
+    """Returns x and the iterations of each colony, (B,)."""
     spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
     p, rr = r, _dot(r, r)
     for _ in range(MAX_ITERATIONS):
@@ -186,7 +196,7 @@ def _conjugate_gradients(
 def _bicgstab(
     apply: Map, x: Tensor, r: Tensor, going: Tensor, target: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """van der Vorst's stabilised bi-conjugate gradients."""
+    """van der Vorst's stabilised bi-conjugate gradients; returns as `_conjugate_gradients`."""
     spent = torch.zeros(x.shape[0], dtype=torch.int64, device=x.device)
     shadow, p, rho = r, r, _dot(r, r)
     for _ in range(MAX_ITERATIONS):
@@ -204,24 +214,21 @@ def _bicgstab(
         new = _dot(shadow, r)
         beta = torch.where(going, _ratio(new, rho) * _ratio(alpha, omega), 0.0)
         p, rho = torch.addcmul(r, beta, torch.addcmul(p, omega, v, value=-1.0)), new
-        # nothing left to go on with: let this colony start again from its true residual
+        # a breakdown of the method: this colony restarts from its true residual
         going = going & (alpha != 0) & (omega != 0) & (new != 0)
     return x, spent
 
 
 def convolve(operator: Operator, u: Tensor) -> Tensor:
-    """du/dt as `apply` gives it, by conv3d with a stencil of 3 × 3 × 3: the paper's equation 7, for
-    rates that are the same everywhere.
+    """du/dt as `apply` gives it, by conv3d with a stencil of 3 × 3 × 3: the paper's equation 7.
 
-    A second way to the same numbers, to check the first by. On the CPU it is many times slower than
-    differences of fluxes, and its last bits depend on what else is in the batch.
+    It requires uniform rates. It is a second way to the same numbers, to check `apply`. On the CPU
+    it is many times slower than differences of fluxes, and its last bits depend on the rest of the
+    batch.
     """
     if operator.interior is None:
         raise checks.input_error(
-            "velocity",
-            "one that varies from place to place",
-            "uniform for a convolution",
-            "Use apply.",
+            "velocity", "a velocity that is not uniform", "uniform for a convolution", "Use apply."
         )
     kernel = torch.zeros(operator.colonies, 1, 3, 3, 3, dtype=torch.float64, device=u.device)
     inside = u if operator.mask is None else u * operator.mask

@@ -1,5 +1,7 @@
-"""Where the voxels of a scene's signals are, and what lies between them: the part of a medium that
-a state carries along."""
+"""The layout of a medium: the grid of a scene's signals, obstacles and reservoir.
+
+It is the part of a medium that a state contains.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +20,11 @@ from torchfilm.tools.ragged import expand_ranges
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Where cells meet the medium, the concentration of each signal that they find there, (N,) by
-    name, and which of them stand in the reservoir beyond the box, (N,) bool, or None where there is
-    none or nobody in it."""
+    """Where cells meet the medium.
+
+    found: the concentration of each signal at the cells, (N,) by name. in_reservoir: (N,) bool,
+    cells in the reservoir beyond the box, or None if there are none.
+    """
 
     stencil: Stencil
     found: dict[str, Tensor]
@@ -28,16 +32,18 @@ class Contact:
 
     @cached_property
     def pool(self) -> Tensor:
-        """The volume of which each cell may take up all that is there, (N,) µm³."""
+        """The volume whose whole content each cell may take up, (N,) µm³."""
         return pool_volume(self.stencil)
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """grid: one a colony. periodic: along which axes space closes on itself. height: z of the plane
-    of 2-D cells, µm. obstacle: a function from places (nodes, 3) µm to (nodes,) bool, true where no
-    signal can be, or None. reservoir: None, or what cells beyond the box find there, the
-    concentration of each signal by name, one number or one per colony of the scene.
+    """The space of a medium.
+
+    grid: one per colony. periodic: the axes along which space is periodic. height: z of the plane
+    of 2-D cells, µm. obstacle: a function from positions (nodes, 3) µm to (nodes,) bool, true where
+    no signal can be, or None. reservoir: None, or the concentration of each signal by name for
+    cells beyond the box, one number or one per colony of the scene.
     """
 
     grid: Grid
@@ -61,16 +67,17 @@ class Layout:
             raise checks.input_error(
                 "obstacles(places)",
                 shown,
-                f"a bool tensor of shape ({self.grid.nodes},), one value for each place",
+                f"a bool tensor of shape ({self.grid.nodes},), one value per position",
             )
         if not bool((~solid).any()):
             raise checks.InputError(
-                "obstacles(places) is true everywhere: nothing is left of the medium."
+                "obstacles(places) is true everywhere, so no medium remains. Return False where"
+                " signals can be."
             )
         return ~solid
 
     def places(self, position: Tensor) -> Tensor:
-        """Where cells at (N, d) are in the three dimensions of the grid, (N, 3) float64, µm."""
+        """The positions of cells at (N, d) in the grid's three dimensions, (N, 3) float64, µm."""
         if position.shape[1] == 3:
             return position.double()
         return torch.cat(
@@ -82,7 +89,7 @@ class Layout:
         )
 
     def stencil(self, position: Tensor, colony: Tensor, dtype: torch.dtype) -> Stencil:
-        """Where cells at (N, d) µm of colonies (N,) meet the grid."""
+        """The stencil of cells at (N, d) µm of colonies (N,)."""
         return stencil(
             self.grid,
             self.places(position),
@@ -93,8 +100,10 @@ class Layout:
         )
 
     def outside_medium(self, position: Tensor, colony: Tensor) -> Tensor:
-        """Which cells at (N, d) µm of colonies (N,) are where no medium is, (N,) bool: beyond the
-        box, if it stands in no reservoir, or in an obstacle."""
+        """Which cells at (N, d) µm of colonies (N,) are outside the medium, (N,) bool.
+
+        They are in an obstacle, or beyond a box without a reservoir.
+        """
         if self.obstacle is None:
             return outside_box(self.grid, self.places(position), colony, self.periodic)
         where = self.stencil(position, colony, torch.float64)
@@ -109,8 +118,10 @@ class Layout:
         signals: Mapping[str, Tensor],
         dtype: torch.dtype,
     ) -> Contact:
-        """What cells at (N, d) µm of colonies (N,), whose ids are `ids` (N,), find of each signal
-        (nodes,)."""
+        """The concentration of each signal (nodes,) at cells at (N, d) µm of colonies (N,).
+
+        ids: (N,), the ids of the cells' colonies.
+        """
         where = self.stencil(position, colony, dtype)
         found = {name: read(value, where) for name, value in signals.items()}
         if self.reservoir is None:
@@ -128,8 +139,11 @@ class Layout:
     def on_faces(
         self, flow: Callable[[Tensor], Tensor], batch: GridBatch
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """A velocity field, a function from places (M, 3) µm to velocities (M, 2 or 3), on the
-        faces of the voxels of some colonies: (b, nx + 1, ny, nz) along x, and so on."""
+        """A velocity field on the voxel faces of some colonies.
+
+        flow: a function from positions (M, 3) µm to velocities (M, 2 or 3). Returns (b, nx + 1, ny,
+        nz) along x, and so on.
+        """
         out = []
         step, origin = self.grid.step, self.grid.origin.index_select(0, batch.places)
         for axis in range(3):
@@ -158,7 +172,7 @@ class Layout:
         return self if grid is self.grid else replace(self, grid=grid)
 
     def take(self, places: Tensor) -> tuple[Layout, Tensor]:
-        """The layout of some colonies (b,), and the rows (nodes,) of their voxels in this one."""
+        """The layout of some colonies (b,), and the indices (nodes,) of their voxels here."""
         grid = Grid(
             self.grid.origin.index_select(0, places),
             self.grid.shape.index_select(0, places),

@@ -1,4 +1,4 @@
-"""The box of a medium and what flows through it, as a user gives them: checked, and in one form."""
+"""Checks of the box of a medium and of its flow, as a user gives them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from torch import Tensor
 
 from torchfilm.tools import checks
 
-# The most of a colony's grid, 0.27 GB a signal in float32; where it grows, one cell that is flung
-# far away must not take all memory there is.
+# The most voxels of a colony's grid, 0.27 GB per signal in float32. Where the grid grows, one cell
+# that moves far away must not take all memory.
 MOST_VOXELS = 2**26
 
 
 def checked_box(
     box: Any, spacing: Any, depth: float | None, height: float
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Lower and upper corner and size of voxels, checked."""
+    """Returns the lower corner, the upper corner and the size of voxels, checked."""
     try:
         low, high = (tuple(float(x) for x in corner) for corner in box)
     except (TypeError, ValueError) as error:
@@ -55,19 +55,17 @@ def checked_box(
             )
     voxels = math.prod(round((b - a) / h) for a, b, h in zip(low, high, voxel, strict=True))
     if voxels > MOST_VOXELS:
-        hint = f"Here it is {voxels:,}: a larger spacing, or a smaller box."
+        hint = f"It has {voxels:,}; give a larger spacing or a smaller box."
         raise checks.input_error(
             "Medium.box",
             (low, high),
-            f"of at most {MOST_VOXELS:,} voxels of {spacing} µm a colony",
+            f"of at most {MOST_VOXELS:,} voxels of {spacing} µm per colony",
             hint,
         )
     if depth is not None:
         checks.number("Medium.depth", depth, above=0.0)
         if len(low) == 3:
-            raise checks.input_error(
-                "Medium.depth", depth, "left out where the box has three dimensions"
-            )
+            raise checks.input_error("Medium.depth", depth, "omitted for a box of three dimensions")
     checks.number("Medium.height", height)
     if len(low) == 3 and not low[2] <= height <= high[2]:
         raise checks.input_error(
@@ -77,17 +75,19 @@ def checked_box(
 
 
 def checked_flow(name: str, given: Any) -> Any:
-    """A velocity as numbers, one or one per colony each, or the function or None that it was given
-    as, checked."""
+    """Returns a checked velocity: None, a function, or a tuple of numbers.
+
+    Each component is one number or one per colony.
+    """
     if given is None or callable(given):
         return given
     if not isinstance(given, (tuple, list, Tensor)) or len(given) not in (2, 3):
-        raise checks.input_error(name, given, "two or three numbers, or a function of places")
+        raise checks.input_error(name, given, "two or three numbers, or a function of positions")
     if isinstance(given, Tensor) and given.dim() == 2:
         raise checks.input_error(
             name,
             tuple(given.shape),
             "two or three components",
-            "For one velocity a colony give (vx, vy), each a tensor with one number per colony.",
+            "For one velocity per colony give (vx, vy), each a tensor with one number per colony.",
         )
     return tuple(checks.value(f"{name}[{k}]", v) for k, v in enumerate(given))

@@ -1,11 +1,12 @@
-"""A step of transport: the methods, which of them suits, and the one door to them.
+"""A step of transport: the methods, and the choice between them.
 
-| method           | order in Δt | positive, conserves at any Δt | works for                                  |
-|------------------|-------------|-------------------------------|--------------------------------------------|
-| "exponential"    | exact       | yes                           | no obstacle, velocity the same everywhere  |
-| "implicit"       | 1           | yes                           | everything                                 |
-| "crank_nicolson" | 2           | rings, goes below 0           | everything; the paper's, for comparison    |
-| "euler"          | 1           | yes, by sub-steps             | everything; the oracle                     |
+| method           | order in Δt | positive, conserves at any Δt | works for                    |
+|------------------|-------------|-------------------------------|------------------------------|
+| "exponential"    | exact       | yes                           | no obstacle, uniform flow    |
+| "implicit"       | 1           | yes                           | everything                   |
+| "crank_nicolson" | 2           | oscillates, goes below 0      | everything; the paper's, for |
+|                  |             |                               | comparison                   |
+| "euler"          | 1           | yes, by sub-steps             | everything; the reference    |
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from torchfilm.tools import checks
 
 
 class Stepper(Protocol):
-    """A step of fixed length, its factors worked out once."""
+    """A step of fixed length, with its factors computed once."""
 
     def step(self, u: Tensor) -> Tensor:
-        """u (B, nx, ny, nz) a step later."""
+        """u (B, nx, ny, nz) one step later."""
         ...
 
 
@@ -40,12 +41,12 @@ METHODS: dict[str, Callable[[Operator, float], Stepper]] = {
 
 
 def choose(operator: Operator) -> str:
-    """The method that suits: "exponential" where it is possible, else "implicit"."""
+    """The suitable method: "exponential" where it is possible, else "implicit"."""
     return "exponential" if operator.separable else "implicit"
 
 
 def prepare(operator: Operator, dt: float, method: str | None = None) -> Stepper:
-    """A step of `dt` hours by `method`, or by the one that suits."""
+    """A step of `dt` hours by `method`; default: the suitable one."""
     if method is not None:
         checks.choice("method", method, tuple(METHODS))
     dt = checks.number("dt", dt, above=0.0, most=math.inf)

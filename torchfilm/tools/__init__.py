@@ -1,1 +1,1 @@
-"""Tools that know nothing of cells."""
+"""General tools, without knowledge of cells."""

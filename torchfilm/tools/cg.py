@@ -1,5 +1,7 @@
-"""Preconditioned conjugate gradients for many independent systems at once, each converged by
-itself."""
+"""Preconditioned conjugate gradients for many independent systems at once.
+
+Each system converges by itself.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +13,18 @@ from torch import Tensor
 
 from torchfilm.tools.ragged import Groups
 
-# How often the host asks whether every system is done. Asking stalls a GPU's queue; the answer
-# never changes a result, because a finished system no longer moves.
+# The number of iterations between the host's checks whether every system is done. A check stalls a
+# GPU's queue. It never changes a result, because a finished system does not move.
 CHECK_EVERY = {"cpu": 1, "cuda": 8}
 
 
 @dataclass(frozen=True)
 class CGResult:
-    """x (N, D); iterations (B,) int64 spent on each system; worst (B,) greatest preconditioned
-    residual left, as recurred."""
+    """The result of a CG solve.
+
+    x: (N, D). iterations: (B,) int64 for each system. worst: (B,) the greatest preconditioned
+    residual at the end, as recurred.
+    """
 
     x: Tensor
     iterations: Tensor
@@ -27,7 +32,7 @@ class CGResult:
 
 
 def worst_of(value: Tensor, groups: Groups) -> Tensor:
-    """Greatest |entry| of (N, D) in each group, (B,); NaN where one is."""
+    """Greatest |entry| of (N, D) in each group, (B,); NaN where an entry is NaN."""
     if groups.size == 1 and value.numel():
         return value.detach().abs().amax().reshape(1)
     return groups.max(value.abs().amax(1))
@@ -35,13 +40,15 @@ def worst_of(value: Tensor, groups: Groups) -> Tensor:
 
 def _dot(a: Tensor, b: Tensor, groups: Groups) -> Tensor:
     """a · b of (N, D) in each group, (B, 1)."""
-    # the rows of a group first: to sum each short row by itself takes twice as long
+    # sum over the rows of a group first: to sum each short row first takes twice as long
     return groups.sum(a * b).sum(1, keepdim=True)
 
 
 def _for_rows(value: Tensor, groups: Groups, width: int) -> Tensor:
-    """A number of each group (B, 1) for each entry of (N, D), or (1, 1) for all; as a column, which
-    is spread as it is read, it would take six times as long."""
+    """The number of each group (B, 1), repeated for each entry of (N, D), or (1, 1) for one group.
+
+    It is written out in full width: a column that broadcasts would take six times as long.
+    """
     return (
         value
         if groups.size == 1
@@ -58,12 +65,11 @@ def conjugate_gradients(
     target: Tensor,
     max_iterations: int,
 ) -> CGResult:
-    """Solve A x = b from x = 0 for symmetric positive definite A, rows of each group in `groups` a
-    system of its own.
+    """Solve A x = b from x = 0 for symmetric positive definite A, one system per group.
 
     b: (N, D). `apply` and `precondition` map (N, D) to (N, D) and keep groups apart. A system stops
     when its greatest preconditioned residual is at most target (B,), or is not finite, or after
-    `max_iterations`; the others go on.
+    `max_iterations`; the others continue.
     """
     x = torch.zeros_like(b)
     r = b.clone()

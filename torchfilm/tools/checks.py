@@ -1,4 +1,4 @@
-"""Checks of input, all in one voice: which name, which value, what is allowed, what to do."""
+"""Checks of user input, with one message style: the name, the value, the rule, the fix."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Value = float | Tensor | Sequence[float]
 
 
 class InputError(ValueError):
-    """Something given to torchfilm is not allowed; raised before anything runs."""
+    """Invalid input to torchfilm; raised before anything runs."""
 
 
 class SimulationError(RuntimeError):
-    """A run cannot go on. `colonies` holds the ids of the colonies that failed."""
+    """A run cannot continue. `colonies` has the ids of the colonies that failed."""
 
     def __init__(self, message: str, colonies: Sequence[int] = ()):
         super().__init__(message)
@@ -30,7 +30,7 @@ class SimulationError(RuntimeError):
 
 
 def input_error(name: str, value: object, allowed: str, hint: str = "") -> InputError:
-    """The error for a value that is not allowed; raise what this returns."""
+    """The error for an invalid value. The caller raises it."""
     shown = repr(value) if len(repr(value)) < 120 else repr(value)[:117] + "..."
     return InputError(
         f"{name} = {shown} is not allowed: it must be {allowed}." + (f" {hint}" if hint else "")
@@ -72,7 +72,7 @@ def number(
     most: float = math.inf,
     hint: str = "",
 ) -> float:
-    """One finite number within bounds."""
+    """Returns one finite number within bounds, or raises InputError."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise input_error(name, value, "a number", hint)
     rule = _rule(above, least, most)
@@ -89,8 +89,10 @@ def value(
     least: float = -math.inf,
     most: float = math.inf,
 ) -> float | Tensor:
-    """One number, or one per colony: a float or a 1-D tensor of floats, each within bounds. A
-    tensor keeps its gradient."""
+    """One number, or one per colony: returns a float or a 1-D tensor of floats.
+
+    Raises InputError if an entry is outside the bounds. A tensor keeps its gradient.
+    """
     if isinstance(given, (list, tuple)):
         try:
             given = torch.tensor(given, dtype=torch.float64)
@@ -115,28 +117,30 @@ def value(
         )
     if not given.is_floating_point():
         given = given.double()
-    seen = given.detach()
-    good = torch.isfinite(seen) & (seen > above) & (seen >= least) & (seen <= most)
+    detached = given.detach()
+    good = torch.isfinite(detached) & (detached > above) & (detached >= least) & (detached <= most)
     if not bool(good.all()):
         where = torch.nonzero(~good.reshape(-1)).reshape(-1)
         at = int(where[0])
         raise InputError(
-            f"{name}[{at}] = {float(seen.reshape(-1)[at])} is not allowed ({len(where)} of"
-            f" {seen.numel()} values): each must be {_rule(above, least, most)}."
+            f"{name}[{at}] = {float(detached.reshape(-1)[at])} is not allowed ({len(where)} of"
+            f" {detached.numel()} values): each must be {_rule(above, least, most)}."
         )
     return given
 
 
 def below(low: float | Tensor, high: float | Tensor) -> bool:
-    """Whether low < high, everywhere."""
+    """Whether low < high for every entry."""
     return bool((torch.as_tensor(low).detach() < torch.as_tensor(high).detach()).all())
 
 
 def corners(
     name: str, low: object, high: object, hint: str = ""
 ) -> tuple[tuple[float | Tensor, ...], tuple[float | Tensor, ...]]:
-    """Two opposite corners, low < high along every axis; entries are numbers (±inf allowed) or one
-    number per colony."""
+    """Two opposite corners, with low < high along every axis, as two tuples.
+
+    Entries are numbers (±inf allowed) or one number per colony.
+    """
     if not all(
         isinstance(corner, (tuple, list, Tensor)) or hasattr(corner, "__array__")
         for corner in (low, high)
@@ -172,6 +176,7 @@ def corners(
 
 
 def _rule(above: float, least: float, most: float) -> str:
+    """The bounds in words."""
     parts = ["finite"]
     if above > -math.inf:
         parts.append(f"above {above:g}")
@@ -183,12 +188,13 @@ def _rule(above: float, least: float, most: float) -> str:
 
 
 def choice(name: str, given: object, allowed: Sequence[object]) -> None:
+    """Raises InputError if the value is not one of `allowed`."""
     if given not in allowed:
         raise input_error(name, given, "one of " + ", ".join(repr(a) for a in allowed))
 
 
 def vector(name: str, given: object, size: int | None = None) -> tuple[float, ...]:
-    """A short tuple of finite numbers."""
+    """Returns a short tuple of finite numbers, or raises InputError."""
     try:
         out = tuple(float(x) for x in given)  # type: ignore[attr-defined]
     except (TypeError, ValueError) as error:

@@ -1,5 +1,4 @@
-"""What a piece of work asks of torch: operators dispatched, and bytes allocated for their results.
-Free of the hardware's speed."""
+"""Counts of torch operators and of the bytes that they allocate, independent of hardware speed."""
 
 from __future__ import annotations
 
@@ -12,8 +11,11 @@ from torch.utils._pytree import tree_leaves
 
 
 class Operators(TorchDispatchMode):
-    """Within `with Operators() as seen:` every operator is counted by name in `seen.calls`, and in
-    `seen.bytes` the memory of results that are not views."""
+    """Counts operators within `with Operators() as seen:`.
+
+    `seen.calls` has the number of calls by name; `seen.bytes` the memory of results that are not
+    views.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -22,13 +24,12 @@ class Operators(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        # or torch would load its compiler, a second or two, only to be told to leave this class
-        # alone
+        # otherwise torch would load its compiler, for a second or two, only to skip this class
         return False
 
     @property
     def total(self) -> int:
-        """Operators in all."""
+        """The number of operators."""
         return sum(self.calls.values())
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -40,10 +41,10 @@ class Operators(TorchDispatchMode):
             for x in tree_leaves(out)
             if _plain(x)
         }
-        self.bytes += sum(size for place, size in new.items() if place not in before)
+        self.bytes += sum(size for address, size in new.items() if address not in before)
         return out
 
 
 def _plain(x: object) -> bool:
-    """Whether x is a tensor with memory of its own kind, which a sparse one has not."""
+    """Whether x is a strided tensor; a sparse one has no memory of that kind."""
     return isinstance(x, Tensor) and x.layout.__str__() == "torch.strided"

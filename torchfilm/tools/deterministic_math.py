@@ -1,13 +1,17 @@
-"""Powers and other functions whose bits do not depend on where an element stands.
+"""Powers and other functions whose bits do not depend on an element's place in a tensor.
 
-On the CPU torch works through a tensor in blocks of a vector register and finishes the remainder
-one by one, by another library: for some functions the two differ in the last bit, so an element's
-value depends on its place and on its company. Found so on torch 2.13 (AVX-512, both precisions):
-pow with any exponent other than the plain numbers 0, 1, 2, 3, ±½, −1, −2 (a tensor that holds 2 is
-not exempt), a number to the power of a tensor, exp2, sinh, cosh, atanh, sigmoid, softplus, silu,
-elu, gelu, mish, logit (strided), logaddexp, hypot, atan2, gammainc. Found steady, with their
-derivatives: exp, expm1, log, log2, log10, log1p, sqrt, rsqrt, sin, cos, tan, asin, acos, atan,
-tanh, asinh, acosh, erf, erfc, erfinv, lgamma, gammaincc, log_sigmoid and the four operations.
+On the CPU torch works through a tensor in blocks of a vector register, and finishes the remainder
+one by one with another library. For some functions the two differ in the last bit, so an element's
+value depends on its place and on the tensor's size.
+
+Functions found to differ, on torch 2.13 (AVX-512, both precisions): pow with any exponent other
+than the plain numbers 0, 1, 2, 3, ±½, −1, −2 (also a tensor with value 2), a number to the power of
+a tensor, exp2, sinh, cosh, atanh, sigmoid, softplus, silu, elu, gelu, mish, logit (strided),
+logaddexp, hypot, atan2, gammainc.
+
+Functions found deterministic, with their derivatives: exp, expm1, log, log2, log10, log1p, sqrt,
+rsqrt, sin, cos, tan, asin, acos, atan, tanh, asinh, acosh, erf, erfc, erfinv, lgamma, gammaincc,
+log_sigmoid and the four operations.
 """
 
 from __future__ import annotations
@@ -20,34 +24,35 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-MOST_SQUARED = 64  # a greater whole exponent goes by exp and log, whose error is then the smaller
+# Larger integer exponents use exp and log, whose error is then smaller.
+MAX_SQUARED = 64
 # |x| at or below this counts as 0 where a logarithm is taken: the second derivative, ~ 1/x², must
-# stay a number of the dtype
+# not overflow the dtype.
 FLOOR = {torch.float32: 1e-18, torch.float64: 1e-150}
 
 
 def power(x: Tensor, n: float | Tensor) -> Tensor:
-    """xⁿ by steady functions, to a few units in the last place times n log x; n a number or a
-    tensor that broadcasts with x.
+    """xⁿ by deterministic functions; n is a number or a tensor that broadcasts with x.
 
-    Whole exponents take any x; for others a negative x gives NaN, and one at or below FLOOR counts
-    as 0. With n ≥ 1 the value and two derivatives at x = 0 are right where they are finite; those
-    that are infinite there (of √x, the second of x^1.5) come out 0.
+    The error is a few units in the last place times n log x. Integer exponents take any x. For
+    other exponents a negative x gives NaN, and |x| at or below FLOOR counts as 0. With n ≥ 1 the
+    value and two derivatives at x = 0 are right where they are finite. Infinite ones (of √x, the
+    second of x^1.5) are returned as 0.
     """
     if isinstance(n, Tensor):
         return _tensor_power(x, n)
     if n < 0:
         return power(x, -n).reciprocal()
     whole = math.floor(n) if math.isfinite(n) else 0
-    if whole > MOST_SQUARED or not math.isfinite(n):
+    if whole > MAX_SQUARED or not math.isfinite(n):
         return _tensor_power(x, torch.tensor(n, dtype=x.dtype, device=x.device))
     if n == whole:
-        return _whole_power(x, whole)
-    root = _broken_power(x, n - whole)
-    return _whole_power(x, whole) * root if whole else root
+        return _integer_power(x, whole)
+    root = _fractional_power(x, n - whole)
+    return _integer_power(x, whole) * root if whole else root
 
 
-def _whole_power(x: Tensor, n: int) -> Tensor:
+def _integer_power(x: Tensor, n: int) -> Tensor:
     """xⁿ for n = 0, 1, 2, … by squaring."""
     if n <= 1:
         return x.clone() if n else torch.ones_like(x)
@@ -62,8 +67,8 @@ def _whole_power(x: Tensor, n: int) -> Tensor:
     return out
 
 
-def _broken_power(x: Tensor, n: float) -> Tensor:
-    """xⁿ for 0 < n < 1; 0 with zero derivative at 0, NaN below."""
+def _fractional_power(x: Tensor, n: float) -> Tensor:
+    """xⁿ for 0 < n < 1; 0 with zero derivative at x = 0, NaN below."""
     positive = x > _floor(x)
     safe = torch.where(positive, x, 1.0)
     out = safe.sqrt() if n == 0.5 else torch.exp(n * torch.log(safe))
@@ -71,8 +76,10 @@ def _broken_power(x: Tensor, n: float) -> Tensor:
 
 
 def _tensor_power(x: Tensor, n: Tensor) -> Tensor:
-    """xⁿ = xᵐ · |x|ⁿ⁻ᵐ with m = 0, 1 or 2, so that value and two derivatives by x are right at x =
-    0 for whole exponents."""
+    """xⁿ = xᵐ · |x|ⁿ⁻ᵐ with m = 0, 1 or 2.
+
+    So the value and two derivatives by x are right at x = 0 for integer exponents.
+    """
     m = n.detach().floor().clamp(0, 2)
     rest = n - m
     zero = x.abs() <= _floor(x)
@@ -84,7 +91,7 @@ def _tensor_power(x: Tensor, n: Tensor) -> Tensor:
     odd = torch.remainder(fixed, 2.0)
     below = x < 0
     out = torch.where(below & (odd == 1), -out, out)
-    # a constant NaN: a product with one would hand NaN back to elements that never used it
+    # a constant NaN: a product with NaN would pass NaN gradients to elements that never used it
     out = torch.where(below & (odd != 0) & (odd != 1), torch.nan, out)
     return torch.where(m == 0, out, torch.where(m == 1, x, x * x) * out)
 
@@ -107,7 +114,7 @@ def sigmoid(x: Tensor) -> Tensor:
 
 
 def softplus(x: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
-    """log(1 + e^{βx})/β; exact also beyond the threshold, which is there for torch's signature."""
+    """log(1 + e^{βx})/β, exact beyond `threshold` too, which exists for torch's signature."""
     y = x * beta
     positive = y >= 0
     tail = torch.log1p(torch.exp(torch.where(positive, -y, y)))
@@ -143,7 +150,9 @@ def logaddexp(x: Tensor, y: Tensor) -> Tensor:
     """log(eˣ + eʸ)."""
     first = x >= y
     high, low = torch.where(first, x, y), torch.where(first, y, x)
-    gap = torch.where(torch.isfinite(high), low - high, 0.0)  # infinities have no difference
+    gap = torch.where(
+        torch.isfinite(high), low - high, 0.0
+    )  # the difference of infinities is undefined
     return high + torch.log1p(torch.exp(gap))
 
 
@@ -183,8 +192,8 @@ def _floating(function: Callable[..., Tensor]) -> Callable[..., Tensor | None]:
     )
 
 
-# What stands in for what; a function that returns None leaves the work to torch.
-STEADY: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
+# Replacements of torch's functions. A replacement that returns None leaves the call to torch.
+REPLACEMENTS: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
     **dict.fromkeys((torch.pow, Tensor.pow, Tensor.__pow__), _pow),
     **dict.fromkeys((Tensor.__rpow__,), _rpow),
     **dict.fromkeys((Tensor.pow_, Tensor.__ipow__), _ipow),
@@ -206,22 +215,21 @@ STEADY: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
 }
 
 
-class _Steady(TorchFunctionMode):
+class _DeterministicMode(TorchFunctionMode):
     def __torch_function__(self, func, types, args=(), kwargs=None):
-        mine = STEADY.get(func)
-        if mine is not None and not (kwargs and "out" in kwargs):
-            found = mine(*args, **(kwargs or {}))
+        replacement = REPLACEMENTS.get(func)
+        if replacement is not None and not (kwargs and "out" in kwargs):
+            found = replacement(*args, **(kwargs or {}))
             if found is not None:
                 return found
         return func(*args, **(kwargs or {}))
 
 
 def deterministic_functions() -> TorchFunctionMode:
-    """Within `with deterministic_functions():` torch's unsteady functions are replaced by the steady ones
-    of this module.
+    """Within `with deterministic_functions():` this module's functions replace torch's.
 
-    Covers pow and **, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp and hypot,
-    in the forward and reverse modes of autograd. Not covered: gelu, mish, logit, atan2, gammainc,
-    matrix products. Costs about a microsecond a torch call.
+    It covers pow and **, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp and
+    hypot, in the forward and reverse modes of autograd. It does not cover gelu, mish, logit, atan2,
+    gammainc and matrix products. The cost is about a microsecond per torch call.
     """
-    return _Steady()
+    return _DeterministicMode()

@@ -1,5 +1,4 @@
-"""What a thing is made of, as a digest: equal for things that are alike, in this process and in
-another."""
+"""Digests of Python objects: equal for equal content, in this process and in another."""
 
 from __future__ import annotations
 
@@ -16,59 +15,60 @@ import numpy as np
 import torch
 
 
-def without_addresses(words: str) -> str:
-    """How a thing is written, without where it lies in the memory of this process."""
-    return re.sub(r" at 0x[0-9a-f]+", "", words)
+def without_addresses(text: str) -> str:
+    """A text, such as a repr, without memory addresses of this process."""
+    return re.sub(r" at 0x[0-9a-f]+", "", text)
 
 
 def digest(*things: Any) -> str:
-    """A short hexadecimal word that differs where numbers, arrays, options or the code of functions
-    differ.
+    """A short hexadecimal word that differs where numbers, arrays, options or functions differ.
 
-    Lists and tuples, and floats of any precision, go by what they hold. Functions go by what they
-    do: their code, defaults, what they hold on to and what they use of their own module, not their
-    names, line numbers or docstrings; objects of a user's class by their attributes and functions.
-    What is imported from elsewhere is not looked into, and versions of Python may compile one
-    function in two ways.
+    Lists and tuples count as equal if their items do, and floats of any precision if their values
+    do. A function counts by its code, its defaults, its closure and the globals of its own module
+    that it uses. Its name, line numbers and docstring do not count. An object of a user's class
+    counts by its attributes and methods. Names imported from other modules are not followed.
+    Different versions of Python may compile one function in different ways, and so give different
+    digests.
     """
-    made = hashlib.sha256()
-    _add(made, things, set())
-    return made.hexdigest()[:16]
+    hasher = hashlib.sha256()
+    _add(hasher, things, set())
+    return hasher.hexdigest()[:16]
 
 
-def _add(made: Any, thing: Any, within: set[int]) -> None:
+def _add(hasher: Any, thing: Any, enclosing: set[int]) -> None:
     if isinstance(thing, torch.Tensor):
         thing = thing.detach().cpu().numpy()
     if isinstance(thing, np.ndarray):
         if thing.dtype.kind == "f":
-            # a number from a file is the number that was written, in whatever precision
+            # a number from a file equals the written number, in any precision
             thing = thing.astype(np.float64)
-        made.update(
+        hasher.update(
             f"array {thing.dtype} {thing.shape} ".encode() + np.ascontiguousarray(thing).tobytes()
         )
         return
     if isinstance(thing, (str, bytes, int, float, bool, complex, type(None))):
-        made.update(f"{type(thing).__name__} {thing!r};".encode())
+        hasher.update(f"{type(thing).__name__} {thing!r};".encode())
         return
-    if id(thing) in within:  # a thing that holds itself, as a function that calls itself does
-        made.update(b"again;")
+    if id(thing) in enclosing:  # an object that contains itself, such as a recursive function
+        hasher.update(b"again;")
         return
-    within = within | {id(thing)}
-    # a list may have been a tuple before it was in a file
-    made.update(f"{'list' if isinstance(thing, tuple) else type(thing).__name__}(".encode())
+    enclosing = enclosing | {id(thing)}
+    # a list may have been a tuple before it was written to a file
+    hasher.update(f"{'list' if isinstance(thing, tuple) else type(thing).__name__}(".encode())
     for part in _parts(thing):
-        _add(made, part, within)
-    made.update(b")")
+        _add(hasher, part, enclosing)
+    hasher.update(b")")
 
 
 OURS = ("torchfilm", "design", "torch", "numpy", "builtins")
 
 
 def _parts(thing: Any) -> list[Any]:
+    """The parts of an object that count for its digest."""
     if isinstance(thing, FunctionType):
-        held = [c.cell_contents for c in thing.__closure__ or () if not _is_empty(c)]
+        closure = [c.cell_contents for c in thing.__closure__ or () if not _is_empty(c)]
         code = thing.__code__
-        # its first constant may be its docstring, which does nothing
+        # its first constant may be its docstring, which has no effect
         used = code.co_consts[1:] if code.co_consts[:1] == (thing.__doc__,) else code.co_consts
         return [
             code.co_code,
@@ -76,7 +76,7 @@ def _parts(thing: Any) -> list[Any]:
             used,
             thing.__defaults__,
             thing.__kwdefaults__,
-            *held,
+            *closure,
             *_globals(thing),
         ]
     if isinstance(thing, MethodType):
@@ -99,13 +99,13 @@ def _parts(thing: Any) -> list[Any]:
         return [without_addresses(repr(thing))]
     kind = type(thing)
     if dataclasses.is_dataclass(thing):
-        # what is not shown is not given by the user but worked out
+        # fields without repr are derived, not given by the user
         given = [getattr(thing, f.name) for f in dataclasses.fields(thing) if f.repr]
     elif kind.__module__.split(".")[0] in OURS:
         return [kind.__qualname__, without_addresses(repr(thing))]
     else:
         given = [x for name, value in vars(thing).items() for x in (name, value)]
-    # a class of the user's own is also what its functions do
+    # a user's class also counts by its functions
     own = [c for c in kind.__mro__ if c.__module__.split(".")[0] not in OURS]
     return [
         kind.__qualname__,
@@ -115,7 +115,7 @@ def _parts(thing: Any) -> list[Any]:
 
 
 def _globals(function: FunctionType) -> list[Any]:
-    """What a function uses of its own module: numbers, texts, arrays and other functions of it."""
+    """The numbers, texts, arrays and functions of its own module that a function uses."""
     names: list[str] = []
     codes = [function.__code__]
     while codes:
@@ -136,6 +136,6 @@ def _globals(function: FunctionType) -> list[Any]:
 
 def _is_empty(cell: Any) -> bool:
     try:
-        return cell.cell_contents is cell  # raises where nothing was put in yet
+        return cell.cell_contents is cell  # raises ValueError for an empty cell
     except ValueError:
         return True

@@ -1,5 +1,4 @@
-"""The user's functions, from a file that may be edited while a run is going, and what they must not
-do."""
+"""The user's functions from a file, reloaded when the file is edited during a run."""
 
 from __future__ import annotations
 
@@ -18,8 +17,10 @@ T = TypeVar("T")
 
 
 def load_functions(path: Path, names: tuple[str, ...]) -> Functions:
-    """Run a Python file of the user's and return those of its functions that have one of the
-    names."""
+    """Run a user's Python file and return its functions with the given names.
+
+    Raises InputError if the file defines none of them.
+    """
     given = run_file(path)
     found = {name: given.get(name) for name in names}
     if not any(map(callable, found.values())):
@@ -28,17 +29,19 @@ def load_functions(path: Path, names: tuple[str, ...]) -> Functions:
 
 
 def unchanged(now: Tensor, then: Tensor) -> bool:
-    """Whether two tensors hold the same, a NaN taken for equal to itself: what is not finite is the
-    driver's matter, not a rule's."""
+    """Whether two tensors are equal, with NaN equal to NaN.
+
+    The driver checks for non-finite values; a rule is not responsible for them.
+    """
     return torch.equal(now, then) or bool(((now == then) | ((now != now) & (then != then))).all())
 
 
 class HotReload:
-    """Functions by name and the file, if any, that they came from.
+    """Functions by name, and the file (if any) that defines them.
 
-    While `watching`, an edit is taken up at the next `refresh`; one that is broken is reported in
-    `messages`, at once or when it first fails, and the functions before it go on. Messages carry
-    the simulated time of the last `refresh`.
+    While `watching` is set, `refresh` loads an edited file. `messages` reports a broken edit, when
+    it fails to load or when it first fails; the previous functions stay in use. Messages give the
+    simulated time of the last `refresh`.
     """
 
     def __init__(self, path: Path | None, functions: Functions):
@@ -51,20 +54,20 @@ class HotReload:
         self._proven = True
 
     def refresh(self, time: float) -> None:
-        """Take up an edited file if it loads. time: simulated, h."""
+        """Load the file again if it was edited. time: simulated, h."""
         self._time = time
         if not self.watching or self.path is None:
             return
         try:
             stamp = self.path.stat().st_mtime_ns
         except OSError:
-            return  # an editor is just replacing the file
+            return  # an editor is replacing the file at this moment
         if stamp == self._stamp:
             return
         self._stamp = stamp
         try:
             functions = load_functions(self.path, tuple(self.functions))
-        except Exception as error:  # the user's own code may fail in any way; the run goes on
+        except Exception as error:  # user code may raise anything; the run continues
             self._report(error)
             return
         if self._proven:
@@ -72,8 +75,11 @@ class HotReload:
         self.functions, self._proven = functions, False
 
     def call(self, name: str, act: Callable[[Callable[..., None]], T], otherwise: T) -> T:
-        """`act` on the function of that name, or `otherwise` if there is none. If it fails and
-        there is an earlier version: report, and go back to that."""
+        """`act` on the function with that name, or `otherwise` if there is none.
+
+        If the function fails and there is an earlier version, this reports the failure and uses the
+        earlier version from then on.
+        """
         function = self.functions[name]
         try:
             result = otherwise if function is None else act(function)
@@ -85,11 +91,11 @@ class HotReload:
             return self.call(name, act, otherwise)
         if not self._proven:
             self._proven = True
-            self._say("taken up")
+            self._say("reloaded")
         return result
 
     def _report(self, error: Any) -> None:
-        self._say(f"is broken, still running the last good rules: {type(error).__name__}: {error}")
+        self._say(f"is broken, the last good rules stay in use: {type(error).__name__}: {error}")
 
     def _say(self, what: str) -> None:
         name = self.path.name if self.path is not None else "the rules"

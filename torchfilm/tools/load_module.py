@@ -1,4 +1,4 @@
-"""Running a Python file of the user's."""
+"""Runs a user's Python file."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import Any
 
 
 def run_file(path: Path) -> dict[str, Any]:
-    """The names that a Python file defines, as a module called as the file is; raises whatever the
-    file does.
+    """The names that a Python file defines, as a module with the file's name.
 
-    While it runs it is listed among the modules, where a dataclass looks up the types of its
-    fields, unless another is called so: nothing that is imported later, by this file or another,
-    comes upon it by mistake.
+    Raises whatever the file raises. While the file runs, the module is in `sys.modules`, where a
+    dataclass looks up the types of its fields, unless a module of that name is already there.
+    Afterwards it is removed, so that no later import finds it by mistake.
     """
     module = ModuleType(path.stem)
     module.__file__ = str(path)

@@ -1,21 +1,21 @@
-"""Keep freed memory for the next step instead of handing it back to the system."""
+"""Keeps freed memory in the process for the next step."""
 
 from __future__ import annotations
 
 import ctypes
 
-# glibc's names for its settings (malloc.h)
+# Names of glibc's settings (malloc.h).
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 LARGEST_MMAP_THRESHOLD = 32 * 1024 * 1024
 KEEP = 1024 * 1024 * 1024
 
 
 def keep_memory() -> bool:
-    """Let this process reuse freed memory: on Linux a fifth faster on the CPU, since fresh pages
-    cost as much as the sums done in them.
+    """Let this process reuse freed memory; returns whether the setting was made.
 
-    A process-wide setting of the C library, so it is yours to make: the command line and the
-    benchmarks do. Returns whether it was set.
+    On Linux this makes the CPU a fifth faster, since fresh pages cost as much as the sums done in
+    them. It is a process-wide setting of the C library, so the library does not make it by itself:
+    the command line and the benchmarks do.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -1,9 +1,8 @@
-"""Random numbers that belong to a cell, not to a moment of the program: Philox4x32-10 (Salmon et
-al. 2011), counter based.
+"""Counter-based random numbers for cells: Philox4x32-10 (Salmon et al. 2011).
 
-A draw is a pure function of (seed, stream of the colony, cell uid, step, purpose), so it is the
-same whatever the batch, the order of colonies or a restart in between. 32-bit arithmetic is carried
-out in int64, where products wrap harmlessly.
+A draw is a pure function of (seed, stream of the colony, cell uid, step, purpose). So it does not
+depend on the batch, the order of colonies or a restart. The 32-bit arithmetic uses int64, where
+products wrap without harm.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ WEYL = (0x9E3779B9, 0xBB67AE85)
 def philox(
     counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor | int, Tensor | int]
 ) -> tuple[Tensor, ...]:
-    """Ten rounds of Philox4x32: four words in [0, 2³²) as int64 in, four out, elementwise."""
+    """Ten rounds of Philox4x32, elementwise: four words in [0, 2³²), as int64, to four words."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(10):
@@ -55,14 +54,14 @@ def uniform(
 ) -> Tensor:
     """One draw per cell from the open interval (0, 1)."""
     w = words(seed, stream, uid, step, purpose)
-    # 23 bits and half a unit: the most that a float32 holds without rounding a draw to 1
+    # 23 bits and half a unit: the most bits for which a float32 does not round a draw to 1
     return ((w[0] >> 9).to(torch.float64) + 0.5).mul(2.0**-23).to(dtype)
 
 
 def normal(
     seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype
 ) -> Tensor:
-    """Four standard normal draws per cell, (M, 4), by Box and Muller from four words."""
+    """Four standard normal draws per cell, (M, 4), by the Box–Muller method from four words."""
     w = [(x.to(torch.float64) + 0.5) * 2.0**-32 for x in words(seed, stream, uid, step, purpose)]
     out = []
     for u, v in ((w[0], w[1]), (w[2], w[3])):

@@ -1,4 +1,4 @@
-"""How long each effect takes."""
+"""The wall-clock time of each effect."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ class Timings:
 
     @contextmanager
     def of(self, name: str, device: torch.device) -> Iterator[None]:
-        """Add the time of this block to `name`; waits for a GPU to finish, so that its work is
-        counted where it belongs."""
+        """Add the time of this block to `name`.
+
+        It waits for a GPU to finish, so that the GPU's work counts for this block.
+        """
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         start = time.perf_counter()

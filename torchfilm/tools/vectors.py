@@ -1,8 +1,8 @@
 """Small vector algebra, components first: an array of K vectors in d dimensions is (d, K).
 
-Components first keeps every operation a plain pass over contiguous memory, and fixes the order of
-the two or three additions of a dot product, so that results do not depend on how many vectors stand
-side by side.
+With components first, every operation is a plain pass over contiguous memory. It also fixes the
+order of the two or three additions of a dot product, so results do not depend on the number of
+vectors in the array.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def dot(u: Tensor, v: Tensor) -> Tensor:
 
 
 def cross(u: Tensor, v: Tensor) -> Tensor:
-    """u × v: (3, K) in 3-D; in 2-D its one component out of the plane, as (1, K)."""
+    """u × v: (3, K) in 3-D; in 2-D the component out of the plane, (1, K)."""
     if u.shape[0] == 2:
         return (u[0] * v[1] - u[1] * v[0]).unsqueeze(0)
     return torch.stack(
@@ -29,8 +29,11 @@ def cross(u: Tensor, v: Tensor) -> Tensor:
 
 
 def perpendicular(u: Tensor) -> Tensor:
-    """A unit vector perpendicular to unit u, (d, K): the left-hand normal in 2-D; in 3-D built on
-    the axis that u is least along."""
+    """A unit vector perpendicular to unit u, (d, K).
+
+    In 2-D it is the left-hand normal. In 3-D it is built from the axis with the least component of
+    u.
+    """
     if u.shape[0] == 2:
         return torch.stack([-u[1], u[0]])
     x, y, z = u.detach().abs().unbind(0)
@@ -41,12 +44,12 @@ def perpendicular(u: Tensor) -> Tensor:
 
 
 def safe_norm(u: Tensor, eps: float = 1e-30) -> Tensor:
-    """|u| for (d, K) -> (K,), with a zero gradient instead of a NaN where u = 0."""
+    """|u| for (d, K) -> (K,), with gradient 0 instead of NaN where u = 0."""
     return safe_sqrt(dot(u, u), eps)
 
 
 def safe_sqrt(x: Tensor, eps: float = 1e-30) -> Tensor:
-    """√x, and 0 with zero gradient where x ≤ eps."""
+    """√x, and 0 with gradient 0 where x ≤ eps."""
     if not (torch.is_grad_enabled() and x.requires_grad):
         return torch.where(x > eps, x.sqrt(), 0.0)
     positive = x > eps

@@ -1,0 +1,169 @@
+"""The linearised contact problem of a batch of colonies, and the report of its solve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchfilm.physics.jacobian import ContactJacobian
+from torchfilm.tools.ragged import Groups
+
+CONVERGED, ITERATION_LIMIT, NOT_FINITE, TOO_FAST = 0, 1, 2, 3
+STATUS = {
+    CONVERGED: "converged",
+    ITERATION_LIMIT: "reached its iteration limit",
+    NOT_FINITE: "is not finite",
+    TOO_FAST: "would have to follow too much growth in one step",
+}
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """What a solve did in each colony; every field is (B,).
+
+    status: see STATUS. iterations: of CG. residual: recomputed from x, the worst preconditioned
+    residual of the rows that act, divided by the worst residual at x = 0. Where opposing forces
+    cancel, the divisor is the least residual that rounding resolves.
+    """
+
+    status: Tensor
+    iterations: Tensor
+    residual: Tensor
+
+
+@dataclass(frozen=True)
+class ContactProblem:
+    """One linearised contact problem: R rows over N cells with D degrees of freedom, in B colonies.
+
+    rows: D J M^(−½), scaled by row weights and drag. gap: (R,) D g. applied_force: (R,) force that
+    each row already exerted in this step: D min(0, g) for soft rows in later passes, else 0. alpha:
+    (N, D). lower: (N,) least scaled Δl. scale: (N, D) M^(−½). rigid: (N,) bool, cells that do not
+    grow. The length of a rigid cell is not a degree of freedom, so bilateral contacts cannot
+    stretch it.
+    """
+
+    rows: ContactJacobian
+    gap: Tensor
+    applied_force: Tensor
+    alpha: Tensor
+    lower: Tensor
+    scale: Tensor
+    rigid: Tensor
+    colonies: Groups
+    unilateral: bool
+
+    def gap_after(self, y: Tensor) -> Tensor:
+        """The scaled gap of each row after the move y (N, D): D(g − Jx), (R,)."""
+        return self.gap - self.rows.apply(y)
+
+    def acting(self, after: Tensor) -> Tensor:
+        """1 for each row that acts, else 0, (R,).
+
+        Bilateral rows all act. Unilateral rows act where they overlap after the move.
+        """
+        return (after < 0).to(after.dtype) if self.unilateral else torch.ones_like(after)
+
+    def gradient(self, y: Tensor, violation: Tensor) -> Tensor:
+        """The gradient of the minimised function, (N, D).
+
+        violation: (R,) the gap after the move for rows that act, 0 for the others.
+        """
+        return self.alpha * y - self.rows.apply_transpose(violation - self.applied_force)
+
+    def detached(self) -> ContactProblem:
+        """The same problem without gradients."""
+        r = self.rows
+        if not torch.is_grad_enabled() and not r.row_first.requires_grad:
+            return self
+        rows = ContactJacobian(
+            r.first,
+            r.second,
+            r.row_first.detach(),
+            r.row_second.detach(),
+            r.at_wall,
+            r.row_wall.detach(),
+            r.cells,
+        )
+        return ContactProblem(
+            rows,
+            self.gap.detach(),
+            self.applied_force.detach(),
+            self.alpha.detach(),
+            self.lower.detach(),
+            self.scale.detach(),
+            self.rigid,
+            self.colonies,
+            self.unilateral,
+        )
+
+    def among(self, moving: Tensor) -> ContactProblem:
+        """The problem of the moving cells, (N,) bool, while the others stay at rest.
+
+        Colonies keep their numbers.
+        """
+        cells = torch.nonzero(moving).squeeze(1)
+        rows, places = self.rows.among(moving)
+        of_rows, of_cells = (
+            lambda x, index=index: x.index_select(0, index) for index in (places, cells)
+        )
+        return ContactProblem(
+            rows,
+            of_rows(self.gap),
+            of_rows(self.applied_force),
+            of_cells(self.alpha),
+            of_cells(self.lower),
+            of_cells(self.scale),
+            of_cells(self.rigid),
+            Groups(of_cells(self.colonies.owner), self.colonies.size),
+            self.unilateral,
+        )
+
+    def part(self, which: Selection) -> ContactProblem:
+        """The problem of some of its colonies."""
+        cells, rows = which.cells, which.rows
+        number = torch.empty(self.rows.cells, dtype=torch.int64, device=cells.device)
+        number[cells] = torch.arange(cells.numel(), device=cells.device)
+        place = torch.empty(self.colonies.size, dtype=torch.int64, device=cells.device)
+        place[which.colonies] = torch.arange(which.colonies.numel(), device=cells.device)
+        owner = place.index_select(0, self.colonies.owner.index_select(0, cells))
+        return ContactProblem(
+            self.rows.part(rows, number, cells.numel()),
+            self.gap.index_select(0, rows),
+            self.applied_force.index_select(0, rows),
+            self.alpha.index_select(0, cells),
+            self.lower.index_select(0, cells),
+            self.scale.index_select(0, cells),
+            self.rigid.index_select(0, cells),
+            Groups(owner, which.colonies.numel()),
+            self.unilateral,
+        )
+
+    @cached_property
+    def of_rows(self) -> Groups:
+        """The rows of each colony."""
+        return Groups(self.colonies.owner.index_select(0, self.rows.row_owner), self.colonies.size)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Some colonies of a problem: their indices, their cells and their rows."""
+
+    colonies: Tensor
+    cells: Tensor
+    rows: Tensor
+
+    def by_field(self) -> tuple[Tensor, ...]:
+        """The index into each field of an Iterate, in the order of its fields."""
+        return (
+            self.cells,
+            self.rows,
+            self.rows,
+            self.cells,
+            self.cells,
+            self.colonies,
+            self.colonies,
+            self.colonies,
+        )

@@ -1,0 +1,154 @@
+"""Contacts of cells with walls: their rows in the contact problem, and moves cut at walls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.physics.contacts import NEAR
+from torchfilm.physics.surfaces import FlatSurface, Surface
+from torchfilm.tools.vectors import cross, dot, safe_sqrt
+
+# Position (P, d) float64, axis (P, d) and half length (P,) of some capsules.
+Pose = tuple[Tensor, Tensor, Tensor]
+# The number of points along a move where a sphere met from outside is looked for. Other walls have
+# all cells on one side, so the end of the move is enough.
+POINTS_ON_MOVE = 8
+
+
+@dataclass(frozen=True)
+class WallContacts:
+    """W rows of one cell and one wall.
+
+    cell: (W,). gap: (W,) µm. row: (W, D). surface: (W,) index of the touched surface. Where rows
+    share one contact (see `find_wall_contacts`), gap and row of each are multiplied by the root of
+    its share.
+    """
+
+    cell: Tensor
+    gap: Tensor
+    row: Tensor
+    surface: Tensor
+
+    def take(self, index: Tensor) -> WallContacts:
+        """The rows at `index`."""
+        return WallContacts(
+            *(x.index_select(0, index) for x in (self.cell, self.gap, self.row, self.surface))
+        )
+
+
+def find_wall_contacts(
+    surfaces: Sequence[Surface],
+    position: Tensor,
+    axis: Tensor,
+    length: Tensor,
+    radius: Tensor,
+    colony_id: Tensor,
+    unilateral: bool = False,
+    include_near: bool = False,
+) -> WallContacts:
+    """One row for each capsule end that overlaps a wall (gap < 0).
+
+    A sphere met from outside gives one more row, for the nearest point, wherever it is on the cell.
+
+    position: (N, d) float64, absolute. axis: (N, d). length, radius: (N,). colony_id: (N,) selects
+    a wall's value per colony. unilateral, include_near: as in `contacts_of`, for walls that are not
+    soft.
+    """
+    found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+    half = 0.5 * length
+    for number, surface in enumerate(surfaces):
+        for s, end, root in _contact_candidates(surface, position, axis, half, colony_id):
+            point = position + (s.unsqueeze(1) * axis).to(position.dtype)
+            distance, way = surface.gap_of_points(point, colony_id)
+            gap = distance.to(length.dtype) - radius
+            margin = (
+                NEAR * radius
+                if include_near and surface.wall.stiffness is None
+                else torch.zeros_like(radius)
+            )
+            keep = torch.nonzero((gap < margin) & (root > 0)).squeeze(1)
+            if keep.numel() == 0:
+                continue
+            if include_near and not unilateral:
+                root, gap = (
+                    root * (1.0 - gap / margin.clamp(min=1e-30)).clamp(min=0.0, max=1.0),
+                    gap.clamp(max=0.0),
+                )
+            pick = lambda x, keep=keep: x.index_select(0, keep)
+            n = way.index_select(1, keep).to(axis.dtype)
+            a = pick(axis).T
+            row = torch.cat([n, cross(pick(s) * a, n), (0.5 * pick(end) * dot(n, a)).unsqueeze(0)])
+            found.append(
+                (keep, pick(root) * pick(gap), (pick(root) * row).T, torch.full_like(keep, number))
+            )
+    if not found:
+        degrees = 4 if axis.shape[1] == 2 else 7
+        none = colony_id.new_empty(0)
+        return WallContacts(none, length.new_empty(0), length.new_empty(0, degrees), none)
+    return WallContacts(*(torch.cat(part) for part in zip(*found, strict=True)))
+
+
+def _contact_candidates(
+    surface: Surface, position: Tensor, axis: Tensor, half: Tensor, colony_id: Tensor
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """The points of each capsule that may touch a surface.
+
+    For each point: its arc length from the centre, which end it moves with as the cell grows (±1,
+    or 0), and the root of its share of the contact; each (N,).
+
+    On a sphere met from outside, the nearest point slides along the cell and has a whole row. The
+    two ends share another row, by the distance of the nearest point from each. When the nearest
+    point arrives at an end, that end has no share left and the other end has it all, as at a plane.
+    So no force appears or vanishes suddenly, whatever a cell does.
+    """
+    one = torch.ones_like(half)
+    if isinstance(surface, FlatSurface) or surface.inside:
+        return [(half, one, one), (-half, -one, one)]
+    # −1 … 1 along the cell; the nearest point of a spherical cell is at one of its ends
+    at = (surface.foot(position, axis, colony_id).to(half.dtype) / half.clamp(min=1e-9)).clamp(
+        -1, 1
+    )
+    return [
+        (at * half, torch.trunc(at.detach()), one),
+        (half, one, safe_sqrt(0.5 * (1 - at))),
+        (-half, -one, safe_sqrt(0.5 * (1 + at))),
+    ]
+
+
+@torch.no_grad()
+def share_to_walls(
+    surfaces: Sequence[Surface], at: Callable[[float], Pose], radius: Tensor, colony_id: Tensor
+) -> Tensor:
+    """The share of its move after which each cell is at most its radius behind any wall, (P,).
+
+    A cell that was already deeper may stay as deep as it was. The check is needed because a wall
+    that a cell did not touch before the move has no row in the solve. at: returns, for a share of
+    the move, position (P, d) float64, axis (P, d) and half length (P,).
+    """
+
+    def gap(surface: Surface, share: float) -> Tensor:
+        position, axis, half = at(share)
+        deepest = surface.deepest(
+            position, axis.to(position.dtype), half.to(position.dtype), colony_id
+        )
+        distance, _ = surface.gap_of_points(
+            position + deepest.unsqueeze(1) * axis.to(position.dtype), colony_id
+        )
+        return distance.to(radius.dtype) - radius
+
+    out = torch.ones_like(radius)
+    for surface in surfaces:
+        places = 1 if isinstance(surface, FlatSurface) or surface.inside else POINTS_ON_MOVE
+        before = gap(surface, 0.0)
+        limit = before.clamp(max=0.0) - radius
+        for k in range(places):
+            after = gap(surface, (k + 1) / places)
+            through = (after < limit) & (out > k / places)
+            part = (before - limit) / torch.where(through, before - after, 1.0)
+            out = torch.where(through, torch.minimum(out, (k + part) / places), out)
+            before = after
+    return out
