@@ -19,7 +19,8 @@ OWN = """
 import torchfilm as tf
 
 def scene(rate=1.0, longest=4.0):
-    return tf.Scene(tf.Growth(rate=rate), tf.Division(length=tf.Uniform(3.0, longest)), tf.Mechanics(dim=2), dt=0.05)
+    division = tf.Division(length=tf.Uniform(3.0, longest))
+    return tf.Scene(tf.Growth(rate=rate), division, tf.Mechanics(dim=2), dt=0.05)
 """
 
 

@@ -1,5 +1,5 @@
-"""Tensors of the CPU that say they are on CUDA, and input_error to meet others: what a machine without a
-GPU can tell about device="cuda".
+"""Tensors of the CPU that say they are on CUDA, and input_error to meet others: what a machine
+without a GPU can tell about device="cuda".
 
 Not that it is fast, or that its sums are ordered; but that every tensor is made on the device that
 was asked for, that none is read by NumPy, and that the ways taken on CUDA only do what they should.

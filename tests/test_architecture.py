@@ -153,8 +153,8 @@ def test_crossings_are_noticed(module, source):
         (
             "torchfilm.physics.solve",
             (
-                "from torchfilm.physics.jacobian import ContactJacobian\nfrom torchfilm.tools.cg import"
-                " worst_of"
+                "from torchfilm.physics.jacobian import ContactJacobian\nfrom torchfilm.tools.cg"
+                " import worst_of"
             ),
         ),
         (

@@ -46,7 +46,10 @@ def shine(cells):
 
 scene = tf.Scene(
     tf.Rules(shine, variables={"yfp": 0.0, "cfp": 1.0}), tf.Growth(rate=1.0), tf.Mechanics(dim=2),
-    tf.Medium(ahl=tf.Signal(diffusion=1.0, initial=1.0), box=((-16, -8, -4), (16, 8, 4)), spacing=4.0), dt=0.1,
+    tf.Medium(
+        ahl=tf.Signal(diffusion=1.0, initial=1.0), box=((-16, -8, -4), (16, 8, 4)), spacing=4.0
+    ),
+    dt=0.1,
 )
 """
 

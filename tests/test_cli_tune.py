@@ -16,7 +16,8 @@ import torchfilm as tf
 def made(u, s, p, cell):
     return {"m": 1.0 - u.m}
 
-scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Circuit(made, species=("m",)), dt=0.05)
+circuit = tf.Circuit(made, species=("m",))
+scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), circuit, dt=0.05, dim=3)
 """
 
 

@@ -207,7 +207,8 @@ def test_lineage_of_a_run_that_starts_in_the_middle_of_another(tmp_path):
 READ = """
 import sys, torchfilm as tf
 with tf.Results(sys.argv[1]) as results:
-    print(len(results), int(results.counts[-1].sum()), len(results.frame()["uid"]), len(results.lineage()["uid"]))
+    sizes = len(results.frame()["uid"]), len(results.lineage()["uid"])
+    print(len(results), int(results.counts[-1].sum()), *sizes)
 """
 
 

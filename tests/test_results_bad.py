@@ -303,7 +303,8 @@ import torchfilm as tf
 from recorded import make_scene
 scene = make_scene()
 try:
-    for _ in tf.simulate(scene, scene.bind(3, seed=11).start(), until=3.0, record=tf.Recorder(sys.argv[1], scene, every=1)):
+    recorder = tf.Recorder(sys.argv[1], scene, every=1)
+    for _ in tf.simulate(scene, colonies=3, seed=11, until=3.0, record=recorder):
         pass
 except tf.SimulationError as error:
     print(error)
@@ -343,7 +344,8 @@ disk, out = sys.argv[1:]
 subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", disk], check=True)
 path, scene, done = os.path.join(disk, "run.h5"), make_scene(), 0
 try:
-    for state in tf.simulate(scene, scene.bind(3, seed=11).start(), until=3.0, record=tf.Recorder(path, scene, every=1)):
+    recorder = tf.Recorder(path, scene, every=1)
+    for state in tf.simulate(scene, colonies=3, seed=11, until=3.0, record=recorder):
         done = state.step
     print("the run ended as if nothing had happened")
 except tf.SimulationError as error:
@@ -354,7 +356,8 @@ with tf.Results(path) as results:
 subprocess.run(["mount", "-o", "remount,size=20m", disk], check=True)
 with tf.Results(path) as results:
     state = results.state(scene)
-for _ in tf.simulate(scene, state, until=3.0, record=tf.Recorder(path, scene, every=1, append=True)):
+recorder = tf.Recorder(path, scene, every=1, append=True)
+for _ in tf.simulate(scene, state, until=3.0, record=recorder):
     pass
 shutil.copy(path, out)
 print("resumed")

@@ -217,7 +217,8 @@ WRITE = """
 import sys, torchfilm as tf
 from recorded import make_scene
 scene = make_scene()
-for _ in tf.simulate(scene, scene.bind(3, seed=11).start(), until=3.0, record=tf.Recorder(sys.argv[1], scene, every=1)):
+recorder = tf.Recorder(sys.argv[1], scene, every=1)
+for _ in tf.simulate(scene, colonies=3, seed=11, until=3.0, record=recorder):
     pass
 """
 

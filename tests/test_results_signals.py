@@ -169,8 +169,8 @@ def test_a_colony_alone_and_in_another_order_is_the_same(make):
     scene = make()
     first = scene.bind(3, seed=7).start()
     states = [first, *tf.simulate(scene, first, until=UNTIL)]
-    for step, places in ((0, [1]), (0, [2, 0]), (12, [2, 1, 0]), (12, [0])):
-        part = list(tf.simulate(scene, states[step].select(places), until=UNTIL))[-1]
+    for k, places in ((0, [1]), (0, [2, 0]), (12, [2, 1, 0]), (12, [0])):
+        part = list(tf.simulate(scene, states[k].select(places), until=UNTIL))[-1]
         assert_same(part, states[-1].select(places))
 
 

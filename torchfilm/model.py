@@ -1,9 +1,9 @@
 """A scene bound to a batch of colonies: all that is decided once, and the step that decides
 nothing.
 
-    model = scene.bind(colonies=64, seed=0)     # values resolved, circuits and rules traced, declarations checked
+    model = scene.bind(colonies=64, seed=0)     # values resolved, circuits and rules traced
     state = model.start()
-    state = model.step(state, dt)               # for effect in model.effects: state = effect.step(state, dt)
+    state = model.step(state, dt)               # each effect in turn
 
 A model also says what depends on what: who drives whom, and which effects grow the colonies and can
 be recorded once (`recorded`), while the others only follow (`following`).
@@ -126,6 +126,13 @@ class Model:
         """Raise InputError if this is not a state of this model."""
         if state.dim != self.dim:
             raise checks.input_error("state", f"{state.dim}-D", f"{self.dim}-D, as the scene is")
+        if state.dtype != self.batch.dtype or state.device.type != self.batch.device.type:
+            raise checks.input_error(
+                "state",
+                f"{state.dtype} on {state.device}",
+                f"{self.batch.dtype} on {self.batch.device}, as the model is",
+                "Bind the scene to the state: scene.bind(state=state).",
+            )
         highest = int(state.colony_id.max())
         if highest >= self.batch.colonies and self.scene.per_colony():
             path, tensor = self.scene.per_colony()[0]
@@ -315,7 +322,7 @@ def bind(
     """As `Scene.bind`. places: bind only the effects at these places of the scene. check_first:
     check whether the first cells may be where they are; not needed where a file replaces them."""
     if state is not None:
-        return _bind_to_state(scene, state, per_colony, places)
+        return _bind_to_state(scene, state, places)
     founders = cells if cells is not None else scene.founders
     count = _count(scene, colonies, founders, places)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
@@ -333,13 +340,12 @@ def bind(
     return model
 
 
-def _bind_to_state(
-    scene: Scene, state: State, per_colony: bool, places: Collection[int] | None
-) -> Model:
+def _bind_to_state(scene: Scene, state: State, places: Collection[int] | None) -> Model:
     if not isinstance(state, State):
         raise checks.input_error("state", state, "a State, such as scene.bind(colonies=8).start()")
     count = max(scene.fixed_colonies if places is None else 1, int(state.colony_id.max()) + 1)
-    batch = Batch(count, state.dtype, state.device, _types(scene.founders), per_colony)
+    # what lists of numbers mean was settled when the state was made
+    batch = Batch(count, state.dtype, state.device, _types(scene.founders), per_colony=True)
     streams = torch.arange(count) if count != state.colonies else state.stream
     model = Model(scene, batch, _Start(count, state.seed, streams, scene.founders), places)
     model.check(state)

@@ -3,7 +3,7 @@ growth is recorded once, and the circuits and signals of any number of designs r
 
     recording = tf.GrowthRecording(scene, streams=range(4))     # grows only as far as it is read
     model = designs.bind(colonies=256, streams=torch.arange(4).repeat(64))
-    replay = tf.Replay(model, recording)    # `designs`: the same scene with other circuits, one value per colony
+    replay = tf.Replay(model, recording)    # designs: the scene, circuits with one value per colony
     state = replay.step(model.start())      # as model.step would, without growth and mechanics
 
 Both are views of a model: `model.recorded` are the effects that grow the colonies,

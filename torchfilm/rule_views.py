@@ -199,12 +199,11 @@ class CellsView:
         )
         tensor = _as_tensor(f"cells.{name}", value, state.device)
         if dtype is None:
-            known = state.fields.get(name)
             # a Python number makes a variable of floating-point type
             plain = tensor.is_floating_point() or (
                 not isinstance(value, (bool, Tensor)) and tensor.dtype != torch.bool
             )
-            dtype = known.dtype if known is not None else state.dtype if plain else tensor.dtype
+            dtype = state.dtype if plain else tensor.dtype
         if self._declaring and name not in (*state.fields, *KNOWN_FIELDS, "remove_flag"):
             near = difflib.get_close_matches(
                 name, [*state.fields, *KNOWN_FIELDS, "remove_flag", *PAPER_NAMES], 1, cutoff=0.85
@@ -215,9 +214,8 @@ class CellsView:
                     f" own, give Rules(…, variables={{{name!r}: 0.0}})."
                 )
         self._written.add(name)
-        shape = (
-            state.fields[name].shape if name in state.fields else (state.cells, *tensor.shape[1:])
-        )
+        own = declared.shape if name in state.fields and declared else tuple(tensor.shape[1:])
+        shape = (state.cells, *own)
         self._work[name] = _broadcast_copy(f"cells.{name}", tensor.to(state.device), dtype, shape)
 
     def __iter__(self):

@@ -42,7 +42,7 @@ class Field:
     scope: str = CELL
     shape: tuple[int, ...] = ()
     dtype: torch.dtype | None = None  # None: the state's own
-    initial: float | Callable[[State, Tensor], Tensor] = 0.0
+    initial: float | Callable[..., Tensor] = 0.0
     at_division: str = "copy"
 
     def __post_init__(self) -> None:
@@ -243,13 +243,8 @@ class State:
                 f"the field {field.name!r} needs a grid, and this state has none: list a Medium in"
                 " the scene."
             )
-        rows = (
-            self.cells
-            if field.scope == CELL
-            else self.colonies
-            if field.scope == COLONY
-            else self.layout.grid.nodes
-        )  # type: ignore[union-attr]
+        nodes = 0 if self.layout is None else self.layout.grid.nodes
+        rows = {CELL: self.cells, COLONY: self.colonies, GRID: nodes}[field.scope]
         start = field.start(declared, torch.arange(rows, device=self.device))
         if start.shape[0] != rows:
             raise checks.input_error(

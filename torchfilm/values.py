@@ -1,12 +1,12 @@
 """Physical values: one way to give a parameter of any effect, and one way to look it up.
 
-| a user gives                 | meaning                                                               |
-|------------------------------|-----------------------------------------------------------------------|
-| `1.0`                        | the same for all cells of all colonies                                |
-| a list, array or 1-D tensor  | one value per colony, by the colony's id                              |
-| `{0: 0.6, 1: 1.2}`           | one value per cell type                                               |
-| `tf.LogNormal(1.0, 0.2)`     | drawn for each cell at birth, from random numbers keyed by the cell   |
-| `tf.PerColony([…])`          | one value per colony, where a list could also mean cell types         |
+| given                        | meaning                                                           |
+|------------------------------|-------------------------------------------------------------------|
+| `1.0`                        | the same for all cells of all colonies                            |
+| a list, array or 1-D tensor  | one value per colony, by the colony's id                          |
+| `{0: 0.6, 1: 1.2}`           | one value per cell type                                           |
+| `tf.LogNormal(1.0, 0.2)`     | drawn for each cell at birth, by random numbers keyed by the cell |
+| `tf.PerColony([…])`          | one value per colony, where a list could also mean cell types     |
 
 A description holds what was given, checked. Binding a scene to a batch resolves it once: `Resolved`
 holds tensors of the batch's dtype on its device, copied, so that a tensor that is changed later in
@@ -96,7 +96,7 @@ def checked(name: str, given: object, rule: Rule) -> Any:
 
     Raises InputError for what `rule` does not allow.
     """
-    bounds = {"above": rule.above, "least": rule.least, "most": rule.most}
+    bounds: dict[str, Any] = {"above": rule.above, "least": rule.least, "most": rule.most}
     if isinstance(given, ByType):
         given = given.values
     if isinstance(given, (Distribution, Mapping)) and rule.scope == COLONY:
@@ -252,7 +252,7 @@ class BoundDraw:
         known = torch.zeros_like(kind, dtype=torch.bool)
         out = torch.zeros(rows.numel(), dtype=state.dtype, device=state.device)
         for number, part in self.parts:
-            mine = kind == number
+            mine = torch.eq(kind, int(number or 0))
             known = known | mine
             out = torch.where(mine, self._part(part, state, rows, purpose), out)
         if not bool(known.all()):
@@ -281,6 +281,9 @@ class Values:
 
     def __init__(self, found: Mapping[str, Resolved | None]):
         self.__dict__.update(found)
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"the effect has no physical value {name!r}: it has {', '.join(self)}")
 
     def __getitem__(self, name: str) -> Resolved:
         return self.__dict__[name]

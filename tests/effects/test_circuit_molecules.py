@@ -203,8 +203,8 @@ def test_birth_and_death_under_dilution(method):
 
 
 def test_noise_and_no_noise_agree_where_molecules_are_many():
-    """10⁵ molecules_per_unit: the smooth circuit to within 5 standard deviations of √n in n, and the leap's
-    0.03²."""
+    """10⁵ molecules_per_unit: the smooth circuit to within 5 standard deviations of √n in n, and
+    the leap's 0.03²."""
     ends = []
     for method, molecules_per_unit in (("tau_leap", 1e5), ("rosenbrock", 1.0)):
         circuit = tf.Circuit(

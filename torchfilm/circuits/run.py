@@ -49,8 +49,8 @@ class CircuitCells:
 
     rows: (M,) int64. cell, p: columns over the N cells by name. signals: what each cell finds
     outside, (N,) by name. pool: (N,) µm³, the part of the medium that is each cell's own, if
-    anything is exchanged. in_reservoir: (N,) bool, cells whose pool is a reservoir that nothing changes,
-    or None.
+    anything is exchanged. in_reservoir: (N,) bool, cells whose pool is a reservoir that nothing
+    changes, or None.
     """
 
     part: RateFunction | Network
@@ -176,8 +176,9 @@ class CircuitCells:
 
 @dataclass(frozen=True, eq=False)
 class CircuitOutcome:
-    """After a step: concentrations (M, S); amounts given to the pools and to a reservoir, conc·µm³, (M,) by
-    signal; whether a cell failed (M,) bool and why, (M,) codes for `words`; steps taken (M,) int64.
+    """After a step: concentrations (M, S); amounts given to the pools and to a reservoir, conc·µm³,
+    (M,) by signal; whether a cell failed (M,) bool and why, (M,) codes for `words`; steps taken
+    (M,) int64.
     """
 
     concentrations: Tensor

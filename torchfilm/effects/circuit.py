@@ -89,7 +89,9 @@ class Circuit(Effect):
         shared: Sequence[str] | Mapping[str, str] = (),
         **parameters: Value,
     ):
-        by_type: dict[int | str, Part] = {**rates} if isinstance(rates, Mapping) else {EVERY: rates}
+        by_type: dict[int | str, Part] = (
+            dict(rates.items()) if isinstance(rates, Mapping) else {EVERY: rates}
+        )
         names = _names(species)
         others = (
             dict(shared)

@@ -199,7 +199,7 @@ class DivisionRule(BoundEffect):
         twice = state.take(torch.cat([one, one]))
         births = Births(one, one + 1, torch.cat([one, one]), state.take(one))
         views = _after_divide(divide, twice, births)
-        read = {MEANS.get(n, (n,))[0] for view in views for n in view._work}
+        read = {m for view in views for n in view._work for m in MEANS.get(n, (n,))}
         self.traced_reads = tuple(sorted(read))
         self.traced_writes = tuple(sorted(views[1]._set | views[2]._set))
         return state

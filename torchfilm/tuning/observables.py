@@ -1,17 +1,18 @@
 """What `tune` looks at: a window of some colonies' growth, run again and again from one state, and
 what one would read off it.
 
-| observable | error                                                                                                                     |
-|------------|---------------------------------------------------------------------------------------------------------------------------|
-| cells      | difference of their number, relative; those that are due to divide at the next step count as two                          |
-| volume     | difference of what the window's second half added, relative, or to what growth would add if neither pressure nor loss of   |
-|            | cells set it back: what a longer run comes to. In the first half cells settle: how deep they overlap goes by the          |
-|            | settings, and the start is by others. Of the cylinders round the cells, π r² by the length from end to end, which no      |
-|            | division changes                                                                                                          |
-| radius     | difference, relative                                                                                                      |
-| overlap    | mean overlap of touching cells over their diameter, 0 being right; of soft cells its difference                           |
-| a species  | difference of its mean and standard deviation over cells, relative                                                        |
-| signal …   | difference of its amount, and of its mean seen by its own molecules, relative; the greater                                |
+- cells: relative difference of their number; a cell that is due to divide at the next step counts
+  as two.
+- volume: relative difference of what the window's second half added, or, where that is more, of
+  what growth would add without pressure or loss of cells. In the first half cells settle, since the
+  start was grown by other settings. It is the volume of the cylinders round the cells, π r² times the
+  length from end to end, which no division changes.
+- radius: relative difference.
+- overlap: mean overlap of touching cells over their diameter (0 is right); of soft cells its
+  difference.
+- a species: relative difference of its mean and of its standard deviation over cells.
+- signal NAME: relative difference of its amount, and of the mean concentration that its own
+  molecules find; the larger.
 
 Colonies are chaotic: two runs of one law differ by chance. How much of an error that may be is told
 by the colonies themselves, each left out in turn.

@@ -384,13 +384,13 @@ class Search:
             own.settings: own.errors
         }
         closest = min(found, key=lambda s: max(e.upper_bound for e in found[s].values()))
-        name = max(found[closest], key=lambda n: found[closest][n].most)
+        name = max(found[closest], key=lambda n: found[closest][n].upper_bound)
         error = found[closest][name]
         return checks.input_error(
             "error",
             self.error,
             f"reached by some settings, in both probes: the closest came to {error}, at most"
-            f" {_percent(error.most)}, in {name!r}, with {_words(closest)}",
+            f" {_percent(error.upper_bound)}, in {name!r}, with {_words(closest)}",
             "Ask for a larger error, probe more colonies (the scene's own number, where its"
             " parameters have one value a colony), or name what matters (of=…).",
         )
