@@ -175,7 +175,7 @@ def test_defaults_told_of_contacts_are_those_used(dim, unilateral):
     effect = tf.Mechanics(dim=dim, unilateral=unilateral)
     said = " ".join(how(effect, tf.Scene(effect, tf.Growth(rate=1.0)).bind().start(), 0.025))
     assert (
-        f"at most {effect.most_passes} a step" in said
+        f"at most {effect.settings.passes} a step" in said
         and f"residual of {TOLERANCE:g} (default)" in said
     )
 
@@ -222,7 +222,7 @@ def test_what_is_listed_and_what_is_left_out_are_all(name):
 @pytest.mark.parametrize("name", tf.scenes.READY)
 def test_whether_growth_serves_many_designs_is_what_a_course_says(name):
     scene = tf.scenes.build(name)
-    why = tf.GrowthRecording.obstacle(scene)
+    why = scene.bind().why_not_replayable
     assert replayed(scene) == f"no, {why}" if why else replayed(scene).startswith("yes, ")
     if name == "boundary_detector":
         assert replayed(scene) == "yes, circuit and transport only follow (GrowthRecording, Replay)"
@@ -233,12 +233,12 @@ def test_whether_growth_serves_many_designs_is_what_a_course_says(name):
 @pytest.mark.parametrize("name", tf.scenes.READY)
 def test_couplings_are_those_of_the_scene(name):
     scene = tf.scenes.build(name)
-    said, info = tf.explain(scene, seconds=0), scene.explain()
-    assert scene.drives() and all(
-        f"    {line}\n" in said and f"    {line}" in info for line in scene.drives()
+    said, info = tf.explain(scene, seconds=0), scene.bind().describe()
+    assert scene.bind().drives() and all(
+        f"    {line}\n" in said and f"    {line}" in info for line in scene.bind().drives()
     )
-    assert {tuple(line.split(": ")[0].split(" -> ")) for line in scene.drives()} == {
-        (w, r) for w, _, r in scene.couplings()
+    assert {tuple(line.split(": ")[0].split(" -> ")) for line in scene.bind().drives()} == {
+        (w, r) for w, _, r in scene.bind().couplings()
     }
 
 

@@ -114,12 +114,12 @@ def test_couplings_say_who_drives_whom():
     sink = named(order, "sink", 20, reads=("heat",))
     needy = named(order, "needy", 30, needs=("heat",), writes=("length",))
     scene = tf.Scene(needy, source, sink)
-    assert set(scene.couplings()) == {("source", "heat", "sink"), ("source", "heat", "needy")}
+    assert set(scene.bind().couplings()) == {("source", "heat", "sink"), ("source", "heat", "needy")}
 
 
 def test_couplings_of_growth_and_mechanics():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2))
-    found = scene.couplings()
+    found = scene.bind().couplings()
     assert ("growth", "elongation", "mechanics") in found
     assert ("growth", "length", "division") in found
     assert ("mechanics", "length", "growth") in found, "mechanics holds growth back"
@@ -128,8 +128,8 @@ def test_couplings_of_growth_and_mechanics():
 
 def test_growth_alone_is_driven_by_nobody():
     scene = tf.Scene(tf.Growth(rate=1.0))
-    assert scene.couplings() == []
-    assert "nobody" in scene.explain()
+    assert scene.bind().couplings() == []
+    assert "nobody" in scene.bind().describe()
 
 
 def test_explain_names_stages_parameters_fields_and_couplings():
@@ -138,7 +138,7 @@ def test_explain_names_stages_parameters_fields_and_couplings():
         tf.Division(length=tf.Uniform(3.0, 4.0)),
         tf.Mechanics(dim=2, walls=[tf.Plane(y=-2.0, facing="+y")]),
         name="mine",
-    ).explain()
+    ).bind().describe()
     for part in (
         "mine",
         "2-D",
@@ -597,5 +597,5 @@ def test_an_effect_of_ones_own_needs_a_title_and_a_stage():
 def test_what_drives_what_is_said_once():
     scene = tf.scenes.quorum_sensing()
     scene.bind(1).start()  # what a rate function reads is known once it is tried
-    told = scene.drives()
+    told = scene.bind().drives()
     assert "transport -> circuit: out.ahl" in told and "circuit -> transport: out.ahl" in told

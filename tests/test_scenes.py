@@ -60,7 +60,7 @@ def test_it_runs_and_its_recipe_builds_it_again(kind):
 def test_it_explains_itself(kind):
     scene = small(kind)
     scene.bind(2).start()
-    assert "growth -> mechanics" in scene.explain()
+    assert "growth -> mechanics" in scene.bind().describe()
     assert len(READY[kind.split()[0]].__doc__) > 60
 
 

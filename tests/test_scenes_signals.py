@@ -273,7 +273,7 @@ def test_what_is_eaten_times_the_yield_is_what_is_grown():
 )
 def test_every_scene_explains_itself_and_refuses_nonsense(name):
     make = getattr(tf.scenes, name)
-    said = make().explain()
+    said = make().bind().describe()
     assert "who drives whom" in said and ("circuit" in said or "nutrition" in said)
     with pytest.raises((InputError, TypeError)):
         make(rate=-1.0).bind().start()

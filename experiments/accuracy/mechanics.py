@@ -78,7 +78,7 @@ def one_by_one(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
             0.1 / LENGTH_DRAG,
             (0.1, 0.01, 0.001) if quick else (0.1, 0.03, 0.01, 0.003, 0.001),
         ),
-        ("passes", "passes", plain.most_passes, (1, 2) if quick else (1, 2, 4)),
+        ("passes", "passes", plain.settings.passes, (1, 2) if quick else (1, 2, 4)),
         ("tolerance", "tolerance", TOLERANCE, (0.2, 0.05, 0.02) if quick else TOLERANCES),
     ):
         found += [
@@ -112,7 +112,7 @@ def together(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
         )
         for dt in (0.05, 0.025, 0.0125)
         for alpha in (0.1, 0.01, 0.001)
-        for passes in (plain.most_passes, 2 * plain.most_passes)
+        for passes in (plain.settings.passes, 2 * plain.settings.passes)
         for tolerance in (0.2, 0.02)
     ]
 

@@ -80,7 +80,7 @@ def test_a_cell_that_is_thrown_at_a_wall_stays(device, dtype):
     scene = tf.Scene(tf.Mechanics(dim=2, walls=[tf.Plane(y=0.55, facing="-y")], alpha=1e-4))
     state = run(scene, seeded(scene, cells, device, dtype), 1, dt=0.01)
     assert float(state.displacement[1, 1]) > 0.9 and float(state.position[1, 1]) <= 0.55 + 1e-5
-    assert state.reports["mechanics"].limited.tolist() == [1]
+    assert state.reports["mechanics"].clipped.tolist() == [1]
 
 
 @pytest.mark.parametrize(

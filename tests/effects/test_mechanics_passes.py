@@ -90,7 +90,7 @@ def test_a_later_pass_moves_only_what_is_too_deep(device, dtype):
     deep = torch.zeros_like(moved)
     deep[torch.cat([first[gap < -0.1], second[gap < -0.1]])] = True
     assert bool(moved[deep].all()) and not bool(moved[-2:].any())
-    assert 0 < int((moved & ~deep).sum()) <= int(one.reports["mechanics"].limited[0]) < RODS
+    assert 0 < int((moved & ~deep).sum()) <= int(one.reports["mechanics"].clipped[0]) < RODS
     assert not bool(moved[:RODS].all())
 
 
@@ -233,14 +233,14 @@ def test_a_colony_whose_cells_stay_in_one_another_is_told():
     scene = tf.Scene(tf.Mechanics(dim=3, alpha=1e4), founders=thrown(0.3, 6.0))
     with pytest.warns(RuntimeWarning, match=r"for 20 steps in colony 0 \(\d+ cells\).*alpha"):
         states = list(tf.simulate(scene, scene.bind(2).start(), until=25 * 0.025, dt=0.025))
-    assert int(states[0].reports["mechanics"].buried[0]) > 10
+    assert int(states[0].reports["mechanics"].deeply_overlapping[0]) > 10
 
 
 def test_a_heap_that_parts_is_no_collapse():
     """In tests warnings are errors."""
     scene = tf.Scene(tf.Mechanics(dim=3), founders=thrown(1.0, 6.0))
     *_, state = tf.simulate(scene, scene.bind(2).start(), until=40 * 0.025, dt=0.025)
-    assert int(state.reports["mechanics"].buried.max()) == 0
+    assert int(state.reports["mechanics"].deeply_overlapping.max()) == 0
 
 
 @pytest.mark.parametrize("unilateral", [False, True])

@@ -253,5 +253,5 @@ def test_what_is_missing_is_told():
 
 
 def test_explain_says_who_drives_whom():
-    said = eating(tf.Monod("food")).explain()
+    said = eating(tf.Monod("food")).bind().describe()
     assert "nutrition -> growth: growth_rate" in said and "transport -> nutrition: out.food" in said

@@ -412,7 +412,7 @@ def test_a_negative_rate_from_a_rule_never_makes_a_negative_length(law):
 def test_what_a_rule_reads_and_writes_is_declared():
     scene = tf.Scene(tf.Rules(short_update), tf.Growth(), tf.Division(), founders=pair_of_cells())
     scene.bind().start()
-    found = scene.couplings()
+    found = scene.bind().couplings()
     assert ("rules", "growth_rate", "growth") in found
     assert ("rules", "divide_flag", "division") in found
 
@@ -426,7 +426,7 @@ def test_reading_a_derived_quantity_is_reading_the_length(name):
 
     scene = tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), founders=pair_of_cells())
     scene.bind().start()
-    assert "growth" in {w for w, _, r in scene.couplings() if r == "rules"}
+    assert "growth" in {w for w, _, r in scene.bind().couplings() if r == "rules"}
 
 
 def test_looking_for_contacts_is_reading_the_geometry():
@@ -437,7 +437,7 @@ def test_looking_for_contacts_is_reading_the_geometry():
         tf.Rules(update), tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=pair_of_cells()
     )
     scene.bind().start()
-    assert {"growth", "mechanics"} <= {w for w, _, r in scene.couplings() if r == "rules"}
+    assert {"growth", "mechanics"} <= {w for w, _, r in scene.bind().couplings() if r == "rules"}
 
 
 def test_a_rule_that_would_fail_with_two_cells_is_told_at_once_with_one():

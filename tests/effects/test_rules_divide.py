@@ -214,4 +214,4 @@ def test_what_a_divide_rule_writes_is_declared():
         tf.Rules(divide=divide), tf.Growth(rate=1.0), tf.Division(), founders=pair_of_cells()
     )
     scene.bind().start()
-    assert "growth" in {r for w, _, r in scene.couplings() if w.startswith("rules")}
+    assert "growth" in {r for w, _, r in scene.bind().couplings() if w.startswith("rules")}
