@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from torchfilm import effect, measure, scenes
 from torchfilm.circuits import kinetics, parts
 from torchfilm.circuits.reactions import Reaction
+from torchfilm.distributions import LogNormal, Normal, Uniform
 from torchfilm.effect import Effect
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
@@ -37,7 +38,7 @@ from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.timing import Timings
-from torchfilm.values import LogNormal, Normal, PerColony, Uniform, physical
+from torchfilm.values import PerColony, physical
 from torchfilm.version import __version__
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ if TYPE_CHECKING:
     from torchfilm.explanation import explain
     from torchfilm.pictures import show
     from torchfilm.tuning.settings import Settings, preset
-    from torchfilm.tuning.tuner import Tuned, tune
+    from torchfilm.tuning.tuned import Tuned
+    from torchfilm.tuning.tuner import tune
 
 # Imported when first used: `import torchfilm` takes little longer than torch.
 _LAZY = {
@@ -53,7 +55,7 @@ _LAZY = {
     "show": "torchfilm.pictures",
     "Settings": "torchfilm.tuning.settings",
     "preset": "torchfilm.tuning.settings",
-    "Tuned": "torchfilm.tuning.tuner",
+    "Tuned": "torchfilm.tuning.tuned",
     "tune": "torchfilm.tuning.tuner",
 }
 

@@ -15,20 +15,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 
+from torchfilm.resolver import Batch, Resolved, Values, drawn_field, resolve
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, hashing
-from torchfilm.values import (
-    Batch,
-    ByType,
-    PerColony,
-    Resolved,
-    Rule,
-    Values,
-    checked,
-    drawn_field,
-    is_drawn,
-    resolve,
-)
+from torchfilm.values import ByType, PerColony, Rule, checked, is_drawn
 
 if TYPE_CHECKING:
     from torchfilm.tools.hot_reload import HotReload

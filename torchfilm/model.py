@@ -21,11 +21,11 @@ from torch import Tensor
 
 from torchfilm.effect import BUILT_IN, Binding, BoundEffect, parameters
 from torchfilm.initial_cells import Cells
+from torchfilm.resolver import Batch
 from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.timing import Timings
-from torchfilm.values import Batch
 
 if TYPE_CHECKING:
     from torchfilm.scene import Scene

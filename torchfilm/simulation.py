@@ -58,25 +58,9 @@ def simulate(
     """
     _check_kinds("simulate", scene, state)
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
-    if record is not None and not isinstance(record, (str, Path, Recorder)):
-        raise checks.input_error("record", record, "the path of a new results file, or a Recorder")
     observers = (observers,) if callable(observers) else tuple(observers)
-    if not all(callable(o) for o in observers):
-        raise checks.input_error(
-            "observers", observers, "a list of functions that are called with a state"
-        )
-    if until is None and cells is None:
-        raise checks.InputError(
-            "simulate needs an end: give until=… (hours) or cells=… (per colony)."
-        )
-    checks.choice("on_failure", on_failure, ("raise", "drop"))
-    if cells is not None and (isinstance(cells, bool) or not isinstance(cells, int) or cells < 1):
-        raise checks.input_error("cells", cells, "an integer from 1")
-    if state is not None and (colonies is not None or streams is not None):
-        given = "colonies" if colonies is not None else "streams"
-        raise checks.input_error(
-            given, colonies or streams, "left out where a state is given", "The state has its own."
-        )
+    _check_options(record, observers, until, cells, on_failure)
+    _check_batch(state, colonies, streams)
     if state is not None and until is not None:
         _last_step(state, checks.number("until", until), dt)
     model = _bound(scene, state, colonies, seed, streams, device, dtype)
@@ -107,6 +91,34 @@ def simulate(
         recorder,
         bar,
     )
+
+
+def _check_options(
+    record: object, observers: Sequence[object], until: object, cells: object, on_failure: str
+) -> None:
+    """Raise InputError for options that mean nothing."""
+    if record is not None and not isinstance(record, (str, Path, Recorder)):
+        raise checks.input_error("record", record, "the path of a new results file, or a Recorder")
+    if not all(callable(o) for o in observers):
+        raise checks.input_error(
+            "observers", observers, "a list of functions that are called with a state"
+        )
+    if until is None and cells is None:
+        raise checks.InputError(
+            "simulate needs an end: give until=… (hours) or cells=… (per colony)."
+        )
+    checks.choice("on_failure", on_failure, ("raise", "drop"))
+    if cells is not None and (isinstance(cells, bool) or not isinstance(cells, int) or cells < 1):
+        raise checks.input_error("cells", cells, "an integer from 1")
+
+
+def _check_batch(state: State | None, colonies: object, streams: object) -> None:
+    """Raise InputError where a batch is described twice."""
+    for name, given in (("colonies", colonies), ("streams", streams)):
+        if state is not None and given is not None:
+            raise checks.input_error(
+                name, given, "left out where a state is given", "The state has its own."
+            )
 
 
 def _monitors(

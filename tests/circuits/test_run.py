@@ -10,6 +10,7 @@ import torch
 from torchfilm.circuits import run
 from torchfilm.circuits.columns import Columns, Lazy, column
 from torchfilm.circuits.names import UnknownName
+from torchfilm.circuits.trial import try_circuit
 from torchfilm.tools.checks import InputError
 
 F64 = torch.float64
@@ -148,14 +149,14 @@ def test_a_signal_whose_amount_breaks_is_told_apart():
     with pytest.raises(
         InputError, match=r"gives -inf for the signal 'a' at the start \(a = 1, b = 0\)"
     ):
-        run.trial(made, start)
+        try_circuit(made, start)
 
 
 def test_the_trial_tells_what_is_given():
     start = torch.ones(3, 2, dtype=F64)
-    assert run.trial(circuit(), start) == ("a",)
-    assert run.trial(circuit(lambda u, s, p, cell: {"a": -u.a}), start) == ()
-    assert run.trial(circuit(lambda u, s, p, cell: ({"a": -u.a}, {})), start) == ()
+    assert try_circuit(circuit(), start) == ("a",)
+    assert try_circuit(circuit(lambda u, s, p, cell: {"a": -u.a}), start) == ()
+    assert try_circuit(circuit(lambda u, s, p, cell: ({"a": -u.a}, {})), start) == ()
 
 
 def test_rates_may_be_numbers():

@@ -6,7 +6,6 @@ The Runge–Kutta methods are those of torchdiffeq.
 from __future__ import annotations
 
 import torch
-import torchdiffeq
 from torch import Tensor
 
 from torchfilm.circuits.rosenbrock import Rates
@@ -38,10 +37,12 @@ def runge_kutta(rates: Rates, u: Tensor, dt: float, steps: int = 1, method: str 
     checks.choice("method", method, METHODS)
     if dt == 0 or u.numel() == 0:
         return u.clone()
+    from torchdiffeq import odeint  # imported where it is used: it takes longer to load than torchfilm itself
+
     rows = torch.arange(u.shape[0], device=u.device)
     # times in float64 on the host: in float32 the last step could be tiny
     grid = torch.linspace(0.0, dt, steps + 1, dtype=torch.float64)
-    found = torchdiffeq.odeint(
+    found = odeint(
         lambda t, y: rates(y, rows),
         u,
         grid[[0, -1]],

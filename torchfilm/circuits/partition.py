@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import scipy.stats
 import torch
 from torch import Tensor
 
@@ -13,7 +12,9 @@ def binomial(count: Tensor, share: Tensor, uniform: Tensor) -> Tensor:
 
     It is the least k with P(X ≤ k) ≥ uniform (M,).
     """
-    found = scipy.stats.binom.ppf(
+    from scipy.stats import binom  # imported where it is used: it takes longer to load than torchfilm itself
+
+    found = binom.ppf(
         uniform.double().cpu().numpy(), count.double().cpu().numpy(), share.double().cpu().numpy()
     )
     return torch.from_numpy(found).to(count).clamp(min=0.0)

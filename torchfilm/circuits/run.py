@@ -19,9 +19,8 @@ from torch import Tensor
 from torchfilm.circuits import integrators, rosenbrock, stochastic
 from torchfilm.circuits.columns import Columns, column
 from torchfilm.circuits.draws import Draw
-from torchfilm.circuits.names import Names, UnknownName, unknown
+from torchfilm.circuits.names import Names, unknown
 from torchfilm.circuits.network import Network
-from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.deterministic_math import deterministic_functions
 
@@ -245,11 +244,9 @@ def _molecules(
     assert isinstance(circuit.part, Network)
     network, rows = circuit.part, circuit.rows
     volume = circuit.names(concentrations, rows)[3].volume.double()
-    molecules_per_unit = (
-        settings.molecules_per_unit.index_select(0, rows).double()
-        if isinstance(settings.molecules_per_unit, Tensor) and settings.molecules_per_unit.dim()
-        else settings.molecules_per_unit
-    )
+    given = settings.molecules_per_unit
+    each = isinstance(given, Tensor) and bool(given.dim())
+    molecules_per_unit = given.index_select(0, rows).double() if each else given  # type: ignore
     parts = [torch.round(concentrations.double() * (volume * molecules_per_unit).unsqueeze(1))]
     pool = None
     if network.signals:
@@ -292,16 +289,7 @@ def _molecules(
         n: (end[:, size + k] - start[:, size + k]) / molecules_per_unit
         for k, n in enumerate(network.signals)
     }
-    away = None if circuit.in_reservoir is None else circuit.in_reservoir.index_select(0, rows)
-    pools = {
-        n: (x if away is None else torch.where(away, 0.0, x)).to(concentrations.dtype)
-        for n, x in amount.items()
-    }
-    reservoir = (
-        {}
-        if away is None
-        else {n: torch.where(away, x, 0.0).to(concentrations.dtype) for n, x in amount.items()}
-    )
+    pools, reservoir = _split(circuit, amount, concentrations.dtype)
     found = (end[:, :size] / (volume * molecules_per_unit).unsqueeze(1)).to(concentrations.dtype)
     # a code of its own for each reaction that went wrong, apart from those of the smooth methods
     code = torch.where(
@@ -310,6 +298,17 @@ def _molecules(
         torch.where(report.reaction >= 0, MOLECULES + report.reaction, report.status),
     )
     return CircuitOutcome(found, pools, reservoir, report.status != 0, code, report.steps)
+
+
+def _split(
+    circuit: CircuitCells, amount: Mapping[str, Tensor], dtype: torch.dtype
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Amounts given to signals, (M,) by name: those to pools, and those to a reservoir."""
+    if circuit.in_reservoir is None:
+        return {n: x.to(dtype) for n, x in amount.items()}, {}
+    away = circuit.in_reservoir.index_select(0, circuit.rows)
+    pools = {n: torch.where(away, 0.0, x).to(dtype) for n, x in amount.items()}
+    return pools, {n: torch.where(away, x, 0.0).to(dtype) for n, x in amount.items()}
 
 
 MOLECULES = 100
@@ -377,65 +376,3 @@ def _not_finite(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float
         if bad:
             return bad
     return []
-
-
-def trial(
-    circuit: CircuitCells, concentrations: Tensor, derivatives: bool = False
-) -> tuple[str, ...]:
-    """Try the circuit once at concentrations (M, S), with derivatives where its method asks for
-    them: raise InputError for what it returns wrongly; the signals that it exchanges."""
-    try:
-        inside, outside = circuit.changes(concentrations, circuit.rows)
-        # a little of everything, another little in every cell: at 0 a sum over cells would not show
-        some = concentrations + 0.1 * torch.arange(
-            1, len(concentrations) + 1, device=concentrations.device
-        ).unsqueeze(1)
-        crowd, alone = (
-            circuit.changes(some, circuit.rows),
-            circuit.changes(some[:1], circuit.rows[:1]),
-        )
-        if derivatives:
-            with torch.enable_grad():
-                circuit.changes(some.detach().clone().requires_grad_(), circuit.rows)
-    except UnknownName as error:
-        raise UnknownName(f"{circuit.label}: {error}") from error
-    except InputError:
-        raise
-    except (TypeError, ValueError, RuntimeError, IndexError) as error:
-        raise InputError(
-            f"{circuit.label} failed on the columns of {len(concentrations)} cells: {error}. It is"
-            " called with (u, s, p, cell), each name a column with one value a cell: use torch.exp"
-            " and the like rather than math or numpy, torch.where rather than if, and change"
-            " nothing in place."
-        ) from error
-    for whole, one in zip(crowd, alone, strict=True):
-        for name, value in one.items():
-            if not torch.allclose(
-                whole[name].detach()[:1], value.detach(), rtol=1e-4, atol=1e-30, equal_nan=True
-            ):
-                raise InputError(
-                    f"{circuit.label}: the rate of {name!r} in one cell depends on what other cells"
-                    " there are (a sum or a mean over them, or a draw?). A rate function may go by"
-                    " its own cell and what it finds outside only."
-                )
-    for what, found in (("species", inside), ("signal", outside)):
-        for name, value in found.items():
-            if not bool(torch.isfinite(value.detach()).all()):
-                k = int(torch.nonzero(~torch.isfinite(value.detach()))[0])
-                at = ", ".join(
-                    f"{n} = {float(x):g}"
-                    for n, x in zip(circuit.species, concentrations[k], strict=True)
-                )
-                raise checks.InputError(
-                    f"{circuit.label} gives {float(value[k])} for the {what} {name!r} at the start"
-                    f" ({at}): every rate must be a finite number."
-                )
-    if isinstance(circuit.part, Network):
-        exchanged = {
-            n.removeprefix("out.")
-            for r in circuit.part.reactions
-            for n in r.change()
-            if n.startswith("out.")
-        }
-        return tuple(n for n in circuit.part.signals if n in exchanged)
-    return tuple(n for n in circuit.signals if n in outside)

@@ -18,11 +18,13 @@ from torchfilm.circuits.columns import Lazy
 from torchfilm.circuits.draws import keyed_draws
 from torchfilm.circuits.names import unknown
 from torchfilm.circuits.network import build_network
+from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect, number_range
 from torchfilm.medium_exchange import MediumExchange
+from torchfilm.resolver import snapshot
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
-from torchfilm.values import numbers, snapshot
+from torchfilm.values import numbers
 
 if TYPE_CHECKING:
     from torchfilm.effects.circuit import Circuit
@@ -131,7 +133,7 @@ class BoundCircuit(BoundEffect):
             ).repeat(2)[:64]
             tried = self._cells(state, rows, kind, (), found, seen=seen)
             derivatives = circuit.method == "rosenbrock"
-            exchanged[kind] = run.trial(
+            exchanged[kind] = try_circuit(
                 tried, self._concentrations(state, rows), derivatives=derivatives
             )
         self._check_constants(seen["p"])

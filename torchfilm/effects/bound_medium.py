@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import BEFORE_CELLS, GRID_COVERAGE, Binding, BoundEffect
+from torchfilm.resolver import snapshot
 from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
@@ -21,7 +22,6 @@ from torchfilm.signals.space import MOST_VOXELS
 from torchfilm.signals.transport import Stepper, choose, prepare
 from torchfilm.state import GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
-from torchfilm.values import snapshot
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Flow, Medium, OnGrid, Signal

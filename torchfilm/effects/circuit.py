@@ -19,9 +19,10 @@ from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.effect import CIRCUIT, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_circuit import BoundCircuit
+from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks
-from torchfilm.values import COLONY, Rule, Value, Values, checked
+from torchfilm.values import COLONY, Rule, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
@@ -93,42 +94,15 @@ class Circuit(Effect):
             dict(rates.items()) if isinstance(rates, Mapping) else {EVERY: rates}
         )
         names = _names(species)
-        others = (
-            dict(shared)
-            if isinstance(shared, Mapping)
-            else {n: n for n in _names(shared, "shared")}
-            if shared
-            else {}
-        )
+        others = _shared(shared)
         _check_species(names, others)
         _check_rates(by_type, isinstance(rates, Mapping))
         _check_initial(initial, names)
-        for odd, value in parameters.items():
-            if isinstance(value, str) or callable(value):
-                near = difflib.get_close_matches(odd, [f.name for f in dataclasses.fields(self)], 1)
-                hint = (
-                    f"Did you mean {near[0]}?"
-                    if near
-                    else "Further names are constants of the rates."
-                )
-                raise checks.input_error(
-                    f"Circuit.{odd}", value, "a number, or one number per colony", hint
-                )
+        _check_constants(parameters, [f.name for f in dataclasses.fields(self)])
+        _check_method(method, steps, by_type)
         checks.choice("Circuit.daughters", daughters, ("concentration", "amount"))
-        checks.choice("Circuit.method", method, METHODS)
         if name and not (isinstance(name, str) and name.isidentifier()):
             raise checks.input_error("Circuit.name", name, 'an identifier, such as "toggle"')
-        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-            raise checks.input_error("Circuit.steps", steps, "an integer from 1")
-        functions = [part for part in by_type.values() if callable(part)]
-        if method in (LEAP, DIRECT) and functions:
-            shown = getattr(functions[0], "__name__", "a function")
-            raise checks.input_error(
-                "Circuit.method",
-                method,
-                f"for reactions; {shown} gives rates",
-                "Write the circuit as a list of reactions.",
-            )
         first = Rule(least=0.0)
         given = {
             "rates": by_type,
@@ -331,3 +305,36 @@ def _check_initial(initial: object, names: tuple[str, ...]) -> None:
             raise checks.InputError(
                 unknown(f"Circuit.initial names {name!r}, which is no species", name, names)
             )
+
+
+def _shared(given: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
+    """Species of another circuit, by the name here, with their fields."""
+    if isinstance(given, Mapping):
+        return dict(given)
+    return {n: n for n in _names(given, "shared")} if given else {}
+
+
+def _check_constants(given: Mapping[str, Any], options: Sequence[str]) -> None:
+    for name, value in given.items():
+        if isinstance(value, str) or callable(value):
+            near = difflib.get_close_matches(name, options, 1)
+            hint = (
+                f"Did you mean {near[0]}?" if near else "Further names are constants of the rates."
+            )
+            raise checks.input_error(
+                f"Circuit.{name}", value, "a number, or one number per colony", hint
+            )
+
+
+def _check_method(method: str, steps: int, by_type: Mapping[int | str, Any]) -> None:
+    checks.choice("Circuit.method", method, METHODS)
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        raise checks.input_error("Circuit.steps", steps, "an integer from 1")
+    functions = [part for part in by_type.values() if callable(part)]
+    if method in (LEAP, DIRECT) and functions:
+        raise checks.input_error(
+            "Circuit.method",
+            method,
+            f"for reactions; {getattr(functions[0], '__name__', 'a function')} gives rates",
+            "Write the circuit as a list of reactions.",
+        )

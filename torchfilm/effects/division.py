@@ -10,20 +10,11 @@ from torch import Tensor
 
 from torchfilm.effect import DIVISION, Effect
 from torchfilm.physics import capsule
+from torchfilm.resolver import Resolved, Values
 from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
-from torchfilm.values import (
-    ByType,
-    Resolved,
-    Value,
-    Values,
-    is_drawn,
-    is_inherited,
-    largest,
-    physical,
-    smallest,
-)
+from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 CRITERIA = ("length", "volume", "added")
 

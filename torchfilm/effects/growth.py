@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import GROWTH, Binding, BoundEffect, Effect
+from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
-from torchfilm.values import ByType, Value, Values, is_drawn, is_inherited, physical, smallest
+from torchfilm.values import ByType, Value, is_drawn, is_inherited, physical, smallest
 
 LAWS = ("volume", "length", "linear")
 UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}

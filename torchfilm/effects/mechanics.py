@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import MECHANICS, Binding, BoundEffect, Concern, Effect, number_range
-from torchfilm.physics.contact_step import (
+from torchfilm.physics.contact_records import (
     CLOSE,
     DEEP,
     PENALTY,
@@ -21,16 +21,17 @@ from torchfilm.physics.contact_step import (
     ContactReport,
     ContactSettings,
     Moved,
-    contact_step,
 )
+from torchfilm.physics.contact_step import contact_step
 from torchfilm.physics.initial_overlaps import check_apart
 from torchfilm.physics.problem import CONVERGED, NOT_FINITE, STATUS, TOO_FAST
 from torchfilm.physics.surfaces import Surface
 from torchfilm.physics.walls import Wall
+from torchfilm.resolver import Values, snapshot
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
-from torchfilm.values import Rule, Value, Values, numbers, physical, snapshot
+from torchfilm.values import Rule, Value, numbers, physical
 
 MOST_SUBSTEPS = 1000
 # A colony whose contacts do not hold has more than this share of its cells (of MANY, if it has

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -116,38 +117,9 @@ class Medium(Effect):
         splitting: str = "strang",
         **signals: Signal,
     ):
-        if not signals:
-            raise checks.InputError(
-                "Medium() has no signal: name at least one, such as ahl=tf.Signal(diffusion=10.0)."
-            )
-        for name, signal in signals.items():
-            if not isinstance(signal, Signal):
-                raise checks.input_error(
-                    f"Medium.{name}",
-                    signal,
-                    "a Signal",
-                    f"Write {name}=tf.Signal(diffusion=…), or check the spelling of an option.",
-                )
+        _check_signals(signals)
         low, high, voxel = checked_box(box, spacing, depth, height)
-        if boundary is not None and not isinstance(boundary, BoundaryConditions):
-            raise checks.input_error(
-                "Medium.boundary",
-                boundary,
-                "BoundaryConditions",
-                "Write boundary=tf.BoundaryConditions(x=tf.Open(), y=tf.NoFlux()).",
-            )
-        checks.choice("Medium.outside", outside, OUTSIDE_CELLS)
-        if not isinstance(grows, str) or not grows or set(grows) - set("xyz"):
-            raise checks.input_error(
-                "Medium.grows", grows, 'some of the letters x, y and z, such as "x"'
-            )
-        if method is not None:
-            checks.choice("Medium.method", method, tuple(METHODS))
-        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-            raise checks.input_error("Medium.steps", steps, "a whole number from 1")
-        checks.choice("Medium.splitting", splitting, SPLITTINGS)
-        if obstacles is not None and not callable(obstacles):
-            raise checks.input_error("Medium.obstacles", obstacles, "a function of places")
+        _check_medium(boundary, outside, grows, method, steps, splitting, obstacles)
         given = {
             "signals": dict(signals),
             "box": (low, high),
@@ -165,16 +137,19 @@ class Medium(Effect):
         }
         for name, value in given.items():
             object.__setattr__(self, name, value)
-        periodic = {self.boundary_of(name).periodic for name in signals}
+        self._check_periodic()
+
+    def _check_periodic(self) -> None:
+        periodic = {self.boundary_of(name).periodic for name in self.signals}
         if len(periodic) > 1:
             raise checks.InputError(
                 "Medium: a face is periodic for one signal and not for another; space closes on"
                 " itself for all or for none."
             )
-        if True in next(iter(periodic)) and outside == "grow":
+        if True in next(iter(periodic)) and self.outside == "grow":
             raise checks.input_error(
                 "Medium.outside",
-                outside,
+                self.outside,
                 '"error" or "reservoir" with periodic faces',
                 "A box that closes on itself cannot grow.",
             )
@@ -279,3 +254,48 @@ class Medium(Effect):
             "grow": f"the box grows with its colony along {self.grows}, {BLOCK} voxels at a time",
             "reservoir": "cells outside the box meet a reservoir that stays as it is",
         }[self.outside]
+
+
+def _check_signals(signals: Mapping[str, Any]) -> None:
+    if not signals:
+        raise checks.InputError(
+            "Medium() has no signal: name at least one, such as ahl=tf.Signal(diffusion=10.0)."
+        )
+    for name, signal in signals.items():
+        if not isinstance(signal, Signal):
+            raise checks.input_error(
+                f"Medium.{name}",
+                signal,
+                "a Signal",
+                f"Write {name}=tf.Signal(diffusion=…), or check the spelling of an option.",
+            )
+
+
+def _check_medium(
+    boundary: object,
+    outside: str,
+    grows: object,
+    method: str | None,
+    steps: object,
+    splitting: str,
+    obstacles: object,
+) -> None:
+    if boundary is not None and not isinstance(boundary, BoundaryConditions):
+        raise checks.input_error(
+            "Medium.boundary",
+            boundary,
+            "BoundaryConditions",
+            "Write boundary=tf.BoundaryConditions(x=tf.Open(), y=tf.NoFlux()).",
+        )
+    checks.choice("Medium.outside", outside, OUTSIDE_CELLS)
+    if not isinstance(grows, str) or not grows or set(grows) - set("xyz"):
+        raise checks.input_error(
+            "Medium.grows", grows, 'some of the letters x, y and z, such as "x"'
+        )
+    if method is not None:
+        checks.choice("Medium.method", method, tuple(METHODS))
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        raise checks.input_error("Medium.steps", steps, "a whole number from 1")
+    checks.choice("Medium.splitting", splitting, SPLITTINGS)
+    if obstacles is not None and not callable(obstacles):
+        raise checks.input_error("Medium.obstacles", obstacles, "a function of places")

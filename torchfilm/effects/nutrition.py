@@ -12,9 +12,10 @@ from torch import Tensor
 from torchfilm.circuits.rosenbrock import rodas3
 from torchfilm.effect import NUTRITION, Binding, BoundEffect, Effect
 from torchfilm.medium_exchange import MediumExchange
+from torchfilm.resolver import Values
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
-from torchfilm.values import Value, Values, physical
+from torchfilm.values import Value, physical
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import REMOVAL, Effect
+from torchfilm.resolver import Values
 from torchfilm.state import State
 from torchfilm.tools import checks
-from torchfilm.values import COLONY, Rule, Values
+from torchfilm.values import COLONY, Rule
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ import torch
 from torchfilm.scene import Scene
 from torchfilm.scenes import channels, circuits, colonies, nutrients, signalling
 from torchfilm.tools import checks
-from torchfilm.tuning.settings import Settings
 
 
 def _is_list_of_numbers(given: Any) -> bool:
@@ -74,6 +73,12 @@ READY: dict[str, Callable[..., Scene]] = {
 }
 
 
+def _accuracy_settings() -> set[str]:
+    from torchfilm.tuning.settings import Settings  # only where a message needs it
+
+    return {f.name for f in dataclasses.fields(Settings)}
+
+
 def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
     """The ready-made scene `name`. Raises InputError for an unknown name or parameter."""
     if name not in READY:
@@ -90,7 +95,7 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
         if given not in allowed:
             knob = (
                 "It is an accuracy setting: use --settings FILE or tf.Settings(…)."
-                if given in {f.name for f in dataclasses.fields(Settings)}
+                if given in _accuracy_settings()
                 else ""
             )
             raise checks.input_error(

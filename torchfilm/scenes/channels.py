@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchfilm.distributions import Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
@@ -9,7 +10,6 @@ from torchfilm.effects.removal import Removal
 from torchfilm.initial_cells import Cells
 from torchfilm.physics.walls import Channel
 from torchfilm.scene import Scene
-from torchfilm.values import Uniform
 
 
 def channel(

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from torchfilm.circuits import parts
 from torchfilm.circuits.reactions import Reaction
+from torchfilm.distributions import Uniform
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
@@ -13,7 +14,6 @@ from torchfilm.effects.mechanics import Mechanics
 from torchfilm.effects.rules import Rules
 from torchfilm.rule_views import DivisionView
 from torchfilm.scene import Scene
-from torchfilm.values import Uniform
 
 Value = float | Tensor
 

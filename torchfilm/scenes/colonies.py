@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import torch
 
+from torchfilm.distributions import Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
@@ -14,7 +15,6 @@ from torchfilm.effects.rules import Rules
 from torchfilm.physics.walls import Plane
 from torchfilm.rule_views import CellsView
 from torchfilm.scene import Scene
-from torchfilm.values import Uniform
 
 
 def microcolony(

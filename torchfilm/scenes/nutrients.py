@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from torchfilm.distributions import Uniform
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
 from torchfilm.effects.mechanics import Mechanics
@@ -11,7 +12,6 @@ from torchfilm.effects.medium import Medium, Signal
 from torchfilm.effects.nutrition import Monod
 from torchfilm.scene import Scene
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet
-from torchfilm.values import Uniform
 
 
 def nutrient_limited(

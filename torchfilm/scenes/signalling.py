@@ -8,6 +8,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchfilm.circuits.names import Names
+from torchfilm.distributions import Uniform
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
 from torchfilm.effects.growth import Growth
@@ -16,7 +17,6 @@ from torchfilm.effects.medium import Medium, Signal
 from torchfilm.initial_cells import Cells
 from torchfilm.physics.walls import Channel
 from torchfilm.scene import Scene
-from torchfilm.values import Uniform
 
 Value = float | Tensor
 

@@ -18,7 +18,6 @@ import warnings
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse
 import torch
 from torch import Tensor
 
@@ -88,7 +87,9 @@ class Groups:
             self.owner.int().numpy(),
             np.arange(count + 1, dtype=np.int32),
         )
-        found = scipy.sparse.csc_array(entries, shape=(self.size, count)).tocsr()
+        from scipy.sparse import csc_array  # imported where it is used: it takes longer to load than torchfilm itself
+
+        found = csc_array(entries, shape=(self.size, count)).tocsr()
         return torch.from_numpy(found.indptr), torch.from_numpy(found.indices)
 
     def _incidence(self, dtype: torch.dtype) -> Tensor:

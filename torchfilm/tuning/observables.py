@@ -5,8 +5,8 @@ what one would read off it.
   as two.
 - volume: relative difference of what the window's second half added, or, where that is more, of
   what growth would add without pressure or loss of cells. In the first half cells settle, since the
-  start was grown by other settings. It is the volume of the cylinders round the cells, π r² times the
-  length from end to end, which no division changes.
+  start was grown by other settings. It is the volume of the cylinders round the cells, π r² times
+  the length from end to end, which no division changes.
 - radius: relative difference.
 - overlap: mean overlap of touching cells over their diameter (0 is right); of soft cells its
   difference.

@@ -1,0 +1,95 @@
+"""Distributions of a physical value over cells: uniform, normal, lognormal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.state import State
+from torchfilm.tools import checks
+from torchfilm.values import COLONY, Distribution, Rule, largest, numbers, smallest
+
+
+@dataclass(frozen=True, eq=False)
+class Uniform(Distribution):
+    """Uniform between low and high; each one number or one per colony."""
+
+    low: float | Tensor
+    high: float | Tensor
+
+    parameters = ("low", "high")
+
+    def __post_init__(self) -> None:
+        self._check(low=Rule(scope=COLONY), high=Rule(scope=COLONY))
+        if bool((numbers(self.low) > numbers(self.high)).any()):
+            raise checks.input_error(
+                "Uniform", (self.low, self.high), "low ≤ high", "Swap the two."
+            )
+
+    def draw(self, state: State, rows: Tensor, purpose: str, values: Any) -> Tensor:
+        low, high = values.low.of_rows(state, rows), values.high.of_rows(state, rows)
+        return low + (high - low) * state.uniform(rows, purpose)
+
+    def least(self) -> float:
+        return smallest(self.low)
+
+    def greatest(self) -> float:
+        return largest(self.high)
+
+
+@dataclass(frozen=True, eq=False)
+class Normal(Distribution):
+    """Gaussian of mean and sd; each one number or one per colony. Its tails beyond 4 sd (one draw
+    in 16,000) are folded back inside."""
+
+    mean: float | Tensor
+    sd: float | Tensor
+
+    parameters = ("mean", "sd")
+
+    def __post_init__(self) -> None:
+        self._check(mean=Rule(scope=COLONY), sd=Rule(scope=COLONY, least=0.0))
+
+    def draw(self, state: State, rows: Tensor, purpose: str, values: Any) -> Tensor:
+        z = _standard_normal(state, rows, purpose)
+        return values.mean.of_rows(state, rows) + values.sd.of_rows(state, rows) * z
+
+    def least(self) -> float:
+        return float((numbers(self.mean) - 4 * numbers(self.sd)).min())
+
+    def greatest(self) -> float:
+        return float((numbers(self.mean) + 4 * numbers(self.sd)).max())
+
+
+@dataclass(frozen=True, eq=False)
+class LogNormal(Distribution):
+    """The exponential of a Gaussian: its median, and sigma, the standard deviation of its
+    logarithm; each one number or one per colony."""
+
+    median: float | Tensor
+    sigma: float | Tensor
+
+    parameters = ("median", "sigma")
+
+    def __post_init__(self) -> None:
+        self._check(median=Rule(scope=COLONY, above=0.0), sigma=Rule(scope=COLONY, least=0.0))
+
+    def draw(self, state: State, rows: Tensor, purpose: str, values: Any) -> Tensor:
+        z = _standard_normal(state, rows, purpose)
+        # (0 + 1 · z, as of a Normal of mean 0 and sd 1)
+        return values.median.of_rows(state, rows) * torch.exp(values.sigma.of_rows(state, rows) * z)
+
+    def least(self) -> float:
+        return float((numbers(self.median) * torch.exp(-4 * numbers(self.sigma))).min())
+
+    def greatest(self) -> float:
+        return float((numbers(self.median) * torch.exp(4 * numbers(self.sigma))).max())
+
+
+def _standard_normal(state: State, rows: Tensor, purpose: str) -> Tensor:
+    """Standard normal draws (M,), the tails beyond 4 folded back inside."""
+    z = state.normal(rows, purpose)[:, 0]
+    return torch.where(z.abs() > 4, z.sign() * (8 - z.abs()).clamp(min=0), z)

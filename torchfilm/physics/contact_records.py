@@ -1,0 +1,157 @@
+"""What the parts of a contact step hand to each other: settings, properties of cells, where cells
+are, and what the solves did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.physics.problem import SolveReport
+from torchfilm.physics.surfaces import Surface
+from torchfilm.tools.ragged import Groups
+
+# What a pass leaves overlapping by more than DEEP radii is solved again in the next one, among all
+# the others at rest. It is a few cells in a hundred, which slip or turn. For the others one solve
+# already reaches the overlap that the penalty allows, and solving for them again takes twice the
+# time.
+DEEP = 0.2
+# The overlap, µm, that colonies which take sub-steps are solved to: their steps are coarse.
+CLOSE = 0.02
+COARSE_PASSES = 6
+# Tolerance of the solve at the default penalty α γ. Overlaps hardly depend on it, growth under
+# pressure does: at 0.2 a twentieth of what a colony grows is wrong, at 0.05 less than a hundredth.
+# The harder contacts are, the farther from rest is what moves with none of them at the same
+# residual: a tolerance that falls as (α γ)^¼ is enough from 0.1 down to 1e-6 (0.02 is needed at
+# 0.01), and one that falls faster is out of reach of float32.
+PENALTY, TOLERANCE = 0.1, 0.05
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """How contacts are solved, every default filled in: a default that is given explicitly is the
+    default.
+
+    dim: 2 or 3. unilateral: contacts only push. soft: cells have a physical stiffness. passes: at
+    most this many a step; coarse_passes: for colonies that take sub-steps. overlap: µm, that later
+    passes solve to; None: DEEP radii, CLOSE for colonies that take sub-steps. tolerance: of the
+    solve; None: by the penalty. max_iterations: of CG a solve.
+    """
+
+    dim: int
+    unilateral: bool
+    soft: bool
+    passes: int
+    coarse_passes: int
+    overlap: float | None
+    tolerance: float | None
+    max_iterations: int
+
+    @staticmethod
+    def resolve(
+        dim: int,
+        *,
+        unilateral: bool,
+        soft: bool,
+        passes: int | None,
+        overlap: float | None,
+        tolerance: float | None,
+        max_iterations: int,
+    ) -> ContactSettings:
+        """From what a user gave, None for a default: one pass in the plane, two in space, twice as
+        many one-sided."""
+        usual = (dim - 1) * (2 if unilateral else 1) if passes is None else passes
+        return ContactSettings(
+            dim,
+            unilateral,
+            soft,
+            usual,
+            max(usual, COARSE_PASSES),
+            overlap,
+            tolerance,
+            max_iterations,
+        )
+
+    @property
+    def degrees(self) -> int:
+        """Degrees of freedom of a cell: 4 in strict 2-D, 7 in 3-D."""
+        return 4 if self.dim == 2 else 7
+
+    @property
+    def sees_near(self) -> tuple[bool, bool]:
+        """Whether the first pass, and a later one, see what nearly touches. Rows that hold would
+        glue what growth takes apart; soft cells have no later pass that could push what nearly
+        touches together."""
+        return self.unilateral and not self.soft, not self.soft
+
+
+@dataclass(frozen=True)
+class CellProperties:
+    """What the contact step needs of N cells in B colonies and does not change, for one step.
+
+    radius (N,) µm; viscosity, length_drag, alpha (N,) or 0-dim; dt (N,) h, of each cell's sub-step;
+    overlap (N,) µm, how deep a contact may be left; colony_ids (N,); reference (N, d), a point near
+    each cell's colony. walls: for each surface its kind ("hard", "stiffness", "weight") and its
+    stiffness · α · Δt or weight by cell.
+    """
+
+    settings: ContactSettings
+    radius: Tensor
+    viscosity: Tensor
+    length_drag: Tensor
+    alpha: Tensor
+    overlap: Tensor
+    colony_ids: Tensor
+    reference: Tensor
+    start: Tensor
+    groups: Groups
+    surfaces: Sequence[Surface]
+    walls: Sequence[tuple[str, Tensor | None]]
+
+    @property
+    def colony(self) -> Tensor:
+        return self.groups.owner
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Where cells are, and what one solve hands to the next: position (N, d) float64 µm, axis (N,
+    d), length (N,) µm; clipped (N,) bool, whether the last move was cut short; reach (N,) µm, how
+    far the surface came at most; first_move (N, D), of the first solve, from which the next step
+    starts."""
+
+    position: Tensor
+    axis: Tensor
+    length: Tensor
+    clipped: Tensor
+    reach: Tensor
+    first_move: Tensor
+
+
+@dataclass(frozen=True)
+class ContactReport:
+    """What the contact solves of a step did, per colony (B,). `status` of the worst solve,
+    `iterations` of CG in all, and the worst true `residual`; `passes` taken; `clipped`: cells whose
+    last move was cut short; `deeply_overlapping`: cells that were deeper in another than a radius
+    when the step, or its last sub-step, began (0 of soft cells, which may be).
+    """
+
+    status: Tensor
+    iterations: Tensor
+    residual: Tensor
+    passes: Tensor
+    clipped: Tensor
+    deeply_overlapping: Tensor
+
+    def with_solve(self, new: SolveReport, clipped: Tensor, active: Tensor) -> ContactReport:
+        """The report after one more pass in the colonies that are active, (B,) bool."""
+        return ContactReport(
+            torch.where(active, torch.maximum(self.status, new.status), self.status),
+            self.iterations + torch.where(active, new.iterations, 0),
+            torch.where(active, torch.maximum(self.residual, new.residual), self.residual),
+            self.passes + active,
+            torch.where(active, clipped, self.clipped),
+            self.deeply_overlapping,
+        )

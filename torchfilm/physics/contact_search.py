@@ -1,0 +1,141 @@
+"""Which cells touch which, and which walls: all before a first pass, the unresolved ones after."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchfilm.physics.contact_records import CellProperties, ContactReport, Moved
+from torchfilm.physics.contacts import NEAR, CandidateContacts, Capsules, contact_gaps
+from torchfilm.physics.neighbours import Neighbourhood
+from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
+
+
+def find_contacts(
+    cells: CellProperties, at: Moved, active: Tensor, include_near: bool
+) -> tuple[CandidateContacts, WallContacts]:
+    """All that touches in the active colonies, (B,) bool; include_near: also what nearly
+    touches."""
+    near, rows, capsules = _neighbourhood(cells, at, active, include_near)
+    first, second = (rows.index_select(0, side) for side in near.pairs())
+    walls = _at_walls(cells, at, active.index_select(0, cells.colony), include_near)
+    return CandidateContacts.among(capsules, first, second, include_near), walls
+
+
+def unresolved_contacts(
+    cells: CellProperties, at: Moved, active: Tensor, pairs: CandidateContacts
+) -> tuple[CandidateContacts, WallContacts, Tensor]:
+    """After a move, in the active colonies (B,) bool: what touches the cells whose move was clipped
+    or left them too deep, and these cells, (N,) bool. pairs: what touched before the move.
+
+    Only there is it looked for: of two cells that did not touch, one must have moved by half of
+    what may be left, and two that did must have come nearer by what was missing to it.
+    """
+    include_near = cells.settings.sees_near[1]
+    near, rows, capsules = _neighbourhood(cells, at, active, include_near)
+    of_active = active.index_select(0, cells.colony)
+    walls = _at_walls(cells, at, of_active, include_near)
+    overlap = cells.overlap
+    with torch.no_grad():
+        count = torch.arange(rows.numel(), device=rows.device)
+        number = torch.full_like(cells.colony, -1).index_copy(0, rows, count)
+        pairs_of = lambda which: [
+            rows.index_select(0, side) for side in near.pairs_of(number[which])
+        ]
+        sum_of = lambda x, one, other: x.index_select(0, one) + x.index_select(0, other)
+        far = (2 * at.reach > overlap) & of_active
+        nearer = sum_of(at.reach, pairs.first, pairs.second) - pairs.gap
+        come = nearer > 0.5 * sum_of(overlap, pairs.first, pairs.second)
+        come = torch.nonzero(come & of_active.index_select(0, pairs.first)).squeeze(1)
+        first, second = pairs_of(far)
+        left = at.clipped & of_active
+        # soft cells, and cells at a soft wall or one of little weight, are pressed as deep as these
+        # let them
+        if not cells.settings.soft:
+            known = pairs.first.index_select(0, come), pairs.second.index_select(0, come)
+            for one, other in (known, (first, second)):
+                gap = contact_gaps(capsules, one, other)
+                deep = torch.nonzero(gap < -0.5 * sum_of(overlap, one, other)).squeeze(1)
+                left[torch.cat([one.index_select(0, deep), other.index_select(0, deep)])] = True
+        root, soft = wall_weights(cells, walls)
+        too_deep = root * root * walls.gap < -overlap.index_select(0, walls.cell)
+        left[walls.cell[~soft & too_deep]] = True
+        more = pairs_of(left & ~far)
+        # the others are known by now
+        new = torch.nonzero(~far.index_select(0, more[1])).squeeze(1)
+        first, second = (
+            torch.cat([a, b.index_select(0, new)])
+            for a, b in zip((first, second), more, strict=True)
+        )
+        theirs = left.index_select(0, first) | left.index_select(0, second)
+        theirs = torch.nonzero(theirs).squeeze(1)
+    found = CandidateContacts.among(
+        capsules, first.index_select(0, theirs), second.index_select(0, theirs), include_near
+    )
+    return found, walls.take(torch.nonzero(left.index_select(0, walls.cell)).squeeze(1)), left
+
+
+@torch.no_grad()
+def note_deeply_overlapping(
+    cells: CellProperties, pairs: CandidateContacts, report: ContactReport, active: Tensor
+) -> ContactReport:
+    """The report with the number of cells that lie deeper than a radius in another."""
+    if cells.settings.soft:
+        return report
+    deep = torch.nonzero(pairs.gap < -0.5 * (pairs.a.radius + pairs.b.radius)).squeeze(1)
+    marked = torch.zeros_like(cells.radius)
+    marked[torch.cat([pairs.first.index_select(0, deep), pairs.second.index_select(0, deep)])] = 1.0
+    found = cells.groups.sum(marked.unsqueeze(1)).squeeze(1).long()
+    return replace(report, deeply_overlapping=torch.where(active, found, report.deeply_overlapping))
+
+
+def _neighbourhood(
+    cells: CellProperties, at: Moved, active: Tensor, include_near: bool
+) -> tuple[Neighbourhood, Tensor, Capsules]:
+    """The cells of the active colonies (others may be too far gone to be stepped), which those are
+    (M,), and the capsules of all cells."""
+    local = (at.position - cells.reference).to(at.length.dtype)
+    capsules = Capsules(local.T.contiguous(), at.axis.T.contiguous(), 0.5 * at.length, cells.radius)
+    rows = torch.nonzero(active.index_select(0, cells.colony)).squeeze(1)
+    everyone = rows.numel() == cells.colony.numel()
+    pick = lambda x: x.detach() if everyone else x.detach().index_select(0, rows)
+    radius = pick(cells.radius)
+    margin = NEAR * radius if include_near else 0.0
+    near = Neighbourhood(
+        pick(local),
+        pick(at.axis),
+        pick(at.length),
+        radius,
+        pick(cells.colony),
+        cells.groups.size,
+        margin,
+    )
+    return near, rows, capsules
+
+
+def _at_walls(cells: CellProperties, at: Moved, which: Tensor, include_near: bool) -> WallContacts:
+    """What touches walls among the marked cells, (N,) bool."""
+    parts = (at.position, at.axis, at.length, cells.radius, cells.colony_ids)
+    unilateral = cells.settings.unilateral
+    if bool(which.all()):
+        return find_wall_contacts(cells.surfaces, *parts, unilateral, include_near)
+    rows = torch.nonzero(which).squeeze(1)
+    parts = tuple(x.index_select(0, rows) for x in parts)  # type: ignore[assignment]
+    found = find_wall_contacts(cells.surfaces, *parts, unilateral, include_near)
+    return replace(found, cell=rows.index_select(0, found.cell))
+
+
+def wall_weights(cells: CellProperties, walls: WallContacts) -> tuple[Tensor, Tensor]:
+    """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
+    root = torch.ones_like(walls.gap)
+    soft = torch.zeros_like(walls.cell, dtype=torch.bool)
+    for number, (kind, value) in enumerate(cells.walls):
+        here = walls.surface == number
+        if kind == "stiffness" and value is not None:
+            root = torch.where(here, value.index_select(0, walls.cell).sqrt(), root)
+            soft = soft | here
+        elif kind == "weight" and value is not None:
+            root = torch.where(here, value.index_select(0, walls.cell), root)
+    return root, soft
