@@ -51,7 +51,7 @@ class Designs:
 
 def stepped(scene, state, steps):
     for _ in range(steps):
-        state = step(scene, state, DT) if isinstance(scene, tf.Scene) else step(scene, state)
+        state = step(scene, state, DT) if isinstance(scene, tf.Scene) else scene.step(state)
     return state
 
 
@@ -79,8 +79,8 @@ def test_a_replay_is_the_full_run(name, dtype):
     )
     scene = DESIGNS[name](values)
     full = stepped(scene, scene.bind(6, seed=5, streams=streams, dtype=dtype).start(), 130)
-    course = tf.GrowthRecording(DESIGNS[name](1.0), streams=(3, 7), seed=5, dtype=dtype)
-    replay = Designs(scene, course)
+    recording = tf.GrowthRecording(DESIGNS[name](1.0), streams=(3, 7), seed=5, dtype=dtype)
+    replay = Designs(scene, recording)
     found = stepped(replay, replay.start(6, streams=streams), 130)
     assert found.cells > 6 * 6
     same(found, full)
@@ -106,12 +106,12 @@ def test_colonies_of_one_stream_differ_by_their_parameters_only():
     assert torch.equal(apart.position, first.position)
 
 
-def test_a_course_grows_as_far_as_it_is_asked_and_no_further():
-    course = tf.GrowthRecording(lit(), streams=(0,))
-    course.changes(9)
-    assert len(course.steps) == 10
-    course.changes(4)
-    assert len(course.steps) == 10 and course.nbytes > 0
+def test_a_recording_grows_as_far_as_it_is_read_and_no_further():
+    recording = tf.GrowthRecording(lit(), streams=(0,))
+    recording.changes(9)
+    assert len(recording.steps) == 10
+    recording.changes(4)
+    assert len(recording.steps) == 10 and recording.nbytes > 0
 
 
 @pytest.mark.parametrize(
@@ -139,13 +139,13 @@ def test_a_design_that_acts_on_growth_is_refused():
         tf.GrowthRecording(lit(rate=torch.tensor([1.0, 2.0])), streams=(0, 1))
     with pytest.raises(tf.InputError, match="rules may read and write anything"):
         tf.GrowthRecording(tf.scenes.random_partition(), streams=(0,))
-    course = tf.GrowthRecording(lit(), streams=(0,))
+    recording = tf.GrowthRecording(lit(), streams=(0,))
     with pytest.raises(tf.InputError, match="does not grow as the recording did: Growth\\(rate=2"):
-        Designs(lit(rate=2.0), course)
+        Designs(lit(rate=2.0), recording)
     with pytest.raises(
         tf.InputError, match="streams = 1 is not allowed: it must be of the recording: 0"
     ):
-        Designs(lit(), course).start(2, streams=[0, 1])
+        Designs(lit(), recording).start(2, streams=[0, 1])
 
 
 def test_other_founders_are_another_growth():
@@ -155,7 +155,7 @@ def test_other_founders_are_another_growth():
         Designs(other, tf.GrowthRecording(lit(), streams=(0,)))
 
 
-def test_what_fails_in_the_course_fails_in_every_replay():
+def test_what_fails_in_the_recording_fails_in_every_replay():
     # a cell due to divide by volume while shorter than its two new caps
     scene = tf.Scene(
         tf.Growth(rate=1.0),
@@ -258,15 +258,15 @@ class Started(tf.Effect):
         return state
 
 
-def twice(state, rows):
+def twice(state, rows, values):
     return torch.full((rows.numel(),), 2.0, dtype=state.dtype)
 
 
-def four_times(state, rows):
+def four_times(state, rows, values):
     return torch.full((rows.numel(),), 4.0, dtype=state.dtype)
 
 
-def rate_at_birth(state, rows):
+def rate_at_birth(state, rows, values):
     return state.growth_rate.index_select(0, rows)
 
 
@@ -286,10 +286,10 @@ def test_what_growth_reads_belongs_to_it_also_where_nothing_writes_it():
 
 
 def test_growth_is_told_by_what_its_functions_do():
-    course = tf.GrowthRecording(tf.Scene(*lit().effects, Started("drag", twice)), streams=(0,))
-    Designs(tf.Scene(*lit().effects, Started("drag", twice)), course)
+    recording = tf.GrowthRecording(tf.Scene(*lit().effects, Started("drag", twice)), streams=(0,))
+    Designs(tf.Scene(*lit().effects, Started("drag", twice)), recording)
     with pytest.raises(tf.InputError, match="does not grow as the recording did"):
-        Designs(tf.Scene(*lit().effects, Started("drag", four_times)), course)
+        Designs(tf.Scene(*lit().effects, Started("drag", four_times)), recording)
 
 
 def test_daughters_fields_start_from_what_they_see_where_cells_divide():
@@ -328,7 +328,7 @@ def test_effects_of_one_stage_act_in_the_order_in_which_they_are_listed():
 @pytest.mark.parametrize(
     "scene, why",
     [
-        (lambda: lit(rate=torch.tensor(1.0, requires_grad=True)), "wants a gradient"),
+        (lambda: lit(rate=torch.tensor(1.0, requires_grad=True)), "requires a gradient"),
         (
             lambda: tf.Scene(
                 *lit().effects,

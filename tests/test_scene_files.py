@@ -174,11 +174,11 @@ def test_bytes_that_are_no_text_are_no_design(folder):
     [
         ({"cells": "many"}, "cells in .*best.json = 'many'.*a whole number"),
         ({"cells": 4.5}, "cells in .*best.json = 4.5.*a whole number"),
-        ({"cells": 0}, "cells = 0.*a whole number from 1"),
+        ({"cells": 0}, "cells = 0.*an integer from 1"),
         ({"seed": "x"}, "seed in .*best.json = 'x'.*a whole number"),
         ({"seed": -1}, "seed = -1.*from 0"),
         ({"until": [1]}, r"until in .*best.json = \[1\].*a number"),
-        ({"until": 0.33}, "until = 0.33.*a whole number of steps"),
+        ({"until": 0.33}, "until = 0.33.*an integer number of steps"),
     ],
 )
 def test_what_a_design_says_of_its_run_is_checked(folder, command, told, words):
@@ -220,10 +220,24 @@ def test_a_scene_file_may_define_dataclasses(tmp_path, future):
 
 def test_an_error_in_a_scene_file_says_where(tmp_path):
     path = tmp_path / "own.py"
-    path.write_text("import torchfilm as tf\n\nscene = tf.Scene(tf.Growth(rates=1.0))\n")
+    path.write_text("import torchfilm as tf\n\nscene = tf.Scene(tf.Growth(rate=float([])))\n")
     with pytest.raises(
-        tf.InputError, match=r"own\.py cannot be run: TypeError: .*rates.* \(line 3\)"
+        tf.InputError, match=r"own\.py cannot be run: TypeError: .*float.* \(line 3\)"
     ):
+        load_scene(str(path), {})
+
+
+@pytest.mark.parametrize(
+    "growth, words",
+    [
+        ("rates=1.0", "Growth has no parameter 'rates'. Did you mean rate"),
+        ("rate=-1.0", r"Growth\.rate = -1"),
+    ],
+)
+def test_bad_input_in_a_scene_file_says_where(tmp_path, growth, words):
+    path = tmp_path / "own.py"
+    path.write_text(f"import torchfilm as tf\n\nscene = tf.Scene(tf.Growth({growth}))\n")
+    with pytest.raises(tf.InputError, match=rf"own\.py \(line 3\): {words}"):
         load_scene(str(path), {})
 
 

@@ -50,7 +50,7 @@ def test_it_runs_and_its_recipe_builds_it_again(kind):
     scene = small(kind)
     again = build(*json.loads(json.dumps(scene.recipe)))
     assert scene.name == again.name == kind.split()[0]
-    a, b = (run(s, s.bind(2, seed=1).start(), 3.0) for s in (scene, again))
+    a, b = (run(s, s.bind(2, seed=1, per_colony=True).start(), 3.0) for s in (scene, again))
     assert (a.counts >= 4).all() and torch.isfinite(a.position).all()
     for name in ("uid", "position", "axis", "length", "growth_rate", "division_threshold"):
         assert torch.equal(getattr(a, name), getattr(b, name)), name
@@ -59,8 +59,7 @@ def test_it_runs_and_its_recipe_builds_it_again(kind):
 @pytest.mark.parametrize("kind", list(SMALL))
 def test_it_explains_itself(kind):
     scene = small(kind)
-    scene.bind(2).start()
-    assert "growth -> mechanics" in scene.bind().describe()
+    assert "growth -> mechanics" in scene.bind(2, per_colony=True).describe()
     assert len(READY[kind.split()[0]].__doc__) > 60
 
 

@@ -95,7 +95,7 @@ def test_many_steps_end_on_time():
 @pytest.mark.parametrize("until", [0.55, 1.01, 0.05])
 def test_an_end_between_two_steps_is_refused(until):
     scene = alone()
-    with pytest.raises(tf.InputError, match=r"until.*whole number of steps.*0\.1.*Next to it"):
+    with pytest.raises(tf.InputError, match=r"until.*integer number of steps.*0\.1.*Nearest"):
         tf.simulate(scene, scene.bind().start(), until=until)
 
 
@@ -145,7 +145,7 @@ def test_a_number_of_cells_that_no_growth_leads_to_is_refused():
     with pytest.raises(
         tf.InputError,
         match=(
-            r"growth_rate', which is 0 in 1 of 3 colonies, the first of them 2 .*come to 4"
+            r"growth_rate', which is 0 in 1 of 3 colonies, first in colony 2 .*come to 4"
             r" cells.*until="
         ),
     ):

@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from torchfilm import effect, measure, scenes
+from torchfilm import effect
 from torchfilm.circuits import kinetics, parts
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.distributions import LogNormal, Normal, Uniform
@@ -17,8 +17,6 @@ from torchfilm.effects.nutrition import Monod
 from torchfilm.effects.removal import Removal
 from torchfilm.effects.rules import Rules
 from torchfilm.initial_cells import Cells
-from torchfilm.io.recorder import Recorder
-from torchfilm.io.results import Results
 from torchfilm.loop import advance, failures
 from torchfilm.model import Model
 from torchfilm.physics.walls import Box, Channel, Plane, Sphere
@@ -42,15 +40,20 @@ from torchfilm.values import PerColony, physical
 from torchfilm.version import __version__
 
 if TYPE_CHECKING:
-    from torchfilm import pictures
+    from torchfilm import measure, pictures, scenes
     from torchfilm.explanation import explain
+    from torchfilm.io.recorder import Recorder
+    from torchfilm.io.results import Results
     from torchfilm.pictures import show
     from torchfilm.tuning.settings import Settings, preset
     from torchfilm.tuning.tuned import Tuned
     from torchfilm.tuning.tuner import tune
 
 # Imported when first used: `import torchfilm` takes little longer than torch.
+_LAZY_MODULES = ("measure", "pictures", "scenes")
 _LAZY = {
+    "Recorder": "torchfilm.io.recorder",
+    "Results": "torchfilm.io.results",
     "explain": "torchfilm.explanation",
     "show": "torchfilm.pictures",
     "Settings": "torchfilm.tuning.settings",
@@ -121,8 +124,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name == "pictures":
-        return import_module("torchfilm.pictures")
+    if name in _LAZY_MODULES:
+        return import_module(f"torchfilm.{name}")
     if name in _LAZY:
         return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'torchfilm' has no attribute {name!r}")

@@ -3,6 +3,7 @@ simulated."""
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import warnings
 from collections.abc import Iterable, Sequence
@@ -188,6 +189,11 @@ def _check_effects(effects: Sequence[Any]) -> None:
                 hint = "Unpack the list: Scene(*effects)."
             raise checks.input_error(
                 "Scene", effect, "made of effects such as Growth(), Division(), Mechanics()", hint
+            )
+        if not dataclasses.is_dataclass(effect):
+            raise checks.InputError(
+                f"{type(effect).__name__} is no dataclass: write @dataclass(frozen=True) above its"
+                " class statement."
             )
         for what, example in (
             ("title", '"ageing"'),

@@ -8,13 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchfilm.io.recorder import Recorder
 from torchfilm.loop import EndlessRunWarning, Monitor, ReportWarnings, advance, handle_failures
 from torchfilm.model import Model
 from torchfilm.scene import Scene
@@ -22,6 +21,9 @@ from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.progress import progress_bar
 from torchfilm.tools.timing import Timings
+
+if TYPE_CHECKING:
+    from torchfilm.io.recorder import Recorder
 
 Observer = Callable[[State], Any]
 
@@ -71,7 +73,7 @@ def simulate(
     if until is None:
         assert cells is not None
         model.check_end(state, cells)
-    recorder = Recorder(record, model.scene) if isinstance(record, (str, Path)) else record
+    recorder = _new_recorder(record, model) if isinstance(record, (str, Path)) else record
     if recorder is not None:
         recorder.attach(model, dt)
     monitors = _monitors(recorder, observers, cells if until is None else None, on_failure, timings)
@@ -93,11 +95,17 @@ def simulate(
     )
 
 
+def _new_recorder(path: str | Path, model: Model) -> Recorder:
+    from torchfilm.io.recorder import Recorder  # loads h5py, which most scripts do without
+
+    return Recorder(path, model.scene)
+
+
 def _check_options(
     record: object, observers: Sequence[object], until: object, cells: object, on_failure: str
 ) -> None:
     """Raise InputError for options that mean nothing."""
-    if record is not None and not isinstance(record, (str, Path, Recorder)):
+    if not (record is None or isinstance(record, (str, Path)) or hasattr(record, "attach")):
         raise checks.input_error("record", record, "the path of a new results file, or a Recorder")
     if not all(callable(o) for o in observers):
         raise checks.input_error(

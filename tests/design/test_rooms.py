@@ -15,9 +15,6 @@ import pytest
 import design
 
 ROOT = Path(__file__).parents[2]
-# classes that torchfilm has under the same name as design/; remove a name here once torchfilm has
-# renamed its own
-SHARED = {"Ring", "Search"}
 
 
 def name_of(path: Path) -> str:
@@ -105,7 +102,7 @@ def classes(trees: dict[str, ast.Module]) -> list[str]:
 def test_class_names_are_unique():
     own, others = Counter(classes(DESIGN)), set(classes(sources("torchfilm")))
     assert [name for name, count in own.items() if count > 1] == []
-    assert set(own) & others <= SHARED
+    assert set(own) & others == set()
 
 
 def called(tree: ast.Module) -> set[str]:
@@ -115,8 +112,8 @@ def called(tree: ast.Module) -> set[str]:
 
 @pytest.mark.parametrize("name", [name for name in DESIGN if name != "design.colonies"])
 def test_only_colonies_uses_the_running_interface_of_torchfilm(name):
-    running = ("tf.GrowthRecording", "tf.Replay", "tf.failures", "tf.simulate", "scene.seed")
-    running += ("scene.step", "scene.bind", "scene.check_moves")
+    running = ("tf.GrowthRecording", "tf.Replay", "tf.failures", "tf.simulate", "tf.rollout")
+    running += ("scene.bind", "model.start", "model.step", "model.check", "replay.st")
     assert [call for call in called(DESIGN[name]) if call.startswith(running)] == []
 
 

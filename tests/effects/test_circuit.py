@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -168,6 +169,7 @@ def test_what_a_rule_shares_out_is_diluted_from_the_daughters_on():
     )
 
 
+@dataclass(frozen=True)
 class Stretch(tf.Effect):
     """A user's own effect that makes cells 1 µm longer, once, before they divide."""
 
@@ -376,8 +378,9 @@ def test_a_rate_may_ask_for_everything_about_its_cell(device):
         tf.Circuit({0: asks}, species=("u",)),
         founders=tf.Cells([[3.0, 4.0]], [1.0, 0]),
     )
-    state = scene.bind(2, dtype=F64, device=device).start()
-    last = step(scene, state, 0.1)
+    model = scene.bind(2, dtype=F64, device=device)
+    state = model.start()
+    last = model.step(state, 0.1)
     # made at 5/h through a step of 0.1 h, and thinned by half of the step's growth
     assert last.u.tolist() == pytest.approx([0.5 * math.exp(-0.05)] * 2)
     assert seen["y"].tolist() == [4.0, 4.0] and seen["growth_rate"].tolist() == [1.0, 1.0]
@@ -390,7 +393,7 @@ def test_a_rate_may_ask_for_everything_about_its_cell(device):
         seen["area"], capsule.area(seen["length"], seen["radius"]), rtol=1e-12, atol=0.0
     )
     assert {"position", "growth_rate", "mark", "cell_type"} <= set(
-        next(e for e in scene.effects if e.title == "circuit").reads()
+        next(e for e in model.effects if e.title == "circuit").reads()
     )
 
 

@@ -52,7 +52,7 @@ AT_ONCE = {
     "negative initial": (bad(idle, initial={"m": -1.0}), r"Circuit\.initial\['m'\].*at least 0"),
     "initial that may be negative": (
         bad(idle, initial={"m": tf.Normal(1.0, 1.0)}),
-        r"least value of Circuit\.initial\['m'\]",
+        r"smallest value of Circuit\.initial\['m'\]",
     ),
     "daughters": (
         bad(idle, daughters="copy"),
@@ -74,7 +74,7 @@ AT_ONCE = {
         r"Circuit\.rates.*a function \(u, s, p, cell\), a list of reactions, or a dict",
     ),
     "no reactions": (bad([]), r"Circuit\.rates"),
-    "types that are names": (bad({"source": idle}), r"Circuit\.rates = 'source'.*whole numbers"),
+    "types that are names": (bad({"source": idle}), r"Circuit\.rates = 'source'.*integers"),
     "molecules of a rate function": (
         bad(made, method="tau_leap", k=1.0, g=1.0),
         r"Circuit\.method = 'tau_leap'.*for reactions; made gives rates.*list",
@@ -142,8 +142,7 @@ def test_a_misspelt_option_is_not_taken_for_a_parameter(
         with pytest.raises(
             InputError,
             match=(
-                rf"Circuit\.{name} is taken for a parameter, but no rate reads it. Did you mean the"
-                rf" option {option}\?"
+                rf"Circuit\.{name} is a constant that no rate reads. Did you mean the option {option}\?"
             ),
         ):
             resting(tf.Circuit(spelt, species=("m",), k=1.0, **{name: 1.0}), 2).bind().start()

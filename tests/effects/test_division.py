@@ -306,14 +306,14 @@ class Marks(Effect):
             tf.Field(
                 "carried",
                 "copied",
-                initial=lambda s, rows: 1.0 + s.uid.index_select(0, rows).double(),
+                initial=lambda s, rows, values: 1.0 + s.uid.index_select(0, rows).double(),
             ),
             tf.Field("clock", "starts anew", initial=7.0, at_division="reset"),
             tf.Field(
                 "own",
                 "a function of the newborn",
                 dtype=torch.int64,
-                initial=lambda s, rows: s.uid.index_select(0, rows),
+                initial=lambda s, rows, values: s.uid.index_select(0, rows),
                 at_division="reset",
             ),
             tf.Field("pair", "two numbers", shape=(2,)),

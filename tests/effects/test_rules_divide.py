@@ -168,7 +168,7 @@ class Plate(Effect):
                 "plate",
                 "per colony",
                 scope="colony",
-                initial=lambda s, rows: 1.0 + rows.to(s.dtype),
+                initial=lambda s, rows, values: 1.0 + rows.to(s.dtype),
             ),
         )
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 import torch
-from helpers import step
-from ruled import pair_of_cells, run
+from ruled import pair_of_cells
+from ruled import run as run_scene
 
 import torchfilm as tf
+from torchfilm.tools.hot_reload import HotReload
 
 
 @pytest.fixture
@@ -17,16 +20,25 @@ def rules_file(tmp_path):
     return path
 
 
-def watched(path, *effects: tf.Effect) -> tuple[tf.Rules, tf.Scene]:
-    rules = tf.Rules(path)
-    rules.source.watching = True
-    return rules, tf.Scene(rules, *(effects or (tf.Growth(),)), founders=pair_of_cells())
+def watched(path, *effects: tf.Effect) -> tuple[HotReload, tf.Model]:
+    """A model of the rules in a file, and the functions that are loaded again after an edit."""
+    scene = tf.Scene(tf.Rules(path), *(effects or (tf.Growth(),)), founders=pair_of_cells())
+    model = scene.bind()
+    (source,) = {e.hot_reload for e in model.effects if e.hot_reload is not None}
+    source.watching = True
+    return source, model
+
+
+def run(model: tf.Model, state: tf.State, steps: int) -> tf.State:
+    for _ in range(steps):
+        state = model.step(state, 0.1)
+    return state
 
 
 def test_rules_from_a_file(rules_file):
     for given in (rules_file, str(rules_file)):
         scene = tf.Scene(tf.Rules(given), tf.Growth(), founders=pair_of_cells())
-        assert run(scene, scene.bind().start(), 1).growth_rate.tolist() == [1.0, 1.0]
+        assert run_scene(scene, scene.bind().start(), 1).growth_rate.tolist() == [1.0, 1.0]
 
 
 def test_a_rules_file_may_define_dataclasses(rules_file):
@@ -35,28 +47,28 @@ def test_a_rules_file_may_define_dataclasses(rules_file):
         " update(cells):\n    cells.growth_rate = P().rate\n"
     )
     scene = tf.Scene(tf.Rules(rules_file), tf.Growth(), founders=pair_of_cells())
-    assert run(scene, scene.bind().start(), 1).growth_rate.tolist() == [0.5, 0.5]
+    assert run_scene(scene, scene.bind().start(), 1).growth_rate.tolist() == [0.5, 0.5]
 
 
 def test_an_edit_takes_effect_at_the_next_step(rules_file):
-    rules, scene = watched(rules_file)
+    source, model = watched(rules_file)
     rates = []
-    for state in tf.simulate(scene, scene.bind().start(), until=0.6, dt=0.1):
+    for state in tf.simulate(model, model.start(), until=0.6, dt=0.1):
         rates.append(float(state.growth_rate[0]))
         if state.step == 3:
             rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
     assert rates == [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]
-    assert rules.source.messages == ["t = 0.3 h: my_rules.py reloaded"], (
+    assert source.messages == ["t = 0.3 h: my_rules.py reloaded"], (
         "it was the step from 0.3 to 0.4 h that first ran the new rules"
     )
 
 
 def test_without_watching_an_edit_waits(rules_file):
-    rules, scene = watched(rules_file)
-    rules.source.watching = False
-    state = run(scene, scene.bind().start(), 1)
+    source, model = watched(rules_file)
+    source.watching = False
+    state = run(model, model.start(), 1)
     rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
-    assert run(scene, state, 2).growth_rate.tolist() == [1.0, 1.0] and not rules.source.messages
+    assert run(model, state, 2).growth_rate.tolist() == [1.0, 1.0] and not source.messages
 
 
 BROKEN = {
@@ -77,46 +89,67 @@ BROKEN = {
 @pytest.mark.parametrize("kind", list(BROKEN))
 def test_a_broken_edit_is_told_and_the_run_goes_on_with_the_last_good_one(rules_file, kind):
     text, word = BROKEN[kind]
-    rules, scene = watched(rules_file)
-    state = run(scene, scene.bind().start(), 2)
+    source, model = watched(rules_file)
+    state = run(model, model.start(), 2)
     rules_file.write_text(text)
-    state = run(scene, state, 3)
+    state = run(model, state, 3)
     assert state.growth_rate.tolist() == [1.0, 1.0] and state.step == 5
-    (message,) = rules.source.messages
+    (message,) = source.messages
     assert message.startswith("t = 0.2 h: my_rules.py is broken") and word in message, message
     rules_file.write_text("def update(cells):\n    cells.growth_rate = 3.0\n")
-    assert run(scene, state, 1).growth_rate.tolist() == [3.0, 3.0], "a mended file must be taken up"
-    assert len(rules.source.messages) == 2
+    assert run(model, state, 1).growth_rate.tolist() == [3.0, 3.0], "a mended file must be taken up"
+    assert len(source.messages) == 2
+
+
+def test_an_edit_between_the_making_of_a_scene_and_its_binding_is_taken_up(rules_file):
+    scene = tf.Scene(tf.Rules(rules_file), tf.Growth(), founders=pair_of_cells())
+    stamp = rules_file.stat().st_mtime_ns + 10**9
+    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
+    os.utime(rules_file, ns=(stamp, stamp))
+    model = scene.bind()
+    for effect in model.effects:
+        if effect.hot_reload is not None:
+            effect.hot_reload.watching = True
+    assert run(model, model.start(), 1).growth_rate.tolist() == [2.0, 2.0]
+
+
+def test_models_of_one_scene_are_watched_apart(rules_file):
+    source, model = watched(rules_file)
+    other = model.scene.bind()
+    state, apart = run(model, model.start(), 1), run(other, other.start(), 1)
+    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
+    assert run(model, state, 1).growth_rate.tolist() == [2.0, 2.0] and source.messages
+    assert run(other, apart, 1).growth_rate.tolist() == [1.0, 1.0]
 
 
 def test_a_file_that_is_gone_for_a_moment_is_no_error(rules_file):
-    _, scene = watched(rules_file)
-    state = run(scene, scene.bind().start(), 1)
+    _, model = watched(rules_file)
+    state = run(model, model.start(), 1)
     rules_file.unlink()
-    state = run(scene, state, 1)
+    state = run(model, state, 1)
     rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
-    assert run(scene, state, 1).growth_rate.tolist() == [2.0, 2.0]
+    assert run(model, state, 1).growth_rate.tolist() == [2.0, 2.0]
 
 
 def test_an_edit_that_breaks_only_later_does_not_end_the_run(rules_file):
     """It passes when it is taken up and fails two steps after: the last good rules must carry
     on."""
-    rules, scene = watched(rules_file)
-    state = run(scene, scene.bind().start(), 1)
+    source, model = watched(rules_file)
+    state = run(model, model.start(), 1)
     rules_file.write_text(
         "def update(cells):\n    cells.growth_rate = 2.0 if cells.time < 0.25 else speed\n"
     )
-    state = run(scene, state, 5)
+    state = run(model, state, 5)
     assert state.step == 6
-    assert any("t = 0.3 h" in m and "broken" in m and "speed" in m for m in rules.source.messages)
+    assert any("t = 0.3 h" in m and "broken" in m and "speed" in m for m in source.messages)
 
 
 DIVIDE = "def divide(parent, daughter1, daughter2):\n    daughter1.growth_rate = {}\n"
 
 
-def grow_and_divide(path) -> tuple[tf.Rules, tf.Scene, tf.State]:
-    rules, scene = watched(path, tf.Growth(rate=1.0), tf.Division())
-    return rules, scene, scene.bind().start()
+def grow_and_divide(path) -> tuple[HotReload, tf.Model, tf.State]:
+    source, model = watched(path, tf.Growth(rate=1.0), tf.Division())
+    return source, model, model.start()
 
 
 def flagged(state: tf.State) -> tf.State:
@@ -128,18 +161,18 @@ def flagged(state: tf.State) -> tf.State:
 
 def test_divide_in_a_file_and_its_edit(rules_file):
     rules_file.write_text(DIVIDE.format(5.0))
-    _, scene, state = grow_and_divide(rules_file)
-    state = step(scene, flagged(state), 0.1)
+    _, model, state = grow_and_divide(rules_file)
+    state = model.step( flagged(state), 0.1)
     assert state.growth_rate.tolist() == [5.0, 1.0] * 2
     rules_file.write_text(DIVIDE.format(6.0))
     long_enough = flagged(state).replace(length=torch.full_like(state.length, 3.0))
-    assert step(scene, long_enough, 0.1).growth_rate.tolist() == [6.0, 1.0] * 4
+    assert model.step( long_enough, 0.1).growth_rate.tolist() == [6.0, 1.0] * 4
 
 
 def test_a_broken_divide_is_told_and_the_run_goes_on(rules_file):
     rules_file.write_text(DIVIDE.format(5.0))
-    rules, scene, state = grow_and_divide(rules_file)
+    source, model, state = grow_and_divide(rules_file)
     rules_file.write_text(DIVIDE.format("speed"))
-    state = step(scene, flagged(state.replace(time=1.5)), 0.1)
+    state = model.step( flagged(state.replace(time=1.5)), 0.1)
     assert state.growth_rate.tolist() == [5.0, 1.0] * 2
-    assert any("t = 1.5 h" in m and "broken" in m and "speed" in m for m in rules.source.messages)
+    assert any("t = 1.5 h" in m and "broken" in m and "speed" in m for m in source.messages)

@@ -37,7 +37,9 @@ def runge_kutta(rates: Rates, u: Tensor, dt: float, steps: int = 1, method: str 
     checks.choice("method", method, METHODS)
     if dt == 0 or u.numel() == 0:
         return u.clone()
-    from torchdiffeq import odeint  # imported where it is used: it takes longer to load than torchfilm itself
+    from torchdiffeq import (
+        odeint,
+    )  # imported where it is used: it takes longer to load than torchfilm itself
 
     rows = torch.arange(u.shape[0], device=u.device)
     # times in float64 on the host: in float32 the last step could be tiny

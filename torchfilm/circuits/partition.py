@@ -12,7 +12,9 @@ def binomial(count: Tensor, share: Tensor, uniform: Tensor) -> Tensor:
 
     It is the least k with P(X ≤ k) ≥ uniform (M,).
     """
-    from scipy.stats import binom  # imported where it is used: it takes longer to load than torchfilm itself
+    from scipy.stats import (
+        binom,
+    )  # imported where it is used: it takes longer to load than torchfilm itself
 
     found = binom.ppf(
         uniform.double().cpu().numpy(), count.double().cpu().numpy(), share.double().cpu().numpy()

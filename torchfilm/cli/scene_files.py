@@ -97,8 +97,6 @@ def _run_scene_file(path: Path, what: str) -> dict[str, Any]:
     sys.path.insert(0, str(path.parent.resolve()))
     try:
         return run_file(path)
-    except InputError:
-        raise
     except Exception as error:
         lines = [
             frame.lineno
@@ -106,6 +104,8 @@ def _run_scene_file(path: Path, what: str) -> dict[str, Any]:
             if frame.filename == str(path)
         ]
         at = f" (line {lines[-1]})" if lines else ""
+        if isinstance(error, InputError):
+            raise InputError(f"{what}{at}: {error}") from error
         raise InputError(f"{what} cannot be run: {type(error).__name__}: {error}{at}") from error
 
 

@@ -46,13 +46,14 @@ class Rules(Effect):
     variables: Mapping[str, float] = field(default_factory=dict)
     path: Path | None = field(init=False, repr=False)
     functions: dict[str, Any] = field(init=False, repr=False)
+    stamp: int = field(init=False, repr=False)  # of the file as it was loaded, ns
 
     stage = RULES
     title = "rules"
     writes_anything = True
 
     def __post_init__(self) -> None:
-        path = None
+        path, stamp = None, 0
         functions: dict[str, Any] = {"update": self.update, "divide": self.divide}
         if isinstance(self.update, (str, Path)):
             # as given, or beside the scene file or wherever else Python looks for modules
@@ -65,6 +66,7 @@ class Rules(Effect):
                     "a function or the path of a Python file",
                     "No such file.",
                 )
+            stamp = path.stat().st_mtime_ns
             functions = load_functions(path, ("update", "divide"))
         for name, given in functions.items():
             if given is not None and not callable(given):
@@ -78,6 +80,7 @@ class Rules(Effect):
             checks.number(f"Rules.variables[{name!r}]", value)
         object.__setattr__(self, "path", path)
         object.__setattr__(self, "functions", functions)
+        object.__setattr__(self, "stamp", stamp)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # a rules file is read again where it is unpickled
@@ -93,7 +96,7 @@ class Rules(Effect):
         return ["your own Python, once a step on whole tensors"]
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
-        source = HotReload(self.path, dict(self.functions))
+        source = HotReload(self.path, dict(self.functions), self.stamp)
         main = BoundRules(self, binding, source)
         divides = self.functions["divide"] is not None or self.path is not None
         return (main, DivisionRule(self, binding, source)) if divides else (main,)

@@ -41,15 +41,16 @@ class HotReload:
 
     While `watching` is set, `refresh` loads an edited file. `messages` reports a broken edit, when
     it fails to load or when it first fails; the previous functions stay in use. Messages give the
-    simulated time of the last `refresh`.
+    simulated time of the last `refresh`. stamp: time of the file's last edit, ns, when its functions
+    were loaded.
     """
 
-    def __init__(self, path: Path | None, functions: Functions):
+    def __init__(self, path: Path | None, functions: Functions, stamp: int = 0):
         self.path, self.functions = path, functions
         self.watching = False
         self.messages: list[str] = []
         self._time = 0.0
-        self._stamp = path.stat().st_mtime_ns if path else 0
+        self._stamp = stamp
         self._previous: Functions | None = None
         self._proven = True
 

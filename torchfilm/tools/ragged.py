@@ -87,7 +87,9 @@ class Groups:
             self.owner.int().numpy(),
             np.arange(count + 1, dtype=np.int32),
         )
-        from scipy.sparse import csc_array  # imported where it is used: it takes longer to load than torchfilm itself
+        from scipy.sparse import (
+            csc_array,
+        )  # imported where it is used: it takes longer to load than torchfilm itself
 
         found = csc_array(entries, shape=(self.size, count)).tocsr()
         return torch.from_numpy(found.indptr), torch.from_numpy(found.indices)
