@@ -31,7 +31,7 @@ from torchfilm.resolver import Values, snapshot
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
-from torchfilm.values import Rule, Value, numbers, physical
+from torchfilm.values import Rule, Value, checked, numbers, physical
 
 MOST_SUBSTEPS = 1000
 # A colony whose contacts do not hold has more than this share of its cells (of MANY, if it has
@@ -146,6 +146,7 @@ class Mechanics(Effect):
             checks.number("Mechanics.overlap", self.overlap, above=0.0)
         object.__setattr__(self, "walls", tuple(self.walls))
         self.surfaces()  # raises for a wall that does not fit the dimension
+        self.physical_values()  # raises for a wall value that is not allowed
 
     def surfaces(self) -> list[Surface]:
         """What the walls are made of."""
@@ -179,7 +180,8 @@ class Mechanics(Effect):
                 ("weight", Rule(above=0.0, most=1.0)),
             ):
                 if getattr(wall, name) is not None:
-                    found[f"walls[{k}].{name}"] = (getattr(wall, name), rule)
+                    label = f"{type(wall).__name__}.{name}"
+                    found[f"walls[{k}].{name}"] = (checked(label, getattr(wall, name), rule), rule)
         return found
 
     def declares(self, dim: int) -> tuple[Field, ...]:

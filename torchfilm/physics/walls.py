@@ -9,7 +9,7 @@ itself instead, as in the paper; such a wall hardens as α is lowered.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,11 +28,11 @@ class Wall:
     """The base of all walls.
 
     stiffness: μ·µm/h; None = hard. weight: D in 0 … 1, the paper's relative weight. At most one of
-    the two; each is one number or one per colony.
+    the two; each is one number, one per colony, one per cell type, or a distribution over cells.
     """
 
-    stiffness: float | Tensor | None = field(default=None, kw_only=True)
-    weight: float | Tensor | None = field(default=None, kw_only=True)
+    stiffness: Any = field(default=None, kw_only=True)
+    weight: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         name = type(self).__name__
@@ -43,25 +43,33 @@ class Wall:
                 "omitted when a stiffness is given",
                 "Give only one of stiffness and weight.",
             )
-        if self.stiffness is not None:
-            object.__setattr__(
-                self, "stiffness", checks.value(f"{name}.stiffness", self.stiffness, above=0.0)
-            )
-        if self.weight is not None:
-            object.__setattr__(
-                self, "weight", checks.value(f"{name}.weight", self.weight, above=0.0, most=1.0)
-            )
+        for which, most in (("stiffness", math.inf), ("weight", 1.0)):
+            given = getattr(self, which)
+            # the effect checks values by cell type and distributions
+            if given is not None and not isinstance(given, Mapping) and not hasattr(given, "draw"):
+                made = checks.value(f"{name}.{which}", given, above=0.0, most=most)
+                object.__setattr__(self, which, made)
 
     @property
     def yields(self) -> bool:
         """Whether cells may press into the wall: it is soft, or its weight is below 1."""
         return self.stiffness is not None or (
-            self.weight is not None and bool((torch.as_tensor(self.weight).detach() < 1).any())
+            self.weight is not None and any(_below_one(w) for w in _each(self.weight))
         )
 
     def surfaces(self, dim: int) -> list[Surface]:
         """The wall as planes and spheres in `dim` dimensions."""
         raise NotImplementedError
+
+
+def _each(given: Any) -> list[Any]:
+    return list(given.values()) if isinstance(given, Mapping) else [given]
+
+
+def _below_one(given: Any) -> bool:
+    if hasattr(given, "draw"):
+        return True
+    return bool((torch.as_tensor(given).detach() < 1).any())
 
 
 @dataclass(frozen=True)

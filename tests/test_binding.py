@@ -1,0 +1,176 @@
+"""Describe, bind, step: scenes never change, may be bound many times, and a step decides
+nothing."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.state import PER_CELL
+
+
+def run(model: tf.Model, steps: int = 30) -> tf.State:
+    state = model.start()
+    for _ in range(steps):
+        state = model.step(state)
+    return state
+
+
+def same(one: tf.State, other: tf.State) -> None:
+    for name in (*PER_CELL, *one.fields):
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize("name", ["boundary_detector", "toggle_switch", "programmed_growth"])
+def test_one_scene_bound_twice_and_stepped_in_turn(name):
+    """Two models of one scene, and two runs of one model, do not disturb each other."""
+    scene = tf.scenes.READY[name]()
+    alone = [run(scene.bind(2, seed=k)) for k in (1, 2)]
+    models = [scene.bind(2, seed=k) for k in (1, 2)]
+    states = [m.start() for m in models]
+    third = models[0].start()
+    for _ in range(30):
+        states = [m.step(s) for m, s in zip(models, states, strict=True)]
+        third = models[0].step(third)
+    same(states[0], alone[0])
+    same(states[1], alone[1])
+    same(third, alone[0])
+
+
+def made(u, s, p, cell):
+    return {"m": 1.0 - u.m}
+
+
+def test_one_circuit_in_two_scenes_takes_the_network_of_neither():
+    """What a circuit has found out in one scene is not known to the other."""
+    reactions = [tf.parts.constitutive("m", 1.0), tf.parts.exchange("m", 2.0)]
+    circuit = tf.Circuit(reactions, species=("m",))
+    body = (tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2), circuit)
+    box = {"box": ((-16, -16), (16, 16)), "spacing": 4.0}
+    wide = tf.Scene(*body, tf.Medium(m=tf.Signal(diffusion=5.0), x=tf.Signal(diffusion=1.0), **box))
+    plain = tf.Scene(*body, tf.Medium(m=tf.Signal(diffusion=5.0), **box))
+    first = run(plain.bind(seed=1))
+    other = wide.bind(seed=1)
+    model = plain.bind(seed=1)
+    run(other)
+    same(run(model), first)
+
+
+def test_a_scene_does_not_change_and_says_so():
+    scene = tf.scenes.boundary_detector()
+    before = scene.fingerprint
+    run(scene.bind(2))
+    tf.explain(scene, seconds=0)
+    assert scene.fingerprint == before
+    for name in ("dt", "name", "effects", "anything"):
+        with pytest.raises(AttributeError, match=r"never changes: scene\.replace"):
+            setattr(scene, name, 1.0)
+    longer = scene.replace(dt=0.05)
+    assert (longer.dt, scene.dt) == (0.05, 0.025) and longer != scene
+    assert longer.replace(dt=0.025) == scene and hash(longer.replace(dt=0.025)) == hash(scene)
+    with pytest.raises(tf.InputError, match=r"no parameter 'dtt'.*Did you mean dt"):
+        scene.replace(dtt=0.1)
+
+
+@pytest.mark.parametrize("name", tf.scenes.READY)
+def test_ready_scenes_are_compared_copied_and_pickled(name):
+    scene = tf.scenes.READY[name]()
+    assert scene == tf.scenes.READY[name]()
+    if name != "programmed_growth":  # its rule is a function inside a function
+        twin = pickle.loads(pickle.dumps(scene))
+        assert twin == scene
+        same(run(twin.bind(2, seed=3), 5), run(scene.bind(2, seed=3), 5))
+    assert copy.deepcopy(scene) == scene
+    assert scene.bind(1).describe() == scene.bind(1).describe()
+
+
+def test_a_model_bound_to_a_state_continues_it():
+    scene = tf.scenes.boundary_detector(k3=[0.5, 1.0, 2.0])
+    model = scene.bind(seed=4)
+    state = run(model, 20)
+    other = scene.bind(state=state)
+    same(other.step(state), model.step(state))
+    part = state.select([2, 0])
+    same(scene.bind(state=part).step(part), model.step(state).select([2, 0]))
+
+
+def test_a_state_of_another_precision_is_refused():
+    scene = tf.scenes.microcolony()
+    state = scene.bind(dtype=torch.float64).start()
+    with pytest.raises(
+        tf.InputError, match=r"float64.*float32 on cpu, as the model is.*bind\(state="
+    ):
+        next(tf.simulate(scene.bind(), state, until=1.0))
+
+
+def test_simulate_binds_by_itself():
+    scene = tf.scenes.microcolony()
+    *_, by_scene = tf.simulate(scene, until=0.5, colonies=3, seed=5)
+    *_, by_model = tf.simulate(scene.bind(3, seed=5), until=0.5)
+    *_, by_state = tf.simulate(scene, scene.bind(3, seed=5).start(), until=0.5)
+    same(by_scene, by_model)
+    same(by_scene, by_state)
+    with pytest.raises(
+        tf.InputError, match=r"colonies = 2 is not allowed: .*left out where a state"
+    ):
+        tf.simulate(scene, by_scene, until=1.0, colonies=2)
+
+
+def test_progress_is_shown_where_it_is_wanted(capfd):
+    for _ in tf.simulate(tf.scenes.microcolony(), until=0.25, progress=True):
+        pass
+    assert "microcolony: 1 colonies" in capfd.readouterr().err
+
+
+def test_several_circuits_are_modules():
+    """Two circuits: their species are fields of their own; a shared species is changed by both."""
+
+    def source(u, s, p, cell):
+        return {"a": p.make}
+
+    def sink(u, s, p, cell):
+        return {"a": -p.lose * u.a, "b": p.lose * u.a}
+
+    body = (tf.Growth(rate=0.0), tf.Mechanics(dim=2))
+    scene = tf.Scene(
+        *body,
+        tf.Circuit(source, species=("a",), make=2.0),
+        tf.Circuit(sink, species=("b",), shared=("a",), name="second", lose=1.0),
+    )
+    one = tf.Scene(
+        *body, tf.Circuit(lambda u, s, p, cell: {"a": 2.0 - u.a, "b": u.a}, species=("a", "b"))
+    )
+    model = scene.bind(dtype=torch.float64)
+    assert {"a", "second_b"} <= set(model.start().fields)
+    together = run(one.bind(dtype=torch.float64), 80)
+    # circuits act in turn: first order in dt
+    apart = run(scene.replace(dt=0.0025).bind(dtype=torch.float64), 800)
+    assert float(apart.a) == pytest.approx(float(together.a), rel=2e-3)
+    assert float(apart.fields["second_b"]) == pytest.approx(float(together.b), rel=2e-3)
+    assert sum(t.startswith("circuit") for t, _, _ in model.couplings()) > 0
+    with pytest.raises(
+        tf.InputError,
+        match=r"field 'm' is declared by circuit and by circuit.*name|" r"lists circuit 2 times",
+    ):
+        tf.Scene(*body, tf.Circuit(made, species=("m",)), tf.Circuit(made, species=("m",)))
+    with pytest.raises(tf.InputError, match="needs the field 'z'"):
+        tf.Scene(*body, tf.Circuit(sink, species=("b",), shared={"a": "z"}, lose=1.0))
+
+
+def test_fields_declared_alike_are_one():
+    """Two circuits by cell type declare the cell type; a field of one name and two kinds is
+    refused."""
+    scene = tf.Scene(
+        tf.Mechanics(dim=2),
+        tf.Circuit({0: made}, species=("m",)),
+        tf.Circuit({0: made}, species=("m",), name="b"),
+    )
+    assert list(scene.bind().start().fields).count("cell_type") == 1
+    with pytest.raises(
+        tf.InputError, match="field 'growth_rate' is declared by growth and by circuit"
+    ):
+        tf.Scene(tf.Growth(rate=1.0), tf.Circuit(made, species=("growth_rate",)), dim=2)

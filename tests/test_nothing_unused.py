@@ -1,0 +1,110 @@
+"""Nothing that a user gives is silently unused, and nothing runs that cannot mean what it says."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+
+import torchfilm as tf
+
+
+def made(u, s, p, cell):
+    return {"m": p.strength - u.m}
+
+
+def quiet(make):
+    """What is made without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return make()
+
+
+def test_a_constant_that_no_rate_reads_is_warned_of():
+    scene = tf.Scene(
+        tf.Mechanics(dim=2), tf.Circuit(made, species=("m",), strength=1.0, leftover=3.0)
+    )
+    with pytest.warns(UserWarning, match=r"Circuit\.leftover is a constant that no rate reads"):
+        scene.bind()
+    quiet(
+        lambda: tf.Scene(tf.Mechanics(dim=2), tf.Circuit(made, species=("m",), strength=1.0)).bind()
+    )
+
+
+def test_a_misspelt_option_of_a_circuit_is_an_error():
+    scene = tf.Scene(
+        tf.Mechanics(dim=2), tf.Circuit(made, species=("m",), strength=1.0, initials=1.0)
+    )
+    with pytest.raises(tf.InputError, match=r"Circuit\.initials.*Did you mean the option initial"):
+        scene.bind()
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: tf.Growth(rat=1.0), "Growth has no parameter 'rat'. Did you mean rate?"),
+        (
+            lambda: tf.Division(lenght=4.0),
+            "Division has no parameter 'lenght'. Did you mean length?",
+        ),
+        (lambda: tf.Mechanics(dimension=2), "Mechanics has no parameter 'dimension'"),
+        (
+            lambda: tf.simulate(tf.scenes.microcolony(), untill=1.0),
+            "simulate has no parameter 'untill'. Did you mean until?",
+        ),
+    ],
+)
+def test_a_keyword_that_nothing_takes_is_an_error(make, words):
+    with pytest.raises(tf.InputError) as caught:
+        make()
+    assert words in str(caught.value)
+
+
+def test_growth_without_a_rate_is_warned_of_unless_something_sets_it():
+    def rule(cells):
+        cells.growth_rate = 1.0
+
+    with pytest.warns(UserWarning, match=r"Growth\(\) has no rate.*tf\.Growth\(rate=1\.0\)"):
+        tf.Scene(tf.Growth(), tf.Mechanics(dim=2))
+    quiet(lambda: tf.Scene(tf.Growth(), tf.Rules(rule), tf.Mechanics(dim=2)))
+    quiet(tf.scenes.nutrient_limited)
+
+
+def test_a_rate_per_minute_is_warned_of():
+    with pytest.warns(UserWarning, match=r"0\.035 per hour.*20 h.*multiplied by 60 \(2\.1\)"):
+        tf.Scene(tf.Growth(rate=0.035), tf.Mechanics(dim=2)).bind()
+
+
+def test_a_dimension_that_was_never_stated_is_warned_of():
+    with pytest.warns(UserWarning, match=r"no Mechanics and no founders.*dim=2"):
+        assert tf.Scene(tf.Growth(rate=1.0)).dim == 3
+    assert quiet(lambda: tf.Scene(tf.Growth(rate=1.0), dim=2)).dim == 2
+    assert quiet(lambda: tf.Scene(tf.Growth(rate=1.0), founders=tf.Cells.single(2))).dim == 2
+    with pytest.raises(tf.InputError, match=r"Scene\.dim = 3.*2, as the mechanics are"):
+        tf.Scene(tf.Mechanics(dim=2), dim=3)
+
+
+@pytest.mark.parametrize("options", [{"rate": 60.0}, {"rate": 1.0, "dt": 1.5}])
+def test_a_step_in_which_a_cell_divides_twice_is_an_error(options):
+    scene = tf.scenes.microcolony(rate=options["rate"])
+    with pytest.raises(
+        tf.InputError, match=r"due to divide more than once in a step.*Take dt below"
+    ):
+        tf.simulate(scene, until=3.0, dt=options.get("dt"))
+    quiet(lambda: tf.simulate(tf.scenes.microcolony(rate=1.0), until=1.0, dt=0.5))
+
+
+def test_founders_in_one_another_are_warned_of():
+    cells = tf.Cells([[0, 0], [0.1, 0.05]], [[1, 0], [1, 0]], 2.0)
+    scene = tf.Scene(tf.Mechanics(dim=2), founders=cells)
+    with pytest.warns(RuntimeWarning, match="deep in one another"):
+        scene.bind()
+
+
+def test_brackets_and_lists():
+    with pytest.raises(tf.InputError, match=r"Unpack the list: Scene\(\*effects\)"):
+        tf.Scene([tf.Growth(rate=1.0), tf.Mechanics(dim=2)])
+    with pytest.raises(tf.InputError, match=r"Write Growth\(\) with its brackets"):
+        tf.Scene(tf.Growth)
+    with pytest.raises(tf.InputError, match=r"Names in use: .*x"):
+        tf.Circuit(made, species=("x",), strength=1.0)
