@@ -52,8 +52,9 @@ def grow(
     most = state.counts.new_zeros(count)
     since = state.counts.new_zeros(count, dtype=torch.float64)
     notes: list[Tensor] = []
+    running = tf.advance(prepared.step, state)
+    state = next(running)
     while True:
-        state = prepared.step(state)
         failed, gone = _failed(state)
         yield from failed
         if bool(gone.all()):
@@ -73,7 +74,7 @@ def grow(
         gone = done | stuck
         if bool(gone.all()):
             return
-        state = _keep(state, ~gone)
+        state = running.send(_keep(state, ~gone))
 
 
 def _failed(state: tf.State) -> tuple[list[FailedColony], Tensor]:

@@ -4,7 +4,7 @@ replaying and probing all drive this one loop, and share its monitors."""
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -28,14 +28,19 @@ def advance(
     *,
     stop: Callable[[State], bool] | None = None,
     monitors: Sequence[Monitor] = (),
-) -> Iterator[State]:
-    """The states after each step, until `stop(state)` is true; without `stop`, for ever."""
+) -> Generator[State, State | None, None]:
+    """The states after each step, until `stop(state)` is true; without `stop`, for ever.
+
+    A caller that drops colonies on the way continues with `send(state)`: the next step starts from
+    the state that it sends.
+    """
     while stop is None or not stop(state):
         state = step(state)
         for monitor in monitors:
             seen = monitor(state)
             state = state if seen is None else seen
-        yield state
+        sent = yield state
+        state = state if sent is None else sent
 
 
 @dataclass(frozen=True)
