@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+import design
+import torchfilm
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FILE = re.compile(r"# (\w+\.py)\n")
@@ -30,3 +33,10 @@ def test_blocks_run(page, tmp_path, monkeypatch):
             subprocess.run([sys.executable, file[1]], check=True)
             continue
         exec(compile(code, f"{page.name}, block {number}", "exec"), names)
+
+
+def test_the_reference_lists_every_public_name():
+    text = (ROOT / "docs" / "reference.md").read_text()
+    names = [f"tf.{n}" for n in torchfilm.__all__ if not n.startswith("_")]
+    assert [n for n in names if f"`{n}`" not in text] == []
+    assert [n for n in design.__all__ if f"`{n}`" not in text] == []
