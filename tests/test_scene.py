@@ -109,7 +109,10 @@ def test_couplings_say_who_drives_whom():
     sink = named(order, "sink", 20, reads=("heat",))
     needy = named(order, "needy", 30, needs=("heat",), writes=("length",))
     scene = tf.Scene(needy, source, sink)
-    assert set(scene.bind().couplings()) == {("source", "heat", "sink"), ("source", "heat", "needy")}
+    assert set(scene.bind().couplings()) == {
+        ("source", "heat", "sink"),
+        ("source", "heat", "needy"),
+    }
 
 
 def test_couplings_of_growth_and_mechanics():
@@ -128,12 +131,16 @@ def test_growth_alone_is_driven_by_nobody():
 
 
 def test_explain_names_stages_parameters_fields_and_couplings():
-    text = tf.Scene(
-        tf.Growth(rate=[0.5, 1.5]),
-        tf.Division(length=tf.Uniform(3.0, 4.0)),
-        tf.Mechanics(dim=2, walls=[tf.Plane(y=-2.0, facing="+y")]),
-        name="mine",
-    ).bind().describe()
+    text = (
+        tf.Scene(
+            tf.Growth(rate=[0.5, 1.5]),
+            tf.Division(length=tf.Uniform(3.0, 4.0)),
+            tf.Mechanics(dim=2, walls=[tf.Plane(y=-2.0, facing="+y")]),
+            name="mine",
+        )
+        .bind()
+        .describe()
+    )
     for part in (
         "mine",
         "2-D",
@@ -300,7 +307,9 @@ def test_what_is_no_effect_is_refused(made):
 
 @pytest.mark.parametrize("kind", [list, tuple])
 def test_a_list_of_effects_is_to_be_unpacked(kind):
-    with pytest.raises(tf.InputError, match=r"Growth\(.*Unpack the list: Scene\(\*effects\)") as caught:
+    with pytest.raises(
+        tf.InputError, match=r"Growth\(.*Unpack the list: Scene\(\*effects\)"
+    ) as caught:
         tf.Scene(kind([tf.Growth(rate=1.0), tf.Mechanics(dim=2)]))
     assert "brackets" not in str(caught.value)
 
@@ -337,7 +346,8 @@ OTHERWISE = {
 def test_a_field_declared_twice_in_different_ways_is_refused(what):
     heat = tf.Field("heat", "of the medium", initial=1.0)
     first, second = (
-        named([], n, 10, declares=(field,)) for n, field in (("one", heat), ("two", OTHERWISE[what]))
+        named([], n, 10, declares=(field,))
+        for n, field in (("one", heat), ("two", OTHERWISE[what]))
     )
     with pytest.raises(tf.InputError, match=r"'heat'.*one.*two"):
         tf.Scene(first, second)
@@ -618,7 +628,9 @@ def test_an_effect_of_ones_own_is_a_dataclass_with_a_title_and_a_stage():
     class Plain(tf.Effect):
         stage, title = 35, "plain"
 
-    with pytest.raises(tf.InputError, match=r"Plain is no dataclass: write @dataclass\(frozen=True"):
+    with pytest.raises(
+        tf.InputError, match=r"Plain is no dataclass: write @dataclass\(frozen=True"
+    ):
         tf.Scene(Plain())
     with pytest.raises(tf.InputError, match="Ageing has no title: give the class one"):
         tf.Scene(Ageing())

@@ -120,20 +120,24 @@ class Cells:
     def dim(self) -> int:
         return self.position.shape[1]
 
+    def batch_size(self, colonies: int) -> int:
+        """How many colonies a batch of `colonies` has; 1 stands for as many as the cells require.
+        Raises InputError for fewer."""
+        if colonies not in (1, self.colonies) and colonies < self.colonies:
+            raise checks.input_error(
+                "colonies",
+                colonies,
+                f"at least {self.colonies}, since a cell has colony {self.colonies - 1}",
+            )
+        return max(colonies, self.colonies)
+
     def state(self, colonies: int, seed: int, device: torch.device, dtype: torch.dtype) -> State:
         """The state of these cells, with no fields except cell_type and the extra columns."""
         if self.colony is None:
             index = np.tile(np.arange(self.count), colonies)
             colony = np.repeat(np.arange(colonies), self.count)
         else:
-            greatest = self.colonies
-            if colonies not in (1, greatest) and colonies < greatest:
-                raise checks.input_error(
-                    "colonies",
-                    colonies,
-                    f"at least {greatest}, since a cell has colony {greatest - 1}",
-                )
-            colonies = max(colonies, greatest)
+            colonies = self.batch_size(colonies)
             index = np.argsort(self.colony, kind="stable")
             colony = self.colony[index]
         counts = np.bincount(colony, minlength=colonies)

@@ -364,7 +364,7 @@ def _count(
         raise checks.input_error(
             "colonies", colonies, "an integer from 1", "A batch has at least one colony."
         )
-    return max(colonies, founders.colonies)
+    return founders.batch_size(colonies)
 
 
 def _types(founders: Cells) -> tuple[int, ...]:

@@ -142,7 +142,8 @@ def test_a_misspelt_option_is_not_taken_for_a_parameter(
         with pytest.raises(
             InputError,
             match=(
-                rf"Circuit\.{name} is a constant that no rate reads. Did you mean the option {option}\?"
+                rf"Circuit\.{name} is a constant that no rate reads. Did you mean the option"
+                rf" {option}\?"
             ),
         ):
             resting(tf.Circuit(spelt, species=("m",), k=1.0, **{name: 1.0}), 2).bind().start()

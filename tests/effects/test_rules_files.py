@@ -162,17 +162,17 @@ def flagged(state: tf.State) -> tf.State:
 def test_divide_in_a_file_and_its_edit(rules_file):
     rules_file.write_text(DIVIDE.format(5.0))
     _, model, state = grow_and_divide(rules_file)
-    state = model.step( flagged(state), 0.1)
+    state = model.step(flagged(state), 0.1)
     assert state.growth_rate.tolist() == [5.0, 1.0] * 2
     rules_file.write_text(DIVIDE.format(6.0))
     long_enough = flagged(state).replace(length=torch.full_like(state.length, 3.0))
-    assert model.step( long_enough, 0.1).growth_rate.tolist() == [6.0, 1.0] * 4
+    assert model.step(long_enough, 0.1).growth_rate.tolist() == [6.0, 1.0] * 4
 
 
 def test_a_broken_divide_is_told_and_the_run_goes_on(rules_file):
     rules_file.write_text(DIVIDE.format(5.0))
     source, model, state = grow_and_divide(rules_file)
     rules_file.write_text(DIVIDE.format("speed"))
-    state = model.step( flagged(state.replace(time=1.5)), 0.1)
+    state = model.step(flagged(state.replace(time=1.5)), 0.1)
     assert state.growth_rate.tolist() == [5.0, 1.0] * 2
     assert any("t = 1.5 h" in m and "broken" in m and "speed" in m for m in source.messages)

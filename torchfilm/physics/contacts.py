@@ -124,27 +124,28 @@ def contact_points(a: Capsules, b: Capsules) -> tuple[Tensor, Tensor, Tensor, Te
     return _line_points(a, b, *closest_points(a, b))
 
 
-def _slide(turn: Tensor) -> Tensor:
-    """How far the ends of a line of contact are from meeting, (P,), from the axes' cross product.
+def _slide(sine2: Tensor) -> Tensor:
+    """How far the ends of a line of contact are from meeting, (P,). sine2: of the axes' angle.
 
     1 for parallel axes; 0 or less where there is no line.
     """
-    return 1.0 - dot(turn, turn) / LINE_CONTACT_SINE**2
+    return 1.0 - sine2 / LINE_CONTACT_SINE**2
 
 
 def _line_points(
     a: Capsules, b: Capsules, s0: Tensor, t0: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The result of `contact_points`, from the closest points (s0, t0)."""
-    turn = cross(a.axis, b.axis)
-    slide = _slide(turn)
+    turn, cosine, between = cross(a.axis, b.axis), dot(a.axis, b.axis), b.centre - a.centre
+    sine2 = dot(turn, turn)
+    slide = _slide(sine2)
     # the common part of the two segments, measured along the mean axis so that neither cell is
     # preferred
-    sign = torch.where(dot(a.axis, b.axis) < 0, -1.0, 1.0).to(a.half.dtype)
+    sign = torch.where(cosine < 0, -1.0, 1.0).to(a.half.dtype)
     mean = a.axis + sign * b.axis
     mean = mean / safe_norm(mean)
     project = dot(a.axis, mean)
-    offset = dot(b.centre - a.centre, mean)
+    offset = dot(between, mean)
     low = torch.maximum(-a.half * project, offset - b.half * project)
     high = torch.minimum(a.half * project, offset + b.half * project)
     line = (slide > 0) & (high > low)
@@ -153,14 +154,13 @@ def _line_points(
     share = ((high - low) / (0.5 * (a.radius + b.radius))).clamp(max=1.0)
     # so does the line of two centrelines that cross, whose ends lie on opposite sides: the contact
     # is near the crossing
-    swing = 0.5 * (high - low) * safe_sqrt(dot(turn, turn))
+    swing = 0.5 * (high - low) * safe_sqrt(sine2)
     crossed = swing > 1e-6 * a.radius
-    apart = safe_sqrt(_distance2(b.centre - a.centre, a.axis, b.axis, s0, t0))
+    apart = safe_sqrt(_distance2(between, a.axis, b.axis, s0, t0))
     share = share * torch.where(crossed, apart / torch.where(crossed, swing, 1.0), 1.0).clamp(
         max=1.0
     )
     slide = torch.where(line, slide * slide * share, 0.0)
-    cosine, between = dot(a.axis, b.axis), b.centre - a.centre
     end_a0 = _end_while_sliding(s0, cosine * t0 + dot(between, a.axis), a, slide)
     end_b0 = _end_while_sliding(t0, cosine * s0 - dot(between, b.axis), b, slide)
     s_all, t_all, end_a, end_b = [], [], [], []
@@ -271,7 +271,8 @@ def contacts_of(
     """
     first, second, a, b, s, t = pairs.first, pairs.second, pairs.a, pairs.b, pairs.s, pairs.t
     # only nearly parallel pairs may have a line; all others touch at the closest point
-    flat = torch.nonzero(_slide(cross(a.axis, b.axis)).detach() > 0).squeeze(1)
+    turn = cross(a.axis, b.axis).detach()
+    flat = torch.nonzero(_slide(dot(turn, turn)) > 0).squeeze(1)
     flat_a, flat_b = a.take(flat), b.take(flat)
     *of_lines, line = _line_points(flat_a, flat_b, s.index_select(0, flat), t.index_select(0, flat))
     points = [

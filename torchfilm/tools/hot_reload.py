@@ -41,7 +41,7 @@ class HotReload:
 
     While `watching` is set, `refresh` loads an edited file. `messages` reports a broken edit, when
     it fails to load or when it first fails; the previous functions stay in use. Messages give the
-    simulated time of the last `refresh`. stamp: time of the file's last edit, ns, when its functions
+    simulated time of the last `refresh`. stamp: time of the file's last edit, ns, as its functions
     were loaded.
     """
 

@@ -1,2 +1,2 @@
-"""How accurately a scene is simulated: settings, presets, and the search for the cheapest settings
-that hold an error."""
+"""The accuracy of a simulation: settings, presets, and the search for the cheapest settings that
+keep the error within a limit."""

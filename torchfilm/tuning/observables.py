@@ -1,21 +1,22 @@
-"""What `tune` looks at: a window of some colonies' growth, run again and again from one state, and
-what one would read off it.
+"""What `tune` measures: observables in a window of growth, which it runs repeatedly from one state.
 
-- cells: relative difference of their number; a cell that is due to divide at the next step counts
-  as two.
-- volume: relative difference of what the window's second half added, or, where that is more, of
-  what growth would add without pressure or loss of cells. In the first half cells settle, since the
-  start was grown by other settings. It is the volume of the cylinders round the cells, π r² times
-  the length from end to end, which no division changes.
+The error of each observable:
+
+- cells: relative difference of the number of cells. A cell that is due to divide at the next step
+  counts as two.
+- volume: difference of the volume added in the second half of the window, relative to that volume.
+  If growth without pressure or loss of cells would add more, the difference is relative to that. In
+  the first half the cells settle, because other settings grew the start. A cell's volume is here
+  that of the cylinder around it, π r² times the length from end to end: no division changes it.
 - radius: relative difference.
-- overlap: mean overlap of touching cells over their diameter (0 is right); of soft cells its
-  difference.
+- overlap: mean overlap of touching cells over their diameter, of which the right value is 0. For
+  soft cells, the difference of this mean.
 - a species: relative difference of its mean and of its standard deviation over cells.
-- signal NAME: relative difference of its amount, and of the mean concentration that its own
-  molecules find; the larger.
+- signal NAME: relative difference of its amount, or of the mean concentration at its own molecules,
+  whichever is larger.
 
-Colonies are chaotic: two runs of one law differ by chance. How much of an error that may be is told
-by the colonies themselves, each left out in turn.
+Colonies are chaotic, so two runs of the same scene differ at random. The jackknife over colonies
+(each is left out in turn) estimates this random part of an error.
 """
 
 from __future__ import annotations
@@ -41,24 +42,24 @@ from torchfilm.tools.ragged import Groups
 from torchfilm.tools.timing import Timings
 from torchfilm.tuning.settings import Settings
 
-# The window, in steps of the scene. Of half as many, most of the second half's error in volume is
-# still the start's settling (measured).
+# Length of the window, in steps of the scene. With half as many, the settling of the start causes
+# most of the error in volume, even in the second half (measured).
 WINDOW = 24
-# A scene that never has as many cells as asked for is taken as it is where so many steps have not
-# made a colony larger by a hundredth, or after MOST_STEPS.
+# If a scene never reaches the given number of cells, its growth ends when a colony has grown by less
+# than a hundredth in STILL steps, or after MOST_STEPS.
 STILL, MOST_STEPS = 10 * WINDOW, 2000
 SIGNAL = "signal "
-SURE = 0.95  # of 20 errors 19 are at most what is told
+SURE = 0.95  # level of upper bounds: 19 of 20 errors are below
 
 Seen = dict[str, list[Tensor]]
-"""By observable, what it is made of in the middle and at the end, summed over each colony: (B, m)
-float64; NaN if a colony failed."""
+"""By observable, its sums over each colony, (B, m) float64, in the middle of the window and at its
+end; NaN if a colony failed."""
 
 
 @dataclass(frozen=True)
 class Error:
-    """A relative error, and how much of it may be chance: its standard error among `colonies`
-    (jackknife: Efron and Stein 1981)."""
+    """A relative error, and its standard error over `colonies` colonies (jackknife: Efron and Stein
+    1981)."""
 
     value: float
     noise: float
@@ -66,12 +67,12 @@ class Error:
 
     @property
     def ci95(self) -> float:
-        """How much more it may be, to 95 % (Student's t)."""
+        """Distance from the value to the upper bound (one-sided 95 %, Student's t)."""
         return float(stdtrit(self.colonies - 1, SURE)) * self.noise if self.noise else 0.0
 
     @property
     def upper_bound(self) -> float:
-        """What it is at most, to 95 %."""
+        """The upper end of the one-sided 95 % confidence interval."""
         return self.value + self.ci95
 
     def __str__(self) -> str:
@@ -84,8 +85,11 @@ class Error:
 
 @dataclass(frozen=True)
 class WindowRun:
-    """What was found in a window's middle and at its end, the seconds it took, in all (on the CPU
-    of the thread that ran it) and by effect, and whether a step was taken in `several`."""
+    """One run of the window.
+
+    found: the observables in the middle and at the end. seconds: computing time (on the CPU: of the
+    thread that ran it). spent: seconds by effect. several: whether a step was split into substeps.
+    """
 
     found: Seen
     seconds: float
@@ -95,26 +99,27 @@ class WindowRun:
 
 @dataclass(frozen=True)
 class AccuracyProbe:
-    """Where all windows begin, and what they are compared with."""
+    """The state from which all windows start, and how their observables are compared."""
 
     given: Scene
-    scene: Scene  # as it is probed: molecules by their mean
-    model: Model  # of that, as its own settings have it
+    scene: Scene  # without noise: molecules by their mean
+    model: Model  # of that scene, with its own settings
     start: State
     dt: float
     of: tuple[str, ...] | None
 
     @property
     def needed(self) -> tuple[str, ...]:
-        """What must be told: what was named, or the volume, in which every knob tells."""
+        """The observables that must be resolved: those that the user named, or the volume, which
+        every knob affects."""
         return self.of or ("volume",)
 
     def steps(self, settings: Settings) -> int:
-        """Into how many steps the window is divided."""
+        """The number of steps in the window."""
         return round(WINDOW * self.dt / (settings.dt or self.dt))
 
     def observed(self, settings: Settings) -> WindowRun:
-        """What is read off the window by these settings."""
+        """Runs the window with these settings."""
         steps = self.steps(settings)
         made = settings.apply(self.scene).bind(state=self.start, per_colony=True)
         dt, state, seen, timings, broken, several = (
@@ -125,7 +130,7 @@ class AccuracyProbe:
             False,
             False,
         )
-        # what other work on the machine takes does not count, where the work is this thread's own
+        # on the CPU, the time of this thread only: other work on the machine does not count
         clock = time.thread_time if state.device.type == "cpu" else time.perf_counter
         begun = clock()
         last = self.start.step + steps
@@ -156,15 +161,15 @@ class AccuracyProbe:
         return WindowRun(found, seconds, timings.seconds, several)
 
     def _due(self, state: State) -> Tensor:
-        """The number of cells after the divisions with which the next step would begin, (B, 1):
-        until then it is late, by a step that is known."""
+        """The number of cells after the divisions at the start of the next step, (B, 1). Before
+        these divisions, the number is late by up to one step."""
         for effect in self.model.effects:
             if effect.stage <= DIVISION:
                 state = effect.step(state, self.dt)
         return state.counts.double().cpu().unsqueeze(1)
 
     def _wanted(self, state: State) -> Tensor:
-        """By how much the volume would grow in an hour if nothing held it back, (B, 1) µm³."""
+        """Growth of the volume per hour without pressure, (B, 1) µm³/h."""
         grown = state
         for effect in self.model.effects:
             if effect.stage == GROWTH:
@@ -172,11 +177,11 @@ class AccuracyProbe:
         return _over(state, math.pi * state.radius**2 * (grown.length - state.length) / self.dt)
 
     def errors(self, found: Seen, against: Seen, apart: bool = False) -> dict[str, Error]:
-        """By observable of `against`, the greater of the errors in the middle and at the end;
-        infinite where it is not found.
+        """For each observable of `against`, the greater of the errors in the middle and at the end;
+        infinite where `found` lacks it.
 
-        apart: of two runs of which neither is right, so that overlaps, too, are compared and not
-        told.
+        apart: neither run is the reference. The overlap is then also a difference of the two runs,
+        not an error by itself.
         """
         out = {}
         for name, rights in against.items():
@@ -187,7 +192,7 @@ class AccuracyProbe:
             each = self._error(name, _left_out(name, values), _left_out(name, rights), apart)
             error, without = float(each[0]), each[1:]
             noise = math.sqrt((len(without) - 1) * float(without.var(correction=0)))
-            # of colonies of which all but one have lost their cells nothing can be told
+            # if only one colony has cells, the standard error is unknown, hence infinite
             out[name] = (
                 Error(math.inf, 0.0)
                 if math.isnan(error)
@@ -196,10 +201,10 @@ class AccuracyProbe:
         return out
 
     def _error(self, name: str, value: Tensor, right: Tensor, apart: bool) -> Tensor:
-        """Of an observable (J, 2, k) the greater of the errors in the middle and at the end,
-        (J,)."""
+        """The greater of an observable's errors in the middle and at the end, (J,), from values
+        (J, 2, k)."""
         if name == "volume":
-            # the volume, and by how much it would grow in an hour
+            # columns: the volume, and its growth per hour without pressure
             added, growth = right[:, -1, 0] - right[:, 0, 0], right[:, :, 1].mean(1)
             return (value[:, -1, 0] - value[:, 0, 0] - added).abs() / torch.maximum(
                 added.abs(), growth * self.dt * WINDOW / 2
@@ -224,34 +229,34 @@ def begin(
     seed: int = 0,
     device: str | torch.device = "cpu",
 ) -> AccuracyProbe:
-    """The scene as it is probed, grown to where the windows begin."""
+    """Grows a noise-free copy of the scene to `cells` cells per colony, where the windows start."""
     made = scene.replace(*(e.without_noise() for e in scene.effects))
     fixed = scene.fixed_colonies
     model = made.bind(fixed if fixed > 1 else colonies, seed=seed, device=device, per_colony=True)
     founded = state = model.start()
     standstill = Standstill(cells, STILL)
     for state in simulate(model, founded, cells=cells, until=MOST_STEPS * scene.dt):
-        # one colony that stays small is enough: the others would grow without end
+        # stop if any colony stays small: the others would grow without end
         if bool(standstill(state).any()):
             break
     return AccuracyProbe(scene, made, model, state, scene.dt, None if of is None else tuple(of))
 
 
 def observables(state: State) -> dict[str, Tensor]:
-    """What is read off a state of a batch: numbers by name, (k,) float64 each. Species and signals
-    that are 0 everywhere are left out."""
+    """The observables of a batch by name, (k,) float64 each. Species and signals that are 0
+    everywhere are omitted."""
     return {name: _made(name, parts.sum(0)) for name, parts in sums(state).items()}
 
 
 def sums(state: State) -> dict[str, Tensor]:
-    """By observable, what it is made of, summed over each colony: (B, m) float64."""
+    """By observable, its sums over each colony, (B, m) float64."""
     over = partial(_over, state)
     one, radius = torch.ones_like(state.length), state.radius.double()
     out = {
         "cells": over(one),
         "volume": over(math.pi * radius**2 * (state.length.double() + 2.0 * radius)),
     }
-    # cells that do not push each other have no overlap to speak of
+    # without mechanics, cells may overlap freely
     if "displacement" in state.fields:
         found = measure.overlaps(state)
         out["overlap"] = torch.cat(
@@ -280,12 +285,12 @@ def sums(state: State) -> dict[str, Tensor]:
 
 
 def _over(state: State, *values: Tensor) -> Tensor:
-    """Sums over each colony of k values of its cells (N,), (B, k) float64."""
+    """Sums of k values per cell, (N,) each, over each colony: (B, k) float64."""
     return torch.stack([state.groups.sum(v.double()) for v in values], 1).cpu()
 
 
 def _made(name: str, total: Tensor) -> Tensor:
-    """An observable (…, k) of its sums (…, m)."""
+    """An observable (…, k) from its sums (…, m)."""
     if name in ("cells", "volume"):
         return total
     if name == "overlap":
@@ -294,7 +299,7 @@ def _made(name: str, total: Tensor) -> Tensor:
     if name == "radius":
         return total[..., :1] / total[..., 1:]
     if name.startswith(SIGNAL):
-        # the amount, and the mean concentration that a molecule of it finds itself in
+        # the amount, and the mean concentration at the molecules of the signal
         amount, square = total.unbind(-1)
         return torch.stack([amount, square / amount], -1)
     first, second, cells = total.unbind(-1)
@@ -303,13 +308,13 @@ def _made(name: str, total: Tensor) -> Tensor:
 
 
 def _left_out(name: str, parts: Sequence[Tensor]) -> Tensor:
-    """An observable of all colonies, and with each of them left out, in the middle and at the end:
-    (1 + B, 2, k)."""
+    """An observable of all colonies, then without each colony in turn, in the middle and at the
+    end: (1 + B, 2, k)."""
     each = torch.stack(list(parts), 1)  # (B, 2, m)
     total = each.sum(0, keepdim=True)
     return _made(name, torch.cat([total, total - each]))
 
 
 def species(state: State) -> list[str]:
-    """Names of fields that are concentrations in cells."""
+    """Names of the fields that are concentrations in cells."""
     return [name for name, f in state.declared.items() if f.scope == "cell" and f.unit == "conc"]

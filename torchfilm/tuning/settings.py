@@ -1,8 +1,8 @@
-"""How accurately a scene is simulated: the knobs that trade time for error, in one place, apart
-from what the scene says of the world.
+"""Accuracy settings: the knobs that trade computing time for error, apart from the physics of the
+scene.
 
-`Settings` are a handful of numbers that any scene can be given; `preset` has three, and
-`torchfilm.tuning.tuner` finds them for an error that one names.
+`Settings` are a few numbers that apply to any scene. `preset` returns one of three named settings.
+`torchfilm.tuning.tuner` finds settings for a given error.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ FORMAT = "torchfilm settings"
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Knobs of accuracy; None leaves what the scene says.
+    """Knobs of accuracy. None keeps the scene's own value.
 
-    dt: step, h. penalty: α·γ of contacts, by how far they give way (0.1 by default; cells that are
-    physically soft, `Mechanics(stiffness=…)`, keep theirs). passes, tolerance: of the contact solve
-    (see `Mechanics`). rtol: of circuits that run by the stiff solver.
+    dt: step, h. penalty: α·γ of contacts, which sets how far contacts yield (default 0.1; physically
+    soft cells, `Mechanics(stiffness=…)`, keep their own). passes, tolerance: of the contact solve
+    (see `Mechanics`). rtol: relative tolerance of circuits that use the stiff solver.
     """
 
     dt: float | None = None
@@ -58,8 +58,8 @@ class Settings:
         }
 
     def apply(self, scene: Scene) -> Scene:
-        """The same scene, simulated so: its results say so too, and go on so. Knobs of effects that
-        it does not list do nothing."""
+        """The same scene with these settings. Its results file stores them, and a resumed run uses
+        them again. Knobs of effects that the scene does not list have no effect."""
         return scene.replace(
             *(effect.with_settings(self) for effect in scene.effects),
             dt=scene.dt if self.dt is None else self.dt,
@@ -67,7 +67,8 @@ class Settings:
         )
 
     def save(self, path: str | Path) -> Path:
-        """Write them to a new JSON file."""
+        """Writes the settings to a new JSON file. Raises InputError if the file exists or cannot be
+        written."""
         path = Path(path)
         Settings.check_new(path)
         try:
@@ -80,7 +81,7 @@ class Settings:
 
     @staticmethod
     def check_new(path: Path) -> None:
-        """Refuse to replace a file."""
+        """Raises InputError if the path exists, or if its folder does not."""
         if path.exists() or not path.parent.is_dir():
             raise checks.input_error(
                 "the settings' path",
@@ -91,7 +92,7 @@ class Settings:
 
     @staticmethod
     def load(path: str | Path) -> Settings:
-        """Read what `save` wrote. Raises InputError for anything else."""
+        """Reads a file that `save` wrote. Raises InputError for any other file."""
         try:
             found = json.loads(Path(path).read_text())
         except OSError as error:
@@ -103,15 +104,15 @@ class Settings:
             found = None
         if not isinstance(found, dict) or found.pop("format", None) != FORMAT:
             raise checks.InputError(
-                f"{path} holds no settings of accuracy: `torchfilm tune SCENE --out FILE` writes"
+                f"{path} contains no settings of accuracy: `torchfilm tune SCENE --out FILE` writes"
                 " such a file."
             )
         return Settings.named(found, str(path))
 
     @staticmethod
     def named(knobs: dict[str, Any], where: str) -> Settings:
-        """From knobs by name, as files hold them. Raises InputError for a name that there is
-        not."""
+        """Settings from knobs by name, as files store them. Raises InputError for an unknown
+        name."""
         known = [f.name for f in dataclasses.fields(Settings)]
         for name in knobs:
             if name not in known:
@@ -119,9 +120,9 @@ class Settings:
         return Settings(**knobs)
 
 
-# By name: the step as a part of the scene's own, and the other knobs. Their places on the fronts
-# are in docs/accuracy.md: a step much longer than a draft's makes cells of usual growth take
-# sub-steps, which cost more than they save.
+# By name: the step as a multiple of the scene's own, and the other knobs. docs/accuracy.md compares
+# their cost and error. With a step much longer than a draft's, cells of usual growth take substeps,
+# which cost more than they save.
 PRESETS: dict[str, tuple[float, Settings]] = {
     "draft": (1.6, Settings(penalty=0.1, tolerance=0.2, rtol=1e-2)),
     "standard": (1.0, Settings()),
@@ -130,16 +131,16 @@ PRESETS: dict[str, tuple[float, Settings]] = {
 
 
 def preset(name: str, scene: Scene) -> Settings:
-    """Named settings for a scene: "draft" to look at it, "standard" (its own, the defaults),
-    "reference" to measure others against."""
+    """Named settings for a scene: "draft" for a first view, "standard" for the scene's own values,
+    "reference" to compare others with. Raises InputError for any other name."""
     checks.choice("preset", name, tuple(PRESETS))
     pace, settings = PRESETS[name]
     return dataclasses.replace(settings, dt=None if pace == 1.0 else scene.dt * pace)
 
 
 def accurate(scene: Scene, named: str | None, file: Path | None) -> Scene:
-    """The scene as accurately as a preset by name or a file of settings says, if either is given.
-    Raises InputError for both."""
+    """The scene with the settings of a preset or of a file, if one is given. Raises InputError if
+    both are."""
     if named is not None and file is not None:
         raise checks.InputError("--preset and --settings: give one of the two.")
     if file is not None:
