@@ -47,16 +47,17 @@ def mechanics(draw: Contacts, capsules: Capsules) -> tf.Mechanics:
         if draw.give > 0
         else {"stiffness": -draw.give}
     )
-    return tf.Mechanics(
+    made = tf.Mechanics(
         walls=walls[draw.wall],
         dim=dim,
         viscosity=draw.viscosity,
         length_drag=draw.length_drag,
         unilateral=draw.unilateral,
-        passes=draw.passes,
         max_iterations=300,
         **accuracy,
     )
+    # with the overlap that goes with a number of passes
+    return made.with_settings(tf.Settings(passes=draw.passes))
 
 
 def growing(draw: Draw) -> list[tf.Effect]:

@@ -32,6 +32,10 @@ def of(made: tf.Scene, kind: type):
     return next(e for e in made.effects if isinstance(e, kind))
 
 
+def bound_circuit(made: tf.Scene):
+    return next(e for e in made.bind().effects if isinstance(e.effect, tf.Circuit))
+
+
 def test_knobs_reach_their_effects_and_nothing_else():
     first = scene(length_drag=20.0, walls=[tf.Channel(8.0)])
     second = tf.Settings(dt=0.01, penalty=0.2, passes=3, tolerance=0.01, rtol=1e-3).apply(first)
@@ -46,14 +50,38 @@ def test_knobs_reach_their_effects_and_nothing_else():
     assert mechanics.walls == of(first, tf.Mechanics).walls and mechanics.length_drag == 20.0
     assert (
         circuit.rates == of(first, tf.Circuit).rates
-        and circuit.noted is not of(first, tf.Circuit).noted
+        and circuit is not of(first, tf.Circuit)
+        and of(first, tf.Circuit).rtol == 1e-4
     )
+    # what is found out of one by trying it is not that of the other
+    noted = [bound_circuit(made) for made in (first, second)]
+    assert noted[0].exchanged is not noted[1].exchanged
+    assert noted[0].values is not noted[1].values and noted[0].effect is of(first, tf.Circuit)
     assert (
         second.effects[:2] == first.effects[:2]
         and second.name == "mine"
         and second.founders is first.founders
     )
     assert first.dt == 0.02 and of(first, tf.Mechanics).passes is None  # the first is as it was
+
+
+@pytest.mark.parametrize(
+    "given, settings, overlap",
+    [
+        ({}, {"passes": 3}, 0.02),
+        ({}, {"passes": 3, "penalty": 0.2}, 0.02),
+        ({}, {"passes": 3, "penalty": 0.03}, 0.006),
+        ({"alpha": 0.001}, {"passes": 3}, 0.002),
+        ({"alpha": 0.001}, {"passes": 3, "penalty": 0.1}, 0.02),
+        ({"overlap": 0.05}, {"passes": 3, "penalty": 0.03}, 0.05),
+        ({"stiffness": 100.0}, {"passes": 3, "penalty": 0.03}, 0.02),
+        ({}, {"penalty": 0.03}, None),
+    ],
+)
+def test_who_sets_passes_wants_overlaps_gone(given, settings, overlap):
+    """Down to 0.02 µm, or as much less as α·γ is below 0.1, where none is given (γ = 10)."""
+    made = of(tf.Settings(**settings).apply(scene(**given)), tf.Mechanics)
+    assert made.overlap == (None if overlap is None else pytest.approx(overlap))
 
 
 def test_without_knobs_the_scene_stays_as_it_is():
@@ -72,7 +100,7 @@ def test_physical_softness_and_molecules_are_no_knobs():
     molecules = tf.Circuit([tf.parts.constitutive("m", 1.0)], species="m", method="tau_leap")
     grown = tf.Settings(rtol=1e-2).apply(tf.Scene(tf.Growth(rate=1.0), molecules))
     assert of(grown, tf.Circuit) is molecules
-    assert molecules.smooth().method == "rosenbrock" and molecules.method == "tau_leap"
+    assert molecules.without_noise().method == "rosenbrock" and molecules.method == "tau_leap"
 
 
 def test_one_penalty_for_drags_that_differ_between_colonies():

@@ -1,10 +1,11 @@
 """A scene pays for what it lists and for nothing else, proved by counting: operators dispatched and
 bytes allocated, not seconds.
 
-Four claims. The steps of growth, division and mechanics cost exactly the same operators and bytes
+Five claims. The steps of growth, division and mechanics cost exactly the same operators and bytes
 whatever else the scene lists. What a scene does not list is not called: with every public function
-of its rooms taken away the scene runs as before. Its fields are not there. And operators are for
-the whole batch: many colonies ask for no more of them than two.
+of its rooms taken away the scene runs as before. Its fields are not there. Operators are for
+the whole batch: many colonies ask for no more of them than two. And a step of a small scene asks
+for no more of them than it did.
 """
 
 from __future__ import annotations
@@ -71,12 +72,12 @@ LISTED = {
 
 
 def spend(
-    scene: tf.Scene, state: tf.State
+    model: tf.Model, state: tf.State
 ) -> tuple[dict[str, tuple[dict[str, int], int]], tf.State]:
     """What each effect of a step asks for, by its title: (operators by name, bytes), and the state
     after it."""
     state, here = state.replace(births=(), ended=(), reports={}), {}
-    for effect in scene.effects:
+    for effect in model.effects:
         with Operators() as seen:
             state = effect.step(state, 0.05)
         here[effect.title] = (dict(seen.calls), seen.bytes)
@@ -88,9 +89,10 @@ def costs(
 ) -> tuple[list[dict[str, tuple[dict[str, int], int]]], list[tf.State]]:
     """What each effect of each step asked for, by its title: (operators by name, bytes), and the
     states."""
-    state, spent, states = scene.bind(seed=5, dtype=torch.float64).start(), [], []
+    model = scene.bind(seed=5, dtype=torch.float64)
+    state, spent, states = model.start(), [], []
     for _ in range(steps):
-        here, state = spend(scene, state)
+        here, state = spend(model, state)
         spent.append(here)
         states.append(state)
     return spent, states
@@ -116,7 +118,7 @@ def test_growth_division_and_mechanics_cost_the_same_whatever_else_is_listed(lis
             if title != "division" or not state.births or listed in ("medium", "removal"):
                 assert here[title] == there[title], (title, state.step)
         extra = set(here) - set(there)
-        assert all(sum(here[title][0].values()) > 0 or title == "cover" for title in extra), (
+        assert all(sum(here[title][0].values()) > 0 or title == "grid coverage" for title in extra), (
             "an effect that is listed and does nothing proves nothing"
         )
 
@@ -138,17 +140,12 @@ def test_the_counter_sees_what_it_should(bare):
 def test_on_the_same_cells_nutrition_leaves_the_others_costs_alone():
     """Nutrition changes how cells grow, so the runs differ; but on the cells of any moment growth
     and mechanics cost the same with and without it."""
-    fed, unfed = (
-        tf.Scene(*body(None), *more)
-        for more in (
-            [tf.Monod("ahl"), tf.Medium(ahl=tf.Signal(diffusion=10.0, initial=9.0), **BOX)],
-            [],
-        )
-    )
-    state, bare = (
-        fed.bind(seed=5, dtype=torch.float64).start(),
-        unfed.bind(seed=5, dtype=torch.float64).start(),
-    )
+    food = tf.Medium(ahl=tf.Signal(diffusion=10.0, initial=9.0), **BOX)
+    fed = tf.Scene(*body(None), tf.Monod("ahl"), food).bind(seed=5, dtype=torch.float64)
+    # its cells get their rates from those of the other
+    with pytest.warns(UserWarning, match="nothing grows"):
+        unfed = tf.Scene(*body(None)).bind(seed=5, dtype=torch.float64)
+    state, bare = fed.start(), unfed.start()
     compared = 0
     for _ in range(30):
         same = {
@@ -186,15 +183,35 @@ def test_many_colonies_ask_for_no_more_operators_than_two(listed):
     nine: the same operators by name in every step. (Not than one, which goes without what tells
     colonies apart.)"""
     scene = tf.Scene(*body(), *LISTED[listed]())
-    two, nine = (
-        scene.bind(n, seed=5, streams=[3] * n, dtype=torch.float64).start() for n in (2, 9)
-    )
+    models = [scene.bind(n, seed=5, streams=[3] * n, dtype=torch.float64) for n in (2, 9)]
+    two, nine = (model.start() for model in models)
     for _ in range(30):
-        (here, two), (there, nine) = spend(scene, two), spend(scene, nine)
+        (here, two), (there, nine) = spend(models[0], two), spend(models[1], nine)
         assert {title: calls for title, (calls, _) in here.items()} == {
             title: calls for title, (calls, _) in there.items()
         }, two.step
     assert 2 * nine.cells == 9 * two.cells > 18
+
+
+# The operators of a step of two colonies, float32, after 20 steps: (now, at most; at 8b0ffbc, before
+# scenes were bound: the same cells, measured by the same counter with torch 2.13).
+SMALL = {
+    "microcolony": (1512, 1520),
+    "quorum_sensing": (8487, 8504),
+    "boundary_detector": (4830, 4867),
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_step_of_a_small_scene_takes_no_more_operators_than_before(name):
+    most, before = SMALL[name]
+    model = tf.scenes.build(name).bind(2)
+    state = model.start()
+    for _ in range(20):
+        state = model.step(state)
+    with Operators() as seen:
+        model.step(state)
+    assert seen.total <= most < before, seen.calls.most_common(20)
 
 
 def functions(*rooms: str) -> list[tuple[object, str]]:

@@ -4,30 +4,18 @@ estimate is the arithmetic that it claims to be."""
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import step
 
 import torchfilm as tf
-from torchfilm.effects import medium as medium_module
+from torchfilm.cost_estimate import COLUMNS, ROWS, Block, CostProbe, Spending, crowd, state_bytes
+from torchfilm.effects import KNOWN, bound_medium
+from torchfilm.effects.bound_medium import FirstHalf, GridCoverage
 from torchfilm.effects.mechanics import TOLERANCE
-from torchfilm.effects.medium import GridCoverage
-from torchfilm.explanation import (
-    COLUMNS,
-    KNOWN,
-    ROWS,
-    Block,
-    Probe,
-    Spending,
-    crowd,
-    how,
-    left_out,
-    replayed,
-    state_bytes,
-    transport,
-)
+from torchfilm.explanation import left_out, replayed
 from torchfilm.tools.counting import Operators
 
 BODY = (tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2))
@@ -79,18 +67,21 @@ def graded(places):
     ],
 )
 def test_the_way_of_transport_told_is_the_one_that_is_chosen(made, words, monkeypatch):
-    chosen, choose = [], medium_module.choose
-    monkeypatch.setattr(medium_module, "choose", lambda op: chosen.append(choose(op)) or chosen[-1])
+    chosen, choose = [], bound_medium.choose
+    monkeypatch.setattr(bound_medium, "choose", lambda op: chosen.append(choose(op)) or chosen[-1])
     scene = tf.Scene(*BODY, made)
-    step(scene, scene.bind(2).start(), scene.dt)
-    method, why = transport(made, "ahl")
+    model = scene.bind(2)
+    model.step(model.start())
+    method, why = made.method_of("ahl")
     assert set(chosen) == {method} and words in why
     assert f"ahl: {method}, " in tf.explain(scene, seconds=0)
 
 
 @pytest.mark.parametrize("method", ["exponential", "implicit", "crank_nicolson", "euler"])
 def test_a_way_of_transport_that_was_asked_for_is_told(method):
-    assert transport(medium(method=method), "ahl") == (method, "as asked for")
+    made = medium(method=method)
+    assert made.method_of("ahl") == (method, "as given")
+    assert f"ahl: {method}, " in tf.explain(tf.Scene(*BODY, made), seconds=0)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +164,9 @@ def test_methods_and_tolerances_are_those_of_the_scene(effect, words):
 @pytest.mark.parametrize("unilateral", [False, True])
 def test_defaults_told_of_contacts_are_those_used(dim, unilateral):
     effect = tf.Mechanics(dim=dim, unilateral=unilateral)
-    said = " ".join(how(effect, tf.Scene(effect, tf.Growth(rate=1.0)).bind().start(), 0.025))
+    model = tf.Scene(effect, tf.Growth(rate=1.0)).bind()
+    bound = next(e for e in model.effects if e.effect is effect)
+    said = " ".join(bound.numerics(0.025, model.start()))
     assert (
         f"at most {effect.settings.passes} a step" in said
         and f"residual of {TOLERANCE:g} (default)" in said
@@ -191,19 +184,43 @@ def test_every_effect_that_torchfilm_has_is_known_and_has_words():
         for x in vars(tf).values()
         if isinstance(x, type) and issubclass(x, tf.Effect) and x is not tf.Effect
     }
-    assert public == set(KNOWN)
-    assert all(how.dispatch(kind) is not how.dispatch(object) for kind in (*KNOWN, GridCoverage))
+    assert public == set(KNOWN.values())
+
+    def watching(cells):
+        cells.mark = cells.length * 2.0
+
+    model = tf.Scene(
+        *BODY[1:],
+        tf.Growth(),
+        tf.Monod("ahl"),
+        tf.Rules(watching),
+        tf.Circuit(plain, species="m"),
+        medium(),
+        tf.Removal((-50, -50), (50, 50)),
+    ).bind()
+    state = model.start()
+    assert {type(e.effect) for e in model.effects} == public
+    assert {FirstHalf, GridCoverage} <= {type(e) for e in model.effects}
+    for effect in model.effects:
+        words = effect.numerics(0.025, state)
+        assert words and all(words), effect.title
 
 
 def test_an_effect_of_ones_own_is_told_by_its_name_alone():
     class Mine(tf.Growth):
         title = "mine"
 
+    @dataclass(frozen=True)
     class Other(tf.Effect):
         stage, title = 35, "other"
 
-    assert how(Other(), tf.Scene(*BODY).bind().start(), 0.025) == []
-    assert "mine" in tf.explain(tf.Scene(Mine(rate=1.0)), seconds=0)
+    model = tf.Scene(*BODY, Other()).bind()
+    (other,) = (e for e in model.effects if isinstance(e.effect, Other))
+    assert other.numerics(0.025, model.start()) == []
+    lines = tf.explain(model.scene, seconds=0).splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith("  other "))
+    assert not lines[at + 1].startswith(" " * 13)
+    assert "mine" in tf.explain(tf.Scene(Mine(rate=1.0), dim=3), seconds=0)
 
 
 # --- who, what not, and again ---------------------------------------------------------------------
@@ -213,7 +230,7 @@ def test_an_effect_of_ones_own_is_told_by_its_name_alone():
 def test_what_is_listed_and_what_is_left_out_are_all(name):
     scene = tf.scenes.build(name)
     listed, left = [e.title for e in scene.effects], left_out(scene)
-    assert sorted(listed + left) == sorted(kind.title for kind in KNOWN)
+    assert sorted(listed + left) == sorted(KNOWN)
     assert f"not simulated: {', '.join(left)} (no field, no operation)" in tf.explain(
         scene, seconds=0
     )
@@ -222,12 +239,13 @@ def test_what_is_listed_and_what_is_left_out_are_all(name):
 @pytest.mark.parametrize("name", tf.scenes.READY)
 def test_whether_growth_serves_many_designs_is_what_a_course_says(name):
     scene = tf.scenes.build(name)
-    why = scene.bind().why_not_replayable
-    assert replayed(scene) == f"no, {why}" if why else replayed(scene).startswith("yes, ")
+    model = scene.bind()
+    why, said = model.why_not_replayable, replayed(model)
+    assert said == f"no, {why}" if why else said.startswith("yes, ")
     if name == "boundary_detector":
-        assert replayed(scene) == "yes, circuit and transport only follow (GrowthRecording, Replay)"
+        assert said == "yes, circuit and transport only follow (GrowthRecording, Replay)"
     if name == "toggle_switch":
-        assert replayed(scene) == "yes, circuit only follows (GrowthRecording, Replay)"
+        assert said == "yes, circuit only follows (GrowthRecording, Replay)"
 
 
 @pytest.mark.parametrize("name", tf.scenes.READY)
@@ -246,7 +264,7 @@ def test_without_an_estimate_nothing_runs(monkeypatch):
     def input_error(*_):
         raise AssertionError("a step was taken")
 
-    monkeypatch.setattr(tf.Scene, "step", input_error)
+    monkeypatch.setattr(tf.Model, "step", input_error)
     said = tf.explain(tf.scenes.boundary_detector(), seconds=0)
     assert "estimated" not in said and said == tf.explain(tf.scenes.boundary_detector(), seconds=0)
 
@@ -262,15 +280,17 @@ def test_a_fit_gives_back_what_is_linear():
         "growth": (2e-5, 1e-8, 0.0),
         "mechanics": (1e-3, 2e-5, 0.0),
         "transport": (3e-4, 0.0, 2e-4),
-        "cover": (0.0, 0.0, 1e-5),
+        "grid coverage": (0.0, 0.0, 1e-5),
         "division": (0.0, 0.0, 0.0),
     }
     blocks = [
         Block(n, b, {t: x + y * n + z * b for t, (x, y, z) in truth.items()}, {})
         for n, b in ((32, 1), (40, 1), (256, 8), (300, 8), (420, 8))
     ]
-    state = scene.bind().start()
-    found = Probe(blocks, state, state, "", True).fit(scene, "seconds")
+    model = scene.bind()
+    assert set(truth) == {e.title for e in model.effects}
+    state = model.start()
+    found = CostProbe(model, blocks, state, state, "", True).fit("seconds")
     for title, expected in truth.items():
         assert found[title] == pytest.approx(expected, rel=1e-6, abs=1e-12), title
 
@@ -281,7 +301,7 @@ def test_a_run_is_foretold_from_the_pace_of_growth():
     said = tf.explain(tf.Scene(tf.Growth(rate=1.0)), cells=1000, seconds=0.01)
     assert "  a run    277 steps (6.93 h)" in said
     assert "  a run    0 steps" in tf.explain(tf.Scene(tf.Growth(rate=1.0)), cells=1, seconds=0.01)
-    assert "not foretold" in tf.explain(tf.Scene(tf.Growth(rate=0.0)), seconds=0.01)
+    assert "no estimate: the probe did not grow" in tf.explain(tf.Scene(tf.Growth(rate=0.0)), seconds=0.01)
 
 
 @pytest.mark.parametrize(
@@ -361,16 +381,16 @@ def test_bytes_of_a_state_are_those_of_its_tensors(name):
 def test_spending_is_what_the_operators_are():
     """The step with every effect counted apart, against the same step counted as a whole: nothing
     is left between effects but the step's own clock."""
-    scene = tf.scenes.quorum_sensing()
+    model = tf.scenes.quorum_sensing().bind()
     # two, since a state keeps what was worked out of it
-    one, other, spent = scene.bind().start(), scene.bind().start(), Spending()
+    one, other, spent = model.start(), model.start(), Spending()
     with Operators() as seen:
-        step(scene, one, scene.dt)
-    step(scene, other, scene.dt, spent)
+        model.step(one)
+    model.step(other, timings=spent)
     assert seen.total == sum(c.total() for c in spent.calls.values()) and seen.bytes == sum(
         spent.bytes.values()
     )
-    assert list(spent.calls) == list(dict.fromkeys(e.title for e in scene.effects))
+    assert list(spent.calls) == list(dict.fromkeys(e.title for e in model.effects))
 
 
 # --- input and the command line -------------------------------------------------------------------

@@ -248,25 +248,40 @@ def test_functions_of_places_may_hold_what_wants_a_gradient():
 
 
 def test_what_was_made_ready_without_a_gradient_does_not_hide_it():
-    """A look without gradients, then a step with them; and a constant that an optimiser changes in
-    place: nothing made ready before may be used."""
+    """A look without gradients, then a step with them, by one model: nothing made ready before may
+    be used. A constant that an optimiser changes in place counts once the scene is bound again."""
     K = torch.tensor(15.0, dtype=F64, requires_grad=True)
     scene = tf.Scene(
         tf.Medium(a=tf.Signal(diffusion=K, initial=lambda at: (at[:, 0] > 0).double()), **BOX),
         founders=founders(),
     )
     with torch.no_grad():
-        state = scene.bind(dtype=F64).start()
-        before = step(scene, state, DT).signals["a"]
-    after = step(scene, state, DT).signals["a"]
+        model = scene.bind(dtype=F64)
+        state = model.start()
+        before = model.step(state, DT).signals["a"]
+    after = model.step(state, DT).signals["a"]
     assert after.requires_grad and torch.equal(before, after.detach())
     (gradient,) = torch.autograd.grad((after * weights(after)).sum(), K)
     with torch.no_grad():
         K += 1e-3
-        moved = step(scene, state, DT).signals["a"]
+        assert torch.equal(model.step(state, DT).signals["a"], before)
+        moved = scene.bind(dtype=F64).step(state, DT).signals["a"]
     slope = float(((moved - before) * weights(before)).sum()) / 1e-3
     # a one-sided difference, h times the curvature
     assert slope == pytest.approx(float(gradient), rel=1e-3) and slope != 0
+
+
+def test_a_model_bound_without_gradients_carries_them():
+    """The values of cells, too."""
+    rate = torch.tensor(1.0, dtype=F64, requires_grad=True)
+    scene = tf.Scene(tf.Growth(rate=rate), dim=2)
+    with torch.no_grad():
+        model = scene.bind(dtype=F64)
+        assert not model.step(model.start(), DT).length.requires_grad
+    (late,) = torch.autograd.grad(model.step(model.start(), DT).length.sum(), rate)
+    usual = scene.bind(dtype=F64)
+    (wanted,) = torch.autograd.grad(usual.step(usual.start(), DT).length.sum(), rate)
+    assert late == wanted != 0
 
 
 # --- rollout --------------------------------------------------------------------------------------

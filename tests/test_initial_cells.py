@@ -415,7 +415,7 @@ def test_the_cells_of_several_frames_in_one_table_are_noticed():
 
 def on_a_plane(*places, **options) -> tf.State:
     cells = tf.Cells([list(p) for p in places], [1.0, 0.0], **options)
-    return tf.Scene(tf.Growth(), tf.Mechanics(dim=2), founders=cells).bind().start()
+    return tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), founders=cells).bind().start()
 
 
 def test_two_cells_at_one_place_are_noticed():

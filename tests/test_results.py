@@ -265,7 +265,7 @@ class Plate(Effect):
     def declares(self, dim):
         return (tf.Field("plate", "per colony", scope="colony", shape=(2,)),)
 
-    def step(self, state, dt):
+    def step(self, state, dt, values):
         return state.with_fields(plate=state.plate + 1)
 
 

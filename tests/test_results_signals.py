@@ -245,7 +245,7 @@ def test_what_a_file_tells_of_signals(tmp_path):
 
 def test_files_without_a_medium_say_so_and_hold_nothing_of_it(tmp_path):
     scene = tf.Scene(tf.Growth(rate=1.0), *body())
-    record(scene, scene.bind().start(), tmp_path / "run.h5", until=0.3)
+    record(scene, scene.bind(3).start(), tmp_path / "run.h5", until=0.3)
     with h5py.File(tmp_path / "run.h5") as file:
         assert (
             "signals" not in file and "grid" not in file["frames"] and "spacing" not in file.attrs

@@ -1,8 +1,8 @@
-"""About what a scene will cost: measured, not modelled.
+"""An estimate of a scene's time and memory, from a short measurement.
 
-The scene itself is run for a moment on a small crowd of cells, once in a single colony and once in
-several. The time and bytes of each effect are fitted by a + b · cells, or a + b · colonies where it
-works on their grids.
+The scene runs briefly with a small crowd of cells, once in a single colony and once in several. A
+least-squares fit gives the time and bytes of each effect: a + b · cells, or a + b · colonies for
+effects on grids.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from torchfilm.tools import checks
 from torchfilm.tools.counting import Operators
 from torchfilm.tools.timing import Timings
 
-# The probe: a colony of ROWS × COLUMNS cells alone for a few blocks of steps, then several side by
-# side, until time is up or each has so many cells. The steps of a block are timed; at first, and
-# whenever there are so many times the cells, the bytes of one more step are counted, which takes
-# far longer.
+# The probe: one colony of ROWS × COLUMNS cells for ALONE_BLOCKS blocks of steps, then
+# PROBE_COLONIES colonies, until time is up or each has PROBE_CELLS cells. The steps of a block are
+# timed. At first, and whenever the cells are COUNT_AGAIN times as many, the bytes of one more step
+# are counted, which takes far longer.
 ROWS, COLUMNS, ALONE_BLOCKS, PROBE_COLONIES, PROBE_CELLS, BLOCK_STEPS, COUNT_AGAIN = (
     8,
     4,
@@ -44,8 +44,8 @@ ROWS, COLUMNS, ALONE_BLOCKS, PROBE_COLONIES, PROBE_CELLS, BLOCK_STEPS, COUNT_AGA
 
 
 class Spending(Timings):
-    """In place of seconds, what each effect of `model.step(state, dt, spending)` asks of torch, by
-    title: operators by name, and bytes for their results."""
+    """Counts torch operators instead of seconds, for each effect of `model.step(state, dt,
+    spending)` by title: calls by operator name, and bytes of their results."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class Spending(Timings):
 
     @contextmanager
     def of(self, name: str, device: torch.device) -> Iterator[None]:
-        """Count what this block asks for under `name`."""
+        """Adds the operators and bytes of this block to `name`."""
         with Operators() as seen:
             yield
         self.calls[name] = self.calls.get(name, Counter()) + seen.calls
@@ -63,8 +63,11 @@ class Spending(Timings):
 
 @dataclass(frozen=True)
 class Block:
-    """A few steps of a probe: mean cells in all, colonies, and by effect the median seconds of a
-    step and, if they were counted, the bytes that one allocated for results."""
+    """A few steps of a probe.
+
+    cells: mean number in all colonies. seconds: median of a step, by effect. bytes: what one step
+    allocated for results, by effect; empty if not counted.
+    """
 
     cells: float
     colonies: int
@@ -74,9 +77,12 @@ class Block:
 
 @dataclass(frozen=True)
 class CostProbe:
-    """What a scene's first steps took: blocks, where the several colonies began and ended, what
-    failed, if something did, and whether they began as a crowd that was laid out, or as the scene's
-    founders."""
+    """The measurement of a scene's first steps.
+
+    first, last: the states at the start and end of the run with several colonies. failed: why a
+    step failed, or "". laid: whether the colonies started as a laid-out crowd, not as the scene's
+    founders.
+    """
 
     model: Model
     blocks: list[Block]
@@ -86,9 +92,9 @@ class CostProbe:
     laid: bool
 
     def fit(self, what: str) -> dict[str, tuple[float, float, float]]:
-        """By effect (a, b, c) ≥ 0 of a + b · cells + c · colonies, for "seconds" or "bytes" of a
-        step, by least squares of the relative errors. A grid is per colony, all else per cell:
-        effects that work on grids have b = 0, the others c = 0."""
+        """Fits "seconds" or "bytes" of a step by a + b · cells + c · colonies: (a, b, c) ≥ 0 by
+        effect, by least squares of the relative errors. A grid is per colony, all else per cell: so
+        effects on grids have b = 0, the others c = 0."""
         found = {}
         for title in self.blocks[0].seconds:
             on_grid = any(e.title == title and e.works_on_grid for e in self.model.effects)
@@ -102,8 +108,8 @@ class CostProbe:
 
 
 def crowd(founders: Cells) -> Cells:
-    """Cells like the nearest founder each, laid side by side about the founders' middle: a small
-    colony that need not be grown."""
+    """A small colony without growing one: cells side by side around the founders' centre, each a
+    copy of the nearest founder."""
     mine = (
         np.flatnonzero(founders.colony == 0)
         if founders.colony is not None
@@ -129,8 +135,8 @@ def crowd(founders: Cells) -> Cells:
 
 
 def probe(scene: Scene, colonies: int, device: str | torch.device, seconds: float) -> CostProbe:
-    """Run a scene's first steps: one colony, then several, of `colonies` that it can be seeded
-    with, for about so many seconds."""
+    """Runs a scene's first steps for about `seconds`: one colony, then several. `colonies` is the
+    number of colonies to seed."""
     begun, laid = time.perf_counter(), True
     try:
         laid_out = crowd(scene.founders)
@@ -146,9 +152,9 @@ def probe(scene: Scene, colonies: int, device: str | torch.device, seconds: floa
 
 @torch.no_grad()
 def _watched(model: Model, state: State, most: int, end: float) -> tuple[list[Block], State, str]:
-    """Blocks of steps, at least one, until there are `most`, or cells enough, or the clock shows
-    `end`; the state then; what failed."""
-    state = model.step(state)  # what is made once is made now
+    """Runs blocks of steps, at least one, until there are `most`, or enough cells, or the clock
+    reaches `end`. Returns the blocks, the last state, and why a step failed, or ""."""
+    state = model.step(state)  # one-time work happens here, untimed
     blocks: list[Block] = []
     counted, broken = 0, failures(state)
     while not broken and (
@@ -182,7 +188,7 @@ def _watched(model: Model, state: State, most: int, end: float) -> tuple[list[Bl
 
 
 def state_bytes(state: State) -> tuple[float, float]:
-    """Bytes of a state for each cell, and for each colony's grid."""
+    """Bytes of a state per cell, and per colony's grid."""
     cell = sum(getattr(state, n).nbytes for n in PER_CELL) + sum(
         v.nbytes for n, v in state.fields.items() if state.declared[n].scope == CELL
     )
@@ -198,13 +204,13 @@ def cost_lines(
     device: str | torch.device,
     seconds: float,
 ) -> list[str]:
-    """The estimate in lines."""
+    """The estimate, in lines of text."""
     begun = time.perf_counter()
     seen = probe(scene, seedable, device, seconds)
     took = time.perf_counter() - begun
     if not seen.blocks:
         return [f"estimated cost: none, since the first step failed: {seen.failed}"]
-    spent, asked = seen.fit("seconds"), seen.fit("bytes")
+    spent, allocated = seen.fit("seconds"), seen.fit("bytes")
     total = cells * colonies
     each = {title: value(abc, total, colonies) for title, abc in spent.items()}
     step = sum(each.values())
@@ -214,7 +220,7 @@ def cost_lines(
         if t >= 0.005 * step
     )
     per_cell, per_grid = state_bytes(seen.last)
-    working = sum(value(abc, total, colonies) for abc in asked.values())
+    working = sum(value(abc, total, colonies) for abc in allocated.values())
     where = f"{cells} cells" + (f" in each of {colonies} colonies" if colonies > 1 else "")
     start = f"{ROWS * COLUMNS} cells laid side by side" if seen.laid else "the founders"
     lines = [
@@ -226,8 +232,8 @@ def cost_lines(
         f"  a run    {_run(scene, seen, spent, cells, colonies)}",
         (
             f"  memory   the state {_size(per_cell * total + per_grid * colonies)}; a step"
-            f" allocates {_size(working)} in all and frees most as it goes; with gradients, up to"
-            " that is kept for each step"
+            f" allocates {_size(working)} in all and frees most on the way; with gradients, each"
+            " step may keep all of it"
         ),
         (
             f"  how      measured for {took:.1f} s from {start}: at most"
@@ -237,7 +243,7 @@ def cost_lines(
         "           fitted by a + b · cells, for grids a + b · colonies",
         (
             "           an estimate, to a factor of two or three: larger colonies take more"
-            " iterations to solve, circuits may get busier than they begin,"
+            " iterations to solve, circuits may take more steps later,"
         ),
         "           and other work on the machine counts too",
     ]
@@ -256,12 +262,12 @@ def _run(
     cells: int,
     colonies: int,
 ) -> str:
-    """Steps and time of a run from the founders to so many cells, at the pace at which the probe's
-    volume grew."""
+    """Steps and time of a run from the founders to `cells` cells, at the growth rate of the probe's
+    volume."""
     before, after = (max(1e-30, float(state.volume.sum())) for state in (seen.first, seen.last))
     pace = math.log2(after / before) / max(1, seen.last.step)
     if pace <= 0:
-        return "not foretold: the probe did not grow"
+        return "no estimate: the probe did not grow"
     start = scene.founders.count / scene.founders.colonies
     steps = math.ceil(max(0.0, math.log2(cells / max(1.0, start))) / pace)
     taken = sum(
@@ -271,12 +277,12 @@ def _run(
     )
     return (
         f"{steps} steps ({steps * scene.dt:.3g} h), {_time(taken)}, from the founders at the"
-        " probe's pace; more where pressure or hunger holds growth back"
+        " probe's growth rate; more if pressure or lack of nutrient slows growth"
     )
 
 
 def _time(seconds: float) -> str:
-    """Seconds in a unit that suits."""
+    """Seconds in a suitable unit."""
     for unit, size in (("h", 3600.0), ("min", 60.0), ("s", 1.0)):
         if seconds >= size:
             return (
@@ -288,7 +294,7 @@ def _time(seconds: float) -> str:
 
 
 def _size(count: float) -> str:
-    """Bytes in a unit that suits."""
+    """Bytes in a suitable unit."""
     for unit, size in (("GB", 1e9), ("MB", 1e6)):
         if count >= size:
             return (

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 
-from torchfilm.resolver import Batch, Resolved, Values, drawn_field, resolve
+from torchfilm.resolver import BoundBatch, Resolved, Values, drawn_field, resolve
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, hashing
 from torchfilm.values import ByType, PerColony, Rule, checked, is_drawn
@@ -37,7 +37,7 @@ class Binding:
     """What an effect sees while it is bound: the batch, the scene's step (h), its dimension, and
     the names that its other effects declare."""
 
-    batch: Batch
+    batch: BoundBatch
     dt: float
     dim: int
     declared: Mapping[str, str]
@@ -206,7 +206,7 @@ class BoundEffect:
         self.values = Values(self._resolve(effect, binding.batch))
 
     @staticmethod
-    def _resolve(effect: Effect, batch: Batch) -> dict[str, Resolved | None]:
+    def _resolve(effect: Effect, batch: BoundBatch) -> dict[str, Resolved | None]:
         found = {}
         for name, (value, rule) in effect.physical_values().items():
             kept = None

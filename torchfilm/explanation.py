@@ -1,5 +1,5 @@
-"""What a scene will simulate, by which methods, what it leaves out, and about what it will cost:
-before it runs. `torchfilm info` prints the same scene's fields."""
+"""A description of a scene before it runs: effects, methods, what is not simulated, and an estimate
+of the cost. `torchfilm info` prints the fields of the scene."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ def explain(
     device: str | torch.device = "cpu",
     seconds: float = 2.0,
 ) -> str:
-    """How a scene will be simulated: effects and their methods, who drives whom, what is left out,
-    whether one growth serves many designs, and an estimate of time and memory at `cells` cells in
-    each of `colonies` colonies.
+    """Describes how a scene will be simulated: effects and their methods, which effect drives
+    which, what is not simulated, whether one recorded growth serves many designs, and an estimate
+    of time and memory.
 
-    colonies: by default as many as the scene's parameters and founders have, else 1. seconds: about
-    how long the estimate may measure, by running the scene's first steps on `device` in float32,
-    rules included; 0 leaves it out. Raises InputError where the scene cannot be seeded.
+    cells, colonies: size of the run to estimate; cells are per colony. colonies: by default as many
+    as the scene's parameters and founders have, else 1. seconds: about how long to measure, by
+    running the scene's first steps on `device` in float32, rules included; 0 omits the estimate.
+    Raises InputError if the scene cannot be seeded.
     """
     if not isinstance(scene, Scene):
         raise checks.input_error("scene", scene, "a Scene, such as tf.scenes.microcolony()")
@@ -67,14 +68,13 @@ def explain(
 
 
 def left_out(scene: Scene) -> list[str]:
-    """Names of the effects that torchfilm has and this scene does not list, in the order of a
-    step."""
+    """Names of torchfilm's effects that the scene does not list, in the order of a step."""
     listed = tuple(type(effect) for effect in scene.effects)
     return [name for name, kind in KNOWN.items() if not any(issubclass(x, kind) for x in listed)]
 
 
 def replayed(model: Model) -> str:
-    """Whether the scene's growth can be recorded once and used for many designs, in words."""
+    """Whether one recording of the scene's growth can serve many designs, as text."""
     if model.why_not_replayable:
         return f"no, {model.why_not_replayable}"
     effects = sorted((model.scene.effects[k] for k in model.following), key=lambda e: e.stage)

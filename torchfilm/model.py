@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchfilm.effect import BUILT_IN, Binding, BoundEffect, parameters
 from torchfilm.initial_cells import Cells
-from torchfilm.resolver import Batch
+from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hashing import digest
@@ -51,17 +51,21 @@ class Model:
     parameter.
     """
 
-    def __init__(self, scene: Scene, batch: Batch, start: _Start, places: Collection[int] | None):
+    def __init__(
+        self, scene: Scene, batch: BoundBatch, start: _Start, places: Collection[int] | None
+    ):
         self.scene, self.batch, self.dt, self.dim = scene, batch, scene.dt, scene.dim
         self._begin = start
         binding = Binding(batch, scene.dt, scene.dim, scene.declared_by)
         bound: list[BoundEffect] = []
-        for place, effect in enumerate(scene.effects):
-            if places is not None and place not in places:
-                continue
-            for part in effect.bind(binding):
-                part.place = place
-                bound.append(part)
+        # a model that was bound under torch.no_grad() may be stepped with gradients
+        with torch.enable_grad():
+            for place, effect in enumerate(scene.effects):
+                if places is not None and place not in places:
+                    continue
+                for part in effect.bind(binding):
+                    part.place = place
+                    bound.append(part)
         self.effects: tuple[BoundEffect, ...] = tuple(sorted(bound, key=lambda e: e.stage))
 
     # --- running -------------------------------------------------------------------------
@@ -331,7 +335,7 @@ def bind(
         raise checks.input_error("dtype", dtype, "torch.float32 or torch.float64")
     if founders.dim != scene.dim:
         raise checks.input_error("cells", f"{founders.dim}-D", f"{scene.dim}-D, as the scene is")
-    batch = Batch(count, dtype, known_device(device), _types(founders), per_colony)
+    batch = BoundBatch(count, dtype, known_device(device), _types(founders), per_colony)
     model = Model(scene, batch, _Start(count, seed, _streams(streams, count), founders), places)
     first = model.trace(None)
     model.check(first)
@@ -345,7 +349,7 @@ def _bind_to_state(scene: Scene, state: State, places: Collection[int] | None) -
         raise checks.input_error("state", state, "a State, such as scene.bind(colonies=8).start()")
     count = max(scene.fixed_colonies if places is None else 1, int(state.colony_id.max()) + 1)
     # what lists of numbers mean was settled when the state was made
-    batch = Batch(count, state.dtype, state.device, _types(scene.founders), per_colony=True)
+    batch = BoundBatch(count, state.dtype, state.device, _types(scene.founders), per_colony=True)
     streams = torch.arange(count) if count != state.colonies else state.stream
     model = Model(scene, batch, _Start(count, state.seed, streams, scene.founders), places)
     model.check(state)

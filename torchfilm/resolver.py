@@ -21,7 +21,7 @@ from torchfilm.values import ByType, Distribution, PerColony, is_drawn, is_inher
 
 
 @dataclass(frozen=True)
-class Batch:
+class BoundBatch:
     """What a scene is bound to: `colonies` colonies, the cell `types` of their founders, dtype and
     device.
 
@@ -159,7 +159,9 @@ class Values:
         return any(v is not None and v.requires_grad for v in self.__dict__.values())
 
 
-def resolve(name: str, value: Any, batch: Batch, *, field: str | None = None) -> Resolved | None:
+def resolve(
+    name: str, value: Any, batch: BoundBatch, *, field: str | None = None
+) -> Resolved | None:
     """A checked value, made ready for a batch. field: where a value drawn at birth is kept; None:
     the caller draws."""
     if value is None:
@@ -175,7 +177,7 @@ def resolve(name: str, value: Any, batch: Batch, *, field: str | None = None) ->
     return Resolved(name, _per_colony(name, value, batch))
 
 
-def _bound_draw(name: str, value: Any, batch: Batch) -> BoundDraw:
+def _bound_draw(name: str, value: Any, batch: BoundBatch) -> BoundDraw:
     if isinstance(value, Distribution):
         return BoundDraw(name, ((None, _distribution(name, value, batch)),))
     parts = [
@@ -192,13 +194,13 @@ def _bound_draw(name: str, value: Any, batch: Batch) -> BoundDraw:
     return BoundDraw(name, tuple(parts))
 
 
-def _distribution(name: str, value: Distribution, batch: Batch) -> tuple[Distribution, Values]:
+def _distribution(name: str, value: Distribution, batch: BoundBatch) -> tuple[Distribution, Values]:
     return value, Values(
         {p: resolve(f"{name}.{p}", getattr(value, p), batch) for p in value.parameters}
     )
 
 
-def _per_colony(name: str, value: Any, batch: Batch, listed: bool = True) -> Tensor:
+def _per_colony(name: str, value: Any, batch: BoundBatch, listed: bool = True) -> Tensor:
     """One number, or one per colony, as a tensor of the batch."""
     stated = isinstance(value, PerColony)
     given = value.values if stated else value
@@ -224,7 +226,7 @@ def _per_colony(name: str, value: Any, batch: Batch, listed: bool = True) -> Ten
     return given.to(dtype=batch.dtype, device=batch.device, copy=True)
 
 
-def check_length(name: str, given: Tensor, batch: Batch) -> None:
+def check_length(name: str, given: Tensor, batch: BoundBatch) -> None:
     """Raise InputError where a tensor has not one value for each colony of the batch."""
     if given.dim() and given.shape[0] != batch.colonies:
         raise checks.InputError(
@@ -234,7 +236,7 @@ def check_length(name: str, given: Tensor, batch: Batch) -> None:
         )
 
 
-def snapshot(part: Any, path: str, batch: Batch) -> Any:
+def snapshot(part: Any, path: str, batch: BoundBatch) -> Any:
     """A wall, signal or other part of an effect with its tensors copied to the batch's device,
     their lengths checked."""
     if isinstance(part, Tensor):

@@ -22,6 +22,7 @@ from contact_settings import (
     ContactSetting,
     followed,
     mechanics_of,
+    with_passes,
 )
 from growth import RowCounter
 from scipy import stats
@@ -64,6 +65,12 @@ def tight(plain: tf.Mechanics, quick: bool) -> tuple[ContactSetting, ContactSett
     )
 
 
+def _changed(plain: tf.Mechanics, knob: str, value: float) -> tf.Mechanics:
+    if knob == "passes":
+        return with_passes(plain, int(value))
+    return dataclasses.replace(plain, **{knob: value})
+
+
 def one_by_one(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
     """Returns settings with one knob changed.
 
@@ -84,7 +91,7 @@ def one_by_one(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
         found += [
             ContactSetting(
                 series,
-                plain if v == usual else dataclasses.replace(plain, **{knob: v}),
+                plain if v == usual else _changed(plain, knob, v),
                 default=v == usual,
             )
             for v in values
@@ -101,13 +108,15 @@ def together(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
     if quick:
         return [
             ContactSetting(
-                "several", dataclasses.replace(plain, alpha=0.003, tolerance=0.02, passes=2), 0.0125
+                "several",
+                with_passes(dataclasses.replace(plain, alpha=0.003, tolerance=0.02), 2),
+                0.0125,
             )
         ]
     return [
         ContactSetting(
             "several",
-            dataclasses.replace(plain, alpha=alpha, passes=passes, tolerance=tolerance),
+            with_passes(dataclasses.replace(plain, alpha=alpha, tolerance=tolerance), passes),
             dt,
         )
         for dt in (0.05, 0.025, 0.0125)

@@ -12,7 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from contact_settings import DIAMETER, DT, TOLERANCES, WORK, ContactSetting, followed, mechanics_of
+from contact_settings import (
+    DIAMETER,
+    DT,
+    TOLERANCES,
+    WORK,
+    ContactSetting,
+    followed,
+    mechanics_of,
+    with_passes,
+)
 from numpy import ndarray
 from scipy.integrate import solve_ivp
 from study import Point, Study
@@ -257,7 +266,7 @@ def refinements(plain: tf.Mechanics, hours: float, quick: bool) -> list[ContactS
         for t in TOLERANCES
     ]
     return found + [
-        ContactSetting("passes", dataclasses.replace(tight, passes=n), hours / 64, torch.float64)
+        ContactSetting("passes", with_passes(tight, n), hours / 64, torch.float64)
         for n in (1, 2, 4)
     ]
 

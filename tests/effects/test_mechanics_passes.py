@@ -8,7 +8,9 @@ import torch
 from helpers import run, seeded, step
 
 import torchfilm as tf
-from torchfilm.effects.mechanics import _Run
+from torchfilm.physics import contact_step
+from torchfilm.physics.contact_records import CellProperties, Moved
+from torchfilm.physics.contact_search import find_contacts, unresolved_contacts
 from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.physics.problem import CONVERGED
 
@@ -46,23 +48,36 @@ def deepest(state: tf.State) -> float:
 
 
 def test_later_passes_part_what_the_first_left_deep(device, dtype):
-    """Further passes reduce the crowd's mean overlap, until none exceeds 0.02 µm.
-
-    That is the limit where `passes` is given.
-    """
-    more = [first_step(device, dtype, passes=passes) for passes in (1, 2, 4, 8)]
+    """Further passes reduce the crowd's mean overlap, until none exceeds the limit of 0.02 µm."""
+    more = [first_step(device, dtype, passes=passes, overlap=0.02) for passes in (1, 2, 4, 8)]
     mean = [float(tf.measure.overlaps(s).mean[0]) for s in more]
     assert mean[0] > mean[1] > mean[2] > mean[3]
-    last = first_step(device, dtype, passes=200)
+    last = first_step(device, dtype, passes=200, overlap=0.02)
     assert deepest(last) <= 0.02 + 1e-6 < deepest(more[2])
     assert int(last.reports["mechanics"].passes[0]) < 200
 
 
 def test_two_passes_are_the_default_in_space(device, dtype):
-    """The crowd needs both, down to a fifth of the radius."""
+    """The crowd needs both, down to a fifth of the radius. A default that is given explicitly is
+    the default."""
     state = first_step(device, dtype)
     assert state.reports["mechanics"].passes.tolist()[0] == 2 and deepest(state) > 0.1
-    assert torch.equal(state.position, first_step(device, dtype, passes=2, overlap=0.1).position)
+    for options in ({"passes": 2, "overlap": 0.1}, {"passes": 2}, {"overlap": 0.1}):
+        assert torch.equal(state.position, first_step(device, dtype, **options).position)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("unilateral", [False, True])
+def test_a_number_of_passes_leaves_the_overlap_as_it_is(dim, unilateral):
+    """More passes than usual solve the same cells as the usual ones do, to a fifth of a radius; only
+    colonies that take sub-steps take at least 6."""
+    usual = tf.Mechanics(dim=dim, unilateral=unilateral).settings
+    assert usual.passes == (dim - 1) * (1 + unilateral) and usual.overlap is None
+    for passes in (usual.passes, 4, 8):
+        given = tf.Mechanics(dim=dim, unilateral=unilateral, passes=passes).settings
+        assert given.overlap is None and given.passes == passes
+        assert given.coarse_passes == max(6, passes)
+        assert (given == usual) == (passes == usual.passes)
 
 
 def test_the_overlap_that_is_left_can_be_named(device, dtype):
@@ -94,19 +109,21 @@ def test_a_later_pass_moves_only_what_is_too_deep(device, dtype):
     assert not bool(moved[:RODS].all())
 
 
-def every_pair(run_of: _Run, active: torch.Tensor) -> tuple[list, torch.Tensor]:
+def every_pair(
+    cells: CellProperties, at: Moved, active: torch.Tensor
+) -> tuple[list, torch.Tensor]:
     """The pairs that a later pass should find, by a search over all pairs.
 
     These are the pairs with a cell that takes part. Also which cells take part, (N,) bool.
     """
-    pairs, walls = run_of._all_that_touches(active, run_of.sees_near[1])
-    of_active = active[run_of.state.colony]
-    left = run_of.cut & of_active
-    if run_of.settings.stiffness is None:
-        deep = pairs.gap < -0.5 * (run_of.overlap[pairs.first] + run_of.overlap[pairs.second])
+    pairs, walls = find_contacts(cells, at, active, cells.settings.sees_near[1])
+    of_active = active[cells.colony]
+    left = at.clipped & of_active
+    if not cells.settings.soft:
+        deep = pairs.gap < -0.5 * (cells.overlap[pairs.first] + cells.overlap[pairs.second])
         left[torch.cat([pairs.first[deep], pairs.second[deep]])] = True
-    hard = torch.tensor([s.wall.stiffness is None for s in run_of.surfaces], dtype=torch.bool)
-    left[walls.cell[hard[walls.surface] & (walls.gap < -run_of.overlap[walls.cell])]] = True
+    hard = torch.tensor([s.wall.stiffness is None for s in cells.surfaces], dtype=torch.bool)
+    left[walls.cell[hard[walls.surface] & (walls.gap < -cells.overlap[walls.cell])]] = True
     held = left[pairs.first] | left[pairs.second]
     return as_list(pairs.first[held], pairs.second[held]), left
 
@@ -121,7 +138,7 @@ LIMITS = {
     "small": {"passes": 6, "overlap": 0.01},
     "by radius": {},
     "large": {"passes": 4, "overlap": 0.3},
-    "soft cells": {"stiffness": 40.0, "passes": 4},
+    "soft cells": {"stiffness": 40.0, "passes": 4, "overlap": 0.02},
 }
 
 
@@ -134,23 +151,23 @@ def test_what_is_left_deep_is_found_wherever_it_is(dtype, limit, unilateral, mon
     The search is only near moved cells. The cells have many sizes, in colonies from loose to
     jammed, in a hard box with a soft plane in it. Some colonies are done before others.
     """
-    found_of, seen = _Run._left_deep, []
+    seen = []
 
-    def compared(run_of, active, before):
-        pairs, walls, left = found_of(run_of, active, before)
-        wanted, taking = every_pair(run_of, active)
+    def compared(cells, at, active, before):
+        pairs, walls, left = unresolved_contacts(cells, at, active, before)
+        wanted, taking = every_pair(cells, at, active)
         assert torch.equal(left, taking)
         assert as_list(pairs.first, pairs.second) == wanted
         seen.append(
             (
                 int(left.sum()),
                 bool(active.all()),
-                int((left & (2 * run_of.moved <= run_of.overlap) & ~run_of.cut).sum()),
+                int((left & (2 * at.reach <= cells.overlap) & ~at.clipped).sum()),
             )
         )
         return pairs, walls, left
 
-    monkeypatch.setattr(_Run, "_left_deep", compared)
+    monkeypatch.setattr(contact_step, "unresolved_contacts", compared)
     stretches = (1.0, 0.7, 1.6, 6.0)
     cells = thrown(*stretches)
     rng = np.random.default_rng(3)
@@ -203,6 +220,7 @@ def test_more_passes_over_hard_contacts_keep_a_full_channel_apart(full_channel, 
         walls=[tf.Channel(10.0, low_end=0.0)],
         alpha=1e-3,
         passes=4,
+        overlap=0.002,
         tolerance=1e-3,
         unilateral=unilateral,
     )
@@ -270,7 +288,7 @@ def test_nearly_hard_contacts_converge_in_32_bits(alpha, unilateral):
 @pytest.mark.parametrize("passes", [1, 2, 3])
 def test_no_more_passes_than_asked(device, dtype, passes):
     """Even if overlaps remain."""
-    state = first_step(device, dtype, passes=passes)
+    state = first_step(device, dtype, passes=passes, overlap=0.02)
     assert int(state.reports["mechanics"].passes.max()) == passes
     assert deepest(state) > 0.1
 
@@ -287,7 +305,7 @@ def test_a_pass_is_as_fine_as_asked(device, dtype):
     )
     assert (
         float(
-            first_step(device, dtype, passes=2, tolerance=1e-3).reports["mechanics"].residual.max()
+            first_step(device, dtype, passes=2, overlap=0.02, tolerance=1e-3).reports["mechanics"].residual.max()
         )
         <= 1e-3
     )
@@ -295,7 +313,7 @@ def test_a_pass_is_as_fine_as_asked(device, dtype):
 
 def test_passes_do_not_depend_on_the_batch(device, dtype):
     """Colonies with many and with few passes in a batch: each has the bits that it has alone."""
-    scene = tf.Scene(tf.Mechanics(dim=3, passes=5))
+    scene = tf.Scene(tf.Mechanics(dim=3, passes=5, overlap=0.02))
     start = seeded(scene, thrown(1.0, 1.6, 6.0, 0.9), device, dtype)
     state = run(scene, start, 3, dt=0.025)
     for k in range(4):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gc
+
 import pytest
 import torch
 
+import torchfilm as tf
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.layout import Layout
 from torchfilm.tools.checks import InputError
@@ -23,11 +26,32 @@ def grid(device: str | torch.device = "cpu") -> Grid:
 
 
 def test_what_is_made_ready_belongs_to_one_grid():
-    layout = Layout(grid())
-    layout.work["made"] = 1
+    layout = Layout(grid(), obstacle=lambda at: at[:, 0] > 0)
+    mask = layout.mask
     assert layout.on(layout.grid) is layout
     other = layout.on(grid())
-    assert other.work == {} and layout.work == {"made": 1}
+    assert "mask" not in vars(other) and layout.mask is mask is not other.mask
+
+
+def test_steppers_belong_to_one_grid_and_go_with_it():
+    """A model makes the step of a signal once for each grid; one that is no longer used takes its
+    steppers along."""
+    medium = tf.Medium(a=tf.Signal(diffusion=5.0), box=((-8.0, -8.0), (8.0, 8.0)), spacing=4.0)
+    model = tf.Scene(medium, dim=2).bind()
+    steppers = next(e for e in model.effects if e.title == "transport").transport.steppers
+    first = model.step(model.start(), 0.1)
+    gc.collect()
+    made = [list(of_grid.values()) for of_grid in steppers.values()]
+    assert len(made) == 1 and len(made[0]) == 1
+    model.step(first, 0.1)
+    assert list(steppers[first.layout.grid].values()) == made[0]
+    second = model.step(model.start(), 0.1)
+    gc.collect()
+    assert set(steppers) == {first.layout.grid, second.layout.grid}
+    assert list(steppers[second.layout.grid].values())[0] is not made[0][0]
+    del second
+    gc.collect()
+    assert set(steppers) == {first.layout.grid}
 
 
 def test_a_layout_of_other_colonies_finds_their_voxels(device):

@@ -1,10 +1,9 @@
-"""One circuit in the cells of one type, over one step: rates by a user's function or by reactions,
-with the medium about each cell as its pool.
+"""One circuit in the cells of one type, over one step. A user's function or reactions give the
+rates. Each cell has a pool: the part of the medium from which it may take in this step.
 
-What a cell exchanges with the medium is solved together with what happens inside it: the circuit's
-variables are the species and, for each signal that it gives or takes, the concentration in the
-cell's own pool, the part of the medium from which it may draw in this step. So however fast the
-exchange, neither side falls below zero, and what one gives the other has.
+The solver integrates exchange with the medium together with the reactions inside the cell. The
+variables are the species and, for each exchanged signal, its concentration in the cell's pool. So
+however fast the exchange, neither side falls below zero, and amounts are conserved.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from torchfilm.circuits.network import Network
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.deterministic_math import deterministic_functions
 
-# rates of change of species by name, conc/h, and amounts per hour given to signals by name,
-# conc·µm³/h
+# Returns the rates of species by name, conc/h, and the amounts per hour that the cell releases to
+# signals by name, conc·µm³/h.
 RateFunction = Callable[[Names, Names, Names, Names], Any]
 
 
 @dataclass(frozen=True, eq=False)
 class IntegrationSettings:
-    """How circuits are stepped: method, its `steps` or tolerances, and molecules per unit of
+    """The numerical method of circuits: its `steps` or tolerances, and the molecules per unit of
     concentration × µm³, (N,) or one number."""
 
     method: str
@@ -43,13 +42,13 @@ class IntegrationSettings:
 
 @dataclass(frozen=True, eq=False)
 class CircuitCells:
-    """A circuit in M of N cells. part: a rate function, or reactions made ready. species: its
-    variables. given: the signals it exchanges.
+    """A circuit in M of N cells.
 
-    rows: (M,) int64. cell, p: columns over the N cells by name. signals: what each cell finds
-    outside, (N,) by name. pool: (N,) µm³, the part of the medium that is each cell's own, if
-    anything is exchanged. in_reservoir: (N,) bool, cells whose pool is a reservoir that nothing
-    changes, or None.
+    part: a rate function, or a network of reactions. species: its variables. given: the signals
+    that it exchanges. rows: the M cells, (M,) int64. cell, p: columns over the N cells by name.
+    signals: the concentration outside each cell, (N,) by name. pool: (N,) µm³, each cell's part of
+    the medium, if the circuit exchanges a signal. in_reservoir: (N,) bool, cells whose pool is a
+    reservoir of constant concentration, or None.
     """
 
     part: RateFunction | Network
@@ -65,8 +64,8 @@ class CircuitCells:
     seen: dict[str, set[str]] = field(default_factory=dict)
 
     def names(self, u: Tensor, rows: Tensor) -> tuple[Names, Names, Names, Names]:
-        """What a rate function is called with, at the variables u (m, ≥ S + E) of the cells `rows`
-        (m,) among the N."""
+        """The arguments of a rate function, for variables u (m, ≥ S + E) of the cells `rows` (m,)
+        among the N."""
         size = len(self.species)
         columns = u.unbind(1)
         outside: dict[str, Any] = dict(self.signals)
@@ -86,8 +85,8 @@ class CircuitCells:
         )
 
     def changes(self, u: Tensor, rows: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Rates of species (m,), conc/h, and amounts given to signals (m,), conc·µm³/h, by name; u
-        (m, …), rows (m,) among the N cells."""
+        """Rates of species (m,), conc/h, and amounts released to signals (m,), conc·µm³/h, by name;
+        u (m, …), rows (m,) among the N cells."""
         u_, s, p, cell = self.names(u, rows)
         with deterministic_functions():
             if isinstance(self.part, Network):
@@ -135,8 +134,8 @@ class CircuitCells:
         return out
 
     def rates(self, u: Tensor, rows: Tensor) -> Tensor:
-        """du/dt of all variables, (m, S + E), or (m, S + 3E) where there is a reservoir; rows (m,)
-        among the M."""
+        """du/dt of all variables, (m, S + E), or (m, S + 3E) with a reservoir; rows (m,) among the
+        M."""
         rows = self.rows.index_select(0, rows)
         inside, outside = self.changes(u, rows)
         none = torch.zeros_like(u[:, 0])
@@ -147,8 +146,8 @@ class CircuitCells:
             new = [n for n in outside if n not in self.given]
             if new:
                 raise InputError(
-                    f"{self.label} gave {new[0]!r} to the medium, and had not when it was tried:"
-                    " always return it, 0 where nothing passes."
+                    f"{self.label} gave {new[0]!r} to the medium, and had not in its trial: always"
+                    " return it, 0 where nothing passes."
                 )
             flux = [outside.get(n, none) for n in self.given]
             if self.in_reservoir is None:
@@ -161,8 +160,8 @@ class CircuitCells:
         return torch.stack(columns, 1)
 
     def start(self, concentrations: Tensor) -> Tensor:
-        """The variables at the start: concentrations (M, S), then pools, then what went to a
-        reservoir and what came from it."""
+        """The variables at the start: concentrations (M, S), then pools, then the amounts given to
+        a reservoir and the amounts taken from it."""
         columns = [self.signals[n].index_select(0, self.rows) for n in self.given]
         if self.in_reservoir is not None:
             columns += [torch.zeros_like(c) for c in columns] * 2
@@ -175,9 +174,9 @@ class CircuitCells:
 
 @dataclass(frozen=True, eq=False)
 class CircuitOutcome:
-    """After a step: concentrations (M, S); amounts given to the pools and to a reservoir, conc·µm³,
-    (M,) by signal; whether a cell failed (M,) bool and why, (M,) codes for `words`; steps taken
-    (M,) int64.
+    """The result of a step: concentrations (M, S); amounts released to the pools and to a
+    reservoir, conc·µm³, (M,) by signal; whether a cell failed, (M,) bool, and why, (M,) codes for
+    `words`; number of steps, (M,) int64.
     """
 
     concentrations: Tensor
@@ -195,8 +194,8 @@ def step(
     settings: IntegrationSettings,
     draw: Draw | None = None,
 ) -> CircuitOutcome:
-    """The circuit `dt` hours later, from concentrations (M, S). Raises nothing for a cell that
-    fails; it is marked."""
+    """Integrates the circuit over `dt` hours from concentrations (M, S). Does not raise for a cell
+    that fails, but marks it."""
     if settings.method in ("tau_leap", "direct"):
         assert draw is not None
         return _molecules(circuit, concentrations, dt, settings, draw)
@@ -213,12 +212,12 @@ def step(
             end = integrators.euler(circuit.rates, start, dt, settings.steps)
         else:
             end = integrators.runge_kutta(circuit.rates, start, dt, settings.steps, settings.method)
-        # the exact circuit cannot get there: the step is too long for an explicit method
+        # an exact solution stays above zero: the step is too long for an explicit method
         scale = start.abs() + end.abs()
         below = (end < -(settings.atol + settings.rtol * scale.nan_to_num())) & (start >= 0)
         code = torch.where(below.any(1), rosenbrock.BELOW_ZERO, rosenbrock.DONE)
         code = torch.where(torch.isfinite(end).all(1), code, rosenbrock.NOT_FINITE)
-        # by no more than the tolerance, or the cell has failed
+        # values below zero by less than the tolerance become 0; in other cells the step failed
         end = torch.where((end < 0) & (start >= 0), 0.0, end)
     size, more = len(circuit.species), len(circuit.given)
     pools, reservoir = {}, {}
@@ -239,8 +238,8 @@ def _molecules(
     settings: IntegrationSettings,
     draw: Draw,
 ) -> CircuitOutcome:
-    """The same molecule by molecule. A reservoir is a pool so large that what is given to it or
-    taken does not show."""
+    """The same step, molecule by molecule. A reservoir is a pool so large that exchange does not
+    change its concentration noticeably."""
     assert isinstance(circuit.part, Network)
     network, rows = circuit.part, circuit.rows
     volume = circuit.names(concentrations, rows)[3].volume.double()
@@ -291,7 +290,7 @@ def _molecules(
     }
     pools, reservoir = _split(circuit, amount, concentrations.dtype)
     found = (end[:, :size] / (volume * molecules_per_unit).unsqueeze(1)).to(concentrations.dtype)
-    # a code of its own for each reaction that went wrong, apart from those of the smooth methods
+    # one code per failed reaction, distinct from the codes of the smooth methods
     code = torch.where(
         report.status == 0,
         0,
@@ -303,7 +302,8 @@ def _molecules(
 def _split(
     circuit: CircuitCells, amount: Mapping[str, Tensor], dtype: torch.dtype
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Amounts given to signals, (M,) by name: those to pools, and those to a reservoir."""
+    """Splits amounts released to signals, (M,) by name, into those to pools and those to a
+    reservoir."""
     if circuit.in_reservoir is None:
         return {n: x.to(dtype) for n, x in amount.items()}, {}
     away = circuit.in_reservoir.index_select(0, circuit.rows)
@@ -322,7 +322,7 @@ def words(
     method: str,
     dt: float,
 ) -> str:
-    """What went wrong in the k-th of the M cells, from concentrations (M, S) on."""
+    """Describes the failure of the k-th of the M cells, in a step from concentrations (M, S)."""
     code = int(outcome.code[k])
     if method in ("tau_leap", "direct"):
         assert isinstance(circuit.part, Network)
@@ -358,7 +358,7 @@ def words(
 @torch.no_grad()
 def _not_finite(circuit: CircuitCells, concentrations: Tensor, k: int, dt: float) -> list[str]:
     """The species and signals whose rates in the k-th cell are not finite, at the start of the step
-    or ahead of it: a careful method stops short of there."""
+    or further along it: an adaptive method stops before it gets there."""
     one = torch.tensor([k], device=concentrations.device)
     start, rows = (
         circuit.start(concentrations).index_select(0, one),

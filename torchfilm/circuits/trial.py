@@ -1,4 +1,4 @@
-"""The trial of a circuit before it runs: what it returns wrongly is found at binding."""
+"""The trial of a circuit at binding, which finds wrong return values before the run starts."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from torchfilm.tools.checks import InputError
 def try_circuit(
     circuit: CircuitCells, concentrations: Tensor, derivatives: bool = False
 ) -> tuple[str, ...]:
-    """Try the circuit once at concentrations (M, S), with derivatives where its method asks for
-    them: raise InputError for what it returns wrongly; the signals that it exchanges."""
+    """Calls the circuit once at concentrations (M, S), with derivatives if its method needs them.
+
+    Returns the names of the signals that it exchanges. Raises InputError for wrong return values.
+    """
     try:
         inside, outside = circuit.changes(concentrations, circuit.rows)
-        # a little of everything, another little in every cell: at 0 a sum over cells would not show
+        # small amounts, different in every cell: at 0, a sum over cells would go unnoticed
         some = concentrations + 0.1 * torch.arange(
             1, len(concentrations) + 1, device=concentrations.device
         ).unsqueeze(1)
@@ -48,8 +50,8 @@ def try_circuit(
             ):
                 raise InputError(
                     f"{circuit.label}: the rate of {name!r} in one cell depends on what other cells"
-                    " there are (a sum or a mean over them, or a draw?). A rate function may go by"
-                    " its own cell and what it finds outside only."
+                    " there are (a sum or a mean over them, or a draw?). A rate function may use"
+                    " only its own cell and the concentrations outside it."
                 )
     for what, found in (("species", inside), ("signal", outside)):
         for name, value in found.items():

@@ -114,8 +114,8 @@ class Tune:
     """Cells in each colony of the run that you plan. Settings are tested at this size, and at one
     and a half times this size."""
     colonies: int = 24
-    """Colonies of the probe, unless the scene's parameters give a number. Where chance would hide
-    the error, two to twelve times as many."""
+    """Colonies of the probe, unless the scene's parameters give a number. If random errors are too
+    large, `tune` grows two to twelve times as many."""
     seed: int = 0
     """Seed of the probe."""
     device: str = "cpu"

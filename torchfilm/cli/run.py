@@ -27,6 +27,7 @@ from torchfilm.io.recorder import Recorder
 from torchfilm.io.results import Results
 from torchfilm.model import Model
 from torchfilm.scene import Scene
+from torchfilm.scenes.recipes import from_plain
 from torchfilm.simulation import simulate
 from torchfilm.state import State
 from torchfilm.tools import checks
@@ -166,7 +167,8 @@ class Resume:
             raise InputError("resume needs an end: --cells or --until.")
         with Results(self.file) as results:
             if self.scene is not None:
-                scene = load_scene(str(self.scene), results.settings)
+                given = {n: from_plain(v) for n, v in results.settings.items()}
+                scene = load_scene(str(self.scene), given)
             elif results.recipe is not None:
                 scene = scenes.build(*results.recipe)
             else:

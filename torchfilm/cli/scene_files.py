@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import inspect
 import json
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 
 from torchfilm import scenes
 from torchfilm.scene import Scene
+from torchfilm.scenes.recipes import parse_value, to_plain
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.load_module import run_file
@@ -66,7 +66,7 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
             f"{function} in {what}", made, "a Scene, or a function that returns one"
         )
     name = path.stem if made.name == "scene" else made.name
-    return made.replace(name=name, settings=parameters)
+    return made.replace(name=name, settings={n: to_plain(v) for n, v in parameters.items()})
 
 
 def _hint(path: Path) -> str:
@@ -155,11 +155,8 @@ def design(what: str) -> dict[str, Any]:
 
 
 def parse_setting(text: str) -> tuple[str, Any]:
-    """Name and value from NAME=VALUE. A value that is no Python literal is text."""
+    """Name and value from NAME=VALUE (see scenes.recipes.parse_value)."""
     name, equals, value = text.partition("=")
     if not equals or not name.isidentifier():
         raise checks.input_error("--set", text, "NAME=VALUE")
-    try:
-        return name, ast.literal_eval(value)
-    except (ValueError, SyntaxError):
-        return name, value
+    return name, parse_value(value)

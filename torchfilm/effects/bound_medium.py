@@ -1,5 +1,5 @@
-"""A medium bound to a batch: its grids laid, its transport steppers built once, in up to three
-parts of a step."""
+"""A medium bound to a batch: its grids, its transport steppers (built once), and its parts of a
+step, up to three."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from torchfilm.tools import checks
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Flow, Medium, OnGrid, Signal
 
-# A grid that grows with its colony does so by this many voxels at a time, and keeps this many
-# between the cells and its faces.
+# A growing grid grows by BLOCK voxels at a time, and keeps MARGIN voxels between the cells and its
+# faces.
 BLOCK, MARGIN = 8, 2
 
 
 @dataclass(frozen=True)
 class MediumReport:
-    """`status` (B,): 1 where cells of a colony are beyond the box. `left` (B,) how many, `first`
-    (B, 3) where one of them is, µm."""
+    """Cells outside the medium, per colony. `status` (B,): 1 if there are any. `left` (B,): how
+    many. `first` (B, 3): the position of one of them, µm."""
 
     status: Tensor
     left: Tensor
@@ -54,8 +54,8 @@ class MediumReport:
 
 
 class Transport:
-    """What the parts of a medium share: its signals with their values on the batch's device, and
-    the steppers of the grids that there are."""
+    """What the parts of a medium share: the signals, with their values on the batch's device, and
+    the steppers of the grids in use."""
 
     def __init__(self, medium: Medium, binding: Binding):
         self.medium, batch = medium, binding.batch
@@ -68,11 +68,11 @@ class Transport:
             n: snapshot(medium.boundary_of(n), f"boundary of the signal {n!r}", batch)
             for n in medium.signals
         }
-        # by grid, so that a grid that is no longer used takes its steppers along
+        # weak keys: a grid no longer in use releases its steppers
         self.steppers: WeakKeyDictionary[Grid, dict[Any, Stepper]] = WeakKeyDictionary()
 
     def lay(self, state: State) -> State:
-        """The state with its grids, all as the box says."""
+        """The state with one grid per colony, as `box` and `spacing` give it."""
         low, high, step = self.medium.corners
         count = [round((b - a) / h) for a, b, h in zip(low, high, step, strict=True)]
         places = (state.colonies, 3)
@@ -132,7 +132,7 @@ class Transport:
         return value if layout.mask is None else value * layout.mask
 
     def carried(self, state: State, dt: float) -> State:
-        """The state in which the signals alone have moved on by dt hours."""
+        """The state after transport of the signals for dt hours; cells do not change."""
         assert state.layout is not None
         grid = state.layout.grid
         changed = {}
@@ -147,10 +147,10 @@ class Transport:
         return state.with_fields(**changed)
 
     def stepper(self, name: str, state: State, batch: GridBatch, dt: float) -> Stepper:
-        """The step of a signal on the grids of one shape, made once for as long as they stay."""
+        """The stepper of a signal on grids of one shape; it is reused while the grids stay."""
         assert state.layout is not None
         numbers = [x for x in self._numbers(name) if isinstance(x, Tensor)]
-        numbers += _held(self.signals[name], self.flows[name])
+        numbers += _closure_tensors(self.signals[name], self.flows[name])
         if torch.is_grad_enabled() and any(x.requires_grad for x in numbers):
             return self._prepare(name, state, batch, dt)[0]
         known = self.steppers.setdefault(state.layout.grid, {})
@@ -158,13 +158,14 @@ class Transport:
         found = known.get(key)
         if found is None:
             found, tracked = self._prepare(name, state, batch, dt)
-            # a function may refer to what requires a gradient; its graph is good for one way back
+            # a function may use a tensor that requires a gradient; such a stepper serves one
+            # backward pass only, so it is not kept
             if not tracked:
                 known[key] = found
         return found
 
     def _numbers(self, name: str) -> list[Any]:
-        """What a signal's transport depends on, tensors among it."""
+        """The values that a signal's transport depends on; some are tensors."""
         signal, flow = self.signals[name], self.flows[name]
         faces = [face.outside_value() for pair in self.boundary[name].pairs for face in pair]
         moving = [] if callable(flow) else list(flow or ())
@@ -173,7 +174,7 @@ class Transport:
     def _prepare(
         self, name: str, state: State, batch: GridBatch, dt: float
     ) -> tuple[Stepper, bool]:
-        """The step, and whether a gradient passes through what it was made of."""
+        """The stepper, and whether its coefficients require a gradient."""
         signal, layout = self.signals[name], state.layout
         assert layout is not None
         ids = state.colony_id.index_select(0, batch.places)
@@ -204,13 +205,13 @@ class Transport:
             dtype=state.dtype,
             device=state.device,
         )
-        held = (
+        coefficients = (
             made.decay,
             made.source,
             *(x for axis in made.axes for x in (axis.up, axis.down, axis.low, axis.high)),
         )
         return prepare(made, dt, self.medium.method or choose(made)), any(
-            x is not None and x.requires_grad for x in held
+            x is not None and x.requires_grad for x in coefficients
         )
 
 
@@ -234,7 +235,7 @@ class _MediumPart(BoundEffect):
 
 
 class FirstHalf(_MediumPart):
-    """Carries signals through the first half of a step, before the cells exchange any."""
+    """Transports signals over the first half of a step, before exchange with the cells."""
 
     def __init__(self, effect: Medium, binding: Binding, transport: Transport):
         super().__init__(effect, binding, transport)
@@ -244,11 +245,11 @@ class FirstHalf(_MediumPart):
         return self.transport.carried(state, dt / 2)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        return ["of signals through the first half of the step, before the cells"]
+        return ["of signals over the first half of the step, before the cells"]
 
 
 class BoundMedium(_MediumPart):
-    """Carries signals after the cells have exchanged: the second half of a step, or all of it."""
+    """Transports signals after exchange with the cells: over the second half of a step, or all."""
 
     def declares(self) -> list[Field]:
         first = self.transport.first
@@ -267,7 +268,7 @@ class BoundMedium(_MediumPart):
         flat = len(medium.box[0]) == 2 and medium.depth is None
         if state.dim == 3 and flat and medium.outside == "error":
             hint = (
-                "Give both corners a z; or a depth=…, if all cells stay in one layer; or let the"
+                "Give both corners a z; or give depth=…, if all cells stay in one layer; or let the"
                 " box grow, outside='grow'."
             )
             raise checks.input_error(
@@ -288,7 +289,7 @@ class BoundMedium(_MediumPart):
 
 
 class GridCoverage(_MediumPart):
-    """Sees to it that every cell is on the grid, before anything is exchanged."""
+    """Checks before exchange that every cell is on its grid, and extends grids that may grow."""
 
     def __init__(self, effect: Medium, binding: Binding, transport: Transport):
         super().__init__(effect, binding, transport)
@@ -330,7 +331,7 @@ class GridCoverage(_MediumPart):
 
     @torch.no_grad()
     def _look(self, state: State) -> MediumReport | None:
-        """Which cells are where no medium is; None where that is no failure."""
+        """The report on cells outside the medium; None if such cells are allowed."""
         layout = state.layout
         if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
@@ -342,7 +343,7 @@ class GridCoverage(_MediumPart):
 
     @torch.no_grad()
     def _span(self, state: State) -> tuple[Tensor, Tensor]:
-        """The box that cells need, (B, 3) twice."""
+        """The lower and upper corner of the box that the cells need, (B, 3) µm each."""
         assert state.layout is not None
         places, groups, step = (
             state.layout.places(state.position),
@@ -352,25 +353,25 @@ class GridCoverage(_MediumPart):
         high = torch.stack([groups.max(x, empty=-torch.inf) for x in places.unbind(1)], 1)
         low = -torch.stack([groups.max(-x, empty=-torch.inf) for x in places.unbind(1)], 1)
         corner, end, size = self.effect.corners
-        # a layer, as the box was given, stays one
+        # a box of one layer stays one layer
         flat = torch.tensor(
             [round((b - a) / h) == 1 for a, b, h in zip(corner, end, size, strict=True)],
             device=state.device,
         )
         margin = torch.where(flat, 0.0, MARGIN * step)
-        held = torch.tensor(
+        fixed = torch.tensor(
             [letter not in self.effect.grows for letter in "xyz"], device=state.device
         )
-        return torch.where(held, torch.inf, low - margin), torch.where(
-            held, -torch.inf, high + margin
+        return torch.where(fixed, torch.inf, low - margin), torch.where(
+            fixed, -torch.inf, high + margin
         )
 
     def _grown(self, state: State) -> State:
         layout = state.layout
         assert layout is not None
         low, high = self._span(state)
-        # a colony that would need more, or whose cells are nowhere, keeps its grid; its cells are
-        # then beyond it, which is reported
+        # a colony that needs more voxels than allowed, or whose positions are not finite, keeps its
+        # grid; its cells are then outside the grid, which is reported
         size = (
             (torch.maximum(high, layout.grid.high) - torch.minimum(low, layout.grid.origin))
             / layout.grid.step
@@ -396,8 +397,8 @@ class GridCoverage(_MediumPart):
 
 
 def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any], Any]) -> Any:
-    """The velocity as the operator wants it: none, uniform (b, 3), or on the faces of the voxels,
-    three tensors."""
+    """The velocity for the operator: None, uniform (b, 3), or on the faces of the voxels, three
+    tensors."""
     if flow is None:
         return None
     if not callable(flow):
@@ -411,8 +412,8 @@ def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any],
     return layout.on_faces(flow, batch)
 
 
-def _held(signal: Signal, flow: Flow) -> list[Tensor]:
-    """Tensors that functions of places hold on to."""
+def _closure_tensors(signal: Signal, flow: Flow) -> list[Tensor]:
+    """Tensors in the closures of functions of places."""
     functions = [f for f in (signal.decay, signal.source, flow) if callable(f)]
     cells = [
         cell.cell_contents for f in functions for cell in getattr(f, "__closure__", None) or ()
@@ -421,8 +422,8 @@ def _held(signal: Signal, flow: Flow) -> list[Tensor]:
 
 
 def _of_colonies(given: float | Tensor, state: State) -> Tensor:
-    """A value as (B,) or 0-dim tensor of the state's dtype, by colony id where there is one
-    each."""
+    """A value as a (B,) or 0-dim tensor of the state's dtype; one value per colony is taken by
+    colony id."""
     if not isinstance(given, Tensor):
         return torch.tensor(given, dtype=state.dtype, device=state.device)
     value = given.to(dtype=state.dtype, device=state.device)

@@ -1,4 +1,4 @@
-"""Division: every cell that is due becomes two, end to end in its parent's place."""
+"""Division: every cell that is due becomes two daughters, end to end in its place."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, phy
 CRITERIA = ("length", "volume", "added")
 
 TOO_SHORT = 1
-PIXELS = 10.0  # µm; a message about a longer first cell says that its length may be in pixels
+PIXELS = 10.0  # µm; for a longer first cell, messages say that lengths may be in pixels
 
 
 @dataclass(frozen=True)
 class DivisionReport:
-    """Why colonies could not divide, per colony (B,): `status`, 0 or TOO_SHORT; `uid` and `length`
-    (µm) of the first cell that was due and too short, and the length that it `needs`. Made only
-    where there is such a cell; nobody divided in its colony.
+    """Which colonies could not divide, per colony (B,).
+
+    status: 0 or TOO_SHORT. uid, length: the first cell that was due and too short, µm. needs: the
+    length that it needs, µm. The report exists only if there is such a cell; no cell divided in its
+    colony.
     """
 
     status: Tensor
@@ -37,7 +39,7 @@ class DivisionReport:
     hint: ClassVar[str] = "Divide later, or start from longer cells"
 
     def reason(self, place: int) -> str:
-        """What went wrong in the colony at this place of the batch."""
+        """Describes the failure of the colony at this place of the batch."""
         return (
             f"cell {int(self.uid[place])} is due to divide at length {float(self.length[place]):g}"
             f" µm, but needs at least {float(self.needs[place]):g} µm for two new caps"
@@ -46,14 +48,16 @@ class DivisionReport:
 
 @dataclass(frozen=True, eq=False)
 class Division(Effect):
-    """Cells divide, by one criterion or by flag.
+    """Cells divide at a threshold, or when a rule sets their `divide_flag`.
 
-    length: centreline length, µm, at which a cell divides; volume: µm³; added: µm of centreline
-    grown since birth (the adder). Each a number, one per colony, one per cell type, or a
-    distribution drawn for each cell at birth. None of them: only cells whose `divide_flag` a rule
-    sets divide; the flag works beside a criterion too. fraction: share of the length that the first
-    daughter (at the −axis end) gets, drawn at each division where it is a distribution. axis_noise:
-    standard deviation of the noise on each component of a daughter's axis.
+    Give at most one threshold. length: centreline length, µm. volume: µm³. added: centreline grown
+    since birth, µm (the adder). Each is a number, one per colony, one per cell type, or a
+    distribution drawn for each cell at birth. Without a threshold, only cells with `divide_flag`
+    divide; the flag also works beside a threshold.
+
+    fraction: share of the length that the first daughter (at the −axis end) gets; a distribution is
+    drawn at each division. axis_noise: standard deviation of the noise on each component of a
+    daughter's axis.
     """
 
     length: Value | None = physical(None, unit="µm", above=0.0, drawn_by_effect=True)
@@ -139,8 +143,8 @@ class Division(Effect):
         if self.criterion is None or state.cells == 0:
             return
         given = getattr(self, self.criterion)
-        # cells from a micrograph may be past the threshold drawn for them, and then divide at once;
-        # none may be past all that can be drawn
+        # cells from a micrograph may exceed the threshold drawn for them, and divide at once; no
+        # cell may exceed every threshold that can be drawn
         most = largest(given) if is_drawn(given) else state.division_threshold
         start = {
             "length": state.length,
@@ -165,7 +169,7 @@ class Division(Effect):
         if self.criterion != "added" and least < needed:
             raise checks.InputError(
                 f"Division.{self.criterion} can be {least:g}: it must be at least {needed:g} for"
-                f" radius {radius:g} µm, or the daughters would be shorter than nothing (each loses"
+                f" radius {radius:g} µm, or the daughters would have a negative length (each loses"
                 " a new cap). Raise the threshold."
             )
 
@@ -199,7 +203,7 @@ class Division(Effect):
 
 
 def _pixels_hint(length: float, radius: float) -> str:
-    """What to do where a first cell is tens of µm long."""
+    """A hint for initial cells of tens of µm; "" for shorter ones."""
     if length < PIXELS:
         return ""
     return (
@@ -209,7 +213,7 @@ def _pixels_hint(length: float, radius: float) -> str:
 
 
 def _too_short(state: State, short: Tensor) -> DivisionReport:
-    """The report of the cells that are due and too short, (N,) bool."""
+    """The report on cells that are due but too short, (N,) bool."""
     number = torch.arange(state.cells, device=state.device)
     first = state.cells - state.groups.max(torch.where(short, state.cells - number, 0))
     status = torch.where(first < state.cells, TOO_SHORT, 0)
@@ -224,11 +228,11 @@ def _too_short(state: State, short: Tensor) -> DivisionReport:
 
 
 def divide(state: State, due: Tensor, fraction: Resolved, axis_noise: Resolved) -> State:
-    """The state in which each cell that is due (N,) bool has become two neighbours in the batch,
-    first daughter at its −axis end.
+    """Divides the cells that are due, (N,) bool. The daughters are neighbours in the batch; the
+    first lies at the parent's −axis end.
 
-    Lengths (l − 2r)f and (l − 2r)(1 − f), outer ends where the parent's were; gradients pass
-    through.
+    Their lengths are (l − 2r)f and (l − 2r)(1 − f). Their outer ends are those of the parent.
+    Gradients pass through.
     """
     copies = due.long() + 1
     source = torch.repeat_interleave(torch.arange(state.cells, device=state.device), copies)
@@ -260,11 +264,11 @@ def divide(state: State, due: Tensor, fraction: Resolved, axis_noise: Resolved) 
 
 
 def _new_ids(new: State, daughters: Tensor, parents: State) -> tuple[Tensor, Tensor, Tensor]:
-    """Fresh uids counted on within each colony, the parents' uids, and each colony's next uid."""
+    """New uids, numbered on within each colony; the parents' uids; and each colony's next uid."""
     is_new = torch.zeros(new.cells, dtype=torch.int64, device=new.device)
     is_new[daughters] = 1
     before = torch.cumsum(is_new, 0) - is_new
-    # cumulative count of new cells at each colony's first row
+    # number of new cells in the colonies before each colony
     per_colony = new.groups.sum(is_new.double()).long()
     base = new.next_uid - offsets(per_colony)[:-1]
     uid = torch.where(is_new > 0, base.index_select(0, new.colony) + before, new.uid)
@@ -289,7 +293,7 @@ def _length_of_rows(state: State, rows: Tensor, values: Values) -> Tensor:
 
 @dataclass(frozen=True)
 class _FirstThreshold:
-    """The threshold of new cells, by one criterion."""
+    """The initial threshold of new cells for one criterion."""
 
     name: str
 

@@ -31,7 +31,7 @@ from torchfilm.resolver import Values, snapshot
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
-from torchfilm.values import Rule, Value, checked, numbers, physical
+from torchfilm.values import Rule, Value, checked, numbers, physical, smallest
 
 MOST_SUBSTEPS = 1000
 # A colony whose contacts do not hold has more than this share of its cells (of MANY, if it has
@@ -290,14 +290,24 @@ class Mechanics(Effect):
         if settings.tolerance is not None:
             changed["tolerance"] = settings.tolerance
         if settings.passes is not None:
-            # who sets passes wants overlaps gone, and not only the deep ones
+            # who sets passes wants overlaps gone, and not only the deep ones; harder contacts leave
+            # less of them
+            close = CLOSE * min(1.0, self._penalty(settings) / PENALTY)
             changed |= {
                 "passes": settings.passes,
-                "overlap": CLOSE if self.overlap is None else self.overlap,
+                "overlap": close if self.overlap is None else self.overlap,
             }
         if settings.penalty is not None and self.stiffness is None:
             changed["alpha"] = _over(settings.penalty, self.length_drag)
         return replace(self, **changed) if changed else self
+
+    def _penalty(self, settings: Any) -> float:
+        """α γ by these settings, the smallest of several; the usual one of soft cells."""
+        if self.stiffness is not None:
+            return PENALTY
+        if settings.penalty is not None:
+            return settings.penalty
+        return PENALTY if self.alpha is None else smallest(self.alpha) * smallest(self.length_drag)
 
 
 def _over(penalty: float, drag: Any) -> Any:

@@ -32,11 +32,11 @@ SPLITTINGS = ("lie", "strang")
 class Signal:
     """A substance outside the cells.
 
-    diffusion: K, µm²/h; decay: 1/h; each one number or one per colony; decay may also be a function
-    from places (M, 3) µm to (M,), a sink. initial: concentration at the start, and source:
-    concentration/h made everywhere, each a number, one per colony, or such a function. boundary:
-    what happens at the faces of the box, and flow: what carries it, µm/h, if not as the medium
-    says. reservoir: the concentration that cells beyond an open box find there.
+    diffusion: K, µm²/h, one number or one per colony. decay: 1/h. initial: concentration at the
+    start. source: production, concentration/h. Each of these three is one number, one per colony,
+    or a function from places (M, 3) µm to (M,). boundary, flow: faces of the box, and velocity,
+    µm/h, if they differ from the medium's. reservoir: the concentration outside an open box, one
+    number or one per colony.
     """
 
     diffusion: float | Tensor
@@ -59,26 +59,30 @@ class Signal:
 
 @dataclass(frozen=True, init=False, eq=False)
 class Medium(Effect):
-    """Signals about the cells, on one grid per colony: `Medium(ahl=Signal(diffusion=10.0),
+    """Signals around the cells, on one grid per colony: `Medium(ahl=Signal(diffusion=10.0),
     box=((-64, -64), (64, 64)), spacing=4.0)`.
 
-    box: lower and upper corner, µm, in 2 or 3 dimensions; a flat box is one layer `depth` µm thick
-    (by default as thick as a voxel is wide; in a 3-D scene that no cell may leave, outside="error",
-    the depth is to be given). Cells of a 2-D scene may lie in a box with three: in the plane z =
-    `height`. spacing: of voxels, µm, one number or one an axis. boundary: of the box; without,
-    nothing passes them, or where the medium flows, what it carries. flow: velocity of the medium,
-    µm/h: two or three numbers (or one per colony each), or a function from places (M, 3) µm to
-    velocities (M, 3). obstacles: a function from places (M, 3) to (M,) bool, true where there is
-    none of the medium. outside: what cells outside the box mean: "error"; "grow": the box grows
-    with its colony, along the axes that `grows` names; "reservoir": the box stands in a reservoir
-    in which each signal is at its `reservoir`, and what cells give to it and take from it is kept
-    count of in the fields NAME_reservoir. method: "exponential" (exact, where the box is all medium
-    and the flow uniform), "implicit" (positive at any step; elsewhere), "crank_nicolson" (the
-    paper's) or "euler"; by default the first of them that the scene allows. steps: of transport
-    within one of the scene's, for accuracy. splitting: how transport and what cells exchange take
-    turns in a step: "strang", half of transport before the cells and half after, which leaves the
-    signal an error many times smaller for one more transport a step, or "lie", cells and then
-    transport.
+    box: lower and upper corner, µm, in 2 or 3 dimensions. A flat box is one layer, `depth` µm thick
+    (by default the width of a voxel). In a 3-D scene with outside="error", a flat box requires the
+    depth. Cells of a 2-D scene in a 3-D box lie in the plane z = `height`. spacing: of voxels, µm,
+    one number or one per axis.
+
+    boundary: the faces of the box. Default: no flux; if the medium flows, open faces. flow:
+    velocity of the medium, µm/h: two or three numbers (or one per colony each), or a function from
+    places (M, 3) µm to velocities (M, 3). obstacles: a function from places (M, 3) µm to (M,) bool,
+    true where there is no medium.
+
+    outside: the meaning of cells outside the box. "error": the colony fails. "grow": the box grows
+    with its colony, along the axes in `grows`. "reservoir": around the box each signal has its
+    `reservoir` concentration; the fields NAME_reservoir sum what cells give to it, less what they
+    take.
+
+    method: "exponential" (exact if there are no obstacles and flow and decay are uniform),
+    "implicit" (positive at any step), "crank_nicolson" (the paper's) or "euler". Default:
+    "exponential" if exact, else "implicit". steps: transport steps within one step of the scene,
+    for accuracy. splitting: "strang", half of transport before exchange with the cells and half
+    after, or "lie", exchange and then transport. Strang makes the error of the signal many times
+    smaller, for one more transport per step.
     """
 
     signals: Mapping[str, Signal]
@@ -143,19 +147,19 @@ class Medium(Effect):
         periodic = {self.boundary_of(name).periodic for name in self.signals}
         if len(periodic) > 1:
             raise checks.InputError(
-                "Medium: a face is periodic for one signal and not for another; space closes on"
-                " itself for all or for none."
+                "Medium: a face is periodic for one signal and not for another. Make it periodic"
+                " for all signals or for none."
             )
         if True in next(iter(periodic)) and self.outside == "grow":
             raise checks.input_error(
                 "Medium.outside",
                 self.outside,
                 '"error" or "reservoir" with periodic faces',
-                "A box that closes on itself cannot grow.",
+                "A periodic box cannot grow.",
             )
 
     def boundary_of(self, name: str) -> BoundaryConditions:
-        """The faces that a signal meets."""
+        """The boundary conditions of a signal."""
         signal = self.signals[name]
         if signal.boundary is not None or self.boundary is not None:
             return signal.boundary or self.boundary or BoundaryConditions()
@@ -166,7 +170,7 @@ class Medium(Effect):
         )
 
     def flow_of(self, name: str) -> Flow:
-        """What carries a signal."""
+        """The velocity that carries a signal, or None."""
         own = self.signals[name].flow
         return self.flow if own is None else own
 
@@ -182,7 +186,7 @@ class Medium(Effect):
 
     @property
     def halves(self) -> bool:
-        """Whether signals move half a step before the cells exchange any, and half after."""
+        """Whether transport takes half a step before exchange with the cells, and half after."""
         return self.splitting == "strang"
 
     def declares(self, dim: int) -> tuple[Field, ...]:
@@ -190,8 +194,7 @@ class Medium(Effect):
             Field(OUTSIDE + n, "signal in the medium", "conc", scope=GRID) for n in self.signals
         ]
         if self.outside == "reservoir":
-            # counted in float64: over thousands of steps a float32 sum would no longer notice what
-            # a step adds
+            # float64: after thousands of steps, a float32 sum would round away what a step adds
             meaning = "amount given to the reservoir outside the box, less what was taken"
             fields += [
                 Field(f"{n}_reservoir", meaning, "conc·µm³", scope=COLONY, dtype=torch.float64)
@@ -232,8 +235,8 @@ class Medium(Effect):
         return lines
 
     def method_of(self, name: str) -> tuple[str, str]:
-        """The method by which a signal is transported, and why: as `signals.transport.choose` has
-        it."""
+        """The transport method of a signal, and the reason for it: the same choice as
+        `signals.transport.choose` makes."""
         if self.method is not None:
             return self.method, "as given"
         found = {
@@ -248,11 +251,11 @@ class Medium(Effect):
 
     @property
     def coverage(self) -> str:
-        """What happens to cells outside the box, in words."""
+        """The treatment of cells outside the box, as text."""
         return {
-            "error": "a cell outside the box is its colony's failure",
+            "error": "a colony fails if a cell is outside the box",
             "grow": f"the box grows with its colony along {self.grows}, {BLOCK} voxels at a time",
-            "reservoir": "cells outside the box meet a reservoir that stays as it is",
+            "reservoir": "cells outside the box meet a reservoir of constant concentration",
         }[self.outside]
 
 

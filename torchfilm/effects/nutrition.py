@@ -1,5 +1,5 @@
-"""Nutrition: cells take up a signal of the medium and grow by what they get, so that a crowd
-starves from the inside (Monod 1949)."""
+"""Nutrition: cells take up a signal of the medium, and this uptake limits their growth, so that
+dense colonies starve in the middle (Monod 1949)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchfilm.values import Value, physical
 
 @dataclass(frozen=True)
 class NutritionReport:
-    """`status` (B,): 1 where the uptake of a cell could not be stepped. `uptake` (B,): amount taken
+    """`status` (B,): 1 if the integration of a cell's uptake failed. `uptake` (B,): amount taken up
     in this step, conc·µm³."""
 
     status: Tensor
@@ -28,21 +28,23 @@ class NutritionReport:
     hint = "A smaller dt may help"
 
     def reason(self, place: int) -> str:
-        return "the uptake of a cell could not be stepped"
+        return "the integration of a cell's uptake failed"
 
 
 @dataclass(frozen=True, eq=False)
 class Monod(Effect):
-    """Growth on a nutrient: dV/dt = rate · s/(half + s) · V, and an amount dV/dt / yield is taken
-    from the medium about the cell.
+    """Growth on a nutrient: dV/dt = rate · s/(half + s) · V. The cell takes dV/dt / yield per hour
+    from the medium around it.
 
-    signal: name of the nutrient in the Medium. rate: greatest growth, 1/h; half: concentration of
-    half the growth; growth_yield: µm³ of cell made from one unit of concentration × µm³ of
-    nutrient. Each one number or one per colony. Sets `growth_rate`, so the scene's Growth has no
-    rate of its own. What is eaten is exactly what the medium loses, and cannot be more than there
-    is; growth over the step follows from it, exponential where the food stays what it is. Where
-    contacts hold that growth back, what was eaten for it is spent all the same, and so is the
-    volume of the caps lost at division.
+    signal: name of the nutrient in the Medium. rate: greatest growth rate, 1/h. half: concentration
+    of half that rate. growth_yield: µm³ of cell per unit of concentration × µm³ of nutrient. Each
+    is one number or one per colony. Monod sets `growth_rate`, so the scene's Growth must have no
+    rate of its own.
+
+    The medium loses exactly what the cells take up, and never more than it contains. The uptake
+    determines growth over the step, which is exponential at constant concentration. If contacts
+    slow this growth, the nutrient is consumed all the same. So is the nutrient for the volume of
+    the caps lost at division.
     """
 
     signal: str
@@ -78,8 +80,8 @@ class Monod(Effect):
 
     def numerics(self, dt: float, state: State) -> list[str]:
         return [
-            "each cell by the stiff solver, with its default tolerances; what cells take up the"
-            " medium loses, to rounding"
+            "each cell by the stiff solver, with its default tolerances; the medium loses what"
+            " cells take up, to rounding"
         ]
 
     def check(self, state: State, values: Values) -> None:
@@ -107,8 +109,8 @@ class Monod(Effect):
         columns = (greatest, half, gain, volume, medium.pool)
 
         def rates(x: Tensor, rows: Tensor) -> Tensor:
-            """Of the nutrient left in the pool, and of what was taken up: kept apart, since where
-            nutrient abounds their sum would hide the uptake in rounding."""
+            """Rates of the nutrient in the pool, and of the uptake. Both are variables: where
+            nutrient abounds, the uptake as a difference would be lost in rounding."""
             rate, k, y, start, pool = (c.index_select(0, rows) for c in columns)
             eating = rate * (start / y + x[:, 1]) * x[:, 0] / (k + x[:, 0])
             return torch.stack([-eating / pool, eating], 1)
@@ -116,7 +118,7 @@ class Monod(Effect):
         end, report = rodas3(rates, torch.stack([there, torch.zeros_like(there)], 1), dt)
         eaten = end[:, 1]
         to_reservoir, inside = None, eaten
-        if in_reservoir is not None:  # a reservoir stays as it is
+        if in_reservoir is not None:  # the concentration of a reservoir is constant
             there_for_good = volume / gain * torch.expm1(greatest * there / (half + there) * dt)
             eaten = torch.where(in_reservoir, there_for_good, eaten)
             inside = torch.where(in_reservoir, 0.0, eaten)
@@ -132,7 +134,7 @@ class Monod(Effect):
 
 
 class _BoundMonod(BoundEffect):
-    """The reservoir's field is read and written where the medium has one."""
+    """Monod bound to a batch; it also reads and writes the reservoir's field, if there is one."""
 
     effect: Monod
 

@@ -1,4 +1,4 @@
-"""Removal: cells that leave a region are gone, and the lineage remembers them."""
+"""Removal: cells that leave a region are removed; the lineage keeps their end."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ from torchfilm.values import COLONY, Rule
 
 @dataclass(frozen=True, eq=False)
 class Removal(Effect):
-    """Cells whose centre leaves the box from `low` to `high` are removed, as at a channel's open
-    end.
+    """Removes cells whose centre leaves the box from `low` to `high`, as at a channel's open end.
 
-    low, high: µm, each entry one number or one per colony; ±inf leaves a side out.
+    low, high: corners, µm, each entry one number or one per colony; ±inf means no limit.
     """
 
     low: Sequence[float | Tensor]

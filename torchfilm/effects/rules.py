@@ -1,13 +1,13 @@
-"""Rules, the paper's way: `update(cells)` and `divide(parent, daughter1, daughter2)` with Table 1's
-names, on whole tensors.
+"""Rules as in the paper: `update(cells)` and `divide(parent, daughter1, daughter2)` with the names
+of Table 1, on whole tensors.
 
     def update(cells):
         cells.growth_rate = 2.1
         cells.divide_flag = cells.volume > 3
 
-Rules are the user's own Python. Binding tries `update` once on the first state, before anything
-runs: names that it sets and that nothing declares become variables, and what it reads and writes is
-noted, so that the model knows who drives whom.
+Rules are the user's own Python. Before the run, binding calls `update` once on the first state. New
+names that it sets become variables. The model notes what it reads and writes, to know which effect
+drives which.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from torchfilm.state import Births, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hot_reload import HotReload, load_functions
 
-TRIAL_STEP = 0.025  # h, the step that a rule sees when it is tried
+TRIAL_STEP = 0.025  # h, the step that a rule sees in its trial
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +37,8 @@ class Rules(Effect):
     """The user's rules: `update(cells)` at the start of each step, `divide(parent, daughter1,
     daughter2)` after divisions.
 
-    update: a function, or the path of a Python file that defines `update` and, if wanted, `divide`.
-    variables: first values of variables of the user's own, one number each.
+    update: a function, or the path of a Python file that defines `update` and optionally `divide`.
+    variables: initial values of the user's own variables, one number each.
     """
 
     update: Callable[[CellsView], None] | str | Path | None = None
@@ -56,7 +56,7 @@ class Rules(Effect):
         path, stamp = None, 0
         functions: dict[str, Any] = {"update": self.update, "divide": self.divide}
         if isinstance(self.update, (str, Path)):
-            # as given, or beside the scene file or wherever else Python looks for modules
+            # the path as given, else in a folder of sys.path, such as that of the scene file
             places = [Path(self.update), *(Path(p) / self.update for p in sys.path)]
             path = next((p for p in places if p.is_file()), places[0])
             if not path.is_file():
@@ -83,7 +83,7 @@ class Rules(Effect):
         object.__setattr__(self, "stamp", stamp)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # a rules file is read again where it is unpickled
+        # unpickling reads a rules file again
         return (Rules, (self.update, self.divide, dict(self.variables)))
 
     def declares(self, dim: int) -> tuple[Field, ...]:
@@ -103,8 +103,7 @@ class Rules(Effect):
 
 
 class BoundRules(BoundEffect):
-    """Rules that have been tried once: what they read and write, and the variables that they
-    bring."""
+    """Rules after their trial: what they read and write, and the variables that they add."""
 
     effect: Rules
 
@@ -117,7 +116,7 @@ class BoundRules(BoundEffect):
 
     @property
     def hot_reload(self) -> HotReload:
-        """The functions, which may be edited during a run."""
+        """The functions, which the user may edit during a run."""
         return self.source
 
     def reads(self) -> tuple[str, ...]:
@@ -133,12 +132,12 @@ class BoundRules(BoundEffect):
         return state
 
     def trace(self, state: State) -> State:
-        """Try `update` once: new names become fields, and what is read and written is noted."""
+        """Calls `update` once. New names become fields; reads and writes are noted."""
         update = self.source.functions["update"]
         if update is None:
             return state
-        # one cell would let pass what fails with two, such as `if cells.length > 3`; where none
-        # divides, there may never be two
+        # two cells, since rules such as `if cells.length > 3` fail only with more than one; a cell
+        # that cannot divide stays alone
         twice = state.cells == 1 and "divide_flag" in state.fields
         both = torch.zeros(2, dtype=torch.int64, device=state.device)
         tried = state.take(both) if twice else state
@@ -173,8 +172,7 @@ def _variable(name: str, value: Tensor) -> Field:
 
 
 class DivisionRule(BoundEffect):
-    """The part of Rules that acts after division: the user's `divide(parent, daughter1,
-    daughter2)`."""
+    """The part of Rules after division: the user's `divide(parent, daughter1, daughter2)`."""
 
     effect: Rules
 
@@ -194,7 +192,7 @@ class DivisionRule(BoundEffect):
         return self.traced_writes
 
     def trace(self, state: State) -> State:
-        """Try `divide` on a first cell and two copies of it, and note what it reads and writes."""
+        """Calls `divide` on a first cell and two copies of it, and notes its reads and writes."""
         divide = self.source.functions["divide"]
         if divide is None or not state.cells:
             return state
@@ -218,7 +216,7 @@ class DivisionRule(BoundEffect):
 
 
 def _label(rule: Callable[..., None]) -> str:
-    """What keeps the random draws of one rule apart from another's."""
+    """A label that gives each rule its own random numbers."""
     return (
         f"rule {getattr(rule, '__module__', '')}"
         f" {getattr(rule, '__qualname__', type(rule).__name__)}"
@@ -226,7 +224,7 @@ def _label(rule: Callable[..., None]) -> str:
 
 
 def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
-    """Let a rule act on what it sees."""
+    """Calls a rule on its views. Raises RuleError if it uses a tensor as one number."""
     try:
         rule(*views)
     except (RuntimeError, ValueError) as error:
@@ -239,7 +237,7 @@ def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
             )
         ):
             raise
-        # the first line is this one; the rule's may be called by torch's
+        # the innermost frame outside torch is a line of the rule
         at = next(
             f
             for f in reversed(traceback.extract_tb(error.__traceback__))
@@ -247,7 +245,7 @@ def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
         )
         raise RuleError(
             f"{Path(at.filename).name}, line {at.lineno} ({at.line}): a rule sees all cells at"
-            " once, so there is no one truth or number for `if` or `float`. Write"
+            " once, so `if` or `float` has no single value to use. Write"
             " torch.where(condition, a, b) with &, | and ~, or go through them one by one (slow):"
             " for cell in cells."
         ) from error
@@ -271,8 +269,8 @@ def _apply(update: Callable[[CellsView], None], state: State, dt: float) -> Stat
         if name not in state.fields:
             if name not in KNOWN_FIELDS:
                 raise checks.SimulationError(
-                    f"rules set the variable {name!r} for the first time in mid-run: give Rules(…,"
-                    f" variables={{{name!r}: 0.0}})."
+                    f"rules set the variable {name!r} for the first time during a run: give"
+                    f" Rules(…, variables={{{name!r}: 0.0}})."
                 )
             state = state.declare(KNOWN_FIELDS[name])
     state = state.with_fields(**work)
@@ -282,7 +280,7 @@ def _apply(update: Callable[[CellsView], None], state: State, dt: float) -> Stat
 def _after_divide(
     act: Callable[..., None], state: State, births: Births
 ) -> tuple[DivisionView, DivisionView, DivisionView]:
-    """Parent, first and second daughter as the rule leaves them."""
+    """The views of parent, first and second daughter, after the rule."""
     views = (
         DivisionView(births.parents, None, "parent", "divide parent"),
         DivisionView(state, births.first, "daughter1", "divide first"),

@@ -13,6 +13,7 @@ import torch
 
 from torchfilm.scene import Scene
 from torchfilm.scenes import channels, circuits, colonies, nutrients, signalling
+from torchfilm.scenes.recipes import from_plain, to_plain
 from torchfilm.tools import checks
 
 
@@ -39,7 +40,7 @@ def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
                 for n, v in bound.arguments.items()
             }
         )
-        plain = {n: v.tolist() if hasattr(v, "tolist") else v for n, v in bound.arguments.items()}
+        plain = {n: to_plain(v) for n, v in bound.arguments.items()}
         return scene.replace(name=make.__name__, recipe=(make.__name__, plain))
 
     # the module where pickle finds it by name, for another process
@@ -101,4 +102,4 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
             raise checks.input_error(
                 f"parameter of {name}", given, "one of " + ", ".join(allowed), knob
             )
-    return READY[name](**(parameters or {}))
+    return READY[name](**{n: from_plain(v) for n, v in (parameters or {}).items()})

@@ -41,8 +41,8 @@ LARGER = 1.5
 # it. The search ends after this many refuted settings.
 MOST_REFUTED = 20
 # Settings whose error is within the limit, but whose upper bound is not, are tested again in MORE
-# times as many colonies, if they are at least WORTH times as fast as the best. At most MOST_UNSURE
-# settings are tested so, the cheapest first.
+# times as many colonies, if they would be WORTH times as fast as confirmed ones. At most
+# MOST_UNSURE settings are tested so, the cheapest first.
 MORE, WORTH, MOST_UNSURE = 3, 1.2, 8
 # Greatest uncertainty of an error, as a share of the allowed error. Above it, `tune` grows more
 # colonies.
@@ -54,7 +54,7 @@ OFF, SMALL = 2.0, 0.3
 
 
 def knobs_of(scene: Scene) -> dict[str, float]:
-    """The accuracy knobs of a scene's effects, with their current values."""
+    """The accuracy knobs of a scene's effects, with their usual values."""
     return {
         name: value for effect in scene.effects for name, value in effect.accuracy_knobs().items()
     }

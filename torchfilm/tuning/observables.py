@@ -45,8 +45,8 @@ from torchfilm.tuning.settings import Settings
 # Length of the window, in steps of the scene. With half as many, the settling of the start causes
 # most of the error in volume, even in the second half (measured).
 WINDOW = 24
-# If a scene never reaches the given number of cells, its growth ends when a colony has grown by less
-# than a hundredth in STILL steps, or after MOST_STEPS.
+# If a scene never reaches the given number of cells, its growth ends when a colony has grown by
+# less than a hundredth in STILL steps, or after MOST_STEPS.
 STILL, MOST_STEPS = 10 * WINDOW, 2000
 SIGNAL = "signal "
 SURE = 0.95  # level of upper bounds: 19 of 20 errors are below

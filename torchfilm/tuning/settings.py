@@ -23,9 +23,9 @@ FORMAT = "torchfilm settings"
 class Settings:
     """Knobs of accuracy. None keeps the scene's own value.
 
-    dt: step, h. penalty: α·γ of contacts, which sets how far contacts yield (default 0.1; physically
-    soft cells, `Mechanics(stiffness=…)`, keep their own). passes, tolerance: of the contact solve
-    (see `Mechanics`). rtol: relative tolerance of circuits that use the stiff solver.
+    dt: step, h. penalty: α·γ of contacts, which sets how far contacts yield (default 0.1;
+    physically soft cells, `Mechanics(stiffness=…)`, keep their own). passes, tolerance: of the
+    contact solve (see `Mechanics`). rtol: relative tolerance of circuits that use the stiff solver.
     """
 
     dt: float | None = None
@@ -104,7 +104,7 @@ class Settings:
             found = None
         if not isinstance(found, dict) or found.pop("format", None) != FORMAT:
             raise checks.InputError(
-                f"{path} contains no settings of accuracy: `torchfilm tune SCENE --out FILE` writes"
+                f"{path} holds no settings of accuracy: `torchfilm tune SCENE --out FILE` writes"
                 " such a file."
             )
         return Settings.named(found, str(path))

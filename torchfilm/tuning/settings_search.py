@@ -1,4 +1,4 @@
-"""The search behind `tune`: settings tried from coarse to fine, refuted, confirmed and compared."""
+"""The search behind `tune`: it tries settings from coarse to fine, and confirms or refutes them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,11 @@ from torchfilm.tuning.tuned import Trial, Tuned, percent, settings_text
 
 
 class SettingsSearch:
-    """Settings tried from coarse to fine."""
+    """The search for the cheapest settings that keep the error within a limit.
+
+    probe: where settings are tried. other: the colonies that confirm or refute them. error: the
+    limit. watch: receives a line of text for each stage. more: grows a larger probe, or None.
+    """
 
     def __init__(
         self,
@@ -44,7 +48,7 @@ class SettingsSearch:
     ):
         self.probe, self.other, self.error, self.watch, self.more = probe, other, error, watch, more
         self.knobs = knobs_of(probe.scene)
-        # of the scene as it is given: circuits that run molecule by molecule have no tolerance
+        # from the scene as given: circuits that run molecule by molecule have no tolerance
         self.stiff = "rtol" in knobs_of(probe.given)
         self.contacts = CONTACTS if "tolerance" in self.knobs else (TIGHT_CONTACTS,)
         self.tight = TIGHT * error
@@ -53,15 +57,14 @@ class SettingsSearch:
         self.runs: dict[Settings, WindowRun] = {}
         self.errors: dict[Settings, dict[str, Error]] = {}
         self.tries: dict[Settings, Trial] = {}
-        # what came of them in the other colonies
+        # their errors in the other colonies
         self.refuted: dict[Settings, dict[str, Error]] = {}
-        self.finely: tuple[AccuracyProbe, Seen] | None = (
-            None  # more colonies, once they are asked for
-        )
-        self.unheld: set[Settings] = set()  # what did not hold there
+        # the probe with more colonies and its reference, made when first needed
+        self.larger_probe: tuple[AccuracyProbe, Seen] | None = None
+        self.retested: set[Settings] = set()  # settings that ran in the larger probe
 
     def settings(self, steps: int, contacts: tuple[float, int, float], rtol: float) -> Settings:
-        """As knobs of the scene; those of effects that it does not list stay unset."""
+        """Settings from these values. Knobs of effects that the scene does not list stay None."""
         penalty, more, tolerance = contacts
         knobs = self.knobs
         return Settings(
@@ -74,7 +77,7 @@ class SettingsSearch:
 
     @torch.no_grad()
     def run(self) -> Tuned:
-        left_out = self._refer()
+        left_out = self._run_references()
         own = self._try(Settings())
         best, confirmed = self._confirmed()
         return Tuned(
@@ -95,17 +98,19 @@ class SettingsSearch:
             self.finest,
         )
 
-    def _refer(self) -> dict[str, str]:
-        """Run the reference, twice as finely where only that can tell what must be told, and say
-        what cannot be told."""
+    def _run_references(self) -> dict[str, str]:
+        """Runs the references. Returns the observables that they cannot resolve, with the reason.
+
+        The number of steps is doubled if only that resolves the observables that must be resolved.
+        """
         probe, half = self.probe, self.error / 2
-        # the coarser reference is off by twice as much as the finer is: their difference is the
-        # finer's own error
-        coarser, self.reference = (self._seen_finely(probe, n) for n in (FINEST // 2, FINEST))
+        # the coarser reference has twice the error of the finer one, so their difference is the
+        # error of the finer one
+        coarser, self.reference = (self._run_reference(probe, n) for n in (FINEST // 2, FINEST))
         self.unsure = probe.errors(coarser, self.reference, apart=True)
         if any(half < self.unsure[n].value <= self.error for n in probe.needed if n in self.unsure):
             self.finest *= 2
-            coarser, self.reference = self.reference, self._seen_finely(probe, self.finest)
+            coarser, self.reference = self.reference, self._run_reference(probe, self.finest)
             self.unsure = probe.errors(coarser, self.reference, apart=True)
         said = lambda e: (
             "a reference failed" if math.isinf(e.value) else f"two references differ by {e}"
@@ -114,41 +119,47 @@ class SettingsSearch:
         self.reference = {n: v for n, v in self.reference.items() if n not in left_out}
         missing = [n for n in left_out if n in probe.needed]
         if missing or not self.reference:
-            raise self._untold({n: left_out[n] for n in missing or left_out})
+            raise self._undetermined({n: left_out[n] for n in missing or left_out})
         for name, e in probe.errors(self._run(Settings()).found, self.reference).items():
             if e.ci95 > half and name not in probe.needed:
-                left_out[name] = f"much of {e} is chance"
+                left_out[name] = f"much of {e} is random"
                 del self.reference[name]
         return left_out
 
-    def _seen_finely(self, probe: AccuracyProbe, steps: int) -> Seen:
+    def _run_reference(self, probe: AccuracyProbe, steps: int) -> Seen:
         self.watch(f"a reference in {steps} steps")
         return probe.observed(self.settings(steps, TIGHT_CONTACTS, self.tight)).found
 
     def _confirmed(self) -> tuple[Trial, dict[str, Error]]:
-        """The cheapest that holds the error in the other colonies too, and its errors there, in
-        what can be seen there. (What of them may be chance has been allowed for in the first.)"""
-        right = self._right(self.other)
+        """The cheapest trial within the error in the other colonies too, and its errors there, for
+        the observables that have a reference there. The errors there pass by value: the first
+        probe has already passed with the upper bound."""
+        right = self._reference_in(self.other)
         while len(self.refuted) < MOST_REFUTED and (best := self._cheapest()) is not None:
-            errors = self._elsewhere(self.other, best, right)
+            errors = self._errors_in(self.other, best, right)
             if largest_error(errors) <= self.error:
-                return self._surer(right, best.seconds / WORTH) or (best, errors)
+                return self._best_retested(right, best.seconds / WORTH) or (best, errors)
             self.refuted[best.settings] = errors
-            # where chance has misled once, more colonies tell more than finer steps do
+            # after a first lucky candidate, more colonies help more than finer steps
             known = min(
-                (t.seconds for t in self.tries.values() if self._holds(t)), default=math.inf
+                (t.seconds for t in self.tries.values() if self._passes(t)), default=math.inf
             )
-            if len(self.refuted) == 1 and (found := self._surer(right, known)) is not None:
+            if len(self.refuted) == 1 and (found := self._best_retested(right, known)) is not None:
                 return found
-        found = self._surer(right, math.inf)
+        found = self._best_retested(right, math.inf)
         if found is None:
             raise self._out_of_reach()
         return found
 
-    def _surer(self, right: Seen, limit: float) -> tuple[Trial, dict[str, Error]] | None:
-        """Of the tries that hold the error but for chance and take less than `limit` seconds, the
-        cheapest that holds it to 95 % among more colonies, and in the others as it is."""
-        known = {Settings(), *self.refuted, *self.unheld}
+    def _best_retested(self, right: Seen, limit: float) -> tuple[Trial, dict[str, Error]] | None:
+        """Tests undecided trials again in more colonies, and returns the cheapest that passes, with
+        its errors in the other colonies.
+
+        Undecided: faster than `limit` seconds, and within the error by value, but not by its upper
+        bound. To pass, the upper bound in the larger probe and the value in the other colonies must
+        be within the error.
+        """
+        known = {Settings(), *self.refuted, *self.retested}
         unsure = [
             t
             for t in self.tries.values()
@@ -158,23 +169,23 @@ class SettingsSearch:
         ]
         if not unsure or self.more is None:
             return None
-        if self.finely is None:
-            self.watch("growing more colonies, to tell more finely")
+        if self.larger_probe is None:
+            self.watch("growing more colonies, for smaller standard errors")
             probe = self.more()
-            self.finely = probe, self._right(probe)
-        probe, finely = self.finely
+            self.larger_probe = probe, self._reference_in(probe)
+        probe, reference = self.larger_probe
         for tried in sorted(unsure, key=lambda t: t.seconds)[:MOST_UNSURE]:
-            self.unheld.add(tried.settings)
-            errors = self._elsewhere(probe, tried, finely)
+            self.retested.add(tried.settings)
+            errors = self._errors_in(probe, tried, reference)
             if max(e.upper_bound for e in errors.values()) <= self.error:
-                others = self._elsewhere(self.other, tried, right)
+                others = self._errors_in(self.other, tried, right)
                 if largest_error(others) <= self.error:
                     return dataclasses.replace(tried, errors=errors), others
         return None
 
-    def _right(self, probe: AccuracyProbe) -> Seen:
-        """The reference in other colonies, of what can be told in the first."""
-        seen = self._seen_finely(probe, self.finest)
+    def _reference_in(self, probe: AccuracyProbe) -> Seen:
+        """The reference in another probe, of the observables that the first probe resolves."""
+        seen = self._run_reference(probe, self.finest)
         right = {
             n: seen[n]
             for n in self.reference
@@ -186,29 +197,31 @@ class SettingsSearch:
             if n in self.reference and n not in right
         }
         if missing:
-            raise self._untold(missing)
+            raise self._undetermined(missing)
         return right
 
-    def _elsewhere(self, probe: AccuracyProbe, tried: Trial, right: Seen) -> dict[str, Error]:
-        """What the same settings come to in other colonies."""
+    def _errors_in(self, probe: AccuracyProbe, tried: Trial, right: Seen) -> dict[str, Error]:
+        """The errors of the same settings in another probe."""
         self.watch(f"confirming {settings_text(tried.settings)}")
         return probe.errors(probe.observed(tried.settings).found, right)
 
-    def _untold(self, why: dict[str, str]) -> checks.InputError:
+    def _undetermined(self, why: dict[str, str]) -> checks.InputError:
+        """The error to raise if the probe cannot resolve these observables, by name with why."""
         worst = (
             ", ".join(f"{name}: {words}" for name, words in why.items())
-            or "nothing of what was named is there: it is 0 everywhere"
+            or "every named observable is 0 everywhere"
         )
         return checks.input_error(
             "error",
             self.error,
-            "one that the probe can tell",
-            f"Here {worst}. Ask for a larger error, or probe more colonies or cells.",
+            "one that the probe can resolve",
+            f"Here {worst}. Give a larger error, or probe more colonies or cells.",
         )
 
     def _out_of_reach(self) -> checks.InputError:
+        """The error to raise if no settings passed in both probes."""
         own, *others = self.tries.values()
-        found = {t.settings: t.errors for t in others if not self._holds(t)} | self.refuted or {
+        found = {t.settings: t.errors for t in others if not self._passes(t)} | self.refuted or {
             own.settings: own.errors
         }
         closest = min(found, key=lambda s: max(e.upper_bound for e in found[s].values()))
@@ -219,8 +232,8 @@ class SettingsSearch:
             self.error,
             f"reached by some settings, in both probes: the closest came to {error}, at most"
             f" {percent(error.upper_bound)}, in {name!r}, with {settings_text(closest)}",
-            "Ask for a larger error, probe more colonies (the scene's own number, where its"
-            " parameters have one value a colony), or name what matters (of=…).",
+            "Give a larger error, probe more colonies (unless the scene's parameters give their"
+            " number), or name the observables that matter (of=…).",
         )
 
     def _run(self, settings: Settings) -> WindowRun:
@@ -236,22 +249,24 @@ class SettingsSearch:
         return self.tries[settings]
 
     def _cheapest(self) -> Trial | None:
-        """Of the tries that hold the error and are not refuted, the one that took the least time,
-        once every step that could be cheaper has been looked at: from the scene's own to finer ones
-        first, until one holds the error and tells what is too dear.
+        """The fastest trial that is within the error and not refuted; None if there is none.
+
+        It first tries every step that could be cheaper: from the scene's own step to finer ones,
+        then coarser ones. A passing trial sets the time limit for the others.
         """
         best: Trial | None = None
         for steps in (*(n for n in STEPS if n >= WINDOW), *(n for n in STEPS if n < WINDOW)):
             if best is None or steps * self._least() <= best.seconds:
-                self._look_at(steps, math.inf if best is None else best.seconds)
+                self._try_step(steps, math.inf if best is None else best.seconds)
                 best = min(
-                    (t for t in self.tries.values() if self._holds(t)),
+                    (t for t in self.tries.values() if self._passes(t)),
                     key=lambda t: t.seconds,
                     default=None,
                 )
         return best
 
-    def _holds(self, tried: Trial) -> bool:
+    def _passes(self, tried: Trial) -> bool:
+        """Whether a trial other than the scene's own settings is within the error, not refuted."""
         return (
             tried.worst <= self.error
             and tried.settings != Settings()
@@ -259,8 +274,10 @@ class SettingsSearch:
         )
 
     def _least(self) -> float:
-        """What a step would take, s, if every effect took as little as it ever did; 0 as long as
-        nothing tells, since all steps were taken in several."""
+        """A lower bound of the time of a step, s: the sum of each effect's least time so far.
+
+        Runs with substeps do not count; the bound is 0 until another run exists.
+        """
         each: dict[str, float] = {}
         for settings, run in self.runs.items():
             share = run.seconds / max(1e-9, sum(run.spent.values())) / self.probe.steps(settings)
@@ -268,9 +285,9 @@ class SettingsSearch:
                 each[name] = min(each.get(name, math.inf), share * spent)
         return sum(each.values())
 
-    def _look_at(self, steps: int, limit: float) -> None:
-        """Trial a window of so many steps with tighter and tighter knobs until the error is held,
-        or more than `limit` seconds are taken; not at all what is hopeless."""
+    def _try_step(self, steps: int, limit: float) -> None:
+        """Runs the window in `steps` steps with tighter and tighter knobs, until a trial passes or
+        takes more than `limit` seconds. Skips hopeless settings."""
         tightest = self.settings(steps, TIGHT_CONTACTS, self.tight)
         if (
             self._hopeless(tightest)
@@ -280,7 +297,7 @@ class SettingsSearch:
         self._found(tightest)
         if self._hopeless(tightest):
             return
-        # (where the usual contacts fail, nothing tells what circuits add)
+        # (if the usual contacts fail, the share of circuits is unknown)
         rtol = next(
             (r for r in self.rtols if self._circuits_add(steps, r) <= SMALL * self.error),
             self.tight,
@@ -293,22 +310,24 @@ class SettingsSearch:
             settings = self.settings(steps, contacts, r)
             if not self._hopeless(settings):
                 tried = self._try(settings)
-                if self._holds(tried) or tried.seconds > limit:
+                if self._passes(tried) or tried.seconds > limit:
                     return
 
     def _found(self, settings: Settings) -> dict[str, Error]:
-        """The errors of settings, by observable."""
+        """The errors of settings, by observable, computed once."""
         if settings not in self.errors:
             self.errors[settings] = self.probe.errors(self._run(settings).found, self.reference)
         return self.errors[settings]
 
     def _hopeless(self, settings: Settings) -> bool:
-        """Are these looser than others that are far off? By finer steps alone an error falls at
-        most with their square."""
+        """Whether looser knobs cannot pass here, because tighter ones had too large an error.
+
+        Finer steps alone reduce an error at most with the square of the step.
+        """
         for other, errors in self.errors.items():
             if other.given and is_looser(settings, other):
                 finer = min(1.0, self.probe.steps(other) / self.probe.steps(settings)) ** 2
-                # (what fails with tight contacts may run with loose ones)
+                # (a run that fails with tight contacts may not fail with loose ones)
                 far = {
                     n: finer * (e.value - e.ci95)
                     for n, e in errors.items()
@@ -322,7 +341,7 @@ class SettingsSearch:
         return False
 
     def _circuits_add(self, steps: int, rtol: float) -> float:
-        """What circuits at `rtol` change in the worst observable, contacts as they usually are."""
+        """The largest change of an observable by circuits at `rtol`, with the usual contacts."""
         usual = CONTACTS[3] if "tolerance" in self.knobs else TIGHT_CONTACTS
         loose, tight = (self._run(self.settings(steps, usual, r)).found for r in (rtol, self.tight))
         return largest_error(
@@ -332,8 +351,8 @@ class SettingsSearch:
         )
 
     def _parts(self, best: Trial) -> dict[str, dict[str, Error]]:
-        """By knob, what of each observable's error is gone when it alone is tight; for the step,
-        what is left when all others are."""
+        """By knob, the part of each observable's error that vanishes if only this knob is tight.
+        For the step: the error that remains if all other knobs are tight."""
         s = best.settings
         tight = self.settings(self.probe.steps(s), TIGHT_CONTACTS, self.tight)
         parts = {"step": self._found(tight)}
@@ -344,6 +363,7 @@ class SettingsSearch:
         return parts
 
     def _difference(self, one: Settings, other: Settings) -> dict[str, Error]:
+        """How far two settings differ, by observable."""
         found, against = self._run(one).found, self._run(other).found
         return self.probe.errors(
             found, {n: v for n, v in against.items() if n in self.reference}, apart=True

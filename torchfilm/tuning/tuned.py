@@ -1,4 +1,4 @@
-"""What `tune` returns: the settings that hold an error, how that is known, and its tables."""
+"""The result of `tune`: the chosen settings, the evidence for them, and the printed tables."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from torchfilm.tuning.settings import Settings
 
 @dataclass(frozen=True)
 class Trial:
-    """One setting that was run: its errors by observable, and what its window took, s, in all (on
-    the CPU of the thread that ran it) and by effect."""
+    """Settings that were run, with their errors by observable.
+
+    seconds: computing time of the window (on the CPU: of the thread that ran it). spent: seconds by
+    effect.
+    """
 
     settings: Settings
     errors: dict[str, Error]
@@ -23,22 +26,23 @@ class Trial:
 
     @property
     def worst(self) -> float:
-        """The greatest error, with what of it may be chance."""
+        """The greatest upper bound of the errors."""
         return max(e.upper_bound for e in self.errors.values())
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """Settings that hold an error, and how that is known.
+    """Settings that keep the error within a limit, and the evidence for this.
 
-    scene: with the settings. error: what was asked. chosen: the try that was taken, its errors as
-    of more colonies where only these could tell; own: the scene's own settings, for comparison.
-    parts: by knob, how much of each observable's error comes from it. confirmed: errors in the
-    other colonies. unsure: by observable, how far two references differ; left_out: observables that
-    cannot be told so finely, with why. tries: the scene's own and all that might have been chosen,
-    in order; runs: how many settings the first probe was run by. window: hours, cells: at its
-    start, least: in the smallest colony that has any, finest: steps of the reference. Errors are
-    relative, each with its standard error (`Error.value`, `.noise`).
+    scene: the scene with the settings. error: the limit that the user gave. chosen: the chosen
+    trial; its errors are those of the larger probe, if only that could resolve them. own: the
+    scene's own settings, for comparison. confirmed: errors in the other colonies. parts: by knob,
+    its part of each observable's error. unsure: by observable, the difference of two references.
+    left_out: observables whose error the probe cannot resolve, with the reason. tries: the scene's
+    own settings, then every candidate, in order. runs: number of settings that ran in the first
+    probe. window: its length, h. cells: number of cells at its start. least: cells in the smallest
+    colony that has cells. finest: steps of the reference. Errors are relative, each with its
+    standard error (`Error.value`, `.noise`).
     """
 
     scene: Scene
@@ -62,7 +66,7 @@ class Tuned:
 
 
 def describe(tuned: Tuned) -> list[str]:
-    """The tables."""
+    """The tables, in lines."""
     best, own = tuned.chosen, tuned.own
     head = (
         f"{tuned.scene.name}: {percent(tuned.error)} in {', '.join(best.errors)}, over"
@@ -93,7 +97,7 @@ def describe(tuned: Tuned) -> list[str]:
         (
             n,
             str(e),
-            str(tuned.confirmed.get(n, "not seen there")),
+            str(tuned.confirmed.get(n, "not measured")),
             str(own.errors[n]),
             str(tuned.unsure[n]),
         )
@@ -101,11 +105,12 @@ def describe(tuned: Tuned) -> list[str]:
     ]
     lines += _aligned(rows)
     lines += [
-        "  (± standard error by chance, which is allowed for in the first column; the parts may set"
-        " each other off)"
+        "  (± standard error; the first column must pass with its 95 % upper bound; the parts may"
+        " cancel each other)"
     ]
     lines += [
-        f"NOT CHECKED: {name}, since {why}. It may be off by more: name it (of) to have it told"
+        f"NOT CHECKED: {name}, since {why}. Its error may exceed the limit: name it (of) to"
+        " check it"
         for name, why in tuned.left_out.items()
     ]
     ratio = best.seconds / own.seconds

@@ -1,13 +1,16 @@
-"""The cheapest settings that hold an error: `tune(scene, error=0.01)`.
+"""The cheapest settings that keep the error within a limit: `tune(scene, error=0.01)`.
 
-A few colonies of the scene are grown by its own settings; from that same state a window of some
-steps is run again and again: once by far tighter settings, the reference, and then by other
-settings, each step by knobs from loose to tight. What a user would read off at the end is compared,
-observable by observable: the table is in `torchfilm.tuning.observables`. Each error, with what of
-it may be chance, must be within what was asked; of the settings that are, the one that took the
-least time is chosen, confirmed in other colonies that are smaller by a third, and measured once
-more with each of its knobs tightened, which tells the knobs' parts in the error. Cheaper ones whose
-error is within it but for chance are looked at among more colonies, and chosen if it is there.
+1. `tune` grows a few colonies with the scene's own settings. From that state it runs a window of
+   some steps repeatedly: once with far tighter settings, the reference, then with other settings.
+   For each step length it tries the knobs from loose to tight.
+2. It compares every observable with the reference. `torchfilm.tuning.observables` lists them. The
+   upper bound of each error (95 %) must be at most the given error.
+3. Of the settings that pass, it takes those that need the least time, and confirms them in other
+   colonies, which are smaller by a third.
+4. It tests cheaper settings again in more colonies, if their error passes but its upper bound does
+   not.
+5. It runs the chosen settings again with each knob tightened in turn. This gives each knob's part
+   of the error.
 """
 
 from __future__ import annotations
@@ -37,25 +40,36 @@ def tune(
     device: str | torch.device = "cpu",
     watch: Callable[[str], None] | None = None,
 ) -> Tuned:
-    """The cheapest settings with which a scene's observables are within `error` (relative, 0.01 for
-    1 %) of what far tighter settings give; some minutes.
+    """Finds the cheapest settings that keep a scene's observables within `error` (relative: 0.01
+    for 1 %) of what far tighter settings give. It takes some minutes.
 
-    cells: in each of `colonies` colonies (or as many as the scene's parameters are for) what will
-    be run: settings hold in a probe that begins there and in one that begins with half as many
-    again; a scene that stays smaller is taken as it is where it grows no more. Where chance would
-    hide the error, twice or four times as many colonies are grown, and three times those again
-    where it hides whether cheaper settings hold it. of: names of the observables that matter, by
-    default all: "cells", "volume", "radius", "overlap", species, "signal NAME". Circuits that run
-    molecule by molecule are probed by their smooth mean, since noise is no error. watch: is told in
-    words what is being done. Raises InputError where nothing holds the error, or where the probe
-    cannot tell it; SimulationError where the scene fails on the way to where the probe begins.
+    cells: the number of cells per colony in the run that you plan. The error stays within the limit
+    in a probe that starts with this many cells, and in one that starts with half as many again. A
+    scene that stays smaller is probed where it stops growing.
+
+    colonies: the number of colonies in each probe, unless the scene's parameters give it. If the
+    random error is too large, `tune` grows twice or four times as many, and then three times those
+    to test cheaper settings.
+
+    of: names of the observables that matter; by default all: "cells", "volume", "radius",
+    "overlap", species, "signal NAME". watch: a function that receives a line of text for each
+    stage of the work.
+
+    Circuits that run molecule by molecule are probed by their smooth mean, since noise is not an
+    error. Raises InputError if no settings keep the error within the limit, or if the probe cannot
+    resolve it; SimulationError if the scene fails before the probe starts.
     """
     if not isinstance(scene, Scene):
         raise checks.input_error("scene", scene, "a Scene, such as tf.scenes.microcolony()")
     checks.number("error", error, above=0.0, most=0.5)
     for name, given, least, why in (
         ("cells", cells, 1, ""),
-        ("colonies", colonies, 2, "By how they differ it tells what of an error may be chance."),
+        (
+            "colonies",
+            colonies,
+            2,
+            "The spread between colonies gives the standard error of each error.",
+        ),
     ):
         if isinstance(given, bool) or not isinstance(given, int) or given < least:
             raise checks.input_error(name, given, f"a whole number from {least}", why)
@@ -79,7 +93,7 @@ def tune(
             if name not in known:
                 raise checks.input_error("of", name, "among " + ", ".join(known))
     for more in (2, 4) if scene.fixed_colonies == 1 else ():
-        if _chance(probe) <= UNSURE * error:
+        if _uncertainty(probe) <= UNSURE * error:
             break
         watch(f"growing {more * colonies} colonies to {many} cells")
         probe = begin(scene, many, more * colonies, of, seed, device)
@@ -92,9 +106,9 @@ def tune(
 
 
 @torch.no_grad()
-def _chance(probe: AccuracyProbe) -> float:
-    """How much of the error in what must be told, the volume or what was named, may be chance: as
-    runs by the scene's own step and by half of it differ."""
+def _uncertainty(probe: AccuracyProbe) -> float:
+    """The greatest uncertainty of the errors that must be resolved, from two runs: with the scene's
+    own step, and with half of it."""
     one, other = (probe.observed(Settings(dt=dt)).found for dt in (None, probe.dt / 2))
     return max(
         (e.ci95 for n, e in probe.errors(one, other, apart=True).items() if n in probe.needed),

@@ -1,0 +1,67 @@
+"""The parameters of a ready-made scene as plain data, so that a results file can hold them."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from torchfilm.distributions import LogNormal, Normal, Uniform
+from torchfilm.tools import checks
+from torchfilm.values import Distribution, PerColony
+
+DISTRIBUTIONS = {kind.__name__: kind for kind in (Uniform, Normal, LogNormal)}
+
+
+def to_plain(value: Any) -> Any:
+    """A parameter as JSON can hold it; `from_plain` gives it back."""
+    if isinstance(value, PerColony):
+        return {"per colony": to_plain(value.values)}
+    if isinstance(value, Distribution):
+        fields = {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"distribution": type(value).__name__, **fields}
+    if isinstance(value, Mapping):
+        return {"by type": [[int(k), to_plain(v)] for k, v in value.items()]}
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def from_plain(value: Any) -> Any:
+    """The parameter that `to_plain` wrote."""
+    if not isinstance(value, Mapping):
+        return value
+    if "per colony" in value:
+        return PerColony(value["per colony"])
+    if "by type" in value:
+        return {int(k): from_plain(v) for k, v in value["by type"]}
+    if "distribution" in value:
+        kind = DISTRIBUTIONS[value["distribution"]]
+        return kind(**{n: from_plain(v) for n, v in value.items() if n != "distribution"})
+    return value
+
+
+def parse_value(text: str) -> Any:
+    """A parameter as typed on the command line: a Python literal, `PerColony([…])`, or a
+    distribution such as `LogNormal(1.0, 0.2)`; anything else is text."""
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        pass
+    try:
+        return _call(ast.parse(text, mode="eval").body)
+    except (ValueError, SyntaxError, TypeError):
+        return text
+
+
+def _call(node: ast.expr) -> Any:
+    """The value of a literal, of a call of a known name, or of a dict of either."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        known: dict[str, Any] = {**DISTRIBUTIONS, "PerColony": PerColony}
+        if node.func.id not in known:
+            raise checks.InputError(f"{node.func.id} is not one of {', '.join(known)}.")
+        given = {k.arg: _call(k.value) for k in node.keywords if k.arg is not None}
+        return known[node.func.id](*(_call(a) for a in node.args), **given)
+    if isinstance(node, ast.Dict) and all(k is not None for k in node.keys):
+        pairs = zip(node.keys, node.values, strict=True)
+        return {ast.literal_eval(k): _call(v) for k, v in pairs if k is not None}
+    return ast.literal_eval(node)
