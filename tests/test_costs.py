@@ -118,9 +118,9 @@ def test_growth_division_and_mechanics_cost_the_same_whatever_else_is_listed(lis
             if title != "division" or not state.births or listed in ("medium", "removal"):
                 assert here[title] == there[title], (title, state.step)
         extra = set(here) - set(there)
-        assert all(sum(here[title][0].values()) > 0 or title == "grid coverage" for title in extra), (
-            "an effect that is listed and does nothing proves nothing"
-        )
+        assert all(
+            sum(here[title][0].values()) > 0 or title == "grid coverage" for title in extra
+        ), "an effect that is listed and does nothing proves nothing"
 
 
 def test_the_counter_sees_what_it_should(bare):
@@ -193,8 +193,8 @@ def test_many_colonies_ask_for_no_more_operators_than_two(listed):
     assert 2 * nine.cells == 9 * two.cells > 18
 
 
-# The operators of a step of two colonies, float32, after 20 steps: (now, at most; at 8b0ffbc, before
-# scenes were bound: the same cells, measured by the same counter with torch 2.13).
+# The operators of a step of two colonies, float32, after 20 steps: (now, at most; at 8b0ffbc,
+# before scenes were bound: the same cells, measured by the same counter with torch 2.13).
 SMALL = {
     "microcolony": (1512, 1520),
     "quorum_sensing": (8487, 8504),
@@ -280,7 +280,7 @@ WITHOUT = {
     "no circuits": (lambda: [medium()], ("torchfilm.circuits",)),
     "nobody who exchanges": (
         lambda: [medium()],
-        ("torchfilm.signals.implicit", "torchfilm.signals.iterative"),
+        ("torchfilm.signals.transport_implicit", "torchfilm.signals.transport_iterative"),
     ),
 }
 

@@ -301,7 +301,9 @@ def test_a_run_is_foretold_from_the_pace_of_growth():
     said = tf.explain(tf.Scene(tf.Growth(rate=1.0)), cells=1000, seconds=0.01)
     assert "  a run    277 steps (6.93 h)" in said
     assert "  a run    0 steps" in tf.explain(tf.Scene(tf.Growth(rate=1.0)), cells=1, seconds=0.01)
-    assert "no estimate: the probe did not grow" in tf.explain(tf.Scene(tf.Growth(rate=0.0)), seconds=0.01)
+    assert "no estimate: the probe did not grow" in tf.explain(
+        tf.Scene(tf.Growth(rate=0.0)), seconds=0.01
+    )
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def dividing(**circuit) -> tf.Scene:
 
 
 @pytest.fixture(scope="module")
-def search() -> Search:
+def search() -> SettingsSearch:
     scene = tf.scenes.microcolony()
     return SettingsSearch(begin(scene, 38, 4), begin(scene, 25, 4, seed=1), 0.02)
 
@@ -198,7 +198,9 @@ def test_settings_are_not_chosen_by_what_is_left_when_the_volume_cannot_be_told(
 
 
 def test_what_cannot_be_held_or_told_is_said():
-    with pytest.raises(InputError, match=r"the probe can resolve\. Here m: two references differ by"):
+    with pytest.raises(
+        InputError, match=r"the probe can resolve\. Here m: two references differ by"
+    ):
         tf.tune(dividing(), 1e-9, cells=8, colonies=2, of=["m"])
 
 

@@ -22,12 +22,12 @@ from scipy.sparse.linalg import expm_multiply
 from study import Point, Study, timed
 
 import torchfilm as tf
-from torchfilm.signals import iterative
-from torchfilm.signals.assembly import build_operator
+from torchfilm.signals import transport_iterative
 from torchfilm.signals.exchange import read, stencil, write
-from torchfilm.signals.exponential import aligned
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.transport import prepare
+from torchfilm.signals.transport_exponential import aligned
+from torchfilm.signals.transport_rates import build_operator
 
 ERROR, BELOW, WORK = "relative error", "below zero", "multiplications"
 APPLY = 7  # multiplications per voxel of one application of the operator
@@ -167,17 +167,17 @@ class Applied:
 @contextmanager
 def count_applications() -> Iterator[Applied]:
     """Counts applications of the operator by Euler and Crank–Nicolson, which use it directly."""
-    applied, original = Applied(), iterative.apply
+    applied, original = Applied(), transport_iterative.apply
 
     def counting(*args, **options):
         applied.times += 1
         return original(*args, **options)
 
-    iterative.apply = counting
+    transport_iterative.apply = counting
     try:
         yield applied
     finally:
-        iterative.apply = original
+        transport_iterative.apply = original
 
 
 def point(

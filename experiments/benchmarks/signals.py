@@ -26,10 +26,10 @@ from record import machine
 from scipy.special import ive
 
 import torchfilm as tf
-from torchfilm.signals.assembly import build_operator
-from torchfilm.signals.iterative import convolve
-from torchfilm.signals.operator import Operator, apply
 from torchfilm.signals.transport import METHODS, prepare
+from torchfilm.signals.transport_iterative import convolve
+from torchfilm.signals.transport_operator import Operator, apply
+from torchfilm.signals.transport_rates import build_operator
 
 SIZES = (32, 64, 128)
 CASES = (*METHODS, "implicit, mask", "apply", "conv3d")

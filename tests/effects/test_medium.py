@@ -444,7 +444,7 @@ BAD = {
         lambda: tf.Medium(
             ahl=AHL, boundary=tf.BoundaryConditions(x=tf.Periodic()), outside="grow", **GOOD
         ),
-        "closes on itself cannot grow",
+        "periodic box cannot grow",
     ),
     "growing along nothing": (lambda: tf.Medium(ahl=AHL, grows="", **GOOD), r"Medium\.grows"),
     "method": (

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet, Periodic
 from torchfilm.signals.exchange import pool_volume, read, stencil, write
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.transport import METHODS, prepare
+from torchfilm.signals.transport_rates import build_operator
 
 CHOSEN = pytest.mark.parametrize("method", ["exponential", "implicit"])
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from torchfilm.signals.assembly import build_operator, fitted_rates
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
@@ -16,8 +15,9 @@ from torchfilm.signals.boundary_conditions import (
     Open,
     Periodic,
 )
-from torchfilm.signals.iterative import convolve
-from torchfilm.signals.operator import Operator, apply
+from torchfilm.signals.transport_iterative import convolve
+from torchfilm.signals.transport_operator import Operator, apply
+from torchfilm.signals.transport_rates import build_operator, fitted_rates
 from torchfilm.tools.checks import InputError
 
 SPACING = (1.0, 2.0, 1.5)

@@ -9,7 +9,6 @@ import pytest
 import torch
 from scipy.special import ive
 
-from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
@@ -18,8 +17,9 @@ from torchfilm.signals.boundary_conditions import (
     Open,
     Periodic,
 )
-from torchfilm.signals.operator import apply
 from torchfilm.signals.transport import prepare
+from torchfilm.signals.transport_operator import apply
+from torchfilm.signals.transport_rates import build_operator
 
 D = torch.float64
 

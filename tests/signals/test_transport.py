@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_operator import BOUNDARIES, FLOWS, SHAPES, SPACING, every, make
 
-from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import (
     BoundaryConditions,
     Dirichlet,
@@ -22,8 +21,9 @@ from torchfilm.signals.boundary_conditions import (
     Open,
     Periodic,
 )
-from torchfilm.signals.iterative import CrankNicolson
 from torchfilm.signals.transport import METHODS, choose, prepare
+from torchfilm.signals.transport_iterative import CrankNicolson
+from torchfilm.signals.transport_rates import build_operator
 from torchfilm.tools.checks import InputError
 
 MASKED = pytest.mark.parametrize("masked", [False, True], ids=["", "obstacles"])

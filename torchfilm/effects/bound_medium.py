@@ -14,12 +14,12 @@ from torch import Tensor
 
 from torchfilm.effect import BEFORE_CELLS, GRID_COVERAGE, Binding, BoundEffect
 from torchfilm.resolver import snapshot
-from torchfilm.signals.assembly import build_operator
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.signals.layout import Layout
 from torchfilm.signals.space import MOST_VOXELS
 from torchfilm.signals.transport import Stepper, choose, prepare
+from torchfilm.signals.transport_rates import build_operator
 from torchfilm.state import GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 

@@ -17,10 +17,10 @@ from typing import Protocol
 
 from torch import Tensor
 
-from torchfilm.signals.exponential import prepare_exponential
-from torchfilm.signals.implicit import prepare_implicit
-from torchfilm.signals.iterative import prepare_crank_nicolson, prepare_euler
-from torchfilm.signals.operator import Operator
+from torchfilm.signals.transport_exponential import prepare_exponential
+from torchfilm.signals.transport_implicit import prepare_implicit
+from torchfilm.signals.transport_iterative import prepare_crank_nicolson, prepare_euler
+from torchfilm.signals.transport_operator import Operator
 from torchfilm.tools import checks
 
 

@@ -21,7 +21,7 @@ from torchfilm.signals.boundary_conditions import (
     Periodic,
 )
 from torchfilm.signals.grid import Shape
-from torchfilm.signals.operator import Exchange, Operator
+from torchfilm.signals.transport_operator import Exchange, Operator
 from torchfilm.tools import checks
 
 AXES = "xyz"

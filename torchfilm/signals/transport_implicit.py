@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfilm.signals.operator import Exchange, Operator, entering
+from torchfilm.signals.transport_operator import Exchange, Operator, entering
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.signals.operator import Exchange, Operator
+from torchfilm.signals.transport_operator import Exchange, Operator
 from torchfilm.tools import checks
 
 # exp(t(Q + ρ)) with tρ ≤ ½ by its series: the first omitted term is ½¹⁶/16! = 7e-19.
@@ -135,9 +135,11 @@ def prepare_exponential(operator: Operator, dt: float) -> Exponential:
                 more.reshape(-1, 1, 1, 1), gained + multiply(kept(now, time), gained), gained
             )
         now = [
-            None
-            if f is None
-            else torch.where(more.reshape(-1, 1, 1), _normalised(torch.bmm(f, f)), f)
+            (
+                None
+                if f is None
+                else torch.where(more.reshape(-1, 1, 1), _normalised(torch.bmm(f, f)), f)
+            )
             for f in now
         ]
         time = torch.where(more, 2 * time, time)

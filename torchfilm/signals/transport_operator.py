@@ -6,7 +6,7 @@ It has diffusion, flow, decay and a constant source: ∂s/∂t = K∇²s − v·
 
 All rates are ≥ 0, so the matrix has no negative entry off its diagonal, and each column sums to
 minus the rate at which the voxel loses amount to the outside and to decay. Whatever the flow,
-amount is conserved and no value need become negative. `assembly` computes the rates.
+amount is conserved and no value need become negative. `transport_rates` computes the rates.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Exchange:
 
 @dataclass(frozen=True, eq=False)
 class Operator:
-    """The operator of B colonies with grids of one shape; made by `assembly.build_operator`.
+    """The operator of B colonies with grids of one shape; made by `transport_rates.build_operator`.
 
     Rates are float64; values advance in `dtype`. axes: the exchange along x, y, z. decay: (B or 1,
     1, 1, 1) or (B or 1, nx, ny, nz), 1/h. source: None or (B or 1, …), concentration/h. mask: None

@@ -14,7 +14,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchfilm.signals.operator import Operator, apply
+from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 
