@@ -1,4 +1,5 @@
-# Two commands do everything on a fresh machine: `make run` and `make test`. `make help` lists the rest.
+# Two commands do everything on a fresh machine: `make run` and `make test`. `make help`
+# lists the rest.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,10 +7,10 @@ STAMP := $(VENV)/.installed
 
 .PHONY: help run colonies test quick lint types docs bench clean
 
-run: $(STAMP)  ## search for a circuit that draws a stripe where two populations meet, show the best (a minute or two)
+run: $(STAMP)  ## search for a circuit that draws a stripe (a minute or two)
 	$(BIN)/python experiments/boundary_stripe.py --colonies 800 --out runs/stripe
 
-colonies: $(STAMP)  ## grow 16 colonies of 500 cells in one batch, write results and a picture (about a minute)
+colonies: $(STAMP)  ## grow 16 colonies of 500 cells in one batch (a minute)
 	$(BIN)/torchfilm run microcolony --colonies 16 --cells 500 --out runs/colonies.h5 --overwrite
 
 test: $(STAMP)  ## all tests

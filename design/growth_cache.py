@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,7 @@ import torchfilm as tf
 
 MOST_BYTES = 2**30  # of recorded steps; above this, the least recently used recordings are dropped
 _kept: dict[Any, tf.GrowthRecording] = {}
+_lock = threading.Lock()
 
 
 def find_or_record(
@@ -21,14 +23,24 @@ def find_or_record(
 
     key: everything else that the growth depends on. record: starts a new recording.
     """
+    with _lock:  # threads of one search share the recordings
+        return _find(key, streams, cells) or _keep((*key, streams, cells), record())
+
+
+def _find(
+    key: tuple[Any, ...], streams: tuple[int, ...], cells: int | None
+) -> tf.GrowthRecording | None:
     for known, recording in _kept.items():
         # a colony leaves the recording at its own end, so a longer recording serves as well
         long_enough = recording.cells is None or (cells is not None and recording.cells >= cells)
         if known[:-2] == key and set(streams) <= set(recording.streams) and long_enough:
             _kept[known] = _kept.pop(known)  # the dictionary is in order of use, the latest last
             return recording
-    recording = record()
+    return None
+
+
+def _keep(key: tuple[Any, ...], recording: tf.GrowthRecording) -> tf.GrowthRecording:
     while _kept and sum(kept.nbytes for kept in _kept.values()) > MOST_BYTES:
         _kept.pop(next(iter(_kept)))
-    _kept[(*key, streams, cells)] = recording
+    _kept[key] = recording
     return recording

@@ -52,7 +52,7 @@ ROOMS = {
     # simulate takes a path to record to, so results lie below it
     "simulate": Room(8, ("torchfilm.simulation",)),
     "the rest": Room(9, ("torchfilm",)),
-    "command line": Room(10, ("torchfilm.cli",)),
+    "command line": Room(10, ("torchfilm.cli", "torchfilm.__main__")),
 }
 # Modules of one effect, which may import each other: the description and what binding makes of it.
 ONE_EFFECT = {

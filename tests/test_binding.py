@@ -120,6 +120,32 @@ def test_simulate_binds_by_itself():
         tf.simulate(scene, by_scene, until=1.0, colonies=2)
 
 
+def test_the_options_of_a_batch_are_refused_where_it_has_its_own():
+    scene = tf.scenes.microcolony()
+    model = scene.bind()
+    batch = {"colonies": 5, "seed": 7, "streams": [3], "device": "cpu", "dtype": torch.float64}
+    for name, value in batch.items():
+        for what, given in (("model", (model,)), ("state", (scene, model.start()))):
+            with pytest.raises(tf.InputError, match=f"^{name} = .*left out where a {what} is"):
+                tf.simulate(*given, until=0.05, **{name: value})
+
+
+def test_colonies_keep_their_streams_where_a_scene_is_bound_to_a_state():
+    scene = tf.scenes.microcolony()
+    state = scene.bind(3, streams=[70, 80, 90]).start()
+    turned = scene.bind(state=state.select([2, 0, 1])).start()
+    assert (turned.colony_id.tolist(), turned.stream.tolist()) == ([0, 1, 2], [70, 80, 90])
+    assert scene.bind(state=state.select([1])).start().stream.tolist() == [0, 80]
+
+
+def test_a_low_rate_is_warned_of_once_for_a_run():
+    scene = tf.Scene(tf.Growth(rate=0.02), dim=2)
+    with pytest.warns(UserWarning, match="per hour") as told:
+        state = scene.bind().start()
+        list(tf.simulate(scene, state, until=0.05))
+    assert len(told) == 1
+
+
 def test_progress_is_shown_where_it_is_wanted(capfd):
     for _ in tf.simulate(tf.scenes.microcolony(), until=0.25, progress=True):
         pass

@@ -144,7 +144,7 @@ def test_a_way_of_transport_that_was_asked_for_is_told(method):
         ),
         (
             medium(method="crank_nicolson", steps=5),
-            ("order 2 in steps of 0.0025 h", "failure", "Strang"),
+            ("order 2 in steps of 0.0025 h", "fails", "Strang"),
         ),
         (
             medium(method="implicit", splitting="lie", steps=5),

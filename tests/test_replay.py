@@ -35,15 +35,17 @@ class Designs:
 
     def __init__(self, scene: tf.Scene, recording: tf.GrowthRecording):
         self.scene, self.recording = scene, recording
-        self.replay = tf.Replay(scene.bind(per_colony=True), recording)
+        self.replay = tf.Replay(self._bind(None, None), recording)
 
     def start(self, colonies: int, streams) -> tf.State:
+        self.replay = tf.Replay(self._bind(colonies, streams), self.recording)
+        return self.replay.start()
+
+    def _bind(self, colonies: int | None, streams) -> tf.Model:
         first = self.recording.state
-        model = self.scene.bind(
+        return self.scene.bind(
             colonies, seed=first.seed, streams=streams, dtype=first.dtype, device=first.device
         )
-        self.replay = tf.Replay(model, self.recording)
-        return self.replay.start()
 
     def step(self, state: tf.State) -> tf.State:
         return self.replay.step(state)

@@ -51,6 +51,24 @@ def test_resume_bit_for_bit(tmp_path, whole, stop):
     assert not [p for p in tmp_path.iterdir() if p != path], "something was left lying about"
 
 
+def founded(colony: list[int]) -> tf.Cells:
+    return tf.Cells([[0.0, 0.0]] * len(colony), [1.0, 0.0], colony=colony)
+
+
+@pytest.mark.parametrize(
+    ("rate", "founders"),
+    [([1.0, 1.1, 1.2, 1.3], None), (1.0, founded([0, 1, 2, 3]))],
+    ids=["rates", "founders"],
+)
+def test_selected_colonies_can_be_read(tmp_path, rate, founders):
+    """Also where the scene is for more colonies than the file has."""
+    scene = tf.Scene(tf.Growth(rate=rate), founders=founders, dim=2)
+    first = scene.bind().start().select([2, 0])
+    *_, last = tf.simulate(scene, first, until=0.5, record=tmp_path / "run.h5")
+    with tf.Results(tmp_path / "run.h5") as results:
+        assert_same_state(results.state(scene), last)
+
+
 def test_every_step_can_be_resumed_from(tmp_path):
     """Also those in which a cell is due to divide but has not done so yet."""
     scene = make_scene()

@@ -1,8 +1,10 @@
 """Parameters of a ready-made scene: every form of a value is recorded, read back and typed."""
 
+import dataclasses
 import json
 
 import pytest
+import torch
 
 import torchfilm as tf
 from torchfilm import scenes
@@ -45,3 +47,56 @@ def test_a_typed_parameter_is_read_without_running_it(text, value):
 def test_a_parameter_with_an_impossible_value_names_it():
     with pytest.raises(tf.InputError, match=r"Foo\(1\)"):
         scenes.build("microcolony", dict([parse_setting("rate=Foo(1)")]))
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        tf.Removal((-5.0, -5.0), ([5.0, 6.0], 9.0)),
+        tf.Growth(rate=tf.LogNormal([1.0, 2.0], 0.1)),
+        tf.Mechanics([tf.Plane(x=-3.0, facing="+x", stiffness=tf.PerColony([1.0, 2.0]))], dim=2),
+    ],
+    ids=["a corner", "a median", "stated"],
+)
+def test_a_list_that_can_only_be_per_colony_is_taken_so(effect):
+    founders = tf.Cells(
+        [[0.0, 0.0], [0.0, 3.0]], [[1.0, 0.0]] * 2, length=2.0, radius=0.5, cell_type=[0, 1]
+    )
+    others = [] if isinstance(effect, tf.Mechanics) else [tf.Mechanics(dim=2)]
+    scene = tf.Scene(effect, *others, founders=founders)
+    assert scene.bind(colonies=2).start().cells == 4
+
+
+def test_a_state_goes_on_with_the_values_of_the_scene_that_steps_it():
+    def growing(low, high):
+        return tf.Scene(tf.Growth(rate=tf.Uniform(low, high)), tf.Division(length=3.0), dim=2)
+
+    *_, first = tf.simulate(growing(1.0, 1.1), until=0.5, dt=0.02)
+    *_, last = tf.simulate(growing(2.0, 2.1), first, until=2.0, dt=0.02)
+    assert last.cells >= 4 and bool((last.growth_rate >= 2.0).all())
+
+
+def test_a_rate_by_type_needs_no_typed_founders():
+    scene = tf.Scene(tf.Growth(rate={0: 1.0, 1: 0.5}), dim=2)
+    assert scene.bind().start().growth_rate.tolist() == [1.0]
+    with pytest.raises(tf.InputError, match="a cell has type 0"):
+        tf.Scene(tf.Growth(rate={1: 0.5}), dim=2).bind()
+
+
+def test_an_effect_that_makes_a_field_of_another_length_is_named():
+    @dataclasses.dataclass(frozen=True)
+    class Age(tf.Effect):
+        title, stage = "ageing", 15
+
+        def declares(self, dim):
+            return [tf.Field("age", "time since birth", "h")]
+
+        def writes(self):
+            return ("age",)
+
+        def step(self, state, dt, values):
+            return state.with_fields(age=torch.ones(7))
+
+    model = tf.Scene(tf.Growth(rate=1.0), Age(), dim=2).bind()
+    with pytest.raises(tf.InputError, match=r"ageing made the field 'age' of shape \(7,\)"):
+        model.step(model.start())

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch
 
@@ -183,3 +185,67 @@ def test_a_bound_model_keeps_its_values():
     assert torch.equal(model.step(model.start()).length, before)
     again = scene.bind()
     assert bool((again.step(again.start()).length > before).all())
+
+
+@dataclass(frozen=True, eq=False)
+class Ageing(tf.Effect):
+    """Notes the rates of the cells, looked up by rows."""
+
+    rate: tf.Value = tf.physical(1.0)  # noqa: RUF009
+    title: str = "age"  # type: ignore[misc]
+    stage = 35
+
+    def step(self, state, dt, values):
+        rows = torch.arange(state.cells, device=state.device)
+        assert torch.equal(values.rate.of_rows(state, rows), values.rate.of_cells(state))
+        return state
+
+
+def test_a_kept_value_is_looked_up_by_rows_too():
+    grown(tf.Scene(Ageing(tf.LogNormal(1.0, 0.3)), founders=TYPES), 2)
+
+
+def test_effects_of_one_class_draw_apart_and_keep_apart():
+    """Effects of one title would share one field; with titles of their own they share nothing."""
+    one, two = tf.Uniform(1.0, 2.0), tf.Uniform(11.0, 12.0)
+    with pytest.raises(tf.InputError, match=r"age is listed twice.*'age_rate'.*title of its own"):
+        tf.Scene(Ageing(one), Ageing(two), founders=TYPES)
+    state = tf.Scene(Ageing(one), Ageing(two, "second"), founders=TYPES).bind(20).start()
+    first, second = state.fields["age_rate"], state.fields["second_rate"] - 10.0
+    assert float(second.min()) >= 1.0 and float(second.max()) <= 2.0
+    assert float((first - second).abs().min()) > 1e-4
+    named = tf.Circuit(decay, species=("m",), name="a", k=one)
+    other = tf.Circuit(decay, species=("m",), k=1.0, a_k=two)
+    with pytest.raises(tf.InputError, match=r"a_k of circuit.*'circuit_a_k', which circuit a has"):
+        tf.Scene(named, other, founders=TYPES)
+
+
+def test_types_inherit_alike_and_in_any_order():
+    drawn, kept = tf.LogNormal(1.0, 0.3), tf.LogNormal(1.0, 0.3, inherited=True)
+    with pytest.raises(tf.InputError, match=r"Growth\.rate = \{0: .* must be inherited for all"):
+        tf.Growth(rate={0: kept, 1: drawn})
+    assert tf.Growth(rate={0: kept, 1: kept, 2: 1.0}).rate.is_drawn
+    assert tf.Growth(rate={1: 0.5, 0: 1.0}) == tf.Growth(rate={0: 1.0, 1: 0.5})
+    assert tf.Growth(rate={np.int64(0): 1.0}) == tf.Growth(rate={0: 1.0})
+    rates = {np.int64(1): decay}
+    assert tf.Circuit(rates, species=("m",), k=1.0) == tf.Circuit({1: decay}, species=("m",), k=1.0)
+
+
+def test_a_drawn_value_has_the_gradient_of_its_distribution():
+    low = torch.tensor(1.0, requires_grad=True)
+    for given in (tf.Uniform(low, 2.0), {0: tf.Uniform(low, 2.0), 1: 1.0}):
+        values = tf.Scene(Ageing(given), founders=TYPES).bind().effects[0].values
+        assert values.rate.requires_grad and values.requires_grad
+    values = tf.Scene(Ageing(tf.Uniform(1.0, 2.0)), founders=TYPES).bind().effects[0].values
+    assert not values.requires_grad
+
+
+def test_constants_are_needed_where_the_circuit_runs():
+    """Cells of a type without reactions need no constants."""
+
+    def made(u, s, p, cell):
+        return {"m": p.k}
+
+    scene = tf.Scene(tf.Circuit({1: made}, species=("m",), k={1: 1.0}), founders=TYPES)
+    state = grown(scene, 4)
+    assert state.m.tolist() == pytest.approx([0.0, 0.1])

@@ -18,7 +18,7 @@ import torch
 from torchfilm.resolver import BoundBatch, Resolved, Values, drawn_field, resolve
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, hashing
-from torchfilm.values import ByType, PerColony, Rule, checked, is_drawn
+from torchfilm.values import CELL, COLONY, ByType, PerColony, Rule, checked, is_drawn
 
 if TYPE_CHECKING:
     from torchfilm.tools.hot_reload import HotReload
@@ -99,6 +99,22 @@ class Effect:
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         """All its physical values by name, with their rules."""
         return self.physical_fields()
+
+    def value_owner(self) -> str:
+        """Whose its physical values are, in errors and in the keys of their random numbers. Effects
+        of one class that have titles of their own are told apart."""
+        kind = type(self)
+        own = getattr(kind, "title", None) == self.title
+        return kind.__name__ if own else f"{kind.__name__} {self.title!r}"
+
+    def kept_values(self) -> dict[str, Field]:
+        """The field of each physical value that is drawn for a cell at its birth, by the value's
+        name."""
+        return {
+            name: drawn_field(self.title, name, value)
+            for name, (value, rule) in self.physical_values().items()
+            if value is not None and is_drawn(value) and not rule.drawn_by_effect
+        }
 
     def declares(self, dim: int) -> Sequence[Field]:
         """The fields that this effect adds to the state of a scene in `dim` dimensions.
@@ -207,12 +223,12 @@ class BoundEffect:
 
     @staticmethod
     def _resolve(effect: Effect, batch: BoundBatch) -> dict[str, Resolved | None]:
+        owner, kept = effect.value_owner(), effect.kept_values()
         found = {}
         for name, (value, rule) in effect.physical_values().items():
-            kept = None
-            if value is not None and is_drawn(value) and not rule.drawn_by_effect:
-                kept = drawn_field(effect.title, name, value).name
-            found[name] = resolve(f"{type(effect).__name__}.{name}", value, batch, field=kept)
+            field = kept[name].name if name in kept else None
+            typed = rule.scope == CELL
+            found[name] = resolve(f"{owner}.{name}", value, batch, field=field, typed=typed)
         return found
 
     def declares(self) -> list[Field]:
@@ -223,13 +239,14 @@ class BoundEffect:
         ] + self._value_fields()
 
     def _value_fields(self) -> list[Field]:
+        kept = self.effect.kept_values()
         out = []
-        for name, (value, rule) in self.effect.physical_values().items():
+        for name, (value, _) in self.effect.physical_values().items():
             if isinstance(value, ByType):
                 out.append(CELL_TYPE)
-            if value is not None and is_drawn(value) and not rule.drawn_by_effect:
-                kept = drawn_field(self.effect.title, name, value)
-                out.append(dataclasses.replace(kept, initial=_DrawnValue(self.values[name], name)))
+            if name in kept:
+                first = _DrawnValue(self.values[name])
+                out.append(dataclasses.replace(kept[name], initial=first))
         return out
 
     def _bound(self, field: Field) -> Field:
@@ -275,7 +292,17 @@ class BoundEffect:
 
     def step(self, state: State, dt: float) -> State:
         """The state after this effect has acted for dt hours."""
-        return self.effect.step(state, dt, self.values)
+        after = self.effect.step(state, dt, self.values)
+        rows = {CELL: after.cells, COLONY: after.colonies}
+        for name, value in after.fields.items():
+            scope = after.declared[name].scope
+            if value.shape[0] != rows.get(scope, value.shape[0]):
+                raise checks.InputError(
+                    f"{self.title} made the field {name!r} of shape {tuple(value.shape)}: the state"
+                    f" has {after.cells} cells in {after.colonies} colonies, and this field has one"
+                    f" value for each {scope}."
+                )
+        return after
 
     def numerics(self, dt: float, state: State) -> list[str]:
         """By which methods it is computed, in lines."""
@@ -321,11 +348,12 @@ class _FirstValue:
 
 @dataclass(frozen=True, eq=False)
 class _DrawnValue:
+    """The first value of a field that keeps what is drawn for a cell."""
+
     value: Resolved
-    purpose: str
 
     def __call__(self, state: State, rows: torch.Tensor) -> torch.Tensor:
-        return self.value.of_rows(state, rows)
+        return self.value.drawn(state, rows)
 
 
 def number_range(value: torch.Tensor) -> str:

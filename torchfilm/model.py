@@ -45,17 +45,17 @@ class Model:
     """A scene bound to a batch. Made by `scene.bind(…)`.
 
     effects: what acts in a step, in order. fields: every field of its states by name. batch:
-    colonies, dtype, device. dt: the scene's step, h. `start` gives the first state, `step` the next
-    one. A model holds no state of a run: it may run many states, one after the other or in turn.
-    Values are as they were when the scene was bound; bind again after an optimiser has changed a
-    parameter.
+    colonies, dtype, device. seed: of its first state. dt: the scene's step, h. `start` gives the
+    first state, `step` the next one. A model holds no state of a run: it may run many states, one
+    after the other or in turn. Values are as they were when the scene was bound; bind again after
+    an optimiser has changed a parameter.
     """
 
     def __init__(
         self, scene: Scene, batch: BoundBatch, start: _Start, places: Collection[int] | None
     ):
         self.scene, self.batch, self.dt, self.dim = scene, batch, scene.dt, scene.dim
-        self._begin = start
+        self._begin, self.seed = start, start.seed
         binding = Binding(batch, scene.dt, scene.dim, scene.declared_by)
         bound: list[BoundEffect] = []
         # a model that was bound under torch.no_grad() may be stepped with gradients
@@ -80,7 +80,9 @@ class Model:
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""
         dt = self.dt if dt is None else dt
-        state = state.replace(births=(), ended=(), reports={})
+        # values are this model's, also in a state that another model made
+        declared = {**state.declared, **self._first_fields}
+        state = state.replace(births=(), ended=(), reports={}, declared=declared)
         for effect in self.effects:
             if timings is None:
                 state = effect.step(state, dt)
@@ -109,7 +111,8 @@ class Model:
         for effect in self.effects:
             for field in effect.declares():
                 found.setdefault(field.name, field)
-        return found
+        # first values of other fields may go by type
+        return {n: found[n] for n in sorted(found, key=lambda n: n != "cell_type")}
 
     @torch.no_grad()
     def trace(self, state: State | None) -> State:
@@ -122,6 +125,9 @@ class Model:
         tried = self._laid() if state is None else state
         for effect in self.effects:
             tried = effect.trace(tried)
+        for effect in self.effects:
+            if hasattr(effect, "check_others"):  # now that it is known what rules write
+                effect.check_others(self.effects)
         return tried
 
     # --- checks --------------------------------------------------------------------------
@@ -230,16 +236,20 @@ class Model:
 
     @cached_property
     def recorded(self) -> tuple[int, ...]:
-        """Which effects, by their places in the scene, move, grow, divide or remove cells, or drive
-        what does."""
+        """Which effects, by their places in the scene, move, grow, divide or remove cells, or
+        change or provide what those use."""
         everything = {e.place for e in self.effects}
         if any(e.effect.writes_anything for e in self.effects):
             return tuple(sorted(everything))
-        reads, writes = self._by_place()
+        reads, writes, declares = self._by_place()
         growth = {k for k in everything if writes[k] & set(BUILT_IN)}
         while True:
-            wanted = set().union(*(reads[k] for k in growth))
-            more = {k for k in everything if writes[k] & wanted} - growth
+            fields = [f for k in growth for f in declares[k]]
+            used = {f.name for f in fields}.union(*(reads[k] | writes[k] for k in growth))
+            more = {k for k in everything if writes[k] & used} - growth
+            # what is declared has a first value: who uses a field that it does not declare needs it
+            lacked = {k: {f.name for f in declares[k] if f not in fields} for k in everything}
+            more = more or {k for k in everything if lacked[k] & used} - growth
             if not more:
                 return tuple(sorted(growth))
             growth |= more
@@ -249,14 +259,16 @@ class Model:
         """Which effects, by their places in the scene, act back on nothing of that."""
         return tuple(sorted({e.place for e in self.effects} - set(self.recorded)))
 
-    def _by_place(self) -> tuple[dict[int, set[str]], dict[int, set[str]]]:
+    def _by_place(self) -> tuple[dict[int, set[str]], dict[int, set[str]], dict[int, list[Field]]]:
+        """What the effects at each place of the scene read, write and declare."""
         reads: dict[int, set[str]] = {e.place: set() for e in self.effects}
         writes: dict[int, set[str]] = {e.place: set() for e in self.effects}
+        declares: dict[int, list[Field]] = {e.place: [] for e in self.effects}
         for e in self.effects:
             reads[e.place] |= {*e.reads(), *e.effect.needs()}
-            # what is declared has a first value, and whoever reads that needs it
-            writes[e.place] |= {*e.writes(), *(f.name for f in e.declares())}
-        return reads, writes
+            writes[e.place] |= set(e.writes())
+            declares[e.place] += e.declares()
+        return reads, writes, declares
 
     @cached_property
     def growth_fingerprint(self) -> str:
@@ -350,7 +362,8 @@ def _bind_to_state(scene: Scene, state: State, places: Collection[int] | None) -
     count = max(scene.fixed_colonies if places is None else 1, int(state.colony_id.max()) + 1)
     # what lists of numbers mean was settled when the state was made
     batch = BoundBatch(count, state.dtype, state.device, _types(scene.founders), per_colony=True)
-    streams = torch.arange(count) if count != state.colonies else state.stream
+    # by colony id: the places may be others
+    streams = torch.arange(count, device=state.device).index_copy(0, state.colony_id, state.stream)
     model = Model(scene, batch, _Start(count, state.seed, streams, scene.founders), places)
     model.check(state)
     # what it can be tried on: cells that there are, or else the founders

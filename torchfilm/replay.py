@@ -12,6 +12,7 @@ Both are views of a model: `model.recorded` are the effects that grow the coloni
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -65,7 +66,8 @@ class GrowthRecording:
     scene: any design of it; streams: of random numbers, one colony each; seed, dt (h, by default
     the scene's), dtype and device as in `Scene.bind`. cells: a colony that has as many is grown no
     further, and is empty from the next step; None: all continue. `nbytes` is the memory that it
-    takes. Raises InputError where growth depends on what would only follow.
+    takes. Raises InputError where growth depends on what would only follow. Threads may share it; a
+    step that an exception has interrupted is done again by whoever reads on.
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class GrowthRecording:
         self.fingerprint = design.growth_fingerprint
         self.grown_by = _listing(design)
         self.dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
+        design.check_step(self.dt)
         self.streams, self.cells = tuple(streams), cells
         if len(set(self.streams)) != len(self.streams):
             raise checks.input_error("streams", self.streams, "different integers")
@@ -99,8 +102,7 @@ class GrowthRecording:
         self.state = self.model.start()
         self.steps: list[list[RecordedChange]] = []
         self.failed: dict[int, tuple[int, str]] = {}
-        self._noted: list[RecordedChange] = []
-        self._growing = advance(self._step, self.state)
+        self._lock = threading.Lock()
 
     @property
     def nbytes(self) -> int:
@@ -116,16 +118,19 @@ class GrowthRecording:
     @torch.no_grad()
     def changes(self, step: int) -> list[RecordedChange]:
         """What each effect changed in the step after `step` steps; grown now if it has not been."""
-        while len(self.steps) <= step:
-            self.state = next(self._growing)
-        return self.steps[step]
+        with self._lock:
+            while len(self.steps) <= step:
+                self.state = next(advance(self._step, self.state))
+            return self.steps[step]
 
     def _step(self, state: State) -> State:
-        """The state one step later; what each effect changed is kept."""
+        """The state one step later; what each effect changed is kept. The same step may be done
+        again, with the same result."""
         state = state.replace(births=(), ended=(), reports={})
         noted: list[RecordedChange] = []
-        full = torch.tensor([s in self.failed for s in self.streams], device=state.device)
-        if self.cells is not None and self.steps:
+        failed = {s: (at, why) for s, (at, why) in self.failed.items() if at < state.step}
+        full = torch.tensor([s in failed for s in self.streams], device=state.device)
+        if self.cells is not None and state.step > 0:
             full = full | (state.counts >= self.cells)
         full = full & (state.counts > 0)
         if bool(full.any()):  # or the quick would fill the memory while the slow are waited for
@@ -139,8 +144,9 @@ class GrowthRecording:
             state = after
         for report in state.reports.values():
             for place in torch.nonzero(report.status).squeeze(1).tolist():
-                self.failed.setdefault(self.streams[place], (state.step, report.reason(place)))
-        self.steps.append(noted)
+                failed.setdefault(self.streams[place], (state.step, report.reason(place)))
+        self.failed = failed
+        self.steps[state.step :] = [noted]
         return advanced(state, self.dt)
 
 
@@ -155,6 +161,21 @@ def _check_replayable(model: Model) -> None:
         raise checks.InputError(
             "the growth of this scene cannot be recorded for other designs:"
             f" {model.why_not_replayable}. Run the scene itself."
+        )
+
+
+def _check_alike(model: Model, recorded: Model) -> None:
+    """Raise InputError where a run of the model would draw other random numbers or round in another
+    way than the recording."""
+    mine, other = (
+        f"seed {m.seed}, {m.batch.dtype} on {m.batch.device.type}" for m in (model, recorded)
+    )
+    if mine != other:
+        raise checks.input_error(
+            "model",
+            mine,
+            f"{other}, as the recording is",
+            "Give scene.bind(…) and GrowthRecording the same seed, dtype and device.",
         )
 
 
@@ -221,6 +242,7 @@ class Replay:
                 f"this scene does not grow as the recording did: {mine} and its founders, instead"
                 f" of {', '.join(recording.grown_by)}. Make a GrowthRecording of this scene."
             )
+        _check_alike(model, recording.model)
         device = recording.state.device
         self.streams, self.order = torch.sort(torch.tensor(recording.streams, device=device))
         # each effect with its number among the recorded ones, or None if it only follows
@@ -228,7 +250,10 @@ class Replay:
         self.parts = [
             (e, next(numbers) if e.place in model.recorded else None) for e in model.effects
         ]
-        self.own = [f.name for e, number in self.parts if number is None for f in e.declares()]
+        # fields of those that only follow; what a recorded effect declares as well is recorded
+        recorded = {f.name for e in recording.model.effects for f in e.declares()}
+        following = [e for e, number in self.parts if number is None]
+        self.own = [f.name for e in following for f in e.declares() if f.name not in recorded]
 
     def start(self) -> State:
         """The first state of the model, whose colonies follow streams of the recording."""
@@ -249,7 +274,8 @@ class Replay:
             self._check_streams(state)
         place = self.order.index_select(0, torch.searchsorted(self.streams, state.stream))
         changes = {change.part: change for change in self.recording.changes(number)}
-        state = state.replace(births=(), ended=(), reports={})
+        declared = {**state.declared, **self.model._first_fields}  # as in Model.step
+        state = state.replace(births=(), ended=(), reports={}, declared=declared)
         if FIRST in changes:
             state = self._apply(state, changes[FIRST], place)
         for effect, part in self.parts:

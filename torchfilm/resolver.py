@@ -54,24 +54,30 @@ class Resolved:
         assert self.value is not None and self.types is None
         return self.value if self.value.dim() == 0 else self.value.index_select(0, state.colony_id)
 
-    def of_cells(self, state: State) -> Tensor:
-        """0-dim, or (N,) for the cells of a state."""
+    def of_cells(self, state: State, kind: int | None = None) -> Tensor:
+        """0-dim, or (N,) for the cells of a state. kind: as if all cells were of this type."""
         if self.field is not None:
             return state.fields[self.field]
         if self.types is not None:
-            return self._by_type(state, state.fields["cell_type"], None)
+            own = state.fields["cell_type"]
+            return self._by_type(state, own if kind is None else torch.full_like(own, kind), None)
         found = self.of_colonies(state)
         return found if found.dim() == 0 else found.index_select(0, state.colony)
 
     def of_rows(self, state: State, rows: Tensor, purpose: str | None = None) -> Tensor:
-        """(M,) for the cells `rows` (M,); drawn now where the value is a distribution, by the key
-        `purpose`."""
-        if self.draw is not None:
-            return self.draw(state, rows, purpose or self.name)
+        """(M,) for the cells `rows` (M,); drawn now, by the key `purpose`, where the value is a
+        distribution and no field keeps it."""
+        if self.draw is not None and self.field is None:
+            return self.drawn(state, rows, purpose)
         if self.types is not None:
             return self._by_type(state, state.fields["cell_type"].index_select(0, rows), rows)
         found = self.of_cells(state)
         return found.expand(rows.numel()) if found.dim() == 0 else found.index_select(0, rows)
+
+    def drawn(self, state: State, rows: Tensor, purpose: str | None = None) -> Tensor:
+        """(M,) for the cells `rows` (M,), drawn now by the key `purpose`, or else by its name."""
+        assert self.draw is not None
+        return self.draw(state, rows, purpose or self.name)
 
     def _by_type(self, state: State, kind: Tensor, rows: Tensor | None) -> Tensor:
         assert self.types is not None and self.value is not None
@@ -86,6 +92,8 @@ class Resolved:
 
     @property
     def requires_grad(self) -> bool:
+        if self.draw is not None:
+            return self.draw.requires_grad
         return self.value is not None and self.value.requires_grad
 
     @cached_property
@@ -121,6 +129,11 @@ class BoundDraw:
         if not bool(known.all()):
             raise _missing_type(self.name, int(kind[~known][0]), [n for n, _ in self.parts])
         return out
+
+    @property
+    def requires_grad(self) -> bool:
+        each = (part if isinstance(part, Resolved) else part[1] for _, part in self.parts)
+        return any(x.requires_grad for x in each)
 
     @staticmethod
     def _part(part: Any, state: State, rows: Tensor, purpose: str) -> Tensor:
@@ -160,10 +173,11 @@ class Values:
 
 
 def resolve(
-    name: str, value: Any, batch: BoundBatch, *, field: str | None = None
+    name: str, value: Any, batch: BoundBatch, *, field: str | None = None, typed: bool = True
 ) -> Resolved | None:
     """A checked value, made ready for a batch. field: where a value drawn at birth is kept; None:
-    the caller draws."""
+    the caller draws. typed: whether the value may also be one per cell type, so that a list of as
+    many numbers can be meant as either."""
     if value is None:
         return None
     if is_drawn(value):
@@ -174,7 +188,7 @@ def resolve(
         if any(v.dim() for v in each):
             each = [v.expand(batch.colonies) for v in each]
         return Resolved(name, torch.stack(each), types=torch.tensor(kinds, device=batch.device))
-    return Resolved(name, _per_colony(name, value, batch))
+    return Resolved(name, _per_colony(name, value, batch, listed=typed))
 
 
 def _bound_draw(name: str, value: Any, batch: BoundBatch) -> BoundDraw:
@@ -186,7 +200,7 @@ def _bound_draw(name: str, value: Any, batch: BoundBatch) -> BoundDraw:
             (
                 _distribution(f"{name}[{kind}]", v, batch)
                 if isinstance(v, Distribution)
-                else resolve(f"{name}[{kind}]", v, batch)
+                else resolve(f"{name}[{kind}]", v, batch, typed=False)
             ),
         )
         for kind, v in sorted(value.values.items())
@@ -196,7 +210,7 @@ def _bound_draw(name: str, value: Any, batch: BoundBatch) -> BoundDraw:
 
 def _distribution(name: str, value: Distribution, batch: BoundBatch) -> tuple[Distribution, Values]:
     return value, Values(
-        {p: resolve(f"{name}.{p}", getattr(value, p), batch) for p in value.parameters}
+        {p: resolve(f"{name}.{p}", getattr(value, p), batch, typed=False) for p in value.parameters}
     )
 
 

@@ -246,6 +246,11 @@ def _check_fields(effects: Sequence[Effect], dim: int, founders: Cells) -> dict[
                     " rename one." + effect.clash_hint(f.name)
                 )
             declared.setdefault(f.name, (f, effect.title))
+    for effect in effects:
+        for value, f in effect.kept_values().items():
+            if f.name in declared:
+                raise checks.InputError(_kept_twice(effect, value, f.name, declared[f.name][1]))
+            declared[f.name] = (f, effect.title)
     names = {name: title for name, (_, title) in declared.items()}
     for effect in effects:
         for name in effect.needs():
@@ -260,6 +265,20 @@ def _check_fields(effects: Sequence[Effect], dim: int, founders: Cells) -> dict[
                     )
                 )
     return names
+
+
+def _kept_twice(effect: Effect, value: str, field: str, other: str) -> str:
+    """What is wrong where a value drawn at birth would be kept in another one's field."""
+    if other == effect.title:
+        return (
+            f"{effect.title} is listed twice, and both draw their {value} for each cell, kept in"
+            f" the one field {field!r}. Give each a title of its own: make title a field or a"
+            f" property of {type(effect).__name__}."
+        )
+    return (
+        f"the {value} of {effect.title}, drawn for each cell, is kept in the field {field!r}, which"
+        f" {other} has, too: rename one."
+    )
 
 
 def _signal_hint(name: str, declared: Iterable[str]) -> str:

@@ -37,10 +37,10 @@ def simulate(
     cells: int | None = None,
     dt: float | None = None,
     colonies: int | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     streams: Sequence[int] | Tensor | None = None,
-    device: str | torch.device = "cpu",
-    dtype: torch.dtype = torch.float32,
+    device: str | torch.device | None = None,
+    dtype: torch.dtype | None = None,
     record: str | Path | Recorder | None = None,
     observers: Sequence[Observer] = (),
     on_failure: str = "raise",
@@ -49,23 +49,26 @@ def simulate(
 ) -> Iterator[State]:
     """Run a scene, yielding the state after each step.
 
-    scene: a scene, which is bound here to `colonies` colonies (`seed`, `streams`, `device` and
-    `dtype` as in `Scene.bind`), or a model. state: start from this one instead. until: time to stop
-    at, h. cells: stop once every colony has this many cells, or none at all. At least one of the
-    two; the first reached ends the run. dt: step, h; by default the scene's. record: path of a new
-    results file (every tenth step and the last), or a Recorder. observers: called with the first
-    state and after every step. progress: show a progress bar. on_failure: "raise" a SimulationError
-    that names the colonies that failed (a solve that did not converge, a cell too short to divide),
-    or "drop" their cells, note it, and continue.
+    scene: a scene, which is bound here to `colonies` colonies, or a model. seed, streams, device,
+    dtype: as in `Scene.bind`, by default 0, stream k for colony k, "cpu" and torch.float32. Where a
+    model or a state is given, these and `colonies` are its own and must be left out. state: start
+    from this one instead. until: time to stop at, h. cells: stop once every colony has this many
+    cells, or none at all. At least one of the two; the first reached ends the run. dt: step, h; by
+    default the scene's. record: path of a new results file (every tenth step and the last), or a
+    Recorder. observers: called with the first state and after every step. progress: show a progress
+    bar. on_failure: "raise" a SimulationError that names the colonies that failed (a solve that did
+    not converge, a cell too short to divide), or "drop" their cells, note it, and continue.
     """
     _check_kinds("simulate", scene, state)
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
     observers = (observers,) if callable(observers) else tuple(observers)
     _check_options(record, observers, until, cells, on_failure)
-    _check_batch(state, colonies, streams)
+    given = dict(colonies=colonies, seed=seed, streams=streams, device=device, dtype=dtype)
+    batch = {name: value for name, value in given.items() if value is not None}
+    _check_batch(scene, state, batch)
     if state is not None and until is not None:
         _last_step(state, checks.number("until", until), dt)
-    model = _bound(scene, state, colonies, seed, streams, device, dtype)
+    model = _bound(scene, state, batch)
     state = model.start() if state is None else state
     last = math.inf if until is None else _last_step(state, checks.number("until", until), dt)
     model.check(state)
@@ -77,11 +80,8 @@ def simulate(
     if recorder is not None:
         recorder.attach(model, dt)
     monitors = _monitors(recorder, observers, cells if until is None else None, on_failure, timings)
-    bar = (
-        progress_bar(f"{model.scene.name}: {state.colonies} colonies", state, cells, until)
-        if progress
-        else None
-    )
+    what = f"{model.scene.name}: {state.colonies} colonies"
+    bar = progress_bar(what, state, cells, until) if progress else None
     first = (*((recorder,) if recorder else ()), *observers)
     step = partial(model.step, dt=dt, timings=timings)
     return _run(
@@ -120,13 +120,18 @@ def _check_options(
         raise checks.input_error("cells", cells, "an integer from 1")
 
 
-def _check_batch(state: State | None, colonies: object, streams: object) -> None:
+def _check_batch(scene: Scene | Model, state: State | None, batch: dict[str, Any]) -> None:
     """Raise InputError where a batch is described twice."""
-    for name, given in (("colonies", colonies), ("streams", streams)):
-        if state is not None and given is not None:
-            raise checks.input_error(
-                name, given, "left out where a state is given", "The state has its own."
-            )
+    if not batch or (state is None and isinstance(scene, Scene)):
+        return
+    name, given = next(iter(batch.items()))
+    what = "model" if state is None else "state"
+    raise checks.input_error(
+        name,
+        given,
+        f"left out where a {what} is given",
+        f"The {what} has its own, from scene.bind({name}=…).",
+    )
 
 
 def _monitors(
@@ -190,10 +195,11 @@ def rollout(
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
     if isinstance(segment, bool) or not isinstance(segment, int) or segment < 1:
         raise checks.input_error("segment", segment, "an integer number of steps from 1")
-    model = _bound(scene, state, None, 0, None, "cpu", torch.float32)
+    model = _bound(scene, state, {})
     state = model.start() if state is None else state
     last = _last_step(state, checks.number("until", until), dt)
     model.check(state)
+    model.check_step(dt)
     monitors = [partial(handle_failures, on_failure="raise")]
 
     def segment_of(begin: State, steps: int) -> State:
@@ -208,12 +214,10 @@ def rollout(
     return state
 
 
-def _bound(scene, state, colonies, seed, streams, device, dtype) -> Model:
+def _bound(scene: Scene | Model, state: State | None, batch: dict[str, Any]) -> Model:
     if isinstance(scene, Model):
         return scene
-    if state is not None:
-        return scene.bind(state=state)
-    return scene.bind(colonies, seed=seed, streams=streams, device=device, dtype=dtype)
+    return scene.bind(**batch) if state is None else scene.bind(state=state)
 
 
 def _check_kinds(name: str, scene: object, state: object) -> None:

@@ -18,6 +18,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -99,7 +100,7 @@ def checked(name: str, given: object, rule: Rule) -> Any:
         return given
     if isinstance(given, Mapping):
         for kind in given:
-            if isinstance(kind, bool) or not isinstance(kind, int) or kind < 0:
+            if isinstance(kind, bool) or not isinstance(kind, Integral) or kind < 0:
                 raise checks.input_error(
                     f"{name}, cell type", kind, "an integer from 0", "Write {0: 0.6, 1: 1.2}."
                 )
@@ -107,10 +108,18 @@ def checked(name: str, given: object, rule: Rule) -> Any:
             raise checks.input_error(
                 name, dict(given), "one value for each cell type, such as {0: 0.6, 1: 1.2}"
             )
-        each = dataclasses.replace(rule)
-        return ByType(
-            {kind: checked(f"{name}[{kind}]", value, each) for kind, value in given.items()}
+        by_type = ByType(
+            {int(k): checked(f"{name}[{k}]", value, rule) for k, value in sorted(given.items())}
         )
+        drawn = [v for v in by_type.values.values() if isinstance(v, Distribution)]
+        if len({v.inherited for v in drawn}) > 1:
+            raise checks.input_error(
+                name,
+                by_type,
+                "inherited for all cell types that it is drawn for, or for none",
+                "Give each distribution inherited=True, or none of them.",
+            )
+        return by_type
     if isinstance(given, PerColony):
         inner = checks.value(name, given.values, **bounds)
         if not isinstance(inner, Tensor) or inner.dim() != 1:
@@ -186,3 +195,15 @@ class Distribution:
 
 
 Value = float | Tensor | Sequence[float] | Mapping[int, Any] | Distribution | PerColony
+
+
+def quotient(number: float, name: str, value: Any) -> Any:
+    """number / value, given in the way that the value is. Raises InputError for a drawn value."""
+    if isinstance(value, ByType):
+        return {kind: quotient(number, f"{name}[{kind}]", v) for kind, v in value.values.items()}
+    if isinstance(value, PerColony):
+        return PerColony(number / torch.as_tensor(value.values))
+    if isinstance(value, Distribution):
+        allowed = "a value that is not drawn, where the settings set a penalty"
+        raise checks.input_error(name, value, allowed, "Leave the penalty out of the settings.")
+    return number / value

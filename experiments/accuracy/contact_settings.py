@@ -74,7 +74,9 @@ class ContactSetting:
 
         A row of a wall has half the entries of a row between two cells and counts half.
         """
-        return counter.bytes / (2 * self.mechanics.settings.degrees * torch.finfo(self.dtype).bits // 8)
+        return counter.bytes / (
+            2 * self.mechanics.settings.degrees * torch.finfo(self.dtype).bits // 8
+        )
 
 
 def with_passes(mechanics: tf.Mechanics, passes: int) -> tf.Mechanics:

@@ -90,9 +90,7 @@ def one_by_one(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
     ):
         found += [
             ContactSetting(
-                series,
-                plain if v == usual else _changed(plain, knob, v),
-                default=v == usual,
+                series, plain if v == usual else _changed(plain, knob, v), default=v == usual
             )
             for v in values
         ]

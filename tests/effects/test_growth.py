@@ -236,6 +236,42 @@ def test_bad_rates_are_refused(rate):
         tf.Growth(rate=rate)
 
 
+@pytest.mark.parametrize(
+    ("rate", "name"),
+    [
+        (60.0, "Growth.rate"),
+        ([0.5, 60.0], "Growth.rate"),
+        ({0: 0.5, 1: 60.0}, "Growth.rate of cell type 1"),
+        ({0: 0.5, 1: tf.Uniform(60.0, 70.0)}, "Growth.rate of cell type 1"),
+    ],
+)
+def test_a_step_in_which_the_fastest_cell_more_than_doubles_is_refused(rate, name):
+    cells = tf.Cells([[0.0, 0.0], [0.0, 3.0]], [1.0, 0.0], cell_type=[0, 1])
+    founders = cells if isinstance(rate, dict) else one_cell()
+    scene = scene_of(rate, "volume", founders, tf.Division(length=3.0))
+    for run in (tf.simulate, tf.rollout):
+        with pytest.raises(tf.InputError, match=rf"too long for {name} = 60/h"):
+            run(scene, until=0.05)
+
+
+def test_the_tail_of_a_distribution_may_be_too_fast_for_the_step():
+    scene = scene_of(tf.Uniform(1.0, 60.0), "volume", one_cell(), tf.Division(length=3.0))
+    scene.bind().check_step(scene.dt)
+
+
+def test_a_rule_may_not_set_the_rate_where_it_goes_by_type():
+    def update(cells):
+        cells.growth_rate = 2.1
+
+    cells = tf.Cells([[0.0, 0.0], [0.0, 3.0]], [1.0, 0.0], cell_type=[0, 1])
+    scene = scene_of({0: 1.0, 1: 0.5}, "volume", cells, tf.Rules(update))
+    with pytest.raises(tf.InputError, match=r"sets growth_rate, but Growth\.rate = .*cell_type"):
+        scene.bind()
+    one_rate = scene_of(1.0, "volume", cells, tf.Rules(update))
+    state = step(one_rate, one_rate.bind().start(), 0.1)
+    assert state.growth_rate.tolist() == pytest.approx([2.1, 2.1])
+
+
 def test_unknown_law_is_refused():
     with pytest.raises(tf.InputError, match=r"Growth\.law.*'volume'"):
         tf.Growth(rate=1.0, law="logistic")

@@ -69,8 +69,10 @@ def test_two_passes_are_the_default_in_space(device, dtype):
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("unilateral", [False, True])
 def test_a_number_of_passes_leaves_the_overlap_as_it_is(dim, unilateral):
-    """More passes than usual solve the same cells as the usual ones do, to a fifth of a radius; only
-    colonies that take sub-steps take at least 6."""
+    """More passes than usual solve the same cells as the usual ones do, to a fifth of a radius.
+
+    Colonies that take sub-steps take at least 6.
+    """
     usual = tf.Mechanics(dim=dim, unilateral=unilateral).settings
     assert usual.passes == (dim - 1) * (1 + unilateral) and usual.overlap is None
     for passes in (usual.passes, 4, 8):
@@ -109,9 +111,7 @@ def test_a_later_pass_moves_only_what_is_too_deep(device, dtype):
     assert not bool(moved[:RODS].all())
 
 
-def every_pair(
-    cells: CellProperties, at: Moved, active: torch.Tensor
-) -> tuple[list, torch.Tensor]:
+def every_pair(cells: CellProperties, at: Moved, active: torch.Tensor) -> tuple[list, torch.Tensor]:
     """The pairs that a later pass should find, by a search over all pairs.
 
     These are the pairs with a cell that takes part. Also which cells take part, (N,) bool.
@@ -305,7 +305,9 @@ def test_a_pass_is_as_fine_as_asked(device, dtype):
     )
     assert (
         float(
-            first_step(device, dtype, passes=2, overlap=0.02, tolerance=1e-3).reports["mechanics"].residual.max()
+            first_step(device, dtype, passes=2, overlap=0.02, tolerance=1e-3)
+            .reports["mechanics"]
+            .residual.max()
         )
         <= 1e-3
     )

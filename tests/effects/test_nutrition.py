@@ -255,3 +255,9 @@ def test_what_is_missing_is_told():
 def test_explain_says_who_drives_whom():
     said = eating(tf.Monod("food")).bind().describe()
     assert "nutrition -> growth: growth_rate" in said and "transport -> nutrition: out.food" in said
+
+
+def test_a_step_in_which_a_fed_cell_more_than_doubles_is_refused():
+    scene = eating(tf.Monod("food", rate=[0.5, 60.0]), more=(tf.Division(length=3.0),))
+    with pytest.raises(InputError, match=r"too long for Monod\.rate = 60/h"):
+        tf.simulate(scene, until=0.05)

@@ -219,4 +219,5 @@ class Undeclared(tf.Effect):
 def test_what_is_not_declared_is_found():
     model = tf.Scene(*body(), Undeclared()).bind()
     wrong, _ = undeclared(model, model.start())
-    assert wrong == ["undeclared reads length", "undeclared reads radius", "undeclared writes length"]
+    parts = ("reads length", "reads radius", "writes length")
+    assert wrong == [f"undeclared {part}" for part in parts]

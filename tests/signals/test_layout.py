@@ -48,7 +48,7 @@ def test_steppers_belong_to_one_grid_and_go_with_it():
     second = model.step(model.start(), 0.1)
     gc.collect()
     assert set(steppers) == {first.layout.grid, second.layout.grid}
-    assert list(steppers[second.layout.grid].values())[0] is not made[0][0]
+    assert next(iter(steppers[second.layout.grid].values())) is not made[0][0]
     del second
     gc.collect()
     assert set(steppers) == {first.layout.grid}

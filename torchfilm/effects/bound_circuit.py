@@ -253,7 +253,7 @@ class BoundCircuit(BoundEffect):
                 concentrations,
                 dt,
                 settings,
-                None if keys is None else partial(_draw, keys, rows),
+                None if keys is None else partial(_draw, keys, rows, circuit.name),
             )
             report.note(cells, made, concentrations, circuit.method, dt)
             for name, value in zip(self.fields, made.concentrations.unbind(1), strict=True):
@@ -293,7 +293,9 @@ class BoundCircuit(BoundEffect):
         pool, in_reservoir = (None, None) if medium is None else (medium.pool, medium.in_reservoir)
         if isinstance(part, run.Network):
             exchanged = part.signals
-        p = {n: Lazy(partial(self.values[n].of_cells, state)) for n in self.effect.parameters}
+        # other cells need no constants
+        own = None if isinstance(kind, str) else kind
+        p = {n: Lazy(partial(self.values[n].of_cells, state, own)) for n in self.effect.parameters}
         return run.CircuitCells(
             part,
             tuple(self.effect.variables),
@@ -309,8 +311,11 @@ class BoundCircuit(BoundEffect):
         )
 
 
-def _draw(keys: Any, rows: Tensor, mine: Tensor, event: int, what: str, count: int) -> Tensor:
-    return keys(rows.index_select(0, mine), event, what, count)
+def _draw(
+    keys: Any, rows: Tensor, name: str, mine: Tensor, event: int, what: str, count: int
+) -> Tensor:
+    """Random numbers of a circuit's own: circuits of one scene differ by their names."""
+    return keys(rows.index_select(0, mine), event, f"{name} {what}" if name else what, count)
 
 
 def _half_way(state: State, volume_field: str) -> State:

@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -105,7 +106,7 @@ class Circuit(Effect):
             raise checks.input_error("Circuit.name", name, 'an identifier, such as "toggle"')
         first = Rule(least=0.0)
         given = {
-            "rates": by_type,
+            "rates": {k if isinstance(k, str) else int(k): part for k, part in by_type.items()},
             "species": names,
             "name": name,
             "shared": others,
@@ -132,6 +133,9 @@ class Circuit(Effect):
     @property
     def may_repeat(self) -> bool:  # type: ignore[override]
         return bool(self.name)
+
+    def value_owner(self) -> str:
+        return f"Circuit {self.name!r}" if self.name else "Circuit"
 
     @property
     def is_stochastic(self) -> bool:
@@ -233,7 +237,8 @@ class _First:
     def __call__(self, state: State, rows: Tensor, values: Values) -> Tensor:
         circuit, name = self.circuit, self.species
         if not state.births:
-            return values[EACH_CELL.format(name)].of_rows(state, rows, f"Circuit.{name}")
+            first = values[EACH_CELL.format(name)]
+            return first.of_rows(state, rows, f"Circuit.{circuit.variables[name]}")
         births, own = state.births[-1], circuit.variables[name]
         amount = births.parents.fields[own] * births.parents.fields[circuit.volume_field]
         volumes = [state.volume.index_select(0, r) for r in (births.first, births.second)]
@@ -285,7 +290,7 @@ def _check_species(names: tuple[str, ...], shared: Mapping[str, str]) -> None:
 
 def _check_rates(by_type: Mapping[int | str, Any], typed: bool) -> None:
     for kind, part in by_type.items():
-        if typed and (isinstance(kind, bool) or not isinstance(kind, int)):
+        if typed and (isinstance(kind, bool) or not isinstance(kind, Integral)):
             raise checks.input_error("Circuit.rates", kind, "by cell types that are integers")
         if not callable(part) and not (isinstance(part, (list, tuple)) and part):
             raise checks.input_error(

@@ -16,7 +16,8 @@ from torchfilm.effect import GROWTH, Binding, BoundEffect, Effect
 from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
-from torchfilm.values import ByType, Value, is_drawn, is_inherited, physical, smallest
+from torchfilm.tools.doubling import check_doubling
+from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 LAWS = ("volume", "length", "linear")
 UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}
@@ -45,7 +46,9 @@ class Growth(Effect):
     """Cells grow longer.
 
     rate: 1/h (µm/h with law "linear"): a number, one per colony, one per cell type, or a
-    distribution drawn at birth. None: cells grow at whatever rules or nutrition write to
+    distribution drawn at birth. A rate by type follows the cell's type, and no rule may set
+    `growth_rate` then; where a type's rate is drawn, it is drawn when the cell is made and does not
+    follow a later change of type. None: cells grow at whatever rules or nutrition write to
     `growth_rate`, at first 0. law: "volume", dV/dt = rate·V, so that ln 2/rate is the doubling time
     whatever the shape (the paper's wording); "length", dl/dt = rate·l of the centreline (the
     authors' program); "linear", dl/dt = rate. Exponentials are exact over a step.
@@ -100,19 +103,18 @@ class Growth(Effect):
             warnings.warn(
                 "Growth() has no rate, and no rule or nutrition sets growth_rate: nothing grows."
                 " Write tf.Growth(rate=1.0), in 1/h.",
-                stacklevel=4,
+                stacklevel=3,
             )
 
     def check_step(self, dt: float, divides: bool) -> None:
         if self.rate is None or not divides or self.law == "linear":
             return
-        rate = smallest(self.rate)
-        if rate * dt > math.log(2.0):
-            raise checks.InputError(
-                f"dt = {dt:g} h is too long for Growth.rate = {rate:g}/h: a cell would be due to"
-                f" divide more than once in a step. Take dt below {math.log(2.0) / rate:.2g} h;"
-                f" {math.log(2.0) / rate / 28:.1g} h is usual. (Rates are per hour.)"
-            )
+        each = self.rate.values if isinstance(self.rate, ByType) else {None: self.rate}
+        for kind, rate in each.items():
+            where = "" if kind is None else f" of cell type {kind}"
+            # of a distribution the least, since its tail is rarely drawn
+            fastest = smallest(rate) if is_drawn(rate) else largest(rate)
+            check_doubling(f"Growth.rate{where}", fastest, dt)
 
     def numerics(self, dt: float, state: State) -> list[str]:
         held = "; what contacts hold back is taken off afterwards"
@@ -149,17 +151,30 @@ class Growth(Effect):
 class _BoundGrowth(BoundEffect):
     """The drawn rate is the field growth_rate itself."""
 
-    def trace(self, state: State) -> State:
-        if self.effect.law != "linear" and state.cells:  # type: ignore[attr-defined]
-            usual = float(state.growth_rate.median())
-            if 0 < usual < 0.05 and state.step == 0 and self.effect.rate is not None:  # type: ignore[attr-defined]
-                warnings.warn(
-                    f"Growth.rate is {usual:g} per hour: a doubling takes"
-                    f" {math.log(2.0) / usual:.0f} h. Rates are per hour; a rate per minute is to"
-                    f" be multiplied by 60 ({60 * usual:g}).",
-                    stacklevel=2,
+    effect: Growth
+
+    def check_others(self, effects: Sequence[BoundEffect]) -> None:
+        """Raise InputError where a rate by cell type would undo what another effect sets."""
+        for other in effects if self.effect.by_type else ():
+            if other is not self and "growth_rate" in other.writes():
+                raise checks.InputError(
+                    f"{other.title} sets growth_rate, but Growth.rate = {self.effect.rate!r} sets"
+                    " it again by cell type in every step. Set cell_type instead, or give Growth"
+                    " one rate, or none."
                 )
-        return self.ready(state)
+
+    def check(self, state: State) -> None:
+        super().check(state)
+        if self.effect.law == "linear" or self.effect.rate is None or not state.cells:
+            return
+        usual = float(state.growth_rate.detach().median())
+        if 0 < usual < 0.05:
+            warnings.warn(
+                f"Growth.rate is {usual:g} per hour: a doubling takes"
+                f" {math.log(2.0) / usual:.0f} h. Rates are per hour; a rate per minute is to"
+                f" be multiplied by 60 ({60 * usual:g}).",
+                stacklevel=2,
+            )
 
 
 def _first_rate(state: State, rows: Tensor, values: Values) -> Tensor:

@@ -31,7 +31,7 @@ from torchfilm.resolver import Values, snapshot
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
-from torchfilm.values import Rule, Value, checked, numbers, physical, smallest
+from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, smallest
 
 MOST_SUBSTEPS = 1000
 # A colony whose contacts do not hold has more than this share of its cells (of MANY, if it has
@@ -298,7 +298,7 @@ class Mechanics(Effect):
                 "overlap": close if self.overlap is None else self.overlap,
             }
         if settings.penalty is not None and self.stiffness is None:
-            changed["alpha"] = _over(settings.penalty, self.length_drag)
+            changed["alpha"] = quotient(settings.penalty, "Mechanics.length_drag", self.length_drag)
         return replace(self, **changed) if changed else self
 
     def _penalty(self, settings: Any) -> float:
@@ -308,18 +308,6 @@ class Mechanics(Effect):
         if settings.penalty is not None:
             return settings.penalty
         return PENALTY if self.alpha is None else smallest(self.alpha) * smallest(self.length_drag)
-
-
-def _over(penalty: float, drag: Any) -> Any:
-    """penalty / drag, given in the way that the drag is."""
-    if isinstance(drag, (float, Tensor)):
-        return penalty / drag
-    raise checks.input_error(
-        "Mechanics.length_drag",
-        drag,
-        "a number, or one per colony, where a penalty is set",
-        "Give Mechanics(alpha=…).",
-    )
 
 
 class _BoundMechanics(BoundEffect):

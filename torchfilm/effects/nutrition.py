@@ -15,7 +15,8 @@ from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
-from torchfilm.values import Value, physical
+from torchfilm.tools.doubling import check_doubling
+from torchfilm.values import Value, is_drawn, largest, physical, smallest
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,11 @@ class Monod(Effect):
             "each cell by the stiff solver, with its default tolerances; the medium loses what"
             " cells take up, to rounding"
         ]
+
+    def check_step(self, dt: float, divides: bool) -> None:
+        if divides:
+            fastest = smallest(self.rate) if is_drawn(self.rate) else largest(self.rate)
+            check_doubling("Monod.rate", fastest, dt)
 
     def check(self, state: State, values: Values) -> None:
         unit = state.declared["growth_rate"].unit

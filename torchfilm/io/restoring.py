@@ -63,7 +63,7 @@ def _template(results: Results, scene: Scene, device: torch.device, changed: boo
     about = results.attributes
     model = bind(
         scene,
-        int(results.colony_id.max()) + 1,
+        max(scene.fixed_colonies, int(results.colony_id.max()) + 1),
         seed=int(about["seed"]),
         dtype=getattr(torch, str(about["dtype"])),
         device=device,

@@ -45,8 +45,9 @@ class Wall:
             )
         for which, most in (("stiffness", math.inf), ("weight", 1.0)):
             given = getattr(self, which)
-            # the effect checks values by cell type and distributions
-            if given is not None and not isinstance(given, Mapping) and not hasattr(given, "draw"):
+            # the effect checks a value per colony (stated), by cell type or drawn
+            stated = hasattr(given, "values") and not isinstance(given, Tensor)
+            if given is not None and not stated and not hasattr(given, "draw"):
                 made = checks.value(f"{name}.{which}", given, above=0.0, most=most)
                 object.__setattr__(self, which, made)
 
@@ -63,7 +64,9 @@ class Wall:
 
 
 def _each(given: Any) -> list[Any]:
-    return list(given.values()) if isinstance(given, Mapping) else [given]
+    if isinstance(given, Tensor) or not hasattr(given, "values"):
+        return [given]
+    return list(given.values()) if isinstance(given, Mapping) else [given.values]
 
 
 def _below_one(given: Any) -> bool:

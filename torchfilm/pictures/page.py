@@ -213,7 +213,8 @@ def fill(ax: Axes, frame: Frame, place: int, layout: PanelLayout, titles: Sequen
         ax.set_facecolor("black")
     add_walls(ax, frame.walls, int(frame.colony_id[place]), layout.style.view)
     add_cells(ax, cells, layout.scales, layout.style)
-    inches = ax.get_position().width * ax.figure.get_figwidth() + 0.5 * GAP  # type: ignore[union-attr]
+    whole = ax.figure.get_figwidth()  # type: ignore[union-attr]
+    inches = ax.get_position().width * whole + 0.5 * GAP
     ax.set_title(next((t for t in titles if LETTER * len(t) <= inches), ""), fontsize=7, pad=2.5)
 
 

@@ -57,7 +57,8 @@ def build_operator(
     or ([B,] nx, ny, nz). B is `colonies`. Raises InputError for values or shapes that are not
     allowed.
     """
-    given = _OperatorInput(tuple(shape), checks.vector("spacing", spacing, 3), colonies, device)  # type: ignore[arg-type]
+    spacing = checks.vector("spacing", spacing, 3)
+    given = _OperatorInput(tuple(shape), spacing, colonies, device)  # type: ignore[arg-type]
     boundary = BoundaryConditions() if boundary is None else boundary
     rate = given.number("diffusion", diffusion, least=0.0)
     open_ = None if mask is None else given.grid("mask", mask, torch.bool)

@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from torchfilm.scene import Scene
+from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tuning.candidates import LARGER, MORE, UNSURE
 from torchfilm.tuning.observables import SIGNAL, AccuracyProbe, begin, observables, species
@@ -79,19 +80,7 @@ def tune(
     many, watch = math.ceil(LARGER * cells), watch or (lambda words: None)
     watch(f"growing {colonies} colonies to {many} cells")
     probe = begin(scene, many, colonies, of, seed, device)
-    if of is not None:
-        known = list(
-            dict.fromkeys(
-                [
-                    *observables(probe.start),
-                    *species(probe.start),
-                    *(SIGNAL + n for n in probe.start.signals),
-                ]
-            )
-        )
-        for name in of:
-            if name not in known:
-                raise checks.input_error("of", name, "among " + ", ".join(known))
+    _check_names(of, probe.start)
     for more in (2, 4) if scene.fixed_colonies == 1 else ():
         if _uncertainty(probe) <= UNSURE * error:
             break
@@ -103,6 +92,15 @@ def tune(
     return SettingsSearch(
         probe, other, error, watch, finer if scene.fixed_colonies == 1 else None
     ).run()
+
+
+def _check_names(of: Sequence[str] | None, state: State) -> None:
+    """Raise InputError for an observable that the scene has not."""
+    signals = [SIGNAL + name for name in state.signals]
+    known = list(dict.fromkeys([*observables(state), *species(state), *signals]))
+    for name in of or ():
+        if name not in known:
+            raise checks.input_error("of", name, "among " + ", ".join(known))
 
 
 @torch.no_grad()
