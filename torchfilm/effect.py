@@ -18,7 +18,7 @@ import torch
 from torchfilm.resolver import BoundBatch, Resolved, Values, drawn_field, resolve
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, hashing
-from torchfilm.values import CELL, COLONY, ByType, PerColony, Rule, checked, is_drawn
+from torchfilm.values import CELL, ByType, PerColony, Rule, checked, is_drawn
 
 if TYPE_CHECKING:
     from torchfilm.tools.hot_reload import HotReload
@@ -292,17 +292,7 @@ class BoundEffect:
 
     def step(self, state: State, dt: float) -> State:
         """The state after this effect has acted for dt hours."""
-        after = self.effect.step(state, dt, self.values)
-        rows = {CELL: after.cells, COLONY: after.colonies}
-        for name, value in after.fields.items():
-            scope = after.declared[name].scope
-            if value.shape[0] != rows.get(scope, value.shape[0]):
-                raise checks.InputError(
-                    f"{self.title} made the field {name!r} of shape {tuple(value.shape)}: the state"
-                    f" has {after.cells} cells in {after.colonies} colonies, and this field has one"
-                    f" value for each {scope}."
-                )
-        return after
+        return self.effect.step(state, dt, self.values)
 
     def numerics(self, dt: float, state: State) -> list[str]:
         """By which methods it is computed, in lines."""

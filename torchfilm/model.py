@@ -89,6 +89,7 @@ class Model:
             else:
                 with timings.of(effect.title, state.device):
                     state = effect.step(state, dt)
+        state.check_fields()
         return advanced(state, dt)
 
     def _laid(self) -> State:

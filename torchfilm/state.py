@@ -235,6 +235,19 @@ class State:
             )
         return self.replace(fields={**self.fields, **values})
 
+    def check_fields(self) -> None:
+        """Raise InputError for a field that has not one value per cell, or per colony."""
+        rows = {CELL: self.cells, COLONY: self.colonies}
+        for name, value in self.fields.items():
+            scope = self.declared[name].scope
+            if scope in rows and value.shape[:1] != (rows[scope],):
+                raise checks.input_error(
+                    f"shape of the field {name!r}",
+                    tuple(value.shape),
+                    f"one value for each {scope} first; the state has {self.cells} cells in"
+                    f" {self.colonies} colonies",
+                )
+
     def declare(self, field: Field) -> State:
         """A state that has one more field, at its initial value."""
         declared = self.replace(declared={**self.declared, field.name: field})
