@@ -285,6 +285,9 @@ class BoundEffect:
         """Raise InputError if this effect cannot start from this first state."""
         self.effect.check(state, self.values)
 
+    def check_others(self, effects: Sequence[BoundEffect]) -> None:
+        """Raise InputError if this effect cannot act together with the others (all traced)."""
+
     def check_step(self, dt: float, divides: bool) -> None:
         """Raise InputError for a step of dt hours that this effect cannot follow. divides: cells
         may."""

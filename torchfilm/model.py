@@ -79,18 +79,19 @@ class Model:
 
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""
-        dt = self.dt if dt is None else dt
-        # values are this model's, also in a state that another model made
-        declared = {**state.declared, **self._first_fields}
-        state = state.replace(births=(), ended=(), reports={}, declared=declared)
+        dt, state = self.dt if dt is None else dt, self.opened(state)
         for effect in self.effects:
             if timings is None:
                 state = effect.step(state, dt)
             else:
                 with timings.of(effect.title, state.device):
                     state = effect.step(state, dt)
-        state.check_fields()
         return advanced(state, dt)
+
+    def opened(self, state: State) -> State:
+        """The state as a step of this model begins, also where another model made it."""
+        declared = {**state.declared, **self._first_fields}
+        return state.replace(births=(), ended=(), reports={}, declared=declared)
 
     def _laid(self) -> State:
         start = self._begin
@@ -126,9 +127,8 @@ class Model:
         tried = self._laid() if state is None else state
         for effect in self.effects:
             tried = effect.trace(tried)
-        for effect in self.effects:
-            if hasattr(effect, "check_others"):  # now that it is known what rules write
-                effect.check_others(self.effects)
+        for effect in self.effects:  # now that it is known what rules write
+            effect.check_others(self.effects)
         return tried
 
     # --- checks --------------------------------------------------------------------------
@@ -290,8 +290,9 @@ class Model:
 
 
 def advanced(state: State, dt: float) -> State:
-    """The state with its step counted. With an even step time is counted in steps, so that it
-    gathers no rounding."""
+    """The state with its fields checked and its step counted; evenly, so that time gathers no
+    rounding."""
+    state.check_fields()
     even = abs(state.step * dt - state.time) < 1e-9 * max(1.0, state.time)
     return state.replace(
         step=state.step + 1, time=(state.step + 1) * dt if even else state.time + dt
@@ -368,7 +369,7 @@ def _bind_to_state(scene: Scene, state: State, places: Collection[int] | None) -
     model = Model(scene, batch, _Start(count, state.seed, streams, scene.founders), places)
     model.check(state)
     # what it can be tried on: cells that there are, or else the founders
-    model.trace(state.replace(births=(), ended=(), reports={}) if state.cells else None)
+    model.trace(model.opened(state) if state.cells else None)
     return model
 
 

@@ -126,7 +126,7 @@ class GrowthRecording:
     def _step(self, state: State) -> State:
         """The state one step later; what each effect changed is kept. The same step may be done
         again, with the same result."""
-        state = state.replace(births=(), ended=(), reports={})
+        state = self.model.opened(state)
         noted: list[RecordedChange] = []
         failed = {s: (at, why) for s, (at, why) in self.failed.items() if at < state.step}
         full = torch.tensor([s in failed for s in self.streams], device=state.device)
@@ -274,8 +274,7 @@ class Replay:
             self._check_streams(state)
         place = self.order.index_select(0, torch.searchsorted(self.streams, state.stream))
         changes = {change.part: change for change in self.recording.changes(number)}
-        declared = {**state.declared, **self.model._first_fields}  # as in Model.step
-        state = state.replace(births=(), ended=(), reports={}, declared=declared)
+        state = self.model.opened(state)
         if FIRST in changes:
             state = self._apply(state, changes[FIRST], place)
         for effect, part in self.parts:
