@@ -109,20 +109,27 @@ def draw(report: SearchReport, path: Path) -> Path:
     designs = (report.first, report.best)
     grown = [_one_by_one(d.colonies)[:SHOWN] for d in designs]
     columns = max(1, *(len(g) for g in grown))
-    figure = Figure(figsize=(2.6 * columns + 4.2, 6.4), layout="constrained")
+    figure = Figure(figsize=(2.6 * columns + 4.2, 6.2), layout="constrained")
     grid = figure.add_gridspec(
-        4, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 0.05, 1.0, 0.05]
+        3, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 1.0, 0.05]
     )
-    size = max(
-        (_extent(tf.pictures.frame_of(d.state).colony(k)) for g in grown for d, k in g), default=1.0
-    )
+    target = report.task.target
+    frames = [[tf.pictures.frame_of(d.state).colony(k) for d, k in g] for g in grown]
+    every = [cells for row in frames for cells in row]
+    size = max(map(_extent, every), default=1.0)
+    limits = _limits(target, every)
+    scales: list[Any] = []
     for row, one in enumerate(designs):
-        axes = [figure.add_subplot(grid[2 * row, k]) for k in range(columns)]
-        bars = [figure.add_subplot(grid[2 * row + 1, k]) for k in range(columns)]
+        axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
         title = f"{one.title}, loss {one.loss:.3f}"
-        _draw_row(axes, bars, grown[row], report.task.target, size, title)
+        scales = _draw_row(axes, grown[row], frames[row], target, size, limits, title) or scales
+    bars = [figure.add_subplot(grid[2, k]) for k in range(columns)]
+    for bar, scale in zip(bars, scales, strict=False):
+        tf.pictures.colour_bar(bar, scale)
+    for bar in bars[len(scales) :]:
+        bar.set_visible(False)
     _draw_convergence(figure.add_subplot(grid[0, columns]), report.study)
-    _draw_parameters(figure.add_subplot(grid[2:, columns]), report)
+    _draw_parameters(figure.add_subplot(grid[1:, columns]), report)
     figure.savefig(path, dpi=160)
     return path
 
@@ -160,18 +167,25 @@ def _colour(name: str, place: int) -> str:
     return known.get(name.lower(), ("yellow", "cyan", "magenta", "red", "lime", "white")[place % 6])
 
 
+def _limits(target: Target, frames: list[dict[str, np.ndarray]]) -> dict[str, tuple[float, float]]:
+    """The range of colours of each species that the target reads in cells: one for both designs, so
+    that these can be compared."""
+    names = [n for n in target.names if not n.startswith("out.")]
+    return {n: (0.0, max((float(f[n].max()) for f in frames), default=1.0) or 1.0) for n in names}
+
+
 def _draw_row(
     axes: list[Axes],
-    bars: list[Axes],
     grown: list[tuple[FinishedColonies, int]],
+    frames: list[dict[str, np.ndarray]],
     target: Target,
     size: float,
+    limits: dict[str, tuple[float, float]],
     title: str,
-) -> None:
-    """Draw colonies of one design to one scale, coloured by the species of the target."""
-    names = [n for n in target.names if not n.startswith("out.")]
-    frames = [tf.pictures.frame_of(d.state).colony(k) for d, k in grown]
-    limits = {n: (0.0, max((float(f[n].max()) for f in frames), default=1.0) or 1.0) for n in names}
+) -> list[Any]:
+    """Draw colonies of one design, coloured by the species of the target. Returns the scales of the
+    colours; none without species or colonies."""
+    names = list(limits)
     colour = names[0] if len(names) == 1 else None
     channels = {n: _colour(n, k) for k, n in enumerate(names)} if len(names) > 1 else None
     scales: list[Any] = []
@@ -190,10 +204,7 @@ def _draw_row(
         )
     for ax in axes[len(grown) :]:
         ax.set_visible(False)
-    for ax, scale in zip(bars, scales if names else [], strict=False):
-        tf.pictures.colour_bar(ax, scale)
-    for ax in bars[len(scales) if names else 0 :]:
-        ax.set_visible(False)
+    return scales if names else []
 
 
 def _draw_convergence(ax: Axes, study: Study) -> None:
@@ -232,7 +243,7 @@ def _draw_parameters(ax: Axes, report: SearchReport) -> None:
             ax.annotate(
                 bound,
                 (x, y),
-                xytext=(-4 if side == "right" else 4, 0),
+                xytext=(-7 if side == "right" else 7, 0),  # clear of a marker at the bound
                 textcoords="offset points",
                 ha=side,
                 va="center",

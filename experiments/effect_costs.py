@@ -17,7 +17,6 @@ bytes must be the same.
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import sys
@@ -28,10 +27,10 @@ from pathlib import Path
 import torch
 
 import torchfilm as tf
-from torchfilm.explanation import Spending
+from torchfilm.cost_estimate import Spending
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
-from record import machine, write_page
+from record import machine, scenes_parser, write_page
 
 HERE = Path(__file__).parent
 STEPS, HOURS = 20, 12.0
@@ -226,15 +225,7 @@ def tables(noted: dict, records: list[dict]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--scene",
-        action="append",
-        choices=tuple(tf.scenes.READY),
-        help="one scene; may be repeated",
-    )
+    parser = scenes_parser(__doc__)
     parser.add_argument("--cells", type=int, default=200, help="in each colony")
     parser.add_argument("--colonies", type=int, default=4)
     parser.add_argument(

@@ -19,7 +19,6 @@ the chosen settings over that of the cheapest ones.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import itertools
 import sys
@@ -31,13 +30,14 @@ import torch
 
 import torchfilm as tf
 from torchfilm.cli.inspect import parse_error
+from torchfilm.tuning.candidates import TIGHT_CONTACTS
 from torchfilm.tuning.observables import AccuracyProbe, Error, Seen, begin
-from torchfilm.tuning.tuner import TIGHT_CONTACTS, Search
+from torchfilm.tuning.settings_search import SettingsSearch
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "accuracy"), str(HERE / "benchmarks")]
 import appendix  # noqa: E402
-from record import machine  # noqa: E402
+from record import machine, scenes_parser  # noqa: E402
 
 STEPS = (12, 18, 24, 30, 40, 54)
 FINER = (72, 96, 128)  # if none of STEPS holds the error
@@ -70,14 +70,14 @@ class TestRun:
     """A run that `tune` has not used, and its reference."""
 
     probe: AccuracyProbe
-    search: Search
+    search: SettingsSearch
     reference: Seen
 
     @staticmethod
     def of(scene: tf.Scene, cells: int, colonies: int, seed: int, finest: int) -> TestRun:
         """Grows the probe and runs the reference with `finest` steps."""
         probe = begin(scene, cells, colonies, seed=seed)
-        search = Search(probe, probe, 0.01)
+        search = SettingsSearch(probe, probe, 0.01)
         return TestRun(
             probe,
             search,
@@ -99,8 +99,8 @@ class TestRun:
 def sweep(run: TestRun, steps: Sequence[int]) -> list[tf.Settings]:
     """Returns all settings of the sweep with these steps."""
     search = run.search
-    contacts = SWEPT if search.mechanics is not None else (TIGHT_CONTACTS,)
-    rtols = RTOLS if search.circuit is not None else (search.tight,)
+    contacts = SWEPT if "tolerance" in search.knobs else (TIGHT_CONTACTS,)
+    rtols = RTOLS if search.stiff else (search.tight,)
     return [
         search.settings(n, contact, rtol)
         for n, contact, rtol in itertools.product(steps, contacts, rtols)
@@ -144,15 +144,7 @@ def check(name: str, error: float) -> dict[str, str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--scene",
-        action="append",
-        choices=tuple(tf.scenes.READY),
-        help="one scene; may be repeated",
-    )
+    parser = scenes_parser(__doc__)
     parser.add_argument("--error", default="1%", help="error to request")
     parser.add_argument(
         "--out", type=Path, help="CSV file; default: that of the records, or none with --scene"

@@ -46,7 +46,15 @@ ROOMS = {
         ),
     ),
     "effects": Room(4, ("torchfilm.effects",), talk=False),
-    "scene": Room(5, ("torchfilm.scene", "torchfilm.model", "torchfilm.initial_cells")),
+    "scene": Room(
+        5,
+        (
+            "torchfilm.scene",
+            "torchfilm.model",
+            "torchfilm.binding_checks",
+            "torchfilm.initial_cells",
+        ),
+    ),
     "loop": Room(6, ("torchfilm.loop", "torchfilm.replay")),
     "results": Room(7, ("torchfilm.io",)),
     # simulate takes a path to record to, so results lie below it
@@ -58,6 +66,7 @@ ROOMS = {
 ONE_EFFECT = {
     frozenset({"torchfilm.effects.circuit", "torchfilm.effects.bound_circuit"}),
     frozenset({"torchfilm.effects.medium", "torchfilm.effects.bound_medium"}),
+    frozenset({"torchfilm.effects.rules", "torchfilm.effects.bound_rules"}),
 }
 # Kernels take tensors: they never see a state, nor what is built on one.
 TENSORS_ONLY = "kernels"

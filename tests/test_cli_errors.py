@@ -91,7 +91,7 @@ ERRORS = {
     "run microcolony --start negative.csv": (r"length\[0\]", "-2"),
     "run microcolony --start text.h5": (r"text\.h5", ""),
     "run microcolony --start foreign.h5": (r"foreign\.h5", "'y'"),
-    "run microcolony --out good.h5": (r"good\.h5", "overwrite"),
+    "run microcolony --out good.h5": (r"--out = 'good\.h5'", r"--overwrite.*resume good\.h5"),
     "run microcolony --out text.csv/a.h5 --until 1": (r"text\.csv", ""),
     "resume good.h5": ("--cells", "--until"),
     "resume good.h5 --until 0.1": ("until", r"0\.1"),
@@ -193,7 +193,7 @@ def test_resume_with_an_edited_scene_says_which_fields_differ(command):
     command("resume", "mine.h5", "--scene", "mine.py", "--until", 2)
 
 
-def test_resume_with_a_field_of_another_shape_is_told(command):
+def test_resume_with_a_field_of_another_shape_is_reported(command):
     rules = (
         "import torchfilm as tf\ndef update(cells):\n    cells.mark = cells.{}\nscene ="
         " tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), dt=0.05)\n"

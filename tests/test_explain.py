@@ -66,7 +66,7 @@ def graded(places):
         "two reasons",
     ],
 )
-def test_the_way_of_transport_told_is_the_one_that_is_chosen(made, words, monkeypatch):
+def test_the_way_of_transport_reported_is_the_one_that_is_chosen(made, words, monkeypatch):
     chosen, choose = [], bound_medium.choose
     monkeypatch.setattr(bound_medium, "choose", lambda op: chosen.append(choose(op)) or chosen[-1])
     scene = tf.Scene(*BODY, made)
@@ -78,7 +78,7 @@ def test_the_way_of_transport_told_is_the_one_that_is_chosen(made, words, monkey
 
 
 @pytest.mark.parametrize("method", ["exponential", "implicit", "crank_nicolson", "euler"])
-def test_a_way_of_transport_that_was_asked_for_is_told(method):
+def test_a_way_of_transport_that_was_asked_for_is_reported(method):
     made = medium(method=method)
     assert made.method_of("ahl") == (method, "as given")
     assert f"ahl: {method}, " in tf.explain(tf.Scene(*BODY, made), seconds=0)
@@ -162,7 +162,7 @@ def test_methods_and_tolerances_are_those_of_the_scene(effect, words):
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("unilateral", [False, True])
-def test_defaults_told_of_contacts_are_those_used(dim, unilateral):
+def test_defaults_reported_of_contacts_are_those_used(dim, unilateral):
     effect = tf.Mechanics(dim=dim, unilateral=unilateral)
     model = tf.Scene(effect, tf.Growth(rate=1.0)).bind()
     bound = next(e for e in model.effects if e.effect is effect)
@@ -204,9 +204,10 @@ def test_every_effect_that_torchfilm_has_is_known_and_has_words():
     for effect in model.effects:
         words = effect.numerics(0.025, state)
         assert words and all(words), effect.title
+        assert type(effect).__name__ not in effect.summary(), "a part has a plain sentence"
 
 
-def test_an_effect_of_ones_own_is_told_by_its_name_alone():
+def test_an_effect_of_ones_own_is_reported_by_its_name_alone():
     class Mine(tf.Growth):
         title = "mine"
 
@@ -295,7 +296,7 @@ def test_a_fit_gives_back_what_is_linear():
         assert found[title] == pytest.approx(expected, rel=1e-6, abs=1e-12), title
 
 
-def test_a_run_is_foretold_from_the_pace_of_growth():
+def test_a_run_is_predicted_from_the_pace_of_growth():
     """Nothing but dV/dt = V: a thousandfold takes ln(1000)/0.025 = 276.3 steps, whatever the
     machine."""
     said = tf.explain(tf.Scene(tf.Growth(rate=1.0)), cells=1000, seconds=0.01)

@@ -2,7 +2,7 @@
 against central differences.
 
 Bounds as in test_gradients: the central difference at h = 1e-5 is off by h² ≈ 1e-10 of the third
-derivative and by the solves' 1e-10 over 2h, hence 1e-5 of the gradient's size. The stiff integrator
+derivative and by the solves' 1e-10 over 2h, so 1e-5 of the gradient's size. The stiff integrator
 chooses its steps by what it meets, and its gradient takes them as given; here every run is made
 such that it goes in one step at both ends of the difference, so that the two are the same function.
 """
@@ -13,8 +13,8 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from differences import F64, compare, weights
 from helpers import step
-from test_gradients import F64, compare, weights
 from torch import Tensor
 
 import torchfilm as tf

@@ -317,14 +317,14 @@ def test_bad_csv_files_are_refused_with_the_place(tmp_path, kind):
     [b"x,y,angle,length\n0,0,0,\xff\xfe\n", b"x,y,angle,length\n0,0,\x00,2\n"],
     ids=["not UTF-8", "a zero byte"],
 )
-def test_a_csv_file_that_is_no_text_is_told(tmp_path, data):
+def test_a_csv_file_that_is_no_text_is_reported(tmp_path, data):
     path = tmp_path / "cells.csv"
     path.write_bytes(data)
     with pytest.raises(tf.InputError, match=r"cells\.csv"):
         tf.Cells.from_csv(path)
 
 
-def test_a_table_without_cells_is_told():
+def test_a_table_without_cells_is_reported():
     with pytest.raises(tf.InputError, match=r"table.*no cell"):
         tf.Cells.from_table({"x": [], "y": [], "angle": [], "length": []})
 
@@ -338,19 +338,19 @@ def test_csv_lines_are_counted_as_an_editor_does(tmp_path):
 
 
 @pytest.mark.parametrize("read", [tf.Cells.from_csv, tf.Cells.from_hdf5])
-def test_a_missing_file_is_told_with_its_name(tmp_path, read):
+def test_a_missing_file_is_reported_with_its_name(tmp_path, read):
     with pytest.raises((tf.InputError, FileNotFoundError), match=r"no_such_file"):
         read(tmp_path / "no_such_file.xx")
 
 
-def test_a_file_that_is_no_hdf5_is_told(tmp_path):
+def test_a_file_that_is_no_hdf5_is_reported(tmp_path):
     path = tmp_path / "cells.h5"
     path.write_text("x,y\n0,0\n")
     with pytest.raises(tf.InputError, match=r"cells\.h5"):
         tf.Cells.from_hdf5(path)
 
 
-def test_a_missing_group_is_told(tmp_path):
+def test_a_missing_group_is_reported(tmp_path):
     path = tmp_path / "cells.h5"
     with h5py.File(path, "w") as file:
         file["x"] = [0.0]
@@ -358,7 +358,7 @@ def test_a_missing_group_is_told(tmp_path):
         tf.Cells.from_hdf5(path, "/frame")
 
 
-def test_a_data_set_of_text_is_told(tmp_path):
+def test_a_data_set_of_text_is_reported(tmp_path):
     path = tmp_path / "cells.h5"
     with h5py.File(path, "w") as file:
         file["x"], file["y"], file["angle"], file["length"] = [0.0], [0.0], [0.0], [2.0]

@@ -75,6 +75,60 @@ def test_a_rate_per_minute_is_warned_of():
         tf.Scene(tf.Growth(rate=0.035), tf.Mechanics(dim=2)).bind()
 
 
+def warnings_of(make):
+    """What is made, and the texts of the warnings on the way."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        made_here = make()
+    said = [str(w.message) for w in told]
+    return made_here, [text for text in said if not text.startswith("Sparse CSR")]  # torch's own
+
+
+def test_a_scene_warns_once_and_its_copies_do_not():
+    scene, told = warnings_of(lambda: tf.Scene(tf.Growth(), tf.Mechanics(dim=2)))
+    assert len(told) == 1
+    for copy in (
+        lambda: scene.replace(dt=0.01),
+        lambda: scene.replace(dt=0.01).replace(name="other"),
+        lambda: scene.replace(*scene.effects, tf.Removal((-9, -9), (9, 9))),
+        lambda: tf.Settings(passes=3).apply(scene),
+    ):
+        assert warnings_of(copy)[1] == []
+    good = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2))
+    assert len(warnings_of(lambda: good.replace(tf.Growth(), tf.Mechanics(dim=2)))[1]) == 1
+
+
+def test_what_binds_a_scene_several_times_warns_once(tmp_path):
+    circuit = tf.Circuit(made, species=("m",), strength=1.0, leftover=3.0)
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2), circuit)
+    path = tmp_path / "run.h5"
+
+    def recorded():
+        list(tf.simulate(scene, until=0.05, record=path))
+
+    def by_hand():
+        recorder = tf.Recorder(tmp_path / "own.h5", scene)
+        recorder(state)
+        recorder.close()
+
+    def restored():
+        with tf.Results(path) as results:
+            return results.state(scene)
+
+    for ask in (
+        scene.bind,
+        scene.bind,
+        lambda: tf.explain(scene, seconds=0.1),
+        lambda: tf.GrowthRecording(scene, streams=[0, 1]),
+        recorded,
+    ):
+        told = warnings_of(ask)[1]
+        assert len(told) == 1 and "leftover" in told[0], told
+    state, told = warnings_of(restored)
+    assert told == []
+    assert warnings_of(by_hand)[1] == []
+
+
 def test_a_dimension_that_was_never_stated_is_warned_of():
     with pytest.warns(UserWarning, match=r"no Mechanics and no founders.*dim=2"):
         assert tf.Scene(tf.Growth(rate=1.0)).dim == 3

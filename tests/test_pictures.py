@@ -244,25 +244,25 @@ def test_the_same_frame_makes_the_same_picture(recorded, tmp_path):
         ({"frame": 99}, r"frame = 99"),
     ],
 )
-def test_what_cannot_be_drawn_is_told(recorded, tmp_path, options, message):
+def test_what_cannot_be_drawn_is_reported(recorded, tmp_path, options, message):
     with pytest.raises(tf.InputError, match=message):
         tf.show(recorded, out=tmp_path / "a.png", **options)
     assert not (tmp_path / "a.png").exists()
 
 
-def test_a_frame_without_cells_is_told(tmp_path):
+def test_a_frame_without_cells_is_reported(tmp_path):
     state = tf.scenes.microcolony().bind().start()
     empty = state.remove(torch.tensor([True]), "removed")
     with pytest.raises(tf.InputError, match="no cell"):
         sheet(cells_of(empty), tmp_path / "a.png")
 
 
-def test_a_place_that_is_not_there_is_told(recorded, tmp_path):
+def test_a_place_that_is_not_there_is_reported(recorded, tmp_path):
     with pytest.raises((tf.InputError, FileNotFoundError), match="nowhere"):
         tf.show(recorded, out=tmp_path / "nowhere" / "a.png")
 
 
-def test_a_kind_of_picture_that_is_not_known_is_told(recorded, tmp_path):
+def test_a_kind_of_picture_that_is_not_known_is_reported(recorded, tmp_path):
     with pytest.raises((tf.InputError, ValueError), match="nonsense"):
         tf.show(recorded, out=tmp_path / "a.nonsense")
 

@@ -266,7 +266,7 @@ def test_no_picture_replaces_the_results(run, tmp_path, draw):
 @pytest.mark.parametrize(
     "colonies, message", [([7], r"colonies = \[7\].*0, 1"), ([], r"colonies = \[\]")]
 )
-def test_colonies_that_are_not_there_are_told(run, tmp_path, colonies, message):
+def test_colonies_that_are_not_there_are_reported(run, tmp_path, colonies, message):
     with pytest.raises(tf.InputError, match=message):
         tf.show(run, colonies=colonies, out=tmp_path / "a.png")
 
@@ -360,7 +360,7 @@ def test_a_film_moves_neither_its_window_nor_its_legend(run, film_options):
         ("a.gif", {"colour": "nope"}, "colour = 'nope'"),
     ],
 )
-def test_a_film_that_cannot_be_made_is_told(run, tmp_path, out, options, message):
+def test_a_film_that_cannot_be_made_is_reported(run, tmp_path, out, options, message):
     with pytest.raises(tf.InputError, match=message):
         tf.pictures.movie(run, tmp_path / out, **options)
     assert list(tmp_path.iterdir()) == []

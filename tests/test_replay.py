@@ -287,7 +287,7 @@ def test_what_growth_reads_belongs_to_it_also_where_nothing_writes_it():
     )
 
 
-def test_growth_is_told_by_what_its_functions_do():
+def test_growth_is_identified_by_what_its_functions_do():
     recording = tf.GrowthRecording(tf.Scene(*lit().effects, Started("drag", twice)), streams=(0,))
     Designs(tf.Scene(*lit().effects, Started("drag", twice)), recording)
     with pytest.raises(tf.InputError, match="does not grow as the recording did"):
@@ -295,7 +295,7 @@ def test_growth_is_told_by_what_its_functions_do():
 
 
 def test_daughters_fields_start_from_what_they_see_where_cells_divide():
-    """A field that starts anew from another that does, growth_rate drawn at birth: it sees the
+    """A field that starts again from another that does, growth_rate drawn at birth: it sees the
     parent's, as in the full run."""
     circuit = tf.Circuit(reporter, species=("gfp",), make=torch.tensor([1.0, 2.0]))
     scene = tf.Scene(

@@ -47,7 +47,7 @@ def test_frames_are_the_states(whole):
 
 
 @pytest.mark.parametrize("frame", [10, -11])
-def test_a_frame_that_is_not_there_is_told(whole, frame):
+def test_a_frame_that_is_not_there_is_reported(whole, frame):
     with tf.Results(whole[0]) as results, pytest.raises(tf.InputError, match="10 frames"):
         results.frame(frame)
 
@@ -69,7 +69,7 @@ def test_what_a_file_says_of_itself(whole):
     assert "Division(length=Uniform(low=3.0, high=4.0))" in a["scene"]
 
 
-def test_the_step_that_was_used_is_the_step_that_is_told(tmp_path):
+def test_the_step_that_was_used_is_the_step_that_is_reported(tmp_path):
     """`simulate(dt=…)` may differ from the scene's own step: a resumed run must know."""
     scene = make_scene()
     for _ in tf.simulate(

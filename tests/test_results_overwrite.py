@@ -194,7 +194,7 @@ def test_another_file_in_the_place_of_the_new_one_is_kept(old, whole):
 def test_a_file_that_another_process_writes_is_not_replaced(old, whole, process):
     writer = process(WRITER, old)
     assert writer.stdout.readline() == "open\n"
-    with pytest.raises(tf.InputError, match=r"run\.h5.*no other process writes.*--out"):
+    with pytest.raises(tf.InputError, match=r"run\.h5.*no other process writes.*another path"):
         tf.Recorder(old, make_scene(), overwrite=True)
     writer.communicate("\n")
     assert_same_file(whole[0], old)

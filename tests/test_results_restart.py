@@ -184,7 +184,7 @@ def test_a_rule_that_keeps_a_diary_is_not_taken_for_edited(tmp_path):
         assert results.state(scene).step == 4
 
 
-def test_going_on_by_other_settings_is_told_in_the_file(tmp_path):
+def test_going_on_by_other_settings_is_reported_in_the_file(tmp_path):
     path, base = tmp_path / "run.h5", tf.scenes.microcolony()
     last = record(base, base.bind(2).start(), path, until=2 * base.dt)[-1]
     finer = tf.Settings(tolerance=0.01).apply(base)

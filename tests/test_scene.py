@@ -1,15 +1,13 @@
-"""The scene: order, couplings, parameters per colony, bad input, and that nothing runs which was
-not asked for."""
+"""The scene: order, couplings and bad input."""
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 
 import pytest
 import torch
+from founded import cells_in
 from helpers import step
-from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchfilm as tf
 from torchfilm.effect import Effect
@@ -40,14 +38,6 @@ def named(order: list[str], name: str, at: int, **how) -> Effect:
             return how.get("declares", ())
 
     return Named()
-
-
-def cells_in(dim: int, count: int = 2) -> tf.Cells:
-    position = torch.zeros(count, dim)
-    position[:, 0] = 3.0 * torch.arange(count)
-    axis = torch.zeros(count, dim)
-    axis[:, 1] = 1.0
-    return tf.Cells(position, axis)
 
 
 # --- order and couplings --------------------------------------------------------------------------
@@ -115,6 +105,42 @@ def test_couplings_say_who_drives_whom():
     }
 
 
+@pytest.mark.parametrize(
+    "how, words",
+    [
+        ({"reads": ("growthrate",)}, r"reads\(\) names 'growthrate'.*mean 'growth_rate'"),
+        ({"reads": ("volume",)}, r"names 'volume'.*Name 'length' and 'radius' instead"),
+        ({"reads": ("heat",)}, r"'heat', which no effect of this scene declares.*declares\(\)"),
+        ({"writes": ("lenght",)}, r"writes\(\) names 'lenght'.*Did you mean 'length'"),
+        ({"reads": ("drag",)}, r"reads\(\) names 'drag'"),
+    ],
+)
+def test_names_that_nothing_provides_are_refused_when_bound(how, words):
+    scene = tf.Scene(named([], "mine", 15, **how), tf.Growth(rate=1.0), dim=2)
+    with pytest.raises(tf.InputError, match=words):
+        scene.bind()
+
+
+def test_names_of_first_cells_rules_and_states_are_known():
+    """A column of the first cells, a variable of a rule, a field that a rule may set later, and
+    what a derived effect of torchfilm uses where it is there."""
+
+    def update(cells):
+        cells.heat = cells.length
+
+    scene = tf.Scene(named([], "mine", 15, reads=("heat", "drag")), tf.Rules(update), dim=2)
+    scene.bind()
+    plain = tf.Scene(named([], "mine", 15, reads=("heat",)), tf.Growth(rate=1.0), dim=2)
+    warm = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], extra={"heat": [1.0]})
+    assert plain.bind(state=plain.bind(cells=warm).start()).effects
+
+    class Pushing(tf.Mechanics):
+        pass
+
+    Pushing.__module__ = "mine"
+    tf.Scene(Pushing(dim=2)).bind()
+
+
 def test_couplings_of_growth_and_mechanics():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.5), tf.Mechanics(dim=2))
     found = scene.bind().couplings()
@@ -161,131 +187,6 @@ def test_repr_shows_the_effects():
     )
 
 
-# --- one number, or one per colony ----------------------------------------------------------------
-
-
-def two_designs(make, colonies: int = 2) -> list[tf.State]:
-    """Each colony of a batch with a parameter per colony, and the same colony in a scene with its
-    one number."""
-    batch = make(torch.tensor([1.0, 2.0], dtype=torch.float64))
-    return [run_a_little(batch, colonies)] + [run_a_little(make(v), colonies) for v in (1.0, 2.0)]
-
-
-def run_a_little(scene: tf.Scene, colonies: int) -> tf.State:
-    state = scene.bind(colonies, dtype=torch.float64).start()
-    for _ in range(6):
-        state = step(scene, state, 0.1)
-    return state
-
-
-def crowd(dim: int = 2) -> tf.Cells:
-    """Overlapping cells, so that every parameter of the mechanics matters."""
-    position = torch.zeros(4, dim, dtype=torch.float64)
-    position[:, 1] = torch.tensor([0.0, 0.8, 1.6, 2.4], dtype=torch.float64)
-    position[:, 0] = torch.tensor([0.0, 0.4, 0.1, 0.3], dtype=torch.float64)
-    axis = torch.zeros_like(position)
-    axis[:, 0] = 1.0
-    return tf.Cells(position, axis, [1.9, 2.0, 2.1, 2.2])
-
-
-PUSH = tf.Growth(rate=0.5)
-PER_COLONY = {
-    "Growth.rate": lambda v: tf.Scene(tf.Growth(rate=v), founders=crowd()),
-    "Growth.rate drawn": lambda v: tf.Scene(tf.Growth(rate=tf.Uniform(0.1, v)), founders=crowd()),
-    "Division.length": lambda v: tf.Scene(PUSH, tf.Division(length=v + 1.5), founders=crowd()),
-    "Division.volume": lambda v: tf.Scene(PUSH, tf.Division(volume=v + 1.5), founders=crowd()),
-    "Division.added": lambda v: tf.Scene(PUSH, tf.Division(added=v * 0.4), founders=crowd()),
-    "Division.fraction": lambda v: tf.Scene(
-        PUSH, tf.Division(length=2.5, fraction=v * 0.3), founders=crowd()
-    ),
-    "Division.axis_noise": lambda v: tf.Scene(
-        PUSH, tf.Division(length=2.5, axis_noise=v * 0.01), founders=crowd()
-    ),
-    "Mechanics.viscosity": lambda v: tf.Scene(
-        PUSH, tf.Mechanics(dim=2, viscosity=v), founders=crowd()
-    ),
-    "Mechanics.length_drag": lambda v: tf.Scene(
-        PUSH, tf.Mechanics(dim=2, length_drag=v), founders=crowd()
-    ),
-    "Mechanics.alpha": lambda v: tf.Scene(PUSH, tf.Mechanics(dim=2, alpha=v), founders=crowd()),
-    "Mechanics.stiffness": lambda v: tf.Scene(
-        PUSH, tf.Mechanics(dim=2, stiffness=v * 10), founders=crowd()
-    ),
-    "Plane.y": lambda v: tf.Scene(
-        PUSH, tf.Mechanics(dim=2, walls=[tf.Plane(y=v + 1.8, facing="-y")]), founders=crowd()
-    ),
-    "Plane.stiffness": lambda v: tf.Scene(
-        PUSH,
-        tf.Mechanics(dim=2, walls=[tf.Plane(y=2.5, facing="-y", stiffness=v)]),
-        founders=crowd(),
-    ),
-    "Plane.weight": lambda v: tf.Scene(
-        PUSH,
-        tf.Mechanics(dim=2, walls=[tf.Plane(y=2.5, facing="-y", weight=v / 2)]),
-        founders=crowd(),
-    ),
-    "Sphere.radius": lambda v: tf.Scene(
-        PUSH, tf.Mechanics(dim=2, walls=[tf.Sphere((0.0, 1.2), v + 1.0)]), founders=crowd()
-    ),
-    "Channel.width": lambda v: tf.Scene(
-        PUSH, tf.Mechanics(dim=2, walls=[tf.Channel(v + 4.0)]), founders=crowd()
-    ),
-    "Box.high": lambda v: tf.Scene(
-        PUSH, tf.Mechanics(dim=2, walls=[tf.Box((-9.0, -9.0), (9.0, v + 1.5))]), founders=crowd()
-    ),
-    "Removal.high": lambda v: tf.Scene(
-        PUSH, tf.Mechanics(dim=2), tf.Removal((-9.0, -9.0), (9.0, v + 1.5)), founders=crowd()
-    ),
-}
-
-
-@pytest.mark.parametrize("name", list(PER_COLONY))
-def test_every_physical_parameter_may_differ_from_colony_to_colony(name):
-    """A colony of a batch with many designs is, bit for bit, that colony in a batch of its own
-    design."""
-    batch, *each = two_designs(PER_COLONY[name])
-    first, second = (state.select([0]) for state in each)
-    assert any(
-        not torch.equal(getattr(first, part), getattr(second, part))
-        for part in ("position", "axis", "length")
-    )
-    for k in range(2):
-        mine, alone = batch.select([k]), each[k].select([k])
-        for part in ("uid", "position", "axis", "length"):
-            assert torch.equal(getattr(mine, part), getattr(alone, part)), part
-
-
-SHORT = {
-    "Growth.rate": lambda v: (tf.Growth(rate=v),),
-    "Uniform.low": lambda v: (tf.Growth(rate=tf.Uniform(v, 3.0)),),
-    "Division.length": lambda v: (tf.Division(length=v + 3),),
-    "Division.fraction": lambda v: (tf.Division(fraction=v / 4),),
-    "Mechanics.viscosity": lambda v: (tf.Mechanics(dim=2, viscosity=v),),
-    "Mechanics.alpha": lambda v: (tf.Mechanics(dim=2, alpha=v),),
-    "Plane.y": lambda v: (tf.Mechanics(dim=2, walls=[tf.Plane(y=v + 5, facing="-y")]),),
-    "Plane.stiffness": lambda v: (
-        tf.Mechanics(dim=2, walls=[tf.Plane(y=5.0, facing="-y", stiffness=v)]),
-    ),
-    "Sphere.radius": lambda v: (tf.Mechanics(dim=2, walls=[tf.Sphere((0.0, 0.0), v + 9)]),),
-}
-
-
-@pytest.mark.parametrize("name", list(SHORT))
-def test_too_few_values_are_refused_by_name(name):
-    scene = tf.Scene(*SHORT[name](torch.tensor([1.0, 2.0])), founders=cells_in(2))
-    with pytest.raises(tf.InputError, match=name.split(".")[1]):
-        scene.bind(3).start()
-
-
-@pytest.mark.parametrize("name", list(SHORT))
-def test_too_many_values_are_refused_by_name(name):
-    """Four designs for three colonies: one would never be looked at, which can only be a
-    mistake."""
-    scene = tf.Scene(*SHORT[name](torch.tensor([1.0, 2.0, 1.0, 2.0])), founders=cells_in(2))
-    with pytest.raises(tf.InputError, match=name.split(".")[1]):
-        scene.bind(3).start()
-
-
 # --- bad scenes -----------------------------------------------------------------------------------
 
 
@@ -294,7 +195,7 @@ def test_an_empty_scene_is_refused():
         tf.Scene()
 
 
-def test_missing_brackets_are_told():
+def test_missing_brackets_are_reported():
     with pytest.raises(tf.InputError, match=r"effects such as Growth\(\).*brackets"):
         tf.Scene(tf.Growth)
 
@@ -362,7 +263,7 @@ def test_a_field_declared_twice_alike_is_one_field():
     assert list(state.fields) == ["heat"] and state.heat.tolist() == [3.0, 3.0]
 
 
-def test_a_needed_field_that_nobody_provides_is_told():
+def test_a_needed_field_that_nobody_provides_is_reported():
     with pytest.raises(tf.InputError, match=r"sink needs the field 'heat'.*growth_rate"):
         tf.Scene(named([], "sink", 20, needs=("heat",)), tf.Growth(rate=1.0))
 
@@ -440,7 +341,7 @@ def test_a_device_that_is_not_there_is_refused(device):
     ],
     ids=lambda w: type(w).__name__,
 )
-def test_a_wall_inside_out_is_told_before_anything_runs(wall):
+def test_a_wall_inside_out_is_reported_before_anything_runs(wall):
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, walls=[wall]))
     with pytest.raises(tf.InputError, match=r"cell 0 of colony 0.*inside out"):
         scene.bind().start()
@@ -481,165 +382,6 @@ def test_bad_walls_and_mechanics_are_refused_at_construction(make):
         make()
 
 
-def test_one_wall_instead_of_a_list_is_told():
+def test_one_wall_instead_of_a_list_is_reported():
     with pytest.raises(tf.InputError, match="walls"):
         tf.Mechanics(dim=2, walls=tf.Plane(y=-1.0, facing="+y"))
-
-
-# --- only what is asked ---------------------------------------------------------------------------
-
-
-class Operators(TorchDispatchMode):
-    """Counts the ATen operators that are dispatched."""
-
-    def __init__(self):
-        super().__init__()
-        self.seen: Counter[str] = Counter()
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.seen[func.overloadpacket.__name__] += 1
-        return func(*args, **(kwargs or {}))
-
-
-def operators(*effects: Effect, steps: int = 1) -> Counter[str]:
-    scene = tf.Scene(*effects, founders=cells_in(2, 6))
-    model = scene.bind(3)
-    state = model.start()
-    with Operators() as counted:
-        for _ in range(steps):
-            state = model.step(state, 0.1)
-    return counted.seen
-
-
-def test_growth_alone_is_a_handful_of_operators():
-    """The law by length takes four (rate·dt, expm1, times l, plus l), the law by volume two more
-    for l + 4r/3; two may be for care."""
-    by_length, by_volume = (
-        operators(tf.Growth(rate=1.0, law="length")),
-        operators(tf.Growth(rate=1.0)),
-    )
-    assert sum(by_length.values()) <= 6, by_length
-    assert sum(by_volume.values()) <= 8, by_volume
-    assert by_length["expm1"] == by_volume["expm1"] == 1
-
-
-def test_the_cost_of_growth_does_not_depend_on_the_number_of_steps_before():
-    assert sum(operators(tf.Growth(rate=1.0), steps=5).values()) == 5 * sum(
-        operators(tf.Growth(rate=1.0)).values()
-    )
-
-
-HEAVY = (
-    "sort",
-    "argsort",
-    "sparse",
-    "csr",
-    "mm",
-    "bmm",
-    "inv",
-    "searchsorted",
-    "scatter",
-    "repeat_interleave",
-)
-
-
-def heavy(seen: Counter[str]) -> list[str]:
-    return [name for name in seen if any(word in name for word in HEAVY)]
-
-
-def test_without_mechanics_no_pair_is_looked_for_and_nothing_is_solved():
-    growing = (
-        tf.Growth(rate=1.0),
-        tf.Division(length=9.0),
-        tf.Removal((-99.0, -99.0), (99.0, 99.0)),
-        tf.Rules(lambda c: c.growth_rate),
-    )
-    assert not heavy(operators(*growing))
-    assert heavy(operators(tf.Growth(rate=1.0), tf.Mechanics(dim=2))), (
-        "this test must be able to see them"
-    )
-
-
-def test_rules_that_do_not_ask_for_contacts_do_not_pay_for_them():
-    assert not heavy(operators(tf.Rules(lambda cells: setattr(cells, "big", cells.volume > 3))))
-    assert heavy(operators(tf.Rules(lambda cells: setattr(cells, "near", cells.contact_count()))))
-
-
-def test_an_effect_that_is_not_listed_leaves_no_field_and_no_report():
-    state = tf.Scene(tf.Growth(rate=1.0)).bind().start()
-    assert set(state.fields) == {"growth_rate", "elongation"} and not state.reports
-    assert set(tf.Scene(tf.Division(length=3.0)).bind().start().fields) == {
-        "divide_flag",
-        "division_threshold",
-    }
-    scene = tf.Scene(tf.Mechanics(dim=2))
-    assert set(scene.bind().start().fields) == {"displacement"}
-    assert set(step(scene, scene.bind().start(), 0.1).reports) == {"mechanics"}
-
-
-def test_a_step_does_not_touch_the_state_before():
-    aging = tf.Rules(lambda c: setattr(c, "age", c.age + 1), variables={"age": 0.0})
-    scene = tf.Scene(
-        aging, tf.Growth(rate=1.0), tf.Division(length=2.3), tf.Mechanics(dim=2), founders=crowd()
-    )
-    state = scene.bind(2).start()
-    names = (
-        "colony",
-        "uid",
-        "parent",
-        "position",
-        "axis",
-        "length",
-        "radius",
-        "colony_id",
-        "next_uid",
-    )
-    before = {n: getattr(state, n).clone() for n in names} | {
-        n: v.clone() for n, v in state.fields.items()
-    }
-    after = state
-    for _ in range(5):
-        after = step(scene, after, 0.1)
-    assert after.cells > state.cells and state.step == 0 and state.time == 0.0
-    for name, value in before.items():
-        assert torch.equal(getattr(state, name), value), (
-            f"the step changed {name} of the state before"
-        )
-
-
-def test_timings_name_every_effect():
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Mechanics(dim=2))
-    timings = tf.Timings()
-    step(scene, scene.bind().start(), 0.1, timings)
-    assert list(timings.seconds) == ["division", "growth", "mechanics"] and all(
-        s > 0 for s in timings.seconds.values()
-    )
-
-
-def test_an_effect_of_ones_own_is_a_dataclass_with_a_title_and_a_stage():
-    @dataclass(frozen=True)
-    class Ageing(tf.Effect):
-        stage = 35
-
-    @dataclass(frozen=True)
-    class Placeless(tf.Effect):
-        title = "placeless"
-
-    class Plain(tf.Effect):
-        stage, title = 35, "plain"
-
-    with pytest.raises(
-        tf.InputError, match=r"Plain is no dataclass: write @dataclass\(frozen=True"
-    ):
-        tf.Scene(Plain())
-    with pytest.raises(tf.InputError, match="Ageing has no title: give the class one"):
-        tf.Scene(Ageing())
-    with pytest.raises(tf.InputError, match="Placeless has no stage: give the class one"):
-        tf.Scene(Placeless())
-
-
-def test_what_drives_what_is_said_once():
-    scene = tf.scenes.quorum_sensing()
-    scene.bind(1).start()  # what a rate function reads is known once it is tried
-    told = scene.bind().drives()
-    assert "transport -> circuit: out.ahl" in told and "circuit -> transport: out.ahl" in told

@@ -63,7 +63,7 @@ def test_it_explains_itself(kind):
     assert len(READY[kind.split()[0]].__doc__) > 60
 
 
-def test_unknown_scenes_and_parameters_are_told():
+def test_unknown_scenes_and_parameters_are_reported():
     with pytest.raises(
         tf.InputError, match=r"'macrocolony'.*microcolony, programmed_growth, channel"
     ):
@@ -222,7 +222,7 @@ def test_a_closed_channel_loses_none_and_pressure_stops_growth():
     assert float((states[0].elongation / (0.025 * (states[0].length + 2 / 3))).mean()) > 0.9
 
 
-def test_a_channel_inside_out_is_told():
+def test_a_channel_inside_out_is_reported():
     with pytest.raises(tf.InputError, match=r"Channel|width"):
         tf.scenes.channel(width=-1.0)
     with pytest.raises(tf.InputError):

@@ -61,7 +61,7 @@ def test_frozen():
         state.growth_rate = state.growth_rate * 2
 
 
-def test_fields_are_attributes_and_unknown_names_are_told():
+def test_fields_are_attributes_and_unknown_names_are_reported():
     state = batch()
     assert state.growth_rate is state.fields["growth_rate"]
     with pytest.raises(AttributeError, match=r"'grwth_rate'.*growth_rate, elongation"):

@@ -185,7 +185,7 @@ def test_settings_with_which_a_colony_fails_are_not_chosen():
     assert math.isinf(probe.errors(far, probe.observed(tf.Settings()).found)["volume"].value)
 
 
-def test_settings_are_not_chosen_by_what_is_left_when_the_volume_cannot_be_told():
+def test_settings_are_not_chosen_by_what_is_left_when_the_volume_cannot_be_known():
     """A number of cells alone would call any settings right, as a whole number of few cells is the
     same by all of them."""
     scene = tf.Scene(
@@ -197,7 +197,7 @@ def test_settings_are_not_chosen_by_what_is_left_when_the_volume_cannot_be_told(
         tf.tune(scene, error=1e-6, cells=8, colonies=2, of=("cells", "volume"))
 
 
-def test_what_cannot_be_held_or_told_is_said():
+def test_what_cannot_be_held_or_known_is_said():
     with pytest.raises(
         InputError, match=r"the probe can resolve\. Here m: two references differ by"
     ):
@@ -238,7 +238,7 @@ def test_observables_of_a_known_state():
     assert found["m"].tolist() == [3.0, 0.0] and found["signal ahl"].tolist() == [2.0 * 16 * 2, 2.0]
 
 
-def test_chance_is_told_by_how_colonies_differ():
+def test_chance_is_known_from_how_colonies_differ():
     """Standard errors of a ratio of sums and of a mean, against the textbook's; a run that is
     compared with itself has neither error nor chance."""
     probe = begin(dividing(), 8, 6)

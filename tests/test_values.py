@@ -64,7 +64,7 @@ def test_one_value_per_colony_as_list_array_or_tensor_is_one():
 @pytest.mark.parametrize("inherited", [False, True])
 def test_a_circuit_constant_may_be_drawn_for_each_cell(inherited):
     """Extrinsic noise: cells of one colony have constants of their own, by the seed alone. They are
-    drawn anew at each birth, or kept by the daughters."""
+    drawn again at each birth, or kept by the daughters."""
     scene = tf.Scene(
         tf.Growth(rate=1.0),
         tf.Division(length=3.5),
@@ -134,6 +134,15 @@ EFFECTS = {
         tf.Medium(food=tf.Signal(diffusion=1.0), box=((-8, -8), (8, 8)), spacing=2.0),
     ],
 }
+
+
+@pytest.mark.parametrize("given", [-1.0, "1/h", ["1/h"]])
+def test_a_bad_value_is_refused_with_all_the_forms_that_are_allowed(given):
+    forms = r"one number, a list .*per colony, a dict by cell type .*, or a distribution"
+    with pytest.raises(tf.InputError, match=rf"^Growth\.rate = .*{forms}"):
+        tf.Growth(rate=given)
+    with pytest.raises(tf.InputError, match=r"^Growth\.rate\[0\] = (?!.*a dict).*distribution"):
+        tf.Growth(rate={0: given})
 
 
 @pytest.mark.parametrize("name", EFFECTS)

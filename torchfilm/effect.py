@@ -102,7 +102,7 @@ class Effect:
 
     def value_owner(self) -> str:
         """Whose its physical values are, in errors and in the keys of their random numbers. Effects
-        of one class that have titles of their own are told apart."""
+        of one class that have titles of their own are distinguished."""
         kind = type(self)
         own = getattr(kind, "title", None) == self.title
         return kind.__name__ if own else f"{kind.__name__} {self.title!r}"
@@ -125,7 +125,8 @@ class Effect:
 
     def reads(self) -> Sequence[str]:
         """What `step` reads: "position", "axis", "length", "radius", "cells" (how many, which) or
-        fields."""
+        fields. Each must exist; what is used only where a scene has it, `BoundEffect.reads` adds.
+        """
         return ()
 
     def needs(self) -> Sequence[str]:
@@ -281,12 +282,24 @@ class BoundEffect:
         """A first state made ready for this effect, after all fields are declared."""
         return state
 
+    def opened(self, state: State) -> State:
+        """A state as a step begins, also where another model made it."""
+        return state
+
     def check(self, state: State) -> None:
         """Raise InputError if this effect cannot start from this first state."""
         self.effect.check(state, self.values)
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         """Raise InputError if this effect cannot act together with the others (all traced)."""
+
+    def warn_of_others(self) -> None:
+        """Warn where this effect and the others, checked before, are probably not meant so."""
+
+    def typed_values(self) -> dict[str, tuple[int, ...]]:
+        """Its values that each cell takes by its type, by name, and the types that they have."""
+        each = [v for v in vars(self.values).values() if v is not None]
+        return {v.name: v.known_types for v in each if v.known_types}
 
     def check_step(self, dt: float, divides: bool) -> None:
         """Raise InputError for a step of dt hours that this effect cannot follow. divides: cells
@@ -318,8 +331,8 @@ class BoundEffect:
 @dataclass(frozen=True)
 class Concern:
     """What a report warns of, once it has held for `steps` steps: in which colonies, `where` (B,)
-    bool, and `text(colony ids (B,), where (B,))`, what is wrong and what to do. name: tells
-    concerns apart.
+    bool, and `text(colony ids (B,), where (B,))`, what is wrong and what to do. name:
+    distinguishes concerns.
     """
 
     name: str

@@ -10,8 +10,10 @@ from torchfilm.effects import KNOWN
 from torchfilm.model import Model
 from torchfilm.scene import Scene
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import once
 
 
+@once()  # it binds the scene again to estimate its cost
 def explain(
     scene: Scene,
     *,

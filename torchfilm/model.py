@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchfilm import binding_checks
 from torchfilm.effect import BUILT_IN, Binding, BoundEffect, parameters
 from torchfilm.initial_cells import Cells
 from torchfilm.resolver import BoundBatch
@@ -91,7 +92,10 @@ class Model:
     def opened(self, state: State) -> State:
         """The state as a step of this model begins, also where another model made it."""
         declared = {**state.declared, **self._first_fields}
-        return state.replace(births=(), ended=(), reports={}, declared=declared)
+        state = state.replace(births=(), ended=(), reports={}, declared=declared)
+        for effect in self.effects:
+            state = effect.opened(state)
+        return state
 
     def _laid(self) -> State:
         start = self._begin
@@ -165,36 +169,8 @@ class Model:
             effect.check_step(dt, any("divide_flag" in e.writes() for e in self.effects))
 
     def check_end(self, state: State, cells: int) -> None:
-        """Raise InputError if no run would come to `cells` cells: an effect waits for a field that
-        is 0 everywhere in a colony and that nothing sets."""
-        for effect in self.effects:
-            for name in effect.effect.waits_for():
-                if self._sets(name, effect):
-                    continue
-                moves = state.fields[name] != 0
-                if "divide_flag" in state.fields:
-                    moves = moves | (state.fields["divide_flag"] != 0)
-                still = (state.counts > 0) & (state.counts < cells) & ~state.groups.any(moves)
-                if bool(still.any()):
-                    ids = state.colony_id[still].tolist()
-                    some = f" in {len(ids)} of {state.colonies} colonies, first in colony {ids[0]}"
-                    raise checks.InputError(
-                        f"{effect.title} waits for {name!r}, which is"
-                        f" 0{'' if len(ids) == state.colonies else some} and which nothing in this"
-                        f" scene sets: no run would come to {cells} cells. Give"
-                        f" {type(effect.effect).__name__} a parameter above 0 (such as rate=1.0),"
-                        " or a rule that sets it; or end the run by a time, until=…"
-                    )
-
-    def _sets(self, name: str, effect: BoundEffect) -> bool:
-        """Whether another effect may set a field, or lengthen or add cells in its own way."""
-        others = [e for e in self.effects if e.effect is not effect.effect]
-        return any(
-            e.effect.writes_anything
-            or name in e.writes()
-            or not type(e.effect).__module__.startswith("torchfilm.")
-            for e in others
-        )
+        """Raise InputError, or warn, if no run from this state would come to `cells` cells."""
+        binding_checks.check_end(self.effects, state, cells)
 
     # --- what depends on what ------------------------------------------------------------
 
@@ -349,9 +325,11 @@ def bind(
         raise checks.input_error("dtype", dtype, "torch.float32 or torch.float64")
     if founders.dim != scene.dim:
         raise checks.input_error("cells", f"{founders.dim}-D", f"{scene.dim}-D, as the scene is")
-    batch = BoundBatch(count, dtype, known_device(device), _types(founders), per_colony)
+    batch = BoundBatch(count, dtype, checks.device(device), _types(founders), per_colony)
     model = Model(scene, batch, _Start(count, seed, _streams(streams, count), founders), places)
     first = model.trace(None)
+    if places is None:  # a part of a scene lacks what the rest of it declares
+        binding_checks.check_names(model.effects, scene.declared_by, first)
     model.check(first)
     for effect in model.effects if check_first else ():
         effect.check(first)
@@ -369,7 +347,10 @@ def _bind_to_state(scene: Scene, state: State, places: Collection[int] | None) -
     model = Model(scene, batch, _Start(count, state.seed, streams, scene.founders), places)
     model.check(state)
     # what it can be tried on: cells that there are, or else the founders
-    model.trace(model.opened(state) if state.cells else None)
+    tried = model.trace(model.opened(state) if state.cells else None)
+    if places is None:
+        there = (*scene.declared_by, *state.fields)
+        binding_checks.check_names(model.effects, there, tried)
     return model
 
 
@@ -400,29 +381,6 @@ def _streams(given: Sequence[int] | Tensor | None, colonies: int) -> Tensor | No
             "streams", given, f"{colonies} integers from 0 to 2³² − 1, one for each colony"
         )
     return found.to(torch.int64)
-
-
-def known_device(device: str | torch.device) -> torch.device:
-    """The device of that name, if this machine has it."""
-    try:
-        wanted = torch.device(device)
-    except (RuntimeError, TypeError) as error:
-        raise checks.input_error("device", device, '"cpu" or "cuda"') from error
-    if wanted.type not in ("cpu", "cuda"):
-        raise checks.input_error(
-            "device",
-            str(device),
-            '"cpu" or "cuda"',
-            "Other devices lack the sparse products and float64 that a step needs.",
-        )
-    if wanted.type == "cuda" and not torch.cuda.is_available():
-        raise checks.input_error(
-            "device",
-            str(device),
-            "a device that this machine has",
-            'torch sees no CUDA GPU; use device="cpu".',
-        )
-    return wanted
 
 
 def _with_given(state: State, wanted: Field) -> State:

@@ -25,6 +25,7 @@ from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, Births, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import expand_ranges, offsets
+from torchfilm.tools.warn_once import once
 
 FIRST = -1  # the part of what happens before all effects
 
@@ -70,6 +71,7 @@ class GrowthRecording:
     step that an exception has interrupted is done again by whoever reads on.
     """
 
+    @once()  # it binds the scene twice
     def __init__(
         self,
         scene: Scene,
@@ -312,7 +314,7 @@ class Replay:
         parents = old.take(source.index_select(0, first))
         births = Births(first, second, state.uid.index_select(0, daughters), parents)
         state = state.replace(births=(*state.births, births))
-        # as where cells divide: what starts anew does so from the parents' values of all that does
+        # as where cells divide: what starts again does so from the parents' values of all that does
         return state.reset_at_division(daughters, self.own).with_fields(**taken)
 
     def _with_failures(self, state: State, number: int) -> State:

@@ -7,7 +7,7 @@ changed later in place does not change a bound model.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -49,6 +49,13 @@ class Resolved:
     draw: BoundDraw | None = None
     field: str | None = None
 
+    @property
+    def known_types(self) -> tuple[int, ...]:
+        """The cell types that cells must be of to have a value; none where all cells have one."""
+        if self.types is not None:
+            return tuple(self.types.tolist())
+        return () if self.draw is None or self.draw.others is not None else self.draw.types
+
     def of_colonies(self, state: State) -> Tensor:
         """0-dim, or (B,) for the colonies of a state."""
         assert self.value is not None and self.types is None
@@ -57,6 +64,8 @@ class Resolved:
     def of_cells(self, state: State, kind: int | None = None) -> Tensor:
         """0-dim, or (N,) for the cells of a state. kind: as if all cells were of this type."""
         if self.field is not None:
+            if kind is not None and self.draw is not None:
+                self.draw.check_kind(kind)
             return state.fields[self.field]
         if self.types is not None:
             own = state.fields["cell_type"]
@@ -78,6 +87,15 @@ class Resolved:
         """(M,) for the cells `rows` (M,), drawn now by the key `purpose`, or else by its name."""
         assert self.draw is not None
         return self.draw(state, rows, purpose or self.name)
+
+    def needed_by(self, kinds: Collection[int]) -> Resolved:
+        """The same value where only cells of these types need it. If it is drawn, and for just one
+        of them, cells of types without a value draw that one's too: they may become of that
+        type."""
+        given = [] if self.draw is None else [n for n, _ in self.draw.parts if n in kinds]
+        if self.draw is None or self.field is None or len(given) != 1:
+            return self
+        return dataclasses.replace(self, draw=dataclasses.replace(self.draw, others=given[0]))
 
     def _by_type(self, state: State, kind: Tensor, rows: Tensor | None) -> Tensor:
         assert self.types is not None and self.value is not None
@@ -107,19 +125,23 @@ class Resolved:
 
 @dataclass(frozen=True, eq=False)
 class BoundDraw:
-    """How the values of cells are drawn: by one distribution, or by one value for each cell
-    type."""
+    """How the values of cells are drawn: by one distribution, or by one value for each cell type.
+    others: the type whose value cells of types without one get; None: there may be no such cells.
+    """
 
     name: str
     parts: tuple[
         tuple[int | None, Any], ...
     ]  # (cell type or None, Resolved or (Distribution, its resolved parameters))
+    others: int | None = None
 
     def __call__(self, state: State, rows: Tensor, purpose: str) -> Tensor:
         """(M,) for the cells `rows` (M,)."""
         if self.parts[0][0] is None:
             return self._part(self.parts[0][1], state, rows, purpose)
         kind = state.fields["cell_type"].index_select(0, rows)
+        if self.others is not None:
+            kind = torch.where(torch.isin(kind, kind.new_tensor(self.types)), kind, self.others)
         known = torch.zeros_like(kind, dtype=torch.bool)
         out = torch.zeros(rows.numel(), dtype=state.dtype, device=state.device)
         for number, part in self.parts:
@@ -127,8 +149,21 @@ class BoundDraw:
             known = known | mine
             out = torch.where(mine, self._part(part, state, rows, purpose), out)
         if not bool(known.all()):
-            raise _missing_type(self.name, int(kind[~known][0]), [n for n, _ in self.parts])
+            raise _missing_type(self.name, int(kind[~known][0]), self.types)
         return out
+
+    @property
+    def types(self) -> tuple[int, ...]:
+        """The cell types that it has values for; none if it is the same for all."""
+        return tuple(n for n, _ in self.parts if n is not None)
+
+    def check_kind(self, kind: int) -> None:
+        """Raise InputError if rates in cells of this type read it, and it has no value for them."""
+        if self.types and kind not in self.types:
+            raise checks.InputError(
+                f"{self.name} has values for the cell types {', '.join(map(str, self.types))}, but"
+                f" the rates of type {kind} read it. Add {kind}: … to it."
+            )
 
     @property
     def requires_grad(self) -> bool:

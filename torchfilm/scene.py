@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -18,6 +17,7 @@ from torchfilm.model import Model, bind
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hashing import digest, without_addresses
+from torchfilm.tools.warn_once import once, warn
 from torchfilm.version import __version__
 
 CHANGEABLE = ("name", "dt", "founders", "recipe", "settings", "accuracy", "dim")
@@ -47,6 +47,7 @@ class Scene:
     accuracy: dict[str, float]
     code: list[str]
     declared_by: dict[str, str]
+    _said: frozenset[str]  # warnings given when it was made
 
     def __init__(
         self,
@@ -84,8 +85,10 @@ class Scene:
             digest(effects),
         ]
         self.__dict__.update(made)
-        for effect in effects:
-            effect.check_scene(effects, made["founders"])
+        with once() as said:
+            for effect in effects:
+                effect.check_scene(effects, made["founders"])
+        self.__dict__["_said"] = frozenset(said)
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"a Scene never changes: scene.replace({name}=…) makes another one")
@@ -111,7 +114,8 @@ class Scene:
             if name not in CHANGEABLE:
                 raise checks.unknown_keyword("Scene.replace", name, CHANGEABLE)
         kept = {name: getattr(self, name) for name in CHANGEABLE}
-        return Scene(*(effects or self.effects), **{**kept, **changes})
+        with once(self._said):  # what this scene has warned of, its copies need not
+            return Scene(*(effects or self.effects), **{**kept, **changes})
 
     def bind(
         self,
@@ -226,7 +230,7 @@ def _dimension(effects: Sequence[Effect], founders: Cells | None, given: int | N
         return stated
     if founders is not None:
         return founders.dim
-    warnings.warn(
+    warn(
         "the scene has no Mechanics and no founders, so that its dimension is not stated: it is"
         " 3-D. Write Scene(…, dim=2) or Scene(…, dim=3).",
         stacklevel=3,

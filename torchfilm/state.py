@@ -277,7 +277,7 @@ class State:
 
     def reset_at_division(self, daughters: Tensor, names: Iterable[str]) -> State:
         """The state right after divisions (`births[-1]` tells of them) in which those of the named
-        fields that a division resets start anew in the cells `daughters` (M,), first daughters
+        fields that a division resets start again in the cells `daughters` (M,), first daughters
         first; the others they have from their parents."""
         changed = {}
         for name in names:

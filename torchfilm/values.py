@@ -31,6 +31,15 @@ if TYPE_CHECKING:
     from torchfilm.state import State
 
 CELL, COLONY = "cell", "colony"
+# The forms that a value of a cell may take, and the value of one cell type, for messages.
+FORMS = (
+    "Give one number, a list with one number per colony, a dict by cell type such as {0: 0.6, 1:"
+    " 1.2}, or a distribution such as tf.Uniform(0.5, 1.5)."
+)
+FORMS_OF_TYPE = (
+    "Give one number, a list with one number per colony, or a distribution such as"
+    " tf.Uniform(0.5, 1.5)."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +85,11 @@ def physical(default: Any = dataclasses.MISSING, **rule: Any) -> Any:
     return field(default=default, metadata={"physical": Rule(**rule)})
 
 
-def checked(name: str, given: object, rule: Rule) -> Any:
+def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
     """A physical value as an effect keeps it: a float, a 1-D tensor, `ByType`, `PerColony` or a
     `Distribution`.
 
-    Raises InputError for what `rule` does not allow.
+    Raises InputError for what `rule` does not allow; forms: those that a value of a cell may take.
     """
     bounds: dict[str, Any] = {"above": rule.above, "least": rule.least, "most": rule.most}
     if isinstance(given, ByType):
@@ -109,7 +118,10 @@ def checked(name: str, given: object, rule: Rule) -> Any:
                 name, dict(given), "one value for each cell type, such as {0: 0.6, 1: 1.2}"
             )
         by_type = ByType(
-            {int(k): checked(f"{name}[{k}]", value, rule) for k, value in sorted(given.items())}
+            {
+                int(k): checked(f"{name}[{k}]", value, rule, FORMS_OF_TYPE)
+                for k, value in sorted(given.items())
+            }
         )
         drawn = [v for v in by_type.values.values() if isinstance(v, Distribution)]
         if len({v.inherited for v in drawn}) > 1:
@@ -125,7 +137,8 @@ def checked(name: str, given: object, rule: Rule) -> Any:
         if not isinstance(inner, Tensor) or inner.dim() != 1:
             raise checks.input_error(name, given, "a list or 1-D tensor with one number per colony")
         return PerColony(inner)
-    return checks.value(name, given, **bounds)
+    hint = forms if rule.scope == CELL else checks.ONE_OR_EACH
+    return checks.value(name, given, hint=hint, **bounds)
 
 
 def numbers(value: Any) -> Tensor:

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 # "out.ahl" is the signal at the cell; "ahl" is the level inside the cell
 OUTSIDE = "out."
+# What effects of torchfilm keep for themselves; of a circuit with a name, this is the end of the
+# field. A target may read it, but it is none to offer.
+INTERNAL = ("divide_flag", "division_threshold", "birth_length", "elongation", "circuit_volume")
 
 
 class Target:
@@ -77,14 +80,15 @@ def require(state: tf.State, names: tuple[str, ...]) -> None:
     there = known(state)
     for name in names:
         if name not in there:
-            near = difflib.get_close_matches(name, there, 1, cutoff=0.5)
+            offered = [n for n in there if not n.endswith(INTERNAL)]
+            near = difflib.get_close_matches(name, offered, 1, cutoff=0.5)
             hint = f"Did you mean {near[0]!r}?" if near else ""
             raise checks.input_error(
                 "species",
                 name,
                 (
-                    "one of " + ", ".join(map(repr, there))
-                    if there
+                    "one of " + ", ".join(map(repr, offered))
+                    if offered
                     else "a species of a Circuit; the scene has none"
                 ),
                 hint,

@@ -193,6 +193,8 @@ class OnFraction(Target):
         found = float(self.measures(state)["on_share"][place])
         inset.bar([0, 1], [self.fraction, found], color=[TARGET, FOUND])
         inset.set_xticks([0, 1], ["target", "found"], fontsize=5.0)
+        # above the bars: below them lies the scale bar of the panel
+        inset.tick_params(axis="x", bottom=False, labelbottom=False, labeltop=True, length=0)
         inset.set(ylim=(0, 1), yticks=[])
 
     def describe(self) -> str:

@@ -1,13 +1,17 @@
-"""The machine, versions and commit that every benchmark records, and how tables enter a page."""
+"""The machine, versions and commit that every benchmark records, how tables enter a page, and what
+scripts that run ready-made scenes are asked."""
 
 from __future__ import annotations
 
+import argparse
 import platform
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
+
+import torchfilm as tf
 
 
 def machine() -> dict:
@@ -44,3 +48,17 @@ def write_page(page: Path, text: str, what: str) -> None:
     if not found or not closed:
         raise SystemExit(f"{page} lacks the marks {begin} and {end}")
     page.write_text(f"{before}{begin}\n\n{text}\n\n{end}{after}")
+
+
+def scenes_parser(about: str | None) -> argparse.ArgumentParser:
+    """Returns the parser of a script about ready-made scenes, with the option --scene."""
+    parser = argparse.ArgumentParser(
+        description=about, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scene",
+        action="append",
+        choices=tuple(tf.scenes.READY),
+        help="one scene; may be repeated",
+    )
+    return parser

@@ -95,7 +95,7 @@ def test_only_the_rows_asked_for_in_their_order():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_reservoir_does_not_change_and_what_it_got_is_told(method):
+def test_a_reservoir_does_not_change_and_what_it_got_is_reported(method):
     made = circuit(in_reservoir=(True, False, True))
     start = torch.tensor([[5.0, 0.0], [5.0, 0.0], [0.0, 0.0]], dtype=F64)
     found = run.step(made, start, 0.2, settings(method))
@@ -140,7 +140,7 @@ def test_a_cell_that_fails_leaves_the_others_alone(method):
     assert "the species 'a'" in said and "not a finite number" in said and "a = 5, b = 1" in said
 
 
-def test_a_signal_whose_amount_breaks_is_told_apart():
+def test_a_signal_whose_amount_breaks_is_distinguished():
     made = circuit(lambda u, s, p, cell: ({"a": -u.a}, {"a": torch.log(u.b)}))
     start = torch.tensor([[1.0, 1.0], [1.0, 0.0], [1.0, 1.0]], dtype=F64)
     found = run.step(made, start, 0.1, settings("rk4"))

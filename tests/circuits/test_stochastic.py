@@ -210,8 +210,8 @@ def test_no_number_goes_negative(device, method):
 def test_what_runs_out_fires_alone():
     """a → ∅ at a constant 12/h, from 9 and from 12 molecules: a leap does not see the end.
 
-    From 9 the reaction is critical, hence exact: (9 − Poisson(12))⁺ remains after an hour. From 12
-    leaps may go too far; they are repeated at half the length.
+    From 9 the reaction is critical, so it is exact: (9 − Poisson(12))⁺ remains after an hour. From
+    12 leaps may go too far; they are repeated at half the length.
     """
     steady = lambda n, rows: torch.full_like(n, 12.0)
     left, _ = run("tau", [9.0], steady, [[-1.0]], 1.0, orders=torch.tensor([0.0]))

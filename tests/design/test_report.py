@@ -222,6 +222,21 @@ def test_a_target_draws_on_each_colony_that_is_shown(tmp_path):
     assert drawn == [0, 1, 2, 0, 1, 2]
 
 
+def test_both_designs_are_drawn_with_one_scale_of_colours(tmp_path, monkeypatch):
+    """So that a first guess that is darker than the best design looks darker."""
+    seen, levels, draw_cells = [], [], tf.pictures.draw_cells
+
+    def watched(ax, cells, **options):
+        seen.append(options["limits"])
+        levels.append(float(cells["gfp"].max()))
+        return draw_cells(ax, cells, **options)
+
+    monkeypatch.setattr(tf.pictures, "draw_cells", watched)
+    searched(lit, LIT, Bands(("gfp",), edges=(-2.0, 2.0))).plot(tmp_path / "best.png")
+    assert len(seen) == 4 and len(set(levels)) > 1
+    assert all(limits == {"gfp": (0.0, max(levels))} for limits in seen)
+
+
 def test_a_bad_picture_name_is_refused(tmp_path):
     best = searched(lit, LIT, Spread())
     with pytest.raises((tf.InputError, ValueError), match="Format 'xyz' is not supported"):

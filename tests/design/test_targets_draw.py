@@ -107,7 +107,13 @@ def test_domains_have_a_bar_of_their_size(ax):
 
 def test_a_share_has_two_bars(ax):
     OnFraction("yfp", 0.25, 0.5).draw(ax, state(), 1)
-    assert [p.get_height() for p in ax.child_axes[0].patches] == pytest.approx([0.25, 0.5])
+    (inset,) = ax.child_axes
+    assert [p.get_height() for p in inset.patches] == pytest.approx([0.25, 0.5])
+    # the scale bar of the panel lies just below it
+    ax.figure.canvas.draw()
+    labels = [t.label2 for t in inset.xaxis.get_major_ticks() if t.label2.get_visible()]
+    assert [t.get_text() for t in labels] == ["target", "found"]
+    assert all(t.get_window_extent().y0 > ax.get_window_extent().y0 for t in labels)
 
 
 def test_an_oscillation_has_a_curve_if_there_is_a_history(ax):

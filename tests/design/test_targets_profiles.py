@@ -312,6 +312,21 @@ def test_a_signal_is_seen_where_the_cells_are():
         Bands(("ahl",), (0.0, 1.0)).check(state)
 
 
+def test_an_unknown_species_is_refused_without_what_effects_keep_for_themselves():
+    def made(u, s, p, cell):
+        return {"yfp": 1.0 - u.yfp}
+
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Division(added=2.0),
+        tf.Circuit(made, species="yfp", name="second"),
+        dim=2,
+    )
+    with pytest.raises(tf.InputError) as caught:
+        Bands(("ypf",), (0.0, 1.0)).check(scene.bind().start())
+    assert "one of 'growth_rate', 'second_yfp'." in str(caught.value)
+
+
 @pytest.mark.parametrize("name", PROFILES)
 def test_an_unknown_species_is_refused_with_the_known_ones(name):
     state = crowded(names=("yfq", "cfp"))

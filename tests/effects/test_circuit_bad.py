@@ -64,6 +64,10 @@ AT_ONCE = {
     "atol": (bad(idle, atol=-1.0), r"Circuit\.atol"),
     "molecules_per_unit": (bad(idle, molecules_per_unit=0.0), r"Circuit\.molecules_per_unit"),
     "a misspelt option": (bad(idle, metod="rk4"), r"Circuit\.metod = 'rk4'"),
+    "a misspelt option that takes a dict": (
+        bad(idle, inital={"m": 1.0}),
+        r"Circuit\.inital = \{'m': 1\.0\}.*Did you mean initial\?",
+    ),
     "a parameter that is no number": (bad(made, k="fast", g=1.0), r"Circuit\.k = 'fast'"),
     "a parameter that is not finite": (
         bad(made, k=[1.0, math.nan], g=1.0),

@@ -308,7 +308,7 @@ class Marks(Effect):
                 "copied",
                 initial=lambda s, rows, values: 1.0 + s.uid.index_select(0, rows).double(),
             ),
-            tf.Field("clock", "starts anew", initial=7.0, at_division="reset"),
+            tf.Field("clock", "starts again", initial=7.0, at_division="reset"),
             tf.Field(
                 "own",
                 "a function of the newborn",

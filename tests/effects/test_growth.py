@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
+import warnings
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -254,6 +257,25 @@ def test_a_step_in_which_the_fastest_cell_more_than_doubles_is_refused(rate, nam
             run(scene, until=0.05)
 
 
+@pytest.mark.parametrize(
+    ("rate", "words"),
+    [
+        ([0.5, 60.0, 1.0], r"Growth\.rate = 60/h in colony 1: a cell"),
+        (
+            [60.0, 1.0, 70.0],
+            r"Growth\.rate = 70/h in colony 2 \(too fast in 2 of 3 colonies: 0, 2\): a cell",
+        ),
+        ({0: 0.5, 1: [1.0, 60.0, 2.0]}, r"Growth\.rate of cell type 1 = 60/h in colony 1: a cell"),
+        (tf.PerColony([60.0, 1.0, 1.0]), r"Growth\.rate = 60/h in colony 0: a cell"),
+        (60.0, r"Growth\.rate = 60/h: a cell"),
+    ],
+)
+def test_a_step_that_is_too_long_names_the_colonies(rate, words):
+    scene = scene_of(rate, "volume", one_cell(), tf.Division(length=3.0))
+    with pytest.raises(tf.InputError, match=words):
+        tf.simulate(scene, until=0.05)
+
+
 def test_the_tail_of_a_distribution_may_be_too_fast_for_the_step():
     scene = scene_of(tf.Uniform(1.0, 60.0), "volume", one_cell(), tf.Division(length=3.0))
     scene.bind().check_step(scene.dt)
@@ -268,8 +290,62 @@ def test_a_rule_may_not_set_the_rate_where_it_goes_by_type():
     with pytest.raises(tf.InputError, match=r"sets growth_rate, but Growth\.rate = .*cell_type"):
         scene.bind()
     one_rate = scene_of(1.0, "volume", cells, tf.Rules(update))
-    state = step(one_rate, one_rate.bind().start(), 0.1)
+    with pytest.warns(UserWarning, match=r"Growth\.rate and rules each set growth_rate"):
+        model = one_rate.bind()
+    state = step(one_rate, model.start(), 0.1)
     assert state.growth_rate.tolist() == pytest.approx([2.1, 2.1])
+
+
+@dataclass(frozen=True)
+class Slowing(tf.Effect):
+    """Sets the growth rate; `reads_it`: from what it was."""
+
+    reads_it: bool = False
+    stage, title = 15, "slowing"
+
+    def reads(self):
+        return ("growth_rate",) if self.reads_it else ()
+
+    def writes(self):
+        return ("growth_rate",)
+
+    def step(self, state, dt, values):
+        return state.with_fields(growth_rate=0.5 * state.growth_rate)
+
+
+def setting(cells):
+    cells.growth_rate = 2.1
+
+
+def halving(cells):
+    cells.growth_rate = 0.5 * cells.growth_rate
+
+
+@pytest.mark.parametrize(
+    "rate, other, words",
+    [
+        (1.0, Slowing(), r"Growth\.rate and slowing.*such as Growth\(\) without a rate.*reads\(\)"),
+        (tf.Uniform(0.5, 1.0), tf.Rules(setting), r"Growth\.rate and rules each set growth_rate"),
+        (None, Slowing(), ""),
+        (None, tf.Rules(setting), ""),
+        (0.0, tf.Rules(setting), ""),
+        (1.0, Slowing(reads_it=True), ""),
+        (1.0, tf.Rules(halving), ""),
+    ],
+)
+def test_a_rate_that_another_effect_overrides_is_warned_of(rate, other, words):
+    scene = scene_of(rate, "volume", None, other)
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        scene.bind()
+    said = [str(w.message) for w in given]
+    assert len(said) == (1 if words else 0) and all(re.search(words, text) for text in said), said
+
+
+def test_two_effects_that_set_the_rate_are_warned_of():
+    scene = scene_of(None, "volume", None, tf.Rules(setting), Slowing())
+    with pytest.warns(UserWarning, match="^rules and slowing each set growth_rate"):
+        scene.bind()
 
 
 def test_unknown_law_is_refused():

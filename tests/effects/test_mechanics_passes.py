@@ -243,7 +243,7 @@ def test_more_passes_over_hard_contacts_keep_a_full_channel_apart(full_channel, 
     assert int((state.counts - full_channel.counts).max()) < 30
 
 
-def test_a_colony_whose_cells_stay_in_one_another_is_told():
+def test_a_colony_whose_cells_stay_in_one_another_is_reported():
     """A heap whose contacts are so soft by their alpha that they separate nothing gives a warning.
 
     The other colony is loose. No solve fails.

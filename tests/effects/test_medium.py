@@ -1,5 +1,5 @@
-"""Medium: what cells and grid hold together, cells beyond the box, and what a scene refuses. The
-transport itself is tested with its kernels."""
+"""Medium: what cells and grid hold together, and cells beyond the box. The transport itself is
+tested with its kernels."""
 
 from __future__ import annotations
 
@@ -7,59 +7,11 @@ import math
 
 import pytest
 import torch
+from exchanging_cells import BOX, F64, advance, exchanging, resting, totals
 from helpers import step
-from torch import Tensor
 
 import torchfilm as tf
-from torchfilm.tools.checks import InputError, SimulationError
-
-F64 = torch.float64
-BOX = ((-16.0, -16.0), (16.0, 16.0))
-
-
-def membrane(u, s, p, cell):
-    """Exchange and nothing else: what one side loses the other gains."""
-    into = p.D1 * (s.ahl - u.ahl) * cell.area
-    return {"ahl": into / cell.volume}, {"ahl": -into}
-
-
-def exchanging(start: float = 3.0, *, D1: float = 1.0, **options) -> tf.Circuit:
-    return tf.Circuit(membrane, species=("ahl",), initial={"ahl": start}, D1=D1, **options)
-
-
-def resting(
-    medium: tf.Medium,
-    circuit: tf.Circuit | None = None,
-    founders: tf.Cells | None = None,
-    **options,
-) -> tf.Scene:
-    """Cells that neither grow nor move."""
-    return tf.Scene(
-        circuit or exchanging(), medium, founders=founders or tf.Cells.single(2), **options
-    )
-
-
-def totals(state: tf.State, name: str = "ahl", inside: bool = True) -> Tensor:
-    """Amount of a substance in cells, medium and beyond, conc·µm³, per colony (B,) float64."""
-    grid = state.layout.grid
-    out = torch.zeros(state.colonies, dtype=F64, device=state.device).index_add(
-        0, grid.owner, state.signals[name].double() * grid.voxel_volume
-    )
-    if inside:
-        out = out.index_add(0, state.colony, state.fields[name].double() * state.volume.double())
-    return (
-        out + state.fields[f"{name}_reservoir"].double()
-        if f"{name}_reservoir" in state.fields
-        else out
-    )
-
-
-def advance(scene: tf.Scene, state: tf.State, steps: int, dt: float) -> tf.State:
-    for _ in range(steps):
-        state = step(scene, state, dt)
-        assert all(bool((r.status == 0).all()) for r in state.reports.values())
-    return state
-
+from torchfilm.tools.checks import SimulationError
 
 # --- what there is, stays -------------------------------------------------------------------------
 
@@ -290,6 +242,33 @@ def test_an_open_box_gives_too():
     assert torch.allclose(totals(state), torch.zeros(3, dtype=F64), atol=1e-12)
 
 
+def test_a_state_is_in_the_space_of_the_scene_that_steps_it():
+    """The reservoir and the obstacles are the scene's, as constants of circuits are, and not those
+    with which another scene has laid the grid."""
+
+    def space(reservoir, wall):
+        medium = tf.Medium(
+            ahl=tf.Signal(diffusion=5.0, reservoir=reservoir),
+            box=BOX,
+            spacing=4.0,
+            outside="reservoir",
+            obstacles=lambda at: at[:, 1] > wall,
+        )
+        return resting(medium, exchanging(3.0))
+
+    one, other = space(0.25, 12.0), space([1.0, 2.0, 4.0], 6.0)
+    state = strayed(one, 4.0)
+    layout = strayed(other, 4.0).layout
+    wanted = step(other, state.replace(layout=layout), 0.1)
+    assert not torch.equal(step(one, state, 0.1).ahl, wanted.ahl)
+    *_, found = tf.simulate(other, state, until=0.1, dt=0.1)
+    assert torch.equal(found.ahl, wanted.ahl)
+    for name in ("out.ahl", "ahl_reservoir"):
+        assert torch.equal(found.fields[name], wanted.fields[name]), name
+    again = other.bind(state=found).step(found, 0.1)
+    assert torch.equal(again.ahl, step(other, wanted, 0.1).ahl)
+
+
 def test_a_box_that_grows_along_x_only_says_where_else_it_ends():
     scene = resting(
         tf.Medium(ahl=tf.Signal(diffusion=5.0), box=BOX, spacing=4.0, outside="grow", grows="x")
@@ -311,245 +290,3 @@ def test_a_cell_inside_an_obstacle_is_beyond_the_medium():
     with pytest.raises(SimulationError, match=r"colony 1.*obstacle") as failed:
         list(tf.simulate(scene, state, until=0.1, dt=0.1))
     assert failed.value.colonies == (1,)
-
-
-# --- values on the grid ---------------------------------------------------------------------------
-
-
-def test_first_values_and_constants_may_be_numbers_per_colony_or_functions(dtype):
-    medium = tf.Medium(
-        a=tf.Signal(diffusion=[1.0, 2.0], initial=[3.0, 4.0], decay=[0.0, 1.0]),
-        b=tf.Signal(diffusion=0.0, initial=lambda at: (at[:, 0] > 0).double()),
-        c=tf.Signal(diffusion=0.0, source=lambda at: (at[:, 1] > 0).double() * 2.0),
-        box=BOX,
-        spacing=4.0,
-    )
-    scene = tf.Scene(medium, founders=tf.Cells.single(2))
-    state = scene.bind(2, dtype=dtype).start()
-    assert state.signals["a"].dtype == dtype and state.signals["a"].reshape(2, -1).mean(
-        1
-    ).tolist() == [3.0, 4.0]
-    after = step(scene, state, 0.5)
-    close = {"rel": 20 * torch.finfo(dtype).eps}  # eight voxels an axis, two products
-    assert after.signals["a"].reshape(2, -1).amax(1).tolist() == pytest.approx(
-        [3.0, 4.0 * math.exp(-0.5)], **close
-    )
-    assert (
-        torch.equal(after.signals["b"], state.signals["b"])
-        and float(after.signals["b"].sum()) == 64
-    )
-    assert float(after.signals["c"].sum()) == pytest.approx(2 * 32 * 2.0 * 0.5, **close)
-
-
-def test_obstacles_hold_nothing_at_first():
-    scene = tf.Scene(
-        tf.Medium(
-            a=tf.Signal(diffusion=1.0, initial=1.0),
-            box=BOX,
-            spacing=4.0,
-            obstacles=lambda at: at[:, 0] > 0,
-        ),
-        founders=tf.Cells([[-5.0, 0]], [1.0, 0]),
-    )
-    state = scene.bind(dtype=F64).start()
-    after = advance(scene, state, 3, 0.5)
-    assert (
-        float(state.signals["a"].sum()) == 32
-        and float(after.signals["a"].reshape(8, 8)[4:].abs().max()) == 0
-    )
-    # the implicit solve stops at a relative 1e-10 or so
-    assert float(after.signals["a"].sum()) == pytest.approx(32, rel=1e-9)
-
-
-def test_flat_cells_may_lie_in_a_box_with_three_dimensions():
-    scene = resting(
-        tf.Medium(
-            ahl=tf.Signal(diffusion=5.0), box=((-8, -8, -8), (8, 8, 8)), spacing=4.0, height=2.0
-        ),
-        exchanging(1.0),
-    )
-    after = step(scene, scene.bind(dtype=F64).start(), 1e-6)
-    layers = after.signals["ahl"].reshape(4, 4, 4).sum((0, 1))
-    assert int(layers.argmax()) == 2  # the layer from 0 to 4 µm, with the plane z = 2 in its middle
-    assert float(totals(after)) == pytest.approx(
-        float(totals(scene.bind(dtype=F64).start())), rel=1e-14
-    )
-
-
-# --- what is refused ------------------------------------------------------------------------------
-
-GOOD = {"box": BOX, "spacing": 4.0}
-AHL = tf.Signal(diffusion=1.0)
-BAD = {
-    "negative diffusion": (
-        lambda: tf.Signal(diffusion=-1.0),
-        r"Signal\.diffusion = -1.*at least 0",
-    ),
-    "negative diffusion of one colony": (
-        lambda: tf.Signal(diffusion=[1.0, -2.0]),
-        r"Signal\.diffusion\[1\] = -2",
-    ),
-    "NaN": (lambda: tf.Signal(diffusion=math.nan), r"Signal\.diffusion = nan"),
-    "negative decay": (lambda: tf.Signal(diffusion=1.0, decay=-0.1), r"Signal\.decay"),
-    "negative start": (lambda: tf.Signal(diffusion=1.0, initial=-0.1), r"Signal\.initial"),
-    "periodic without its partner": (
-        lambda: tf.BoundaryConditions(x=(tf.Periodic(), tf.NoFlux())),
-        r"BoundaryConditions\.x.*periodic at both ends",
-    ),
-    "periodic for one signal only": (
-        lambda: tf.Medium(
-            a=AHL,
-            b=tf.Signal(diffusion=1.0, boundary=tf.BoundaryConditions(x=tf.Periodic())),
-            **GOOD,
-        ),
-        "periodic for one signal and not for another",
-    ),
-    "no signal": (lambda: tf.Medium(**GOOD), "has no signal"),
-    "misspelt option": (
-        lambda: tf.Medium(ahl=AHL, hight=2.0, **GOOD),
-        r"Medium\.hight.*a Signal.*spelling",
-    ),
-    "a number for a signal": (
-        lambda: tf.Medium(ahl=10.0, **GOOD),
-        r"Medium\.ahl.*a Signal.*ahl=tf\.Signal",
-    ),
-    "no box": (lambda: tf.Medium(ahl=AHL, box=3.0, spacing=1.0), r"Medium\.box.*two corners"),
-    "box inside out": (
-        lambda: tf.Medium(ahl=AHL, box=((1.0, 0.0), (0.0, 1.0)), spacing=1.0),
-        r"Medium\.box.*first below the second",
-    ),
-    "not a whole number of voxels": (
-        lambda: tf.Medium(ahl=AHL, box=((0, 0), (10, 8)), spacing=4.0),
-        r"along x.*whole number of voxels.*2\.5.*make it 8",
-    ),
-    "too many voxels": (
-        lambda: tf.Medium(ahl=AHL, box=((-16e3, -16e3), (16e3, 16e3)), spacing=0.5),
-        r"Medium\.box.*at most 67,108,864.*4,096,000,000",
-    ),
-    "spacing": (lambda: tf.Medium(ahl=AHL, box=BOX, spacing=0.0), r"Medium\.spacing"),
-    "spacing of three for two": (
-        lambda: tf.Medium(ahl=AHL, box=BOX, spacing=(1.0, 1.0, 1.0)),
-        r"Medium\.spacing.*2 numbers",
-    ),
-    "depth of a box with three": (
-        lambda: tf.Medium(ahl=AHL, box=((0, 0, 0), (4, 4, 4)), spacing=4.0, depth=1.0),
-        r"Medium\.depth",
-    ),
-    "height outside": (
-        lambda: tf.Medium(ahl=AHL, box=((0, 0, 0), (4, 4, 4)), spacing=4.0, height=5.0),
-        r"Medium\.height.*within the box",
-    ),
-    "policy": (lambda: tf.Medium(ahl=AHL, outside="ignore", **GOOD), r"Medium\.outside.*'grow'"),
-    "growing where space closes": (
-        lambda: tf.Medium(
-            ahl=AHL, boundary=tf.BoundaryConditions(x=tf.Periodic()), outside="grow", **GOOD
-        ),
-        "periodic box cannot grow",
-    ),
-    "growing along nothing": (lambda: tf.Medium(ahl=AHL, grows="", **GOOD), r"Medium\.grows"),
-    "method": (
-        lambda: tf.Medium(ahl=AHL, method="exact", **GOOD),
-        r"Medium\.method.*'exponential'",
-    ),
-    "flow": (lambda: tf.Medium(ahl=AHL, flow=3.0, **GOOD), r"Medium\.flow"),
-    "flow of four": (
-        lambda: tf.Medium(ahl=AHL, flow=(1, 2, 3, 4), **GOOD),
-        r"Medium\.flow.*two or three",
-    ),
-    "obstacles": (
-        lambda: tf.Medium(ahl=AHL, obstacles=True, **GOOD),
-        r"Medium\.obstacles.*function of places",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_refused_at_construction(case):
-    make, said = BAD[case]
-    with pytest.raises(InputError, match="(?s)" + said):
-        make()
-
-
-AT_SEED = {
-    "too small for its cells": (
-        {"box": ((4.0, 4.0), (8.0, 8.0)), "spacing": 4.0},
-        r"Medium\.box.*too small for colony 0: 1 cell.*\(0, 0, 0\).*outside='grow'",
-    ),
-    "obstacles of a wrong shape": (
-        {"obstacles": lambda at: at > 0},
-        r"obstacles\(places\).*bool tensor of shape \(64,\)",
-    ),
-    "obstacles everywhere": ({"obstacles": lambda at: at[:, 0] < 99}, "true everywhere"),
-    "flow of a wrong shape": ({"flow": lambda at: at[:, 0]}, r"flow\(places\)"),
-    "exponential with obstacles": (
-        {"method": "exponential", "obstacles": lambda at: at[:, 0] > 8},
-        "(?i)exponential|separable",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", AT_SEED)
-def test_bad_input_that_shows_with_the_cells_is_refused_by_seed(case):
-    options, said = AT_SEED[case]
-    scene = tf.Scene(tf.Medium(ahl=AHL, **{**GOOD, **options}), founders=tf.Cells.single(2))
-    with pytest.raises(InputError, match="(?s)" + said):
-        scene.bind().start()
-
-
-@pytest.mark.parametrize(
-    "signal",
-    [
-        tf.Signal(diffusion=1.0, initial=lambda at: at[:, 0]),
-        tf.Signal(diffusion=1.0, initial=lambda at: at),
-        tf.Signal(diffusion=1.0, decay=lambda at: at),
-        tf.Signal(diffusion=1.0, source=lambda at: at[:, 0] * torch.nan),
-        tf.Signal(diffusion=1.0, initial=lambda at: 3.0),
-    ],
-    ids=["negative", "shape", "decay's shape", "NaN source", "no tensor"],
-)
-def test_a_function_of_places_must_give_one_good_number_for_each(signal):
-    with pytest.raises(
-        InputError,
-        match=r"\(places\) of the signal 'ahl'.*(one number for each place|at least 0 everywhere)",
-    ):
-        tf.Scene(tf.Medium(ahl=signal, **GOOD), founders=tf.Cells.single(2)).bind().start()
-
-
-@pytest.mark.parametrize(
-    ("medium", "path"),
-    [
-        ({"ahl": tf.Signal(diffusion=[1.0, 2.0])}, "diffusion"),
-        ({"ahl": tf.Signal(diffusion=1.0, decay=[1.0, 2.0])}, "decay"),
-        ({"ahl": AHL, "flow": ([1.0, 2.0], 0.0)}, "flow"),
-        (
-            {"ahl": AHL, "boundary": tf.BoundaryConditions(x=tf.Dirichlet([1.0, 2.0]))},
-            "boundary.*value",
-        ),
-    ],
-    ids=["diffusion", "decay", "flow", "face"],
-)
-def test_a_value_per_colony_must_have_one_for_each(medium, path):
-    scene = tf.Scene(tf.Medium(**medium, **GOOD), founders=tf.Cells.single(2))
-    with pytest.raises(InputError, match=f"{path}.* has 2 values, but the batch has 3 colonies"):
-        scene.bind(3).start()
-    assert scene.bind(2).start().colonies == 2
-
-
-def test_two_media_are_one_too_many():
-    with pytest.raises(InputError, match="transport 2 times"):
-        tf.Scene(tf.Medium(a=AHL, **GOOD), tf.Medium(b=AHL, **GOOD))
-
-
-def test_a_flat_box_in_space_is_refused_unless_it_is_meant():
-    growth, flat = tf.Growth(rate=1.0), ((-8.0, -8.0), (8.0, 8.0))
-    scene = lambda **given: tf.Scene(
-        growth,
-        tf.Mechanics(),
-        tf.Medium(ahl=tf.Signal(diffusion=1.0), box=flat, spacing=4.0, **given),
-    )
-    with pytest.raises(
-        tf.InputError, match=r"Medium\.box.*of three dimensions in a 3-D scene.*depth"
-    ):
-        scene().bind().start()
-    for given in ({"depth": 2.0}, {"outside": "grow"}, {"outside": "reservoir"}):
-        scene(**given).bind().start()

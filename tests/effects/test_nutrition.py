@@ -225,7 +225,7 @@ def test_bad_input_is_refused_at_construction(option):
         tf.Monod("food", **option)
 
 
-def test_what_is_missing_is_told():
+def test_what_is_missing_is_reported():
     medium = tf.Medium(food=tf.Signal(diffusion=1.0), **BOX)
     with pytest.raises(
         InputError,

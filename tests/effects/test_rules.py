@@ -344,30 +344,30 @@ def test_what_table_1_only_reads_cannot_be_written(name):
         tf.Scene(tf.Rules(write(name, 1.0))).bind().start()
 
 
-def test_a_misspelt_name_is_told_with_those_that_exist():
+def test_a_misspelt_name_is_reported_with_those_that_exist():
     with pytest.raises(AttributeError, match=r"'lenght'.*length.*growth_rate"):
         tf.Scene(tf.Rules(lambda cells: cells.lenght), tf.Growth()).bind().start()
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 2), (1, 2, 1)])
-def test_a_wrong_shape_is_told_before_anything_runs(shape):
+def test_a_wrong_shape_is_reported_before_anything_runs(shape):
     with pytest.raises(ValueError, match=r"cells\.growth_rate.*shape"):
         tf.Scene(
             tf.Rules(write("growth_rate", torch.ones(shape))), tf.Growth(), founders=pair_of_cells()
         ).bind().start()
 
 
-def test_a_new_variable_of_wrong_length_is_told():
+def test_a_new_variable_of_wrong_length_is_reported():
     with pytest.raises(ValueError, match=r"cells\.mine.*shape"):
         tf.Scene(tf.Rules(write("mine", torch.ones(5))), founders=pair_of_cells()).bind().start()
 
 
-def test_a_value_that_is_no_number_is_told_by_name():
+def test_a_value_that_is_no_number_is_reported_by_name():
     with pytest.raises((ValueError, TypeError), match="growth_rate"):
         tf.Scene(tf.Rules(write("growth_rate", "fast")), tf.Growth()).bind().start()
 
 
-def test_a_variable_that_first_comes_up_in_mid_run_is_told():
+def test_a_variable_that_first_comes_up_in_mid_run_is_reported():
     def update(cells):
         if cells.time > 0.15:
             cells.late = 1.0
@@ -440,7 +440,7 @@ def test_looking_for_contacts_is_reading_the_geometry():
     assert {"growth", "mechanics"} <= {w for w, _, r in scene.bind().couplings() if r == "rules"}
 
 
-def test_a_rule_that_would_fail_with_two_cells_is_told_at_once_with_one():
+def test_a_rule_that_would_fail_with_two_cells_is_reported_at_once_with_one():
     def update(cells):
         if cells.length > 3:
             cells.growth_rate = 1.0
@@ -466,5 +466,5 @@ def test_one_number_of_all_cells_is_refused_where_cells_divide(ask):
         cells.growth_rate = 1.0 if ask(cells.length) else 0.0
 
     with pytest.raises(tf.InputError, match=r"test_rules\.py, line \d+ .*torch\.where"):
-        tf.Scene(tf.Rules(update), tf.Growth(rate=1.0), tf.Division()).bind().start()
-    assert tf.Scene(tf.Rules(update), tf.Growth(rate=0.5)).bind().start().cells == 1
+        tf.Scene(tf.Rules(update), tf.Growth(), tf.Division()).bind().start()
+    assert tf.Scene(tf.Rules(update), tf.Growth()).bind().start().cells == 1

@@ -87,7 +87,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("kind", list(BROKEN))
-def test_a_broken_edit_is_told_and_the_run_goes_on_with_the_last_good_one(rules_file, kind):
+def test_a_broken_edit_is_reported_and_the_run_goes_on_with_the_last_good_one(rules_file, kind):
     text, word = BROKEN[kind]
     source, model = watched(rules_file)
     state = run(model, model.start(), 2)
@@ -97,7 +97,7 @@ def test_a_broken_edit_is_told_and_the_run_goes_on_with_the_last_good_one(rules_
     (message,) = source.messages
     assert message.startswith("t = 0.2 h: my_rules.py is broken") and word in message, message
     rules_file.write_text("def update(cells):\n    cells.growth_rate = 3.0\n")
-    assert run(model, state, 1).growth_rate.tolist() == [3.0, 3.0], "a mended file must be taken up"
+    assert run(model, state, 1).growth_rate.tolist() == [3.0, 3.0], "a repaired file must be used"
     assert len(source.messages) == 2
 
 
@@ -144,6 +144,59 @@ def test_an_edit_that_breaks_only_later_does_not_end_the_run(rules_file):
     assert any("t = 0.3 h" in m and "broken" in m and "speed" in m for m in source.messages)
 
 
+SETS_TYPE = "def update(cells):\n    cells.cell_type = cells.uid % 2\n"
+IN_PLACE = "def update(cells):\n    rate = cells.growth_rate\n    rate *= 3.0\n"
+
+
+@pytest.mark.parametrize("edit", ["def update(cells):\n    cells.growth_rate = 2.0\n", IN_PLACE])
+def test_an_edit_is_checked_against_the_other_effects_as_at_binding(rules_file, edit):
+    """Growth by cell type would undo what the new rule sets."""
+    rules_file.write_text(SETS_TYPE)
+    source, model = watched(rules_file, tf.Growth(rate={0: 1.0, 1: 0.5}))
+    state = run(model, model.start(), 2)
+    rules_file.write_text(edit)
+    state = run(model, state, 2)
+    (message,) = source.messages
+    assert "rules sets growth_rate, but Growth.rate" in message and "last good rules" in message
+    assert state.growth_rate.tolist() == [1.0, 0.5]
+    assert [e.writes() for e in model.effects if e.title == "rules"] == [("cell_type",)]
+    rules_file.write_text(SETS_TYPE.replace("% 2", "* 0"))
+    assert run(model, state, 1).growth_rate.tolist() == [1.0, 1.0] and len(source.messages) == 2
+
+
+def test_an_edit_that_sets_the_rate_beside_growths_own_is_warned_of(rules_file):
+    rules_file.write_text(SETS_TYPE)
+    _, model = watched(rules_file, tf.Growth(rate=1.0))
+    state = run(model, model.start(), 2)
+    rules_file.write_text("def update(cells):\n    cells.growth_rate = 2.0\n")
+    with pytest.warns(UserWarning, match=r"Growth\.rate and rules each set growth_rate") as told:
+        state = run(model, state, 3)
+    assert len(told) == 1 and state.growth_rate.tolist() == [2.0, 2.0]
+
+
+def test_a_branch_that_was_not_tried_is_checked_as_at_binding():
+    def update(cells):
+        cells.cell_type = cells.uid % 2
+        if cells.time > 0.15:
+            cells.growth_rate = 2.0
+
+    scene = tf.Scene(tf.Rules(update), tf.Growth(rate={0: 1.0, 1: 0.5}), founders=pair_of_cells())
+    model = scene.bind()
+    state = run(model, model.start(), 2)
+    with pytest.raises(tf.InputError, match=r"rules sets growth_rate, but Growth\.rate"):
+        model.step(state, 0.1)
+
+
+def test_an_edit_that_gives_a_bad_value_is_undone(rules_file):
+    source, model = watched(rules_file)
+    state = run(model, model.start(), 2)
+    rules_file.write_text("def update(cells):\n    cells.growth_rate = -cells.uid.float()\n")
+    state = run(model, state, 2)
+    assert state.growth_rate.tolist() == [1.0, 1.0] and not state.reports
+    (message,) = source.messages
+    assert "colony 0: cells.growth_rate of cell 1 was set to -1" in message
+
+
 DIVIDE = "def divide(parent, daughter1, daughter2):\n    daughter1.growth_rate = {}\n"
 
 
@@ -169,7 +222,7 @@ def test_divide_in_a_file_and_its_edit(rules_file):
     assert model.step(long_enough, 0.1).growth_rate.tolist() == [6.0, 1.0] * 4
 
 
-def test_a_broken_divide_is_told_and_the_run_goes_on(rules_file):
+def test_a_broken_divide_is_reported_and_the_run_goes_on(rules_file):
     rules_file.write_text(DIVIDE.format(5.0))
     source, model, state = grow_and_divide(rules_file)
     rules_file.write_text(DIVIDE.format("speed"))

@@ -1,5 +1,5 @@
 """Hard cases 24 and 26 to 30: stiff, bistable and oscillating circuits with answers known
-beforehand.
+in advance.
 
 The method is `rosenbrock`. Tolerances of the cases are given; those of ours follow from rtol:
 errors of single steps of rtol |u| add up along a stable orbit to a few of them, and float32 rates,

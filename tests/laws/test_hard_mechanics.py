@@ -1,4 +1,4 @@
-"""Hard cases 1 to 7, 9, 10, 14 and 18 of the mechanics: few cells, answers known beforehand.
+"""Hard cases 1 to 7, 9, 10, 14 and 18 of the mechanics: few cells, answers known in advance.
 
 Radius 0.5 µm, μ = 1, γ = 10, α = 1/γ, growth 1/h by the length law, Δt = 0.01 h, weights 1, unless
 a case says otherwise. `check_always` (finite, |axis| = 1, length ≥ 0, converged by the true

@@ -336,7 +336,7 @@ def test_case_21_batch_is_no_matter(device, dtype, measured, unilateral, dim, de
     rng = np.random.default_rng(21)
     sizes = [3, 1, 5, 3]
     parts = [crowd(rng, n, dim) for n in sizes[:3]]
-    # the first and the last start alike and grow alike: only their random streams tell them apart
+    # the first and the last start alike and grow alike: only their random streams distinguish them
     parts.append(parts[0])
     join = lambda name: np.concatenate([getattr(p, name) for p in parts])
     cells = tf.Cells(

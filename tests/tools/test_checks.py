@@ -16,6 +16,11 @@ from torchfilm.tools.checks import InputError, unknown_keyword
             "Growth has no parameter 'rat'. Did you mean rate? It has: rate, law.",
         ),
         ("colour", ("rate",), "Growth has no parameter 'colour'. It has: rate."),
+        (
+            "dimension",
+            ("walls", "dim"),
+            "Growth has no parameter 'dimension'. Did you mean dim? It has: walls, dim.",
+        ),
         ("rate", (), "Growth has no parameter 'rate'. It has: none."),
     ],
 )

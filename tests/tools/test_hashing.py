@@ -68,7 +68,7 @@ class Adding:
         (partial(holding, 1), partial(holding, 2)),
     ],
 )
-def test_what_differs_is_told_apart(one, other):
+def test_what_differs_is_distinguished(one, other):
     assert digest(one) != digest(other) and digest(one) == digest(one)
 
 

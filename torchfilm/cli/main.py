@@ -11,6 +11,7 @@ from typing import Any
 
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.memory import keep_memory
+from torchfilm.tools.warn_once import once
 
 try:
     import tyro
@@ -56,7 +57,8 @@ def _command() -> None:
     keep_memory()
     line_format, warnings.formatwarning = warnings.formatwarning, _format_warning
     try:
-        command()
+        with once():
+            command()
     except (InputError, SimulationError) as error:
         raise SystemExit(f"torchfilm: {error}") from None
     except KeyboardInterrupt:

@@ -136,6 +136,13 @@ class Run:
             raise checks.input_error(
                 "--out", str(out), "in a folder that can be made", f"{error.strerror}."
             ) from error
+        if out.is_file():
+            check_new(
+                "--out",
+                out,
+                self.overwrite,
+                f"Choose another --out, replace it (--overwrite), or torchfilm resume {out}.",
+            )
         return out
 
 
@@ -167,8 +174,7 @@ class Resume:
             raise InputError("resume needs an end: --cells or --until.")
         with Results(self.file) as results:
             if self.scene is not None:
-                given = {n: from_plain(v) for n, v in results.settings.items()}
-                scene = load_scene(str(self.scene), given)
+                scene = load_scene(str(self.scene), from_plain(results.settings))
             elif results.recipe is not None:
                 scene = scenes.build(*results.recipe)
             else:

@@ -66,7 +66,7 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
             f"{function} in {what}", made, "a Scene, or a function that returns one"
         )
     name = path.stem if made.name == "scene" else made.name
-    return made.replace(name=name, settings={n: to_plain(v) for n, v in parameters.items()})
+    return made.replace(name=name, settings=to_plain(parameters))
 
 
 def _hint(path: Path) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -21,9 +20,10 @@ from torchfilm.circuits.network import build_network
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect, number_range
 from torchfilm.medium_exchange import MediumExchange
-from torchfilm.resolver import snapshot
+from torchfilm.resolver import Values, snapshot
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
 from torchfilm.values import numbers
 
 if TYPE_CHECKING:
@@ -74,6 +74,9 @@ class BoundCircuit(BoundEffect):
 
     def __init__(self, effect: Circuit, binding: Binding):
         super().__init__(effect, binding)
+        kinds = [k for k in effect.rates if isinstance(k, int)]
+        if kinds:  # cells of other types need no constants
+            self.values = Values({n: self.values[n].needed_by(kinds) for n in self.values})
         self.rates = snapshot(effect.rates, "Circuit.rates", binding.batch)
         self.networks: dict[int | str, run.Network] = {}
         self.exchanged: dict[int | str, tuple[str, ...]] = {}
@@ -95,6 +98,13 @@ class BoundCircuit(BoundEffect):
             f"{n}_reservoir" for n in self._signals() if f"{n}_reservoir" in self.binding.declared
         ]
         return (*super().writes(), *written, *reservoir)
+
+    def typed_values(self) -> dict[str, tuple[int, ...]]:
+        """First values serve the start only, and constants by type the rates of that type."""
+        own = [self.values[n] for n in self.effect.parameters]
+        every = all(isinstance(k, str) for k in self.rates)
+        each = [v for v in own if v.known_types and (every or v.draw is not None)]
+        return {v.name: v.known_types for v in each}
 
     def _signals(self) -> tuple[str, ...]:
         """The signals that cells exchange."""
@@ -166,7 +176,7 @@ class BoundCircuit(BoundEffect):
                 )
             known = [n for n in read if n not in given]
             like = difflib.get_close_matches(name, known, 1)
-            warnings.warn(
+            warn(
                 f"Circuit.{name} is a constant that no rate reads"
                 + (
                     f". Did you mean {like[0]!r}?"
@@ -293,7 +303,6 @@ class BoundCircuit(BoundEffect):
         pool, in_reservoir = (None, None) if medium is None else (medium.pool, medium.in_reservoir)
         if isinstance(part, run.Network):
             exchanged = part.signals
-        # other cells need no constants
         own = None if isinstance(kind, str) else kind
         p = {n: Lazy(partial(self.values[n].of_cells, state, own)) for n in self.effect.parameters}
         return run.CircuitCells(

@@ -68,6 +68,17 @@ class Transport:
             n: snapshot(medium.boundary_of(n), f"boundary of the signal {n!r}", batch)
             for n in medium.signals
         }
+        # what of a layout the scene decides, whatever grid a state has
+        self.space: dict[str, Any] = {
+            "periodic": self.boundary[next(iter(self.signals))].periodic,
+            "height": medium.height,
+            "obstacle": medium.obstacles,
+            "reservoir": (
+                {name: s.reservoir for name, s in self.signals.items()}
+                if medium.outside == "reservoir"
+                else None
+            ),
+        }
         # weak keys: a grid no longer in use releases its steppers
         self.steppers: WeakKeyDictionary[Grid, dict[Any, Stepper]] = WeakKeyDictionary()
 
@@ -81,20 +92,15 @@ class Transport:
             torch.tensor(count, device=state.device).expand(places).clone(),
             step,
         )
-        reservoir = (
-            {name: s.reservoir for name, s in self.signals.items()}
-            if self.medium.outside == "reservoir"
-            else None
-        )
-        return state.replace(
-            layout=Layout(
-                grid,
-                self.boundary[next(iter(self.signals))].periodic,
-                self.medium.height,
-                self.medium.obstacles,
-                reservoir,
-            )
-        )
+        return state.replace(layout=Layout(grid, **self.space))
+
+    def opened(self, state: State) -> State:
+        """The state in the space of this medium, also where another model laid its grid."""
+        layout = state.layout
+        # the same layout where nothing differs: it keeps what it has found out about its grid
+        if layout is None or all(getattr(layout, n) is v for n, v in self.space.items()):
+            return state
+        return state.replace(layout=dataclasses.replace(layout, **self.space))
 
     def first(self, name: str) -> Callable[[State, Tensor], Tensor]:
         """The first values of a signal, as a field's `initial`."""
@@ -230,9 +236,6 @@ class _MediumPart(BoundEffect):
     def check(self, state: State) -> None:
         pass
 
-    def summary(self) -> str:
-        return f"{type(self).__name__}()"
-
 
 class FirstHalf(_MediumPart):
     """Transports signals over the first half of a step, before exchange with the cells."""
@@ -245,7 +248,10 @@ class FirstHalf(_MediumPart):
         return self.transport.carried(state, dt / 2)
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        return ["of signals over the first half of the step, before the cells"]
+        return [f"over {dt / 2:g} h, by the methods that the main part of transport lists"]
+
+    def summary(self) -> str:
+        return "moves signals over the first half of the step, before cells exchange them"
 
 
 class BoundMedium(_MediumPart):
@@ -284,9 +290,6 @@ class BoundMedium(_MediumPart):
     def numerics(self, dt: float, state: State) -> list[str]:
         return self.effect.numerics(dt, state)
 
-    def summary(self) -> str:
-        return BoundEffect.summary(self)
-
 
 class GridCoverage(_MediumPart):
     """Checks before exchange that every cell is on its grid, and extends grids that may grow."""
@@ -306,6 +309,9 @@ class GridCoverage(_MediumPart):
 
     def ready(self, state: State) -> State:
         return self._grown(state) if self.effect.outside == "grow" else state
+
+    def opened(self, state: State) -> State:
+        return self.transport.opened(state)
 
     def check(self, state: State) -> None:
         report = self._look(state)
@@ -328,6 +334,9 @@ class GridCoverage(_MediumPart):
 
     def numerics(self, dt: float, state: State) -> list[str]:
         return [self.effect.coverage]
+
+    def summary(self) -> str:
+        return "checks that every cell is on the grid of its colony"
 
     @torch.no_grad()
     def _look(self, state: State) -> MediumReport | None:

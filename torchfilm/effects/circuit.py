@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral
@@ -23,7 +22,7 @@ from torchfilm.effects.bound_circuit import BoundCircuit
 from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks
-from torchfilm.values import COLONY, Rule, Value, checked
+from torchfilm.values import COLONY, FORMS, Rule, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
@@ -57,7 +56,7 @@ class Circuit(Effect):
     field names, or {name here: field}. Circuits act one after the other. Growth dilutes: amounts
     stay, concentrations are multiplied by V_old/V_new. Further keywords are constants of the rates:
     each a number, one per colony, one per cell type, or a distribution drawn for each cell at birth
-    (extrinsic noise).
+    (extrinsic noise). Where rates are given by cell type, cells of other types need no constants.
     """
 
     rates: Mapping[int | str, Part]
@@ -158,7 +157,7 @@ class Circuit(Effect):
 
     @property
     def resets(self) -> bool:
-        """Whether daughters' concentrations are computed anew from their parent's amounts."""
+        """Whether daughters' concentrations are computed again from their parent's amounts."""
         return self.is_stochastic or self.daughters == "amount"
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
@@ -321,14 +320,13 @@ def _shared(given: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
 
 def _check_constants(given: Mapping[str, Any], options: Sequence[str]) -> None:
     for name, value in given.items():
-        if isinstance(value, str) or callable(value):
-            near = difflib.get_close_matches(name, options, 1)
-            hint = (
-                f"Did you mean {near[0]}?" if near else "Further names are constants of the rates."
-            )
-            raise checks.input_error(
-                f"Circuit.{name}", value, "a number, or one number per colony", hint
-            )
+        near = checks.nearest(name, options)
+        # a dict by names is meant for an option such as `initial`; a constant goes by cell types
+        by_names = isinstance(value, Mapping) and any(isinstance(key, str) for key in value)
+        if isinstance(value, str) or callable(value) or (near and by_names):
+            hint = f"Did you mean {near}?" if near else FORMS
+            allowed = "a constant of the rates, as further keywords are"
+            raise checks.input_error(f"Circuit.{name}", value, allowed, hint)
 
 
 def _check_method(method: str, steps: int, by_type: Mapping[int | str, Any]) -> None:

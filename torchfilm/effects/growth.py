@@ -4,7 +4,6 @@ back."""
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +16,8 @@ from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
-from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
+from torchfilm.tools.warn_once import warn
+from torchfilm.values import ByType, Value, is_drawn, is_inherited, numbers, physical
 
 LAWS = ("volume", "length", "linear")
 UNITS = {"volume": "1/h", "length": "1/h of the length", "linear": "µm/h"}
@@ -100,7 +100,7 @@ class Growth(Effect):
             others
         ) + 1 < len(effects)
         if self.rate is None and not sets and "growth_rate" not in founders.extra:
-            warnings.warn(
+            warn(
                 "Growth() has no rate, and no rule or nutrition sets growth_rate: nothing grows."
                 " Write tf.Growth(rate=1.0), in 1/h.",
                 stacklevel=3,
@@ -113,8 +113,8 @@ class Growth(Effect):
         for kind, rate in each.items():
             where = "" if kind is None else f" of cell type {kind}"
             # of a distribution the least, since its tail is rarely drawn
-            fastest = smallest(rate) if is_drawn(rate) else largest(rate)
-            check_doubling(f"Growth.rate{where}", fastest, dt)
+            given = numbers(rate)
+            check_doubling(f"Growth.rate{where}", given.min() if is_drawn(rate) else given, dt)
 
     def numerics(self, dt: float, state: State) -> list[str]:
         held = "; what contacts hold back is taken off afterwards"
@@ -152,9 +152,15 @@ class _BoundGrowth(BoundEffect):
     """The drawn rate is the field growth_rate itself."""
 
     effect: Growth
+    setters: tuple[str, ...] = ()  # effects that set growth_rate, whatever it was
 
     def check_others(self, effects: Sequence[BoundEffect]) -> None:
         """Raise InputError where a rate by cell type would undo what another effect sets."""
+        self.setters = tuple(
+            e.title
+            for e in effects
+            if e is not self and "growth_rate" in e.writes() and "growth_rate" not in e.reads()
+        )
         for other in effects if self.effect.by_type else ():
             if other is not self and "growth_rate" in other.writes():
                 raise checks.InputError(
@@ -165,15 +171,31 @@ class _BoundGrowth(BoundEffect):
 
     def check(self, state: State) -> None:
         super().check(state)
+        self.warn_of_others()
         if self.effect.law == "linear" or self.effect.rate is None or not state.cells:
             return
         usual = float(state.growth_rate.detach().median())
         if 0 < usual < 0.05:
-            warnings.warn(
+            warn(
                 f"Growth.rate is {usual:g} per hour: a doubling takes"
                 f" {math.log(2.0) / usual:.0f} h. Rates are per hour; a rate per minute is to"
                 f" be multiplied by 60 ({60 * usual:g}).",
                 stacklevel=2,
+            )
+
+    def warn_of_others(self) -> None:
+        """Warn where a growth rate has no effect since an effect sets another one."""
+        rate = self.effect.rate
+        given = [] if rate is None or not bool(numbers(rate).any()) else ["Growth.rate"]
+        sources = [*given, *self.setters]
+        if len(sources) > 1:
+            warn(
+                f"{' and '.join(sources)} each set growth_rate, whatever it was before: the one"
+                " that acts last overrides the others. Keep one of them"
+                + (" (such as Growth() without a rate)" if given else "")
+                + ", or let the later one read growth_rate and change it (an effect of your own"
+                " names what it reads in reads()).",
+                stacklevel=5,
             )
 
 

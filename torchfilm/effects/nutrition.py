@@ -16,7 +16,7 @@ from torchfilm.resolver import Values
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
-from torchfilm.values import Value, is_drawn, largest, physical, smallest
+from torchfilm.values import Value, is_drawn, numbers, physical
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class Monod(Effect):
 
     def check_step(self, dt: float, divides: bool) -> None:
         if divides:
-            fastest = smallest(self.rate) if is_drawn(self.rate) else largest(self.rate)
-            check_doubling("Monod.rate", fastest, dt)
+            given = numbers(self.rate)
+            check_doubling("Monod.rate", given.min() if is_drawn(self.rate) else given, dt)
 
     def check(self, state: State, values: Values) -> None:
         unit = state.declared["growth_rate"].unit

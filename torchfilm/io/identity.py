@@ -14,13 +14,16 @@ from torchfilm.physics.surfaces import as_data
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.warn_once import quietly
 
 
 def scene_attributes(scene: Scene, model: Model | None) -> dict[str, str]:
     """The attributes of a results file that identify the scene, and those that rebuild it."""
     walls = [as_data(surface) for effect in scene.effects for surface in effect.wall_surfaces()]
+    with quietly():
+        model = model or scene.bind()
     return {
-        "scene": (model or scene.bind()).describe(),
+        "scene": model.describe(),
         "effects": json.dumps(scene.listing()),
         "code": json.dumps(scene.code),
         "walls": json.dumps(walls),

@@ -102,8 +102,8 @@ class Recorder:
                 "record",
                 shown,
                 "a path where there is no file yet",
-                "Choose another (--out), replace it (--overwrite; in Python tf.Recorder(path,"
-                " scene, overwrite=True)), or resume from it.",
+                "Choose another path, replace the file with record=tf.Recorder(path, scene,"
+                " overwrite=True), or continue its run with append=True instead.",
             )
         replacing.check_replaceable(self.path)
 

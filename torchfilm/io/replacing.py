@@ -35,7 +35,7 @@ def check_replaceable(path: Path) -> None:
                 "record",
                 str(path),
                 "a file that no other process writes",
-                "Choose another (--out), or wait until that process has closed it.",
+                "Choose another path, or wait until that process has closed it.",
             ) from error
         return  # not HDF5, or results that a killed run left
     if not ours:
@@ -43,7 +43,7 @@ def check_replaceable(path: Path) -> None:
             "record",
             str(path),
             "a results file, where it replaces one",
-            "This is another kind of file, such as a study. Choose another (--out).",
+            "This is another kind of file, such as a study. Choose another path.",
         )
 
 

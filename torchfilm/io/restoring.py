@@ -14,6 +14,7 @@ from torchfilm.scene import Scene
 from torchfilm.signals.grid import Grid
 from torchfilm.state import OUTSIDE, PER_CELL, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import quietly
 
 if TYPE_CHECKING:
     from torchfilm.io.results import Results
@@ -61,15 +62,16 @@ def _template(results: Results, scene: Scene, device: torch.device, changed: boo
     """A first state of the scene, for its declared fields and layout. Raises InputError if the file
     is of another scene."""
     about = results.attributes
-    model = bind(
-        scene,
-        max(scene.fixed_colonies, int(results.colony_id.max()) + 1),
-        seed=int(about["seed"]),
-        dtype=getattr(torch, str(about["dtype"])),
-        device=device,
-        per_colony=True,
-        check_first=False,
-    )
+    with quietly():
+        model = bind(
+            scene,
+            max(scene.fixed_colonies, int(results.colony_id.max()) + 1),
+            seed=int(about["seed"]),
+            dtype=getattr(torch, str(about["dtype"])),
+            device=device,
+            per_colony=True,
+            check_first=False,
+        )
     template = model.start()
     if template.dim != int(about["dim"]):
         raise checks.input_error(

@@ -40,8 +40,8 @@ def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
                 for n, v in bound.arguments.items()
             }
         )
-        plain = {n: to_plain(v) for n, v in bound.arguments.items()}
-        return scene.replace(name=make.__name__, recipe=(make.__name__, plain))
+        recipe = (make.__name__, to_plain(bound.arguments))
+        return scene.replace(name=make.__name__, recipe=recipe)
 
     # the module where pickle finds it by name, for another process
     build.__module__ = __name__
@@ -102,4 +102,4 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
             raise checks.input_error(
                 f"parameter of {name}", given, "one of " + ", ".join(allowed), knob
             )
-    return READY[name](**{n: from_plain(v) for n, v in (parameters or {}).items()})
+    return READY[name](**from_plain(parameters or {}))

@@ -14,29 +14,39 @@ from torchfilm.values import Distribution, PerColony
 DISTRIBUTIONS = {kind.__name__: kind for kind in (Uniform, Normal, LogNormal)}
 
 
-def to_plain(value: Any) -> Any:
-    """A parameter as JSON can hold it; `from_plain` gives it back."""
+def to_plain(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters by name as JSON can hold them; `from_plain` gives them back."""
+    return {name: _plain_value(value) for name, value in parameters.items()}
+
+
+def from_plain(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters that `to_plain` made plain."""
+    return {name: _given_value(value) for name, value in plain.items()}
+
+
+def _plain_value(value: Any) -> Any:
+    """A parameter as JSON can hold it."""
     if isinstance(value, PerColony):
-        return {"per colony": to_plain(value.values)}
+        return {"per colony": _plain_value(value.values)}
     if isinstance(value, Distribution):
-        fields = {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        return {"distribution": type(value).__name__, **fields}
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return {"distribution": type(value).__name__, **to_plain(fields)}
     if isinstance(value, Mapping):
-        return {"by type": [[int(k), to_plain(v)] for k, v in value.items()]}
+        return {"by type": [[int(k), _plain_value(v)] for k, v in value.items()]}
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-def from_plain(value: Any) -> Any:
-    """The parameter that `to_plain` wrote."""
+def _given_value(value: Any) -> Any:
+    """The parameter that was made plain."""
     if not isinstance(value, Mapping):
         return value
     if "per colony" in value:
         return PerColony(value["per colony"])
     if "by type" in value:
-        return {int(k): from_plain(v) for k, v in value["by type"]}
+        return {int(k): _given_value(v) for k, v in value["by type"]}
     if "distribution" in value:
         kind = DISTRIBUTIONS[value["distribution"]]
-        return kind(**{n: from_plain(v) for n, v in value.items() if n != "distribution"})
+        return kind(**from_plain({n: v for n, v in value.items() if n != "distribution"}))
     return value
 
 

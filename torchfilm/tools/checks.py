@@ -6,7 +6,7 @@ import difflib
 import functools
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, cast
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 Number = float | int
 F = TypeVar("F", bound=Callable[..., Any])
 Value = float | Tensor | Sequence[float]
+ONE_OR_EACH = "Give one number, or one per colony."
 
 
 class InputError(ValueError):
@@ -37,13 +38,24 @@ def input_error(name: str, value: object, allowed: str, hint: str = "") -> Input
     )
 
 
+def nearest(given: str, known: Iterable[str]) -> str | None:
+    """The known name that was probably meant: a similar one, or one that begins the given name or
+    begins with it ("dim" for "dimension"). None: no name is near."""
+    known = list(known)
+    near = difflib.get_close_matches(given, known, n=1)
+    if near:
+        return near[0]
+    begins = (n for n in known if len(min(n, given, key=len)) >= 3)
+    return next((n for n in begins if n.startswith(given) or given.startswith(n)), None)
+
+
 def unknown_keyword(name: str, given: str, allowed: Sequence[str]) -> InputError:
     """The error for a keyword that a function or class does not have, with the nearest one that it
     has; raise what this returns. name: of the function or class, such as "Growth"."""
-    near = difflib.get_close_matches(given, allowed, n=1)
+    near = nearest(given, allowed)
     return InputError(
         f"{name} has no parameter {given!r}."
-        + (f" Did you mean {near[0]}?" if near else "")
+        + (f" Did you mean {near}?" if near else "")
         + f" It has: {', '.join(allowed) or 'none'}."
     )
 
@@ -88,27 +100,22 @@ def value(
     above: float = -math.inf,
     least: float = -math.inf,
     most: float = math.inf,
+    hint: str = ONE_OR_EACH,
 ) -> float | Tensor:
     """One number, or one per colony: returns a float or a 1-D tensor of floats.
 
-    Raises InputError if an entry is outside the bounds. A tensor keeps its gradient.
+    Raises InputError if an entry is outside the bounds; hint: the forms that are allowed. A tensor
+    keeps its gradient.
     """
     if isinstance(given, (list, tuple)):
         try:
             given = torch.tensor(given, dtype=torch.float64)
         except (TypeError, ValueError) as error:
-            raise input_error(name, given, "a number or one number per colony") from error
+            raise input_error(name, given, "a number, or numbers", hint) from error
     if hasattr(given, "__array__") and not isinstance(given, Tensor):
         given = torch.as_tensor(given)
     if not isinstance(given, Tensor):
-        return number(
-            name,
-            given,
-            above=above,
-            least=least,
-            most=most,
-            hint="Give one number, or one per colony.",
-        )
+        return number(name, given, above=above, least=least, most=most, hint=hint)
     if given.dim() > 1 or not (
         given.is_floating_point() or given.dtype in (torch.int32, torch.int64)
     ):
@@ -204,3 +211,26 @@ def vector(name: str, given: object, size: int | None = None) -> tuple[float, ..
     if not all(map(math.isfinite, out)):
         raise input_error(name, given, "finite")
     return out
+
+
+def device(given: str | torch.device) -> torch.device:
+    """The device of that name, if this machine has it."""
+    try:
+        wanted = torch.device(given)
+    except (RuntimeError, TypeError) as error:
+        raise input_error("device", given, '"cpu" or "cuda"') from error
+    if wanted.type not in ("cpu", "cuda"):
+        raise input_error(
+            "device",
+            str(given),
+            '"cpu" or "cuda"',
+            "Other devices lack the sparse products and float64 that a step needs.",
+        )
+    if wanted.type == "cuda" and not torch.cuda.is_available():
+        raise input_error(
+            "device",
+            str(given),
+            "a device that this machine has",
+            'torch sees no CUDA GPU; use device="cpu".',
+        )
+    return wanted

@@ -4,15 +4,36 @@ from __future__ import annotations
 
 import math
 
+import torch
+from torch import Tensor
+
 from torchfilm.tools.checks import InputError
 
+NAMED = 10  # colonies that a message names
 
-def check_doubling(name: str, rate: float, dt: float) -> None:
-    """Raise InputError for a growth rate (1/h) by which a cell more than doubles in dt hours."""
-    if rate * dt > math.log(2.0):
-        longest = math.log(2.0) / rate
-        raise InputError(
-            f"dt = {dt:g} h is too long for {name} = {rate:g}/h: a cell would be due to"
-            f" divide more than once in a step. Take dt below {longest:.2g} h;"
-            f" {longest / 28:.1g} h is usual. (Rates are per hour.)"
-        )
+
+def check_doubling(name: str, rate: Tensor, dt: float) -> None:
+    """Raise InputError for growth rates, one or (B,) by colony id, 1/h, by which a cell more than
+    doubles in dt hours."""
+    fast = torch.nonzero(rate.reshape(-1) * dt > math.log(2.0)).squeeze(1)
+    if not fast.numel():
+        return
+    fastest = float(rate.max())
+    longest = math.log(2.0) / fastest
+    raise InputError(
+        f"dt = {dt:g} h is too long for {name} = {fastest:g}/h{_where(rate, fast.tolist())}: a cell"
+        f" would be due to divide more than once in a step. Take dt below {longest:.2g} h;"
+        f" {longest / 28:.1g} h is usual. (Rates are per hour.)"
+    )
+
+
+def _where(rate: Tensor, fast: list[int]) -> str:
+    """In which colonies, in words; nothing where all have one rate."""
+    if rate.numel() == 1:
+        return ""
+    first = f" in colony {int(rate.argmax())}"
+    if len(fast) == 1:
+        return first
+    more = ", …" if len(fast) > NAMED else ""
+    listed = ", ".join(map(str, fast[:NAMED])) + more
+    return f"{first} (too fast in {len(fast)} of {rate.numel()} colonies: {listed})"

@@ -54,6 +54,16 @@ class HotReload:
         self._previous: Functions | None = None
         self._proven = True
 
+    @property
+    def proven(self) -> bool:
+        """Whether the functions in use have run since they were loaded."""
+        return self._proven
+
+    @property
+    def can_go_back(self) -> bool:
+        """Whether the last good functions take the place of those in use, should these fail."""
+        return self.watching and self._previous is not None
+
     def refresh(self, time: float) -> None:
         """Load the file again if it was edited. time: simulated, h."""
         self._time = time

@@ -4,7 +4,7 @@ All scatter operations of the package are in this module. On the CPU a sum over 
 with a sparse incidence matrix. It is six times faster than ``index_add_``. Every row of the product
 is accumulated by itself in the order of its entries, so its bits do not depend on the rest of the
 batch. (The matrix-vector product of the same library does *not* have that property: it picks a
-kernel by the shape of the whole matrix. Hence the matrix-matrix product even for one column.)
+kernel by the shape of the whole matrix. So it is the matrix-matrix product even for one column.)
 
 Weighted float32 segment sums use ``torch.embedding_bag``: half the time of weighting and summing,
 in a fixed order. On CUDA ``index_add_`` is fast, and ordered when torch's deterministic algorithms

@@ -192,7 +192,7 @@ class AccuracyProbe:
             each = self._error(name, _left_out(name, values), _left_out(name, rights), apart)
             error, without = float(each[0]), each[1:]
             noise = math.sqrt((len(without) - 1) * float(without.var(correction=0)))
-            # if only one colony has cells, the standard error is unknown, hence infinite
+            # if only one colony has cells, the standard error is unknown, so infinite
             out[name] = (
                 Error(math.inf, 0.0)
                 if math.isnan(error)

@@ -23,6 +23,7 @@ import torch
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import once
 from torchfilm.tuning.candidates import LARGER, MORE, UNSURE
 from torchfilm.tuning.observables import SIGNAL, AccuracyProbe, begin, observables, species
 from torchfilm.tuning.settings import Settings
@@ -30,6 +31,7 @@ from torchfilm.tuning.settings_search import SettingsSearch
 from torchfilm.tuning.tuned import Tuned
 
 
+@once()  # it binds the scene many times
 def tune(
     scene: Scene,
     error: float = 0.01,

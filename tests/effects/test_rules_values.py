@@ -1,0 +1,181 @@
+"""Values that a rule gives during a run and that no effect can use: they fail their colony, and the
+others go on as if they were alone."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from helpers import step
+from ruled import pair_of_cells, run, same
+
+import torchfilm as tf
+from torchfilm.loop import failures
+
+BAD = 1  # the colony whose rule goes wrong, in its second step
+
+
+def gone_wrong(name, value):
+    """A rule that gives the first cell of one colony a wrong value from 0.05 h on."""
+
+    def update(cells):
+        here = (cells.colony == BAD) & (cells.uid == 0) & (cells.time > 0.05)
+        old = getattr(cells, name)
+        setattr(cells, name, torch.where(here, torch.full_like(old, value), old))
+        cells.remove_flag = here
+
+    return update
+
+
+def made(u, s, p, cell):
+    return {"m": 1.0 - u.m}
+
+
+TYPED = tf.Growth(rate={0: 1.0, 1: 0.5})
+CASES = {
+    "a negative rate": ("growth_rate", -1.0, tf.Growth(), r"set to -1: it must be at least 0"),
+    "a rate that is NaN": ("growth_rate", math.nan, tf.Growth(), r"set to nan: .*at least 0"),
+    "no drag": ("drag", 0.0, tf.Mechanics(dim=2), r"set to 0: it must be above 0"),
+    "a drag that is NaN": ("drag", math.nan, tf.Mechanics(dim=2), "set to nan: .*above 0"),
+    "a concentration that is NaN": (
+        "m",
+        math.nan,
+        tf.Circuit(made, species=("m",)),
+        "set to nan: it must be a number",
+    ),
+    "a threshold that is NaN": (
+        "division_threshold",
+        math.nan,
+        tf.Division(length=4.0),
+        "set to nan: it must be a number",
+    ),
+    "a type without a rate": (
+        "cell_type",
+        2,
+        TYPED,
+        r"set to 2, but Growth\.rate has values for the cell types 0, 1\. Add 2: … to it",
+    ),
+    "a type below 0": ("cell_type", -1, TYPED, r"set to -1, but Growth\.rate has values for"),
+    "a type without a drawn constant": (
+        "cell_type",
+        2,
+        tf.Circuit(lambda u, s, p, cell: {"m": p.k}, species=("m",), k={0: tf.Uniform(1.0, 2.0)}),
+        r"set to 2, but Circuit\.k has values for the cell types 0\. Add 2",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_value_that_nothing_can_use_fails_its_colony_only(case):
+    name, value, effect, words = CASES[case]
+    founders = pair_of_cells()
+    founders = tf.Cells(founders.position, founders.axis, cell_type=[0, 0])
+    scene = tf.Scene(tf.Rules(gone_wrong(name, value)), effect, dim=2, founders=founders)
+    if name == "drag":
+        scene = scene.replace(*scene.effects, tf.Growth(rate=0.5))
+    with pytest.raises(
+        tf.SimulationError,
+        match=rf"failed in 1 of 3 colonies:\s+colony {BAD} \(2 cells\): cells\.{name} of cell 0 was"
+        rf" {words}",
+    ) as failed:
+        list(tf.simulate(scene, colonies=3, until=0.3, dt=0.1))
+    assert failed.value.colonies == (BAD,)
+    *_, dropped = tf.simulate(scene, colonies=3, until=0.3, dt=0.1, on_failure="drop")
+    assert dropped.counts.tolist() == [2, 0, 2]
+    alone = run(scene, scene.bind(3).start().select([0, 2]), 3)
+    assert same(dropped.select([0, 2]), alone.select([0, 1]))
+
+
+def test_in_a_colony_that_failed_the_rule_changes_nothing():
+    """Not even what it was allowed to change, and it removes no cell there."""
+
+    def update(cells):
+        cells.growth_rate = torch.where(cells.colony == BAD, -1.0, 2.0)
+        cells.remove_flag = cells.uid == 0
+
+    scene = tf.Scene(tf.Rules(update), tf.Growth(), founders=pair_of_cells())
+    state = step(scene, scene.bind(2).start(), 0.1)
+    assert state.counts.tolist() == [1, 2] and state.growth_rate.tolist() == [2.0, 0.0, 0.0]
+    (failure,) = failures(state)
+    assert failure.place == BAD and "and 1 more cell(s)" in failure.reason
+
+
+def test_values_of_daughters_fail_their_colony_only():
+    def divide(parent, daughter1, daughter2):
+        daughter1.growth_rate = torch.where(daughter1.colony == BAD, -2.0, 3.0)
+        daughter2.growth_rate = torch.where(daughter2.colony == 2, math.nan, 4.0)
+
+    scene = tf.Scene(
+        tf.Rules(divide=divide), tf.Growth(rate=1.0), tf.Division(), founders=pair_of_cells()
+    )
+    state = scene.bind(4).start()
+    state = step(scene, state.with_fields(divide_flag=torch.ones(8, dtype=torch.bool)), 0.0)
+    assert state.growth_rate.reshape(4, 4).tolist() == [
+        [3.0, 4.0, 3.0, 4.0],
+        [1.0] * 4,
+        [1.0] * 4,
+        [3.0, 4.0, 3.0, 4.0],
+    ]
+    found = {f.colony_id: f.reason for f in failures(state)}
+    assert set(found) == {1, 2} and "set to -2" in found[1] and "set to nan" in found[2]
+
+
+def test_several_rules_may_fail_in_one_step():
+    def rule(colony):
+        def update(cells):
+            bad = (cells.colony == colony) & (cells.time > 0.05)
+            cells.growth_rate = torch.where(bad, -1.0 - colony, cells.growth_rate)
+
+        return tf.Rules(update)
+
+    scene = tf.Scene(rule(0), rule(2), tf.Growth(rate=1.0), founders=pair_of_cells())
+    state = run(scene, scene.bind(3).start(), 2)
+    assert {f.colony_id for f in failures(state)} == {0, 2}
+
+
+def test_a_nan_in_a_variable_of_the_users_own_is_allowed():
+    """Only the user knows what it means there, such as "not yet"."""
+
+    def update(cells):
+        cells.since = math.nan if cells.time > 0.05 else 0.0
+
+    scene = tf.Scene(tf.Rules(update, variables={"since": 0.0}), founders=pair_of_cells())
+    state = run(scene, scene.bind().start(), 2)
+    assert bool(state.since.isnan().all()) and not failures(state)
+
+
+def test_what_a_rule_has_only_read_is_not_its_fault():
+    def update(cells):
+        cells.seen = cells.growth_rate * 2.0
+
+    scene = tf.Scene(
+        tf.Rules(update, variables={"seen": 0.0}), tf.Growth(), founders=pair_of_cells()
+    )
+    state = scene.bind().start()
+    state = step(scene, state.with_fields(growth_rate=torch.tensor([math.nan, 1.0])), 0.1)
+    assert [f.reason.split()[0] for f in failures(state)] == ["cell"]  # growth's own report
+
+
+def test_a_wrong_shape_in_mid_run_is_an_error_of_the_step():
+    def update(cells):
+        cells.growth_rate = torch.ones(1 if cells.time < 0.05 else 3)
+
+    scene = tf.Scene(tf.Rules(update), tf.Growth(), founders=pair_of_cells())
+    with pytest.raises(tf.InputError, match=r"cells\.growth_rate was set to a tensor of shape"):
+        list(tf.simulate(scene, colonies=2, until=0.3, dt=0.1, on_failure="drop"))
+
+
+@pytest.mark.parametrize("circuit", [{0: made}, {0: made, 1: made}])
+def test_a_type_in_which_no_circuit_runs_is_no_fault(circuit):
+    """Constants by type are for the cells in which the circuit runs."""
+    rates = {k: (lambda u, s, p, cell: {"m": p.k}) for k in circuit}
+    effect = tf.Circuit(rates, species=("m",), k={k: 1.0 + k for k in circuit})
+    founders = pair_of_cells()
+    scene = tf.Scene(
+        tf.Rules(lambda cells: setattr(cells, "cell_type", 7)),
+        effect,
+        founders=tf.Cells(founders.position, founders.axis, cell_type=[0, 0]),
+    )
+    state = run(scene, scene.bind().start(), 2)
+    assert state.cell_type.tolist() == [7, 7] and not failures(state)

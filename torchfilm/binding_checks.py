@@ -1,0 +1,112 @@
+"""What is checked of the effects of a bound scene together: that the names exist which they read
+and write, and that a run to a number of cells can end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from torchfilm.effect import BUILT_IN, BoundEffect, Effect
+from torchfilm.rule_views import KNOWN_FIELDS, MEANS
+from torchfilm.state import OUTSIDE, State
+from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
+
+
+def check_names(effects: Sequence[BoundEffect], declared: Iterable[str], state: State) -> None:
+    """Raise InputError for a name that an effect says it reads or writes and that nothing provides.
+
+    declared: the fields that the effects of the scene declare. state: one that the effects have
+    been tried on; it also has the fields of its first cells and the variables of rules.
+    """
+    there = [*BUILT_IN, *dict.fromkeys((*declared, *state.fields))]
+    if any(e.effect.writes_anything for e in effects):  # rules may set these at any time
+        there += [name for name in KNOWN_FIELDS if name not in there]
+    for effect in {id(bound.effect): bound.effect for bound in effects}.values():
+        usual = _torchfilms(effect)
+        for verb, names, known in (
+            ("reads", effect.reads(), usual.reads(effect)),
+            ("writes", effect.writes(), usual.writes(effect)),
+        ):
+            for name in names:
+                if name not in there and name not in known:
+                    raise checks.InputError(
+                        f"{type(effect).__name__}.{verb}() names {name!r}, which no effect of this"
+                        f" scene declares and no first cell has. {_instead(name, there)} There are:"
+                        f" {', '.join(there)}."
+                    )
+
+
+def _torchfilms(effect: Effect) -> type[Effect]:
+    """The effect of torchfilm that this one is, or is made from. These name some fields that they
+    use only where a scene has them, such as the drag of a cell."""
+    return next(kind for kind in type(effect).__mro__ if kind.__module__.startswith("torchfilm."))
+
+
+def _instead(name: str, there: Sequence[str]) -> str:
+    """What to do about a name that does not exist."""
+    if name in MEANS:
+        return f"Name {' and '.join(map(repr, MEANS[name]))} instead: {name} follows from that."
+    near = OUTSIDE + name if OUTSIDE + name in there else checks.nearest(name, there)
+    return f"Did you mean {near!r}?" if near else "Correct it, or declare the field in declares()."
+
+
+def check_end(effects: Sequence[BoundEffect], state: State, cells: int) -> None:
+    """Raise InputError if no run from this state would come to `cells` cells in every colony: an
+    effect waits for a field that is 0 everywhere in a colony and that nothing sets, or nothing adds
+    cells. Warn if a run can end only with colonies that have lost all cells."""
+    for effect in effects:
+        for name in effect.effect.waits_for():
+            if not _sets(effects, name, effect):
+                _check_moves(effect, name, state, cells)
+    _check_adds(effects, state, cells)
+
+
+def _sets(effects: Sequence[BoundEffect], name: str, effect: BoundEffect) -> bool:
+    """Whether another effect may set a field, or lengthen or add cells in its own way."""
+    others = [e for e in effects if e.effect is not effect.effect]
+    return any(e.effect.writes_anything or name in e.writes() or _is_own(e) for e in others)
+
+
+def _is_own(effect: BoundEffect) -> bool:
+    """Whether the user has written the effect, which may do anything."""
+    return not type(effect.effect).__module__.startswith("torchfilm.")
+
+
+def _check_moves(effect: BoundEffect, name: str, state: State, cells: int) -> None:
+    """Raise InputError if a colony that is to have more cells rests: a field that `effect` waits
+    for is 0 in all its cells, and none is due to divide."""
+    moves = state.fields[name] != 0
+    if "divide_flag" in state.fields:
+        moves = moves | (state.fields["divide_flag"] != 0)
+    still = (state.counts > 0) & (state.counts < cells) & ~state.groups.any(moves)
+    if bool(still.any()):
+        ids = state.colony_id[still].tolist()
+        some = f" in {len(ids)} of {state.colonies} colonies, first in colony {ids[0]}"
+        raise checks.InputError(
+            f"{effect.title} waits for {name!r}, which is"
+            f" 0{'' if len(ids) == state.colonies else some} and which nothing in this"
+            f" scene sets: no run would come to {cells} cells. Give"
+            f" {type(effect.effect).__name__} a parameter above 0 (such as rate=1.0),"
+            " or a rule that sets it; or end the run by a time, until=…"
+        )
+
+
+def _check_adds(effects: Sequence[BoundEffect], state: State, cells: int) -> None:
+    """Raise InputError, or warn, if a colony is to have more cells and no effect adds any."""
+    divides = any("divide_flag" in (f.name for f in e.declares()) for e in effects)
+    short = (state.counts > 0) & (state.counts < cells)
+    if divides or any(map(_is_own, effects)) or not bool(short.any()):
+        return
+    place = int(short.nonzero()[0])
+    text = (
+        f"cells = {cells} is never reached: no effect of this scene divides cells, and colony"
+        f" {int(state.colony_id[place])} has {int(state.counts[place])}."
+    )
+    hint = (
+        "List tf.Division(length=tf.Uniform(3.5, 4.5)) in the scene, or end the run by a time"
+        " (until=…, --until)."
+    )
+    if any(e.effect.writes_anything or "cells" in e.writes() for e in effects):
+        warn(f"{text} The run ends only if every such colony loses all cells. {hint}", stacklevel=6)
+        return
+    raise checks.InputError(f"{text} {hint}")

@@ -1,0 +1,370 @@
+"""Rules bound to a batch: tried once, then called in each step, and what they write checked.
+
+A value that no effect can use, such as a negative growth rate, fails its colony only. What cannot
+be right in any colony, such as a wrong shape or an unknown name, is an error of the whole step.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchfilm.effect import DIVISION, Binding, BoundEffect
+from torchfilm.rule_views import KNOWN_FIELDS, MEANS, CellsView, DivisionView, RuleError
+from torchfilm.state import Births, Field, State
+from torchfilm.tools import checks
+from torchfilm.tools.hot_reload import HotReload
+
+if TYPE_CHECKING:
+    from torchfilm.effects.rules import Rules
+
+TRIAL_STEP = 0.025  # h, the step that a rule sees in its trial
+MEANING = "variable of the user's rules"
+
+
+@dataclass(frozen=True)
+class RulesReport:
+    """Made only where a rule gave a value that no effect can use: `status` (B,), 1 for its colony,
+    in which the rule changed nothing, and `words`, by place in the batch, what it gave."""
+
+    status: Tensor
+    words: Mapping[int, str]
+    hint = "Let the rule give values that are allowed in every colony"
+
+    def reason(self, place: int) -> str:
+        """What the rule gave in the colony at this place of the batch."""
+        return self.words[place]
+
+
+class _BoundRule(BoundEffect):
+    """A function of the user, which may be edited during a run: what it reads and writes, and what
+    the other effects of the scene allow it to write."""
+
+    effect: Rules
+
+    def __init__(self, effect: Rules, binding: Binding, source: HotReload):
+        super().__init__(effect, binding)
+        self.source = source
+        self.traced_reads: tuple[str, ...] = ()
+        self.traced_writes: tuple[str, ...] = ()
+        self.others: Sequence[BoundEffect] = ()
+        # what a NaN means in the user's own variables, only the user knows
+        self.shared = {n for n, title in binding.declared.items() if title != effect.title}
+        self.types: dict[str, tuple[int, ...]] = {}
+
+    def writes(self) -> tuple[str, ...]:
+        return self.traced_writes
+
+    def check_others(self, effects: Sequence[BoundEffect]) -> None:
+        self.others = effects
+        self.types = {n: t for e in effects for n, t in e.typed_values().items()}
+
+    def _check_written(self, read: Collection[str], written: Collection[str]) -> None:
+        """Raise InputError, or warn, as at binding, where the function writes what it did not write
+        before: after an edit, or in a branch that its trial did not take."""
+        before = self.traced_reads, self.traced_writes
+        if set(written) <= set(self.traced_writes):
+            return
+        self.traced_reads = tuple(sorted({*self.traced_reads, *read}))
+        self.traced_writes = tuple(sorted({*self.traced_writes, *written}))
+        try:
+            for other in self.others:
+                other.check_others(self.others)
+            for other in self.others:
+                other.warn_of_others()
+        except Exception:
+            self.traced_reads, self.traced_writes = before  # of the function that stays in use
+            raise
+
+    # --- values --------------------------------------------------------------------------
+
+    def _with_report(self, state: State, rows: Tensor | None, given: Mapping[str, Tensor]) -> State:
+        """The state with a report of those values that no effect can use, given to the cells `rows`
+        (M,), or to all cells; the state itself where there is no such value."""
+        each = {n: self._unusable(n, value.detach()) for n, value in given.items()}
+        marks = {n: found for n, found in each.items() if found is not None}
+        if not marks or not bool(torch.stack(list(marks.values())).any()):
+            return state
+        words: dict[int, str] = {}
+        for name, found in marks.items():
+            before = state.fields[name]
+            before = before if rows is None else before.index_select(0, rows)
+            # what the rule has not changed is not its fault
+            cells = torch.nonzero(found & _differ(before, given[name])).squeeze(1)
+            own = cells if rows is None else rows.index_select(0, cells)
+            owner = state.colony.index_select(0, own).tolist()
+            for place in sorted(set(owner) - set(words)):
+                mine = [k for k, o in enumerate(owner) if o == place]
+                said = self._words(name, given[name].detach()[cells[mine[0]]])
+                more = f"; and {len(mine) - 1} more cell(s)" if len(mine) > 1 else ""
+                words[place] = f"cells.{name} of cell {int(state.uid[own[mine[0]]])} {said}{more}"
+        if not words:
+            return state
+        if self.source.can_go_back:
+            raise RuleError(
+                "; ".join(f"colony {int(state.colony_id[k])}: {said}" for k, said in words.items())
+            )
+        earlier = state.reports.get(self.title)  # of the other daughters, or of other Rules
+        words |= {} if earlier is None else earlier.words
+        status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
+        status[list(words)] = 1
+        return state.replace(reports={**state.reports, self.title: RulesReport(status, words)})
+
+    def _unusable(self, name: str, value: Tensor) -> Tensor | None:
+        """Which of these values (M, …) no effect can use, (M,) bool; None: all may be used."""
+        if name == "growth_rate":
+            return ~(value >= 0)
+        if name == "drag":
+            return ~(value > 0)
+        if name == "cell_type" and self.types:
+            unknown = [~torch.isin(value, value.new_tensor(t)) for t in self.types.values()]
+            return torch.stack(unknown).any(0)
+        if not value.is_floating_point() or name not in self.shared:
+            return None
+        return _of_rows(value.isnan())
+
+    def _words(self, name: str, value: Tensor) -> str:
+        """What is wrong with a value of this name, and what to do."""
+        if name == "cell_type":
+            kind = int(value)
+            lacking, types = next((n, t) for n, t in self.types.items() if kind not in t)
+            return (
+                f"was set to {kind}, but {lacking} has values for the cell types"
+                f" {', '.join(map(str, types))}. Add {kind}: … to it"
+            )
+        allowed = {
+            "growth_rate": "at least 0. To let cells vanish, set remove_flag",
+            "drag": "above 0",
+        }.get(name, "a number")
+        shown = f"{float(value):g}" if value.dim() == 0 else value.tolist()
+        return f"was set to {shown}: it must be {allowed}"
+
+
+def _differ(one: Tensor, other: Tensor) -> Tensor:
+    """In which rows (N, …) two tensors differ, (N,) bool; NaN is equal to NaN."""
+    return _of_rows(~((one == other) | (one.isnan() & other.isnan())))
+
+
+def _of_rows(found: Tensor) -> Tensor:
+    """Which rows (N, …) have any that is true, (N,) bool."""
+    return found if found.dim() == 1 else found.flatten(1).any(1)
+
+
+def _reported(state: State) -> Tensor:
+    """Which cells are in a colony that a rule has failed in this step, (N,) bool."""
+    reports = [r for r in state.reports.values() if isinstance(r, RulesReport)]
+    failed = torch.stack([r.status for r in reports]).amax(0) > 0
+    return failed.index_select(0, state.colony)
+
+
+class BoundRules(_BoundRule):
+    """`update` after its trial: what it reads and writes, and the variables that it adds."""
+
+    def __init__(self, effect: Rules, binding: Binding, source: HotReload):
+        super().__init__(effect, binding, source)
+        self.variables: tuple[Field, ...] = ()
+
+    @property
+    def hot_reload(self) -> HotReload:
+        """The functions, which the user may edit during a run."""
+        return self.source
+
+    def reads(self) -> tuple[str, ...]:
+        return self.traced_reads
+
+    def ready(self, state: State) -> State:
+        for new in self.variables:
+            if new.name not in state.fields:
+                state = state.declare(new)
+        return state
+
+    def trace(self, state: State) -> State:
+        """Calls `update` once. New names become fields; reads and writes are noted."""
+        update = self.source.functions["update"]
+        if update is None:
+            return state
+        # two cells, since rules such as `if cells.length > 3` fail only with more than one; a cell
+        # that cannot divide stays alone
+        twice = state.cells == 1 and "divide_flag" in state.fields
+        both = torch.zeros(2, dtype=torch.int64, device=state.device)
+        tried = state.take(both) if twice else state
+        view = CellsView(tried, TRIAL_STEP, _label(update), declaring=True)
+        _act(update, view)
+        new = [n for n in view._work if n not in state.fields and n != "remove_flag"]
+        self.variables = tuple(_variable(name, view._work[name]) for name in new)
+        for variable in self.variables:
+            tried = tried.declare(variable)
+        self.traced_reads = tuple(sorted(view._read))
+        self.traced_writes = tuple(_written(view, tried))
+        return self.ready(state)
+
+    def step(self, state: State, dt: float) -> State:
+        if state.cells == 0:
+            return state
+        self.source.refresh(state.time)
+        return self.source.call("update", partial(self._apply, state, dt), state)
+
+    def _apply(self, state: State, dt: float, update: Callable[[CellsView], None]) -> State:
+        view = CellsView(state, dt, _label(update))
+        _act(update, view)
+        work = dict(view._work)
+        gone = work.pop("remove_flag", None)
+        for name in work:
+            if name not in state.fields:
+                if name not in KNOWN_FIELDS:
+                    raise checks.SimulationError(
+                        f"rules set the variable {name!r} for the first time during a run: give"
+                        f" Rules(…, variables={{{name!r}: 0.0}})."
+                    )
+                state = state.declare(KNOWN_FIELDS[name])
+        # what a rule changes in place is compared only where it may have come with an edit
+        written = _effects(view._written) if self.source.proven else _written(view, state)
+        self._check_written(view._read, written)
+        seen = self._with_report(state, None, work)
+        if seen is not state:
+            state, kept = seen, _reported(seen)
+            work = {n: _where(kept, state.fields[n], v) for n, v in work.items()}
+            gone = None if gone is None else gone & ~kept
+        state = state.with_fields(**work)
+        return state if gone is None else state.remove(gone, "removed")
+
+
+def _written(view: CellsView, state: State) -> list[str]:
+    """What a rule wrote, by setting it or in place. state: with the fields of all that it set."""
+    changed = {
+        n
+        for n, v in view._work.items()
+        if n != "remove_flag" and not torch.equal(v, state.fields[n])
+    }
+    return _effects(view._written | changed)
+
+
+def _effects(written: Collection[str]) -> list[str]:
+    """What a rule that writes these names changes: cells that it flags are removed."""
+    return ["cells" if n == "remove_flag" else n for n in sorted(written)]
+
+
+def _where(mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """As torch.where, for rows (N, …) by a mask (N,)."""
+    return torch.where(mask.reshape(-1, *[1] * (one.dim() - 1)), one, other)
+
+
+def _variable(name: str, value: Tensor) -> Field:
+    """The field of a variable that a rule has set."""
+    known = KNOWN_FIELDS.get(name)
+    return known or Field(name, MEANING, dtype=value.dtype, shape=tuple(value.shape[1:]))
+
+
+class DivisionRule(_BoundRule):
+    """The part of Rules after division: the user's `divide(parent, daughter1, daughter2)`."""
+
+    def __init__(self, effect: Rules, binding: Binding, source: HotReload):
+        super().__init__(effect, binding, source)
+        self.stage, self.title = DIVISION + 1, "rules at division"
+
+    def declares(self) -> list[Field]:
+        return []
+
+    def reads(self) -> tuple[str, ...]:
+        return ("cells", *self.traced_reads)
+
+    def trace(self, state: State) -> State:
+        """Calls `divide` on a first cell and two copies of it, and notes its reads and writes."""
+        divide = self.source.functions["divide"]
+        if divide is None or not state.cells:
+            return state
+        one = torch.zeros(1, dtype=torch.int64, device=state.device)
+        twice = state.take(torch.cat([one, one]))
+        births = Births(one, one + 1, torch.cat([one, one]), state.take(one))
+        views = _after_divide(divide, twice, births)
+        self.traced_reads = tuple(sorted(_read(views)))
+        self.traced_writes = tuple(sorted(views[1]._set | views[2]._set))
+        return state
+
+    def step(self, state: State, dt: float) -> State:
+        for births in state.births:
+            act = partial(self._divide, state=state, births=births)
+            state = self.source.call("divide", act, state)
+        return state
+
+    def _divide(self, act: Callable[..., None], state: State, births: Births) -> State:
+        views = _after_divide(act, state, births)
+        daughters = views[1:]
+        self._check_written(_read(views), daughters[0]._set | daughters[1]._set)
+        old, seen = state.fields, state
+        changed: dict[str, Tensor] = {}
+        for daughter, rows in zip(daughters, (births.first, births.second), strict=True):
+            given = {n: v for n, v in daughter._work.items() if daughter._writable(n)}
+            seen = self._with_report(seen, rows, given)
+            for name, value in given.items():
+                changed[name] = changed.get(name, old[name]).index_copy(0, rows, value)
+        if seen is not state:
+            kept = _reported(seen)
+            changed = {n: _where(kept, old[n], v) for n, v in changed.items()}
+        return seen.with_fields(**changed)
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        return ["your own Python, once for all divisions of a step"]
+
+
+def _label(rule: Callable[..., None]) -> str:
+    """A label that gives each rule its own random numbers."""
+    return (
+        f"rule {getattr(rule, '__module__', '')}"
+        f" {getattr(rule, '__qualname__', type(rule).__name__)}"
+    )
+
+
+def _act(rule: Callable[..., None], *views: CellsView | DivisionView) -> None:
+    """Calls a rule on its views. Raises RuleError if it uses a tensor as one number."""
+    try:
+        rule(*views)
+    except (RuntimeError, ValueError) as error:
+        if not any(
+            words in str(error)
+            for words in (
+                "Boolean value of Tensor",
+                "converted to Scalar",
+                "only one element tensors",
+            )
+        ):
+            raise
+        # the innermost frame outside torch is a line of the rule
+        at = next(
+            f
+            for f in reversed(traceback.extract_tb(error.__traceback__))
+            if "torch" not in Path(f.filename).parts
+        )
+        raise RuleError(
+            f"{Path(at.filename).name}, line {at.lineno} ({at.line}): a rule sees all cells at"
+            " once, so `if` or `float` has no single value to use. Write"
+            " torch.where(condition, a, b) with &, | and ~, or go through them one by one (slow):"
+            " for cell in cells."
+        ) from error
+    for view in views:
+        view.check_unharmed()
+
+
+def _read(views: Sequence[DivisionView]) -> set[str]:
+    """The fields that a rule at division has read of parents and daughters."""
+    return {m for view in views for n in view._work for m in MEANS.get(n, (n,))}
+
+
+def _after_divide(
+    act: Callable[..., None], state: State, births: Births
+) -> tuple[DivisionView, DivisionView, DivisionView]:
+    """The views of parent, first and second daughter, after the rule."""
+    views = (
+        DivisionView(births.parents, None, "parent", "divide parent"),
+        DivisionView(state, births.first, "daughter1", "divide first"),
+        DivisionView(state, births.second, "daughter2", "divide second"),
+    )
+    _act(act, *views)
+    return views
