@@ -39,7 +39,7 @@ class Contacts:
     give: float | None
     length_drag: float
     viscosity: float
-    unilateral: bool
+    contacts: str
     passes: int | None
     wall: str | None
     margin: float
@@ -148,7 +148,7 @@ CONTACTS = st.builds(
     give=st.sampled_from([None, 0.1, 1e-6, 10.0, -1.0, -1e6]),
     length_drag=powers(-3, 5),
     viscosity=powers(-3, 3),
-    unilateral=st.booleans(),
+    contacts=st.sampled_from(("one-sided", "bilateral")),
     passes=st.sampled_from([None, 1, 4]),
     wall=st.sampled_from([None, "plane", "box", "channel", "inside a sphere", "outside a sphere"]),
     margin=st.sampled_from([1.0, 0.3, 1e-3, 10.0]),

@@ -52,7 +52,7 @@ def mechanics(draw: Contacts, capsules: Capsules) -> tf.Mechanics:
         dim=dim,
         viscosity=draw.viscosity,
         length_drag=draw.length_drag,
-        unilateral=draw.unilateral,
+        contacts=draw.contacts,
         max_iterations=300,
         **accuracy,
     )

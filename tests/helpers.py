@@ -85,7 +85,8 @@ def check_always(state: tf.State, scene: tf.Scene | None = None) -> None:
         return
     assert (report.status == CONVERGED).all(), report
     if scene is not None:
-        tolerance = next(e.tolerance or 0.05 for e in scene.effects if isinstance(e, tf.Mechanics))
+        mechanics = next(e for e in scene.effects if isinstance(e, tf.Mechanics))
+        tolerance = mechanics.settings.tolerance or 0.05
         assert (report.residual <= tolerance).all(), report
 
 
@@ -183,9 +184,9 @@ def bodies(c, a, length, radius=0.5, *, dtype=torch.float64, device="cpu") -> Ca
     )
 
 
-def rows_of(cells: Capsules, first: Tensor, second: Tensor, unilateral: bool = False) -> Contacts:
+def rows_of(cells: Capsules, first: Tensor, second: Tensor) -> Contacts:
     """All rows that overlap among the given pairs (P,), (P,)."""
-    return contacts_of(CandidateContacts.among(cells, first, second), unilateral)
+    return contacts_of(CandidateContacts.among(cells, first, second))
 
 
 def unit(rng: np.random.Generator, count: int, dim: int) -> np.ndarray:

@@ -15,6 +15,7 @@ import torch
 from scipy import stats
 
 import torchfilm as tf
+from torchfilm.kernels.scheme import OVERLAP, TOLERANCE
 
 HERE = Path(__file__).parent.parent / "experiments"
 sys.path += [str(HERE / "accuracy"), str(HERE / "benchmarks")]
@@ -56,13 +57,13 @@ def test_soft_cells_converge_to_their_motion_at_first_order(dim):
     check_front(study)
     for error in study.errors:
         orders = study.orders(error)
-        for series in ("Δt", "Δt, unilateral"):
+        for series in ("Δt", "Δt, one-sided"):
             assert 0.9 < orders[series] < 1.1, (error, series)
         finest = min(p.step for p in study.points if p.step)
         one, other = (
             p.errors[error]
             for p in study.points
-            if p.step == finest and p.series in ("Δt", "Δt, unilateral")
+            if p.step == finest and p.series in ("Δt", "Δt, one-sided")
         )
         assert one == pytest.approx(other, rel=0.2)
 
@@ -73,21 +74,21 @@ def test_a_window_shows_what_each_knob_is_for(dim):
     study = run("window", dim)
     check_front(study)
     by = {p.setting: p for p in study.points}
-    # a softer penalty leaves more overlap, whatever else
-    assert by["dt=0.025, alpha=0.1"].errors["overlap"] > by["dt=0.025"].errors["overlap"]
+    # softer contacts leave more overlap, whatever else
+    soft = by[f"dt=0.025, contact_overlap={10 * OVERLAP:g}"]
+    assert soft.errors["overlap"] > by["dt=0.025"].errors["overlap"]
     # a tighter solve reads more rows, and so do smaller steps
-    assert (
-        by["dt=0.025, tolerance=0.02"].work
-        > by["dt=0.025"].work
-        > by["dt=0.025, tolerance=0.2"].work
-    )
+    tighter, looser = (by[f"dt=0.025, tolerance={m * TOLERANCE:g}"] for m in (0.3, 3))
+    assert tighter.work > by["dt=0.025"].work > looser.work
     assert all(
         any(p.default for p in study.points if p.series == s)
-        for s in ("Δt", "α", "passes", "tolerance")
+        for s in ("Δt", "overlap", "passes", "tolerance")
     )
+    assert by["dt=0.025, contacts='bilateral'"].work > 0
     assert by["dt=0.0125"].work > by["dt=0.025"].work
     fine, loose = mechanics.tight(tf.Mechanics(dim=dim), True)
-    assert not {fine.label, loose.label} & set(by) and fine.mechanics.unilateral
+    assert not {fine.label, loose.label} & set(by) and fine.mechanics.one_sided
+    assert study.facts["reference"] == fine.label
 
 
 @pytest.mark.slow
@@ -148,20 +149,19 @@ def test_a_label_says_what_a_user_would_type():
     assert contact_settings.ContactSetting("", plain).label == "dt=0.025"
     turned = contact_settings.ContactSetting(
         "",
-        dataclasses.replace(plain, alpha=0.003, tolerance=0.02, unilateral=True),
+        dataclasses.replace(plain, alpha=0.003, tolerance=0.02, contacts="bilateral"),
         0.05,
         torch.float64,
     )
-    assert turned.label == "dt=0.05, alpha=0.003, tolerance=0.02, unilateral=True, float64"
+    assert turned.label == "dt=0.05, alpha=0.003, tolerance=0.02, contacts='bilateral', float64"
     scene = tf.scenes.microcolony(dim=2)
     draft, settings = (
         contact_settings.ContactSetting.of_preset("draft", scene),
         tf.preset("draft", scene),
     )
-    assert (
-        draft.label
-        == f"preset draft: dt={settings.dt:g}, alpha=0.01, tolerance={settings.tolerance:g}"
-    )
+    # its penalty is the usual one, 0.1, and its tolerance four times the usual one, 0.05
+    contacts = f"contact_overlap={OVERLAP:g}, tolerance={4 * TOLERANCE:g}"
+    assert draft.label == f"preset draft: dt={settings.dt:g}, {contacts}"
     assert (
         draft.scene(scene).dt == settings.dt
         and contact_settings.mechanics_of(settings.apply(scene)) == draft.mechanics

@@ -3,12 +3,16 @@ as presets."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import pytest
 import torch
 
 import torchfilm as tf
+from torchfilm.effects.mechanics import TOLERANCE
+from torchfilm.kernels.scheme import OVERLAP
+from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.tools.checks import InputError
 from torchfilm.tuning.settings import PRESETS
 
@@ -36,17 +40,27 @@ def bound_circuit(made: tf.Scene):
     return next(e for e in made.bind().effects if isinstance(e.effect, tf.Circuit))
 
 
-def test_knobs_reach_their_effects_and_nothing_else():
-    first = scene(length_drag=20.0, walls=[tf.Channel(8.0)])
+BILATERAL = {"contacts": "bilateral", "length_drag": 10.0}
+
+
+@pytest.mark.parametrize(
+    "contacts, reached",
+    [
+        # of overlap and of force errors, the part that these knobs are of their usual values;
+        # one-sided contacts repeat passes by themselves
+        ("one-sided", {"contact_overlap": 2 * OVERLAP, "tolerance": 0.2 * FORCE_TOLERANCE}),
+        ("bilateral", {"alpha": 0.01, "tolerance": 0.01, "passes": 3, "overlap": 0.02}),
+    ],
+)
+def test_knobs_reach_their_effects_and_nothing_else(contacts, reached):
+    first = scene(contacts=contacts, length_drag=20.0, walls=[tf.Channel(8.0)])
     second = tf.Settings(dt=0.01, penalty=0.2, passes=3, tolerance=0.01, rtol=1e-3).apply(first)
     mechanics, circuit = of(second, tf.Mechanics), of(second, tf.Circuit)
-    assert (second.dt, mechanics.alpha, mechanics.passes, mechanics.tolerance, circuit.rtol) == (
-        0.01,
-        0.01,
-        3,
-        0.01,
-        1e-3,
-    )
+    for field in dataclasses.fields(tf.Mechanics):
+        before, after = (getattr(of(s, tf.Mechanics), field.name) for s in (first, second))
+        right = reached.get(field.name, before)
+        assert after == (pytest.approx(right) if field.name in reached else right), field.name
+    assert (second.dt, circuit.rtol) == (0.01, 1e-3)
     assert mechanics.walls == of(first, tf.Mechanics).walls and mechanics.length_drag == 20.0
     assert (
         circuit.rates == of(first, tf.Circuit).rates
@@ -79,9 +93,33 @@ def test_knobs_reach_their_effects_and_nothing_else():
     ],
 )
 def test_who_sets_passes_wants_overlaps_gone(given, settings, overlap):
-    """Down to 0.02 µm, or as much less as α·γ is below 0.1, where none is given (γ = 10)."""
-    made = of(tf.Settings(**settings).apply(scene(**given)), tf.Mechanics)
+    """Of bilateral contacts: down to 0.02 µm, or as much less as α·γ is below 0.1, where none is
+    given (γ = 10)."""
+    made = of(tf.Settings(**settings).apply(scene(**BILATERAL, **given)), tf.Mechanics)
     assert made.overlap == (None if overlap is None else pytest.approx(overlap))
+
+
+@pytest.mark.parametrize("contacts", ["one-sided", "bilateral"])
+@pytest.mark.parametrize("given", [{}, {"stiffness": 100.0}, {"alpha": 0.003}])
+def test_knobs_are_those_that_change_something_and_usual_values_are_the_defaults(contacts, given):
+    effect = tf.Mechanics(dim=2, contacts=contacts, length_drag=10.0, **given)
+    knobs = effect.accuracy_knobs()
+    for name, values in (("penalty", (0.03, 0.3)), ("passes", (2, 3)), ("tolerance", (0.01, 0.1))):
+        made = [effect.with_settings(tf.Settings(**{name: value})) for value in values]
+        seen = [(one.alpha, one.overlap, one.settings) for one in made]
+        assert (seen[0] != seen[1]) == (name in knobs), name
+    same = effect.with_settings(tf.Settings(**knobs)).settings
+    usual = dataclasses.replace(effect, alpha=None).settings
+    if contacts == "one-sided":
+        assert same == usual
+    else:
+        assert (same.passes, same.tolerance) == (usual.passes, TOLERANCE)
+
+
+def test_a_penalty_takes_the_place_of_the_scenes_own_hardness():
+    for given in ({}, {"alpha": 0.003}, {"contact_overlap": 0.5}):
+        made = of(tf.Settings(penalty=0.03).apply(scene(**given)), tf.Mechanics)
+        assert made.contact_overlap == pytest.approx(0.3 * OVERLAP) and made.alpha is None
 
 
 def test_without_knobs_the_scene_stays_as_it_is():
@@ -91,12 +129,11 @@ def test_without_knobs_the_scene_stays_as_it_is():
 
 
 def test_physical_softness_and_molecules_are_no_knobs():
-    soft = tf.Settings(penalty=0.2, passes=2).apply(scene(stiffness=100.0))
-    assert (
-        of(soft, tf.Mechanics).stiffness == 100.0
-        and of(soft, tf.Mechanics).alpha is None
-        and of(soft, tf.Mechanics).passes == 2
-    )
+    for contacts, passes in (("one-sided", None), ("bilateral", 2)):
+        first = scene(stiffness=100.0, contacts=contacts)
+        soft = of(tf.Settings(penalty=0.2, passes=2).apply(first), tf.Mechanics)
+        assert (soft.stiffness, soft.alpha, soft.contact_overlap) == (100.0, None, None)
+        assert soft.passes == passes
     molecules = tf.Circuit([tf.parts.constitutive("m", 1.0)], species="m", method="tau_leap")
     grown = tf.Settings(rtol=1e-2).apply(tf.Scene(tf.Growth(rate=1.0), molecules))
     assert of(grown, tf.Circuit) is molecules
@@ -104,15 +141,20 @@ def test_physical_softness_and_molecules_are_no_knobs():
 
 
 def test_one_penalty_for_drags_that_differ_between_colonies():
-    first = scene(length_drag=[10.0, 20.0])
+    """Of bilateral contacts, whose α is measured by the drag; one-sided ones follow their force."""
+    drawn = scene(length_drag=tf.Uniform(9.0, 11.0))
+    made = of(tf.Settings(penalty=0.1).apply(drawn), tf.Mechanics)
+    assert made.contact_overlap == OVERLAP
+    with_drag = lambda drag: scene(contacts="bilateral", length_drag=drag)
+    first = with_drag([10.0, 20.0])
     alpha = of(tf.Settings(penalty=0.1).apply(first), tf.Mechanics).alpha
     assert alpha.tolist() == pytest.approx([0.01, 0.005])
-    typed = tf.Settings(penalty=0.1).apply(scene(length_drag={0: 10.0, 1: 20.0}))
+    typed = tf.Settings(penalty=0.1).apply(with_drag({0: 10.0, 1: 20.0}))
     assert of(typed, tf.Mechanics).physical_values()["alpha"][0].values == pytest.approx(
         {0: 0.01, 1: 0.005}
     )
     with pytest.raises(InputError, match=r"length_drag.*Leave the penalty out"):
-        tf.Settings(penalty=0.1).apply(scene(length_drag=tf.Uniform(9.0, 11.0)))
+        tf.Settings(penalty=0.1).apply(with_drag(tf.Uniform(9.0, 11.0)))
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,8 @@ class Room:
 # To add a room, or a module to one, write it here. A module that is not listed belongs to the last.
 ROOMS = {
     "tools": Room(0, ("torchfilm.tools", "torchfilm.version")),
+    # compiled loops over arrays: they know neither torch nor the rest
+    "loops": Room(0, ("torchfilm.kernels",)),
     "kernels": Room(1, ("torchfilm.physics", "torchfilm.signals", "torchfilm.circuits")),
     "state": Room(2, ("torchfilm.state",)),
     # what an effect is, how values are given and resolved, what rules see, exchange with the medium
@@ -67,6 +69,8 @@ ONE_EFFECT = {
     frozenset({"torchfilm.effects.circuit", "torchfilm.effects.bound_circuit"}),
     frozenset({"torchfilm.effects.medium", "torchfilm.effects.bound_medium"}),
     frozenset({"torchfilm.effects.rules", "torchfilm.effects.bound_rules"}),
+    frozenset({"torchfilm.effects.mechanics", "torchfilm.effects.bound_mechanics"}),
+    frozenset({"torchfilm.effects.bound_mechanics", "torchfilm.effects.mechanics_report"}),
 }
 # Kernels take tensors: they never see a state, nor what is built on one.
 TENSORS_ONLY = "kernels"

@@ -164,6 +164,8 @@ def test_on_the_same_cells_nutrition_leaves_the_others_costs_alone():
             )
         }
         twin = bare.replace(**same, fields={n: state.fields[n] for n in bare.fields})
+        for cells in (state, twin):  # sums over colonies prepare themselves once for some cells
+            assert cells.groups.sum(cells.length.unsqueeze(1)).numel() == cells.counts.numel()
         with_food, state = spend(fed, state)
         twin = twin.with_fields(
             growth_rate=state.growth_rate if state.cells == twin.cells else twin.growth_rate
@@ -319,7 +321,8 @@ def test_fields_and_stages_are_those_of_the_effects_listed():
         and state.signals == {}
         and not any(n.startswith(OUTSIDE) for n in state.fields)
     )
-    known = {"divide_flag", "division_threshold", "growth_rate", "elongation", "displacement"}
+    of_mechanics = {"displacement", "contact_alpha"}
+    known = {"divide_flag", "division_threshold", "growth_rate", "elongation", *of_mechanics}
     assert set(state.fields) == known and set(state.reports) == {"mechanics"}
     for more, added in (
         ([circuit()], {"m", "circuit_volume"}),

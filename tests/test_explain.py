@@ -12,10 +12,12 @@ import torch
 
 import torchfilm as tf
 from torchfilm.cost_estimate import COLUMNS, ROWS, Block, CostProbe, Spending, crowd, state_bytes
-from torchfilm.effects import KNOWN, bound_medium
+from torchfilm.effects import KNOWN, bound_mechanics, bound_medium
 from torchfilm.effects.bound_medium import FirstHalf, GridCoverage
 from torchfilm.effects.mechanics import TOLERANCE
 from torchfilm.explanation import left_out, replayed
+from torchfilm.kernels.scheme import OVERLAP, PASSES
+from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.tools.counting import Operators
 
 BODY = (tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2))
@@ -90,6 +92,21 @@ def test_a_way_of_transport_that_was_asked_for_is_reported(method):
         (
             tf.Mechanics(dim=2),
             (
+                "one-sided, they only push",
+                f"a mean overlap of {OVERLAP:g} radii",
+                f"at most {PASSES} a step, more than one only around cells deeper than 0.2 radii",
+                f"contact forces to {FORCE_TOLERANCE:g}",
+                "at most 2000 iterations",
+            ),
+        ),
+        (
+            tf.Mechanics(dim=2, contact_overlap=0.03, tolerance=0.03, passes=2),
+            ("a mean overlap of 0.03 radii", "at most 2 a step", "contact forces to 0.03, at most"),
+        ),
+        (tf.Mechanics(dim=2, backend="torch"), ("conjugate gradients, torch, contact forces",)),
+        (
+            tf.Mechanics(dim=2, contacts="bilateral", length_drag=10.0),
+            (
                 "bilateral",
                 "α = 0.1/γ = 0.01 (default)",
                 "at most 1 a step",
@@ -97,18 +114,22 @@ def test_a_way_of_transport_that_was_asked_for_is_reported(method):
                 "at most 2000 iterations",
             ),
         ),
-        (tf.Mechanics(dim=2, length_drag=40.0), ("α = 0.1/γ = 0.0025 (default)",)),
         (
-            tf.Mechanics(dim=2, unilateral=True, tolerance=0.03),
-            ("unilateral", "at most 2 a step", "residual of 0.03, at most"),
+            tf.Mechanics(dim=2, contacts="bilateral", length_drag=40.0),
+            ("α = 0.1/γ = 0.0025 (default)",),
         ),
+        (tf.Mechanics(dim=2, contacts="bilateral", tolerance=0.03), ("residual of 0.03, at most",)),
         # 1/(k Δt), Δt = 0.025
         (
             tf.Mechanics(dim=2, stiffness=[100.0, 200.0]),
-            ("stiffness 100 to 200 μ·µm/h", "= 0.2 to 0.4"),
+            ("stiffness 100 to 200 μ·µm/h", "= 0.2 to 0.4", "passes: 1 a step, as cells are soft"),
         ),
         (
             tf.Mechanics(dim=2, alpha=0.5, passes=4, overlap=0.01),
+            ("α = 0.5", "at most 4 a step", "deeper than 0.01 µm"),
+        ),
+        (
+            tf.Mechanics(dim=2, contacts="bilateral", alpha=0.5, passes=4, overlap=0.01),
             ("α = 0.5", "at most 4 a step", "over 0.01 µm"),
         ),
         (
@@ -161,15 +182,36 @@ def test_methods_and_tolerances_are_those_of_the_scene(effect, words):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("unilateral", [False, True])
-def test_defaults_reported_of_contacts_are_those_used(dim, unilateral):
-    effect = tf.Mechanics(dim=dim, unilateral=unilateral)
+@pytest.mark.parametrize("contacts", ["bilateral", "one-sided"])
+def test_defaults_reported_of_contacts_are_those_used(dim, contacts):
+    effect = tf.Mechanics(dim=dim, contacts=contacts)
     model = tf.Scene(effect, tf.Growth(rate=1.0)).bind()
     bound = next(e for e in model.effects if e.effect is effect)
     said = " ".join(bound.numerics(0.025, model.start()))
-    assert (
-        f"at most {effect.settings.passes} a step" in said
-        and f"residual of {TOLERANCE:g} (default)" in said
+    used = bound.settings
+    assert f"at most {used.passes} a step" in said
+    if contacts == "one-sided":
+        assert f"a mean overlap of {used.contact_overlap:g} radii" in said
+        assert f"contact forces to {used.tolerance:g}, " in said
+    else:
+        assert f"residual of {TOLERANCE:g} (default)" in said
+
+
+@pytest.mark.parametrize("backend", [None, "torch"])
+def test_who_computes_contacts_is_who_is_reported(backend, monkeypatch):
+    called = []
+    for name in ("compiled", "one_sided"):
+        part = getattr(bound_mechanics, name)
+        steps = lambda given, name=name, usual=part.contact_steps: (
+            called.append(name) or usual(given)
+        )
+        monkeypatch.setattr(part, "contact_steps", steps)
+    effect = tf.Mechanics(dim=2, backend=backend)
+    model = tf.Scene(effect, tf.Growth(rate=1.0)).bind()
+    model.step(model.start(), 0.025)
+    who = {"compiled": "compiled", "one_sided": "torch"}[called[0]]
+    assert len(called) == 1 and f"conjugate gradients, {who}" in " ".join(
+        effect.numerics(0.025, model.start())
     )
 
 

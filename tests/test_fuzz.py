@@ -147,7 +147,7 @@ def test_hard_contacts_fling_no_cell_through_a_wall():
     0.05 (or, by rounding, of less) by 6 µm, which took one through the wall by 2.7 µm. A move
     through a wall is cut.
     """
-    contacts = fuzz.Contacts(1e-6, 1.0, 1.0, False, None, "box", 0.3, None)
+    contacts = fuzz.Contacts(1e-6, 1.0, 1.0, "bilateral", None, "box", 0.3, None)
     bodies = fuzz.Capsules((7,), 5.0, (2.0, 3.0), 0.5, 2, 0)
     draw = fuzz.Draw(
         bodies, contacts, None, None, None, fuzz.Beside(False, None, False), 0.01, 1, "float32", 0

@@ -24,7 +24,7 @@ def test_growth_rate_between_walls(dim, soft):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_growth_rate_between_walls_that_only_push(dim):
     def experiment(rate):
-        scene = growing(dim, rate, walls=between_walls(dim), unilateral=True)
+        scene = growing(dim, rate, walls=between_walls(dim), contacts="one-sided")
         return run(scene, seeded(scene))
 
     check(experiment, 0.8)

@@ -12,7 +12,7 @@ from test_replay import lit, same, stepped
 
 import torchfilm as tf
 from design import growth_cache
-from torchfilm.effects.mechanics import _BoundMechanics
+from torchfilm.effects.bound_mechanics import BoundMechanics
 from torchfilm.state import CELL_TYPE
 
 THREE = tf.Cells(
@@ -44,7 +44,7 @@ def replayed(scene, steps, streams=(0, 1)):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
 def test_an_interrupted_step_is_done_again(error, monkeypatch):
-    usual, calls = _BoundMechanics.step, []
+    usual, calls = BoundMechanics.step, []
 
     def fails_once(self, state, dt):
         calls.append(state.step)
@@ -53,7 +53,7 @@ def test_an_interrupted_step_is_done_again(error, monkeypatch):
         return usual(self, state, dt)
 
     recording, whole = (tf.GrowthRecording(lit(), streams=(0, 1)) for _ in range(2))
-    monkeypatch.setattr(_BoundMechanics, "step", fails_once)
+    monkeypatch.setattr(BoundMechanics, "step", fails_once)
     with pytest.raises(error):
         recording.changes(19)
     recording.changes(19)

@@ -81,9 +81,9 @@ def test_without_mechanics_no_pair_is_looked_for_and_nothing_is_solved():
         tf.Rules(lambda c: c.growth_rate),
     )
     assert not heavy(operators(*growing))
-    assert heavy(operators(tf.Growth(rate=1.0), tf.Mechanics(dim=2))), (
-        "this test must be able to see them"
-    )
+    # by torch: what kernels do is no operator
+    contacts = tf.Mechanics(dim=2, backend="torch")
+    assert heavy(operators(tf.Growth(rate=1.0), contacts)), "this test must be able to see them"
 
 
 def test_rules_that_do_not_ask_for_contacts_do_not_pay_for_them():
@@ -98,9 +98,11 @@ def test_an_effect_that_is_not_listed_leaves_no_field_and_no_report():
         "divide_flag",
         "division_threshold",
     }
-    scene = tf.Scene(tf.Mechanics(dim=2))
-    assert set(scene.bind().start().fields) == {"displacement"}
-    assert set(step(scene, scene.bind().start(), 0.1).reports) == {"mechanics"}
+    # only one-sided contacts follow their force
+    for contacts, own in (("one-sided", {"contact_alpha"}), ("bilateral", set())):
+        scene = tf.Scene(tf.Mechanics(dim=2, contacts=contacts))
+        assert set(scene.bind().start().fields) == {"displacement", *own}
+        assert set(step(scene, scene.bind().start(), 0.1).reports) == {"mechanics"}
 
 
 def test_a_step_does_not_touch_the_state_before():

@@ -99,11 +99,11 @@ def with_nan(state: tf.State, colony: int) -> tf.State:
     return state.replace(position=position)
 
 
-@pytest.mark.parametrize("unilateral", [False, True])
-def test_a_colony_that_is_not_finite_fails_alone(unilateral, dtype):
+@pytest.mark.parametrize("contacts", ["bilateral", "one-sided"])
+def test_a_colony_that_is_not_finite_fails_alone(contacts, dtype):
     """NaN in one of three colonies: it is named, and dropped the other two go on to the same bits
     as without it."""
-    scene = scene_of(unilateral=unilateral)
+    scene = scene_of(contacts=contacts)
     good = list(tf.simulate(scene, scene.bind(3, dtype=dtype).start(), until=2.0))[-1]
     assert (good.counts >= 4).all()
     with pytest.raises(tf.SimulationError, match=r"colony 1 .*not finite") as caught:
@@ -287,7 +287,7 @@ def every_step(scene: tf.Scene, state: tf.State, until: float) -> list[tf.State]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options", [{}, {"unilateral": True}, {"dim": 3}], ids=["bilateral", "unilateral", "3-D"]
+    "options", [{}, {"contacts": "one-sided"}, {"dim": 3}], ids=["default", "one-sided", "3-D"]
 )
 def test_going_on_from_any_state_is_bit_for_bit_the_same(options):
     """From every tenth step, cells that are just due to divide included; through a fresh scene, as
@@ -305,7 +305,7 @@ def test_going_on_from_any_state_is_bit_for_bit_the_same(options):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options", [{}, {"unilateral": True}, {"dim": 3}], ids=["bilateral", "unilateral", "3-D"]
+    "options", [{}, {"contacts": "one-sided"}, {"dim": 3}], ids=["default", "one-sided", "3-D"]
 )
 def test_one_by_one_equals_the_batch_bit_for_bit(options, dtype):
     scene = scene_of(**options)

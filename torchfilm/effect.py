@@ -332,13 +332,14 @@ class BoundEffect:
 class Concern:
     """What a report warns of, once it has held for `steps` steps: in which colonies, `where` (B,)
     bool, and `text(colony ids (B,), where (B,))`, what is wrong and what to do. name:
-    distinguishes concerns.
+    distinguishes concerns. fails: these colonies have failed then, as those whose step failed.
     """
 
     name: str
     where: torch.Tensor
     steps: int
     text: Callable[[torch.Tensor, torch.Tensor], str]
+    fails: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -139,28 +139,36 @@ class EndlessRunWarning:
             )
 
 
-class ReportWarnings:
-    """Warns, once each, of what the reports of effects are concerned about, when it has held for as
-    many steps as they say."""
+class LastingConcerns:
+    """What the reports of effects are concerned about, when it has held for as many steps as they
+    say: a warning, once each, or, where the concern says so, a failure of the colonies."""
 
-    def __init__(self) -> None:
+    def __init__(self, on_failure: str) -> None:
+        self.on_failure = on_failure
         self.steps: dict[tuple[str, str], Tensor] = {}
         self.warned: set[tuple[str, str]] = set()
 
-    def __call__(self, state: State) -> None:
+    def __call__(self, state: State) -> State:
         for title, report in state.reports.items():
             for concern in report.concerns() if hasattr(report, "concerns") else ():
-                self._look(state, (title, concern.name), concern)
+                state = self._look(state, (title, concern.name), concern)
+        return state
 
-    def _look(self, state: State, key: tuple[str, str], concern) -> None:
+    def _look(self, state: State, key: tuple[str, str], concern) -> State:
         if key in self.warned:
-            return
+            return state
         before = self.steps.get(key, torch.zeros_like(state.counts))
         self.steps[key] = torch.where(concern.where, before + 1, 0)
         lasting = self.steps[key] >= concern.steps
-        if bool(lasting.any()):
+        if not bool(lasting.any()):
+            return state
+        text = concern.text(state.colony_id, lasting)
+        text = f"step {state.step} (t = {state.time:g} h): {text}"
+        if not concern.fails:
             self.warned.add(key)
-            text = concern.text(state.colony_id, lasting)
-            warnings.warn(
-                f"step {state.step} (t = {state.time:g} h): {text}", RuntimeWarning, stacklevel=5
-            )
+            warnings.warn(text, RuntimeWarning, stacklevel=5)
+            return state
+        if self.on_failure == "raise":
+            text += ' on_failure="drop" continues without them.'
+            raise SimulationError(text, state.colony_id[lasting].tolist())
+        return state.remove(lasting.index_select(0, state.colony), "failed")

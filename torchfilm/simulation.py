@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchfilm.loop import EndlessRunWarning, Monitor, ReportWarnings, advance, handle_failures
+from torchfilm.loop import EndlessRunWarning, LastingConcerns, Monitor, advance, handle_failures
 from torchfilm.model import Model
 from torchfilm.scene import Scene
 from torchfilm.state import State
@@ -148,7 +148,7 @@ def _monitors(
     monitors += [partial(_observe, observe) for observe in observers]
     if cells is not None:
         monitors.append(EndlessRunWarning(cells))
-    return [*monitors, ReportWarnings()]
+    return [*monitors, LastingConcerns(on_failure)]
 
 
 def _record(recorder: Recorder, timings: Timings | None, state: State) -> None:

@@ -6,10 +6,13 @@ finding the contacts.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from growth import RowCounter
+from row_counter import RowCounter
 from study import timed
 
 import torchfilm as tf
@@ -19,7 +22,7 @@ DT = 0.025  # h, the default step of a scene
 DIAMETER = 1.0  # µm, of all cells in these studies
 SHORT = 0.1  # s; longer runs are timed once
 TOLERANCES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 1e-3)
-KNOBS = ("stiffness", "alpha", "passes", "tolerance", "overlap", "unilateral")
+KNOBS = ("stiffness", "alpha", "contact_overlap", "passes", "tolerance", "overlap", "contacts")
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class ContactSetting:
         """The setting as a user would give it: only the values that differ from the default."""
         plain = tf.Mechanics(dim=self.mechanics.dim)
         changed = [
-            f"{n}={value if isinstance(value, bool) else f'{value:g}'}"
+            f"{n}={f'{value:g}' if isinstance(value, int | float) else repr(value)}"
             for n in KNOBS
             if (value := getattr(self.mechanics, n)) != getattr(plain, n)
         ]
@@ -80,8 +83,10 @@ class ContactSetting:
 
 
 def with_passes(mechanics: tf.Mechanics, passes: int) -> tf.Mechanics:
-    """Returns mechanics whose passes solve to the overlap of `tf.Settings(passes=…)`: 0.02 µm, less
-    where α·γ is below 0.1."""
+    """Returns mechanics with this many passes at most; those of bilateral contacts solve to the
+    overlap of `tf.Settings(passes=…)`: 0.02 µm, less where α·γ is below 0.1."""
+    if mechanics.one_sided:
+        return dataclasses.replace(mechanics, passes=passes)
     return mechanics.with_settings(tf.Settings(passes=passes))
 
 
@@ -94,14 +99,28 @@ def followed(
     choice: ContactSetting, like: tf.Scene, first: tf.State, hours: float
 ) -> tuple[tf.State, float, float]:
     """Returns the state `hours` later, the seconds (a median if short) and the rows read."""
-    scene, start = choice.scene(like), choice.start(first)
+    start = choice.start(first)
 
-    def run() -> tf.State:
+    def run(scene: tf.Scene) -> tf.State:
         *_, state = tf.simulate(scene, start, until=start.time + hours)
         return state
 
+    return timed_and_counted(choice, like, run)
+
+
+def timed_and_counted(
+    choice: ContactSetting, like: tf.Scene, run: Callable[[tf.Scene], Any]
+) -> tuple[Any, float, float]:
+    """Returns the result of `run` for the scene, the seconds (a median if short) and the rows read.
+
+    Kernels count no rows. Where they are used, rows are counted in a run by torch, which takes the
+    same steps.
+    """
+    by_torch = dataclasses.replace(choice.mechanics, backend="torch")
+    kernels = choice.mechanics.backend_on(torch.device("cpu")) == "compiled"
+    counted = dataclasses.replace(choice, mechanics=by_torch) if kernels else choice
     with RowCounter() as counter:
-        state, seconds = timed(run, 1)
-    if seconds < SHORT:
-        _, seconds = timed(run)
-    return state, seconds, choice.rows(counter)
+        found, seconds = timed(lambda: run(counted.scene(like)), 1)
+    if kernels or seconds < SHORT:
+        found, seconds = timed(lambda: run(choice.scene(like)))
+    return found, seconds, choice.rows(counter)

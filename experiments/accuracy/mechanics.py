@@ -2,8 +2,9 @@
 
 Three studies, each in the plane and in space: the order in Δt (soft_cells.py), every knob over a
 short time, and the statistics of whole runs. Soft cells obey a differential equation, which gives
-their reference. Hard cells have none; there the reference is another kind of contact with a tight
-solve.
+their reference. Hard cells have none; there the reference has much harder contacts, a given α and a
+tight solve. Pressure slows growth (length drag 10): so growth shows errors of contacts, and
+bilateral contacts can be compared.
 """
 
 from __future__ import annotations
@@ -16,22 +17,20 @@ import torch
 from contact_settings import (
     DIAMETER,
     DT,
-    SHORT,
-    TOLERANCES,
     WORK,
     ContactSetting,
     followed,
     mechanics_of,
+    timed_and_counted,
     with_passes,
 )
-from growth import RowCounter
 from scipy import stats
 from soft_cells import LENGTH_DRAG, order
-from study import Point, Study, timed
+from study import Point, Study
 from torch import Tensor
 
 import torchfilm as tf
-from torchfilm.effects.mechanics import TOLERANCE
+from torchfilm.kernels.scheme import OVERLAP, PASSES, TOLERANCE
 from torchfilm.physics.contacts import gaps_nearby
 
 SEED = 1
@@ -41,9 +40,13 @@ SEED = 1
 HOURS, SAMPLING = 0.4, 0.1  # h, the window and the interval between its samples
 
 
+def _colony(dim: int) -> tf.Scene:
+    return tf.scenes.microcolony(dim=dim, length_drag=LENGTH_DRAG)
+
+
 def colonies(dim: int, quick: bool) -> tuple[tf.Scene, tf.State]:
-    """Returns the scene and colonies of about 60 to 100 cells, grown with all defaults."""
-    scene = tf.scenes.microcolony(dim=dim)
+    """Returns the scene and colonies of about 60 to 100 cells, grown with the default contacts."""
+    scene = _colony(dim)
     *_, state = tf.simulate(scene, colonies=2 if quick else 8, seed=SEED, cells=8 if quick else 64)
     return scene, state
 
@@ -51,9 +54,9 @@ def colonies(dim: int, quick: bool) -> tuple[tf.Scene, tf.State]:
 def tight(plain: tf.Mechanics, quick: bool) -> tuple[ContactSetting, ContactSetting]:
     """Returns the reference and a looser one, whose difference shows the reference's own error.
 
-    Both use unilateral contacts, unlike the default.
+    Both have a given α, so their contacts do not follow the force, unlike the default.
     """
-    base = dataclasses.replace(plain, unilateral=True, alpha=0.003, passes=4)
+    base = dataclasses.replace(plain, alpha=0.0003)
     dt, tolerance = (
         (0.0125, 1e-2) if quick else (0.005, 1e-3) if plain.dim == 2 else (0.00625, 1e-2)
     )
@@ -74,30 +77,24 @@ def _changed(plain: tf.Mechanics, knob: str, value: float) -> tf.Mechanics:
 def one_by_one(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
     """Returns settings with one knob changed.
 
-    The series of steps, α, passes and tolerances include the default.
+    The series of steps, overlaps, passes and tolerances include the default.
     """
     steps = (0.05, 0.025, 0.0125) if quick else (0.1, 0.05, 0.025, 0.0125, 0.00625)
     found = [ContactSetting("Δt", plain, dt, default=dt == DT) for dt in steps]
-    for series, knob, usual, values in (
-        (
-            "α",
-            "alpha",
-            0.1 / LENGTH_DRAG,
-            (0.1, 0.01, 0.001) if quick else (0.1, 0.03, 0.01, 0.003, 0.001),
-        ),
-        ("passes", "passes", plain.settings.passes, (1, 2) if quick else (1, 2, 4)),
-        ("tolerance", "tolerance", TOLERANCE, (0.2, 0.05, 0.02) if quick else TOLERANCES),
+    for series, knob, usual, multiples in (
+        ("overlap", "contact_overlap", OVERLAP, (10, 1) if quick else (10, 3, 1, 1 / 3, 0.1)),
+        ("passes", "passes", PASSES, (1 / PASSES, 1)),
+        ("tolerance", "tolerance", TOLERANCE, (3, 1, 0.3) if quick else (6, 3, 1, 0.3, 0.1, 0.01)),
     ):
         found += [
             ContactSetting(
-                series, plain if v == usual else _changed(plain, knob, v), default=v == usual
+                series, plain if m == 1 else _changed(plain, knob, m * usual), default=m == 1
             )
-            for v in values
+            for m in multiples
         ]
-    found += [
-        ContactSetting("unilateral", dataclasses.replace(plain, unilateral=True, passes=n))
-        for n in (None, 1)
-    ]
+    bilateral = dataclasses.replace(plain, contacts="bilateral")
+    found += [ContactSetting("bilateral", bilateral)]
+    found += [ContactSetting("bilateral", with_passes(bilateral, n)) for n in (2, 4)]
     return [*found, ContactSetting("float64", plain, dtype=torch.float64)]
 
 
@@ -107,19 +104,18 @@ def together(plain: tf.Mechanics, quick: bool) -> list[ContactSetting]:
         return [
             ContactSetting(
                 "several",
-                with_passes(dataclasses.replace(plain, alpha=0.003, tolerance=0.02), 2),
+                dataclasses.replace(plain, contact_overlap=0.3 * OVERLAP, tolerance=0.02),
                 0.0125,
             )
         ]
     return [
         ContactSetting(
             "several",
-            with_passes(dataclasses.replace(plain, alpha=alpha, tolerance=tolerance), passes),
+            dataclasses.replace(plain, contact_overlap=overlap * OVERLAP, tolerance=tolerance),
             dt,
         )
         for dt in (0.05, 0.025, 0.0125)
-        for alpha in (0.1, 0.01, 0.001)
-        for passes in (plain.settings.passes, 2 * plain.settings.passes)
+        for overlap in (10.0, 1.0, 0.1)
         for tolerance in (0.2, 0.02)
     ]
 
@@ -128,9 +124,9 @@ def measured(
     choice: ContactSetting, like: tf.Scene, first: tf.State
 ) -> tuple[dict[str, Tensor], float, float]:
     """Returns the observables of each colony over the window, (B,) each, seconds and rows."""
-    scene, start, walls = choice.scene(like), choice.start(first), choice.mechanics.walls
+    start, walls = choice.start(first), choice.mechanics.walls
 
-    def run() -> list[tf.State]:
+    def run(scene: tf.Scene) -> list[tf.State]:
         every = round(SAMPLING / choice.dt)
         return [
             s
@@ -138,16 +134,13 @@ def measured(
             if (s.step - start.step) % every == 0
         ]
 
-    with RowCounter() as counter:
-        states, seconds = timed(run, 1)
-    if seconds < SHORT:
-        _, seconds = timed(run)
+    states, seconds, work = timed_and_counted(choice, like, run)
     overlaps = [tf.measure.overlaps(s, walls) for s in states]
     found = {
         "overlap": torch.stack([o.mean for o in overlaps]).mean(0),
         "worst overlap": torch.stack([o.worst for o in overlaps]).max(0).values,
     }
-    return found | shape(states[-1]), seconds, choice.rows(counter)
+    return found | shape(states[-1]), seconds, work
 
 
 def shape(state: tf.State) -> dict[str, Tensor]:
@@ -269,7 +262,7 @@ def run_settings(like: tf.Scene, quick: bool) -> list[ContactSetting]:
     found = [
         ContactSetting("Δt", plain, default=True),
         draft,
-        ContactSetting("α", change(alpha=0.1)),
+        ContactSetting("overlap", change(contact_overlap=10 * OVERLAP)),
     ]
     if quick:
         return found
@@ -277,9 +270,9 @@ def run_settings(like: tf.Scene, quick: bool) -> list[ContactSetting]:
         *found,
         ContactSetting("Δt", plain, DT / 2),
         *(ContactSetting("tolerance", change(tolerance=t)) for t in (0.2, 0.02)),
-        ContactSetting("unilateral", change(unilateral=True)),
+        ContactSetting("bilateral", change(contacts="bilateral")),
         ContactSetting("float64", plain, dtype=torch.float64),
-        ContactSetting("several", change(tolerance=0.2, alpha=0.1), draft.dt),
+        ContactSetting("several", change(tolerance=0.2, contact_overlap=10 * OVERLAP), draft.dt),
     ]
 
 
@@ -287,7 +280,7 @@ def whole(
     choice: ContactSetting, hours: float, streams: Sequence[int]
 ) -> tuple[dict[str, Tensor], float, float]:
     """Returns statistics of colonies from one cell, one stream each; seconds and rows."""
-    scene = choice.scene(tf.scenes.microcolony(dim=choice.mechanics.dim))
+    scene = choice.scene(_colony(choice.mechanics.dim))
     model = scene.bind(colonies=len(streams), seed=SEED, streams=streams, dtype=choice.dtype)
     state, seconds, work = followed(choice, scene, model.start(), hours)
     return statistics(state), seconds, work
@@ -299,14 +292,12 @@ def long(dim: int, quick: bool) -> Study:
     Whole runs are chaotic, so the study compares statistics over seeds. The reference has other
     seeds.
     """
-    like = tf.scenes.microcolony(dim=dim)
+    like = _colony(dim)
     # multiples of the steps of all settings
     hours, count = (3.0, 3) if quick else (8.4 if dim == 2 else 7.4, 12)
     fine = ContactSetting(
         "reference",
-        dataclasses.replace(
-            mechanics_of(like), alpha=0.003, passes=4, tolerance=0.005, overlap=0.02
-        ),
+        dataclasses.replace(mechanics_of(like), alpha=0.0003, tolerance=0.005, overlap=0.02),
         DT / 2,
     )
     reference, fine_seconds, _ = whole(fine, hours, range(100, 100 + count))

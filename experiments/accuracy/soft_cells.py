@@ -226,7 +226,7 @@ def cluster(dim: int, quick: bool) -> tuple[tf.Scene, tuple[tuple[float, float, 
     return (
         tf.Scene(
             tf.Growth(rate=RATE),
-            tf.Mechanics(dim=dim, stiffness=STIFFNESS, walls=planes),
+            tf.Mechanics(dim=dim, stiffness=STIFFNESS, walls=planes, length_drag=LENGTH_DRAG),
             founders=cells,
         ),
         walls,
@@ -244,8 +244,8 @@ def refinements(plain: tf.Mechanics, hours: float, quick: bool) -> list[ContactS
         )
     ]
     several = [
-        ("Δt", tight, torch.float64),
-        ("Δt, unilateral", dataclasses.replace(tight, unilateral=True), torch.float64),
+        ("Δt", dataclasses.replace(tight, contacts="bilateral"), torch.float64),
+        ("Δt, one-sided", dataclasses.replace(tight, contacts="one-sided"), torch.float64),
         ("Δt, default tolerance", plain, torch.float32),
     ]
     if plain.dim == 2 and not quick:

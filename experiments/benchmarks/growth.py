@@ -1,16 +1,17 @@
-"""Measures the time of growth: one colony to N cells, and B colonies to N cells each.
+"""Measures the time of growth, and how clean contacts stay: colonies from one cell to N cells each.
 
-    python experiments/benchmarks/growth.py                     # the full set, some minutes
+    python experiments/benchmarks/growth.py                     # the usual set, some minutes
     python experiments/benchmarks/growth.py --quick             # small sizes
-    python experiments/benchmarks/growth.py --case 2d-32000 --device cuda
-    python experiments/benchmarks/growth.py --case 2d-32x1000 --processes 2     # one per core
-    python experiments/benchmarks/growth.py --case 2d-32x1000 --tolerance 0.2   # as in draft
+    python experiments/benchmarks/growth.py --case 2d-32000 --regime free --threads 2
+    python experiments/benchmarks/growth.py --case 2d-3000 --backend torch --device cuda
 
 Colonies grow in 2-D and in 3-D between agarose and coverslip. Growth 1/h by the length law,
-Δt 0.025 h, division at 3.5–4.0 µm, μ = 1, γ = 10, α = 0.1/γ; other settings are the defaults. The
-script appends each case to a JSON file with its machine, versions and commit. `floor_seconds` is a
-lower bound of the solver's time: the time to read the contact rows once for every product with J or
-its transpose, at the speed at which this machine copies memory.
+Δt 0.025 h, division at 3.5–4.0 µm, μ = 1; regimes: free (γ = 1e5, the default) and pressed
+(γ = 10, the paper's). All other settings are the defaults. The time is that of `tf.simulate` with
+its checks and reports. Overlaps are measured every fifth step, with the clock stopped. Growth is
+the volume over that of the same colony without mechanics. A first record has the time of one
+product with JᵀJ and that to copy its rows. The script appends each case to a JSON file with its
+machine, versions and commit.
 """
 
 from __future__ import annotations
@@ -18,182 +19,136 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
+import numpy as np
 import torch
 from record import machine
 
 import torchfilm as tf
-from torchfilm.physics.jacobian import ContactJacobian
 
 CASES = {
-    "2d-3000": (2, 1, 3000), "2d-10000": (2, 1, 10000), "2d-32000": (2, 1, 32000),
-    "3d-3000": (3, 1, 3000), "3d-10000": (3, 1, 10000), "3d-32000": (3, 1, 32000),
-    "2d-32x1000": (2, 32, 1000), "3d-32x1000": (3, 32, 1000),
+    "2d-1000": (2, 1, 1000), "2d-3000": (2, 1, 3000), "2d-10000": (2, 1, 10000),
+    "2d-32000": (2, 1, 32000), "2d-100000": (2, 1, 100000), "2d-32x1000": (2, 32, 1000),
+    "2d-64x100": (2, 64, 100), "3d-3000": (3, 1, 3000), "3d-32000": (3, 1, 32000),
 }  # fmt: skip
-QUICK = ("2d-3000", "3d-3000")
+USUAL = ("2d-1000", "2d-3000", "2d-10000", "2d-32x1000", "2d-64x100", "3d-3000")
+QUICK = ("2d-1000", "2d-64x100")
+REGIMES = {"free": 1e5, "pressed": 10.0}
+LOOK = 5  # steps between two looks at the overlaps
 
 
-def scene(dim: int) -> tf.Scene:
-    """Returns the scene in the plane or in space."""
-    walls = (
-        []
-        if dim == 2
-        else [tf.Plane(z=-0.5, facing="+z", stiffness=16.0), tf.Plane(z=0.5, facing="-z")]
-    )
-    return tf.Scene(
+def scene(dim: int, regime: str | None, backend: str | None) -> tf.Scene:
+    """Returns the scene in the plane or in space; without mechanics where regime is None."""
+    film = [tf.Plane(z=-0.5, facing="+z", stiffness=16.0), tf.Plane(z=0.5, facing="-z")]
+    effects: list[tf.Effect] = [
         tf.Growth(rate=1.0, law="length"),
         tf.Division(length=tf.Uniform(3.5, 4.0)),
-        tf.Mechanics(dim=dim, walls=walls),
-        dt=0.025,
-        name=f"growth {dim}-D",
-    )
+    ]
+    if regime is not None:
+        drag, walls = REGIMES[regime], film if dim == 3 else []
+        effects.append(tf.Mechanics(walls, dim=dim, length_drag=drag, backend=backend))
+    return tf.Scene(*effects, dim=dim, dt=0.025, name=f"growth {dim}-D")
 
 
-class RowCounter:
-    """Counts the bytes of contact rows that products with J and its transpose read."""
-
-    def __init__(self) -> None:
-        self.bytes, self.products = 0, 0
-        self._apply, self._transpose = ContactJacobian.apply, ContactJacobian.apply_transpose
-
-    def __enter__(self) -> RowCounter:
-        def counted(method):
-            def call(rows, x):
-                self.products += 1
-                self.bytes += rows.row_first.nbytes + rows.row_second.nbytes + rows.row_wall.nbytes
-                return method(rows, x)
-
-            return call
-
-        ContactJacobian.apply, ContactJacobian.apply_transpose = (
-            counted(self._apply),
-            counted(self._transpose),
-        )
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        ContactJacobian.apply, ContactJacobian.apply_transpose = self._apply, self._transpose
-
-
-def copy_speed(device: str) -> float:
-    """Returns the speed of a copy of 16 MB, bytes read per second, best of 20."""
-    source = torch.ones(4_000_000, device=device)
-    target, best = torch.empty_like(source), float("inf")
-    for _ in range(20):
-        start = time.perf_counter()
-        target.copy_(source)
-        if source.is_cuda:
-            torch.cuda.synchronize()
-        best = min(best, time.perf_counter() - start)
-    return source.nbytes / best
-
-
-def grow(
-    name: str, device: str, seed: int, tolerance: float | None, part: tuple[int, int] = (0, 1)
-) -> dict:
-    """Runs a case, or part k of n of its colonies. Returns costs and results."""
+def grow(name: str, regime: str, backend: str | None, device: str, seed: int) -> dict:
+    """Returns costs and results of a case."""
     dim, colonies, cells = CASES[name]
-    tuned = tf.Settings(tolerance=tolerance).apply(scene(dim))
-    k, parts = part
-    model = tuned.bind(colonies=colonies, seed=seed, device=device)
-    start = model.start().select(range(k * colonies // parts, (k + 1) * colonies // parts))
-    timings, marks, iterations, passes, cell_steps = tf.Timings(), [], 0, 0, 0
+    model = scene(dim, regime, backend).bind(colonies, seed=seed, device=device)
+    kept = {"timings": tf.Timings()}
+    course, marks, iterations, passes, cell_steps, looked = [], [], 0, 0, 0, 0.0
     begin = time.perf_counter()
-    with RowCounter() as counter:
-        for state in tf.simulate(tuned, start, cells=cells, timings=timings):
-            report = state.reports["mechanics"]
-            iterations += int(report.iterations.max())
-            passes += int(report.passes.max())
-            cell_steps += state.cells
-            if state.cells >= 100 * 2 ** len(marks) * state.colonies:
-                marks.append(
-                    {
-                        "cells": state.cells,
-                        "seconds": round(time.perf_counter() - begin, 2),
-                        "time_h": round(state.time, 3),
-                    }
-                )
-    seconds = time.perf_counter() - begin
-    found = tf.measure.overlaps(state)
+    for state in tf.simulate(model.scene, model.start(), cells=cells, **kept):
+        report = state.reports["mechanics"]
+        iterations += int(report.iterations.max())
+        passes += int(report.passes.max())
+        cell_steps += state.cells
+        if state.cells >= 100 * 2 ** len(marks) * colonies:
+            seconds = time.perf_counter() - begin - looked
+            marks.append({"cells": state.cells, "seconds": round(seconds, 3)})
+        if state.step % LOOK == 0:
+            stop = time.perf_counter()
+            found = tf.measure.overlaps(state)
+            if int(found.count.sum()):
+                course.append((float(found.mean[found.count > 0].mean()), float(found.worst.max())))
+            looked += time.perf_counter() - stop
+    seconds = time.perf_counter() - begin - looked
+    *_, free = tf.simulate(scene(dim, None, None), until=state.time, colonies=colonies, seed=seed)
+    mean, worst = np.array(course).T
     return {
-        "cells": state.cells,
-        "colonies": state.colonies,
-        "seconds": seconds,
+        "case": name, "regime": regime, "backend": backend_of(model, device), "device": device,
+        "threads": torch.get_num_threads(), "seconds": round(seconds, 3), "cells": state.cells,
+        "colonies": colonies, "steps": state.step, "cell_steps": cell_steps,
+        "us_per_cell_step": round(1e6 * seconds / cell_steps, 2),
+        "iterations_per_step": round(iterations / state.step, 1),
+        "passes_per_step": round(passes / state.step, 3),
         "simulated_h": round(state.time, 3),
-        "steps": state.step,
-        "cell_steps": cell_steps,
-        "cg_iterations": iterations,
-        "passes": passes,
-        "effects_s": {k: round(v, 2) for k, v in timings.seconds.items()},
-        "overlap_sum_um": float((found.mean * found.count).sum()),
-        "contacts": int(found.count.sum()),
-        "overlap_worst_um": round(float(found.worst.max()), 4),
-        "depth_um": round(float(tf.measure.depth(state).max()), 2),
-        "radius_um": round(float(tf.measure.colony_radius(state).mean()), 1),
-        "products": counter.products,
-        "bytes": counter.bytes,
-        "marks": marks,
-    }
+        "growth_over_free": round(float(state.volume.sum() / free.volume.sum().to(device)), 4),
+        "overlap_course_um": round(float(mean.mean()), 5), "overlap_end_um": round(mean[-1], 5),
+        "overlap_worst_um": {
+            q: round(float(np.quantile(worst, float(q))), 3) for q in ("0.5", "0.99", "1")
+        },
+        "effects_s": {k: round(v, 3) for k, v in kept["timings"].seconds.items()}, "marks": marks,
+    }  # fmt: skip
 
 
-def one_thread() -> None:
-    """Prepares a worker process."""
-    torch.set_num_threads(1)
-    tf.keep_memory()
+def backend_of(model, device: str) -> str:
+    """Returns who computes the contacts: "compiled" or "torch"."""
+    mechanics = next(e for e in model.scene.effects if isinstance(e, tf.Mechanics))
+    return mechanics.backend_on(torch.device(device))
 
 
-def in_processes(
-    name: str, device: str, seed: int, tolerance: float | None, processes: int
-) -> list[dict]:
-    """Runs a case in several processes of one thread, each with its own colonies.
+def product_over_copy(cells: int = 10000) -> dict[str, float]:
+    """Returns the times of a product with JᵀJ and of a copy of its rows, s, best of 50, for a
+    lattice of touching cells in the plane."""
+    from torchfilm.kernels import neighbours, rows, solve
 
-    Returns the results of each; the first has the total time.
-    """
-    with ProcessPoolExecutor(processes, get_context("spawn"), one_thread) as pool:
-        list(pool.map(time.sleep, [1.0] * processes))  # until all have started
-        begin = time.perf_counter()
-        parts = list(
-            pool.map(
-                partial(grow, name, device, seed, tolerance),
-                [(k, processes) for k in range(processes)],
-            )
-        )
-    return [parts[0] | {"seconds": time.perf_counter() - begin}, *parts[1:]]
-
-
-def run(name: str, device: str, seed: int, tolerance: float | None, processes: int) -> dict:
-    """Returns the totals of all parts and the details of the part with most work."""
-    parts = (
-        [grow(name, device, seed, tolerance)]
-        if processes == 1
-        else in_processes(name, device, seed, tolerance, processes)
+    side, dof = round(cells**0.5), (0,) * 4
+    grid = np.stack(np.meshgrid(np.arange(side) * 3.95, np.arange(side) * 0.99), -1)
+    x = grid.reshape(-1, 2) + 0.02 * np.random.default_rng(0).random((side * side, 2))
+    n = len(x)
+    axis, half, radius = np.tile([1.0, 0.0], (n, 1)), np.full(n, 1.5), np.full(n, 0.5)
+    scale = np.ones((n, 4))
+    first, second = neighbours.near_pairs(x, axis, half, radius, 0.3)
+    keep, points, _ = rows.near_contacts(x, axis, half, radius, first, second, 0.3)
+    room = 2 * len(keep)
+    H, gaps = np.empty((2 * room, 4), np.float32), np.empty(room, np.float32)
+    one, two = np.empty(room, np.int32), np.empty(room, np.int32)
+    count = rows.pair_rows(
+        x, axis, half, radius, scale, first, second, keep, points, H, gaps, one, two, dof
     )
-    total = lambda name: sum(p[name] for p in parts)
-    seconds = parts[0]["seconds"]
-    totals = {
-        "case": name,
-        "device": device,
-        "processes": processes,
-        "tolerance": tolerance,
-        "cells": total("cells"),
-        "colonies": total("colonies"),
-        "seconds": round(seconds, 2),
-        "cell_steps": total("cell_steps"),
-        "us_per_cell_step": round(1e6 * seconds / total("cell_steps"), 2),
-        "overlap_mean_um": round(total("overlap_sum_um") / max(1, total("contacts")), 5),
-        "overlap_worst_um": max(p["overlap_worst_um"] for p in parts),
-        "floor_seconds": round(total("bytes") / copy_speed(device), 3),
-    }
-    longest = max(parts, key=lambda p: p["cell_steps"])
-    return totals | {
-        k: v
-        for k, v in longest.items()
-        if k not in (*totals, "overlap_sum_um", "contacts", "bytes")
-    }
+    p, out, act = (
+        np.ones((n, 4), np.float32),
+        np.zeros((n, 4), np.float32),
+        np.ones(count, np.uint8),
+    )
+    H = H[: 2 * count].copy()
+    target = np.empty_like(H)
+
+    def best(call) -> float:
+        times = []
+        for _ in range(50):
+            begin = time.perf_counter()
+            call()
+            times.append(time.perf_counter() - begin)
+        return min(times)
+
+    product = best(lambda: solve.add_product(H, one, two, count, act, p, out, dof))
+    copy = best(lambda: np.copyto(target, H))
+    return {"rows": count, "product_us": round(1e6 * product, 1), "copy_us": round(1e6 * copy, 1)}
+
+
+def show(result: dict) -> None:
+    worst = result["overlap_worst_um"]
+    print(
+        f"{result['case']:<11} {result['regime']:<8} {result['backend']:<9}"
+        f" {result['seconds']:>7.2f} s {result['us_per_cell_step']:>6.2f} µs/cell/step "
+        f" {result['iterations_per_step']:>6.1f} iterations "
+        f" growth {result['growth_over_free']:.3f} "
+        f" overlap {result['overlap_course_um']:.4f}, worst {worst['0.5']} / {worst['0.99']} /"
+        f" {worst['1']} µm  {result['effects_s']}",
+        flush=True,
+    )
 
 
 def main() -> None:
@@ -203,40 +158,30 @@ def main() -> None:
     parser.add_argument(
         "--case", action="append", choices=sorted(CASES), help="one case; may be repeated"
     )
+    parser.add_argument("--regime", choices=sorted(REGIMES), help="default: both")
+    parser.add_argument("--backend", choices=("compiled", "torch"))
     parser.add_argument("--quick", action="store_true", help="small sizes only")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--tolerance", type=float, help="of the contact solve; default: that of Mechanics, 0.05"
-    )
-    parser.add_argument(
-        "--processes",
-        type=int,
-        default=1,
-        help="number of processes that share the colonies, one thread each",
-    )
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("growth.json"))
     options = parser.parse_args()
+    torch.set_num_threads(options.threads)
     tf.keep_memory()
     records = json.loads(options.out.read_text()) if options.out.exists() else []
-    for name in options.case or (QUICK if options.quick else CASES):
-        result = run(
-            name,
-            options.device,
-            options.seed,
-            options.tolerance,
-            min(options.processes, CASES[name][1]),
-        )
-        print(
-            f"{name:<12} {result['seconds']:>7.1f} s  {result['cells']:>6} cells "
-            f" {result['steps']:>5} steps  {result['us_per_cell_step']:>6.2f} µs/cell/step  overlap"
-            f" {result['overlap_mean_um']:.4f} / {result['overlap_worst_um']:.3f} µm  CG"
-            f" {result['cg_iterations'] / result['steps']:.1f} a step  floor"
-            f" {result['floor_seconds']:.1f} s  {result['effects_s']}",
-            flush=True,
-        )
-        records.append(machine() | result)
-        options.out.write_text(json.dumps(records, indent=1) + "\n")
+    if options.device == "cpu" and options.backend != "torch":
+        records.append(machine() | {"case": "product with JᵀJ"} | product_over_copy())
+        print(records[-1])
+    for name in options.case or (QUICK if options.quick else USUAL):
+        dim, _, _ = CASES[name]
+        for regime in [options.regime] if options.regime else REGIMES:
+            # compile, and load what the first steps load
+            warm = scene(dim, regime, options.backend).bind(device=options.device)
+            list(tf.simulate(warm.scene, warm.start(), cells=8))
+            result = grow(name, regime, options.backend, options.device, options.seed)
+            show(result)
+            records.append(machine() | result)
+            options.out.write_text(json.dumps(records, indent=1) + "\n")
 
 
 if __name__ == "__main__":

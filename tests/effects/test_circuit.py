@@ -48,7 +48,7 @@ def test_a_volume_that_mechanics_held_back_is_the_one_that_dilutes(dtype):
     that it has, not by what it wanted."""
     scene = tf.Scene(
         tf.Growth(rate=1.0),
-        tf.Mechanics(dim=2, walls=[tf.Plane(x=-1.6, facing="+x"), tf.Plane(x=1.6, facing="-x")]),
+        tf.Mechanics([tf.Channel(1.2, low_end=-1.6, high_end=1.6)], dim=2),
         tf.Circuit(idle, species=("m",), initial={"m": 1.0}),
     )
     state = scene.bind(dtype=dtype).start()

@@ -90,13 +90,13 @@ def test_volume_law_and_length_law_differ_by_the_caps():
 
 
 @pytest.mark.parametrize("law", ["volume", "length", "linear"])
-@pytest.mark.parametrize("unilateral", [False, True])
-def test_an_isolated_cell_grows_the_same_with_mechanics(law, unilateral, dtype):
+@pytest.mark.parametrize("contacts", ["bilateral", "one-sided"])
+def test_an_isolated_cell_grows_the_same_with_mechanics(law, contacts, dtype):
     """Nothing touches it, so the solve must leave it alone; base + elongation may round once more a
     step."""
     free, held = (
         scene_of(1.0, law),
-        scene_of(1.0, law, one_cell(), tf.Mechanics(dim=2, unilateral=unilateral)),
+        scene_of(1.0, law, one_cell(), tf.Mechanics(dim=2, contacts=contacts)),
     )
     a, b = (grown(s, s.bind(dtype=dtype).start(), 40, 0.025) for s in (free, held))
     assert float(b.length) == pytest.approx(float(a.length), rel=rounding(dtype, 40))

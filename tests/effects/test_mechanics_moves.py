@@ -77,10 +77,16 @@ def test_a_cell_that_is_thrown_at_a_wall_stays(device, dtype):
     The light one makes the whole move, and there is a wall in its way.
     """
     cells = tf.Cells([[0.0, 0.0], [0.0, 0.02]], [X, X], [4.0, 4.0], extra={"drag": [1e4, 1.0]})
-    scene = tf.Scene(tf.Mechanics(dim=2, walls=[tf.Plane(y=0.55, facing="-y")], alpha=1e-4))
+    wall = [tf.Plane(y=0.55, facing="-y")]
+    scene = tf.Scene(tf.Mechanics(wall, dim=2, alpha=1e-4, length_drag=10.0, contacts="bilateral"))
     state = run(scene, seeded(scene, cells, device, dtype), 1, dt=0.01)
     assert float(state.displacement[1, 1]) > 0.9 and float(state.position[1, 1]) <= 0.55 + 1e-5
     assert state.reports["mechanics"].clipped.tolist() == [1]
+    # one-sided contacts bound the moves of a pass, and see the wall from farther away
+    scene = tf.Scene(tf.Mechanics(wall, dim=2))
+    state = run(scene, seeded(scene, cells, device, dtype), 1, dt=0.01)
+    assert float(state.displacement[1, 1]) <= 0.3 + 1e-6
+    assert float(state.position[1, 1]) <= 0.55 - 0.5 + 0.1
 
 
 @pytest.mark.parametrize(

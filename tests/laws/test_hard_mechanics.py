@@ -34,7 +34,7 @@ import torchfilm as tf
 from torchfilm.physics.contacts import LINE_CONTACT_SINE, Capsules, closest_points, contact_gaps
 from torchfilm.physics.wall_contacts import find_wall_contacts
 
-MODES = pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
+MODES = pytest.mark.parametrize("contacts", ["bilateral", "one-sided"])
 DT = 0.01
 X, Y, Z = np.eye(3)
 
@@ -58,19 +58,17 @@ def parted(scene: tf.Scene, cells: tf.Cells, device, dtype, measured) -> None:
 @pytest.mark.parametrize("rate", [0.0, 1.0])
 @pytest.mark.parametrize("sign", [1, -1], ids=["parallel", "antiparallel"])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_case_01_same_centre_parallel(device, dtype, measured, unilateral, rate, sign, dim):
+def test_case_01_same_centre_parallel(device, dtype, measured, contacts, rate, sign, dim):
     """Two cells, same centre, parallel, l = 2: after 6 passes no gap below −1e-3; Σ
     drag·displacement = 0 ± 1e-6."""
-    scene = tf.Scene(
-        growth(rate), mechanics(passes=6, overlap=1e-3, unilateral=unilateral, dim=dim)
-    )
+    scene = tf.Scene(growth(rate), mechanics(passes=6, overlap=1e-3, contacts=contacts, dim=dim))
     axis = rotation(np.random.default_rng(1), dim)[0]
     parted(scene, tf.Cells(np.zeros((2, dim)), [axis, sign * axis], 2.0), device, dtype, measured)
 
 
 @MODES
 @pytest.mark.parametrize("rate", [0.0, 1.0])
-def test_case_02_same_centre_crossing(device, dtype, measured, unilateral, rate):
+def test_case_02_same_centre_crossing(device, dtype, measured, contacts, rate):
     """Same centre, crossing at 90°: the normal is the cross product of the axes; same bounds as
     case 1."""
     a, b, c = rotation(np.random.default_rng(2), 3)
@@ -87,7 +85,7 @@ def test_case_02_same_centre_crossing(device, dtype, measured, unilateral, rate)
         )
         <= 1e-6
     )
-    scene = tf.Scene(growth(rate), mechanics(passes=6, overlap=1e-3, unilateral=unilateral))
+    scene = tf.Scene(growth(rate), mechanics(passes=6, overlap=1e-3, contacts=contacts))
     parted(scene, cells, device, dtype, measured)
 
 
@@ -294,7 +292,7 @@ def trap(weight=None) -> list[tf.Plane]:
 
 @MODES
 @pytest.mark.parametrize("law", ["linear", "length"])
-def test_case_06_trapped_cell(device, dtype, measured, unilateral, law):
+def test_case_06_trapped_cell(device, dtype, measured, contacts, law):
     """One cell, l = 2, between walls at ±1.5, 200 steps: the wall overlap settles (0.0200), growth
     goes to 0.
 
@@ -306,7 +304,7 @@ def test_case_06_trapped_cell(device, dtype, measured, unilateral, law):
     covers both.
     """
     scene = tf.Scene(
-        growth(2.0 if law == "linear" else 1.0, law), mechanics(walls=trap(), unilateral=unilateral)
+        growth(2.0 if law == "linear" else 1.0, law), mechanics(walls=trap(), contacts=contacts)
     )
     state = run(scene, seeded(scene, tf.Cells(np.zeros((1, 3)), [X], 2.0), device, dtype), 200, DT)
     gain = math.expm1(0.01)
@@ -323,7 +321,7 @@ def test_case_06_trapped_cell(device, dtype, measured, unilateral, law):
 
 
 @MODES
-def test_case_07_row_between_walls(device, dtype, measured, unilateral):
+def test_case_07_row_between_walls(device, dtype, measured, contacts):
     """100 cells tip to tip between two hard walls, 60 steps: all 101 overlaps equal g·l·Δt within 1
     % (given).
 
@@ -332,8 +330,7 @@ def test_case_07_row_between_walls(device, dtype, measured, unilateral):
     scene = tf.Scene(
         growth(),
         mechanics(
-            walls=[tf.Plane(x=0.0, facing="+x"), tf.Plane(x=300.0, facing="-x")],
-            unilateral=unilateral,
+            walls=[tf.Plane(x=0.0, facing="+x"), tf.Plane(x=300.0, facing="-x")], contacts=contacts
         ),
     )
     cells = tf.Cells(3.0 * np.arange(100)[:, None] * X + 1.5 * X, X, 2.0)
@@ -358,7 +355,7 @@ def test_case_07_row_between_walls(device, dtype, measured, unilateral):
 
 @pytest.mark.slow
 @MODES
-def test_case_09_soft_wall(device, dtype, measured, unilateral):
+def test_case_09_soft_wall(device, dtype, measured, contacts):
     """The trapped cell of 6 with wall weight D = 1 and D = 0.1: overlap ratio 100 ± 1 % (given).
 
     The balance αγ e = D² o gives o = e/D² with the same wanted e in both: growth is linear, since
@@ -369,8 +366,7 @@ def test_case_09_soft_wall(device, dtype, measured, unilateral):
     colonies.
     """
     scene = tf.Scene(
-        growth(2.0, "linear"),
-        mechanics(walls=trap(torch.tensor([1.0, 0.1])), unilateral=unilateral),
+        growth(2.0, "linear"), mechanics(walls=trap(torch.tensor([1.0, 0.1])), contacts=contacts)
     )
     state = seeded(
         scene, tf.Cells(np.zeros((2, 3)), [X, X], [2.0, 5.8], colony=[0, 1]), device, dtype
@@ -387,7 +383,7 @@ def test_case_09_soft_wall(device, dtype, measured, unilateral):
 @MODES
 @pytest.mark.parametrize("height", [0.0, 0.05])
 @pytest.mark.parametrize("tilt", [0.0, 0.03])
-def test_case_10_planes_too_near(device, dtype, measured, unilateral, height, tilt):
+def test_case_10_planes_too_near(device, dtype, measured, contacts, height, tilt):
     """Two planes 0.8 µm apart, a cell of diameter 1 between them: 0.1 ± 1e-3 overlap each (given),
     no oscillation.
 
@@ -398,8 +394,7 @@ def test_case_10_planes_too_near(device, dtype, measured, unilateral, height, ti
     scene = tf.Scene(
         growth(),
         mechanics(
-            walls=[tf.Plane(z=-0.4, facing="+z"), tf.Plane(z=0.4, facing="-z")],
-            unilateral=unilateral,
+            walls=[tf.Plane(z=-0.4, facing="+z"), tf.Plane(z=0.4, facing="-z")], contacts=contacts
         ),
     )
     state = seeded(scene, tf.Cells([[0, 0, height]], [X + tilt * Z], 2.0), device, dtype)
@@ -417,14 +412,14 @@ def test_case_10_planes_too_near(device, dtype, measured, unilateral, height, ti
 @pytest.mark.parametrize(
     "other", [([0, 0.9, 0], X), ([0.3, 0.8, 0.1], X + 0.4 * Y)], ids=["side by side", "at an angle"]
 )
-def test_case_14_heavy_and_light(device, dtype, measured, unilateral, other):
+def test_case_14_heavy_and_light(device, dtype, measured, contacts, other):
     """Drag ratio 1e4 between two overlapping cells: heavy/light displacement ≤ 1.01e-4 (given).
 
     Forces balance, so the ratio is 1e-4 exactly, and below 0.99e-4 would be as wrong. The solve
     must see the heavy cell: in scaled unknowns it moves 1e-2 of what the light one does, so a
     tolerance of 1e-6 of the light one's move is 1e-4 of the heavy one's.
     """
-    scene = tf.Scene(mechanics(unilateral=unilateral, tolerance=1e-6))
+    scene = tf.Scene(mechanics(contacts=contacts, tolerance=1e-6))
     cells = tf.Cells([[0, 0, 0], other[0]], [X, other[1]], 2.0, extra={"drag": [1e4, 1.0]})
     start = seeded(scene, cells, device, dtype)
     state = step(scene, start, DT)
@@ -435,10 +430,10 @@ def test_case_14_heavy_and_light(device, dtype, measured, unilateral, other):
 
 
 @MODES
-def test_case_18_near_but_not_touching(device, dtype, measured, unilateral):
+def test_case_18_near_but_not_touching(device, dtype, measured, contacts):
     """Gap +0.005, no growth: displacement exactly 0, in every unknown. Beside it a pair that does
     overlap, and so must move."""
-    scene = tf.Scene(mechanics(unilateral=unilateral))
+    scene = tf.Scene(mechanics(contacts=contacts))
     cells = tf.Cells(
         [[0, 0, 0], [0.3, 1.005, 0], [0, 0, 0], [0.3, 0.995, 0]], [X] * 4, 2.0, colony=[0, 0, 1, 1]
     )

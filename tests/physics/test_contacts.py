@@ -7,24 +7,19 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import (
-    array,
-    bodies,
-    crowd,
-    growth,
-    mechanics,
-    rows_of,
-    seeded,
-    segment_distance,
-    step,
-    unit,
-)
+from helpers import array, bodies, rows_of, segment_distance, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import torchfilm as tf
 from torchfilm.physics import capsule
-from torchfilm.physics.contacts import Capsules, closest_points, contact_gaps, contact_points
+from torchfilm.physics.contacts import (
+    CandidateContacts,
+    Capsules,
+    closest_points,
+    contact_gaps,
+    contact_points,
+)
+from torchfilm.physics.one_sided import near_rows
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
 
@@ -193,29 +188,40 @@ def test_rows_of_a_line_of_contact(dim, tilt):
                 assert float((row[:, dof] + (up - down) / (2 * h)).abs().max()) <= 1e-6
 
 
-@DIMS
-@pytest.mark.parametrize("unilateral", [False, True])
-def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, unilateral):
-    """All rows of `contact_points` for every pair that overlaps or is held, and no others.
-
-    Gaps and weights agree to rounding, and the order is exact.
-    """
+def any_pairs(dim: int, dtype: torch.dtype) -> Capsules:
+    """Pairs of all lengths at all angles, a quarter of them nearly parallel."""
     rng, count = np.random.default_rng(4), 8000
     axis = unit(rng, 2 * count, dim)
     tilt = rng.choice([1e-8, 1e-3, 0.08, 0.12], (count // 2, 1))
     axis[count : count + count // 2] = axis[: count // 2] + tilt * unit(rng, count // 2, dim)
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    cells = bodies(
+    return bodies(
         rng.uniform(-0.9, 0.9, (2 * count, dim)),
         axis,
         rng.choice([0.0, 0.5, 2.0, 3.0], 2 * count),
         dtype=dtype,
     )
+
+
+def gaps_of_both(cells: Capsules) -> tuple[torch.Tensor, torch.Tensor]:
+    """The gaps at the two points of `contact_points`, (2, P), and which contacts are lines."""
     first, second = halves(cells)
     s, t, end_a, end_b, line = contact_points(cells.take(first), cells.take(second))
-    gap = torch.stack(
-        [gap_at(cells, first, second, s[k], t[k], end_a[k], end_b[k], cells.half) for k in range(2)]
-    )
+    gaps = [
+        gap_at(cells, first, second, s[k], t[k], end_a[k], end_b[k], cells.half) for k in range(2)
+    ]
+    return torch.stack(gaps), line
+
+
+@DIMS
+def test_no_row_is_lost_before_it_is_looked_at(dtype, dim):
+    """All rows of `contact_points` for every pair that overlaps or is held, and no others.
+
+    Gaps and weights agree to rounding, and the order is exact.
+    """
+    cells = any_pairs(dim, dtype)
+    first, second = halves(cells)
+    gap, line = gaps_of_both(cells)
     # for the others rounding may decide whether they overlap, or are held
     clear = (gap.abs() > 1e-5).all(0) & (gap.sum(0).abs() > 1e-5)
     first, second, gap, line = first[clear], second[clear], gap[:, clear], line[clear]
@@ -224,58 +230,36 @@ def test_no_row_is_lost_before_it_is_looked_at(dtype, dim, unilateral):
         deep[1].sum() > 500 and (~deep[0]).sum() > 500 and (line & (deep[0] != deep[1])).sum() > 3
     )
     weight = torch.where(line, 0.5, 1.0).expand(2, -1).clone()
-    if unilateral:
-        deep = deep | (line & deep.any(0))
-    else:  # the end without overlap is held, with less weight the farther it is
-        held = line & (deep[0] != deep[1]) & (gap.sum(0) < 0)
-        weight = torch.where(held & (gap > 0), (0.5 * gap.sum(0) / gap.amin(0)).float(), weight)
-        deep = deep | held
-        assert held.sum() > 3
-        gap = gap.clamp(max=0.0)
-    found = rows_of(cells, first, second, unilateral)
-    assert torch.equal(found.first, torch.cat([first[d] for d in deep])) and torch.equal(
-        found.second, torch.cat([second[d] for d in deep])
-    )
-    assert (
-        float(
-            (found.weight - torch.cat([w[d] for w, d in zip(weight, deep, strict=True)]))
-            .abs()
-            .max()
-        )
-        <= 1e-3
-    )
-    assert (
-        float((found.gap - torch.cat([g[d] for g, d in zip(gap, deep, strict=True)])).abs().max())
-        <= 1e-5
-    )
+    # the end without overlap is held, with less weight the farther it is
+    held = line & (deep[0] != deep[1]) & (gap.sum(0) < 0)
+    weight = torch.where(held & (gap > 0), (0.5 * gap.sum(0) / gap.amin(0)).float(), weight)
+    deep, gap = deep | held, gap.clamp(max=0.0)
+    assert held.sum() > 3
+    found = rows_of(cells, first, second)
+    all_of = lambda both: torch.cat([x[d] for x, d in zip(both, deep, strict=True)])
+    assert torch.equal(found.first, all_of((first, first)))
+    assert torch.equal(found.second, all_of((second, second)))
+    assert float((found.weight - all_of(weight)).abs().max()) <= 1e-3
+    assert float((found.gap - all_of(gap)).abs().max()) <= 1e-5
 
 
-@pytest.mark.parametrize(
-    "apart, tilt",
-    [(1.9, 0.02), (1.9, 0.05), (1.9, 0.2), (1.7, 0.02), (1.7, 0.2), (1.5, 0.02), (1.5, 0.05)],
-)
-def test_a_cell_squeezed_between_two_comes_to_rest(apart, tilt):
-    """A cell between two almost fixed cells, which overlaps them at opposite ends at any angle.
+@DIMS
+def test_one_sided_contacts_have_a_row_at_every_point(dtype, dim):
+    """One row for each pair that is near, overlapping or not; for a line two of weight ½, side by
+    side.
 
-    A solve with only these ends would turn it as far to the other side in each step. Instead the
-    cell comes to rest between the two, except for the tilt that a tolerance of 0.01 per step
-    leaves.
+    Gaps are those of `contact_points`, to rounding.
     """
-    cells = tf.Cells(
-        [[0.0, -apart / 2], [0.1, 0.0], [0.0, apart / 2]],
-        [[1.0, 0.0], [math.cos(tilt), math.sin(tilt)], [1.0, 0.0]],
-        [4.0, 1.4, 4.0],
-        [0.5] * 3,
-        extra={"drag": [1e3, 1.0, 1e3]},
-    )
-    scene = tf.Scene(tf.Mechanics(dim=2, tolerance=0.01), founders=cells)
-    state, angles = scene.bind(dtype=torch.float64).start(), []
-    for _ in range(30):
-        state = step(scene, state, 0.025)
-        angles.append(float(torch.atan2(state.axis[1, 1], state.axis[1, 0])))
-    assert max(map(abs, angles)) < max(tilt, 0.1) + 0.02 and max(map(abs, angles[-5:])) < 1e-3, (
-        angles
-    )
+    cells = any_pairs(dim, dtype)
+    first, second = halves(cells)
+    gap, line = gaps_of_both(cells)
+    assert line.sum() > 500 and (~line).sum() > 500 and (gap > 0).sum() > 500 < (gap < 0).sum()
+    found = near_rows(CandidateContacts.all_of(cells, first, second))
+    pair = torch.repeat_interleave(first, 1 + line.long())
+    other = torch.cat([pair.new_zeros(1), (pair[1:] == pair[:-1]).long()])
+    assert torch.equal(found.first, pair) and torch.equal(found.second, second[pair])
+    assert torch.equal(found.weight, torch.where(line, 0.5, 1.0).to(dtype)[pair])
+    assert float((found.gap - gap[other, pair]).abs().max()) <= 1e-5
 
 
 def forces(cells: Capsules) -> np.ndarray:
@@ -414,27 +398,6 @@ def test_action_is_reaction(dtype, device, dim):
     # b's centre is `between` from a's, so its force has that lever arm about a's centre
     assert np.abs(turning - arm).max() <= {torch.float32: 2e-6, torch.float64: 1e-14}[dtype]
     assert np.abs(np.linalg.norm(n, axis=1) - 1).max() <= 1e-6
-
-
-@pytest.mark.parametrize("unilateral", [False, True], ids=["bilateral", "unilateral"])
-@DIMS
-def test_a_colony_does_not_push_or_turn_itself(device, dim, unilateral):
-    """Without walls Σ μL Δc = 0 and Σ (μL c × Δc + μL³/12 Δθ) = 0 after one solve, in float64.
-
-    The tolerance of 1e-11 allows an error for sixty moves of 0.1 µm, drags of 3 and arms of 20 µm.
-    """
-    scene = tf.Scene(growth(), mechanics(dim=dim, unilateral=unilateral, passes=1, tolerance=1e-11))
-    start = seeded(scene, crowd(np.random.default_rng(5), 60, dim), device, torch.float64)
-    state = step(scene, start, 0.01)
-    assert not (state.reports["mechanics"].clipped > 0).any()
-    move = array(state.displacement)
-    whole = array(start.length) * math.exp(0.01) + 1.0  # L at the time of the solve
-    across, turning = whole[:, None], whole[:, None] ** 3 / 12
-    force, c = across * move[:, :dim], array(start.position)
-    arm = (c[:, :1] * force[:, 1:] - c[:, 1:] * force[:, :1]) if dim == 2 else np.cross(c, force)
-    assert np.abs(move[:, :dim]).max() > 0.01
-    assert np.abs(force.sum(0)).max() <= 1e-9
-    assert np.abs((arm + turning * move[:, dim:-1]).sum(0)).max() <= 1e-8
 
 
 @DIMS

@@ -161,16 +161,22 @@ class Division(Effect):
                 + _pixels_hint(float(state.length[k]), float(state.radius[k]))
                 + " Raise the threshold or start from smaller cells."
             )
-        least = smallest(given)
-        radius = float(state.radius.max())
-        needed = 2 * radius
+        if self.criterion == "added":
+            return
+        # daughters keep the radius, so a cell's own threshold is compared with its own radius
+        least = state.division_threshold
+        if is_drawn(given):
+            least = torch.full_like(least, smallest(given))
+        needed = 2 * state.radius
         if self.criterion == "volume":
-            needed = float(capsule.volume(torch.tensor(needed), torch.tensor(radius)))
-        if self.criterion != "added" and least < needed:
+            needed = capsule.volume(needed, state.radius)
+        short = torch.nonzero(least < needed * (1 - 1e-6)).squeeze(1)
+        if short.numel():
+            k = int(short[0])
             raise checks.InputError(
-                f"Division.{self.criterion} can be {least:g}: it must be at least {needed:g} for"
-                f" radius {radius:g} µm, or the daughters would have a negative length (each loses"
-                " a new cap). Raise the threshold."
+                f"Division.{self.criterion} can be {float(least[k]):g}: it must be at least"
+                f" {float(needed[k]):g} for radius {float(state.radius[k]):g} µm, or the daughters"
+                " would have a negative length (each loses a new cap). Raise the threshold."
             )
 
     def numerics(self, dt: float, state: State) -> list[str]:

@@ -5,75 +5,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from torchfilm.effect import MECHANICS, Binding, BoundEffect, Concern, Effect, number_range
-from torchfilm.physics.contact_records import (
-    CLOSE,
-    DEEP,
-    PENALTY,
-    TOLERANCE,
-    CellProperties,
-    ContactReport,
-    ContactSettings,
-    Moved,
-)
-from torchfilm.physics.contact_step import contact_step
+from torchfilm.effect import MECHANICS, Binding, BoundEffect, Effect, number_range
+from torchfilm.effects.bound_mechanics import BoundMechanics
+from torchfilm.kernels.scheme import OVERLAP, PASSES
+from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
+from torchfilm.physics import compiled
+from torchfilm.physics.contact_records import CLOSE, PENALTY, TOLERANCE, ContactSettings
 from torchfilm.physics.initial_overlaps import check_apart
-from torchfilm.physics.problem import CONVERGED, NOT_FINITE, STATUS, TOO_FAST
+from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.surfaces import Surface
 from torchfilm.physics.walls import Wall
-from torchfilm.resolver import Values, snapshot
+from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.ragged import offsets
 from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, smallest
 
-MOST_SUBSTEPS = 1000
-# A colony whose contacts do not hold has more than this share of its cells (of MANY, if it has
-# fewer) deep in others for LONG steps. Cells that start in a heap part within a few steps.
-BURIED, MANY, LONG = 0.1, 50, 20
-
-
-@dataclass(frozen=True)
-class MechanicsReport(ContactReport):
-    """As `ContactReport`, with the `substeps` taken in each colony, (B,)."""
-
-    substeps: Tensor
-    counts: Tensor
-    hint = "A smaller dt, a larger alpha or more max_iterations may help"
-
-    def reason(self, place: int) -> str:
-        """What went wrong in the colony at `place`."""
-        status = int(self.status[place])
-        if status == TOO_FAST:
-            return (
-                f"a cell would take more than {MOST_SUBSTEPS} sub-steps to grow as it should in one"
-                " step (rates are per hour, and dt is in hours)"
-            )
-        return (
-            f"the mechanics solve {STATUS[status]} after {int(self.iterations[place])} iterations,"
-            f" residual {float(self.residual[place]):.2g}"
-        )
-
-    def concerns(self) -> tuple[Concern, ...]:
-        """Colonies whose contacts do not hold cells apart, although each solve converges."""
-        deep = self.deeply_overlapping > BURIED * self.counts.clamp(min=MANY)
-        return (Concern("overlap", deep, LONG, partial(_collapsed, self)),)
-
-
-def _collapsed(report: MechanicsReport, ids: Tensor, fallen: Tensor) -> str:
-    each = zip(ids[fallen].tolist()[:5], report.deeply_overlapping[fallen].tolist(), strict=False)
-    names = ", ".join(f"{colony} ({cells} cells)" for colony, cells in each)
-    return (
-        f"cells have been lying deeper in one another than a radius for {LONG} steps in colony"
-        f" {names}. Contacts are too hard for this step (take a smaller dt or a larger alpha), or"
-        " give way too much (take a smaller alpha)."
-    )
+CONTACTS, BACKENDS = ("one-sided", "bilateral"), ("compiled", "torch")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,36 +34,43 @@ class Mechanics(Effect):
 
     walls: what confines them. dim: 3, or 2 for strict 2-D (four degrees of freedom; nothing can
     leave the plane). viscosity: μ. length_drag: γ, resistance to a change of length, in units of
-    μ·µm. A state field `drag` multiplies μ cell by cell. alpha: how far contacts give way to drag,
-    the penalty's accuracy knob: α → 0 is the hard limit. Default 0.1/γ, the knee between overlap
-    and cost; 1/γ is the paper's. Or stiffness: μ·µm/h, physical softness of cells: α =
-    1/(stiffness·Δt), so that a smaller Δt converges to the motion of soft cells, where with α fixed
-    it stiffens the contact. unilateral: contacts only push. False (default, the paper's least
-    squares) also holds an overlapping pair that would part, until the next pass: measured, the
-    overlap is the same or less, at half the CG iterations or fewer. passes: at most this many times
-    a step contacts are found and solved. The first pass solves for every cell, each later one for
-    the cells that the move left deeper than `overlap` or would have turned too far, among the
-    others at rest. Default 1 in the plane; 2 in space, where cells that are squeezed can slip past
-    each other; twice as many for unilateral contacts, since a push at one end may drive in the
-    other; at least 6 for colonies that take sub-steps. overlap: µm; default a fifth of a cell's
-    radius, or 0.02 for colonies that take sub-steps; where α γ is below 0.1 as much less.
-    tolerance: of the solve, worst residual relative to the worst at rest; default 0.05, and where α
-    γ is below 0.1, 0.05 · (α γ/0.1)^¼. max_iterations: CG iterations a solve. max_elongation: µm; a
-    colony whose cells would grow more in a step takes sub-steps.
+    μ·µm; a state field `drag` multiplies μ cell by cell. With the default colonies grow at their
+    free rate up to ten thousand cells; with 10, the paper's, pressure slows them from a hundred
+    cells on.
+
+    contacts: "one-sided" (default), which only push, or "bilateral", the paper's least squares,
+    which also hold an overlapping pair that would part. One-sided contacts hold at any drag;
+    bilateral ones at a length drag of about 10, where they take fewer iterations.
+
+    alpha: how far contacts give way to drag. Default: one-sided contacts follow their force, so
+    that their mean overlap is contact_overlap (default 0.014 radii); bilateral ones take 0.1/γ; 1/γ
+    is the paper's. Or stiffness: μ·µm/h, physical softness of cells: α = 1/(stiffness·Δt), so that
+    a smaller Δt converges to the motion of soft cells.
+
+    passes: at most this many a step; later ones move only the cells deeper than `overlap`, µm, and,
+    if contacts are one-sided, those near them (default 0.2 radii, 8 passes, 1 for soft cells;
+    bilateral: 0.2 radii or less, 1 pass in the plane and 2 in space, 6 with sub-steps). tolerance:
+    of a solve. One-sided: relative error of the contact forces, default 0.07. Bilateral: worst
+    residual relative to that at rest, default 0.05 or, where α γ is below 0.1, 0.05 · (α γ/0.1)^¼.
+    max_iterations: CG iterations a solve. max_elongation: µm; a colony whose cells would grow more
+    in a step takes sub-steps. backend: "compiled" kernels or "torch". Default: compiled where the
+    device is the CPU, contacts are one-sided and no gradient is required.
     """
 
     walls: Sequence[Wall] = ()
     dim: int = 3
     viscosity: Value = physical(1.0, unit="μ", above=0.0)
-    length_drag: Value = physical(10.0, unit="μ·µm", above=0.0)
+    length_drag: Value = physical(1e5, unit="μ·µm", above=0.0)
     alpha: Value | None = physical(None, above=0.0)
     stiffness: Value | None = physical(None, unit="μ·µm/h", above=0.0)
-    unilateral: bool = False
+    contacts: str = "one-sided"
     passes: int | None = None
     overlap: float | None = None
+    contact_overlap: float | None = None
     tolerance: float | None = None
     max_iterations: int = 2000
     max_elongation: float = 0.25
+    backend: str | None = None
 
     stage = MECHANICS
     title = "mechanics"
@@ -120,6 +78,9 @@ class Mechanics(Effect):
 
     def __post_init__(self) -> None:
         checks.choice("Mechanics.dim", self.dim, (2, 3))
+        checks.choice("Mechanics.contacts", self.contacts, CONTACTS)
+        if self.backend is not None:
+            checks.choice("Mechanics.backend", self.backend, BACKENDS)
         super().__post_init__()
         if self.alpha is not None and self.stiffness is not None:
             raise checks.InputError(
@@ -142,8 +103,21 @@ class Mechanics(Effect):
         if self.tolerance is not None:
             checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
         checks.number("Mechanics.max_elongation", self.max_elongation, above=0.0)
-        if self.overlap is not None:
-            checks.number("Mechanics.overlap", self.overlap, above=0.0)
+        for name in ("overlap", "contact_overlap"):
+            if getattr(self, name) is not None:
+                checks.number(f"Mechanics.{name}", getattr(self, name), above=0.0)
+        if self.contact_overlap is not None and (
+            self.contacts == "bilateral" or self.alpha is not None or self.stiffness is not None
+        ):
+            raise checks.InputError(
+                "Mechanics.contact_overlap is for one-sided contacts that follow their force: leave"
+                " it out, or leave out alpha, stiffness and contacts='bilateral'."
+            )
+        if (self.contacts, self.backend) == ("bilateral", "compiled"):
+            raise checks.InputError(
+                "Mechanics.backend = 'compiled' is for one-sided contacts; bilateral ones are"
+                " computed by torch. Leave backend out, or take contacts='one-sided'."
+            )
         object.__setattr__(self, "walls", tuple(self.walls))
         self.surfaces()  # raises for a wall that does not fit the dimension
         self.physical_values()  # raises for a wall value that is not allowed
@@ -160,17 +134,45 @@ class Mechanics(Effect):
         return self.surfaces()
 
     @property
-    def settings(self) -> ContactSettings:
+    def one_sided(self) -> bool:
+        return self.contacts == "one-sided"
+
+    @property
+    def settings(self) -> OneSidedSettings | ContactSettings:
         """How contacts are solved, defaults filled in."""
+        if self.one_sided:
+            return OneSidedSettings(
+                self.dim,
+                self.stiffness is not None,
+                PASSES if self.passes is None else self.passes,
+                self.overlap,
+                OVERLAP if self.contact_overlap is None else self.contact_overlap,
+                FORCE_TOLERANCE if self.tolerance is None else self.tolerance,
+                self.max_iterations,
+            )
         return ContactSettings.resolve(
             self.dim,
-            unilateral=self.unilateral,
             soft=self.stiffness is not None,
             passes=self.passes,
             overlap=self.overlap,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
+
+    def backend_on(self, device: torch.device) -> str:
+        """Who computes the contacts on a device: "compiled" or "torch"."""
+        if not self.one_sided or self.backend == "torch":
+            return "torch"
+        reason = (
+            f"the device is {device.type}, and kernels are for the CPU"
+            if device.type != "cpu"
+            else compiled.unavailable()
+        )
+        if self.backend == "compiled" and reason:
+            raise checks.InputError(
+                f"Mechanics.backend = 'compiled', but {reason}. Leave backend out."
+            )
+        return "torch" if reason else "compiled"
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         found = self.physical_fields()
@@ -189,13 +191,22 @@ class Mechanics(Effect):
             "move of the last first solve of a step or sub-step (Δc, Δθ, Δl), from which the next"
             " starts"
         )
-        return (Field("displacement", meaning, "µm, rad, µm", shape=(self.settings.degrees,)),)
+        move = Field("displacement", meaning, "µm, rad, µm", shape=(self.settings.degrees,))
+        if not self.one_sided:
+            return (move,)
+        meaning = "α of the colony's contacts in the last step, 0 before the first"
+        return move, Field("contact_alpha", meaning, "1/μ/µm")
+
+    @property
+    def _own_fields(self) -> tuple[str, ...]:
+        return ("displacement", "contact_alpha") if self.one_sided else ("displacement",)
 
     def reads(self) -> tuple[str, ...]:
-        return ("position", "axis", "length", "radius", "elongation", "drag", "displacement")
+        cells = ("position", "axis", "length", "radius", "elongation", "drag")
+        return (*cells, *self._own_fields)
 
     def writes(self) -> tuple[str, ...]:
-        return ("position", "axis", "length", "elongation", "displacement")
+        return ("position", "axis", "length", "elongation", *self._own_fields)
 
     def check(self, state: State, values: Values) -> None:
         if state.dim != self.dim:
@@ -223,7 +234,7 @@ class Mechanics(Effect):
         )
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
-        return (_BoundMechanics(self, binding),)
+        return (BoundMechanics(self, binding),)
 
     # --- what explaining and tuning need -------------------------------------------------
 
@@ -237,30 +248,17 @@ class Mechanics(Effect):
             )
         elif self.alpha is not None:
             kind = f"hard by a penalty, α = {text(numbers(self.alpha))}"
+        elif isinstance(settings, OneSidedSettings):
+            kind = f"as hard as leaves a mean overlap of {settings.contact_overlap:g} radii"
         else:
             kind = (
                 f"hard by a penalty, α = {PENALTY:g}/γ ="
                 f" {text(PENALTY / numbers(self.length_drag))} (default)"
             )
-        holds = "bilateral, an overlapping pair is held until the next pass"
-        mode = "unilateral, they only push" if self.unilateral else holds
-        over = (
-            ""
-            if self.overlap is None
-            else f", more than one only for new contacts and overlaps over {self.overlap:g} µm"
-        )
-        lines = [
-            f"contacts: {mode}; {kind}",
-            (
-                f"passes: at most {settings.passes} a step{over}; a colony with a cell that grows"
-                f" more than {self.max_elongation:g} µm takes sub-steps of up to"
-                f" {settings.coarse_passes} passes"
-            ),
-            (
-                "solver: conjugate gradients, each colony to a worst residual of"
-                f" {self._tolerance()}, at most {self.max_iterations} iterations"
-            ),
-        ]
+        if isinstance(settings, OneSidedSettings):
+            lines = self._one_sided_numerics(settings, kind, state.device)
+        else:
+            lines = self._bilateral_numerics(settings, kind)
         soft = [
             wall for wall in self.walls if wall.stiffness is not None or wall.weight is not None
         ]
@@ -270,22 +268,66 @@ class Mechanics(Effect):
             )
         return lines
 
+    def _one_sided_numerics(
+        self, settings: OneSidedSettings, kind: str, device: torch.device
+    ) -> list[str]:
+        deep = "0.2 radii" if settings.overlap is None else f"{settings.overlap:g} µm"
+        passes = (
+            "1 a step, as cells are soft"
+            if settings.soft
+            else f"at most {settings.passes} a step, more than one only around cells deeper than"
+            f" {deep}"
+        )
+        who = self.backend_on(device)
+        also = "; by torch where gradients are required" if who == "compiled" else ""
+        return [
+            f"contacts: one-sided, they only push; {kind}",
+            (
+                f"passes: {passes}; a colony with a cell that grows more than"
+                f" {self.max_elongation:g} µm takes sub-steps"
+            ),
+            (
+                f"solver: Newton and conjugate gradients, {who}{also}, contact forces to"
+                f" {settings.tolerance:g}, at most {self.max_iterations} iterations a solve"
+            ),
+        ]
+
+    def _bilateral_numerics(self, settings: ContactSettings, kind: str) -> list[str]:
+        over = (
+            ""
+            if self.overlap is None
+            else f", more than one only for new contacts and overlaps over {self.overlap:g} µm"
+        )
+        return [
+            f"contacts: bilateral, an overlapping pair is held until the next pass; {kind}",
+            (
+                f"passes: at most {settings.passes} a step{over}; a colony with a cell that grows"
+                f" more than {self.max_elongation:g} µm takes sub-steps of up to"
+                f" {settings.coarse_passes} passes"
+            ),
+            (
+                "solver: conjugate gradients, torch, each colony to a worst residual of"
+                f" {self._tolerance()}, at most {self.max_iterations} iterations"
+            ),
+        ]
+
     def _tolerance(self) -> str:
         if self.tolerance is not None:
             return f"{self.tolerance:g}"
         default = self.alpha is None and self.stiffness is None
-        return (
-            f"{TOLERANCE:g} (default"
-            + ("" if default else f"; less where α·γ is below {PENALTY:g}")
-            + ")"
-        )
+        less = "" if default else f"; less where α·γ is below {PENALTY:g}"
+        return f"{TOLERANCE:g} (default{less})"
 
     def accuracy_knobs(self) -> Mapping[str, float]:
-        usual = replace(self, passes=None).settings.passes
         penalty = {"penalty": PENALTY} if self.stiffness is None else {}
+        if self.one_sided:
+            return {"tolerance": TOLERANCE, **penalty}
+        usual = replace(self, passes=None).settings.passes
         return {"passes": usual, "tolerance": TOLERANCE, **penalty}
 
     def with_settings(self, settings: Any) -> Mechanics:
+        if self.one_sided:
+            return self._one_sided_with(settings)
         changed: dict[str, Any] = {}
         if settings.tolerance is not None:
             changed["tolerance"] = settings.tolerance
@@ -301,6 +343,17 @@ class Mechanics(Effect):
             changed["alpha"] = quotient(settings.penalty, "Mechanics.length_drag", self.length_drag)
         return replace(self, **changed) if changed else self
 
+    def _one_sided_with(self, settings: Any) -> Mechanics:
+        """One-sided contacts give way in proportion to the penalty; they repeat passes where cells
+        lie deep, whatever the settings."""
+        changed: dict[str, Any] = {}
+        if settings.tolerance is not None:
+            # settings are for bilateral solves, whose default is TOLERANCE
+            changed["tolerance"] = min(settings.tolerance / TOLERANCE * FORCE_TOLERANCE, 0.5)
+        if settings.penalty is not None and self.stiffness is None:
+            changed |= {"alpha": None, "contact_overlap": settings.penalty / PENALTY * OVERLAP}
+        return replace(self, **changed) if changed else self
+
     def _penalty(self, settings: Any) -> float:
         """α γ by these settings, the smallest of several; the usual one of soft cells."""
         if self.stiffness is not None:
@@ -308,125 +361,3 @@ class Mechanics(Effect):
         if settings.penalty is not None:
             return settings.penalty
         return PENALTY if self.alpha is None else smallest(self.alpha) * smallest(self.length_drag)
-
-
-class _BoundMechanics(BoundEffect):
-    """Mechanics with its walls on the batch's device and its settings resolved."""
-
-    effect: Mechanics
-
-    def __init__(self, effect: Mechanics, binding: Binding):
-        super().__init__(effect, binding)
-        self.settings = effect.settings
-        walls = snapshot(effect.walls, "Mechanics.walls", binding.batch)
-        # which of the walls each surface belongs to; a surface is made anew in each step, so that a
-        # gradient to a wall's place passes through each of several backward passes
-        self.walls = walls
-        self.kinds = [
-            (
-                k,
-                (
-                    "stiffness"
-                    if w.stiffness is not None
-                    else "weight"
-                    if w.weight is not None
-                    else "hard"
-                ),
-            )
-            for k, w in enumerate(walls)
-        ]
-
-    def step(self, state: State, dt: float) -> State:
-        if state.cells == 0:
-            return state
-        elongation = state.fields.get("elongation", torch.zeros_like(state.length))
-        steps, status = self._substeps(state, elongation)
-        cells = self._properties(state, dt, steps)
-        passes = torch.where(steps > 1, self.settings.coarse_passes, self.settings.passes)
-        none = torch.zeros_like(state.counts)
-        report = ContactReport(
-            status, none, torch.zeros_like(none, dtype=state.dtype), none, none, none
-        )
-        clipped, reach = (
-            torch.zeros_like(state.colony, dtype=torch.bool),
-            torch.zeros_like(state.radius),
-        )
-        base = state.length - elongation
-        at = Moved(state.position, state.axis, base, clipped, reach, state.displacement)
-        share = elongation / steps.index_select(0, state.colony)
-        for k in range(int(steps.max())):
-            at, report = contact_step(
-                cells, at, report, share, (k < steps) & (status == CONVERGED), passes
-            )
-        fields = {"displacement": at.first_move}
-        if "elongation" in state.fields:
-            fields["elongation"] = at.length - base
-        made = MechanicsReport(**vars(report), substeps=steps, counts=state.counts)
-        state = state.replace(position=at.position, axis=at.axis, length=at.length)
-        return state.with_fields(**fields).replace(reports={**state.reports, "mechanics": made})
-
-    @torch.no_grad()
-    def _substeps(self, state: State, elongation: Tensor) -> tuple[Tensor, Tensor]:
-        """How many sub-steps each colony takes, (B,), so that no cell grows by more than
-        `max_elongation` in one; and the status (B,) of colonies that cannot be stepped."""
-        every = torch.cat(
-            [state.position, state.axis, state.length.unsqueeze(1), elongation.unsqueeze(1)], 1
-        )
-        broken = state.groups.any(~torch.isfinite(every).all(1))
-        steps = torch.ceil(state.groups.max(elongation) / self.effect.max_elongation * (1 - 1e-6))
-        status = torch.where(steps > MOST_SUBSTEPS, TOO_FAST, CONVERGED)
-        status = torch.where(broken, NOT_FINITE, status)
-        return torch.where(status == CONVERGED, steps.clamp(min=1), 1).long(), status
-
-    def _properties(self, state: State, dt: float, steps: Tensor) -> CellProperties:
-        """What the contact step needs of the cells."""
-        values, cells = self.values, state.cells
-        drag = state.fields.get("drag")
-        viscosity = values.viscosity.of_cells(state) * (1.0 if drag is None else drag)
-        length_drag = values.length_drag.of_cells(state)
-        own_dt = dt / steps.index_select(0, state.colony).to(state.dtype)
-        if values.stiffness is not None:
-            alpha = 1.0 / (values.stiffness.of_cells(state) * own_dt)
-        elif values.alpha is not None:
-            alpha = values.alpha.of_cells(state).expand(cells)
-        else:
-            alpha = (PENALTY / length_drag).expand(cells)
-        first = offsets(state.counts)[:-1].clamp(max=cells - 1)
-        reference = state.position.detach().index_select(0, first).index_select(0, state.colony)
-        surfaces, walls = [], []
-        for wall, (k, kind) in zip(self.walls, self.kinds, strict=True):
-            made = wall.surfaces(self.effect.dim)
-            surfaces += made
-            walls += [(kind, self._wall_value(state, k, kind, alpha, own_dt))] * len(made)
-        return CellProperties(
-            self.settings,
-            state.radius,
-            viscosity,
-            length_drag,
-            alpha,
-            self._overlap(state, alpha, length_drag, steps),
-            state.own_colony_id,
-            reference,
-            state.displacement,
-            state.groups,
-            surfaces,
-            walls,
-        )
-
-    def _wall_value(
-        self, state: State, k: int, kind: str, alpha: Tensor, own_dt: Tensor
-    ) -> Tensor | None:
-        """A wall's stiffness · α · Δt, or its weight, for each cell, (N,)."""
-        if kind == "hard":
-            return None
-        value = self.values[f"walls[{k}].{kind}"].of_cells(state)
-        return value * alpha * own_dt if kind == "stiffness" else value.expand(state.cells)
-
-    @torch.no_grad()
-    def _overlap(self, state: State, alpha: Tensor, length_drag: Tensor, steps: Tensor) -> Tensor:
-        """How deep a contact of each cell may be left, (N,) µm."""
-        if self.settings.overlap is not None:
-            return torch.full_like(state.radius, self.settings.overlap)
-        coarse = (steps > 1).index_select(0, state.colony)
-        usual = torch.where(coarse, CLOSE, DEEP * state.radius)
-        return usual * (alpha * length_drag / PENALTY).clamp(max=1.0)

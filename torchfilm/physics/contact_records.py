@@ -34,14 +34,13 @@ class ContactSettings:
     """How contacts are solved, every default filled in: a default that is given explicitly is the
     default.
 
-    dim: 2 or 3. unilateral: contacts only push. soft: cells have a physical stiffness. passes: at
-    most this many a step; coarse_passes: for colonies that take sub-steps. overlap: µm, that later
-    passes solve to; None: DEEP radii, CLOSE for colonies that take sub-steps. tolerance: of the
-    solve; None: by the penalty. max_iterations: of CG a solve.
+    dim: 2 or 3. soft: cells have a physical stiffness. passes: at most this many a step;
+    coarse_passes: for colonies that take sub-steps. overlap: µm, that later passes solve to; None:
+    DEEP radii, CLOSE for colonies that take sub-steps. tolerance: of the solve; None: by the
+    penalty. max_iterations: of CG a solve.
     """
 
     dim: int
-    unilateral: bool
     soft: bool
     passes: int
     coarse_passes: int
@@ -53,25 +52,16 @@ class ContactSettings:
     def resolve(
         dim: int,
         *,
-        unilateral: bool,
         soft: bool,
         passes: int | None,
         overlap: float | None,
         tolerance: float | None,
         max_iterations: int,
     ) -> ContactSettings:
-        """From what a user gave, None for a default: one pass in the plane, two in space, twice as
-        many one-sided."""
-        usual = (dim - 1) * (2 if unilateral else 1) if passes is None else passes
+        """From what a user gave, None for a default: one pass in the plane, two in space."""
+        usual = dim - 1 if passes is None else passes
         return ContactSettings(
-            dim,
-            unilateral,
-            soft,
-            usual,
-            max(usual, COARSE_PASSES),
-            overlap,
-            tolerance,
-            max_iterations,
+            dim, soft, usual, max(usual, COARSE_PASSES), overlap, tolerance, max_iterations
         )
 
     @property
@@ -84,7 +74,7 @@ class ContactSettings:
         """Whether the first pass, and a later one, see what nearly touches. Rows that hold would
         glue what growth takes apart; soft cells have no later pass that could push what nearly
         touches together."""
-        return self.unilateral and not self.soft, not self.soft
+        return False, not self.soft
 
 
 @dataclass(frozen=True)

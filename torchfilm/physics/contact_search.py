@@ -118,12 +118,11 @@ def _neighbourhood(
 def _at_walls(cells: CellProperties, at: Moved, which: Tensor, include_near: bool) -> WallContacts:
     """What touches walls among the marked cells, (N,) bool."""
     parts = (at.position, at.axis, at.length, cells.radius, cells.colony_ids)
-    unilateral = cells.settings.unilateral
     if bool(which.all()):
-        return find_wall_contacts(cells.surfaces, *parts, unilateral, include_near)
+        return find_wall_contacts(cells.surfaces, *parts, include_near)
     rows = torch.nonzero(which).squeeze(1)
     parts = tuple(x.index_select(0, rows) for x in parts)  # type: ignore[assignment]
-    found = find_wall_contacts(cells.surfaces, *parts, unilateral, include_near)
+    found = find_wall_contacts(cells.surfaces, *parts, include_near)
     return replace(found, cell=rows.index_select(0, found.cell))
 
 

@@ -74,7 +74,7 @@ def contact_step(
             active = cells.groups.any(moving)
             if not bool(active.any()):
                 break
-        contacts = contacts_of(pairs, cells.settings.unilateral, include_near)
+        contacts = contacts_of(pairs, include_near)
         problem = assemble(cells, at, contacts, walls, base, rigid, number == 0)
         start = cells.start if number == 0 else None
         move, solved = solve_among(cells, problem, moving, start)
@@ -123,9 +123,7 @@ def assemble(
     applied = torch.zeros_like(gap) if first_pass else torch.where(soft, gap.clamp(max=0), 0.0)
     lower = (base - at.length) / scale[:, -1]
     alpha = cells.alpha.unsqueeze(1).expand_as(scale).contiguous()
-    return ContactProblem(
-        rows, gap, applied, alpha, lower, scale, rigid, cells.groups, settings.unilateral
-    )
+    return ContactProblem(rows, gap, applied, alpha, lower, scale, rigid, cells.groups)
 
 
 def solve_among(
@@ -134,10 +132,11 @@ def solve_among(
     """The move of the cells that are moving (N,) bool, as (N, D), while the others stay where they
     are."""
     tolerance, most = _tolerance(cells), cells.settings.max_iterations
+    ids = cells.groups.max(cells.colony_ids)
     if bool(moving.all()):
-        return solve_contacts(problem, start, tolerance, most)
+        return solve_contacts(problem, start, tolerance, most, ids)
     some = None if start is None else start[moving]
-    move, report = solve_contacts(problem.among(moving), some, tolerance, most)
+    move, report = solve_contacts(problem.among(moving), some, tolerance, most, ids)
     which = torch.nonzero(moving).squeeze(1)
     return torch.zeros_like(problem.scale).index_copy(0, which, move), report
 

@@ -121,10 +121,10 @@ def contact_points(a: Capsules, b: Capsules) -> tuple[Tensor, Tensor, Tensor, Te
     weight (D = 1/√2), so neither force nor torque jumps. An `end` is −1, 0 or +1, or in between
     while it slides: the part of ½ l with which the point moves when the cell grows.
     """
-    return _line_points(a, b, *closest_points(a, b))
+    return line_points(a, b, *closest_points(a, b))
 
 
-def _slide(sine2: Tensor) -> Tensor:
+def slide_of(sine2: Tensor) -> Tensor:
     """How far the ends of a line of contact are from meeting, (P,). sine2: of the axes' angle.
 
     1 for parallel axes; 0 or less where there is no line.
@@ -132,13 +132,13 @@ def _slide(sine2: Tensor) -> Tensor:
     return 1.0 - sine2 / LINE_CONTACT_SINE**2
 
 
-def _line_points(
+def line_points(
     a: Capsules, b: Capsules, s0: Tensor, t0: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The result of `contact_points`, from the closest points (s0, t0)."""
     turn, cosine, between = cross(a.axis, b.axis), dot(a.axis, b.axis), b.centre - a.centre
     sine2 = dot(turn, turn)
-    slide = _slide(sine2)
+    slide = slide_of(sine2)
     # the common part of the two segments, measured along the mean axis so that neither cell is
     # preferred
     sign = torch.where(cosine < 0, -1.0, 1.0).to(a.half.dtype)
@@ -190,11 +190,11 @@ def _end_while_sliding(s: Tensor, free: Tensor, cell: Capsules, slide: Tensor) -
     """
     missing = (free.abs() - cell.half) / (slide * cell.radius + 1e-9)
     return torch.where(
-        slide > 0, torch.sign(free) * missing.clamp(min=0.0, max=1.0), _end(s, cell.half)
+        slide > 0, torch.sign(free) * missing.clamp(min=0.0, max=1.0), end_of(s, cell.half)
     )
 
 
-def _end(s: Tensor, half: Tensor) -> Tensor:
+def end_of(s: Tensor, half: Tensor) -> Tensor:
     """The end of the centreline at which a point is: +1, −1, or 0 for neither.
 
     For a sphere the two ends coincide, and the result is 0.
@@ -218,12 +218,18 @@ class CandidateContacts:
     t: Tensor
 
     @staticmethod
+    def all_of(capsules: Capsules, first: Tensor, second: Tensor) -> CandidateContacts:
+        """The given pairs, each (P,)."""
+        a, b = capsules.take(first), capsules.take(second)
+        return CandidateContacts(first, second, a, b, *closest_points(a, b))
+
+    @staticmethod
     def among(
         capsules: Capsules, first: Tensor, second: Tensor, include_near: bool = False
     ) -> CandidateContacts:
         """The given pairs, each (P,), that overlap; with include_near also those within NEAR."""
-        a, b = capsules.take(first), capsules.take(second)
-        found = CandidateContacts(first, second, a, b, *closest_points(a, b))
+        found = CandidateContacts.all_of(capsules, first, second)
+        a, b = found.a, found.b
         with torch.no_grad():
             # no point of a line is nearer than the closest one, except for rounding; this margin is
             # many times larger
@@ -235,7 +241,7 @@ class CandidateContacts:
     @property
     def gap(self) -> Tensor:
         """The gap at the closest points, (K,) µm."""
-        return _gap(self.a, self.b, self.s, self.t)
+        return gap_at(self.a, self.b, self.s, self.t)
 
     def take(self, index: Tensor) -> CandidateContacts:
         """The pairs at `index`."""
@@ -250,9 +256,7 @@ class CandidateContacts:
         )
 
 
-def contacts_of(
-    pairs: CandidateContacts, unilateral: bool = False, include_near: bool = False
-) -> Contacts:
+def contacts_of(pairs: CandidateContacts, include_near: bool = False) -> Contacts:
     """The rows of all pairs that overlap (gap < 0).
 
     A line of contact that overlaps at one end only gets a row at the other end too, with gap 0.
@@ -260,40 +264,34 @@ def contacts_of(
     other end is as far apart as the first end overlaps. Without it a cell that is squeezed between
     two others rocks from step to step, and they close in on it.
 
-    unilateral: for a solve with unilateral contacts, which finds by itself which rows act. Gaps are
-    returned as they are, and a line has both ends if one of them overlaps.
-
     include_near: for a later pass, which moves cells again. It adds rows for pairs within NEAR,
-    with gap 0 unless `unilateral`, and weight that falls to 0 at that distance. Half of the pairs
-    that a pass separates are slightly apart afterwards. A next pass without these rows pushed them
-    together again, deeper with every pass where contacts are hard, until a full channel became a
-    heap.
+    with gap 0 and weight that falls to 0 at that distance. Half of the pairs that a pass separates
+    are slightly apart afterwards. A next pass without these rows pushed them together again, deeper
+    with every pass where contacts are hard, until a full channel became a heap.
     """
     first, second, a, b, s, t = pairs.first, pairs.second, pairs.a, pairs.b, pairs.s, pairs.t
     # only nearly parallel pairs may have a line; all others touch at the closest point
     turn = cross(a.axis, b.axis).detach()
-    flat = torch.nonzero(_slide(dot(turn, turn)) > 0).squeeze(1)
+    flat = torch.nonzero(slide_of(dot(turn, turn)) > 0).squeeze(1)
     flat_a, flat_b = a.take(flat), b.take(flat)
-    *of_lines, line = _line_points(flat_a, flat_b, s.index_select(0, flat), t.index_select(0, flat))
+    *of_lines, line = line_points(flat_a, flat_b, s.index_select(0, flat), t.index_select(0, flat))
     points = [
         x.index_copy(0, flat, ends[0])
-        for x, ends in zip((s, t, _end(s, a.half), _end(t, b.half)), of_lines, strict=True)
+        for x, ends in zip((s, t, end_of(s, a.half), end_of(t, b.half)), of_lines, strict=True)
     ]
-    ends = [_gap(flat_a, flat_b, of_lines[0][k], of_lines[1][k]) for k in (0, 1)]
+    ends = [gap_at(flat_a, flat_b, of_lines[0][k], of_lines[1][k]) for k in (0, 1)]
     point, margin = (
-        _gap(a, b, points[0], points[1]),
+        gap_at(a, b, points[0], points[1]),
         0.5 * NEAR * include_near * (a.radius + b.radius),
     )
     # select again without a gradient: a first row for every pair, a second one where there is a
     # line
     with torch.no_grad():
         deep0, deep1 = point < margin, line & (ends[1] < margin.index_select(0, flat))
-        either = (
-            line & (deep0.index_select(0, flat) | deep1) & (unilateral | (ends[0] + ends[1] < 0))
-        )
+        either = line & (deep0.index_select(0, flat) | deep1) & (ends[0] + ends[1] < 0)
         deep0[flat] |= either
         keep0, keep1 = torch.nonzero(deep0).squeeze(1), torch.nonzero(deep1 | either).squeeze(1)
-    of_ends = _end_weights(ends, line, flat, point, margin, unilateral, include_near)
+    of_ends = _end_weights(ends, line, flat, point, margin, include_near)
     weight = torch.cat(
         [of_ends[0].index_select(0, keep0), of_ends[1].index_select(0, flat).index_select(0, keep1)]
     )
@@ -303,8 +301,8 @@ def contacts_of(
         for x, two in zip(points, of_lines, strict=True)
     )
     a, b = a.take(keep), b.take(keep)
-    gap, row_first, row_second, normal = _rows(a, b, s, t, end_a, end_b)
-    gap = gap if unilateral else gap.clamp(max=0.0)
+    gap, row_first, row_second, normal = rows_at(a, b, s, t, end_a, end_b)
+    gap = gap.clamp(max=0.0)
     pick = lambda x: x.index_select(0, keep)
     return Contacts(pick(first), pick(second), gap, weight, row_first, row_second, normal)
 
@@ -315,7 +313,6 @@ def _end_weights(
     flat: Tensor,
     point: Tensor,
     margin: Tensor,
-    unilateral: bool,
     include_near: bool,
 ) -> list[Tensor]:
     """D² of the two rows that each pair may have, (K,) each.
@@ -323,9 +320,9 @@ def _end_weights(
     ends: the gaps at the two ends of the lines, which are the pairs `flat` where `line` is set.
     point: (K,) the gap of the first row. margin: (K,) see NEAR.
     """
-    share = torch.full_like(ends[0], 0.5) if unilateral else 0.5 * _weight_of_held_end(*ends)
+    share = 0.5 * _weight_of_held_end(*ends)
     whole = torch.ones_like(point)
-    if include_near and not unilateral:
+    if include_near:
         whole, of_each = (
             _weight_near(point, margin),
             [0.5 * _weight_near(end, margin.index_select(0, flat)) for end in ends],
@@ -357,7 +354,7 @@ def _weight_of_held_end(one: Tensor, other: Tensor) -> Tensor:
     return ((one + other) / torch.where(deepest < 0, deepest, -1.0)).clamp(min=0.0, max=1.0)
 
 
-def _gap(a: Capsules, b: Capsules, s: Tensor, t: Tensor) -> Tensor:
+def gap_at(a: Capsules, b: Capsules, s: Tensor, t: Tensor) -> Tensor:
     """The gap of each pair at the points s and t of the centrelines, (P,) µm."""
     return safe_sqrt(_distance2(b.centre - a.centre, a.axis, b.axis, s, t)) - a.radius - b.radius
 
@@ -365,7 +362,7 @@ def _gap(a: Capsules, b: Capsules, s: Tensor, t: Tensor) -> Tensor:
 def contact_gaps(capsules: Capsules, first: Tensor, second: Tensor) -> Tensor:
     """Signed gap of each pair at its closest points, (P,) µm; negative where they overlap."""
     a, b = capsules.take(first), capsules.take(second)
-    return _gap(a, b, *closest_points(a, b))
+    return gap_at(a, b, *closest_points(a, b))
 
 
 @torch.no_grad()
@@ -394,7 +391,7 @@ def gaps_nearby(
     return first, second, contact_gaps(capsules, first, second)
 
 
-def _rows(a: Capsules, b: Capsules, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tensor):
+def rows_at(a: Capsules, b: Capsules, s: Tensor, t: Tensor, end_a: Tensor, end_b: Tensor):
     """Gap, the two cells' rows and the normal at points s and t of the centrelines."""
     lever_a, lever_b = s * a.axis, t * b.axis
     between = b.centre - a.centre + lever_b - lever_a

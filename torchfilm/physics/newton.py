@@ -1,8 +1,8 @@
-"""Rounds of projected semismooth Newton for the contact problem, each solved by CG.
+"""Rounds of projected Newton for the contact problem of bilateral rows, each solved by CG.
 
-One round: find the free degrees of freedom, solve (JᵀAJ + α) Δy = −gradient by CG, where A marks
-the rows that act, then search along Δy. Bilateral problems are linear; they need more than one
-round only where lengths reach their bounds or the residual has drifted.
+One round: find the free degrees of freedom, solve (JᵀJ + α) Δy = −gradient by CG, then search along
+Δy. The problem is linear; it needs more than one round only where lengths reach their bounds or the
+residual has drifted.
 """
 
 from __future__ import annotations
@@ -25,13 +25,10 @@ from torchfilm.physics.problem import (
 from torchfilm.tools.cg import conjugate_gradients, worst_of
 from torchfilm.tools.ragged import Blocks
 
-# The share of the current residual that the CG of one Newton step may leave while contacts may
-# switch. Measured: a sixth to a fifth fewer rounds than with 0.1, for about as many iterations.
-FORCING = 0.02
-# The share of its target that CG must reach where contacts cannot switch. It is below 1, since
-# lengths that meet their bound undo part of the progress, and the true residual differs by rounding
-# from the recurred one. Measured: 0.5 costs as much as 0.8, in fewer rounds of more iterations, and
-# leaves a smaller residual.
+# The share of its target that CG must reach. It is below 1, since lengths that meet their bound
+# undo part of the progress, and the true residual differs by rounding from the recurred one.
+# Measured: 0.5 costs as much as 0.8, in fewer rounds of more iterations, and leaves a smaller
+# residual.
 FINISH = 0.5
 # A solve is limited by its CG iterations, and each round takes at least one. This many rounds is
 # the last resort.
@@ -42,19 +39,23 @@ NEWTON_LIMIT = 200
 class Iterate:
     """The current point of Newton's method.
 
-    y: (N, D) the scaled move. after: (R,) each row's gap after it. active: (R,) 1 for rows that
-    act. free: (N, D) 1 for free degrees of freedom. inverse: (N, D, D) the inverse blocks of the
-    rows that act. Per colony, (B,): scale and worst of its residual, and the CG iterations so far.
+    y: (N, D) the scaled move. after: (R,) each row's gap after it. free: (N, D) 1 for free degrees
+    of freedom. inverse: (N, D, D) the inverse blocks. Per colony, (B,): scale and worst of its
+    residual, and the CG iterations so far.
     """
 
     y: Tensor
     after: Tensor
-    active: Tensor
     free: Tensor
     inverse: Tensor
     scale: Tensor
     worst: Tensor
     iterations: Tensor
+
+    @property
+    def active(self) -> Tensor:
+        """1 for each row, (R,): all act."""
+        return torch.ones_like(self.after)
 
     def part(self, which: Selection) -> Iterate:
         """The iterate of the selected colonies."""
@@ -82,9 +83,8 @@ def minimise(problem: ContactProblem, start: Tensor | None, tolerance: Tensor, m
     """
     colonies = problem.colonies
     zero = torch.zeros_like(problem.scale)
-    active = problem.acting(problem.gap)
-    inverse = block_inverse(problem, active)
-    scale = worst_of(Blocks(inverse).times(problem.gradient(zero, problem.gap * active)), colonies)
+    inverse = block_inverse(problem)
+    scale = worst_of(Blocks(inverse).times(problem.gradient(zero, problem.gap)), colonies)
     still = scale == 0  # no row exerts a force: such a colony does not move at all
     y, after = zero, problem.gap
     if start is not None:
@@ -93,13 +93,10 @@ def minimise(problem: ContactProblem, start: Tensor | None, tolerance: Tensor, m
         )
         y[:, -1] = torch.where(problem.rigid, 0.0, torch.maximum(y[:, -1], problem.lower))
         after = problem.gap_after(y)
-        active = problem.acting(after)
-        inverse = block_inverse(problem, active) if problem.unilateral else inverse
     unknown = torch.full_like(scale, torch.inf)
     begun = Iterate(
         y,
         after,
-        active,
         torch.ones_like(y),
         inverse,
         scale,
@@ -121,16 +118,15 @@ def _newton_rounds(
     rounds: the rounds of rounds already done.
     """
     colonies = problem.colonies
-    y, after, active, inverse, scale, previous, iterations = (
+    y, after, inverse, scale, previous, iterations = (
         at.y,
         at.after,
-        at.active,
         at.inverse,
         at.scale,
         at.worst,
         at.iterations,
     )
-    preconditioner, gradient = FreeDofPreconditioner(inverse), problem.gradient(y, after * active)
+    preconditioner, gradient = FreeDofPreconditioner(inverse), problem.gradient(y, after)
     while True:
         free = _free_dofs(y, gradient, problem)
         precondition = preconditioner.at(free)
@@ -145,7 +141,7 @@ def _newton_rounds(
             scale = torch.where(stalled, torch.maximum(scale, least), scale)
             target = tolerance * scale
             going = going & (worst > target)
-        here = Iterate(y, after, active, free, inverse, scale, worst, iterations)
+        here = Iterate(y, after, free, inverse, scale, worst, iterations)
         if rounds == NEWTON_LIMIT or not bool(going.any()):
             return here
         which = _minority(problem, going)
@@ -160,20 +156,12 @@ def _newton_rounds(
             )
             return here.with_part(end, which)
         previous = worst
-        least = (
-            torch.maximum(0.5 * target, FORCING * worst) if problem.unilateral else FINISH * target
-        )
-        inner = torch.where(going, least, torch.inf)
+        inner = torch.where(going, FINISH * target, torch.inf)
         result = conjugate_gradients(
-            system_matrix(problem, active), -gradient, precondition, colonies, inner, max_iterations
+            problem.system(), -gradient, precondition, colonies, inner, max_iterations
         )
         iterations = iterations + result.iterations
-        y, after, active, gradient = search_line(problem, y, after, gradient, result.x, going)
-        if problem.unilateral:
-            # The block of a cell that nothing touched before is α alone. If it were kept, it would
-            # weight the cell's new contact 1/α times too much, and hide all else.
-            inverse = block_inverse(problem, active)
-            preconditioner = FreeDofPreconditioner(inverse)
+        y, after, gradient = search_line(problem, y, after, gradient, result.x, going)
         rounds += 1
 
 
@@ -198,20 +186,6 @@ def _rounding_residual(problem: ContactProblem, precondition: Map, y: Tensor) ->
         + problem.alpha * y.abs()
     )
     return 2 * torch.finfo(y.dtype).eps * worst_of(precondition(forces), problem.colonies)
-
-
-def system_matrix(problem: ContactProblem, active: Tensor) -> Map:
-    """The map v -> (JᵀAJ + α) v, where A marks the active rows.
-
-    The preconditioner discards its output for degrees of freedom that are not free.
-    """
-    rows, alpha, unilateral = problem.rows, problem.alpha, problem.unilateral
-
-    def apply(v: Tensor) -> Tensor:
-        change = rows.apply(v)
-        return rows.apply_transpose(active * change if unilateral else change).addcmul_(alpha, v)
-
-    return apply
 
 
 def _free_dofs(y: Tensor, gradient: Tensor, problem: ContactProblem) -> Tensor:

@@ -18,9 +18,9 @@ LEAST_LEFT = 1e-3
 BLOCK_FLOOR = 64
 
 
-def block_inverse(problem: ContactProblem, active: Tensor) -> Tensor:
+def block_inverse(problem: ContactProblem) -> Tensor:
     """Block Jacobi: the inverse of each cell's own D × D block, (N, D, D)."""
-    blocks = problem.rows.blocks(active if problem.unilateral else None)
+    blocks = problem.rows.blocks()
     # A sum of products has an error of a few units in the last place of its diagonal. Where alpha
     # is smaller than that error, rounding alone can make a block indefinite. CG needs a positive
     # definite preconditioner, so each block is raised by more than the error.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,8 +26,8 @@ class SolveReport:
     """What a solve did in each colony; every field is (B,).
 
     status: see STATUS. iterations: of CG. residual: recomputed from x, the worst preconditioned
-    residual of the rows that act, divided by the worst residual at x = 0. Where opposing forces
-    cancel, the divisor is the least residual that rounding resolves.
+    residual, divided by the worst residual at x = 0. Where opposing forces cancel, the divisor is
+    the least residual that rounding resolves.
     """
 
     status: Tensor
@@ -53,18 +54,10 @@ class ContactProblem:
     scale: Tensor
     rigid: Tensor
     colonies: Groups
-    unilateral: bool
 
     def gap_after(self, y: Tensor) -> Tensor:
         """The scaled gap of each row after the move y (N, D): D(g − Jx), (R,)."""
         return self.gap - self.rows.apply(y)
-
-    def acting(self, after: Tensor) -> Tensor:
-        """1 for each row that acts, else 0, (R,).
-
-        Bilateral rows all act. Unilateral rows act where they overlap after the move.
-        """
-        return (after < 0).to(after.dtype) if self.unilateral else torch.ones_like(after)
 
     def gradient(self, y: Tensor, violation: Tensor) -> Tensor:
         """The gradient of the minimised function, (N, D).
@@ -72,6 +65,26 @@ class ContactProblem:
         violation: (R,) the gap after the move for rows that act, 0 for the others.
         """
         return self.alpha * y - self.rows.apply_transpose(violation - self.applied_force)
+
+    def system(self, active: Tensor | None = None) -> Callable[[Tensor], Tensor]:
+        """The map v -> (JᵀAJ + α) v. A marks the rows that act, (R,); None: all do.
+
+        The preconditioner discards its output for degrees of freedom that are not free.
+        """
+
+        def apply(v: Tensor) -> Tensor:
+            change = self.rows.apply(v)
+            change = change if active is None else active * change
+            return self.rows.apply_transpose(change).addcmul_(self.alpha, v)
+
+        return apply
+
+    @property
+    def tracked(self) -> bool:
+        """Whether a gradient is required of anything in it."""
+        rows = self.rows
+        parts = (self.gap, rows.row_first, rows.row_wall, self.alpha, self.lower, self.scale)
+        return any(part.requires_grad for part in parts)
 
     def detached(self) -> ContactProblem:
         """The same problem without gradients."""
@@ -96,7 +109,6 @@ class ContactProblem:
             self.scale.detach(),
             self.rigid,
             self.colonies,
-            self.unilateral,
         )
 
     def among(self, moving: Tensor) -> ContactProblem:
@@ -118,7 +130,6 @@ class ContactProblem:
             of_cells(self.scale),
             of_cells(self.rigid),
             Groups(of_cells(self.colonies.owner), self.colonies.size),
-            self.unilateral,
         )
 
     def part(self, which: Selection) -> ContactProblem:
@@ -138,7 +149,6 @@ class ContactProblem:
             self.scale.index_select(0, cells),
             self.rigid.index_select(0, cells),
             Groups(owner, which.colonies.numel()),
-            self.unilateral,
         )
 
     @cached_property
@@ -159,7 +169,6 @@ class Selection:
         """The index into each field of an Iterate, in the order of its fields."""
         return (
             self.cells,
-            self.rows,
             self.rows,
             self.cells,
             self.cells,

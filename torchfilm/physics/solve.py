@@ -1,4 +1,4 @@
-"""The contact solve: minimise ‖D(Jx − g)‖² + α xᵀMx, each colony converged by itself.
+"""The solve of bilateral contacts: minimise ‖D(Jx − g)‖² + α xᵀMx, each colony converged by itself.
 
 | paper                        | here                                                         |
 |------------------------------|--------------------------------------------------------------|
@@ -14,8 +14,6 @@ Where the solve goes beyond the paper:
 
 - Rotational drag differs about the cell's axis. A contact on a centreline exerts no torque about
   that axis, so this direction is never entered, and M stays diagonal.
-- Bilateral rows (the paper's least squares) all act: one linear system. Unilateral rows act only
-  where g − Jx < 0: semismooth Newton with a line search (`newton`).
 - Δl ≥ −growth: projected Newton. A length at its bound leaves the system.
 """
 
@@ -30,18 +28,24 @@ from torchfilm.physics.adjoint import attach_gradient
 from torchfilm.physics.newton import minimise
 from torchfilm.physics.problem import ContactProblem, SolveReport
 
-# A gradient through a solve_contacts with a tolerance above this raises a warning.
-LOOSE_FOR_GRADIENTS = 1e-4
+# Above these tolerances a gradient through contacts raises a warning. One-sided ones are solved to
+# an error of their forces; of bilateral ones only the move is bounded, and forces amplify it.
+LOOSE_FOR_GRADIENTS, LOOSE_IF_BILATERAL = 1e-5, 1e-6
 
 
 def solve_contacts(
-    problem: ContactProblem, start: Tensor | None, tolerance: float | Tensor, max_iterations: int
+    problem: ContactProblem,
+    start: Tensor | None,
+    tolerance: float | Tensor,
+    max_iterations: int,
+    colony_ids: Tensor | None = None,
 ) -> tuple[Tensor, SolveReport]:
     """Solve a contact problem for the move x of each cell, (N, D) in µm, rad and µm.
 
     start: (N, D), an earlier x from which the solve begins, or None for 0. tolerance: one number or
     one per colony, (B,). A colony has converged when its worst preconditioned residual is at most
-    `tolerance` times the worst residual at x = 0. max_iterations: of CG, per colony.
+    `tolerance` times the worst residual at x = 0. max_iterations: of CG, per colony. colony_ids:
+    (B,), for messages.
 
     Returns x and the report. The result is differentiable by the adjoint method, which costs one
     more solve with the same operator. Warns with RuntimeWarning if a gradient is required at a
@@ -52,25 +56,21 @@ def solve_contacts(
     ).expand(problem.colonies.size)
     with torch.no_grad():
         end, report = minimise(problem.detached(), start, tolerance, max_iterations)
-    tracked = (
-        problem.gap,
-        problem.rows.row_first,
-        problem.rows.row_wall,
-        problem.alpha,
-        problem.lower,
-        problem.scale,
-    )
     y = end.y
-    if torch.is_grad_enabled() and any(t.requires_grad for t in tracked):
-        loosest = float(tolerance.max())
-        if loosest > LOOSE_FOR_GRADIENTS:
-            warnings.warn(
-                f"a gradient is required through contacts that are solved to {loosest:g} only."
-                " That is enough for overlaps, but the gradient may even have the wrong sign. Give"
-                " Mechanics a tolerance of 1e-6 or less (1e-8 in float64), or run under"
-                " torch.no_grad().",
-                RuntimeWarning,
-                stacklevel=2,
-            )
-        y = attach_gradient(problem, end, tolerance, max_iterations)
+    if torch.is_grad_enabled() and problem.tracked:
+        warn_if_loose(float(tolerance.max()), LOOSE_IF_BILATERAL)
+        y = attach_gradient(problem, end, tolerance, max_iterations, colony_ids)
     return y * problem.scale, report
+
+
+def warn_if_loose(tolerance: float, most: float = LOOSE_FOR_GRADIENTS) -> None:
+    """Warn of a gradient through contacts that are solved to `tolerance` only, above `most`."""
+    if tolerance > most:
+        warnings.warn(
+            f"a gradient is required through contacts that are solved to {tolerance:g} only."
+            " That is enough for overlaps, but the gradient may even have the wrong sign. Give"
+            f" Mechanics a tolerance of {most:g} or less, or run under"
+            " torch.no_grad().",
+            RuntimeWarning,
+            stacklevel=3,
+        )

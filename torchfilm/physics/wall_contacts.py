@@ -47,16 +47,16 @@ def find_wall_contacts(
     length: Tensor,
     radius: Tensor,
     colony_id: Tensor,
-    unilateral: bool = False,
     include_near: bool = False,
+    reach: Tensor | None = None,
 ) -> WallContacts:
     """One row for each capsule end that overlaps a wall (gap < 0).
 
     A sphere met from outside gives one more row, for the nearest point, wherever it is on the cell.
 
     position: (N, d) float64, absolute. axis: (N, d). length, radius: (N,). colony_id: (N,) selects
-    a wall's value per colony. unilateral, include_near: as in `contacts_of`, for walls that are not
-    soft.
+    a wall's value per colony. include_near: as in `contacts_of`, for walls that are not soft.
+    reach: (N,) µm, instead: rows are made for gaps up to it, and gaps are returned as they are.
     """
     found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     half = 0.5 * length
@@ -70,10 +70,11 @@ def find_wall_contacts(
                 if include_near and surface.wall.stiffness is None
                 else torch.zeros_like(radius)
             )
+            margin = margin if reach is None else reach
             keep = torch.nonzero((gap < margin) & (root > 0)).squeeze(1)
             if keep.numel() == 0:
                 continue
-            if include_near and not unilateral:
+            if include_near:
                 root, gap = (
                     root * (1.0 - gap / margin.clamp(min=1e-30)).clamp(min=0.0, max=1.0),
                     gap.clamp(max=0.0),

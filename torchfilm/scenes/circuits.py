@@ -31,17 +31,17 @@ def _divide_plasmids(
     daughter2.plasmid = amount * (1 - share) / daughter2.volume
 
 
-def random_partition(rate: float = 1.0, start: float = 1.0) -> Scene:
+def random_partition(rate: float = 1.0, start: float = 1.0, length_drag: float = 1e5) -> Scene:
     """A species without production or decay, divided between daughters in random parts.
 
     It is the paper's `divide` example. The total amount is conserved, and cells differ more and
-    more.
+    more. The colony grows freely (length_drag 1e5), so all cells divide at the same rate.
     """
     return Scene(
         Rules(divide=_divide_plasmids),
         Growth(rate=rate),
         Division(length=Uniform(3.5, 4.5)),
-        Mechanics(dim=2),
+        Mechanics(dim=2, length_drag=length_drag),
         Circuit(_no_reactions, species=("plasmid",), initial={"plasmid": start}),
     )
 
@@ -55,6 +55,7 @@ def repressilator(
     molecules_per_unit: float = 0.5,
     noise: bool = True,
     rate: float = 0.7,
+    length_drag: float = 1e5,
 ) -> Scene:
     """Three genes that repress each other in a ring (Elowitz and Leibler 2000), as cells grow.
 
@@ -62,6 +63,7 @@ def repressilator(
     dimensionless model, mᵢ' = −mᵢ + α/(1 + pⱼⁿ) + α₀, pᵢ' = β (mᵢ − pᵢ). speed: the unit of time is
     1/speed h, the mRNA's lifetime. noise: simulate molecule by molecule (tau-leaping), with
     `molecules_per_unit` molecules in a unit of concentration × µm³; otherwise deterministically.
+    The colony grows freely (length_drag 1e5), so dilution is alike in all cells.
     """
     names = ("laci", "tetr", "ci")
     reactions = []
@@ -77,7 +79,7 @@ def repressilator(
     return Scene(
         Growth(rate=rate),
         Division(length=Uniform(3.5, 4.5)),
-        Mechanics(dim=2),
+        Mechanics(dim=2, length_drag=length_drag),
         Circuit(
             reactions,
             species=(*names, *(f"m_{n}" for n in names)),
@@ -100,6 +102,7 @@ def toggle_switch(
     molecules_per_unit: float = 50.0,
     noise: bool = True,
     rate: float = 0.7,
+    length_drag: float = 1e5,
 ) -> Scene:
     """Two genes that repress each other (Gardner et al. 2000), in a growing colony.
 
@@ -107,7 +110,8 @@ def toggle_switch(
     the colony forms sectors. x' = speed (a/(1 + yⁿ) − x) and the same for y, with a = `strength`.
     Founders start at x = y = `start`; by default decay, dilution and repression balance there.
     noise: simulate molecule by molecule, with `molecules_per_unit` molecules in a unit of
-    concentration × µm³. Growth dilutes in addition to decay.
+    concentration × µm³. Growth dilutes in addition to decay; the colony grows freely (length_drag
+    1e5), so the balance is the same in all cells.
     """
     reactions = []
     for name, by in (("red", "green"), ("green", "red")):
@@ -118,7 +122,7 @@ def toggle_switch(
     return Scene(
         Growth(rate=rate),
         Division(length=Uniform(3.5, 4.5)),
-        Mechanics(dim=2),
+        Mechanics(dim=2, length_drag=length_drag),
         Circuit(
             reactions,
             species=("red", "green"),

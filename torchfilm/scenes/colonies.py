@@ -24,13 +24,16 @@ def microcolony(
     shortest: float = 3.5,
     longest: float = 4.5,
     agarose: float = 16.0,
-    length_drag: float = 10.0,
+    length_drag: float = 1e5,
 ) -> Scene:
     """A colony from one cell (Fig. 1, 2).
 
     rate: of growth, 1/h. A cell divides at a centreline length between `shortest` and `longest` µm.
     dim 2: strictly in the plane. dim 3: between a soft agarose below (stiffness `agarose`, μ·µm/h)
     and a hard coverslip above.
+
+    The colony grows freely, as those of E. coli do under a microscope. With length_drag 10, the
+    paper's, pressure slows it from a hundred cells on.
     """
     walls = (
         ()
@@ -53,7 +56,8 @@ def programmed_growth(
 ) -> Scene:
     """A colony in which only cells within `edge` µm of its rightmost point grow (Fig. 4).
 
-    The growing tip is pushed to the right, like a meristem.
+    The growing tip is pushed to the right, like a meristem. Pressure limits growth (length_drag 10,
+    the paper's); it matters little here, since few cells grow.
     """
 
     def update(cells: CellsView) -> None:

@@ -22,13 +22,14 @@ def nutrient_limited(
     rate: float | Tensor = 1.0,
     size: float = 240.0,
     spacing: float = 4.0,
+    length_drag: float = 1e5,
 ) -> Scene:
     """A colony that consumes a nutrient, which diffuses from the edge of a box `size` µm wide.
 
     At the edge the nutrient is kept at `supply`. Only a rim of the colony grows. Where diffusion is
     slow, bumps of the rim grow faster and branch. Growth is `rate` (1/h) · s/(half + s).
     growth_yield: µm³ of cell from one unit of concentration × µm³. The layer is 1 µm deep, like the
-    cells.
+    cells. length_drag: with the default the nutrient limits growth, and pressure does not.
     """
     edge = Dirichlet(supply)
     half_size = size / 2
@@ -36,7 +37,7 @@ def nutrient_limited(
         Monod("nutrient", rate=rate, half=half, growth_yield=growth_yield),
         Growth(),
         Division(length=Uniform(3.5, 4.5)),
-        Mechanics(dim=2),
+        Mechanics(dim=2, length_drag=length_drag),
         Medium(
             nutrient=Signal(diffusion=diffusion, initial=supply),
             box=((-half_size, -half_size), (half_size, half_size)),

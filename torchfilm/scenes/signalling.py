@@ -41,6 +41,7 @@ def quorum_sensing(
     rate: float = 1.0,
     size: float = 128.0,
     spacing: float = 4.0,
+    length_drag: float = 10.0,
 ) -> Scene:
     """Lux quorum sensing (Table 2): together the cells make enough AHL to switch LuxI on.
 
@@ -49,12 +50,14 @@ def quorum_sensing(
     With the constants that Table 2 prints (D1 = k1 = k4 = 1; d2 without a value, its d1 is 1e-3)
     dilution of LuxI is faster than its induction, and nothing switches. With the constants here it
     switches, the sooner the smaller the box.
+
+    Pressure limits growth (length_drag 10, the paper's): the constants are for its dilution.
     """
     half = size / 2
     return Scene(
         Growth(rate=rate),
         Division(length=Uniform(3.5, 4.5)),
-        Mechanics(dim=2),
+        Mechanics(dim=2, length_drag=length_drag),
         Circuit(_lux, species=("luxi", "ahl"), D1=D1, d2=d2, k1=k1, k2=k2, k3=k3, k4=k4, g1=g1),
         Medium(
             ahl=Signal(diffusion=diffusion), box=((-half, -half), (half, half)), spacing=spacing
@@ -99,6 +102,7 @@ def boundary_detector(
     rate: float = 1.0,
     width: float = 32.0,
     rtol: float = 1e-4,
+    length_drag: float = 10.0,
 ) -> Scene:
     """Detection of the boundary between two populations (Fig. 5), in one plane of a channel.
 
@@ -108,12 +112,15 @@ def boundary_detector(
     concentration); d3 = 0 is a strain without AiiA. flow: µm/h along the channel. rtol: relative
     tolerance of the circuits in a step. The grid, with voxels of 4 µm, starts as the paper's 64 × 8
     × 12 voxels around the cells' plane and grows along the channel with the colony.
+
+    Pressure limits growth (length_drag 10, the paper's). With free growth (1e5) the published
+    constants give no band: reporters are diluted faster than they are made.
     """
     half = width / 2
     return Scene(
         Growth(rate=rate),
         Division(length=Uniform(3.5, 4.5)),
-        Mechanics(dim=2, walls=[Channel(width)]),
+        Mechanics(dim=2, walls=[Channel(width)], length_drag=length_drag),
         Circuit(
             {0: _sources, 1: _sinks},
             species=("luxi", "ahl", "aiia", "cfp", "yfp"),

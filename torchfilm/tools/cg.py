@@ -64,19 +64,22 @@ def conjugate_gradients(
     groups: Groups,
     target: Tensor,
     max_iterations: int,
+    by_energy: bool = False,
 ) -> CGResult:
     """Solve A x = b from x = 0 for symmetric positive definite A, one system per group.
 
     b: (N, D). `apply` and `precondition` map (N, D) to (N, D) and keep groups apart. A system stops
     when its greatest preconditioned residual is at most target (B,), or is not finite, or after
-    `max_iterations`; the others continue.
+    `max_iterations`; the others continue. by_energy: target is of residual · preconditioned
+    residual instead.
     """
     x = torch.zeros_like(b)
     r = b.clone()
     z = precondition(r)
     p = z.clone()
     rz = _dot(r, z, groups)
-    worst = worst_of(z, groups)
+    measure = lambda: rz.squeeze(1) if by_energy else worst_of(z, groups)
+    worst = measure()
     going = (worst > target) & (worst < torch.inf)  # neither holds for a NaN
     iterations = torch.zeros(groups.size, dtype=torch.int64, device=b.device)
     every = CHECK_EVERY.get(b.device.type, 8)
@@ -94,11 +97,11 @@ def conjugate_gradients(
         z = precondition(r)
         new = _dot(r, z, groups)
         iterations += going
-        worst = torch.where(going, worst_of(z, groups), worst)
         ratio = _for_rows(
             torch.where(moves, new / torch.where(rz == 0, 1.0, rz), 0.0), groups, b.shape[1]
         )
         p = torch.addcmul(z, ratio, p)
         rz = new
+        worst = torch.where(going, measure(), worst)
         going = moves.squeeze(1) & (worst > target) & (worst < torch.inf)
     return CGResult(x, iterations, worst)

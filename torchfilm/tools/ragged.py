@@ -66,7 +66,7 @@ class Groups:
         self.owner, self.size = owner, size
         self._matrix: dict[torch.dtype, Tensor] = {}
 
-    @property
+    @cached_property
     def counts(self) -> Tensor:
         """(size,) int64, rows in each group."""
         return torch.bincount(self.owner, minlength=self.size)

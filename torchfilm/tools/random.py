@@ -8,8 +8,10 @@ products wrap without harm.
 from __future__ import annotations
 
 import math
+import sys
 import zlib
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,10 +45,16 @@ def purpose_code(purpose: str) -> int:
 
 def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> tuple[Tensor, ...]:
     """Four independent 32-bit words for each cell: stream, uid (M,) int64 -> four (M,) int64."""
-    fill = torch.zeros_like(uid)
-    counter = (uid & MASK, (uid >> 32) & MASK, stream & MASK, fill + (step & MASK))
+    of_cells = (uid & MASK, (uid >> 32) & MASK, stream & MASK)
     mixed = (seed ^ (purpose_code(purpose) << 32)) & (2**64 - 1)
-    return philox(counter, (mixed & MASK, (mixed >> 32) & MASK))
+    key = (mixed & MASK, (mixed >> 32) & MASK)
+    if uid.device.type == "cpu" and "numba" in sys.modules:  # to load it here would cost more
+        from torchfilm.kernels.random import philox_words
+
+        constant = [np.uint64(x) for x in (step & MASK, *key)]
+        given = [x.expand(uid.shape).contiguous().numpy() for x in of_cells]
+        return torch.from_numpy(philox_words(*given, *constant)).unbind(0)
+    return philox((*of_cells, torch.full_like(uid, step & MASK)), key)
 
 
 def uniform(

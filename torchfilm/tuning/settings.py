@@ -23,9 +23,11 @@ FORMAT = "torchfilm settings"
 class Settings:
     """Knobs of accuracy. None keeps the scene's own value.
 
-    dt: step, h. penalty: α·γ of contacts, which sets how far contacts yield (default 0.1;
-    physically soft cells, `Mechanics(stiffness=…)`, keep their own). passes, tolerance: of the
-    contact solve (see `Mechanics`). rtol: relative tolerance of circuits that use the stiff solver.
+    dt: step, h. penalty: how far contacts give way; 0.1 is the default. Overlap of one-sided
+    contacts is proportional to it; for bilateral ones it is α·γ. Physically soft cells,
+    `Mechanics(stiffness=…)`, keep their own. tolerance: of the contact solve; 0.05 is the default,
+    and for one-sided contacts the error of forces is proportional to it. passes: of bilateral
+    contacts (see `Mechanics`). rtol: relative tolerance of circuits that use the stiff solver.
     """
 
     dt: float | None = None

@@ -136,7 +136,7 @@ def _knob_text(knob: str, s: Settings) -> str:
         return f"dt {s.dt:g} h"
     if knob == "circuits":
         return f"rtol {s.rtol:g}"
-    penalty = "" if s.penalty is None else f"penalty α·γ {s.penalty:g}, "
+    penalty = "" if s.penalty is None else f"penalty {s.penalty:g}, "
     passes = "" if s.passes is None else f"passes {s.passes}, "
     return f"{penalty}{passes}tolerance {s.tolerance:g}"
 

@@ -1,0 +1,160 @@
+"""Compiled contacts and those of torch take the same steps; compiled ones give the same bits on any
+number of threads and in any batch.
+
+The two paths add in different orders. In float64, solved to 1e-6 of the contact forces, they differ
+by rounding, 1e-16 of numbers up to 1e2, times what the solve amplifies: 1/(α μ L) and the condition
+of the Newton systems, 1e4 together. So 1e-9 µm and rad is far above rounding, and far below any
+effect of another rule.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.physics import compiled
+
+F64 = torch.float64
+FILM = [tf.Plane(z=-0.5, facing="+z", stiffness=16.0), tf.Plane(z=0.5, facing="-z")]
+
+SETS = {
+    "free growth in the plane": (2, {}),
+    "pressure in the plane": (2, {"length_drag": 10.0}),
+    "little drag on length": (2, {"length_drag": 1.0, "viscosity": 0.1}),
+    "between agarose and coverslip": (3, {"walls": FILM}),
+    "in space": (3, {"length_drag": 10.0}),
+    "a channel": (2, {"walls": [tf.Channel(5.0, low_end=-9.0, high_end=9.0)]}),
+    "a box in space": (3, {"walls": [tf.Box(low=(-4, -4, -1.5), high=(4, 4, 1.5))]}),
+    "in a ball": (3, {"walls": [tf.Sphere((0.0, 0.0, 0.0), 4.5, inside=True)]}),
+    "around a post": (2, {"walls": [tf.Sphere((0.0, 3.0), 2.0, inside=False)]}),
+    "soft cells": (2, {"stiffness": 50.0}),
+    "α given, nearly hard": (2, {"alpha": 1e-6, "length_drag": 10.0}),
+    "α given": (2, {"alpha": 0.05, "length_drag": 10.0}),
+    "a drag for each cell": (2, {"length_drag": tf.LogNormal(1e3, 1.0)}),
+    "sub-steps": (2, {"max_elongation": 0.04}),
+}
+
+
+def model(name: str, backend: str, colonies: int = 2, dtype=F64, **more):
+    dim, given = SETS[name]
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Division(length=tf.Uniform(2.5, 3.5)),
+        tf.Mechanics(dim=dim, backend=backend, **{"tolerance": 1e-6, **given, **more}),
+        dt=0.05,
+    )
+    return scene.bind(colonies, seed=4, dtype=dtype)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_both_paths_take_the_same_steps(name):
+    fast, plain = model(name, "compiled"), model(name, "torch")
+    state = fast.start()
+    for _ in range(90):
+        state = fast.step(state, 0.05)
+        if state.cells >= 2 * 24:
+            break
+    assert state.cells >= 2 * 8, "too few cells: the comparison would prove little"
+    for _ in range(3):
+        one, other = fast.step(state, 0.05), plain.step(state, 0.05)
+        for field in ("position", "axis", "length", "displacement"):
+            difference = (getattr(one, field) - getattr(other, field)).abs().max()
+            assert float(difference) <= 1e-9, (field, float(difference))
+        a, b = one.reports["mechanics"], other.reports["mechanics"]
+        assert float((one.contact_alpha / other.contact_alpha - 1).abs().max()) <= 1e-6
+        assert a.status.tolist() == b.status.tolist() == [0, 0]
+        for count in ("passes", "clipped", "deeply_overlapping", "substeps"):
+            assert getattr(a, count).tolist() == getattr(b, count).tolist(), count
+        state = one
+    assert (a.iterations > 0).any(), "nothing pushed: the comparison would prove nothing"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_number_of_threads_and_the_batch_change_no_bit(dim, monkeypatch):
+    """More colonies than threads, of several sizes; then some of them alone, in another order."""
+    scene = tf.Scene(
+        tf.Growth(rate=tf.PerColony(torch.linspace(0.6, 1.4, 12))),
+        tf.Division(length=tf.Uniform(2.5, 3.5)),
+        tf.Mechanics(dim=dim),
+        dt=0.05,
+    )
+    monkeypatch.setattr(compiled, "WORTH_THREADS", 1)
+    before, runs = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 4, 8, 16):
+            torch.set_num_threads(threads)
+            *_, last = tf.simulate(scene, until=4.0, colonies=12, seed=3)
+            runs.append(last)
+    finally:
+        torch.set_num_threads(before)
+    assert len(set(runs[0].counts.tolist())) > 3
+    for other in runs[1:]:
+        for field in ("position", "axis", "length", "displacement", "contact_alpha"):
+            assert torch.equal(getattr(runs[0], field), getattr(other, field)), field
+
+
+def test_without_numba_contacts_are_computed_by_torch_and_it_is_said_once(monkeypatch):
+    compiled.unavailable.cache_clear()
+    loaded = [name for name in sys.modules if name.startswith("torchfilm.kernels.")]
+    for name in (*loaded, "numba"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    try:
+        scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), dt=0.05)
+        with pytest.warns(RuntimeWarning, match="Numba cannot be imported.*Install numba"):
+            bound = scene.bind()
+        assert bound.step(bound.start(), 0.05).cells == 1
+        scene.bind()  # no second warning: warnings are errors here
+        with pytest.raises(tf.InputError, match="backend = 'compiled', but Numba"):
+            tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, backend="compiled")).bind()
+    finally:
+        compiled.unavailable.cache_clear()
+
+
+COMPILE = """
+import numpy as np
+from torchfilm.kernels import compiling, neighbours
+x = np.random.default_rng(0).random((50, 2)) * 20
+axis, half, radius = np.tile([1.0, 0.0], (50, 1)), np.ones(50), np.full(50, 0.5)
+first, second = neighbours.near_pairs(x, axis, half, radius, 0.3)
+print(compiling.FOLDER is not None, first.size)
+"""
+
+
+def compile_in(cache: Path, count: int) -> list[list[str]]:
+    """What `count` processes print that start at once and compile with this cache."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", COMPILE], env=environment, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(count)
+    ]
+    out = [process.communicate(timeout=300)[0].split() for process in started]
+    assert all(process.returncode == 0 for process in started)
+    return out
+
+
+@pytest.mark.slow
+def test_kernels_compile_where_nothing_can_be_kept(tmp_path):
+    (tmp_path / "file").touch()
+    ((kept, pairs),) = compile_in(tmp_path / "file", 1)
+    assert kept == "False" and int(pairs) > 0
+
+
+@pytest.mark.slow
+def test_two_processes_compile_at_once_and_a_third_finds_what_they_kept(tmp_path):
+    one, other = compile_in(tmp_path, 2)
+    assert one == other and one[0] == "True"
+    (folder,) = (tmp_path / "torchfilm").iterdir()
+    kept = {file.name: file.stat().st_mtime_ns for file in folder.rglob("*.nb?")}
+    assert any(name.endswith(".nbc") for name in kept)
+    assert compile_in(tmp_path, 1) == [one]
+    assert kept == {file.name: file.stat().st_mtime_ns for file in folder.rglob("*.nb?")}

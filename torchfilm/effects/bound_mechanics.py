@@ -1,0 +1,234 @@
+"""Contact mechanics of a batch: its walls on the device, its settings, and who computes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchfilm.effect import Binding, BoundEffect
+from torchfilm.effects.mechanics_report import MOST_SUBSTEPS, MechanicsReport
+from torchfilm.physics import compiled, one_sided
+from torchfilm.physics.contact_records import (
+    CLOSE,
+    DEEP,
+    PENALTY,
+    CellProperties,
+    ContactReport,
+    ContactSettings,
+    Moved,
+)
+from torchfilm.physics.contact_step import contact_step
+from torchfilm.physics.one_sided_records import OneSidedSettings, StepInput
+from torchfilm.physics.problem import CONVERGED, NOT_FINITE, TOO_FAST
+from torchfilm.physics.surfaces import Surface
+from torchfilm.resolver import snapshot
+from torchfilm.state import State
+from torchfilm.tools.ragged import Groups, offsets
+
+if TYPE_CHECKING:
+    from torchfilm.effects.mechanics import Mechanics
+
+
+class BoundMechanics(BoundEffect):
+    """Mechanics with its walls on the batch's device and its settings resolved."""
+
+    effect: Mechanics
+
+    def __init__(self, effect: Mechanics, binding: Binding):
+        super().__init__(effect, binding)
+        self.settings: OneSidedSettings | ContactSettings = effect.settings
+        # A surface is made in each step, so that a gradient to a wall's place passes through each
+        # of several backward passes.
+        self.walls = snapshot(effect.walls, "Mechanics.walls", binding.batch)
+        self.kinds = [
+            "stiffness" if w.stiffness is not None else "weight" if w.weight is not None else "hard"
+            for w in self.walls
+        ]
+        self.compiled = effect.backend_on(binding.batch.device) == "compiled"
+
+    def step(self, state: State, dt: float) -> State:
+        if state.cells == 0:
+            return state
+        elongation = state.fields.get("elongation", torch.zeros_like(state.length))
+        steps, status = self._substeps(state, elongation)
+        own_dt = dt / steps.index_select(0, state.colony).to(state.dtype)
+        base = state.length - elongation
+        if isinstance(self.settings, OneSidedSettings):
+            return self._one_sided(state, base, elongation, steps, status, own_dt)
+        return self._bilateral(state, base, elongation, steps, status, own_dt)
+
+    # --- one-sided contacts --------------------------------------------------------------------
+
+    def _one_sided(
+        self,
+        state: State,
+        base: Tensor,
+        elongation: Tensor,
+        steps: Tensor,
+        status: Tensor,
+        own_dt: Tensor,
+    ) -> State:
+        viscosity, length_drag = self._drags(state)
+        surfaces, walls = self._surfaces(state, own_dt)
+        assert isinstance(self.settings, OneSidedSettings)
+        given = StepInput(
+            self.settings, state.groups, state.position, state.axis, base, elongation,
+            state.radius, viscosity, length_drag, torch.where(status == CONVERGED, steps, 0),
+            state.displacement, _of_colonies(state.contact_alpha, state.groups).double(),
+            self._alpha(state, own_dt), state.own_colony_id, surfaces, walls,
+        )  # fmt: skip
+        steps_of = compiled if self.compiled and not _tracked(given) else one_sided
+        found = steps_of.contact_steps(given)
+        report = ContactReport(
+            torch.maximum(status, found.status), found.iterations, found.error, found.passes,
+            found.clipped, found.deeply_overlapping,
+        )  # fmt: skip
+        at = (found.position, found.axis, found.length, found.move)
+        state = self._placed(state, at, base, report, steps)
+        alpha = found.hardness.to(state.dtype).index_select(0, state.colony)
+        return state.with_fields(contact_alpha=alpha)
+
+    def _alpha(self, state: State, own_dt: Tensor) -> Tensor | None:
+        """α of each cell where it is given, (N,); else None."""
+        if self.values.stiffness is not None:
+            return 1.0 / (self.values.stiffness.of_cells(state) * own_dt)
+        if self.values.alpha is not None:
+            return self.values.alpha.of_cells(state).expand(state.cells)
+        return None
+
+    # --- bilateral contacts --------------------------------------------------------------------
+
+    def _bilateral(
+        self,
+        state: State,
+        base: Tensor,
+        elongation: Tensor,
+        steps: Tensor,
+        status: Tensor,
+        own_dt: Tensor,
+    ) -> State:
+        settings, none = self.settings, torch.zeros_like(state.counts)
+        assert isinstance(settings, ContactSettings)
+        viscosity, length_drag = self._drags(state)
+        alpha = self._alpha(state, own_dt)
+        alpha = PENALTY / length_drag if alpha is None else alpha
+        first = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
+        reference = state.position.detach().index_select(0, first).index_select(0, state.colony)
+        surfaces, walls = self._surfaces(state, own_dt)
+        walls = [(k, v if v is None or k != "stiffness" else v * alpha) for k, v in walls]
+        cells = CellProperties(
+            settings,
+            state.radius,
+            viscosity,
+            length_drag,
+            alpha,
+            self._overlap(state, alpha, length_drag, steps),
+            state.own_colony_id,
+            reference,
+            state.displacement,
+            state.groups,
+            surfaces,
+            walls,
+        )
+        passes = torch.where(steps > 1, settings.coarse_passes, settings.passes)
+        report = ContactReport(
+            status, none, torch.zeros_like(none, dtype=state.dtype), none, none, none
+        )
+        clipped = torch.zeros_like(state.colony, dtype=torch.bool)
+        reach = torch.zeros_like(state.radius)
+        at = Moved(state.position, state.axis, base, clipped, reach, state.displacement)
+        share = elongation / steps.index_select(0, state.colony)
+        for k in range(int(steps.max())):
+            at, report = contact_step(
+                cells, at, report, share, (k < steps) & (status == CONVERGED), passes
+            )
+        placed = (at.position, at.axis, at.length, at.first_move)
+        return self._placed(state, placed, base, report, steps)
+
+    @torch.no_grad()
+    def _overlap(self, state: State, alpha: Tensor, length_drag: Tensor, steps: Tensor) -> Tensor:
+        """How deep a contact of each cell may be left, (N,) µm."""
+        if self.settings.overlap is not None:
+            return torch.full_like(state.radius, self.settings.overlap)
+        coarse = (steps > 1).index_select(0, state.colony)
+        usual = torch.where(coarse, CLOSE, DEEP * state.radius)
+        return usual * (alpha * length_drag / PENALTY).clamp(max=1.0)
+
+    # --- both ----------------------------------------------------------------------------------
+
+    def _placed(
+        self,
+        state: State,
+        at: tuple[Tensor, Tensor, Tensor, Tensor],
+        base: Tensor,
+        report: ContactReport,
+        steps: Tensor,
+    ) -> State:
+        """The state with cells at their new position, axis and length, and their last move."""
+        position, axis, length, move = at
+        fields = {"displacement": move}
+        if "elongation" in state.fields:
+            fields["elongation"] = length - base
+        made = MechanicsReport(**vars(report), substeps=steps, counts=state.counts)
+        state = state.replace(position=position, axis=axis, length=length)
+        return state.with_fields(**fields).replace(reports={**state.reports, "mechanics": made})
+
+    def _drags(self, state: State) -> tuple[Tensor, Tensor]:
+        """Viscosity, with the field `drag`, and length drag of each cell, (N,)."""
+        drag = state.fields.get("drag")
+        viscosity = self.values.viscosity.of_cells(state) * (1.0 if drag is None else drag)
+        length_drag = self.values.length_drag.of_cells(state)
+        return viscosity.expand(state.cells), length_drag.expand(state.cells)
+
+    def _surfaces(
+        self, state: State, own_dt: Tensor
+    ) -> tuple[list[Surface], list[tuple[str, Tensor | None]]]:
+        """The surfaces of all walls; the kind of each, and its stiffness · Δt or weight (N,)."""
+        surfaces: list[Surface] = []
+        walls: list[tuple[str, Tensor | None]] = []
+        for k, (wall, kind) in enumerate(zip(self.walls, self.kinds, strict=True)):
+            value = None
+            if kind != "hard":
+                value = self.values[f"walls[{k}].{kind}"].of_cells(state)
+                value = value * own_dt if kind == "stiffness" else value.expand(state.cells)
+            made = wall.surfaces(self.effect.dim)
+            surfaces += made
+            walls += [(kind, value)] * len(made)
+        return surfaces, walls
+
+    @torch.no_grad()
+    def _substeps(self, state: State, elongation: Tensor) -> tuple[Tensor, Tensor]:
+        """How many sub-steps each colony takes, (B,), so that no cell grows by more than
+        `max_elongation` in one; and the status (B,) of colonies that cannot be stepped."""
+        every = torch.cat(
+            [state.position, state.axis, state.length.unsqueeze(1), elongation.unsqueeze(1)], 1
+        )
+        broken = state.groups.any(~torch.isfinite(every).all(1))
+        steps = torch.ceil(state.groups.max(elongation) / self.effect.max_elongation * (1 - 1e-6))
+        status = torch.where(steps > MOST_SUBSTEPS, TOO_FAST, CONVERGED)
+        status = torch.where(broken, NOT_FINITE, status)
+        return torch.where(status == CONVERGED, steps.clamp(min=1), 1).long(), status
+
+
+def _of_colonies(value: Tensor, groups: Groups) -> Tensor:
+    """The greatest value in each colony, (N,) -> (B,), with its gradient; 0 without cells."""
+    most = groups.max(value)
+    if not (torch.is_grad_enabled() and value.requires_grad):
+        return most
+    place = torch.arange(value.numel(), device=value.device)
+    first = groups.max(torch.where(value.detach() == most[groups.owner], place, -1), -1)
+    return torch.where(first < 0, most, value.index_select(0, first.clamp(min=0)))
+
+
+def _tracked(given: StepInput) -> bool:
+    """Whether gradients are required through the step."""
+    if not torch.is_grad_enabled():
+        return False
+    parts = [v for v in vars(given).values() if isinstance(v, Tensor)]
+    parts += [value for _, value in given.walls if value is not None]
+    for surface in given.surfaces:
+        for entry in vars(surface).values():
+            parts += entry if isinstance(entry, tuple) else [entry]
+    return any(isinstance(part, Tensor) and part.requires_grad for part in parts)

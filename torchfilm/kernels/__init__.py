@@ -1,0 +1,1 @@
+"""Compiled kernels for the CPU: loops over arrays, which know nothing of states or effects."""

@@ -1,0 +1,68 @@
+"""The closest points of two capsules, and the line along which nearly parallel ones touch."""
+
+from __future__ import annotations
+
+from torchfilm.kernels.compiling import kernel
+
+
+@kernel
+def clamp(x, half):
+    """x, limited to −half … half."""
+    return min(max(x, -half), half)
+
+
+@kernel
+def squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s, t):
+    """Of the points s and t of two centrelines. b: from centre to centre; a, c: the axes."""
+    dx = bx + t * cx - s * ax
+    dy = by + t * cy - s * ay
+    dz = bz + t * cz - s * az
+    return dx * dx + dy * dy + dz * dz
+
+
+@kernel
+def closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b):
+    """Arc lengths s and t of the closest points, and their squared distance.
+
+    The nearest of five candidates, as in `physics.contacts.closest_points`.
+    """
+    cosine = ax * cx + ay * cy + az * cz
+    on_a = bx * ax + by * ay + bz * az
+    on_b = bx * cx + by * cy + bz * cz
+    nx, ny, nz = ay * cz - az * cy, az * cx - ax * cz, ax * cy - ay * cx
+    sine2 = nx * nx + ny * ny + nz * nz
+    s = 0.0
+    if sine2 >= 1e-12:
+        s = (on_a - cosine * on_b) / sine2
+    s = clamp(s, half_a)
+    t = clamp(cosine * s - on_b, half_b)
+    s = clamp(cosine * t + on_a, half_a)
+    best = squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s, t)
+    for k in range(4):
+        if k < 2:
+            s1 = half_a if k == 0 else -half_a
+            t1 = clamp(cosine * s1 - on_b, half_b)
+        else:
+            t1 = half_b if k == 2 else -half_b
+            s1 = clamp(cosine * t1 + on_a, half_a)
+        d2 = squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s1, t1)
+        if d2 < best:
+            best, s, t = d2, s1, t1
+    return s, t, best
+
+
+@kernel
+def end_of(s, half):
+    """+1 or −1 at an end of the centreline, else 0."""
+    slack = 1e-6 * half + 1e-9
+    return (1.0 if s >= half - slack else 0.0) - (1.0 if s <= slack - half else 0.0)
+
+
+@kernel
+def end_while_sliding(s, free, half, radius, slide):
+    """`end_of` for a contact that may be a line, as in `physics.contacts`."""
+    if slide <= 0:
+        return end_of(s, half)
+    missing = (abs(free) - half) / (slide * radius + 1e-9)
+    sign = 1.0 if free > 0 else (-1.0 if free < 0 else 0.0)
+    return sign * min(max(missing, 0.0), 1.0)

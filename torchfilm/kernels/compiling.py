@@ -1,0 +1,74 @@
+"""Compiling of the kernels with Numba, and where compiled code is kept."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding as llvm
+import numba
+
+config: Any = numba.config
+
+
+def _digest() -> str:
+    """A name for this version of the kernels: Numba looks at the file of a function only, not at
+    the functions that it calls."""
+    found = hashlib.sha256(numba.__version__.encode())
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        found.update(file.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def cache_folder() -> Path | None:
+    """Where compiled kernels are kept, or None where nothing can be written: the user's own cache,
+    since compiled code that others could write must never be loaded."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    folder = Path(home) / "torchfilm" / f"kernels-{_digest()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f"writable-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError:
+        return None
+    return folder
+
+
+FOLDER = cache_folder()
+
+
+def _mark(name: str) -> Path | None:
+    """A file that tells that the kernels of this name were compiled for this processor."""
+    if FOLDER is None:
+        return None
+    processor = hashlib.sha256(
+        f"{llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}".encode()
+    ).hexdigest()[:8]
+    return FOLDER / f"{name.replace(', ', '-')}-{processor}.compiled"
+
+
+def is_kept(name: str) -> bool:
+    """Whether the kernels of this name, such as "2-D, float32", are in the cache."""
+    mark = _mark(name)
+    return mark is not None and mark.exists()
+
+
+def keep(name: str) -> None:
+    """Note that the kernels of this name are in the cache."""
+    mark = _mark(name)
+    if mark is not None:
+        mark.touch()
+
+
+def kernel(function):
+    """Compile a function at its first call with new types; without the interpreter's lock, and
+    without reordering of sums."""
+    before = config.CACHE_DIR
+    config.CACHE_DIR = "" if FOLDER is None else str(FOLDER)
+    try:
+        return numba.njit(nogil=True, cache=FOLDER is not None, error_model="numpy")(function)
+    finally:
+        config.CACHE_DIR = before

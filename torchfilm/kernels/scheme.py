@@ -1,0 +1,39 @@
+"""The numbers of the scheme for one-sided contacts, for the kernels and for torch alike.
+
+The scheme is for cells that only push, under any drag. Neighbours move almost alike, though they
+may move farther than their own width in a step. So rows are made for all pairs that are near, not
+only for those that overlap; a pass moves a cell only so far from its last move; and where cells
+still lie deep, they and their neighbours are solved again. α follows the force: contacts are as
+hard as leaves a small mean overlap, at any drag and any pressure.
+"""
+
+# In mean radii of a colony: rows are made for pairs nearer than MARGIN, and a pass moves a cell at
+# most MARGIN away from its last move; a pass is repeated where cells lie deeper than TOO_DEEP;
+# contacts are as hard as leaves a mean overlap of OVERLAP.
+MARGIN, TOO_DEEP, OVERLAP = 0.6, 0.2, 0.014
+# The same in sub-steps: a colony that takes them is not seen between them.
+DEEP_IN_SUBSTEPS = 0.08
+# The most that α μ L may be at that overlap, and the least as a share of it.
+SOFTEST, HARDEST = 0.04, 1e-4
+# A pressed cell may lose this part of its growth in a step. Where a cell may lose none, overlaps in
+# closed chambers are twice as deep.
+SHRINK = 0.05
+# The first pass is solved again where α turns out to be less than this share of what it was.
+LAG = 0.5
+# Contacts of a pass whose solve has not converged are taken softer by this factor until it does, at
+# most by MOST_SOFTER, and then harder again, each solve from the last.
+SOFTER, MOST_SOFTER = 8.0, 8.0**5
+# A repeated pass moves the cells that lie deep and those up to HOPS contacts away.
+HOPS = 3
+# No cell turns by more than this in one pass, rad.
+MAX_TURN = 0.5
+# Relative error of the contact forces that a solve leaves, root mean square; passes at most.
+TOLERANCE, PASSES = 0.07, 8
+# The share of a Newton round's residual that CG leaves, and of its slope that the line search
+# leaves; rounds a solve, and looks a line search, at most.
+FORCING, LEVEL = 0.2, 0.1
+MOST_ROUNDS, MOST_LOOKS = 200, 30
+# A length nearer to its bound than this, relative to the bound and the step, is at it.
+ROUNDING = 1e-6
+# Lengths that stop at their bound step alone in the round after one that went less than this share.
+CREEP = 0.5

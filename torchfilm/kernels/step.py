@@ -1,0 +1,382 @@
+"""One contact step of some colonies, each by itself: detect, solve, move, and again where cells lie
+deep."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.neighbours import near_pairs, spatial_order
+from torchfilm.kernels.rows import HARD, STIFF, near_contacts, pair_rows, rows_among, wall_rows
+from torchfilm.kernels.scheme import (
+    DEEP_IN_SUBSTEPS,
+    HARDEST,
+    HOPS,
+    LAG,
+    MARGIN,
+    MAX_TURN,
+    MOST_SOFTER,
+    OVERLAP,
+    SHRINK,
+    SOFTER,
+    SOFTEST,
+    TOO_DEEP,
+)
+from torchfilm.kernels.solve import minimise
+
+# Places in the settings, and in a colony's report. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
+# of contacts, radii.
+DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
+ITERATIONS, PASSES, ERROR, CLIPPED, DEEPLY, STATUS = range(6)
+REPORT = 6
+CONVERGED, ITERATION_LIMIT, NOT_FINITE = 0, 1, 2  # as in `physics.problem`
+
+
+@kernel
+def drags(length, radius, viscosity, length_drag, growth, scale, dof):
+    """M^(−½) of each cell, (n, D). A cell that does not grow is rigid: its length cannot move."""
+    D = len(dof)
+    d = 2 if D == 4 else 3
+    for i in range(length.shape[0]):
+        whole = length[i] + 2 * radius[i]
+        across = 1.0 / math.sqrt(viscosity[i] * whole)
+        turn = 1.0 / math.sqrt(viscosity[i] * whole * whole * whole / 12.0)
+        for k in range(D - 1):
+            scale[i, k] = across if k < d else turn
+        scale[i, D - 1] = 1.0 / math.sqrt(length_drag[i]) if growth[i] > 0 else 0.0
+
+
+@kernel
+def move_cells(x, axis, length, y, scale, about, bound, least, dof):
+    """Carry out the move y, its translation at most `bound` from `about` (n, D), and its rotation
+    at most `bound` at the ends. Returns how many were cut short."""
+    D = len(dof)
+    d = 2 if D == 4 else 3
+    clipped = 0
+    for i in range(x.shape[0]):
+        way = 0.0
+        for k in range(d):
+            way += (y[i, k] * scale[i, k] - about[i, k]) ** 2
+        part = bound / math.sqrt(way) if way > bound * bound else 1.0
+        angle = 0.0
+        for k in range(d, D - 1):
+            angle += (y[i, k] * scale[i, k]) ** 2
+        angle = math.sqrt(angle)
+        most = min(2.0 * bound / max(length[i], 1e-9), MAX_TURN)
+        turn = most / angle if angle > most else 1.0
+        if part < 1.0 or turn < 1.0:
+            clipped += 1
+        for k in range(d):
+            step = about[i, k] + part * (y[i, k] * scale[i, k] - about[i, k])
+            y[i, k] = step
+            x[i, k] += step
+        for k in range(d, D - 1):
+            y[i, k] *= turn * scale[i, k]
+        y[i, D - 1] *= scale[i, D - 1]
+        angle *= turn
+        sinc, versine = 1.0, 0.5
+        if angle > 1e-4:
+            sinc, versine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
+        ax, ay = axis[i, 0], axis[i, 1]
+        if d == 2:
+            t = y[i, 2]
+            bx, by = (
+                ax - sinc * t * ay - versine * t * t * ax,
+                ay + sinc * t * ax - versine * t * t * ay,
+            )
+            size = math.sqrt(bx * bx + by * by)
+            axis[i, 0], axis[i, 1] = bx / size, by / size
+        else:
+            az = axis[i, 2]
+            tx, ty, tz = y[i, 3], y[i, 4], y[i, 5]
+            ux, uy, uz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
+            wx, wy, wz = ty * uz - tz * uy, tz * ux - tx * uz, tx * uy - ty * ux
+            bx = ax + sinc * ux + versine * wx
+            by = ay + sinc * uy + versine * wy
+            bz = az + sinc * uz + versine * wz
+            size = math.sqrt(bx * bx + by * by + bz * bz)
+            axis[i, 0], axis[i, 1], axis[i, 2] = bx / size, by / size, bz / size
+        length[i] = max(length[i] + y[i, D - 1], least[i])
+    return clipped
+
+
+@kernel
+def _deep_cells(first, second, keep, gap, deep, n):
+    """Numbers of the cells deeper than `deep` in others and of those up to HOPS contacts away, in
+    order, −1 for the others; and how many."""
+    mark = np.zeros(n, np.int64)
+    for k in range(keep.shape[0]):
+        if gap[k] < -deep:
+            mark[first[keep[k]]] = mark[second[keep[k]]] = 1
+    for hop in range(1, HOPS + 1):
+        for k in range(keep.shape[0]):
+            i, j = first[keep[k]], second[keep[k]]
+            if gap[k] < 0.1 * deep:
+                if mark[i] == hop and mark[j] == 0:
+                    mark[j] = hop + 1
+                elif mark[j] == hop and mark[i] == 0:
+                    mark[i] = hop + 1
+    number, count = np.full(n, -1, np.int32), 0
+    for i in range(n):
+        if mark[i] > 0:
+            number[i] = count
+            count += 1
+    return number, count
+
+
+@kernel
+def _rows(
+    x, axis, half, radius, scale, margin, kinds, places, sizes, root, reach, is_soft, like, dof
+):
+    """All rows of a colony. Returns near pairs, which of them are contacts with which gap, the rows
+    (see `rows`), how many are of pairs, how many there are, and the deepest gap."""
+    n, D = x.shape[0], len(dof)
+    first, second = near_pairs(x, axis, half, radius, margin)
+    keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin)
+    room = 2 * keep.shape[0] + 3 * kinds.shape[0] * n
+    H, gaps = np.empty((2 * room, D), like.dtype), np.empty(room, like.dtype)
+    one, two = np.empty(room, np.int32), np.empty(room, np.int32)
+    soft = np.zeros(room, np.uint8)
+    pairs = pair_rows(
+        x, axis, half, radius, scale, first, second, keep, points, H, gaps, one, two, dof
+    )
+    rows, deepest = wall_rows(
+        x, axis, half, radius, scale, kinds, places, sizes, root, reach, pairs,
+        H, gaps, one, two, soft, is_soft, dof,
+    )  # fmt: skip
+    for k in range(gap.shape[0]):
+        deepest = min(deepest, gap[k])
+    return first, second, keep, gap, H, gaps, one, two, soft, pairs, rows, deepest
+
+
+@kernel
+def _numbers(x, length, scale, growth, least, last, first_pass, hardness, softer, roots, is_soft,
+             alphas, margin, alpha, low, half, reach, root):  # fmt: skip
+    """α, the least scaled Δl, half length, reach of walls and weight of walls of each cell."""
+    end = scale.shape[1] - 1
+    for i in range(x.shape[0]):
+        alpha[i] = softer * (alphas[i] if alphas.shape[0] > 0 else hardness)
+        low[i] = min((least[i] - length[i]) / scale[i, end], 0.0) if growth[i] > 0 else 0.0
+        half[i] = 0.5 * length[i]
+        way = 0.0
+        for k in range(x.shape[1]):
+            way += last[i, k] * last[i, k]
+        reach[i] = margin + (math.sqrt(way) if first_pass else 0.0)
+        for w in range(roots.shape[0]):
+            root[w, i] = math.sqrt(roots[w, i] * alpha[i]) if is_soft[w] else roots[w, i]
+
+
+@kernel
+def _minimise_some(H, one, two, rows, gaps, soft, numbers, count, alpha, low, y, tolerance, cap,
+                   limit, dof):  # fmt: skip
+    """Minimise from y: for all cells, where no numbers are given; or, in a later pass, in which
+    soft walls have already pushed, for the numbered cells among the others at rest. Puts the move
+    into y, 0 for cells at rest."""
+    D = len(dof)
+    if numbers.shape[0] == 0:
+        none = np.zeros(rows, y.dtype)
+        return minimise(H, one, two, rows, gaps, none, alpha, low, y, tolerance, cap, limit, dof)
+    rows = rows_among(H, gaps, one, two, soft, rows, numbers)
+    pushed, part = np.zeros(rows, y.dtype), np.zeros((count, D), y.dtype)
+    for r in range(rows):
+        if soft[r] == STIFF and gaps[r] < 0:
+            pushed[r] = -gaps[r]
+    some_alpha, some_low = np.empty(count, y.dtype), np.empty(count, y.dtype)
+    for i in range(y.shape[0]):
+        if numbers[i] >= 0:
+            some_alpha[numbers[i]], some_low[numbers[i]] = alpha[i], low[i]
+            part[numbers[i]] = y[i]
+    iterations, error, e = minimise(
+        H, one, two, rows, gaps, pushed, some_alpha, some_low, part, tolerance, cap, limit, dof
+    )
+    for i in range(y.shape[0]):
+        for k in range(D):
+            y[i, k] = part[numbers[i], k] if numbers[i] >= 0 else 0.0
+    return iterations, error, e
+
+
+@kernel
+def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, hardness, kinds,
+                places, sizes, roots, is_soft, alphas, settings, report, dof):  # fmt: skip
+    """Grow one colony by `growth` and part what overlaps; x, axis, last and hardness in place.
+
+    x: (n, d) float64. axis (n, d), base, growth, radius, viscosity, length_drag (n,). last: (n, D)
+    the move of the first pass before, from which this one starts. hardness: (1,) α of the colony.
+    roots: (S, n) D of each wall, or its stiffness · Δt where `is_soft`. alphas: (n,) α of
+    each cell where it is given, or (0,). Returns the new lengths.
+    """
+    margin, target, deep, softest = _of_colony(base, growth, radius, viscosity, settings)
+    tolerance, passes, given = settings[TOLERANCE], settings[MOST_PASSES], alphas.shape[0] > 0
+    if hardness[0] <= 0:
+        hardness[0] = softest
+    length, least, scale = base + growth, base - SHRINK * growth, np.empty(last.shape)
+    half, reach, root = np.empty_like(base), np.empty_like(base), np.empty(roots.shape)
+    alpha, low, y = np.empty_like(last[:, 0]), np.empty_like(last[:, 0]), np.empty_like(last)
+    number, softer, rising, kept, held = 0, 1.0, True, y, 0.0
+    while True:
+        drags(length, radius, viscosity, length_drag, growth, scale, dof)
+        _numbers(
+            x, length, scale, growth, least, last, number == 0, hardness[0], softer, roots,
+            is_soft, alphas, margin, alpha, low, half, reach, root,
+        )  # fmt: skip
+        if rising:
+            y[:] = np.where(scale > 0, last / np.maximum(scale, 1e-300), 0.0) * (number == 0)
+        first, second, keep, gap, H, gaps, one, two, soft, pairs, rows, deepest = _rows(
+            x, axis, half, radius, scale, margin, kinds, places, sizes, root, reach, is_soft, last,
+            dof,
+        )  # fmt: skip
+        if number == 0:
+            report[DEEPLY] = 0 if settings[SOFT] > 0 else _deeply(first, second, keep, gap, radius)
+            numbers, count = np.empty(0, np.int32), 0
+        elif deepest >= -deep or number == passes or settings[SOFT] > 0:
+            break
+        else:
+            numbers, count = _deep_cells(first, second, keep, gap, deep, base.shape[0])
+            count = _deep_in_walls(gaps, one, soft, pairs, rows, deep, numbers, count)
+        iterations, error, e = _minimise_some(
+            H, one, two, rows, gaps, soft, numbers, count, alpha, low, y, tolerance,
+            2 * target, int(settings[LIMIT]), dof,
+        )  # fmt: skip
+        report[ITERATIONS] += iterations
+        failed = error > tolerance and error < np.inf
+        if failed and rising and softer < MOST_SOFTER:
+            softer *= SOFTER
+            continue
+        if softer > 1.0 and not failed:  # back towards the α that is wanted
+            kept, held = y.copy(), error
+            softer, rising = softer / SOFTER, False
+            continue
+        if failed and not rising and not given:
+            y[:], error, softer = kept, held, softer * SOFTER
+        if not _noted(report, error, tolerance):
+            break
+        if error <= tolerance and number == 0 and not given:
+            before = hardness[0] * softer  # softer: no harder ones converged
+            hardness[0] = before if failed else _following(e, soft, before, target, softest)
+            if hardness[0] < LAG * before:  # the force has grown: solve again
+                kept, held, rising = y.copy(), error, False
+                continue
+        about = last * (number == 0)
+        report[CLIPPED] = move_cells(x, axis, length, y, scale, about, margin, least, dof)
+        if number == 0:
+            last[:] = y
+        number, softer, rising = number + 1, 1.0, True
+    return length
+
+
+@kernel
+def _noted(report, error, tolerance):
+    """Report a pass. Returns whether its move is a number."""
+    report[PASSES] += 1
+    report[ERROR] = max(report[ERROR], error)
+    if not error < np.inf:
+        report[STATUS] = NOT_FINITE
+    elif error > tolerance:
+        report[STATUS] = max(report[STATUS], ITERATION_LIMIT)
+    return error < np.inf
+
+
+@kernel
+def _of_colony(base, growth, radius, viscosity, settings):
+    """The margin, the overlap that is wanted, how deep is too deep, all µm, and the α of the
+    softest contacts."""
+    wide, drag, n = 0.0, 0.0, base.shape[0]
+    for i in range(n):
+        wide += radius[i] / n
+        drag += viscosity[i] * (base[i] + growth[i] + 2 * radius[i]) / n
+    deep = settings[DEEP] if settings[DEEP] > 0 else TOO_DEEP * wide
+    softest = SOFTEST * settings[YIELD] / OVERLAP / drag
+    return MARGIN * wide, settings[YIELD] * wide, deep, softest
+
+
+@kernel
+def _deep_in_walls(gaps, one, soft, pairs, rows, deep, numbers, count):
+    """Number the cells deeper than `deep` in a hard wall, too. Returns how many have numbers."""
+    for r in range(pairs, rows):
+        if soft[r] == HARD and gaps[r] < -deep and numbers[one[r]] < 0:
+            numbers[one[r]] = count
+            count += 1
+    return count
+
+
+@kernel
+def _deeply(first, second, keep, gap, radius):
+    """How many cells lie deeper in another than a radius."""
+    deeply = np.zeros(radius.shape[0], np.int64)
+    for k in range(keep.shape[0]):
+        i, j = first[keep[k]], second[keep[k]]
+        if gap[k] < -0.5 * (radius[i] + radius[j]):
+            deeply[i] = deeply[j] = 1
+    return deeply.sum()
+
+
+@kernel
+def _following(e, soft, hardness, target, softest):
+    """α at which the mean overlap of the contacts that push, with cells and with hard walls, is
+    `target`, µm: harder at once, softer by a factor of two a step."""
+    total, count = 0.0, 0
+    for r in range(e.shape[0]):
+        if e[r] < 0 and soft[r] == HARD:
+            total -= e[r]
+            count += 1
+    wanted = softest
+    if count:
+        force = total / count / hardness
+        if force > 0:
+            wanted = min(wanted, target / force)
+    return max(min(wanted, 2.0 * hardness), HARDEST * softest)
+
+
+@kernel
+def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosity, length_drag,
+                  last, hardness, kinds, places, sizes, roots, is_soft, alphas, settings, reports,
+                  dof):  # fmt: skip
+    """Steps of the colonies `which`, steps[b] sub-steps each: everything is changed in place.
+
+    Cells of colony b are begin[b] … begin[b + 1] − 1. x: (N, d) float64. length: before growth.
+    places: (S, B, 3); sizes: (S, B). reports: (B, REPORT). For the others see `step_colony`.
+    """
+    D = len(dof)
+    d = 2 if D == 4 else 3
+    for b in which:
+        n = begin[b + 1] - begin[b]
+        if n == 0 or steps[b] == 0:
+            continue
+        of = spatial_order(x[begin[b] : begin[b + 1]], 6.0 * radius[begin[b]]) + begin[b]
+        own_x, own_axis = np.empty((n, d)), np.empty((n, d))
+        own_last = np.empty((n, D), last.dtype)
+        own_roots = np.empty((roots.shape[0], n))
+        for i in range(n):
+            for k in range(d):
+                own_x[i, k], own_axis[i, k] = x[of[i], k], axis[of[i], k]
+            for k in range(D):
+                own_last[i, k] = last[of[i], k]
+            for w in range(roots.shape[0]):
+                own_roots[w, i] = roots[w, of[i]]
+        own_length = length[of].astype(np.float64)
+        share = growth[of].astype(np.float64) / steps[b]
+        own_settings = settings.copy()
+        if steps[b] > 1 and settings[DEEP] <= 0:
+            own_settings[DEEP] = DEEP_IN_SUBSTEPS * radius[begin[b] : begin[b + 1]].mean()
+        own_radius = radius[of].astype(np.float64)
+        own_viscosity = viscosity[of].astype(np.float64)
+        own_drag = length_drag[of].astype(np.float64)
+        own_alphas = alphas[of] if alphas.shape[0] else alphas
+        for _ in range(steps[b]):
+            own_length = step_colony(
+                own_x, own_axis, own_length, share, own_radius, own_viscosity, own_drag, own_last,
+                hardness[b : b + 1], kinds, places[:, b], sizes[:, b], own_roots, is_soft,
+                own_alphas, own_settings, reports[b], dof,
+            )  # fmt: skip
+            if reports[b, STATUS] == NOT_FINITE:
+                break
+        if reports[b, STATUS] == NOT_FINITE:
+            continue
+        for i in range(n):
+            for k in range(d):
+                x[of[i], k], axis[of[i], k] = own_x[i, k], own_axis[i, k]
+            for k in range(D):
+                last[of[i], k] = own_last[i, k]
+            length[of[i]] = own_length[i]

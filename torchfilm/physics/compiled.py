@@ -1,0 +1,149 @@
+"""Steps of one-sided contacts by compiled kernels: the same as `one_sided`, on the CPU."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.physics.one_sided_records import StepInput, StepResult
+from torchfilm.physics.surfaces import FlatSurface
+from torchfilm.tools.ragged import offsets
+
+# Batches with fewer cells than this take one thread: to start the others costs more.
+WORTH_THREADS = 2000
+
+
+@cache
+def unavailable() -> str:
+    """Why kernels cannot be compiled here, or "" where they can."""
+    try:
+        import numba  # noqa: F401
+    except ImportError as error:
+        reason = f"Numba cannot be imported ({error})"
+        warnings.warn(
+            f"{reason}: contacts are computed by torch, ten times slower or more. Install numba.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return reason
+    return ""
+
+
+@cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="torchfilm")
+
+
+@cache
+def _announce(name: str) -> None:
+    """Say, once, that the kernels of this name have to be compiled first."""
+    from torchfilm.kernels.compiling import is_kept, keep
+
+    if not is_kept(name):
+        print(
+            f"torchfilm: compiling contacts ({name}), some 20 s, once on this machine",
+            file=sys.stderr,
+        )
+        keep(name)
+
+
+@torch.no_grad()
+def contact_steps(given: StepInput) -> StepResult:
+    """As `one_sided.contact_steps`."""
+    from torchfilm.kernels import step as kernels
+
+    dtype = given.radius.dtype
+    _announce(f"{given.settings.dim}-D, {str(dtype).removeprefix('torch.')}")
+    counts = given.groups.counts
+    begin, steps = offsets(counts).numpy(), given.steps.numpy()
+    position, axis = given.position.clone(), given.axis.clone()
+    length, move = given.length.clone(), given.start.clone()
+    hardness = given.hardness.clone()
+    contiguous = lambda x: x.to(dtype).contiguous().numpy()
+    settings = given.settings
+    numbers = np.array(
+        [
+            -1.0 if settings.overlap is None else settings.overlap,
+            settings.tolerance,
+            settings.passes,
+            settings.max_iterations,
+            settings.soft,
+            settings.contact_overlap,
+        ],
+        dtype=np.float64,
+    )
+    reports = np.zeros((counts.numel(), kernels.REPORT))
+    arguments = (
+        begin, steps, position.numpy(), axis.numpy(), length.numpy(),
+        contiguous(given.growth), contiguous(given.radius), contiguous(given.viscosity),
+        contiguous(given.length_drag), move.numpy(), hardness.numpy(), *_walls(given),
+        contiguous(given.radius[:0] if given.alpha is None else given.alpha), numbers, reports,
+        (0,) * settings.degrees,
+    )  # fmt: skip
+    for done in _started(kernels.step_colonies, begin, counts.numpy(), arguments):
+        done()
+    column = lambda k: torch.from_numpy(reports[:, k].astype(np.int64))
+    return StepResult(
+        position, axis, length, move, hardness, column(kernels.STATUS),
+        column(kernels.ITERATIONS), torch.from_numpy(reports[:, kernels.ERROR].copy()),
+        column(kernels.PASSES), column(kernels.CLIPPED), column(kernels.DEEPLY),
+    )  # fmt: skip
+
+
+def _started(kernel, begin: np.ndarray, counts: np.ndarray, arguments: tuple):
+    """Calls that return when a share of the colonies is done. Colonies never meet, so the result
+    does not depend on the number of threads."""
+    threads = min(torch.get_num_threads(), counts.size)
+    if threads < 2 or begin[-1] < WORTH_THREADS:
+        kernel(np.arange(counts.size), *arguments)
+        return []
+    # the largest first, each to the thread with the least work
+    work = [0] * threads
+    shares: list[list[int]] = [[] for _ in range(threads)]
+    for colony in np.argsort(-counts, kind="stable"):
+        least = work.index(min(work))
+        work[least] += int(counts[colony])
+        shares[least].append(colony)
+    pool = _pool(os.getpid(), threads)
+    return [pool.submit(kernel, np.array(s, np.int64), *arguments).result for s in shares if s]
+
+
+def _walls(given: StepInput) -> tuple[np.ndarray, ...]:
+    """Kinds (S,), places (S, B, 3), sizes (S, B), D or stiffness · Δt (S, N), and which are soft
+    (S,)."""
+    from torchfilm.kernels import rows
+
+    surfaces, colonies = given.surfaces, given.groups.size
+    ids = given.ids
+    kinds = np.zeros(len(surfaces), np.int64)
+    places = np.zeros((len(surfaces), colonies, 3))
+    sizes = np.zeros((len(surfaces), colonies))
+    roots = np.ones((len(surfaces), given.radius.shape[0]))
+    soft = np.zeros(len(surfaces), np.uint8)
+    for k, (surface, (kind, value)) in enumerate(zip(surfaces, given.walls, strict=True)):
+        if isinstance(surface, FlatSurface):
+            place, size, kinds[k] = surface.normal, surface.offset, rows.FLAT
+        else:
+            place, size = surface.center, surface.radius
+            kinds[k] = rows.INSIDE if surface.inside else rows.OUTSIDE
+        for c, entry in enumerate(place):
+            places[k, :, c] = _of_colonies(entry, ids)
+        sizes[k] = _of_colonies(size, ids)
+        soft[k] = kind == "stiffness"
+        if value is not None:
+            roots[k] = value.numpy()
+    return kinds, places, sizes, roots, soft
+
+
+def _of_colonies(given: float | Tensor, ids: Tensor):
+    """A wall's number for each colony of the batch."""
+    if not isinstance(given, Tensor):
+        return given
+    return given.double().numpy() if given.dim() == 0 else given.double()[ids].numpy()

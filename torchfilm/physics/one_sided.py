@@ -1,0 +1,376 @@
+"""Steps of one-sided contacts in tensors: the reference, for gradients and for CUDA."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchfilm.kernels.scheme import (
+    DEEP_IN_SUBSTEPS,
+    HARDEST,
+    HOPS,
+    LAG,
+    MARGIN,
+    MAX_TURN,
+    MOST_SOFTER,
+    OVERLAP,
+    SHRINK,
+    SOFTER,
+    SOFTEST,
+    TOO_DEEP,
+)
+from torchfilm.physics import capsule
+from torchfilm.physics.adjoint import attach_gradient
+from torchfilm.physics.contacts import (
+    CandidateContacts,
+    Capsules,
+    Contacts,
+    end_of,
+    line_points,
+    rows_at,
+    slide_of,
+)
+from torchfilm.physics.jacobian import ContactJacobian
+from torchfilm.physics.neighbours import Neighbourhood
+from torchfilm.physics.one_sided_records import StepInput, StepResult
+from torchfilm.physics.one_sided_solve import Minimum, minimise
+from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
+from torchfilm.physics.solve import warn_if_loose
+from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
+from torchfilm.tools.vectors import cross, dot, safe_norm
+
+
+def contact_steps(given: StepInput) -> StepResult:
+    """Grow by given.growth and part what overlaps, in given.steps (B,) sub-steps."""
+    steps = given.steps
+    none = torch.zeros_like(steps)
+    at = StepResult(
+        given.position, given.axis, given.length, given.start, given.hardness,
+        none, none, torch.zeros_like(given.hardness), none, none, none,
+    )  # fmt: skip
+    growth = given.growth / steps.clamp(min=1).index_select(0, given.groups.owner)
+    for k in range(int(steps.max()) if steps.numel() else 0):
+        at = _OneStep(given, at.length, growth, (k < steps) & (at.status != NOT_FINITE)).taken(at)
+    return at
+
+
+class _OneStep:
+    """One sub-step of the active colonies, (B,) bool, from cells of this length, (N,)."""
+
+    def __init__(self, given: StepInput, length: Tensor, growth: Tensor, active: Tensor):
+        self.given, self.groups, self.dim = given, given.groups, given.settings.dim
+        self.growth, self.active = growth, active
+        count = self.groups.counts.clamp(min=1)
+        mean = lambda x: self.groups.sum(x.double().unsqueeze(1)).squeeze(1) / count
+        self.wide = mean(given.radius)
+        yielding = given.settings.contact_overlap
+        self.target = yielding * self.wide
+        whole = length + growth + 2 * given.radius
+        self.softest = SOFTEST * yielding / OVERLAP / mean(given.viscosity * whole)
+        with torch.no_grad():
+            overlap = given.settings.overlap
+            self.deep = (
+                torch.where(given.steps > 1, DEEP_IN_SUBSTEPS, TOO_DEEP) * self.wide
+                if overlap is None
+                else torch.full_like(self.wide, overlap)
+            )
+        self.of_cells = lambda x: x.index_select(0, self.groups.owner).to(given.radius.dtype)
+
+    def taken(self, at: StepResult) -> StepResult:
+        """The result after this step."""
+        given, active = self.given, self.active
+        if not bool(active.any()):
+            return at
+        base = at.length
+        least = base - SHRINK * self.growth.clamp(min=0.0)
+        on = active.index_select(0, self.groups.owner)
+        at = replace(at, length=torch.where(on, base + self.growth, base))
+        hardness = torch.where(at.hardness > 0, at.hardness, self.softest)
+        at = replace(at, hardness=hardness)
+        limit = int(given.settings.passes)
+        for number in range(limit + 1):
+            pairs, walls = self._contacts(at, active, number == 0)
+            gap = pairs.gap.detach()
+            if number == 0 and not given.settings.soft:
+                at = replace(at, deeply_overlapping=self._deeply(pairs, gap, active, at))
+            if number > 0:
+                moving = self._deep_cells(pairs, gap, walls)
+                active = active & self.groups.any(moving)
+                if number == limit or given.settings.soft or not bool(active.any()):
+                    break
+                moving = moving & active.index_select(0, self.groups.owner)
+            else:
+                moving = on
+            at = self._pass(at, pairs, walls, moving, active, least, number == 0)
+            active = active & (at.status != NOT_FINITE)
+        return at
+
+    # --- find ----------------------------------------------------------------------------------
+
+    def _contacts(
+        self, at: StepResult, active: Tensor, first_pass: bool
+    ) -> tuple[CandidateContacts, WallContacts]:
+        """Pairs of cells nearer than the margin, in float64, and cells nearer to walls than that
+        and their last move."""
+        given, owner = self.given, self.groups.owner
+        rows = torch.nonzero(active.index_select(0, owner)).squeeze(1)
+        start = given.position.detach().index_select(0, rows[:1])  # only for the size of numbers
+        local, axis = at.position - start, at.axis.double()
+        length, radius = at.length.double(), given.radius.double()
+        margin = MARGIN * self.wide.index_select(0, owner)
+        pick = lambda x: x.detach().index_select(0, rows)
+        near = Neighbourhood(
+            pick(local), pick(axis), pick(length), pick(radius),
+            pick(owner), self.groups.size, pick(margin),
+        )  # fmt: skip
+        first, second = (rows.index_select(0, side) for side in near.pairs())
+        first, second = torch.minimum(first, second), torch.maximum(first, second)
+        capsules = Capsules(local.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
+        found = CandidateContacts.all_of(capsules, first, second)
+        keep = found.gap.detach() < margin.index_select(0, first)
+        last = at.move.detach()[:, : self.dim].double().square().sum(1).sqrt()
+        reach = margin + last if first_pass else margin
+        position, axis, length, radius, ids, reach = (
+            x.index_select(0, rows)
+            for x in (at.position, axis, length, radius, given.colony_ids, reach)
+        )
+        walls = find_wall_contacts(given.surfaces, position, axis, length, radius, ids, reach=reach)
+        walls = replace(walls, cell=rows.index_select(0, walls.cell))
+        return found.take(torch.nonzero(keep).squeeze(1)), walls
+
+    def _deeply(self, pairs, gap: Tensor, active: Tensor, at: StepResult) -> Tensor:
+        """How many cells of each colony lie deeper in another than a radius, (B,)."""
+        deep = torch.nonzero(gap < -0.5 * (pairs.a.radius + pairs.b.radius)).squeeze(1)
+        marked = torch.zeros_like(self.given.radius)
+        marked[torch.cat([pairs.first[deep], pairs.second[deep]])] = 1.0
+        found = self.groups.sum(marked.unsqueeze(1)).squeeze(1).long()
+        return torch.where(active, found, at.deeply_overlapping)
+
+    def _deep_cells(self, pairs, gap: Tensor, walls: WallContacts) -> Tensor:
+        """The cells deep in others or in a hard wall, and those up to HOPS contacts from the
+        former, (N,) bool."""
+        mark = torch.zeros_like(self.given.radius, dtype=torch.bool)
+        deep = self.deep.index_select(0, self.groups.owner.index_select(0, pairs.first))
+        far = torch.nonzero(gap < -deep).squeeze(1)
+        mark[torch.cat([pairs.first[far], pairs.second[far]])] = True
+        near = torch.nonzero(gap < 0.1 * deep).squeeze(1)
+        one, other = pairs.first[near], pairs.second[near]
+        for _ in range(HOPS):
+            more = torch.cat([other[mark[one]], one[mark[other]]])
+            mark = mark.index_fill(0, more, True)
+        root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
+        hard = ~soft & (root >= 1)  # a lighter wall is meant to give way
+        limit = self.deep.index_select(0, self.groups.owner.index_select(0, walls.cell))
+        mark[walls.cell[hard & (walls.gap.detach() < -limit)]] = True
+        return mark
+
+    def _wall_roots(self, walls: WallContacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
+        """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
+        root = torch.ones_like(walls.gap)
+        soft = torch.zeros_like(walls.cell, dtype=torch.bool)
+        for number, (kind, value) in enumerate(self.given.walls):
+            if value is None:
+                continue
+            here = walls.surface == number
+            own = value.index_select(0, walls.cell)
+            if kind == "stiffness":
+                own = (own * alpha.index_select(0, walls.cell)).sqrt()
+                soft = soft | here
+            root = torch.where(here, own, root)
+        return root, soft
+
+    # --- solve and move ------------------------------------------------------------------------
+
+    def _pass(self, at, pairs, walls, moving, active, least, first_pass: bool) -> StepResult:
+        """One solve of the moving cells (N,) bool among the others at rest, and their moves."""
+        given, settings = self.given, self.given.settings
+        solved = self._solved(at, pairs, walls, moving, active, least, first_pass)
+        part, end, y = solved.problem, solved.end, solved.end.y
+        if torch.is_grad_enabled() and part.tracked:
+            warn_if_loose(settings.tolerance)
+            tolerance = torch.full_like(end.error, settings.tolerance).to(y.dtype)
+            y = attach_gradient(part, end, tolerance, settings.max_iterations, given.ids)
+        move = torch.zeros_like(at.move).index_copy(
+            0, torch.nonzero(moving).squeeze(1), y * part.scale
+        )
+        sound = (end.error < torch.inf) & active
+        status = torch.where(end.error <= settings.tolerance, CONVERGED, ITERATION_LIMIT)
+        status = torch.where(end.error < torch.inf, status, NOT_FINITE)
+        if first_pass and given.alpha is None:
+            after = part.gap_after(y) if y.requires_grad else end.after
+            followed = self._followed(solved.hardness, part, after, walls)
+            followed = torch.where(solved.fell, solved.hardness, followed)
+            good = sound & (end.error <= settings.tolerance)
+            at = replace(at, hardness=torch.where(good, followed, at.hardness))
+        at = replace(
+            at,
+            status=torch.where(active, torch.maximum(at.status, status), at.status),
+            iterations=at.iterations + torch.where(active, solved.spent, 0),
+            error=torch.where(active, torch.maximum(at.error, end.error), at.error),
+            passes=at.passes + active,
+        )
+        return self._moved(at, move, moving & self.of_cells(sound).bool(), least, first_pass)
+
+    def _solved(self, at, pairs, walls, moving, active, least, first_pass: bool) -> _Solved:
+        """Solve for the moving cells: with softer contacts where a solve does not converge, then
+        harder again; and in a first pass again where the force has grown much."""
+        given, settings = self.given, self.given.settings
+        cells, whole = torch.nonzero(moving).squeeze(1), bool(moving.all())
+        hardness, softer = at.hardness, torch.ones_like(at.hardness)
+        follows = first_pass and given.alpha is None
+        spent, fell = torch.zeros_like(at.iterations), torch.zeros_like(active)
+        again, rising = active, torch.ones_like(active)
+        end: Minimum | None = None
+        kept: Minimum | None = None
+        while True:
+            part = self._problem(at, pairs, walls, hardness * softer, softer, least, first_pass)
+            part = part if whole else part.among(moving)
+            if end is not None and not bool(again.any()):
+                return _Solved(part, end, hardness * softer, spent, fell)
+            start = torch.zeros_like(part.scale)
+            if first_pass:
+                scale = part.scale.detach()
+                start = torch.where(scale > 0, at.move.detach()[cells] / scale, 0.0)
+            if end is not None:  # colonies whose contacts grow harder go on
+                going_on = (~rising).index_select(0, part.colonies.owner).unsqueeze(1)
+                start = torch.where(going_on, end.y, start)
+            with torch.no_grad():
+                found = minimise(
+                    part.detached(), start, settings.tolerance,
+                    2 * self.target, settings.max_iterations,
+                )  # fmt: skip
+                end = found if end is None else found.where(again, end, part)
+                spent = spent + torch.where(again, end.iterations, 0)
+                failed = again & (end.error > settings.tolerance) & (end.error < torch.inf)
+                up = failed & rising & (softer < MOST_SOFTER)
+                down = again & ~failed & (softer > 1)
+                falls = failed & ~rising & (given.alpha is None)
+                fell = fell | falls
+                lags = again & ~failed & ~down & (end.error < torch.inf) & follows
+                if follows:
+                    wanted = self._followed(hardness, part, end.after, walls)
+                    lags = lags & (wanted < LAG * hardness)
+                    hardness = torch.where(lags, wanted, hardness)
+                end = end if kept is None else kept.where(falls, end, part)
+                kept = end if kept is None else end.where(down | lags, kept, part)
+            factor = torch.where(up | falls, SOFTER, torch.where(down, 1.0 / SOFTER, 1.0))
+            softer, rising = softer * factor, rising & ~(down | lags)
+            again = up | down | lags
+
+    def _problem(self, at, pairs, walls, hardness, softer, least, first_pass) -> ContactProblem:
+        """The linear problem of one pass: α by colony, or the given one times `softer`, (B,)."""
+        given, settings = self.given, self.given.settings
+        alpha = self.of_cells(hardness)
+        if given.alpha is not None:
+            alpha = given.alpha * self.of_cells(softer)
+        dtype = given.radius.dtype
+        contacts = near_rows(pairs)
+        rigid = self.growth.detach() <= 0
+        across, turning, _ = capsule.drag(at.length, given.radius, given.viscosity)
+        turns = settings.degrees - settings.dim - 1
+        length_drag = torch.where(rigid, torch.inf, given.length_drag)
+        drag = [across] * settings.dim + [turning] * turns + [length_drag]
+        scale = torch.stack(drag, 1).rsqrt()
+        root = contacts.weight.sqrt().unsqueeze(1)
+        wall_root, soft = self._wall_roots(walls, alpha)
+        half = lambda row, cell: (row * scale.double().index_select(0, cell)).to(dtype)
+        rows = ContactJacobian(
+            contacts.first,
+            contacts.second,
+            half(contacts.row_first * root, contacts.first),
+            half(contacts.row_second * root, contacts.second),
+            walls.cell,
+            half(walls.row * wall_root.double().unsqueeze(1), walls.cell),
+            at.length.shape[0],
+        )
+        gap = torch.cat([contacts.gap * root.squeeze(1), walls.gap * wall_root]).to(dtype)
+        soft = torch.cat([torch.zeros_like(contacts.first, dtype=torch.bool), soft])
+        applied = torch.zeros_like(gap) if first_pass else torch.where(soft, gap.clamp(max=0), 0.0)
+        low = torch.where(
+            rigid, 0.0, (least - at.length) * length_drag.sqrt().nan_to_num(posinf=0.0)
+        ).clamp(max=0.0)
+        alphas = alpha.unsqueeze(1).expand_as(scale).to(dtype).contiguous()
+        return ContactProblem(rows, gap, applied, alphas, low, scale, rigid, self.groups)
+
+    def _followed(self, hardness: Tensor, problem, after: Tensor, walls: WallContacts) -> Tensor:
+        """α of each colony at which the mean overlap of its contacts, with cells and with hard
+        walls, is the target: harder at once, softer by a factor of two a step."""
+        root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
+        hard = torch.ones_like(after, dtype=torch.bool)  # all rows: the first pass moves all
+        hard[problem.rows.pairs :] = ~soft & (root >= 1)
+        overlap = torch.where(hard, -after, 0.0).clamp(min=0.0).double()
+        both = torch.stack([overlap, (overlap > 0).double()], 1)
+        total = problem.of_rows.sum(both)
+        force = total[:, 0] / total[:, 1].clamp(min=1) / hardness
+        wanted = self.target / torch.where(force > 0, force, 1.0)
+        wanted = torch.where(force > 0, torch.minimum(wanted, self.softest), self.softest)
+        return torch.maximum(torch.minimum(wanted, 2 * hardness), HARDEST * self.softest)
+
+    def _moved(self, at, move, moving, least, first_pass: bool) -> StepResult:
+        """Carry out the moves (N, D) of the moving cells: the translation at most MARGIN radii from
+        the last move, or from 0 in later passes, and the rotation as far at the ends."""
+        dim, bound = self.dim, self.of_cells(MARGIN * self.wide)
+        about = at.move[:, :dim] if first_pass else torch.zeros_like(move[:, :dim])
+        beyond = move[:, :dim] - about
+        way, angle = safe_norm(beyond.T), safe_norm(move[:, dim:-1].T)
+        most = (2.0 * bound / at.length.clamp(min=1e-9)).clamp(max=MAX_TURN)
+        part, turn = (
+            torch.where(x > limit, limit / torch.where(x > limit, x, 1.0), 1.0)
+            for x, limit in ((way, bound), (angle, most))
+        )
+        clipped = moving & ((part < 1) | (turn < 1))
+        step = about + part.unsqueeze(1) * beyond
+        made = torch.cat([step, turn.unsqueeze(1) * move[:, dim:-1], move[:, -1:]], 1)
+        made = torch.where(moving.unsqueeze(1), made, 0.0)
+        axis = torch.where(moving.unsqueeze(1), capsule.rotate(at.axis, made[:, dim:-1]), at.axis)
+        length = at.length + made[:, -1]
+        length = torch.where(length >= least, length, least)
+        count = self.groups.sum(clipped.to(move.dtype).unsqueeze(1)).squeeze(1).long()
+        some = self.groups.any(moving)
+        return replace(
+            at,
+            position=at.position + made[:, :dim].to(at.position.dtype),
+            axis=axis,
+            length=torch.where(moving, length, at.length),
+            move=torch.where(moving.unsqueeze(1), made, at.move) if first_pass else at.move,
+            clipped=torch.where(some, count, at.clipped),
+        )
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A solve of a pass: its problem, minimum, α by colony (B,), all iterations (B,), and where
+    only softer contacts converged, (B,) bool."""
+
+    problem: ContactProblem
+    end: Minimum
+    hardness: Tensor
+    spent: Tensor
+    fell: Tensor
+
+
+def near_rows(pairs: CandidateContacts) -> Contacts:
+    """The rows of all pairs, gaps as they are: one at the closest points, or, where two cells touch
+    along a line, two of weight ½ at its ends."""
+    a, b, s, t = pairs.a, pairs.b, pairs.s, pairs.t
+    turn = cross(a.axis, b.axis).detach()
+    flat = torch.nonzero(slide_of(dot(turn, turn)) > 0).squeeze(1)
+    lines = line_points(a.take(flat), b.take(flat), s[flat], t[flat])
+    *ends, line = lines
+    flat, ends = flat[line], [x[:, line] for x in ends]
+    points = [
+        torch.cat([x.index_copy(0, flat, two[0]), two[1]])
+        for x, two in zip((s, t, end_of(s, a.half), end_of(t, b.half)), ends, strict=True)
+    ]
+    weight = torch.ones_like(s).index_fill(0, flat, 0.5)
+    keep = torch.cat([torch.arange(s.numel(), device=s.device), flat])
+    order = torch.argsort(keep, stable=True)  # the two rows of a line side by side
+    keep = keep.index_select(0, order)
+    points = [x.index_select(0, order) for x in points]
+    gap, row_first, row_second, normal = rows_at(a.take(keep), b.take(keep), *points)
+    pick = lambda x: x.index_select(0, keep)
+    return Contacts(
+        pick(pairs.first), pick(pairs.second), gap, pick(weight), row_first, row_second, normal
+    )
