@@ -45,6 +45,19 @@ def test_growth_rate_through_contacts(dim, mode):
     check(experiment, 0.8)
 
 
+@pytest.mark.parametrize("length_drag", [10.0, 1e5])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_contacts_that_follow_their_force(dim, length_drag):
+    """α depends on what the contacts bore before, also where the force more than doubles in a step
+    and the pass is solved again."""
+
+    def experiment(rate):
+        scene = growing(dim, rate, alpha=None, length_drag=length_drag)
+        return run(scene, seeded(scene))
+
+    check(experiment, 0.8)
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_one_pass_a_step(mode):
     def experiment(rate):

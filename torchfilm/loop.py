@@ -145,7 +145,7 @@ class LastingConcerns:
 
     def __init__(self, on_failure: str) -> None:
         self.on_failure = on_failure
-        self.steps: dict[tuple[str, str], Tensor] = {}
+        self.steps: dict[tuple[str, str], dict[int, int]] = {}  # by colony id
         self.warned: set[tuple[str, str]] = set()
 
     def __call__(self, state: State) -> State:
@@ -157,11 +157,13 @@ class LastingConcerns:
     def _look(self, state: State, key: tuple[str, str], concern) -> State:
         if key in self.warned:
             return state
-        before = self.steps.get(key, torch.zeros_like(state.counts))
-        self.steps[key] = torch.where(concern.where, before + 1, 0)
-        lasting = self.steps[key] >= concern.steps
-        if not bool(lasting.any()):
+        before, ids = self.steps.get(key, {}), state.colony_id
+        here = ids[concern.where].tolist() if bool(concern.where.any()) else []
+        now = self.steps[key] = {k: before.get(k, 0) + 1 for k in here}
+        long = [k for k, steps in now.items() if steps >= concern.steps]
+        if not long:
             return state
+        lasting = torch.isin(ids, torch.tensor(long, device=ids.device))
         text = concern.text(state.colony_id, lasting)
         text = f"step {state.step} (t = {state.time:g} h): {text}"
         if not concern.fails:

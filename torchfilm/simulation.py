@@ -142,13 +142,16 @@ def _monitors(
     timings: Timings | None,
 ) -> list[Monitor]:
     """What looks at each state, in order. cells: of a run that has no other end."""
-    monitors: list[Monitor] = [partial(handle_failures, on_failure=on_failure)]
+    monitors: list[Monitor] = [
+        partial(handle_failures, on_failure=on_failure),
+        LastingConcerns(on_failure),
+    ]
     if recorder is not None:
         monitors.append(partial(_record, recorder, timings))
     monitors += [partial(_observe, observe) for observe in observers]
     if cells is not None:
         monitors.append(EndlessRunWarning(cells))
-    return [*monitors, LastingConcerns(on_failure)]
+    return monitors
 
 
 def _record(recorder: Recorder, timings: Timings | None, state: State) -> None:

@@ -44,7 +44,7 @@ def pairs_deeper_than(depth: float, state: tf.State) -> set[tuple[int, ...]]:
 @pytest.mark.parametrize(
     "dim, walls, cells, less", [(2, (), 1500, 0.02), (3, FILM, 600, 0.05)], ids=["plane", "film"]
 )
-def test_a_colony_grows_as_fast_as_its_cells(measured, dim, walls, cells, less):
+def test_case_41_a_colony_grows_as_fast_as_its_cells(measured, dim, walls, cells, less):
     """As much volume as without mechanics, and contacts stay clean over the whole course. (A
     division takes the volume of the new caps, so neither follows e^{gt} by itself.)"""
     course = []
@@ -61,7 +61,7 @@ def test_a_colony_grows_as_fast_as_its_cells(measured, dim, walls, cells, less):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
-def test_contacts_hold_under_any_drag(measured, backend):
+def test_case_42_contacts_hold_under_any_drag(measured, backend):
     """γ from 1 to 10⁶, μ from 0.01 to 100, radius from 0.2 to 1 µm, drawn for each colony of one
     batch. Where γ is small pressure stops the larger colonies.
 
@@ -98,9 +98,7 @@ def test_contacts_hold_under_any_drag(measured, backend):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("length_drag", [10.0, 1e5])
-def test_growth_stalls_in_a_closed_chamber_and_nothing_is_thrown_when_it_opens(
-    measured, length_drag
-):
+def test_case_43_a_closed_chamber_stalls_and_nothing_is_thrown_when_it_opens(measured, length_drag):
     """Overlap stays ≤ 0.02 µm on average and ≤ 0.1 µm at worst, walls included. When an end opens,
     no cell moves farther in a step than 16 µm of cells may grow, by up to 1.65 · 2.5 % each where
     they are short, and six contacts in a row may give back, 0.1 µm each."""
@@ -129,7 +127,7 @@ def test_growth_stalls_in_a_closed_chamber_and_nothing_is_thrown_when_it_opens(
 
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
 @pytest.mark.parametrize("length_drag", [10.0, 100.0, 1000.0, 1e5])
-def test_every_overlap_of_a_pressed_chain_is_that_of_theory(measured, length_drag, backend):
+def test_case_44_every_overlap_of_a_pressed_chain_is_that_of_theory(measured, length_drag, backend):
     """100 cells tip to tip between two walls: each contact bears the force that stops growth,
     γ · growth, and overlaps by α times that."""
     n, length = 100, 2.0
@@ -158,7 +156,7 @@ def test_every_overlap_of_a_pressed_chain_is_that_of_theory(measured, length_dra
 
 @pytest.mark.slow
 @pytest.mark.parametrize("length_drag", [10.0, 100.0, 1000.0])
-def test_growth_under_pressure_is_that_of_a_tight_solve(measured, length_drag):
+def test_case_45_growth_under_pressure_is_that_of_a_tight_solve(measured, length_drag):
     """Volume of 12 colonies at 300 cells or so: the default tolerance against 1e-4."""
     ends = []
     for tolerance in (None, 1e-4):
@@ -173,7 +171,7 @@ def test_growth_under_pressure_is_that_of_a_tight_solve(measured, length_drag):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("length_drag", [10.0, 1e5])
-def test_a_colony_is_pressed_through_a_gap(measured, length_drag):
+def test_case_46_a_colony_is_pressed_through_a_gap(measured, length_drag):
     """Two posts leave 5 µm of a closed chamber open: the colony grows through.
 
     Contacts are as clean as in a closed chamber but for pairs that are pushed over one another:
@@ -200,7 +198,7 @@ def test_a_colony_is_pressed_through_a_gap(measured, length_drag):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dim, cells", [(2, 10_000), (3, 2_000)])
-def test_a_heap_parts(measured, dim, cells):
+def test_case_47_a_heap_parts(measured, dim, cells):
     """Cells at random that fill four fifths of the plane, or of space, many across one another.
 
     A pass moves a cell by 0.3 µm at most and there are eight in a step, so cells 1 µm deep part

@@ -158,3 +158,45 @@ def test_two_processes_compile_at_once_and_a_third_finds_what_they_kept(tmp_path
     assert any(name.endswith(".nbc") for name in kept)
     assert compile_in(tmp_path, 1) == [one]
     assert kept == {file.name: file.stat().st_mtime_ns for file in folder.rglob("*.nb?")}
+
+
+def two_cells(apart: float, backend: str, **extra) -> tuple[tf.Scene, tf.State]:
+    cells = tf.Cells([[0.0, 0.0], [0.0, apart]], [[1.0, 0.0]] * 2, 2.0, extra=extra)
+    scene = tf.Scene(tf.Growth(rate=0.0), tf.Mechanics(dim=2, backend=backend), founders=cells)
+    return scene, scene.bind(dtype=F64).start()
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+@pytest.mark.parametrize("name", ["displacement", "drag"])
+@pytest.mark.parametrize("apart", [0.8, 9.0])
+def test_what_is_no_number_fails_its_colony(backend, name, apart):
+    scene, state = two_cells(apart, backend, drag=[1.0, 1.0])
+    broken = state.fields[name].clone()
+    broken[0] = float("nan")
+    with pytest.raises(tf.SimulationError, match=r"colony 0 .*is not finite"):
+        list(tf.simulate(scene, state.with_fields(**{name: broken}), until=0.05, dt=0.025))
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_a_cell_that_nothing_pushes_any_more_stops(backend):
+    """However fast it was."""
+    scene, state = two_cells(9.0, backend)
+    moved = state.displacement.clone()
+    moved[:, 0] = 1.5
+    state = state.with_fields(displacement=moved)
+    after = scene.bind(state=state).step(state, 0.025)
+    assert torch.equal(after.position, state.position)
+    assert float(after.displacement.abs().max()) == 0.0
+
+
+def test_a_colony_in_torch_does_not_depend_on_the_others():
+    """Hard contacts, of which some take many rounds: each colony has the bits that it has alone."""
+    model_ = model("α given, nearly hard", "torch", colonies=4, tolerance=0.07)
+    state = model_.start()
+    for _ in range(60):
+        state = model_.step(state, 0.05)
+    last = model_.step(state, 0.05)
+    for k in range(4):
+        alone = model_.step(state.select([k]), 0.05)
+        for field in ("position", "axis", "length", "displacement", "contact_alpha"):
+            assert torch.equal(getattr(alone, field), getattr(last.select([k]), field)), (k, field)

@@ -202,8 +202,9 @@ class BoundMechanics(BoundEffect):
     def _substeps(self, state: State, elongation: Tensor) -> tuple[Tensor, Tensor]:
         """How many sub-steps each colony takes, (B,), so that no cell grows by more than
         `max_elongation` in one; and the status (B,) of colonies that cannot be stepped."""
+        columns = [state.length, elongation, *(x.to(state.dtype) for x in self._drags(state))]
         every = torch.cat(
-            [state.position, state.axis, state.length.unsqueeze(1), elongation.unsqueeze(1)], 1
+            [state.position, state.axis, state.displacement, *(x.unsqueeze(1) for x in columns)], 1
         )
         broken = state.groups.any(~torch.isfinite(every).all(1))
         steps = torch.ceil(state.groups.max(elongation) / self.effect.max_elongation * (1 - 1e-6))

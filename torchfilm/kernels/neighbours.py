@@ -8,9 +8,6 @@ import numpy as np
 
 from torchfilm.kernels.compiling import kernel
 
-# Bins are counted from here, so that boxes that reach below the least centre have positive numbers.
-ORIGIN = 64
-
 
 @kernel
 def _bins(x, axis, half, radius, margin, low, high):
@@ -20,15 +17,16 @@ def _bins(x, axis, half, radius, margin, low, high):
     least = np.full(d, np.inf)
     for i in range(n):
         for k in range(d):
-            size += abs(axis[i, k]) * half[i] + radius[i] + 0.5 * margin
-            least[k] = min(least[k], x[i, k])
+            e = abs(axis[i, k]) * half[i] + radius[i] + 0.5 * margin
+            size += e
+            least[k] = min(least[k], x[i, k] - e)
     width = 2.0 * size / (n * d)
     top = np.zeros(3, np.int64)
     for i in range(n):
         for k in range(d):
             e = abs(axis[i, k]) * half[i] + radius[i] + 0.5 * margin
-            low[i, k] = math.floor((x[i, k] - e - least[k]) / width) + ORIGIN
-            high[i, k] = math.floor((x[i, k] + e - least[k]) / width) + ORIGIN
+            low[i, k] = math.floor((x[i, k] - e - least[k]) / width)
+            high[i, k] = math.floor((x[i, k] + e - least[k]) / width)
             top[k] = max(top[k], high[i, k] + 1)
     return top
 

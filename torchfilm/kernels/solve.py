@@ -346,6 +346,8 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
         error = math.sqrt(max(fall, left, 0.0) / (overlap if overlap > 0 else cap * cap))
         if left == 0.0:  # solved exactly
             error = 0.0
+        elif not left < np.inf:  # also where it is no number
+            error = np.inf
         done = error <= tolerance or not left < np.inf or stuck > 1
         if done or total >= limit or round_ == MOST_ROUNDS:
             break

@@ -204,17 +204,17 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, har
 
     x: (n, d) float64. axis (n, d), base, growth, radius, viscosity, length_drag (n,). last: (n, D)
     the move of the first pass before, from which this one starts. hardness: (1,) α of the colony.
-    roots: (S, n) D of each wall, or its stiffness · Δt where `is_soft`. alphas: (n,) α of
-    each cell where it is given, or (0,). Returns the new lengths.
+    roots: (S, n) D of each wall, or stiffness · Δt. alphas: (n,) given, or (0,). Returns lengths.
     """
     margin, target, deep, softest = _of_colony(base, growth, radius, viscosity, settings)
     tolerance, passes, given = settings[TOLERANCE], settings[MOST_PASSES], alphas.shape[0] > 0
     if hardness[0] <= 0:
         hardness[0] = softest
-    length, least, scale = base + growth, base - SHRINK * growth, np.empty(last.shape)
+    length, scale = base + growth, np.empty(last.shape)
+    least = base - SHRINK * np.maximum(growth, 0.0)
     half, reach, root = np.empty_like(base), np.empty_like(base), np.empty(roots.shape)
     alpha, low, y = np.empty_like(last[:, 0]), np.empty_like(last[:, 0]), np.empty_like(last)
-    number, softer, rising, kept, held = 0, 1.0, True, y, 0.0
+    number, softer, rising, kept, held, kept_alpha = 0, 1.0, True, y, 0.0, 0.0
     while True:
         drags(length, radius, viscosity, length_drag, growth, scale, dof)
         _numbers(
@@ -245,20 +245,20 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, har
             softer *= SOFTER
             continue
         if softer > 1.0 and not failed:  # back towards the α that is wanted
-            kept, held = y.copy(), error
+            kept, held, kept_alpha = y.copy(), error, hardness[0] * softer
             softer, rising = softer / SOFTER, False
             continue
         if failed and not rising and not given:
-            y[:], error, softer = kept, held, softer * SOFTER
+            y[:], error = kept, held
         if not _noted(report, error, tolerance):
             break
         if error <= tolerance and number == 0 and not given:
-            before = hardness[0] * softer  # softer: no harder ones converged
-            hardness[0] = before if failed else _following(e, soft, before, target, softest)
-            if hardness[0] < LAG * before:  # the force has grown: solve again
-                kept, held, rising = y.copy(), error, False
+            before = hardness[0]
+            hardness[0] = kept_alpha if failed else _following(e, soft, before, target, softest)
+            if hardness[0] < LAG * before and not failed:  # the force has grown: solve again
+                kept, held, kept_alpha, rising = y.copy(), error, before, False
                 continue
-        about = last * (number == 0)
+        about = last * (number == 0 and np.any(gaps[:rows] < 0))  # without a push nothing moves
         report[CLIPPED] = move_cells(x, axis, length, y, scale, about, margin, least, dof)
         if number == 0:
             last[:] = y

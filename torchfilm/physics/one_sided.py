@@ -39,6 +39,7 @@ from torchfilm.physics.one_sided_solve import Minimum, minimise
 from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
 from torchfilm.physics.solve import warn_if_loose
 from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
+from torchfilm.tools.ragged import offsets
 from torchfilm.tools.vectors import cross, dot, safe_norm
 
 
@@ -105,6 +106,8 @@ class _OneStep:
                 moving = on
             at = self._pass(at, pairs, walls, moving, active, least, number == 0)
             active = active & (at.status != NOT_FINITE)
+            if not bool(active.any()):
+                break
         return at
 
     # --- find ----------------------------------------------------------------------------------
@@ -116,8 +119,9 @@ class _OneStep:
         and their last move."""
         given, owner = self.given, self.groups.owner
         rows = torch.nonzero(active.index_select(0, owner)).squeeze(1)
-        start = given.position.detach().index_select(0, rows[:1])  # only for the size of numbers
-        local, axis = at.position - start, at.axis.double()
+        first = offsets(self.groups.counts)[:-1].clamp(max=owner.numel() - 1)
+        start = given.position.detach().index_select(0, first)  # only for the size of numbers
+        local, axis = at.position - start.index_select(0, owner), at.axis.double()
         length, radius = at.length.double(), given.radius.double()
         margin = MARGIN * self.wide.index_select(0, owner)
         pick = lambda x: x.detach().index_select(0, rows)
@@ -187,11 +191,8 @@ class _OneStep:
         """One solve of the moving cells (N,) bool among the others at rest, and their moves."""
         given, settings = self.given, self.given.settings
         solved = self._solved(at, pairs, walls, moving, active, least, first_pass)
-        part, end, y = solved.problem, solved.end, solved.end.y
-        if torch.is_grad_enabled() and part.tracked:
-            warn_if_loose(settings.tolerance)
-            tolerance = torch.full_like(end.error, settings.tolerance).to(y.dtype)
-            y = attach_gradient(part, end, tolerance, settings.max_iterations, given.ids)
+        part, end = solved.problem, solved.end
+        y = self._with_gradient(part, end)
         move = torch.zeros_like(at.move).index_copy(
             0, torch.nonzero(moving).squeeze(1), y * part.scale
         )
@@ -211,7 +212,12 @@ class _OneStep:
             error=torch.where(active, torch.maximum(at.error, end.error), at.error),
             passes=at.passes + active,
         )
-        return self._moved(at, move, moving & self.of_cells(sound).bool(), least, first_pass)
+        about = torch.zeros_like(move[:, : self.dim])
+        if first_pass:  # without a push nothing moves
+            pushes = part.of_rows.any(part.gap.detach() < 0).index_select(0, self.groups.owner)
+            about = torch.where(pushes.unsqueeze(1), at.move[:, : self.dim], about)
+        moving = moving & self.of_cells(sound).bool()
+        return self._moved(at, move, about, moving, least, first_pass)
 
     def _solved(self, at, pairs, walls, moving, active, least, first_pass: bool) -> _Solved:
         """Solve for the moving cells: with softer contacts where a solve does not converge, then
@@ -221,7 +227,7 @@ class _OneStep:
         hardness, softer = at.hardness, torch.ones_like(at.hardness)
         follows = first_pass and given.alpha is None
         spent, fell = torch.zeros_like(at.iterations), torch.zeros_like(active)
-        again, rising = active, torch.ones_like(active)
+        again, rising, kept_alpha = active, torch.ones_like(active), hardness
         end: Minimum | None = None
         kept: Minimum | None = None
         while True:
@@ -252,12 +258,28 @@ class _OneStep:
                 if follows:
                     wanted = self._followed(hardness, part, end.after, walls)
                     lags = lags & (wanted < LAG * hardness)
-                    hardness = torch.where(lags, wanted, hardness)
                 end = end if kept is None else kept.where(falls, end, part)
                 kept = end if kept is None else end.where(down | lags, kept, part)
-            factor = torch.where(up | falls, SOFTER, torch.where(down, 1.0 / SOFTER, 1.0))
-            softer, rising = softer * factor, rising & ~(down | lags)
-            again = up | down | lags
+            was, used = kept_alpha, hardness * softer
+            kept_alpha = torch.where(down | lags, used, kept_alpha)
+            if follows and bool(lags.any()):
+                y = self._with_gradient(part, end)
+                after = part.gap_after(y) if y.requires_grad else end.after
+                wanted = self._followed(hardness, part, after, walls)
+                hardness = torch.where(lags, wanted, hardness)
+            hardness = torch.where(falls, was, hardness)
+            factor = torch.where(up, SOFTER, torch.where(down, 1.0 / SOFTER, 1.0))
+            softer = torch.where(falls, 1.0, softer * factor)
+            rising, again = rising & ~(down | lags), up | down | lags
+
+    def _with_gradient(self, part: ContactProblem, end: Minimum) -> Tensor:
+        """The minimum, as a function of what a gradient is required of."""
+        if not (torch.is_grad_enabled() and part.tracked):
+            return end.y
+        settings = self.given.settings
+        warn_if_loose(settings.tolerance)
+        tolerance = torch.full_like(end.error, settings.tolerance).to(end.y.dtype)
+        return attach_gradient(part, end, tolerance, settings.max_iterations, self.given.ids)
 
     def _problem(self, at, pairs, walls, hardness, softer, least, first_pass) -> ContactProblem:
         """The linear problem of one pass: α by colony, or the given one times `softer`, (B,)."""
@@ -308,11 +330,10 @@ class _OneStep:
         wanted = torch.where(force > 0, torch.minimum(wanted, self.softest), self.softest)
         return torch.maximum(torch.minimum(wanted, 2 * hardness), HARDEST * self.softest)
 
-    def _moved(self, at, move, moving, least, first_pass: bool) -> StepResult:
+    def _moved(self, at, move, about, moving, least, first_pass: bool) -> StepResult:
         """Carry out the moves (N, D) of the moving cells: the translation at most MARGIN radii from
-        the last move, or from 0 in later passes, and the rotation as far at the ends."""
+        `about` (N, d), and the rotation as far at the ends."""
         dim, bound = self.dim, self.of_cells(MARGIN * self.wide)
-        about = at.move[:, :dim] if first_pass else torch.zeros_like(move[:, :dim])
         beyond = move[:, :dim] - about
         way, angle = safe_norm(beyond.T), safe_norm(move[:, dim:-1].T)
         most = (2.0 * bound / at.length.clamp(min=1e-9)).clamp(max=MAX_TURN)

@@ -68,10 +68,12 @@ def minimise(
     iterations = torch.zeros(colonies.size, dtype=torch.int64, device=y.device)
     stuck = torch.zeros_like(iterations)
     alone = torch.zeros_like(problem.rigid)  # lengths that step alone
+    going = torch.ones_like(iterations, dtype=torch.bool)
     for number in range(MOST_ROUNDS + 1):
         at = _look(problem, y, after, alone, fall, cap)
         alone = alone & at.held
-        going = (at.error > tolerance) & (at.residual < torch.inf)
+        # who has stopped stays as it is, whatever the others of the batch do
+        going = going & (at.error > tolerance) & (at.residual < torch.inf)
         going = going & (iterations < limit) & (stuck < 2)
         if number == MOST_ROUNDS or not bool(going.any()):
             break
@@ -82,7 +84,7 @@ def minimise(
             Blocks(at.inverse).times,
             colonies,
             target,
-            limit,
+            limit - iterations,
             by_energy=True,
         )
         iterations = iterations + result.iterations
@@ -92,9 +94,10 @@ def minimise(
         change = problem.rows.apply(step)
         share, lost = _search_line(problem, after, change, y, step, most, going)
         fall = torch.where(going, lost, fall)
-        stuck = torch.where(going & (share == 0), stuck + 1, 0)
+        stuck = torch.where(going, torch.where(share == 0, stuck + 1, 0), stuck)
         stopped = step[:, -1] > wanted[:, -1]
-        alone = (alone | stopped) & (going & (share < CREEP)).index_select(0, owner)
+        creeps = (share < CREEP).index_select(0, owner)
+        alone = torch.where(going.index_select(0, owner), (alone | stopped) & creeps, alone)
         share = share.to(y.dtype)
         y = y + share.index_select(0, owner).unsqueeze(1) * step
         near = low + ROUNDING * (low.abs() + step[:, -1].abs())

@@ -63,15 +63,15 @@ def conjugate_gradients(
     precondition: Callable[[Tensor], Tensor],
     groups: Groups,
     target: Tensor,
-    max_iterations: int,
+    max_iterations: int | Tensor,
     by_energy: bool = False,
 ) -> CGResult:
     """Solve A x = b from x = 0 for symmetric positive definite A, one system per group.
 
     b: (N, D). `apply` and `precondition` map (N, D) to (N, D) and keep groups apart. A system stops
     when its greatest preconditioned residual is at most target (B,), or is not finite, or after
-    `max_iterations`; the others continue. by_energy: target is of residual · preconditioned
-    residual instead.
+    `max_iterations`, one number or (B,); the others continue. by_energy: target is of residual ·
+    preconditioned residual instead.
     """
     x = torch.zeros_like(b)
     r = b.clone()
@@ -81,9 +81,11 @@ def conjugate_gradients(
     measure = lambda: rz.squeeze(1) if by_energy else worst_of(z, groups)
     worst = measure()
     going = (worst > target) & (worst < torch.inf)  # neither holds for a NaN
+    limit = torch.as_tensor(max_iterations, device=b.device)
+    going = going & (limit > 0)
     iterations = torch.zeros(groups.size, dtype=torch.int64, device=b.device)
     every = CHECK_EVERY.get(b.device.type, 8)
-    for k in range(max_iterations):
+    for k in range(int(limit.max())):
         if k % every == 0 and not bool(going.any()):
             break
         q = apply(p)
@@ -103,5 +105,5 @@ def conjugate_gradients(
         p = torch.addcmul(z, ratio, p)
         rz = new
         worst = torch.where(going, measure(), worst)
-        going = moves.squeeze(1) & (worst > target) & (worst < torch.inf)
+        going = moves.squeeze(1) & (worst > target) & (worst < torch.inf) & (iterations < limit)
     return CGResult(x, iterations, worst)
