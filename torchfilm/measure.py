@@ -51,14 +51,12 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     return Overlap(mean, pairs.max(depth[deep]), count, state.groups.max(at_walls))
 
 
-@torch.no_grad()
 def colony_centre(state: State) -> Tensor:
     """Centre of volume of each colony, (B, d) µm; NaN for a colony without cells."""
     volume = state.volume.double().unsqueeze(1)
     return state.groups.sum(state.position * volume) / state.groups.sum(volume)
 
 
-@torch.no_grad()
 def colony_radius(state: State) -> Tensor:
     """Radius of the disc with the same second moment as the cells, (B,) µm: √2 · RMS distance.
 

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from record import machine
+from record import machine, write_page
 
 import torchfilm as tf
 
@@ -155,6 +155,31 @@ def show(result: dict) -> None:
     )
 
 
+def table(records: list[dict]) -> str:
+    """Returns a Markdown table of the newest record of each case, regime, backend and threads."""
+    newest = {
+        (r["case"], r["regime"], r["backend"], r["threads"], r["device"]): r
+        for r in records
+        if "regime" in r
+    }
+    lines = [
+        "| colonies × cells | regime | who computes | time, s | µs a cell and step |"
+        " iterations a step | volume over free | mean overlap, µm | worst, µm: median / 99 % / 1 |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for key in sorted(newest, key=lambda k: (list(CASES).index(k[0]), k[1:])):
+        r, (dim, colonies, cells) = newest[key], CASES[key[0]]
+        who = f"{r['backend']}, {r['threads']} thread{'s' * (r['threads'] > 1)}, {r['device']}"
+        worst = " / ".join(f"{r['overlap_worst_um'][q]:.3f}" for q in ("0.5", "0.99", "1"))
+        growth = "–" if r["growth_over_free"] is None else f"{r['growth_over_free']:.3f}"
+        lines.append(
+            f"| {colonies} × {cells}, {dim}-D | {r['regime']} | {who} | {r['seconds']:.2f} |"
+            f" {r['us_per_cell_step']:.1f} | {r['iterations_per_step']:.0f} | {growth} |"
+            f" {r['overlap_course_um']:.4f} | {worst} |"
+        )
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -168,11 +193,18 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--page", action="store_true", help="write docs/performance.md, run nothing"
+    )
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("growth.json"))
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     tf.keep_memory()
     records = json.loads(options.out.read_text()) if options.out.exists() else []
+    if options.page:
+        page = Path(__file__).parents[2] / "docs" / "performance.md"
+        write_page(page, table(records), "experiments/benchmarks/growth.py --page")
+        return
     if options.device == "cpu" and options.backend != "torch":
         records.append(machine() | {"case": "product with JᵀJ"} | product_over_copy())
         print(records[-1])

@@ -86,6 +86,11 @@ def test_a_number_of_passes_leaves_the_overlap_as_it_is(dim):
         assert (given == usual) == (passes == usual.passes)
 
 
+def test_bilateral_contacts_have_a_length_drag_at_which_they_hold():
+    assert tf.Mechanics(contacts="bilateral").length_drag == 10.0
+    assert tf.Mechanics().length_drag == tf.Mechanics(length_drag=None).length_drag == 1e5
+
+
 def test_the_overlap_that_is_left_can_be_named(device, dtype):
     assert deepest(first_step(device, dtype, passes=100, overlap=0.05)) <= 0.05 + 1e-6
 

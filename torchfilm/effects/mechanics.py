@@ -24,19 +24,21 @@ from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, smallest
 
+# The default length drag: free growth, but for bilateral contacts, which do not hold in it.
+LENGTH_DRAG = {"one-sided": 1e5, "bilateral": 10.0}
 CONTACTS, BACKENDS = ("one-sided", "bilateral"), ("compiled", "torch")
 
 
 @dataclass(frozen=True, eq=False)
 class Mechanics(Effect):
     """Cells are capsules that push each other apart; their length is a degree of freedom, so
-    pressure holds growth back.
+    pressure may hold growth back.
 
     walls: what confines them. dim: 3, or 2 for strict 2-D (four degrees of freedom; nothing can
     leave the plane). viscosity: μ. length_drag: γ, resistance to a change of length, in units of
-    μ·µm; a state field `drag` multiplies μ cell by cell. With the default colonies grow at their
-    free rate up to ten thousand cells; with 10, the paper's, pressure slows them from a hundred
-    cells on.
+    μ·µm; a state field `drag` multiplies μ cell by cell. With the default, 1e5, colonies grow at
+    their free rate up to ten thousand cells; with 10, the paper's and the default of bilateral
+    contacts, pressure slows them from a hundred cells on.
 
     contacts: "one-sided" (default), which only push, or "bilateral", the paper's least squares,
     which also hold an overlapping pair that would part. One-sided contacts hold at any drag;
@@ -60,7 +62,7 @@ class Mechanics(Effect):
     walls: Sequence[Wall] = ()
     dim: int = 3
     viscosity: Value = physical(1.0, unit="μ", above=0.0)
-    length_drag: Value = physical(1e5, unit="μ·µm", above=0.0)
+    length_drag: Value | None = physical(None, unit="μ·µm", above=0.0)
     alpha: Value | None = physical(None, above=0.0)
     stiffness: Value | None = physical(None, unit="μ·µm/h", above=0.0)
     contacts: str = "one-sided"
@@ -81,6 +83,8 @@ class Mechanics(Effect):
         checks.choice("Mechanics.contacts", self.contacts, CONTACTS)
         if self.backend is not None:
             checks.choice("Mechanics.backend", self.backend, BACKENDS)
+        if self.length_drag is None:
+            object.__setattr__(self, "length_drag", LENGTH_DRAG[self.contacts])
         super().__post_init__()
         if self.alpha is not None and self.stiffness is not None:
             raise checks.InputError(

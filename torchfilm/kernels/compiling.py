@@ -14,9 +14,9 @@ config: Any = numba.config
 
 
 def _digest() -> str:
-    """A name for this version of the kernels: Numba looks at the file of a function only, not at
-    the functions that it calls."""
-    found = hashlib.sha256(numba.__version__.encode())
+    """A name for this version of the kernels, at this place: Numba looks at the file of a function
+    only, not at the functions that it calls."""
+    found = hashlib.sha256(f"{numba.__version__} {Path(__file__).parent}".encode())
     for file in sorted(Path(__file__).parent.glob("*.py")):
         found.update(file.read_bytes())
     return found.hexdigest()[:16]

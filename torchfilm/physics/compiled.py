@@ -41,26 +41,31 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="torchfilm")
 
 
-@cache
-def _announce(name: str) -> None:
-    """Say, once, that the kernels of this name have to be compiled first."""
-    from torchfilm.kernels.compiling import is_kept, keep
+_called: set[str] = set()  # names of kernels that this process has called
 
-    if not is_kept(name):
-        print(
-            f"torchfilm: compiling contacts ({name}), some 20 s, once on this machine",
-            file=sys.stderr,
-        )
-        keep(name)
+
+def _announce(name: str) -> bool:
+    """Say, once, that the kernels of this name have to be compiled first; whether it was said."""
+    from torchfilm.kernels.compiling import is_kept
+
+    if name in _called or is_kept(name):
+        return False
+    print(
+        f"torchfilm: compiling contacts ({name}), some 20 s, once for this installation",
+        file=sys.stderr,
+    )
+    return True
 
 
 @torch.no_grad()
 def contact_steps(given: StepInput) -> StepResult:
     """As `one_sided.contact_steps`."""
     from torchfilm.kernels import step as kernels
+    from torchfilm.kernels.compiling import keep
 
     dtype = given.radius.dtype
-    _announce(f"{given.settings.dim}-D, {str(dtype).removeprefix('torch.')}")
+    name = f"{given.settings.dim}-D, {str(dtype).removeprefix('torch.')}"
+    new = _announce(name)
     counts = given.groups.counts
     begin, steps = offsets(counts).numpy(), given.steps.numpy()
     position, axis = given.position.clone(), given.axis.clone()
@@ -89,6 +94,9 @@ def contact_steps(given: StepInput) -> StepResult:
     )  # fmt: skip
     for done in _started(kernels.step_colonies, begin, counts.numpy(), arguments):
         done()
+    if new:
+        keep(name)
+    _called.add(name)
     column = lambda k: torch.from_numpy(reports[:, k].astype(np.int64))
     return StepResult(
         position, axis, length, move, hardness, column(kernels.STATUS),
