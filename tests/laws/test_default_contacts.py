@@ -155,18 +155,24 @@ def test_case_44_every_overlap_of_a_pressed_chain_is_that_of_theory(measured, le
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("length_drag", [10.0, 100.0, 1000.0])
-def test_case_45_growth_under_pressure_is_that_of_a_tight_solve(measured, length_drag):
-    """Volume of 12 colonies at 300 cells or so: the default tolerance against 1e-4."""
+@pytest.mark.parametrize("length_drag, colonies", [(10.0, 32), (100.0, 16), (1000.0, 8)])
+def test_case_45_growth_under_pressure_is_that_of_a_tight_solve(measured, length_drag, colonies):
+    """Volume of colonies of some 300 cells at the default tolerance over that at 1e-4: equal within
+    0.5 % (given), as far as can be told.
+
+    Colonies take other courses from the first decision by a last bit on, so their volumes scatter;
+    the mean may differ by three of its standard errors more, and these must be small.
+    """
     ends = []
     for tolerance in (None, 1e-4):
         scene = colony(tf.Mechanics(dim=2, length_drag=length_drag, tolerance=tolerance))
-        *_, last = tf.simulate(scene, until=8.5, colonies=12, seed=8)
-        ends.append(float(last.volume.double().sum()))
-    assert (
-        measured("volume over a tight solve, less 1", abs(ends[0] / ends[1] - 1), "≤ 0.005")
-        <= 0.005
-    )
+        *_, last = tf.simulate(scene, until=8.5, colonies=colonies, seed=8)
+        ends.append(last.groups.sum(last.volume.double().unsqueeze(1)).squeeze(1))
+    ratio = (ends[0] / ends[1] - 1).numpy()
+    error = ratio.std(ddof=1) / math.sqrt(colonies)
+    assert error <= 0.004
+    off = measured("volume over a tight solve, less 1", abs(ratio.mean()), "≤ 0.005 + 3 errors")
+    assert off <= 0.005 + 3 * error
 
 
 @pytest.mark.slow
