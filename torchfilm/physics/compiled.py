@@ -17,7 +17,7 @@ from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.tools.ragged import offsets
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
-WORTH_THREADS = 2000
+WORTH_THREADS = 300
 
 
 @cache
