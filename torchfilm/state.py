@@ -386,13 +386,9 @@ class State:
 
 PER_CELL = ("colony", "uid", "parent", "position", "axis", "length", "radius")
 PER_COLONY = ("colony_id", "stream", "next_uid")
-RESERVED = frozenset(f.name for f in dataclasses.fields(State)) | {
-    n for n in vars(State) if not n.startswith("__")
-}
+PARTS = frozenset(part.name for part in dataclasses.fields(State))
+RESERVED = PARTS | {n for n in vars(State) if not n.startswith("__")}
 # A field that first cells may bring and rules may set.
 CELL_TYPE = Field(
     "cell_type", "kind of cell, a whole number that rules and circuits go by", dtype=torch.int64
 )
-
-
-PARTS = {part.name for part in dataclasses.fields(State)}
