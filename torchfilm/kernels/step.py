@@ -14,10 +14,12 @@ from torchfilm.kernels.scheme import (
     DEEP_IN_SUBSTEPS,
     HARDEST,
     HOPS,
+    ITERATION_LIMIT,
     LAG,
     MARGIN,
     MAX_TURN,
     MOST_SOFTER,
+    NOT_FINITE,
     OVERLAP,
     SHRINK,
     SOFTER,
@@ -31,7 +33,6 @@ from torchfilm.kernels.solve import minimise
 DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
 ITERATIONS, PASSES, ERROR, CLIPPED, DEEPLY, STATUS = range(6)
 REPORT = 6
-CONVERGED, ITERATION_LIMIT, NOT_FINITE = 0, 1, 2  # as in `physics.problem`
 
 
 @kernel

@@ -9,10 +9,13 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.scheme import CONVERGED as CONVERGED
+from torchfilm.kernels.scheme import ITERATION_LIMIT as ITERATION_LIMIT
+from torchfilm.kernels.scheme import NOT_FINITE as NOT_FINITE
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.tools.ragged import Groups
 
-CONVERGED, ITERATION_LIMIT, NOT_FINITE, TOO_FAST = 0, 1, 2, 3
+TOO_FAST = 3
 STATUS = {
     CONVERGED: "converged",
     ITERATION_LIMIT: "reached its iteration limit",
