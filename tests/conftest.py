@@ -52,7 +52,8 @@ def command(tmp_path, monkeypatch):
     from torchfilm.cli import main as cli
 
     monkeypatch.chdir(tmp_path)
-    path = list(sys.path)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    path, threads = list(sys.path), torch.get_num_threads()
 
     def call(*arguments: object) -> None:
         monkeypatch.setattr(sys, "argv", ["torchfilm", *map(str, arguments)])
@@ -60,6 +61,7 @@ def command(tmp_path, monkeypatch):
 
     yield call
     sys.path[:] = path
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

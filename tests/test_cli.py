@@ -17,6 +17,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import torch
 from commands import ENVIRONMENT, OWN, assert_same, drawn, frames, shell
 
 import torchfilm as tf
@@ -338,3 +339,64 @@ def test_progress_shows_cells_time_rate_and_the_estimated_end(tmp_path, end):
     assert re.search(r"\d+ cells, t = \d+\.\d\d h, \d+ steps/s", text), text[-500:]
     assert re.search(r"\d\d:\d\d<\d\d:\d\d", text), "no estimated end"
     assert "100%" in text
+
+
+@pytest.mark.parametrize(
+    "cores, given, colonies, threads",
+    [(5, None, 3, 3), (2, None, 3, 2), (1, None, 3, 1), (2, 3, 1, 3)],
+)
+def test_a_command_takes_a_thread_for_each_core_and_no_more_than_colonies(
+    command, monkeypatch, capsys, cores, given, colonies, threads
+):
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    options = [] if given is None else ["--threads", given]
+    end = ["--until", 0.05, "--no-picture"]
+    command("run", "microcolony", "--colonies", colonies, *end, *options)
+    assert torch.get_num_threads() == threads
+    assert f" s on {threads} thread{'s' if threads > 1 else ''}\n" in capsys.readouterr().out
+    torch.set_num_threads(4)
+    command("resume", "microcolony.h5", "--until", 0.1, "--no-picture", *options)
+    assert torch.get_num_threads() == threads
+    torch.set_num_threads(4)
+    scene = ["microcolony", "--colonies", colonies, "--cells", 8, "--seconds", 0.05]
+    command("explain", *scene, *options)
+    assert f" {threads} thread(s) of this machine" in capsys.readouterr().out
+
+
+def test_a_command_takes_the_number_of_threads_of_the_environment(command, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(5)), raising=False)
+    command("run", "microcolony", "--colonies", 3, "--until", 0.05, "--no-picture")
+    assert torch.get_num_threads() == 1  # as torch read it from there
+    with pytest.raises(SystemExit, match="--threads = 0 is not allowed"):
+        command("run", "microcolony", "--until", 0.05, "--overwrite", "--threads", 0)
+
+
+LIBRARY = """
+import torch
+torch.set_num_threads(3)
+import torchfilm as tf
+import design
+scene = tf.scenes.toggle_switch()
+for state in tf.simulate(scene, until=0.05, colonies=2):
+    pass
+tf.explain(scene, cells=4, seconds=0.05)
+search = design.Search(
+    tf.scenes.boundary_detector,
+    parameters=[design.Parameter("k3", 0.1, 100, log=True)],
+    target=design.Stripe("yfp", at="border", width=4.0, cell_type=1, floor=0.2),
+    fixed={"k1": 50.0, "D1": 50.0, "width": 16.0},
+    cells=4, dt=0.05, replicates=1, seed=0,
+)
+search.run(colonies=4)
+assert torch.get_num_threads() == 3, torch.get_num_threads()
+"""
+
+
+@pytest.mark.slow
+def test_the_library_leaves_the_number_of_threads_as_it_is():
+    """It is the user's: on import, in a run, an estimate and a search."""
+    done = subprocess.run(
+        [sys.executable, "-c", LIBRARY], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr

@@ -284,11 +284,13 @@ def test_whether_growth_serves_many_designs_is_what_a_course_says(name):
     scene = tf.scenes.build(name)
     model = scene.bind()
     why, said = model.why_not_replayable, replayed(model)
-    assert said == f"no, {why}" if why else said.startswith("yes, ")
+    each, once = "each design grows colonies of its own", "colonies are grown once for all designs"
+    assert said == f"{each}, because {why}" if why else said.startswith(f"{once}, because ")
+    assert f"\n  in a search: {said}" in tf.explain(scene, seconds=0)
     if name == "boundary_detector":
-        assert said == "yes, circuit and transport only follow (GrowthRecording, Replay)"
+        assert "because circuit and transport change neither growth nor motion (tf." in said
     if name == "toggle_switch":
-        assert said == "yes, circuit only follows (GrowthRecording, Replay)"
+        assert "because circuit changes neither growth nor motion (tf." in said
 
 
 @pytest.mark.parametrize("name", tf.scenes.READY)

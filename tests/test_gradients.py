@@ -12,6 +12,8 @@ dozen steps.
 
 from __future__ import annotations
 
+import warnings
+
 import pytest
 import torch
 from differences import (
@@ -372,3 +374,35 @@ def test_a_gradient_through_a_loose_solve_is_not_taken_in_silence():
             words = rf"solved to {loose:g} only.*wrong sign.*tolerance of {most:g} or less"
             with pytest.warns(RuntimeWarning, match=words):
                 grown(rate, tolerance=loose, **given)
+
+
+@pytest.mark.parametrize("contacts", ["one-sided", "bilateral"])
+def test_the_warning_of_a_loose_solve_comes_once_and_points_at_the_users_line(contacts):
+    """Even where Python is asked for every warning: in a run, in a rollout, whose steps are
+    computed again on the way back, and where the user steps by hand."""
+    rate = torch.tensor(1.0, requires_grad=True)
+    cells = tf.Cells([[0.0, 0.0], [2.9, 0.1]], [[1.0, 0.0]] * 2)
+    scene = tf.Scene(
+        tf.Growth(rate=rate),
+        tf.Mechanics(dim=2, contacts=contacts, length_drag=10.0),
+        founders=cells,
+        dt=0.05,
+    )
+
+    def simulated():
+        *_, end = tf.simulate(scene, until=0.2)
+        return end
+
+    def stepped():
+        model = scene.bind()
+        state = model.start()
+        for _ in range(4):
+            state = model.step(state)
+        return state
+
+    for grown in (simulated, stepped, lambda: tf.rollout(scene, until=0.2, segment=2)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            grown().length.sum().backward()
+        assert [(w.category, w.filename) for w in caught] == [(RuntimeWarning, __file__)]
+        assert "solved to" in str(caught[0].message)

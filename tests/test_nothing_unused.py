@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import pickle
 import warnings
 
 import pytest
@@ -52,12 +54,43 @@ def test_a_misspelt_option_of_a_circuit_is_an_error():
             lambda: tf.simulate(tf.scenes.microcolony(), untill=1.0),
             "simulate has no parameter 'untill'. Did you mean until?",
         ),
+        (
+            lambda: tf.Plane(z=0.0, facin="+z"),
+            "Plane has no parameter 'facin'. Did you mean facing?",
+        ),
+        (lambda: tf.Sphere((0, 0), radious=1.0), "Sphere has no parameter 'radious'. Did you mean"),
+        (lambda: tf.Box((0, 0), (1, 1), stifness=1.0), "Did you mean stiffness?"),
+        (lambda: tf.Mechanics(unilateral=True), 'contacts="one-sided", the default'),
     ],
 )
 def test_a_keyword_that_nothing_takes_is_an_error(make, words):
     with pytest.raises(tf.InputError) as caught:
         make()
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (tf.Channel, "Channel: missing a required argument: 'width'. Its parameters: width,"),
+        (lambda: tf.Sphere(center=(0, 0)), "Sphere: missing a required argument: 'radius'."),
+        (lambda: tf.Box((0, 0)), "Box: missing a required argument: 'high'."),
+        (lambda: tf.Plane(0.5), "Plane: too many positional arguments."),
+        (tf.Monod, "Monod: missing a required argument: 'signal'."),
+        (tf.simulate, "simulate: missing a required argument: 'scene'."),
+    ],
+)
+def test_an_argument_that_is_missing_is_named(make, words):
+    with pytest.raises(tf.InputError) as caught:
+        make()
+    assert words in str(caught.value)
+
+
+def test_help_shows_the_parameters_of_walls_and_effects():
+    """Although their class checks each call itself."""
+    assert list(inspect.signature(tf.Sphere).parameters)[:2] == ["center", "radius"]
+    assert "length_drag" in inspect.signature(tf.Mechanics).parameters
+    assert pickle.loads(pickle.dumps(tf.Sphere((0, 0), 1.0))) == tf.Sphere((0, 0), 1.0)
 
 
 def test_growth_without_a_rate_is_warned_of_unless_something_sets_it():

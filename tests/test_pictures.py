@@ -312,6 +312,28 @@ def test_walls_are_drawn_where_they_stand(tmp_path):
     ]
 
 
+def test_a_sheet_of_a_state_has_the_walls_that_the_picture_of_its_file_has(tmp_path):
+    """Also where the scene has a medium, which frames hold otherwise."""
+    medium = tf.Medium(ahl=tf.Signal(diffusion=1.0), box=((-8, -4), (8, 4)), spacing=4.0)
+    for more in ((), (medium,)):
+        walls = [tf.Channel(width=3.0, stiffness=20.0)]
+        scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, walls=walls), *more, dt=0.05)
+        path = tmp_path / f"run{len(more)}.h5"
+        *_, state = tf.simulate(scene, colonies=2, until=0.05, record=path)
+        pictures = [
+            matplotlib.image.imread(p)
+            for p in (
+                tf.show(path),
+                sheet(state, tmp_path / "a.png", scene=scene, title="scene, t = 0.05 h"),
+                sheet(state, tmp_path / "b.png", title="scene, t = 0.05 h"),
+            )
+        ]
+        assert np.array_equal(pictures[0], pictures[1])
+        assert not np.array_equal(pictures[0], pictures[2])
+    with pytest.raises(tf.InputError, match="a frame has its own walls"):
+        sheet(frame_of(state, scene), tmp_path / "c.png", scene=scene)
+
+
 def test_each_colonys_own_walls_are_drawn(tmp_path):
     walls = [
         tf.Channel(width=[4.0, 6.0], low_end=-8.0),

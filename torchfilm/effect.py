@@ -43,7 +43,7 @@ class Binding:
     declared: Mapping[str, str]
 
 
-class Effect:
+class Effect(metaclass=checks.KnownKeywords):
     """Base of all effects: a frozen dataclass with a `stage` and a `title`. Override `step`, and
     the rest where it applies.
 
@@ -60,17 +60,6 @@ class Effect:
     writes_anything: ClassVar[bool] = False
     # Its cost depends on the voxels of the grid, not on the cells.
     works_on_grid: ClassVar[bool] = False
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        cls._suggest_keywords()
-
-    @classmethod
-    def _suggest_keywords(cls) -> None:
-        """Let a misspelt keyword raise InputError with the nearest name."""
-        inner = cls.__dict__.get("__new__", None)
-        if inner is None:
-            cls.__new__ = _new_with_known_keywords  # type: ignore[method-assign,assignment]
 
     def __post_init__(self) -> None:
         for name, (given, rule) in self.physical_fields().items():
@@ -189,24 +178,6 @@ class Effect:
     def wall_surfaces(self) -> Sequence[Any]:
         """Surfaces that confine cells."""
         return ()
-
-
-def _new_with_known_keywords(cls: type, *args: Any, **given: Any) -> Any:
-    known = (
-        [f.name for f in dataclasses.fields(cls) if f.init]
-        if dataclasses.is_dataclass(cls)
-        else None
-    )
-    if known is not None and "__init__" in cls.__dict__ and not _takes_any(cls):
-        for name in given:
-            if name not in known:
-                raise checks.unknown_keyword(cls.__name__, name, known)
-    return object.__new__(cls)
-
-
-def _takes_any(cls: type) -> bool:
-    code = cls.__init__.__code__  # type: ignore[misc]
-    return bool(code.co_flags & 0x08)
 
 
 class BoundEffect:
@@ -332,14 +303,13 @@ class BoundEffect:
 class Concern:
     """What a report warns of, once it has held for `steps` steps: in which colonies, `where` (B,)
     bool, and `text(colony ids (B,), where (B,))`, what is wrong and what to do. name:
-    distinguishes concerns. fails: these colonies have failed then, as those whose step failed.
+    distinguishes concerns.
     """
 
     name: str
     where: torch.Tensor
     steps: int
     text: Callable[[torch.Tensor, torch.Tensor], str]
-    fails: bool = False
 
 
 @dataclass(frozen=True, eq=False)

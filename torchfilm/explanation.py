@@ -23,8 +23,8 @@ def explain(
     seconds: float = 2.0,
 ) -> str:
     """Describes how a scene will be simulated: effects and their methods, which effect drives
-    which, what is not simulated, whether one recorded growth serves many designs, and an estimate
-    of time and memory.
+    which, what is not simulated, whether a search grows colonies once for all designs, and an
+    estimate of time and memory.
 
     cells, colonies: size of the run to estimate; cells are per colony. colonies: by default as many
     as the scene's parameters and founders have, else 1. seconds: about how long to measure, by
@@ -58,7 +58,7 @@ def explain(
         f"  not simulated: {', '.join(left_out(scene)) or 'nothing'}"
         + (" (no field, no operation)" if left_out(scene) else "")
     )
-    lines.append(f"  one growth for many designs: {replayed(model)}")
+    lines.append(f"  in a search: {replayed(model)}")
     if seconds > 0:
         lines += [
             f"  {line}"
@@ -76,10 +76,13 @@ def left_out(scene: Scene) -> list[str]:
 
 
 def replayed(model: Model) -> str:
-    """Whether one recording of the scene's growth can serve many designs, as text."""
+    """Whether a search grows colonies once for all designs, and why, as text."""
     if model.why_not_replayable:
-        return f"no, {model.why_not_replayable}"
+        return f"each design grows colonies of its own, because {model.why_not_replayable}"
     effects = sorted((model.scene.effects[k] for k in model.following), key=lambda e: e.stage)
     follow = [effect.title for effect in effects]
-    verb = "only follows" if len(follow) == 1 else "only follow"
-    return f"yes, {' and '.join(follow)} {verb} (GrowthRecording, Replay)"
+    verb = "changes" if len(follow) == 1 else "change"
+    return (
+        "colonies are grown once for all designs, because"
+        f" {' and '.join(follow)} {verb} neither growth nor motion (tf.GrowthRecording, tf.Replay)"
+    )

@@ -140,37 +140,29 @@ class EndlessRunWarning:
 
 
 class LastingConcerns:
-    """What the reports of effects are concerned about, when it has held for as many steps as they
-    say: a warning, once each, or, where the concern says so, a failure of the colonies."""
+    """Warns, once each, of what the reports of effects are concerned about, when it has held for as
+    many steps as they say."""
 
-    def __init__(self, on_failure: str) -> None:
-        self.on_failure = on_failure
+    def __init__(self) -> None:
         self.steps: dict[tuple[str, str], dict[int, int]] = {}  # by colony id
         self.warned: set[tuple[str, str]] = set()
 
-    def __call__(self, state: State) -> State:
+    def __call__(self, state: State) -> None:
         for title, report in state.reports.items():
             for concern in report.concerns() if hasattr(report, "concerns") else ():
-                state = self._look(state, (title, concern.name), concern)
-        return state
+                self._look(state, (title, concern.name), concern)
 
-    def _look(self, state: State, key: tuple[str, str], concern) -> State:
+    def _look(self, state: State, key: tuple[str, str], concern) -> None:
         if key in self.warned:
-            return state
+            return
         before, ids = self.steps.get(key, {}), state.colony_id
         here = ids[concern.where].tolist() if bool(concern.where.any()) else []
         now = self.steps[key] = {k: before.get(k, 0) + 1 for k in here}
         long = [k for k, steps in now.items() if steps >= concern.steps]
         if not long:
-            return state
-        lasting = torch.isin(ids, torch.tensor(long, device=ids.device))
-        text = concern.text(state.colony_id, lasting)
-        text = f"step {state.step} (t = {state.time:g} h): {text}"
-        if not concern.fails:
-            self.warned.add(key)
-            warnings.warn(text, RuntimeWarning, stacklevel=5)
-            return state
-        if self.on_failure == "raise":
-            text += ' on_failure="drop" continues without them.'
-            raise SimulationError(text, state.colony_id[lasting].tolist())
-        return state.remove(lasting.index_select(0, state.colony), "failed")
+            return
+        self.warned.add(key)
+        text = concern.text(ids, torch.isin(ids, torch.tensor(long, device=ids.device)))
+        warnings.warn(
+            f"step {state.step} (t = {state.time:g} h): {text}", RuntimeWarning, stacklevel=5
+        )

@@ -27,6 +27,7 @@ from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.timing import Timings
+from torchfilm.tools.warn_once import once
 
 if TYPE_CHECKING:
     from torchfilm.scene import Scene
@@ -68,6 +69,7 @@ class Model:
                     part.place = place
                     bound.append(part)
         self.effects: tuple[BoundEffect, ...] = tuple(sorted(bound, key=lambda e: e.stage))
+        self._said: set[str] = set()  # what steps have warned of
 
     # --- running -------------------------------------------------------------------------
 
@@ -81,12 +83,13 @@ class Model:
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""
         dt, state = self.dt if dt is None else dt, self.opened(state)
-        for effect in self.effects:
-            if timings is None:
-                state = effect.step(state, dt)
-            else:
-                with timings.of(effect.title, state.device):
+        with once(self._said) as self._said:
+            for effect in self.effects:
+                if timings is None:
                     state = effect.step(state, dt)
+                else:
+                    with timings.of(effect.title, state.device):
+                        state = effect.step(state, dt)
         return advanced(state, dt)
 
     def opened(self, state: State) -> State:

@@ -71,7 +71,7 @@ class Resolved:
             own = state.fields["cell_type"]
             return self._by_type(state, own if kind is None else torch.full_like(own, kind), None)
         found = self.of_colonies(state)
-        return found if found.dim() == 0 else found.index_select(0, state.colony)
+        return found if found.dim() == 0 else state.groups.spread(found)
 
     def of_rows(self, state: State, rows: Tensor, purpose: str | None = None) -> Tensor:
         """(M,) for the cells `rows` (M,); drawn now, by the key `purpose`, where the value is a

@@ -142,10 +142,7 @@ def _monitors(
     timings: Timings | None,
 ) -> list[Monitor]:
     """What looks at each state, in order. cells: of a run that has no other end."""
-    monitors: list[Monitor] = [
-        partial(handle_failures, on_failure=on_failure),
-        LastingConcerns(on_failure),
-    ]
+    monitors: list[Monitor] = [partial(handle_failures, on_failure=on_failure), LastingConcerns()]
     if recorder is not None:
         monitors.append(partial(_record, recorder, timings))
     monitors += [partial(_observe, observe) for observe in observers]

@@ -175,7 +175,7 @@ class State:
     @cached_property
     def groups(self) -> Groups:
         """The cells of each colony, for sums and maxima over colonies."""
-        return Groups(self.colony, self.colonies)
+        return Groups(self.colony, self.colonies, ordered=True)
 
     @cached_property
     def counts(self) -> Tensor:

@@ -450,6 +450,33 @@ def test_length_threshold_that_leaves_no_room_for_caps_is_refused(threshold):
         tf.Scene(tf.Division(length=threshold), founders=row_of_cells(1, 0.2)).bind().start()
 
 
+@pytest.mark.parametrize(
+    "length, radius, threshold, words",
+    [
+        # the largest number of any type is not what a cell of type 0 may reach
+        (5.0, 0.5, {0: 4.0, 1: tf.Uniform(8.0, 10.0)}, r"threshold 4 of cell 0 .*birth, 5"),
+        (9.0, 0.5, {0: tf.Uniform(4.0, 8.0), 1: 10.0}, r"of cell 0 .*birth, 9"),
+        # nor the smallest what it may divide at
+        (2.0, 1.5, {0: 4.0, 1: tf.Uniform(2.2, 2.5)}, None),
+        (2.0, 1.5, {0: tf.Uniform(3.5, 4.0), 1: 2.5}, None),
+        (2.0, 1.5, {0: tf.Uniform(2.5, 4.0), 1: 5.0}, r"can be 2\.5: it must be at least 3 "),
+        (2.0, 1.5, {0: 2.5, 1: tf.Uniform(3.5, 4.0)}, r"can be 2\.5: it must be at least 3 "),
+    ],
+)
+def test_a_cell_is_compared_with_the_thresholds_of_its_own_type(length, radius, threshold, words):
+    """Numbers for some types, distributions for others. Cell 0 is of type 0; cell 1, of type 1, is
+    small enough for any of these."""
+    cells = tf.Cells(
+        [[0.0, 0.0], [20.0, 0.0]], [[1.0, 0.0]] * 2, [length, 1.2], [radius, 0.5], cell_type=[0, 1]
+    )
+    scene = tf.Scene(tf.Division(length=threshold), founders=cells)
+    if words is None:
+        assert scene.bind(2).start().cells == 4
+    else:
+        with pytest.raises(tf.InputError, match=words):
+            scene.bind(2)
+
+
 def test_volume_threshold_that_leaves_no_room_for_caps_is_refused():
     short = float(capsule.volume(torch.tensor(0.9), torch.tensor(0.5)))
     with pytest.raises(tf.InputError, match=r"Division\.volume"):

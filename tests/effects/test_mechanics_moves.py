@@ -5,6 +5,7 @@ converge.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -138,3 +139,48 @@ def test_contacts_do_not_draw_out_a_cell_that_does_not_grow(device, dtype, dim):
         slack = 1 - 4 * torch.finfo(dtype).eps  # the growth of a step is added and then subtracted
         assert bool((state.length[~still] >= slack * before.length[~still]).all())
     assert float((state.position - before.position).abs().max()) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Thickening(tf.Effect):
+    """Sets the drag of all cells to 2, and that of the first cell of colony 1 to `bad`."""
+
+    bad: float
+
+    stage = 15
+    title = "thickening"
+
+    def declares(self, dim):
+        return [tf.Field("drag", "relative viscosity")]
+
+    def writes(self):
+        return ["drag"]
+
+    def step(self, state, dt, values):
+        bad = (state.own_colony_id == 1) & (state.uid == 0)
+        return state.with_fields(drag=torch.where(bad, self.bad, 2.0))
+
+
+@pytest.mark.parametrize("contacts", ["one-sided", "bilateral"])
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.inf, math.nan])
+def test_a_drag_that_is_not_above_zero_fails_its_colony(contacts, bad):
+    """A rule's values are checked as it sets them, and an effect's here: a cell has no place at a
+    drag of 0. The message names the field; the other colony goes on as if alone."""
+
+    def end(bad, **given):
+        scene = tf.Scene(
+            Thickening(bad),
+            tf.Growth(rate=1.0),
+            tf.Mechanics(dim=2, contacts=contacts),
+            founders=tf.Cells([[0.0, 0.0], [2.2, 0.1]], [[1.0, 0.0]] * 2),
+        )
+        *_, last = tf.simulate(scene, colonies=2, until=0.1, dt=0.025, **given)
+        return last
+
+    words = r"(?s)in 1 of 2.*drag is not above 0 and finite.*Check the effect or rule that sets"
+    with pytest.raises(tf.SimulationError, match=words) as e:
+        end(bad)
+    assert e.value.colonies == (1,)
+    dropped, sound = end(bad, on_failure="drop"), end(2.0)
+    assert dropped.counts.tolist() == [2, 0]
+    assert torch.equal(dropped.position, sound.position[sound.colony == 0])

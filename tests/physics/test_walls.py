@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -372,3 +374,26 @@ def test_cells_behind_a_wall_are_refused_before_the_first_step():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(walls=[tf.Plane(x=1.0, facing="+x")]))
     with pytest.raises(tf.InputError, match="inside out"):
         scene.bind(2).start()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stiffness", [100, 1000])
+def test_a_soft_wall_yields_as_the_documentation_says(stiffness):
+    """The table of docs/mechanics.md, in its set-up, by one colony where it has four."""
+    page = (Path(__file__).parents[2] / "docs" / "mechanics.md").read_text()
+    said = float(re.search(rf"^\| {stiffness} \| ([\d.]+) \(", page, re.M).group(1))
+    scene = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Division(length=tf.Uniform(3.5, 4.5)),
+        tf.Mechanics([tf.Box((-6, -6), (6, 6), stiffness=stiffness)], dim=2, length_drag=10.0),
+        dt=0.025,
+    )
+    depths = []
+    for state in tf.simulate(scene, until=6.0):
+        if state.step >= 200 and state.step % 4 == 0:
+            half = 0.5 * state.length.double().unsqueeze(1) * state.axis.double()
+            ends = torch.stack([state.position - half, state.position + half])
+            depth = (ends.abs().amax(2) - 6.0 + state.radius).amax(0)
+            depths.append(depth[depth > 0])
+    # one colony has some ten cells at a wall, and the four differ by about a tenth
+    assert float(torch.cat(depths).mean()) == pytest.approx(said, rel=0.3)

@@ -8,8 +8,9 @@ import torch
 from helpers import array
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mock_cuda import pretended_cuda  # noqa: F401
 
-from torchfilm.tools.ragged import Blocks, Groups, WeightedRows, expand_ranges, offsets
+from torchfilm.tools.ragged import Blocks, Groups, WeightedRows, expand_ranges, marked, offsets
 
 
 def loop(owner: np.ndarray, size: int, value: np.ndarray, what, empty: float = 0.0) -> np.ndarray:
@@ -132,7 +133,7 @@ def test_a_group_has_the_same_weighted_sum_in_any_company(device, dtype, width, 
 
 
 @pytest.mark.parametrize("width", [(), (1,), (3,)])
-def test_gradient_of_a_sum(width):
+def test_gradients_of_a_sum_and_of_its_reverse(width):
     owner = torch.tensor([2, 0, 2, 1, 2, 4])
     value = torch.randn(
         6,
@@ -142,6 +143,7 @@ def test_gradient_of_a_sum(width):
         requires_grad=True,
     )
     assert torch.autograd.gradcheck(lambda v: Groups(owner, 5).sum(v), (value,))
+    assert torch.autograd.gradcheck(lambda v: Groups(owner, 6).spread(v), (value,))
 
 
 @pytest.mark.parametrize("width", [1, 3, 7, 28])
@@ -188,6 +190,43 @@ def test_a_group_has_the_same_sum_in_any_company(device, dtype, width, count, de
             mixed[torch.as_tensor(owner == 1, device=device)],
         ) = (mine, strange)
         assert torch.equal(summed(owner, mixed, 2, 0), alone)
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+@pytest.mark.parametrize("count", [1, 32, 33, 1025, 5000])
+def test_sums_and_maxima_as_on_cuda(pretended_cuda, dtype, count, ordered):  # noqa: F811
+    """Trees of sums, against loops; bitwise the same alone, before and after others, and among
+    empty groups."""
+    rng = np.random.default_rng(count)
+    mine = rng.normal(size=(count, 4)) * 10.0 ** rng.uniform(-6, 6, (count, 1))
+    results = []
+    for before, after in ((0, 0), (7, 0), (0, 40_000), (3000, 5)):
+        value = np.concatenate([rng.normal(size=(before, 4)), mine, rng.normal(size=(after, 4))])
+        owner = np.repeat([1, 3, 4], [before, count, after])
+        place = np.arange(len(owner))
+        if not ordered:
+            place = np.argsort(np.arange(len(owner)) + 0.5 * len(owner) * (owner != 3))
+        there = lambda x, place=place: torch.as_tensor(x[place], device="cuda")
+        groups = Groups(there(owner), 7, ordered)
+        rows = there(value).to(dtype)
+        sums, most = groups.sum(rows).cpu(), groups.max(rows[:, 0], empty=-9.0).cpu()
+        close = {torch.float32: 1e-4, torch.float64: 1e-12}[dtype]
+        size = np.abs(mine).sum(0)
+        assert (np.abs(array(sums[3]) - mine.sum(0)) <= close * size).all()
+        assert not array(sums)[[0, 2, 5, 6]].any()
+        assert float(most[3]) == float(torch.as_tensor(mine[:, 0]).to(dtype).max())
+        assert most[[0, 2, 5, 6]].tolist() == [-9.0] * 4
+        assert groups.counts.tolist() == [0, before, 0, count, after, 0, 0]
+        whole = groups.max((1e4 * rows[:, 0]).clamp(-1e9, 1e9).long(), empty=-3).cpu()
+        assert whole.dtype == torch.int64 and int(whole[6]) == -3
+        results.append(sums[3])
+    assert all(torch.equal(results[0], other) for other in results[1:])
+
+
+def test_marked_places():
+    index, flag = torch.tensor([3, 1, 3, 0]), torch.tensor([False, True, True, False])
+    assert marked(5, index, flag).tolist() == [False, True, False, True, False]
+    assert marked(2, index[:0], flag[:0]).tolist() == [False, False]
 
 
 @pytest.mark.parametrize("width", [1, 4, 7])

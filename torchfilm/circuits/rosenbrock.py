@@ -26,6 +26,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from torchfilm.circuits import linear
+from torchfilm.tools.reads import numbers, places, places_of, reads_are_free
 
 # rates(u, rows): du/dt (M, S), conc/h, of the cells `rows` (M,) at concentrations u (M, S). Row i
 # of the result depends on row i of u only.
@@ -144,11 +145,9 @@ class _Tableau:
     def linearise(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ, from one call with S copies of the cells."""
         f, jacobian = self._forward(u, rows) if self.tracked else self._backward(u, rows)
-        if not bool(torch.isfinite(jacobian.sum())):
-            # the slope of a root at 0 is infinite; any finite value will do, since only the error
-            # grows, and the error is controlled
-            jacobian = torch.nan_to_num(jacobian, 0.0, 0.0, 0.0)
-        return f, jacobian
+        # the slope of a root at 0 is infinite; any finite value will do, since only the error
+        # grows, and the error is controlled
+        return f, torch.nan_to_num(jacobian, 0.0, 0.0, 0.0)
 
     def _backward(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """By a backward pass; the i-th copy gives the gradient of species i's rate."""
@@ -206,9 +205,10 @@ class _Tableau:
         low = u.detach().clamp(max=0.0)
 
         def rate(y: Tensor) -> Tensor:
-            if not self.nonnegative or not bool((y < low).any()):
+            below = y < low
+            if not self.nonnegative or (reads_are_free(u.device) and not bool(below.any())):
                 return self.evaluate(y, rows)
-            inside = torch.maximum(y, low)
+            inside = torch.where(below, low, y)
             return self.evaluate(inside, rows) + linear.multiply(jacobian, y - inside)
 
         k1 = linear.solve(matrix, lu, f)
@@ -225,7 +225,7 @@ class _Tableau:
                 sound & (new.abs().amax(0) < torch.finfo(self.dtype).max), error, torch.nan
             )
         broken = torch.zeros_like(sound)
-        if self.nonnegative and bool((new < low).any()):
+        if self.nonnegative:
             noise = (
                 8
                 * torch.finfo(self.dtype).eps
@@ -258,7 +258,7 @@ class _Tableau:
         """
         low = u.detach().clamp(max=0.0)
         new = torch.where((new < low) & (new >= low - noise), low, new)
-        at = torch.nonzero((new < low).any(0)).squeeze(1)
+        (at,) = places((new < low).any(0))
         change = torch.zeros_like(new[0])
         if at.numel() == 0:
             return new, change
@@ -296,13 +296,7 @@ def _advance(
         new, error, broken = method.step(u, rows, h)
         good = (error <= 1.0) & ~broken
         ends = good & (h >= left)
-        every = bool(ends.all())
-        if every and not out:
-            return new, RosenbrockReport(accepted + 1, rejected, torch.full_like(rows, DONE))
-        accepted.index_add_(0, rows, good.long())
-        rejected.index_add_(0, rows, (~good).long())
-        u = new if every else _merge(method, u, new, good, rows, h)
-        left = torch.where(good, left - h, left)
+        start, left = h, torch.where(good, left - h, left)
         # a cube root by exp and log, whose bits do not depend on the batch
         factor = (SAFETY * torch.exp(torch.log(error) / -3.0)).clamp(SHRINK, GROW)
         factor = torch.where(torch.isfinite(error), factor, 0.25)
@@ -311,10 +305,17 @@ def _advance(
         # no tiny last step
         h = torch.where((left - h) < 1e-10 * left, left, h)
         lost = ~good & (h < shortest)
-        if bool(error.isnan().any()):
+        ended, some_nan, leaving = numbers(ends.sum(), error.isnan().any(), (ends | lost).sum())
+        if ended == rows.numel() and not out:
+            return new, RosenbrockReport(accepted + 1, rejected, torch.full_like(rows, DONE))
+        accepted.index_add_(0, rows, good.long())
+        rejected.index_add_(0, rows, (~good).long())
+        u = new if ended == rows.numel() else _merge(method, u, new, good, rows, start)
+        if some_nan:
             nonfinite = nonfinite + error.isnan()
             lost |= nonfinite > MAX_NONFINITE_STEPS
             lost |= ~torch.isfinite(method.evaluate(u.detach(), rows)).all(0)  # no step can help
+            (leaving,) = numbers((ends | lost).sum())
         failed = torch.where(
             torch.isfinite(error), torch.where(broken, BELOW_ZERO, TOO_MANY_STEPS), NOT_FINITE
         )
@@ -322,8 +323,8 @@ def _advance(
         status = status.index_copy(
             0, rows, torch.where(ends, DONE, torch.where(lost, failed, TOO_MANY_STEPS))
         )
-        if bool(leave.any()):
-            gone, stay = torch.nonzero(leave).squeeze(1), torch.nonzero(~leave).squeeze(1)
+        if leaving:
+            gone, stay = places_of(leave, leaving), places_of(~leave, rows.numel() - leaving)
             out.append((rows.index_select(0, gone), u.index_select(1, gone)))
             rows, u = rows.index_select(0, stay), u.index_select(1, stay)
             left, h, shortest, nonfinite = (

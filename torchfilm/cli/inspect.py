@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from torchfilm.cli.scene_files import load_scene, parse_setting
+from torchfilm.cli.threads import use_threads
 from torchfilm.explanation import explain
 from torchfilm.io.results import Results
 from torchfilm.tools import checks
@@ -74,6 +75,9 @@ class Explain:
     1."""
     device: str = "cpu"
     """cpu or cuda."""
+    threads: int | None = None
+    """Threads to compute with; by default one for each core that the process may use, at most one
+    for each colony. OMP_NUM_THREADS, if set, takes the place of the cores."""
     preset: str | None = None
     """Accuracy, as for `run`: draft, standard or reference."""
     settings: Path | None = None
@@ -85,6 +89,7 @@ class Explain:
         scene = accurate(
             load_scene(self.scene, dict(map(parse_setting, self.set))), self.preset, self.settings
         )
+        use_threads(self.threads, max(scene.fixed_colonies, self.colonies or 1))
         print(
             explain(
                 scene,
@@ -120,6 +125,9 @@ class Tune:
     """Seed of the probe."""
     device: str = "cpu"
     """cpu or cuda."""
+    threads: int | None = None
+    """Threads to compute with; by default one for each core that the process may use.
+    OMP_NUM_THREADS, if set, takes the place of the cores."""
     out: Path | None = None
     """Write the settings to this new file, for `torchfilm run SCENE --settings FILE`."""
 
@@ -127,6 +135,7 @@ class Tune:
         if self.out is not None:
             Settings.check_new(self.out)
         scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
+        use_threads(self.threads)  # tune itself chooses the number of colonies
         with _status_line() as watch:
             tuned = tune(
                 scene,

@@ -31,7 +31,10 @@ def summary_table(scene: Scene, state: State, timings: Timings, seconds: float) 
     lines = [
         f"{'colonies':<28}{state.colonies}",
         f"{'cells':<28}{state.cells} ({int(counts.min())} to {int(counts.max())} a colony)",
-        f"{'time':<28}{state.time:g} h in {state.step} steps, {seconds:.1f} s",
+        (
+            f"{'time':<28}{state.time:g} h in {state.step} steps, {seconds:.1f} s on"
+            f" {torch.get_num_threads()} thread{'' if torch.get_num_threads() == 1 else 's'}"
+        ),
         f"{'colony radius':<28}{radius}",
         (
             f"{'overlap':<28}mean {float((found.mean * found.count).sum() / pairs):.4f} µm, worst"

@@ -22,6 +22,7 @@ from torchfilm.cli.report import (
 )
 from torchfilm.cli.scene_files import design, load_scene, parse_setting
 from torchfilm.cli.show import check_new, own_picture
+from torchfilm.cli.threads import use_threads
 from torchfilm.initial_cells import Cells
 from torchfilm.io.recorder import Recorder
 from torchfilm.io.results import Results
@@ -66,6 +67,9 @@ class Run:
     """CSV or HDF5 file of cells to start from."""
     device: str = "cpu"
     """cpu or cuda."""
+    threads: int | None = None
+    """Threads to compute with; by default one for each core that the process may use, at most one
+    for each colony. OMP_NUM_THREADS, if set, takes the place of the cores."""
     double: bool = False
     """Compute in float64. A design that was searched in float64 always runs in float64."""
     out: Path | None = None
@@ -99,6 +103,7 @@ class Run:
             device=self.device,
             dtype=torch.float64 if double else torch.float32,
         )
+        use_threads(self.threads, model.batch.colonies)
         state = model.start()
         recorder = Recorder(
             self._results_file(scene, bool(plan)), scene, every=self.every, overwrite=self.overwrite
@@ -162,6 +167,9 @@ class Resume:
     """Stop at this time, h."""
     device: str = "cpu"
     """cpu or cuda."""
+    threads: int | None = None
+    """Threads to compute with; by default one for each core that the process may use, at most one
+    for each colony. OMP_NUM_THREADS, if set, takes the place of the cores."""
     watch: bool = False
     """Reload the rules file when it is edited during the run."""
     picture: bool = True
@@ -187,6 +195,7 @@ class Resume:
             dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
         if self.picture:
             own_picture(self.file)
+        use_threads(self.threads, state.colonies)
         recorder = Recorder(self.file, scene, every=every, append=True, changed=self.changed)
         go(
             scene.bind(state=state, per_colony=True),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import Binding, BoundEffect
-from torchfilm.effects.mechanics_report import MOST_SUBSTEPS, MechanicsReport
+from torchfilm.effects.mechanics_report import BURIED, LONG, MANY, MOST_SUBSTEPS, MechanicsReport
 from torchfilm.physics import compiled, one_sided
 from torchfilm.physics.contact_records import (
     CLOSE,
@@ -21,7 +21,7 @@ from torchfilm.physics.contact_records import (
 )
 from torchfilm.physics.contact_step import contact_step
 from torchfilm.physics.one_sided_records import OneSidedSettings, StepInput
-from torchfilm.physics.problem import CONVERGED, NOT_FINITE, TOO_FAST
+from torchfilm.physics.problem import BAD_DRAG, COLLAPSED, CONVERGED, NOT_FINITE, TOO_FAST
 from torchfilm.physics.surfaces import Surface
 from torchfilm.resolver import snapshot
 from torchfilm.state import State
@@ -87,7 +87,7 @@ class BoundMechanics(BoundEffect):
         )  # fmt: skip
         at = (found.position, found.axis, found.length, found.move)
         state = self._placed(state, at, base, report, steps)
-        alpha = found.hardness.to(state.dtype).index_select(0, state.colony)
+        alpha = state.groups.spread(found.hardness.to(state.dtype))
         return state.with_fields(contact_alpha=alpha)
 
     def _alpha(self, state: State, own_dt: Tensor) -> Tensor | None:
@@ -168,12 +168,22 @@ class BoundMechanics(BoundEffect):
     ) -> State:
         """The state with cells at their new position, axis and length, and their last move."""
         position, axis, length, move = at
-        fields = {"displacement": move}
+        collapsed = self._collapsed_steps(state, report)
+        lasting = (collapsed >= LONG) & (report.status == CONVERGED)
+        status = torch.where(lasting, COLLAPSED, report.status)
+        fields = {"displacement": move, "collapsed_steps": collapsed.index_select(0, state.colony)}
         if "elongation" in state.fields:
             fields["elongation"] = length - base
-        made = MechanicsReport(**vars(report), substeps=steps, counts=state.counts)
+        made = MechanicsReport(**{**vars(report), "status": status}, substeps=steps)
         state = state.replace(position=position, axis=axis, length=length)
         return state.with_fields(**fields).replace(reports={**state.reports, "mechanics": made})
+
+    @staticmethod
+    def _collapsed_steps(state: State, report: ContactReport) -> Tensor:
+        """For how many steps in a row, this one included, the contacts of each colony have not held
+        its cells apart, (B,)."""
+        deep = report.deeply_overlapping > BURIED * state.counts.clamp(min=MANY)
+        return torch.where(deep, state.groups.max(state.collapsed_steps) + 1, 0)
 
     def _drags(self, state: State) -> tuple[Tensor, Tensor]:
         """Viscosity, with the field `drag`, and length drag of each cell, (N,)."""
@@ -202,14 +212,15 @@ class BoundMechanics(BoundEffect):
     def _substeps(self, state: State, elongation: Tensor) -> tuple[Tensor, Tensor]:
         """How many sub-steps each colony takes, (B,), so that no cell grows by more than
         `max_elongation` in one; and the status (B,) of colonies that cannot be stepped."""
-        columns = [state.length, elongation, *(x.to(state.dtype) for x in self._drags(state))]
-        every = torch.cat(
-            [state.position, state.axis, state.displacement, *(x.unsqueeze(1) for x in columns)], 1
-        )
+        columns = [state.length.unsqueeze(1), elongation.unsqueeze(1)]
+        every = torch.cat([state.position, state.axis, state.displacement, *columns], 1)
         broken = state.groups.any(~torch.isfinite(every).all(1))
+        drags = torch.stack([x.to(state.dtype) for x in self._drags(state)])
+        no_drag = state.groups.any(~(torch.isfinite(drags) & (drags > 0)).all(0))
         steps = torch.ceil(state.groups.max(elongation) / self.effect.max_elongation * (1 - 1e-6))
         status = torch.where(steps > MOST_SUBSTEPS, TOO_FAST, CONVERGED)
         status = torch.where(broken, NOT_FINITE, status)
+        status = torch.where(no_drag, BAD_DRAG, status)
         return torch.where(status == CONVERGED, steps.clamp(min=1), 1).long(), status
 
 

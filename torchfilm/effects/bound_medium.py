@@ -345,10 +345,11 @@ class GridCoverage(_MediumPart):
         if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
         away = layout.outside_medium(state.position, state.colony)
-        left = torch.bincount(state.colony[away], minlength=state.colonies)
-        first = torch.zeros(state.colonies, 3, dtype=torch.float64, device=state.device)
-        first[state.colony[away]] = layout.places(state.position)[away]
-        return MediumReport((left > 0).long(), left, first)
+        left = state.groups.sum(away.double()).long()
+        number = torch.arange(state.cells, 0, -1, device=state.device)
+        first = state.cells - state.groups.max(torch.where(away, number, 0))
+        place = torch.nn.functional.pad(layout.places(state.position), (0, 0, 0, 1))  # none: 0
+        return MediumReport((left > 0).long(), left, place.index_select(0, first))
 
     @torch.no_grad()
     def _span(self, state: State) -> tuple[Tensor, Tensor]:

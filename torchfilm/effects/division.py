@@ -14,6 +14,7 @@ from torchfilm.resolver import Resolved, Values
 from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets
+from torchfilm.tools.reads import numbers, places
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 CRITERIA = ("length", "volume", "added")
@@ -142,10 +143,9 @@ class Division(Effect):
     def check(self, state: State, values: Values) -> None:
         if self.criterion is None or state.cells == 0:
             return
-        given = getattr(self, self.criterion)
         # cells from a micrograph may exceed the threshold drawn for them, and divide at once; no
         # cell may exceed every threshold that can be drawn
-        most = largest(given) if is_drawn(given) else state.division_threshold
+        least, most = self._bounds(state)
         start = {
             "length": state.length,
             "volume": state.volume,
@@ -164,9 +164,6 @@ class Division(Effect):
         if self.criterion == "added":
             return
         # daughters keep the radius, so a cell's own threshold is compared with its own radius
-        least = state.division_threshold
-        if is_drawn(given):
-            least = torch.full_like(least, smallest(given))
         needed = 2 * state.radius
         if self.criterion == "volume":
             needed = capsule.volume(needed, state.radius)
@@ -178,6 +175,20 @@ class Division(Effect):
                 f" {float(needed[k]):g} for radius {float(state.radius[k]):g} µm, or the daughters"
                 " would have a negative length (each loses a new cap). Raise the threshold."
             )
+
+    def _bounds(self, state: State) -> tuple[Tensor, Tensor]:
+        """The smallest and the largest threshold that each cell, of its type, can have, (N,): its
+        own one where none is drawn."""
+        given = getattr(self, str(self.criterion))
+        least = most = state.division_threshold
+        every = torch.ones_like(least, dtype=torch.bool)
+        parts = given.values.items() if isinstance(given, ByType) else [(None, given)]
+        for kind, value in parts:
+            if is_drawn(value):
+                mine = every if kind is None else state.fields["cell_type"] == kind
+                least = torch.where(mine, smallest(value), least)
+                most = torch.where(mine, largest(value), most)
+        return least, most
 
     def numerics(self, dt: float, state: State) -> list[str]:
         return [f"checked once a step: up to {dt:g} h late"]
@@ -196,10 +207,11 @@ class Division(Effect):
     def step(self, state: State, dt: float, values: Values) -> State:
         with torch.no_grad():
             due = self.due(state)
-            if not bool(due.any()):
-                return state
             short = due & (state.length < 2 * state.radius)
-            if bool(short.any()):
+            some_due, some_short = numbers(due.any(), short.any())
+            if not some_due:
+                return state
+            if some_short:
                 report = _too_short(state, short)
                 state = state.replace(reports={**state.reports, "division": report})
                 due = due & (report.status != TOO_SHORT).index_select(0, state.colony)
@@ -241,8 +253,10 @@ def divide(state: State, due: Tensor, fraction: Resolved, axis_noise: Resolved) 
     Gradients pass through.
     """
     copies = due.long() + 1
-    source = torch.repeat_interleave(torch.arange(state.cells, device=state.device), copies)
-    parent_rows = torch.nonzero(due).squeeze(1)
+    (parent_rows,) = places(due)
+    whole = state.cells + parent_rows.numel()
+    every = torch.arange(state.cells, device=state.device)
+    source = torch.repeat_interleave(every, copies, output_size=whole)
     first = torch.cumsum(copies, 0).index_select(0, parent_rows) - 2
     second = first + 1
     parents = state.take(parent_rows)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
@@ -77,6 +77,12 @@ class Mechanics(Effect):
     stage = MECHANICS
     title = "mechanics"
     may_repeat = False
+    former_keywords: ClassVar[Mapping[str, str]] = {
+        "unilateral": (
+            'Contacts that only push are contacts="one-sided", the default; unilateral=False is'
+            ' contacts="bilateral" now.'
+        )
+    }
 
     def __post_init__(self) -> None:
         checks.choice("Mechanics.dim", self.dim, (2, 3))
@@ -196,14 +202,17 @@ class Mechanics(Effect):
             " starts"
         )
         move = Field("displacement", meaning, "µm, rad, µm", shape=(self.settings.degrees,))
+        # what a colony has, its cells have, so that growth can be recorded for other designs
+        meaning = "steps in a row in which contacts have not held the colony's cells apart"
+        collapsed = Field("collapsed_steps", meaning, dtype=torch.int64)
         if not self.one_sided:
-            return (move,)
+            return move, collapsed
         meaning = "α of the colony's contacts in the last step, 0 before the first"
-        return move, Field("contact_alpha", meaning, "1/μ/µm")
+        return move, collapsed, Field("contact_alpha", meaning, "1/μ/µm")
 
     @property
     def _own_fields(self) -> tuple[str, ...]:
-        return ("displacement", "contact_alpha") if self.one_sided else ("displacement",)
+        return tuple(field.name for field in self.declares(self.dim))
 
     def reads(self) -> tuple[str, ...]:
         cells = ("position", "axis", "length", "radius", "elongation", "drag")

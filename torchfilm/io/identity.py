@@ -19,18 +19,22 @@ from torchfilm.tools.warn_once import quietly
 
 def scene_attributes(scene: Scene, model: Model | None) -> dict[str, str]:
     """The attributes of a results file that identify the scene, and those that rebuild it."""
-    walls = [as_data(surface) for effect in scene.effects for surface in effect.wall_surfaces()]
     with quietly():
         model = model or scene.bind()
     return {
         "scene": model.describe(),
         "effects": json.dumps(scene.listing()),
         "code": json.dumps(scene.code),
-        "walls": json.dumps(walls),
+        "walls": json.dumps(walls_of(scene)),
         "recipe": json.dumps(scene.recipe),
         "settings": json.dumps(scene.settings),
         "accuracy": json.dumps(scene.accuracy),
     }
+
+
+def walls_of(scene: Scene) -> list[dict[str, Any]]:
+    """The walls of a scene as plain numbers, as in `Results.walls`."""
+    return [as_data(surface) for effect in scene.effects for surface in effect.wall_surfaces()]
 
 
 def declared_fields(attributes: Mapping[str, Any]) -> dict[str, list[Any]]:

@@ -11,45 +11,47 @@ from torchfilm.physics.contact_records import CellProperties, ContactReport, Mov
 from torchfilm.physics.contacts import NEAR, CandidateContacts, Capsules, contact_gaps
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
+from torchfilm.tools.ragged import marked
+from torchfilm.tools.reads import places
 
 
 def find_contacts(
-    cells: CellProperties, at: Moved, active: Tensor, include_near: bool
+    cells: CellProperties, at: Moved, rows: Tensor, include_near: bool
 ) -> tuple[CandidateContacts, WallContacts]:
-    """All that touches in the active colonies, (B,) bool; include_near: also what nearly
-    touches."""
-    near, rows, capsules = _neighbourhood(cells, at, active, include_near)
+    """All that touches of the cells `rows` (M,); include_near: also what nearly touches."""
+    near, capsules = _neighbourhood(cells, at, rows, include_near)
     first, second = (rows.index_select(0, side) for side in near.pairs())
-    walls = _at_walls(cells, at, active.index_select(0, cells.colony), include_near)
+    walls = _at_walls(cells, at, rows, include_near)
     return CandidateContacts.among(capsules, first, second, include_near), walls
 
 
 def unresolved_contacts(
-    cells: CellProperties, at: Moved, active: Tensor, pairs: CandidateContacts
+    cells: CellProperties, at: Moved, active: Tensor, rows: Tensor, pairs: CandidateContacts
 ) -> tuple[CandidateContacts, WallContacts, Tensor]:
     """After a move, in the active colonies (B,) bool: what touches the cells whose move was clipped
-    or left them too deep, and these cells, (N,) bool. pairs: what touched before the move.
+    or left them too deep, and these cells, (N,) bool. rows: at least the cells of these colonies.
+    pairs: what touched before the move.
 
     Only there is it looked for: of two cells that did not touch, one must have moved by half of
     what may be left, and two that did must have come nearer by what was missing to it.
     """
     include_near = cells.settings.sees_near[1]
-    near, rows, capsules = _neighbourhood(cells, at, active, include_near)
+    near, capsules = _neighbourhood(cells, at, rows, include_near)
     of_active = active.index_select(0, cells.colony)
-    walls = _at_walls(cells, at, of_active, include_near)
+    walls = _at_walls(cells, at, rows, include_near)
     overlap = cells.overlap
     with torch.no_grad():
         count = torch.arange(rows.numel(), device=rows.device)
         number = torch.full_like(cells.colony, -1).index_copy(0, rows, count)
         pairs_of = lambda which: [
-            rows.index_select(0, side) for side in near.pairs_of(number[which])
+            rows.index_select(0, side) for side in near.pairs_of(number.index_select(0, which))
         ]
         sum_of = lambda x, one, other: x.index_select(0, one) + x.index_select(0, other)
         far = (2 * at.reach > overlap) & of_active
         nearer = sum_of(at.reach, pairs.first, pairs.second) - pairs.gap
         come = nearer > 0.5 * sum_of(overlap, pairs.first, pairs.second)
-        come = torch.nonzero(come & of_active.index_select(0, pairs.first)).squeeze(1)
-        first, second = pairs_of(far)
+        come, fast = places(come & of_active.index_select(0, pairs.first), far)
+        first, second = pairs_of(fast)
         left = at.clipped & of_active
         # soft cells, and cells at a soft wall or one of little weight, are pressed as deep as these
         # let them
@@ -57,24 +59,24 @@ def unresolved_contacts(
             known = pairs.first.index_select(0, come), pairs.second.index_select(0, come)
             for one, other in (known, (first, second)):
                 gap = contact_gaps(capsules, one, other)
-                deep = torch.nonzero(gap < -0.5 * sum_of(overlap, one, other)).squeeze(1)
-                left[torch.cat([one.index_select(0, deep), other.index_select(0, deep)])] = True
+                deep = gap < -0.5 * sum_of(overlap, one, other)
+                left = left | marked(left.numel(), torch.cat([one, other]), deep.repeat(2))
         root, soft = wall_weights(cells, walls)
         too_deep = root * root * walls.gap < -overlap.index_select(0, walls.cell)
-        left[walls.cell[~soft & too_deep]] = True
-        more = pairs_of(left & ~far)
+        left = (left | marked(left.numel(), walls.cell, ~soft & too_deep)) & of_active
+        more = pairs_of(*places(left & ~far))
         # the others are known by now
-        new = torch.nonzero(~far.index_select(0, more[1])).squeeze(1)
+        (new,) = places(~far.index_select(0, more[1]))
         first, second = (
             torch.cat([a, b.index_select(0, new)])
             for a, b in zip((first, second), more, strict=True)
         )
         theirs = left.index_select(0, first) | left.index_select(0, second)
-        theirs = torch.nonzero(theirs).squeeze(1)
+        theirs, at_wall = places(theirs, left.index_select(0, walls.cell))
     found = CandidateContacts.among(
         capsules, first.index_select(0, theirs), second.index_select(0, theirs), include_near
     )
-    return found, walls.take(torch.nonzero(left.index_select(0, walls.cell)).squeeze(1)), left
+    return found, walls.take(at_wall), left
 
 
 @torch.no_grad()
@@ -84,21 +86,18 @@ def note_deeply_overlapping(
     """The report with the number of cells that lie deeper than a radius in another."""
     if cells.settings.soft:
         return report
-    deep = torch.nonzero(pairs.gap < -0.5 * (pairs.a.radius + pairs.b.radius)).squeeze(1)
-    marked = torch.zeros_like(cells.radius)
-    marked[torch.cat([pairs.first.index_select(0, deep), pairs.second.index_select(0, deep)])] = 1.0
-    found = cells.groups.sum(marked.unsqueeze(1)).squeeze(1).long()
+    deep = (pairs.gap < -0.5 * (pairs.a.radius + pairs.b.radius)).repeat(2)
+    mark = marked(cells.radius.numel(), torch.cat([pairs.first, pairs.second]), deep)
+    found = cells.groups.sum(mark.to(cells.radius.dtype).unsqueeze(1)).squeeze(1).long()
     return replace(report, deeply_overlapping=torch.where(active, found, report.deeply_overlapping))
 
 
 def _neighbourhood(
-    cells: CellProperties, at: Moved, active: Tensor, include_near: bool
-) -> tuple[Neighbourhood, Tensor, Capsules]:
-    """The cells of the active colonies (others may be too far gone to be stepped), which those are
-    (M,), and the capsules of all cells."""
+    cells: CellProperties, at: Moved, rows: Tensor, include_near: bool
+) -> tuple[Neighbourhood, Capsules]:
+    """The cells `rows` (others may be too far gone to be stepped), and the capsules of all."""
     local = (at.position - cells.reference).to(at.length.dtype)
     capsules = Capsules(local.T.contiguous(), at.axis.T.contiguous(), 0.5 * at.length, cells.radius)
-    rows = torch.nonzero(active.index_select(0, cells.colony)).squeeze(1)
     everyone = rows.numel() == cells.colony.numel()
     pick = lambda x: x.detach() if everyone else x.detach().index_select(0, rows)
     radius = pick(cells.radius)
@@ -112,15 +111,14 @@ def _neighbourhood(
         cells.groups.size,
         margin,
     )
-    return near, rows, capsules
+    return near, capsules
 
 
-def _at_walls(cells: CellProperties, at: Moved, which: Tensor, include_near: bool) -> WallContacts:
-    """What touches walls among the marked cells, (N,) bool."""
+def _at_walls(cells: CellProperties, at: Moved, rows: Tensor, include_near: bool) -> WallContacts:
+    """What touches walls among the cells `rows`."""
     parts = (at.position, at.axis, at.length, cells.radius, cells.colony_ids)
-    if bool(which.all()):
+    if rows.numel() == cells.colony.numel():
         return find_wall_contacts(cells.surfaces, *parts, include_near)
-    rows = torch.nonzero(which).squeeze(1)
     parts = tuple(x.index_select(0, rows) for x in parts)  # type: ignore[assignment]
     found = find_wall_contacts(cells.surfaces, *parts, include_near)
     return replace(found, cell=rows.index_select(0, found.cell))

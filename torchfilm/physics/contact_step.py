@@ -37,6 +37,7 @@ from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.problem import NOT_FINITE, ContactProblem, SolveReport
 from torchfilm.physics.solve import solve_contacts
 from torchfilm.physics.wall_contacts import WallContacts, share_to_walls
+from torchfilm.tools.reads import numbers, places, places_of
 
 # No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing.
 # A cell that would turn further makes a part of its move, and takes part in the next pass.
@@ -59,25 +60,26 @@ def contact_step(
     """
     base, rigid = at.length, growth.detach() <= 0
     moving = active.index_select(0, cells.colony)
+    most, count = numbers((passes * active).max(), moving.sum())
+    which = rows = places_of(moving, count)
     at = replace(at, length=torch.where(moving, base + growth, base))
     pairs: CandidateContacts | None = None
-    for number in range(int(passes.max())):
+    for number in range(most):
         active = active & (number < passes)
-        if not bool(active.any()):
-            break
         include_near = cells.settings.sees_near[number > 0]
         if pairs is None:
-            pairs, walls = find_contacts(cells, at, active, include_near)
+            pairs, walls = find_contacts(cells, at, rows, include_near)
             report = note_deeply_overlapping(cells, pairs, report, active)
         else:
-            pairs, walls, moving = unresolved_contacts(cells, at, active, pairs)
+            pairs, walls, moving = unresolved_contacts(cells, at, active, rows, pairs)
             active = cells.groups.any(moving)
-            if not bool(active.any()):
+            which, rows = places(moving, active.index_select(0, cells.colony))
+            if not which.numel():
                 break
         contacts = contacts_of(pairs, include_near)
         problem = assemble(cells, at, contacts, walls, base, rigid, number == 0)
         start = cells.start if number == 0 else None
-        move, solved = solve_among(cells, problem, moving, start)
+        move, solved = solve_among(cells, problem, moving, which, start)
         at = move_cells(cells, at, move, base, moving, solved)
         clipped = cells.groups.sum(at.clipped.to(base.dtype).unsqueeze(1)).squeeze(1).long()
         report = report.with_solve(solved, clipped, active)
@@ -127,17 +129,20 @@ def assemble(
 
 
 def solve_among(
-    cells: CellProperties, problem: ContactProblem, moving: Tensor, start: Tensor | None
+    cells: CellProperties,
+    problem: ContactProblem,
+    moving: Tensor,
+    which: Tensor,
+    start: Tensor | None,
 ) -> tuple[Tensor, SolveReport]:
-    """The move of the cells that are moving (N,) bool, as (N, D), while the others stay where they
-    are."""
+    """The move of the cells that are moving, (N,) bool and their places, as (N, D), while the
+    others stay where they are."""
     tolerance, most = _tolerance(cells), cells.settings.max_iterations
     ids = cells.groups.max(cells.colony_ids)
-    if bool(moving.all()):
+    if which.numel() == moving.numel():
         return solve_contacts(problem, start, tolerance, most, ids)
-    some = None if start is None else start[moving]
-    move, report = solve_contacts(problem.among(moving), some, tolerance, most, ids)
-    which = torch.nonzero(moving).squeeze(1)
+    some = None if start is None else start.index_select(0, which)
+    move, report = solve_contacts(problem.among(moving, which), some, tolerance, most, ids)
     return torch.zeros_like(problem.scale).index_copy(0, which, move), report
 
 
@@ -187,8 +192,8 @@ def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tens
     turn, way = (x.square().sum(1).sqrt() for x in (move[:, dim:-1], move[:, :dim]))
     share = (MAX_TURN / turn).clamp(max=1.0)
     reach = way + 0.5 * turn * at.length + 0.5 * move[:, -1].clamp(min=0.0)
-    far = torch.nonzero(share * reach > radius).squeeze(1)
-    if far.numel() and cells.surfaces:
+    far = places(share * reach > radius)[0] if cells.surfaces else radius.new_empty(0)
+    if far.numel():
         pick = lambda x: x.index_select(0, far)
         position, axis, length = pick(at.position), pick(at.axis), pick(at.length)
         part = pick(move) * pick(share).unsqueeze(1)

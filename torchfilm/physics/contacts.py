@@ -7,11 +7,13 @@ pairs is (d, P).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from torchfilm.physics.neighbours import Neighbourhood
+from torchfilm.tools.reads import places
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
 
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see
@@ -217,6 +219,16 @@ class CandidateContacts:
     s: Tensor
     t: Tensor
 
+    @cached_property
+    def flat(self) -> Tensor:
+        """The pairs that may touch along a line, (F,): only nearly parallel ones may."""
+        return places(self._parallel)[0]
+
+    @property
+    def _parallel(self) -> Tensor:
+        turn = cross(self.a.axis, self.b.axis).detach()
+        return slide_of(dot(turn, turn)) > 0
+
     @staticmethod
     def all_of(capsules: Capsules, first: Tensor, second: Tensor) -> CandidateContacts:
         """The given pairs, each (P,)."""
@@ -229,24 +241,23 @@ class CandidateContacts:
     ) -> CandidateContacts:
         """The given pairs, each (P,), that overlap; with include_near also those within NEAR."""
         found = CandidateContacts.all_of(capsules, first, second)
-        a, b = found.a, found.b
-        with torch.no_grad():
-            # no point of a line is nearer than the closest one, except for rounding; this margin is
-            # many times larger
-            keep = torch.nonzero(
-                found.gap < max(1e-3, 0.5 * NEAR * include_near) * (a.radius + b.radius)
-            ).squeeze(1)
-        return found.take(keep)
+        # no point of a line is nearer than the closest one, except for rounding; this margin is
+        # many times larger
+        most = max(1e-3, 0.5 * NEAR * include_near) * (found.a.radius + found.b.radius)
+        return found.nearer_than(most)
 
     @property
     def gap(self) -> Tensor:
         """The gap at the closest points, (K,) µm."""
         return gap_at(self.a, self.b, self.s, self.t)
 
-    def take(self, index: Tensor) -> CandidateContacts:
-        """The pairs at `index`."""
+    def nearer_than(self, most: Tensor) -> CandidateContacts:
+        """The pairs with a smaller gap than `most` (K,)."""
+        with torch.no_grad():
+            near = self.gap < most
+            index, flat = places(near, near & self._parallel)
         pick = lambda x: x.index_select(0, index)
-        return CandidateContacts(
+        made = CandidateContacts(
             pick(self.first),
             pick(self.second),
             self.a.take(index),
@@ -254,6 +265,8 @@ class CandidateContacts:
             pick(self.s),
             pick(self.t),
         )
+        made.__dict__["flat"] = torch.searchsorted(index, flat)
+        return made
 
 
 def contacts_of(pairs: CandidateContacts, include_near: bool = False) -> Contacts:
@@ -270,9 +283,7 @@ def contacts_of(pairs: CandidateContacts, include_near: bool = False) -> Contact
     with every pass where contacts are hard, until a full channel became a heap.
     """
     first, second, a, b, s, t = pairs.first, pairs.second, pairs.a, pairs.b, pairs.s, pairs.t
-    # only nearly parallel pairs may have a line; all others touch at the closest point
-    turn = cross(a.axis, b.axis).detach()
-    flat = torch.nonzero(slide_of(dot(turn, turn)) > 0).squeeze(1)
+    flat = pairs.flat  # all others touch at the closest point
     flat_a, flat_b = a.take(flat), b.take(flat)
     *of_lines, line = line_points(flat_a, flat_b, s.index_select(0, flat), t.index_select(0, flat))
     points = [
@@ -290,7 +301,7 @@ def contacts_of(pairs: CandidateContacts, include_near: bool = False) -> Contact
         deep0, deep1 = point < margin, line & (ends[1] < margin.index_select(0, flat))
         either = line & (deep0.index_select(0, flat) | deep1) & (ends[0] + ends[1] < 0)
         deep0[flat] |= either
-        keep0, keep1 = torch.nonzero(deep0).squeeze(1), torch.nonzero(deep1 | either).squeeze(1)
+        keep0, keep1 = places(deep0, deep1 | either)
     of_ends = _end_weights(ends, line, flat, point, margin, include_near)
     weight = torch.cat(
         [of_ends[0].index_select(0, keep0), of_ends[1].index_select(0, flat).index_select(0, keep1)]
@@ -398,8 +409,8 @@ def rows_at(a: Capsules, b: Capsules, s: Tensor, t: Tensor, end_a: Tensor, end_b
     distance = safe_norm(between)
     touching = distance <= 1e-5 * (a.radius + b.radius)
     normal = between / torch.where(touching, 1.0, distance)
-    if bool(touching.any()):  # rare, and expensive to compute for every pair
-        normal = torch.where(touching, _fallback_normal(a, b), normal)
+    # rare, but to ask whether there is any costs a read
+    normal = torch.where(touching, _fallback_normal(a, b), normal)
     gap = distance - a.radius - b.radius
     along_a, along_b = dot(normal, a.axis), dot(normal, b.axis)
     # a sphere grows at both ends at once: the end nearer to the contact counts

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools.ragged import Groups, WeightedRows, csr
+from torchfilm.tools.reads import places
 
 
 class ContactJacobian:
@@ -40,12 +41,13 @@ class ContactJacobian:
         """R, the number of rows."""
         return self.pairs + self.walls
 
-    def part(self, rows: Tensor, number: Tensor, cells: int) -> ContactJacobian:
-        """The given rows (M,), in their order, as an operator over `cells` cells.
+    def part(self, rows: Tensor, pairs: int, number: Tensor, cells: int) -> ContactJacobian:
+        """The given rows (M,), of which the first `pairs` are of two cells, as an operator over
+        `cells` cells.
 
         number: (N,) the new index of each cell that these rows touch.
         """
-        pair, wall = rows[rows < self.pairs], rows[rows >= self.pairs] - self.pairs
+        pair, wall = rows[:pairs], rows[pairs:] - self.pairs
         of_pairs = [
             x.index_select(0, pair)
             for x in (self.first, self.second, self.row_first, self.row_second)
@@ -61,21 +63,15 @@ class ContactJacobian:
             cells,
         )
 
-    def among(self, moving: Tensor) -> tuple[ContactJacobian, Tensor]:
-        """The rows of the moving cells, (N,) bool, with these cells renumbered.
+    def among(self, moving: Tensor, cells: int) -> tuple[ContactJacobian, Tensor]:
+        """The rows of the moving cells, (N,) bool, which are `cells`, with these renumbered.
 
         A cell at rest acts on them like a wall. Also returns the index of each new row here, (R',).
         """
         number = torch.cumsum(moving, 0) - 1
         one, other = moving.index_select(0, self.first), moving.index_select(0, self.second)
-        both, only_one, only_other, wall = (
-            torch.nonzero(which).squeeze(1)
-            for which in (
-                one & other,
-                one & ~other,
-                other & ~one,
-                moving.index_select(0, self.at_wall),
-            )
+        both, only_one, only_other, wall = places(
+            one & other, one & ~other, other & ~one, moving.index_select(0, self.at_wall)
         )
         of = lambda cell, rows: number.index_select(0, cell.index_select(0, rows))
         at_wall = torch.cat(
@@ -89,7 +85,7 @@ class ContactJacobian:
             self.row_second.index_select(0, both),
             at_wall,
             torch.cat([row.index_select(0, which) for row, which in parts]),
-            int(moving.sum()),
+            cells,
         )
         return rows, torch.cat([both, only_one, only_other, self.pairs + wall])
 

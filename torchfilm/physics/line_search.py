@@ -36,8 +36,6 @@ def search_line(problem: ContactProblem, y, after, gradient, direction, going):
         # decided for each colony by itself: a colony that needs no search must not change because
         # another one does
         going = going & stopped
-        if not bool(going.any()):
-            break
         step = new - y
         terms = [gradient * step, gradient * direction, ahead * step]
         slope, whole, end = colonies.sum(torch.stack([x.sum(1) for x in terms], 1)).unbind(1)

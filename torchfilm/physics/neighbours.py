@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools.ragged import Groups, expand_ranges, offsets
+from torchfilm.tools.reads import numbers, places
 
 # Slices of a row per reach of a cell. Finer slices leave fewer cells out of reach to test; coarser
 # slices make the table of their starts shorter.
@@ -61,15 +62,22 @@ class Neighbourhood:
         self.grids: list[tuple[_CellGrid, Tensor]] = []
         if colony.numel() < 2:
             return
-        smallest = -Groups(colony, colonies).max(-self.reach)
+        groups = Groups(colony, colonies)
+        smallest = -groups.max(-self.reach)
         level = torch.floor(
             torch.log(self.reach / smallest.index_select(0, colony)) / math.log(CLASS_RATIO) + 1e-3
         ).long()
-        for k in range(int(level.max()) + 1):
-            members = torch.nonzero(level == k).squeeze(1)
+        everyone = torch.arange(colony.numel(), device=colony.device)
+        # most often all are of one class: its grid is made before that is known, for one read less
+        grid, last = _CellGrid.build(position, self.reach, groups, everyone, level.max())
+        if last == 0:
+            self.grids.append((grid, everyone[:0]))
+            return
+        for k in range(last + 1):
+            members, larger = places(level == k, level > k)
             if members.numel():
-                grid = _CellGrid.build(position, self.reach, colony, colonies, members)
-                self.grids.append((grid, torch.nonzero(level > k).squeeze(1)))
+                grid, _ = _CellGrid.build(position, self.reach, groups, members, level.max())
+                self.grids.append((grid, larger))
 
     @torch.no_grad()
     def pairs(self) -> tuple[Tensor, Tensor]:
@@ -95,7 +103,7 @@ class Neighbourhood:
         for grid, _ in self.grids if cells.numel() else ():
             i, j = _keep_spheres_that_meet(self.place, self.reach, *grid.pairs_with(cells))
             # a pair of two selected cells was found twice, and each selected cell has found itself
-            once = torch.nonzero((i < j) | ~selected.index_select(0, j)).squeeze(1)
+            (once,) = places((i < j) | ~selected.index_select(0, j))
             found.append((i.index_select(0, once), j.index_select(0, once)))
         return self._keep_boxes_that_meet(found)
 
@@ -105,13 +113,12 @@ class Neighbourhood:
         i, j = (
             torch.cat([none, *side]) for side in (zip(*found, strict=True) if found else ((), ()))
         )
+        meet = torch.ones_like(i, dtype=torch.bool)
         for x, size in zip(self.place, self.box, strict=True):
-            apart = (x.index_select(0, j) - x.index_select(0, i)).abs() > size.index_select(
-                0, i
-            ) + size.index_select(0, j)
-            keep = torch.nonzero(~apart).squeeze(1)
-            i, j = i.index_select(0, keep), j.index_select(0, keep)
-        return i, j
+            apart = (x.index_select(0, j) - x.index_select(0, i)).abs()
+            meet &= ~(apart > size.index_select(0, i) + size.index_select(0, j))
+        (keep,) = places(meet)
+        return i.index_select(0, keep), j.index_select(0, keep)
 
 
 @dataclass(frozen=True)
@@ -127,19 +134,20 @@ class _CellGrid:
     members: Tensor  # sorted by key
     keys: Tensor
     slices: int  # per row height
+    most_rows: list[int]  # of any colony, along each axis across rows
     table: Tensor | None = None  # number of members before each key
 
     @staticmethod
     def build(
-        position: Tensor, reach: Tensor, colony: Tensor, colonies: int, members: Tensor
-    ) -> _CellGrid:
-        """The grid of one class, for its cells `members`."""
-        greatest = Groups(colony.index_select(0, members), colonies).max(
-            reach.index_select(0, members), empty=1.0
-        )
+        position: Tensor, reach: Tensor, groups: Groups, members: Tensor, also: Tensor
+    ) -> tuple[_CellGrid, int]:
+        """The grid of one class, for its cells `members`, and the number `also`, read with it."""
+        colony, of_members = groups.owner, groups
+        if members.numel() < colony.numel():
+            of_members = Groups(colony.index_select(0, members), groups.size)
+        greatest = of_members.max(reach.index_select(0, members), empty=1.0)
         # narrow rows leave fewer cells out of reach to test, but in space there are many more rows
         wide = 1 if position.shape[1] == 2 else 2
-        groups = Groups(colony, colonies)
         extent = torch.stack([groups.max(x) + groups.max(-x) for x in position.unbind(1)]).amax(0)
         # a lower bound on the row height: keys must fit 64 bits even for cells metres apart
         height = torch.maximum(wide * greatest, extent / MAX_ROWS).index_select(0, colony)
@@ -150,19 +158,21 @@ class _CellGrid:
             low = -groups.max(-x)
             at.append((x - low.index_select(0, colony)) / height)
             shape.append(groups.max(torch.floor(at[k] * (slices if k == 0 else 1)).long()) + 1)
-        numbers = shape[0]
+        entries = shape[0]
         for k in range(1, len(shape)):
-            numbers = numbers * shape[k]
+            entries = entries * shape[k]
+        read, size, *most_rows = numbers(also, entries.sum(), *(rows.amax() for rows in shape[1:]))
         window = (reach + greatest.index_select(0, colony)) / height * (1 + 1e-5)
         grid = _CellGrid(
             torch.stack(at),
             torch.stack(shape),
-            offsets(numbers)[:-1],
+            offsets(entries)[:-1],
             window,
             colony,
             members,
             members,
             slices,
+            most_rows,
         )
         mine = grid.at.index_select(1, members)
         key = grid._key(
@@ -171,10 +181,11 @@ class _CellGrid:
             torch.floor(mine[0] * slices).long(),
         )
         keys, order = torch.sort(key, stable=True)
-        table, size = None, int(numbers.sum())
+        table = None
         if size <= TABLE_SHARE * colony.numel():
-            table = offsets(torch.bincount(keys, minlength=size))
-        return replace(grid, members=members.index_select(0, order), keys=keys, table=table)
+            table = offsets(keys.new_zeros(size).scatter_add_(0, keys, torch.ones_like(keys)))
+        members = members.index_select(0, order)
+        return replace(grid, members=members, keys=keys, table=table), read
 
     def _key(self, colony: Tensor, rows: Tensor, along: Tensor) -> Tensor:
         """The key of a slice: cells are sorted by colony, then row, then slice."""
@@ -227,26 +238,26 @@ class _CellGrid:
         # read is contiguous and fits a cache
         place, reach = place.index_select(1, members), reach.index_select(0, members)
         reaches = 2 if own.shape[0] == 1 else 1
-        greatest = (
-            self.shape[1:].amax(1).tolist()
-        )  # a film one row thick has no rows above or below
-        first, second = [], []
+        starts, counts = [], []
         for step in itertools.product(range(-reaches, reaches + 1), repeat=own.shape[0]):
+            # a film one row thick has no rows above or below
             if step[::-1] < (0,) * len(step) or any(
-                abs(k) >= rows for k, rows in zip(step, greatest, strict=True)
+                abs(k) >= rows for k, rows in zip(step, self.most_rows, strict=True)
             ):
                 continue
-            start, count = self._range_in_row(
-                members, own + torch.tensor(step, device=own.device).unsqueeze(1)
-            )
+            offset = torch.tensor(step, device=own.device).unsqueeze(1)
+            start, count = self._range_in_row(members, own + offset)
             if not any(step):
                 stop = start + count
                 start = torch.arange(1, members.numel() + 1, device=members.device)
                 count = (stop - start).clamp(min=0)
-            owner, run = _keep_spheres_that_meet(place, reach, *expand_ranges(start, count))
-            first.append(members.index_select(0, owner))
-            second.append(members.index_select(0, run))
-        return torch.cat(first), torch.cat(second)
+            starts.append(start)
+            counts.append(count)
+        totals = numbers(*(count.sum() for count in counts))
+        runs = [expand_ranges(*each) for each in zip(starts, counts, totals, strict=True)]
+        (keep,) = places(torch.cat([_spheres_meet(place, reach, *run) for run in runs]))
+        first, second = (torch.cat(side).index_select(0, keep) for side in zip(*runs, strict=True))
+        return members.index_select(0, first), members.index_select(0, second)
 
     def pairs_with(self, queried: Tensor) -> tuple[Tensor, Tensor]:
         """Every pair of one of the cells `queried` (M,), of this class or another, and a member.
@@ -272,11 +283,16 @@ def _keep_spheres_that_meet(
     place: Tensor, reach: Tensor, i: Tensor, j: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The pairs (i, j) whose bounding spheres meet. place: (d, N). reach: (N,)."""
+    (keep,) = places(_spheres_meet(place, reach, i, j))
+    return i.index_select(0, keep), j.index_select(0, keep)
+
+
+def _spheres_meet(place: Tensor, reach: Tensor, i: Tensor, j: Tensor) -> Tensor:
+    """Whether the bounding spheres of each pair meet, (P,) bool."""
     between = [x.index_select(0, j) - x.index_select(0, i) for x in place]
     squared = between[0] * between[0]
     for x in between[1:]:
         squared = squared + x * x
     sum_reach = reach.index_select(0, i) + reach.index_select(0, j)
     # slightly more than the reach: rounding must not lose a pair that touches exactly
-    keep = torch.nonzero(squared <= sum_reach * sum_reach * (1 + 1e-5)).squeeze(1)
-    return i.index_select(0, keep), j.index_select(0, keep)
+    return squared <= sum_reach * sum_reach * (1 + 1e-5)

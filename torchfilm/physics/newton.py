@@ -24,6 +24,7 @@ from torchfilm.physics.problem import (
 )
 from torchfilm.tools.cg import conjugate_gradients, worst_of
 from torchfilm.tools.ragged import Blocks
+from torchfilm.tools.reads import numbers, places_of
 
 # The share of its target that CG must reach. It is below 1, since lengths that meet their bound
 # undo part of the progress, and the true residual differs by rounding from the recurred one.
@@ -134,17 +135,19 @@ def _newton_rounds(
         target = tolerance * scale
         going = (worst > target) & (worst < torch.inf) & (iterations < max_iterations)
         stalled = going & (worst > 0.9 * previous)
-        if bool(stalled.any()):
+        some_stalled, *left = numbers(stalled.any(), *_sizes(problem, going))
+        if some_stalled:
             # where opposing forces on a cell cancel, rounding limits the residual that can be
             # reached
             least = _rounding_residual(problem, precondition, y) / tolerance
             scale = torch.where(stalled, torch.maximum(scale, least), scale)
             target = tolerance * scale
             going = going & (worst > target)
+            left = numbers(*_sizes(problem, going))
         here = Iterate(y, after, free, inverse, scale, worst, iterations)
-        if rounds == NEWTON_LIMIT or not bool(going.any()):
+        if rounds == NEWTON_LIMIT or not left[0]:
             return here
-        which = _minority(problem, going)
+        which = _minority(problem, going, *left)
         if which is not None:  # a few colonies go on without the cost of the others
             part = replace(here.part(which), worst=previous.index_select(0, which.colonies))
             end = _newton_rounds(
@@ -165,15 +168,30 @@ def _newton_rounds(
         rounds += 1
 
 
-def _minority(problem: ContactProblem, going: Tensor) -> Selection | None:
-    """The colonies that still iterate, if they have less than half of the cells; else None."""
+def _sizes(problem: ContactProblem, going: Tensor) -> tuple[Tensor, ...]:
+    """How many colonies still iterate, (B,) bool, and how many cells, rows of two cells and rows at
+    walls they have."""
+    of_rows = going.index_select(0, problem.of_rows.owner)
+    pairs = problem.rows.pairs
+    cells = going.index_select(0, problem.colonies.owner)
+    return going.sum(), cells.sum(), of_rows[:pairs].sum(), of_rows[pairs:].sum()
+
+
+def _minority(
+    problem: ContactProblem, going: Tensor, colonies: int, cells: int, pairs: int, walls: int
+) -> Selection | None:
+    """The colonies that still iterate, if they have less than half of the cells; else None. Their
+    sizes are those of `_sizes`."""
     owner = problem.colonies.owner
-    moving = going.index_select(0, owner)
-    cells = torch.nonzero(moving).squeeze(1)
-    if 2 * cells.numel() >= owner.numel():
+    if 2 * cells >= owner.numel():
         return None
-    rows = torch.nonzero(moving.index_select(0, problem.rows.row_owner)).squeeze(1)
-    return Selection(torch.nonzero(going).squeeze(1), cells, rows)
+    of_rows = going.index_select(0, problem.of_rows.owner)
+    return Selection(
+        places_of(going, colonies),
+        places_of(going.index_select(0, owner), cells),
+        places_of(of_rows, pairs + walls),
+        pairs,
+    )
 
 
 def _rounding_residual(problem: ContactProblem, precondition: Map, y: Tensor) -> Tensor:

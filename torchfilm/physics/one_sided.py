@@ -30,7 +30,6 @@ from torchfilm.physics.contacts import (
     end_of,
     line_points,
     rows_at,
-    slide_of,
 )
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.neighbours import Neighbourhood
@@ -39,8 +38,9 @@ from torchfilm.physics.one_sided_solve import Minimum, minimise
 from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
 from torchfilm.physics.solve import warn_if_loose
 from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
-from torchfilm.tools.ragged import offsets
-from torchfilm.tools.vectors import cross, dot, safe_norm
+from torchfilm.tools.ragged import marked, offsets
+from torchfilm.tools.reads import numbers, places
+from torchfilm.tools.vectors import safe_norm
 
 
 def contact_steps(given: StepInput) -> StepResult:
@@ -77,48 +77,45 @@ class _OneStep:
                 if overlap is None
                 else torch.full_like(self.wide, overlap)
             )
-        self.of_cells = lambda x: x.index_select(0, self.groups.owner).to(given.radius.dtype)
+        self.of_cells = lambda x: self.groups.spread(x).to(given.radius.dtype)
 
     def taken(self, at: StepResult) -> StepResult:
         """The result after this step."""
         given, active = self.given, self.active
-        if not bool(active.any()):
+        moving = active.index_select(0, self.groups.owner)
+        (cells,) = places(moving)
+        if not cells.numel():
             return at
-        base = at.length
+        rows, base = cells, at.length
         least = base - SHRINK * self.growth.clamp(min=0.0)
-        on = active.index_select(0, self.groups.owner)
-        at = replace(at, length=torch.where(on, base + self.growth, base))
+        at = replace(at, length=torch.where(moving, base + self.growth, base))
         hardness = torch.where(at.hardness > 0, at.hardness, self.softest)
         at = replace(at, hardness=hardness)
-        limit = int(given.settings.passes)
-        for number in range(limit + 1):
-            pairs, walls = self._contacts(at, active, number == 0)
+        for number in range(1 if given.settings.soft else int(given.settings.passes)):
+            pairs, walls = self._contacts(at, rows, number == 0)
             gap = pairs.gap.detach()
             if number == 0 and not given.settings.soft:
                 at = replace(at, deeply_overlapping=self._deeply(pairs, gap, active, at))
             if number > 0:
                 moving = self._deep_cells(pairs, gap, walls)
                 active = active & self.groups.any(moving)
-                if number == limit or given.settings.soft or not bool(active.any()):
+                of_active = active.index_select(0, self.groups.owner)
+                moving = moving & of_active
+                cells, rows = places(moving, of_active)
+                if not cells.numel():
                     break
-                moving = moving & active.index_select(0, self.groups.owner)
-            else:
-                moving = on
-            at = self._pass(at, pairs, walls, moving, active, least, number == 0)
+            at = self._pass(at, pairs, walls, moving, cells, active, least, number == 0)
             active = active & (at.status != NOT_FINITE)
-            if not bool(active.any()):
-                break
         return at
 
     # --- find ----------------------------------------------------------------------------------
 
     def _contacts(
-        self, at: StepResult, active: Tensor, first_pass: bool
+        self, at: StepResult, rows: Tensor, first_pass: bool
     ) -> tuple[CandidateContacts, WallContacts]:
-        """Pairs of cells nearer than the margin, in float64, and cells nearer to walls than that
-        and their last move."""
+        """Pairs of the cells `rows` nearer than the margin, in float64, and which of them are
+        nearer to walls than that and their last move."""
         given, owner = self.given, self.groups.owner
-        rows = torch.nonzero(active.index_select(0, owner)).squeeze(1)
         first = offsets(self.groups.counts)[:-1].clamp(max=owner.numel() - 1)
         start = given.position.detach().index_select(0, first)  # only for the size of numbers
         local, axis = at.position - start.index_select(0, owner), at.axis.double()
@@ -133,7 +130,6 @@ class _OneStep:
         first, second = torch.minimum(first, second), torch.maximum(first, second)
         capsules = Capsules(local.T.contiguous(), axis.T.contiguous(), 0.5 * length, radius)
         found = CandidateContacts.all_of(capsules, first, second)
-        keep = found.gap.detach() < margin.index_select(0, first)
         last = at.move.detach()[:, : self.dim].double().square().sum(1).sqrt()
         reach = margin + last if first_pass else margin
         position, axis, length, radius, ids, reach = (
@@ -142,33 +138,30 @@ class _OneStep:
         )
         walls = find_wall_contacts(given.surfaces, position, axis, length, radius, ids, reach=reach)
         walls = replace(walls, cell=rows.index_select(0, walls.cell))
-        return found.take(torch.nonzero(keep).squeeze(1)), walls
+        return found.nearer_than(margin.index_select(0, first)), walls
 
     def _deeply(self, pairs, gap: Tensor, active: Tensor, at: StepResult) -> Tensor:
         """How many cells of each colony lie deeper in another than a radius, (B,)."""
-        deep = torch.nonzero(gap < -0.5 * (pairs.a.radius + pairs.b.radius)).squeeze(1)
-        marked = torch.zeros_like(self.given.radius)
-        marked[torch.cat([pairs.first[deep], pairs.second[deep]])] = 1.0
-        found = self.groups.sum(marked.unsqueeze(1)).squeeze(1).long()
+        deep = gap < -0.5 * (pairs.a.radius + pairs.b.radius)
+        both = torch.cat([pairs.first, pairs.second])
+        mark = marked(self.given.radius.numel(), both, deep.repeat(2))
+        found = self.groups.sum(mark.to(gap.dtype).unsqueeze(1)).squeeze(1).long()
         return torch.where(active, found, at.deeply_overlapping)
 
     def _deep_cells(self, pairs, gap: Tensor, walls: WallContacts) -> Tensor:
         """The cells deep in others or in a hard wall, and those up to HOPS contacts from the
         former, (N,) bool."""
-        mark = torch.zeros_like(self.given.radius, dtype=torch.bool)
-        deep = self.deep.index_select(0, self.groups.owner.index_select(0, pairs.first))
-        far = torch.nonzero(gap < -deep).squeeze(1)
-        mark[torch.cat([pairs.first[far], pairs.second[far]])] = True
-        near = torch.nonzero(gap < 0.1 * deep).squeeze(1)
-        one, other = pairs.first[near], pairs.second[near]
+        count, owner = self.given.radius.numel(), self.groups.owner
+        one = torch.cat([pairs.first, pairs.second])
+        other = torch.cat([pairs.second, pairs.first])
+        gap, deep = gap.repeat(2), self.deep.index_select(0, owner.index_select(0, one))
+        mark, near = marked(count, one, gap < -deep), gap < 0.1 * deep
         for _ in range(HOPS):
-            more = torch.cat([other[mark[one]], one[mark[other]]])
-            mark = mark.index_fill(0, more, True)
+            mark = mark | marked(count, one, near & mark.index_select(0, other))
         root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
         hard = ~soft & (root >= 1)  # a lighter wall is meant to give way
-        limit = self.deep.index_select(0, self.groups.owner.index_select(0, walls.cell))
-        mark[walls.cell[hard & (walls.gap.detach() < -limit)]] = True
-        return mark
+        limit = self.deep.index_select(0, owner.index_select(0, walls.cell))
+        return mark | marked(count, walls.cell, hard & (walls.gap.detach() < -limit))
 
     def _wall_roots(self, walls: WallContacts, alpha: Tensor) -> tuple[Tensor, Tensor]:
         """D of each wall row (W,), and whether the wall is soft, (W,) bool."""
@@ -187,15 +180,15 @@ class _OneStep:
 
     # --- solve and move ------------------------------------------------------------------------
 
-    def _pass(self, at, pairs, walls, moving, active, least, first_pass: bool) -> StepResult:
-        """One solve of the moving cells (N,) bool among the others at rest, and their moves."""
+    def _pass(self, at, pairs, walls, moving, cells, active, least, first_pass: bool) -> StepResult:
+        """One solve of the moving cells, (N,) bool and their places, among the others at rest, and
+        their moves."""
         given, settings = self.given, self.given.settings
-        solved = self._solved(at, pairs, walls, moving, active, least, first_pass)
+        contacts = near_rows(pairs)
+        solved = self._solved(at, contacts, walls, moving, cells, active, least, first_pass)
         part, end = solved.problem, solved.end
         y = self._with_gradient(part, end)
-        move = torch.zeros_like(at.move).index_copy(
-            0, torch.nonzero(moving).squeeze(1), y * part.scale
-        )
+        move = torch.zeros_like(at.move).index_copy(0, cells, y * part.scale)
         sound = (end.error < torch.inf) & active
         status = torch.where(end.error <= settings.tolerance, CONVERGED, ITERATION_LIMIT)
         status = torch.where(end.error < torch.inf, status, NOT_FINITE)
@@ -219,26 +212,27 @@ class _OneStep:
         moving = moving & self.of_cells(sound).bool()
         return self._moved(at, move, about, moving, least, first_pass)
 
-    def _solved(self, at, pairs, walls, moving, active, least, first_pass: bool) -> _Solved:
+    def _solved(self, at, contacts, walls, moving, cells, active, least, first_pass) -> _Solved:
         """Solve for the moving cells: with softer contacts where a solve does not converge, then
         harder again; and in a first pass again where the force has grown much."""
         given, settings = self.given, self.given.settings
-        cells, whole = torch.nonzero(moving).squeeze(1), bool(moving.all())
         hardness, softer = at.hardness, torch.ones_like(at.hardness)
         follows = first_pass and given.alpha is None
         spent, fell = torch.zeros_like(at.iterations), torch.zeros_like(active)
         again, rising, kept_alpha = active, torch.ones_like(active), hardness
+        goes_on = True
         end: Minimum | None = None
         kept: Minimum | None = None
         while True:
-            part = self._problem(at, pairs, walls, hardness * softer, softer, least, first_pass)
-            part = part if whole else part.among(moving)
-            if end is not None and not bool(again.any()):
+            part = self._problem(at, contacts, walls, hardness * softer, softer, least, first_pass)
+            part = part if cells.numel() == moving.numel() else part.among(moving, cells)
+            if end is not None and not goes_on:
                 return _Solved(part, end, hardness * softer, spent, fell)
             start = torch.zeros_like(part.scale)
             if first_pass:
                 scale = part.scale.detach()
-                start = torch.where(scale > 0, at.move.detach()[cells] / scale, 0.0)
+                last = at.move.detach().index_select(0, cells)
+                start = torch.where(scale > 0, last / scale, 0.0)
             if end is not None:  # colonies whose contacts grow harder go on
                 going_on = (~rising).index_select(0, part.colonies.owner).unsqueeze(1)
                 start = torch.where(going_on, end.y, start)
@@ -262,7 +256,8 @@ class _OneStep:
                 kept = end if kept is None else end.where(down | lags, kept, part)
             was, used = kept_alpha, hardness * softer
             kept_alpha = torch.where(down | lags, used, kept_alpha)
-            if follows and bool(lags.any()):
+            goes_on, some_lag = map(bool, numbers((up | down | lags).any(), lags.any()))
+            if follows and some_lag:
                 y = self._with_gradient(part, end)
                 after = part.gap_after(y) if y.requires_grad else end.after
                 wanted = self._followed(hardness, part, after, walls)
@@ -281,14 +276,13 @@ class _OneStep:
         tolerance = torch.full_like(end.error, settings.tolerance).to(end.y.dtype)
         return attach_gradient(part, end, tolerance, settings.max_iterations, self.given.ids)
 
-    def _problem(self, at, pairs, walls, hardness, softer, least, first_pass) -> ContactProblem:
+    def _problem(self, at, contacts, walls, hardness, softer, least, first_pass) -> ContactProblem:
         """The linear problem of one pass: α by colony, or the given one times `softer`, (B,)."""
         given, settings = self.given, self.given.settings
         alpha = self.of_cells(hardness)
         if given.alpha is not None:
             alpha = given.alpha * self.of_cells(softer)
         dtype = given.radius.dtype
-        contacts = near_rows(pairs)
         rigid = self.growth.detach() <= 0
         across, turning, _ = capsule.drag(at.length, given.radius, given.viscosity)
         turns = settings.degrees - settings.dim - 1
@@ -376,11 +370,13 @@ def near_rows(pairs: CandidateContacts) -> Contacts:
     """The rows of all pairs, gaps as they are: one at the closest points, or, where two cells touch
     along a line, two of weight ½ at its ends."""
     a, b, s, t = pairs.a, pairs.b, pairs.s, pairs.t
-    turn = cross(a.axis, b.axis).detach()
-    flat = torch.nonzero(slide_of(dot(turn, turn)) > 0).squeeze(1)
-    lines = line_points(a.take(flat), b.take(flat), s[flat], t[flat])
-    *ends, line = lines
-    flat, ends = flat[line], [x[:, line] for x in ends]
+    flat = pairs.flat
+    found = line_points(
+        a.take(flat), b.take(flat), s.index_select(0, flat), t.index_select(0, flat)
+    )
+    *ends, line = found
+    (line,) = places(line)
+    flat, ends = flat.index_select(0, line), [x.index_select(1, line) for x in ends]
     points = [
         torch.cat([x.index_copy(0, flat, two[0]), two[1]])
         for x, two in zip((s, t, end_of(s, a.half), end_of(t, b.half)), ends, strict=True)

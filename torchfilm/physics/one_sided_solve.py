@@ -12,10 +12,15 @@ import torch
 from torch import Tensor
 
 from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS, ROUNDING
-from torchfilm.physics.preconditioner import BLOCK_FLOOR
+from torchfilm.physics.preconditioner import BLOCK_FLOOR, symmetric_inverse
 from torchfilm.physics.problem import ContactProblem
 from torchfilm.tools.cg import conjugate_gradients
 from torchfilm.tools.ragged import Blocks, Groups
+from torchfilm.tools.reads import numbers, reads_are_free
+
+# Looks of a line search between two reads whether all colonies have found their place: most need
+# fewer.
+LOOKS = 4
 
 
 @dataclass(frozen=True)
@@ -61,21 +66,17 @@ def minimise(
     colonies, owner = problem.colonies, problem.colonies.owner
     pushes = problem.of_rows.any(problem.gap < 0).index_select(0, owner).unsqueeze(1)
     y = torch.where(pushes, y, 0.0)  # where nothing pushes, nothing moves at all
-    low = problem.lower
-    y[:, -1] = torch.maximum(y[:, -1], low)
-    after = problem.gap_after(y)
+    y[:, -1] = torch.maximum(y[:, -1], problem.lower)
     fall = torch.full((colonies.size,), torch.inf, dtype=torch.float64, device=y.device)
     iterations = torch.zeros(colonies.size, dtype=torch.int64, device=y.device)
-    stuck = torch.zeros_like(iterations)
-    alone = torch.zeros_like(problem.rigid)  # lengths that step alone
-    going = torch.ones_like(iterations, dtype=torch.bool)
-    for number in range(MOST_ROUNDS + 1):
-        at = _look(problem, y, after, alone, fall, cap)
-        alone = alone & at.held
-        # who has stopped stays as it is, whatever the others of the batch do
-        going = going & (at.error > tolerance) & (at.residual < torch.inf)
-        going = going & (iterations < limit) & (stuck < 2)
-        if number == MOST_ROUNDS or not bool(going.any()):
+    here = _Point(
+        y, problem.gap_after(y), torch.zeros_like(problem.rigid), fall, torch.zeros_like(iterations)
+    )
+    at = _look(problem, here, cap)
+    going = at.goes_on(tolerance) & (limit > 0)
+    goes_on = bool(going.any())
+    for _ in range(MOST_ROUNDS):
+        if not goes_on:
             break
         target = torch.where(going, FORCING**2 * at.residual, torch.inf)
         result = conjugate_gradients(
@@ -88,25 +89,32 @@ def minimise(
             by_energy=True,
         )
         iterations = iterations + result.iterations
-        wanted = torch.where(alone, -at.downhill, result.x[:, -1])
-        wanted = torch.cat([result.x[:, :-1], wanted.unsqueeze(1)], 1)
-        step, most = _stopped_at_bounds(y, wanted, low, colonies)
-        change = problem.rows.apply(step)
-        share, lost = _search_line(problem, after, change, y, step, most, going)
-        fall = torch.where(going, lost, fall)
-        stuck = torch.where(going, torch.where(share == 0, stuck + 1, 0), stuck)
-        stopped = step[:, -1] > wanted[:, -1]
-        creeps = (share < CREEP).index_select(0, owner)
-        alone = torch.where(going.index_select(0, owner), (alone | stopped) & creeps, alone)
-        share = share.to(y.dtype)
-        y = y + share.index_select(0, owner).unsqueeze(1) * step
-        near = low + ROUNDING * (low.abs() + step[:, -1].abs())
-        y[:, -1] = torch.where(y[:, -1] <= near, low, y[:, -1])
-        after = after - share.index_select(0, problem.of_rows.owner) * change
+        search, searches = _LineSearch(problem, here, at, result.x, going), True
+        while searches:
+            search.look()
+            there = search.end()
+            found = _look(problem, there, cap)
+            # who has stopped stays as it is, whatever the others of the batch do
+            left = going & found.goes_on(tolerance) & (iterations < limit) & (there.stuck < 2)
+            searches, goes_on = map(bool, numbers(search.looking.any(), left.any()))
+        here, at, going = there, found, left
     free = torch.ones_like(y)
     free[:, -1] = (~at.held & ~problem.rigid).to(y.dtype)
     inverse, _ = _inverse_blocks(problem, at.active, torch.zeros_like(at.held))
-    return Minimum(y, after, at.active, free, inverse, at.error, iterations)
+    return Minimum(here.y, here.after, at.active, free, inverse, at.error, iterations)
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Where a round begins: the scaled move (N, D), the gaps after it (R,), lengths that step alone
+    (N,); and, (B,), how far the energy fell in the last round, and for how many rounds it has not.
+    """
+
+    y: Tensor
+    after: Tensor
+    alone: Tensor
+    fall: Tensor
+    stuck: Tensor
 
 
 @dataclass(frozen=True)
@@ -123,11 +131,14 @@ class _Look:
     residual: Tensor
     error: Tensor
 
+    def goes_on(self, tolerance: float) -> Tensor:
+        """Which colonies have not converged but still may, (B,) bool."""
+        return (self.error > tolerance) & (self.residual < torch.inf)
 
-def _look(
-    problem: ContactProblem, y: Tensor, after: Tensor, alone: Tensor, fall: Tensor, cap: Tensor
-) -> _Look:
+
+def _look(problem: ContactProblem, here: _Point, cap: Tensor) -> _Look:
     colonies, rows = problem.colonies, problem.of_rows
+    y, after, alone, fall = here.y, here.after, here.alone, here.fall
     active = (after < 0).to(after.dtype)
     gradient = problem.gradient(y, after * active)
     at_bound = (y[:, -1] <= problem.lower) & (gradient[:, -1] >= 0)
@@ -159,10 +170,9 @@ def _inverse_blocks(problem: ContactProblem, active: Tensor, held: Tensor) -> tu
     free = (~held).double().unsqueeze(1)
     blocks[:, -1, :-1] *= free
     blocks[:, :-1, -1] *= free
-    inverse = torch.linalg.inv_ex(blocks).inverse
-    inverse = (inverse + inverse.mT).mul_(0.5)
+    inverse = symmetric_inverse(blocks)
     inverse[:, -1, -1] *= free.squeeze(1)
-    return inverse.to(active.dtype).contiguous(), own
+    return inverse.to(active.dtype), own
 
 
 def _stopped_at_bounds(
@@ -177,44 +187,72 @@ def _stopped_at_bounds(
     return torch.cat([step[:, :-1], length.unsqueeze(1)], 1), -colonies.max(-most, -torch.inf)
 
 
-def _search_line(
-    problem: ContactProblem,
-    after: Tensor,
-    change: Tensor,
-    y: Tensor,
-    step: Tensor,
-    most: Tensor,
-    going: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """How far each colony goes along its step, at most `most` (B,), until the slope is at most
-    LEVEL of that at the start, and how far the energy falls, (B,)."""
-    rows, colonies = problem.of_rows, problem.colonies
-    e, q = after.double(), change.double()
-    drag = torch.stack([(problem.alpha * y * step).sum(1), (problem.alpha * step**2).sum(1)], 1)
-    pushed = rows.sum((problem.applied_force * change).double().unsqueeze(1)).squeeze(1)
-    first, second = colonies.sum(drag.double()).unbind(1)
-    first = first + pushed
+class _LineSearch:
+    """How far each colony goes along its step: until the slope is at most LEVEL of that at the
+    start, and no farther than its lengths may."""
 
-    def slope(share: Tensor) -> tuple[Tensor, Tensor]:
-        left = (e - share.index_select(0, rows.owner) * q).clamp(max=0.0)
-        both = rows.sum(torch.stack([-left * q, (left < 0) * q * q], 1))
-        return both[:, 0] + first + second * share, both[:, 1] + second
+    def __init__(
+        self, problem: ContactProblem, here: _Point, at: _Look, direction: Tensor, going: Tensor
+    ):
+        rows, colonies = problem.of_rows, problem.colonies
+        self.problem, self.here, self.going = problem, here, going
+        wanted = torch.where(here.alone, -at.downhill, direction[:, -1])
+        wanted = torch.cat([direction[:, :-1], wanted.unsqueeze(1)], 1)
+        self.step, self.most = _stopped_at_bounds(here.y, wanted, problem.lower, colonies)
+        self.stopped = self.step[:, -1] > wanted[:, -1]
+        self.change = problem.rows.apply(self.step)
+        self.e, self.q = here.after.double(), self.change.double()
+        alpha, step = problem.alpha, self.step
+        drag = torch.stack([(alpha * here.y * step).sum(1), (alpha * step**2).sum(1)], 1)
+        pushed = (problem.applied_force * self.change).double().unsqueeze(1)
+        self.first, self.second = colonies.sum(drag.double()).unbind(1)
+        self.first = self.first + rows.sum(pushed).squeeze(1)
+        zero = torch.zeros_like(self.first)
+        self.start, curvature = self._slope(zero)
+        self.looking = going & (self.start < 0) & (curvature > 0)
+        share = -self.start / torch.where(self.looking, curvature, 1.0)
+        self.share = torch.minimum(torch.where(self.looking, share, 0.0), self.most)
+        self.low, self.high, self.looks = zero, torch.full_like(zero, torch.inf), 0
 
-    zero = torch.zeros_like(first)
-    start, curvature = slope(zero)
-    going = going & (start < 0) & (curvature > 0)
-    share = torch.where(going, -start / torch.where(going, curvature, 1.0), 0.0)
-    share = torch.minimum(share, most)
-    low, high, looking = zero, torch.full_like(zero, torch.inf), going
-    for _ in range(MOST_LOOKS):
-        here, curvature = slope(share)
-        looking = looking & ~(here.abs() <= -LEVEL * start) & ~((here < 0) & (share == most))
-        if not bool(looking.any()):
-            break
-        low = torch.where(looking & (here < 0), share, low)
-        high = torch.where(looking & (here >= 0), share, high)
-        new = share - here / torch.where(curvature > 0, curvature, 1.0)
-        between = torch.where(high < torch.inf, 0.5 * (low + high), 2.0 * share)
-        new = torch.where((new > low) & (new < high), new, between)
-        share = torch.where(looking, torch.minimum(new, most), share)
-    return share, -0.5 * start * share
+    def _slope(self, share: Tensor) -> tuple[Tensor, Tensor]:
+        """The slope and the curvature of the energy at a share of the step, (B,)."""
+        rows = self.problem.of_rows
+        left = (self.e - share.index_select(0, rows.owner) * self.q).clamp(max=0.0)
+        both = rows.sum(torch.stack([-left * self.q, (left < 0) * self.q * self.q], 1))
+        return both[:, 0] + self.first + self.second * share, both[:, 1] + self.second
+
+    def look(self) -> None:
+        """Look at LOOKS more places; where a read is free, only until all have found theirs."""
+        free = reads_are_free(self.share.device)
+        for _ in range(LOOKS):
+            here, curvature = self._slope(self.share)
+            flat = here.abs() <= -LEVEL * self.start
+            looking = self.looking & ~flat & ~((here < 0) & (self.share == self.most))
+            self.low = torch.where(looking & (here < 0), self.share, self.low)
+            self.high = torch.where(looking & (here >= 0), self.share, self.high)
+            new = self.share - here / torch.where(curvature > 0, curvature, 1.0)
+            between = torch.where(
+                self.high < torch.inf, 0.5 * (self.low + self.high), 2.0 * self.share
+            )
+            new = torch.where((new > self.low) & (new < self.high), new, between)
+            self.share = torch.where(looking, torch.minimum(new, self.most), self.share)
+            self.looks += 1
+            self.looking = looking & (self.looks < MOST_LOOKS)
+            if free and not bool(self.looking.any()):
+                break
+
+    def end(self) -> _Point:
+        """Where the colonies that were going are then; the others stay."""
+        here, going, owner = self.here, self.going, self.problem.colonies.owner
+        mine, row_owner = going.index_select(0, owner), self.problem.of_rows.owner
+        stuck = torch.where(going, torch.where(self.share == 0, here.stuck + 1, 0), here.stuck)
+        creeps = (self.share < CREEP).index_select(0, owner)
+        alone = torch.where(mine, (here.alone | self.stopped) & creeps, here.alone)
+        fall = torch.where(going, -0.5 * self.start * self.share, here.fall)
+        share, step, low = self.share.to(here.y.dtype), self.step, self.problem.lower
+        y = here.y + share.index_select(0, owner).unsqueeze(1) * step
+        near = low + ROUNDING * (low.abs() + step[:, -1].abs())
+        y[:, -1] = torch.where(y[:, -1] <= near, low, y[:, -1])
+        y = torch.where(mine.unsqueeze(1), y, here.y)
+        after = here.after - share.index_select(0, row_owner) * self.change
+        return _Point(y, after, alone, fall, stuck)

@@ -29,8 +29,24 @@ def block_inverse(problem: ContactProblem) -> Tensor:
     # There is no check here: a colony with a non-finite inverse has a non-finite residual, which
     # reports it without stopping the others. The inversion is in float64, since float32 loses the
     # small eigenvalues of a block whose eigenvalues differ by a factor of a million.
-    inverse = torch.linalg.inv_ex(blocks.double()).inverse
-    return (inverse + inverse.mT).mul_(0.5).to(blocks.dtype).contiguous()
+    return symmetric_inverse(blocks.double()).to(blocks.dtype)
+
+
+def symmetric_inverse(blocks: Tensor) -> Tensor:
+    """The inverse of each symmetric positive definite block, (N, D, D).
+
+    By sweeps over all blocks at once: a library may pick its method by their number.
+    """
+    x = blocks.permute(
+        1, 2, 0
+    ).contiguous()  # blocks last, so that a pass is over contiguous memory
+    for k in range(len(x)):
+        pivot, column = x[k, k].reciprocal(), x[:, k].clone()
+        row = x[k] * pivot
+        x.addcmul_(column.unsqueeze(1), row, value=-1)
+        x[k], x[:, k], x[k, k] = row, column.mul_(-pivot), pivot
+    x = x.permute(2, 0, 1)
+    return (x + x.mT).mul_(0.5).contiguous()
 
 
 class FreeDofPreconditioner:
@@ -41,19 +57,7 @@ class FreeDofPreconditioner:
     """
 
     def __init__(self, inverse: Tensor):
-        self._inverse, self._blocks = inverse, Blocks(inverse.clone())
-        # 1 where a cell's length is free
-        self._free = torch.ones_like(inverse[:, -1, -1])
-
-    def at(self, free: Tensor) -> Map:
-        """The preconditioner for these free degrees of freedom, (N, D).
-
-        The returned map is valid until the next call. From one round to the next few cells change,
-        so only their blocks are updated.
-        """
-        cells = torch.nonzero(free[:, -1] != self._free).squeeze(1)
-        self._free = free[:, -1]
-        whole, fixed = self._inverse.index_select(0, cells), self._free.index_select(0, cells) == 0
+        whole = inverse
         # This is the inverse of the block without the length. It is not a part of the whole block's
         # inverse, in which the length could still move: with that part, cells under pressure whose
         # length is fixed took three times as many iterations. Where rounding would leave nothing of
@@ -67,7 +71,9 @@ class FreeDofPreconditioner:
         without = whole - along.unsqueeze(2) * along.unsqueeze(1)
         without[:, -1] = 0.0
         without[:, :, -1] = 0.0
-        self._blocks.value.index_copy_(
-            0, cells, torch.where(fixed.reshape(-1, 1, 1), without, whole)
-        )
-        return self._blocks.times
+        self._whole, self._without = whole, without
+
+    def at(self, free: Tensor) -> Map:
+        """The preconditioner for these free degrees of freedom, (N, D)."""
+        fixed = (free[:, -1] == 0).reshape(-1, 1, 1)
+        return Blocks(torch.where(fixed, self._without, self._whole)).times

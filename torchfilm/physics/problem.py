@@ -15,12 +15,14 @@ from torchfilm.kernels.scheme import NOT_FINITE as NOT_FINITE
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.tools.ragged import Groups
 
-TOO_FAST = 3
+TOO_FAST, BAD_DRAG, COLLAPSED = 3, 4, 5
 STATUS = {
     CONVERGED: "converged",
     ITERATION_LIMIT: "reached its iteration limit",
     NOT_FINITE: "is not finite",
     TOO_FAST: "would have to follow too much growth in one step",
+    BAD_DRAG: "has a drag that is not above 0 and finite",
+    COLLAPSED: "leaves too many cells deep in others, step after step",
 }
 
 
@@ -114,16 +116,14 @@ class ContactProblem:
             self.colonies,
         )
 
-    def among(self, moving: Tensor) -> ContactProblem:
-        """The problem of the moving cells, (N,) bool, while the others stay at rest.
+    def among(self, moving: Tensor, cells: Tensor) -> ContactProblem:
+        """The problem of the moving cells, (N,) bool and their places, while the others stay at
+        rest.
 
         Colonies keep their numbers.
         """
-        cells = torch.nonzero(moving).squeeze(1)
-        rows, places = self.rows.among(moving)
-        of_rows, of_cells = (
-            lambda x, index=index: x.index_select(0, index) for index in (places, cells)
-        )
+        rows, index = self.rows.among(moving, cells.numel())
+        of_rows, of_cells = (lambda x, at=at: x.index_select(0, at) for at in (index, cells))
         return ContactProblem(
             rows,
             of_rows(self.gap),
@@ -132,7 +132,7 @@ class ContactProblem:
             of_cells(self.lower),
             of_cells(self.scale),
             of_cells(self.rigid),
-            Groups(of_cells(self.colonies.owner), self.colonies.size),
+            Groups(of_cells(self.colonies.owner), self.colonies.size, ordered=True),
         )
 
     def part(self, which: Selection) -> ContactProblem:
@@ -144,14 +144,14 @@ class ContactProblem:
         place[which.colonies] = torch.arange(which.colonies.numel(), device=cells.device)
         owner = place.index_select(0, self.colonies.owner.index_select(0, cells))
         return ContactProblem(
-            self.rows.part(rows, number, cells.numel()),
+            self.rows.part(rows, which.pairs, number, cells.numel()),
             self.gap.index_select(0, rows),
             self.applied_force.index_select(0, rows),
             self.alpha.index_select(0, cells),
             self.lower.index_select(0, cells),
             self.scale.index_select(0, cells),
             self.rigid.index_select(0, cells),
-            Groups(owner, which.colonies.numel()),
+            Groups(owner, which.colonies.numel(), ordered=True),
         )
 
     @cached_property
@@ -162,11 +162,13 @@ class ContactProblem:
 
 @dataclass(frozen=True)
 class Selection:
-    """Some colonies of a problem: their indices, their cells and their rows."""
+    """Some colonies of a problem: their indices, their cells and their rows, of which the first
+    `pairs` are of two cells."""
 
     colonies: Tensor
     cells: Tensor
     rows: Tensor
+    pairs: int
 
     def by_field(self) -> tuple[Tensor, ...]:
         """The index into each field of an Iterate, in the order of its fields."""

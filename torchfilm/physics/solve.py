@@ -19,14 +19,13 @@ Where the solve goes beyond the paper:
 
 from __future__ import annotations
 
-import warnings
-
 import torch
 from torch import Tensor
 
 from torchfilm.physics.adjoint import attach_gradient
 from torchfilm.physics.newton import minimise
 from torchfilm.physics.problem import ContactProblem, SolveReport
+from torchfilm.tools.warn_once import warn
 
 # Above these tolerances a gradient through contacts raises a warning. One-sided ones are solved to
 # an error of their forces; of bilateral ones only the move is bounded, and forces amplify it.
@@ -66,11 +65,10 @@ def solve_contacts(
 def warn_if_loose(tolerance: float, most: float = LOOSE_FOR_GRADIENTS) -> None:
     """Warn of a gradient through contacts that are solved to `tolerance` only, above `most`."""
     if tolerance > most:
-        warnings.warn(
+        warn(
             f"a gradient is required through contacts that are solved to {tolerance:g} only."
             " That is enough for overlaps, but the gradient may even have the wrong sign. Give"
             f" Mechanics a tolerance of {most:g} or less, or run under"
             " torch.no_grad().",
-            RuntimeWarning,
-            stacklevel=3,
+            category=RuntimeWarning,
         )

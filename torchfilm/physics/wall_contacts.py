@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchfilm.physics.contacts import NEAR
 from torchfilm.physics.surfaces import FlatSurface, Surface
+from torchfilm.tools.reads import places
 from torchfilm.tools.vectors import cross, dot, safe_sqrt
 
 # Position (P, d) float64, axis (P, d) and half length (P,) of some capsules.
@@ -58,38 +59,30 @@ def find_wall_contacts(
     a wall's value per colony. include_near: as in `contacts_of`, for walls that are not soft.
     reach: (N,) µm, instead: rows are made for gaps up to it, and gaps are returned as they are.
     """
-    found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     half = 0.5 * length
+    tried: list[tuple[Tensor, ...]] = []
     for number, surface in enumerate(surfaces):
+        margin = torch.zeros_like(radius) if reach is None else reach
+        if include_near and surface.wall.stiffness is None:
+            margin = NEAR * radius
         for s, end, root in _contact_candidates(surface, position, axis, half, colony_id):
             point = position + (s.unsqueeze(1) * axis).to(position.dtype)
             distance, way = surface.gap_of_points(point, colony_id)
             gap = distance.to(length.dtype) - radius
-            margin = (
-                NEAR * radius
-                if include_near and surface.wall.stiffness is None
-                else torch.zeros_like(radius)
-            )
-            margin = margin if reach is None else reach
-            keep = torch.nonzero((gap < margin) & (root > 0)).squeeze(1)
-            if keep.numel() == 0:
-                continue
+            near = (gap < margin) & (root > 0)
             if include_near:
-                root, gap = (
-                    root * (1.0 - gap / margin.clamp(min=1e-30)).clamp(min=0.0, max=1.0),
-                    gap.clamp(max=0.0),
-                )
-            pick = lambda x, keep=keep: x.index_select(0, keep)
-            n = way.index_select(1, keep).to(axis.dtype)
-            a = pick(axis).T
-            row = torch.cat([n, cross(pick(s) * a, n), (0.5 * pick(end) * dot(n, a)).unsqueeze(0)])
-            found.append(
-                (keep, pick(root) * pick(gap), (pick(root) * row).T, torch.full_like(keep, number))
-            )
-    if not found:
-        degrees = 4 if axis.shape[1] == 2 else 7
-        none = colony_id.new_empty(0)
-        return WallContacts(none, length.new_empty(0), length.new_empty(0, degrees), none)
+                root = root * (1.0 - gap / margin.clamp(min=1e-30)).clamp(min=0.0, max=1.0)
+                gap = gap.clamp(max=0.0)
+            of = torch.full_like(colony_id, number)
+            tried.append((near, s, 0.5 * end, root, gap, way.T.to(axis.dtype), of))
+    degrees = 4 if axis.shape[1] == 2 else 7
+    none = colony_id.new_empty(0), length.new_empty(0), length.new_empty(0, degrees)
+    found = [(*none, none[0])]
+    for keep, (_, *parts) in zip(places(*(near for near, *_ in tried)), tried, strict=True):
+        s, end, root, gap, way, of = (x.index_select(0, keep) for x in parts)
+        n, a = way.T, axis.index_select(0, keep).T
+        row = torch.cat([n, cross(s * a, n), (end * dot(n, a)).unsqueeze(0)])
+        found.append((keep, root * gap, (root * row).T, of))
     return WallContacts(*(torch.cat(part) for part in zip(*found, strict=True)))
 
 

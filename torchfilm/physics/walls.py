@@ -24,7 +24,7 @@ AXES = "xyz"
 
 
 @dataclass(frozen=True)
-class Wall:
+class Wall(metaclass=checks.KnownKeywords):
     """The base of all walls.
 
     stiffness: μ·µm/h; None = hard. weight: D in 0 … 1, the paper's relative weight. At most one of

@@ -13,6 +13,7 @@ from torchfilm.io.results import Results
 from torchfilm.pictures.colours import CELLS, Limits, PlotStyle
 from torchfilm.pictures.frames import Frame, RecordedFrames, frame_of
 from torchfilm.pictures.page import PanelLayout, figure_class, fill, make_page, plan_layout, save
+from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools import checks
 
@@ -69,6 +70,7 @@ def sheet(
     what: State | Frame,
     path: str | Path,
     *,
+    scene: Scene | None = None,
     colour: str | None = None,
     channels: Mapping[str, str] | None = None,
     background: str | None = None,
@@ -83,12 +85,15 @@ def sheet(
 ) -> Path:
     """Draw the colonies of a state, one panel each, all with one scale, to the picture `path`.
 
-    The options are those of `show`. most: the greatest number of colonies; the title says if there
-    are more.
+    scene: of the state, whose walls are drawn; a state does not know them, a frame does. most: the
+    greatest number of colonies; the title says if there are more. The other options are those of
+    `show`.
     """
+    if scene is not None and isinstance(what, Frame):
+        raise checks.InputError("sheet got a frame and a scene: a frame has its own walls.")
     figure_class()
     style = PlotStyle(colour, channels, background, limits, view, section, whole)
-    frame = what if isinstance(what, Frame) else frame_of(what)
+    frame = what if isinstance(what, Frame) else frame_of(what, scene)
     places, more = choose_colonies(frame.counts > 0, frame.colony_id, colonies, most)
     return save(sheet_figure(frame, places, style, title + more, dpi), path)
 

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from torchfilm.io.identity import walls_of
 from torchfilm.io.results import Results
+from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, State
 from torchfilm.tools import checks
 
@@ -57,16 +59,17 @@ class Frame:
         return {name: value[part] for name, value in self.cells.items()}
 
 
-def frame_of(state: State) -> Frame:
-    """A state as a frame, with cells as `Results.frame` gives them."""
+def frame_of(state: State, scene: Scene | None = None) -> Frame:
+    """A state as a frame, with cells as `Results.frame` gives them, and the walls of its scene."""
     columns = {n: getattr(state, n) for n in PER_CELL} | {
         n: v for n, v in state.fields.items() if state.declared[n].scope == CELL
     }
     cells = {n: v.detach().cpu().numpy() for n, v in columns.items()}
     units = {f.name: f.unit for f in state.declared.values()}
     ids = state.colony_id.cpu().numpy()
+    walls = [] if scene is None else walls_of(scene)
     if state.layout is None:
-        return Frame(cells, state.time, ids, units)
+        return Frame(cells, state.time, ids, units, walls=walls)
     grid = state.layout.grid
     cuts = grid.offsets.cpu().numpy()[1:-1]
     signals = {
@@ -86,6 +89,7 @@ def frame_of(state: State) -> Frame:
         grid.shape.cpu().numpy(),
         np.asarray(grid.spacing),
         state.layout.height,
+        walls,
     )
 
 

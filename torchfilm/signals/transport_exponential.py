@@ -58,13 +58,21 @@ def multiply(factors: tuple[Tensor | None, ...], u: Tensor) -> Tensor:
             turned = turned.transpose(1, 2)
         else:
             full = factor.shape[1]
-            product = torch.bmm(
+            product = products(
                 padded(turned, full, aligned(a * b)).transpose(1, 2),
                 factor.expand(colonies, full, full),
             )
             turned = product[:, : a * b, :n]
         u = turned.reshape(colonies, a, b, n)
     return u
+
+
+def products(a: Tensor, b: Tensor) -> Tensor:
+    """The matrix product of each colony, (B, r, k), (B, k, c) -> (B, r, c).
+
+    One by one: a library may pick a method for all at once by their number.
+    """
+    return torch.stack([torch.mm(x, y) for x, y in zip(a, b, strict=True)])
 
 
 def aligned(size: int) -> int:
@@ -138,7 +146,7 @@ def prepare_exponential(operator: Operator, dt: float) -> Exponential:
             (
                 None
                 if f is None
-                else torch.where(more.reshape(-1, 1, 1), _normalised(torch.bmm(f, f)), f)
+                else torch.where(more.reshape(-1, 1, 1), _normalised(products(f, f)), f)
             )
             for f in now
         ]
@@ -187,7 +195,7 @@ def _short_exponential(generator: Tensor, fastest: Tensor, time: Tensor) -> Tens
     shifted = (generator + fastest.reshape(-1, 1, 1) * one) * time.reshape(-1, 1, 1)
     out = one.expand(shifted.shape)
     for k in range(TERMS, 0, -1):
-        out = one + torch.bmm(shifted, out) / k
+        out = one + products(shifted, out) / k
     return _normalised(out)  # this also removes the shift
 
 

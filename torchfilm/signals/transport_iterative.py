@@ -143,7 +143,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 @lru_cache(maxsize=8)
 def _rows(count: int, size: int, device: str) -> Groups:
     """`count` groups of `size` rows each."""
-    return Groups(torch.arange(count, device=device).repeat_interleave(size), count)
+    return Groups(torch.arange(count, device=device).repeat_interleave(size), count, ordered=True)
 
 
 def _ratio(a: Tensor, b: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ Each system converges by itself.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,10 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools.ragged import Groups
-
-# The number of iterations between the host's checks whether every system is done. A check stalls a
-# GPU's queue. It never changes a result, because a finished system does not move.
-CHECK_EVERY = {"cpu": 1, "cuda": 8}
+from torchfilm.tools.reads import READ_EVERY, reads_are_free
 
 
 @dataclass(frozen=True)
@@ -81,13 +79,10 @@ def conjugate_gradients(
     measure = lambda: rz.squeeze(1) if by_energy else worst_of(z, groups)
     worst = measure()
     going = (worst > target) & (worst < torch.inf)  # neither holds for a NaN
-    limit = torch.as_tensor(max_iterations, device=b.device)
-    going = going & (limit > 0)
+    going = going & (torch.as_tensor(max_iterations, device=b.device) > 0)
     iterations = torch.zeros(groups.size, dtype=torch.int64, device=b.device)
-    every = CHECK_EVERY.get(b.device.type, 8)
-    for k in range(int(limit.max())):
-        if k % every == 0 and not bool(going.any()):
-            break
+    free = reads_are_free(b.device)
+    for k in itertools.count(1):
         q = apply(p)
         curvature = _dot(p, q, groups)
         moves = going.unsqueeze(1) & (curvature > 0)
@@ -105,5 +100,8 @@ def conjugate_gradients(
         p = torch.addcmul(z, ratio, p)
         rz = new
         worst = torch.where(going, measure(), worst)
-        going = moves.squeeze(1) & (worst > target) & (worst < torch.inf) & (iterations < limit)
+        going = moves.squeeze(1) & (worst > target) & (worst < torch.inf)
+        going = going & (iterations < max_iterations)
+        if (free or k % READ_EVERY == 0) and not bool(going.any()):
+            break
     return CGResult(x, iterations, worst)

@@ -6,7 +6,7 @@ import difflib
 import functools
 import inspect
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
 import torch
@@ -49,30 +49,72 @@ def nearest(given: str, known: Iterable[str]) -> str | None:
     return next((n for n in begins if n.startswith(given) or given.startswith(n)), None)
 
 
-def unknown_keyword(name: str, given: str, allowed: Sequence[str]) -> InputError:
+def unknown_keyword(
+    name: str, given: str, allowed: Sequence[str], former: Mapping[str, str] | None = None
+) -> InputError:
     """The error for a keyword that a function or class does not have, with the nearest one that it
-    has; raise what this returns. name: of the function or class, such as "Growth"."""
+    has; raise what this returns. name: of the function or class, such as "Growth". former: what to
+    write instead of keywords of earlier versions."""
     near = nearest(given, allowed)
+    hint = (former or {}).get(given) or (f"Did you mean {near}?" if near else "")
     return InputError(
         f"{name} has no parameter {given!r}."
-        + (f" Did you mean {near}?" if near else "")
+        + (f" {hint}" if hint else "")
         + f" It has: {', '.join(allowed) or 'none'}."
     )
 
 
 def known_keywords(function: F) -> F:
-    """Let a function raise InputError, with the nearest name, for a keyword that it does not
-    take."""
-    allowed = [n for n in inspect.signature(function).parameters]
+    """Let a function raise InputError, with the nearest name, for a keyword that it does not take,
+    and for an argument that is missing."""
+    signature = inspect.signature(function)
 
     @functools.wraps(function)
     def checked(*args: Any, **given: Any) -> Any:
-        for name in given:
-            if name not in allowed:
-                raise unknown_keyword(function.__name__, name, allowed)
+        check_call(function.__name__, signature, args, given)
         return function(*args, **given)
 
     return cast(F, checked)
+
+
+def check_call(
+    name: str,
+    signature: inspect.Signature,
+    args: Sequence[Any],
+    given: Mapping[str, Any],
+    former: Mapping[str, str] | None = None,
+) -> None:
+    """Raise InputError for arguments that do not fit a signature. former: as in
+    `unknown_keyword`."""
+    kinds = {p.kind for p in signature.parameters.values()}
+    allowed = list(signature.parameters)
+    if inspect.Parameter.VAR_KEYWORD not in kinds:
+        for keyword in given:
+            if keyword not in allowed:
+                raise unknown_keyword(name, keyword, allowed, former)
+    try:
+        signature.bind(*args, **given)
+    except TypeError as error:
+        raise InputError(f"{name}: {error}. Its parameters: {', '.join(allowed)}.") from None
+
+
+class KnownKeywords(type):
+    """The metaclass of classes that raise InputError, with the nearest name, for a keyword that
+    they do not take, and for an argument that is missing.
+
+    former_keywords: of such a class, what to write instead of keywords of earlier versions.
+    """
+
+    former_keywords: Mapping[str, str] = {}
+
+    def __call__(cls, *args: Any, **given: Any) -> Any:
+        check_call(cls.__name__, inspect.signature(cls), args, given, cls.former_keywords)
+        return super().__call__(*args, **given)
+
+    @property
+    def __signature__(cls) -> inspect.Signature:
+        own = inspect.signature(cls.__init__)  # type: ignore[misc]
+        return own.replace(parameters=list(own.parameters.values())[1:])
 
 
 def number(

@@ -1,14 +1,16 @@
 """Sums and maxima over ragged groups, each group in its own fixed order.
 
-All scatter operations of the package are in this module. On the CPU a sum over groups is a product
-with a sparse incidence matrix. It is six times faster than ``index_add_``. Every row of the product
-is accumulated by itself in the order of its entries, so its bits do not depend on the rest of the
-batch. (The matrix-vector product of the same library does *not* have that property: it picks a
-kernel by the shape of the whole matrix. So it is the matrix-matrix product even for one column.)
+All scatter operations of the package are in this module. A group's sum has the same bits whatever
+the other groups are and wherever its rows stand.
 
-Weighted float32 segment sums use ``torch.embedding_bag``: half the time of weighting and summing,
-in a fixed order. On CUDA ``index_add_`` is fast, and ordered when torch's deterministic algorithms
-are on.
+- Sums of weighted rows are bags of embeddings, on every device: one kernel picks, weights and sums
+  the rows of a bag, one after the other.
+- On the CPU a sum over groups is a product with a sparse incidence matrix: every row of the product
+  is accumulated by itself in the order of its entries. (The matrix-vector product of the same
+  library picks a kernel by the shape of the whole matrix. So it is the matrix-matrix product even
+  for one column.)
+- On CUDA a sum over groups is a tree of segmented reductions: sums of FAN rows of a group, then of
+  FAN of these sums, and so on. Each is added up by one thread in order, without atomics.
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Without fbgemm a plain loop sums the bags, many times slower.
-FAST_BAGS = "fbgemm" in torch.backends.quantized.supported_engines
+# The rows that one thread adds up in a sum over groups on CUDA.
+FAN = 32
 
 warnings.filterwarnings(
     "ignore", message="Sparse CSR tensor support is in beta", category=UserWarning
@@ -43,54 +45,71 @@ def offsets(counts: Tensor) -> Tensor:
     return out
 
 
-def expand_ranges(start: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+def expand_ranges(start: Tensor, count: Tensor, total: int | None = None) -> tuple[Tensor, Tensor]:
     """Write out ranges: for each i the numbers start[i] … start[i] + count[i] − 1.
 
-    Returns (owner, value), each as long as the sum of the counts; owner is the i of each value.
+    Returns (owner, value), each as long as the sum of the counts, `total` where the host knows it;
+    owner is the i of each value.
     """
-    owner = torch.repeat_interleave(torch.arange(count.numel(), device=count.device), count)
+    number = torch.arange(count.numel(), device=count.device)
+    owner = torch.repeat_interleave(number, count, output_size=total)
     shift = start - (torch.cumsum(count, 0) - count)
     value = torch.arange(owner.numel(), device=count.device) + shift.index_select(0, owner)
     return owner, value
 
 
+def marked(count: int, index: Tensor, flag: Tensor) -> Tensor:
+    """Which of `count` places some flagged entry points to, (count,) bool: index, flag (K,)."""
+    mark = torch.zeros(count + 1, dtype=torch.bool, device=index.device)
+    return mark.index_fill_(0, torch.where(flag, index, count), True)[:count]
+
+
 class Groups:
-    """Sums and maxima over groups of rows; rows may have any order.
+    """Sums and maxima over groups of rows.
 
     Rows 0 … K − 1 belong to groups 0 … size − 1.
 
-    `owner`: (K,) int64, the group of each row.
+    `owner`: (K,) int64, the group of each row. `ordered`: rows are known to be sorted by group;
+    else they may have any order.
     """
 
-    def __init__(self, owner: Tensor, size: int):
-        self.owner, self.size = owner, size
+    def __init__(self, owner: Tensor, size: int, ordered: bool = False):
+        self.owner, self.size, self.ordered = owner, size, ordered
         self._matrix: dict[torch.dtype, Tensor] = {}
 
     @cached_property
     def counts(self) -> Tensor:
         """(size,) int64, rows in each group."""
-        return torch.bincount(self.owner, minlength=self.size)
+        return self.order[0].diff().long()
 
     @cached_property
     def order(self) -> tuple[Tensor, Tensor]:
         """The rows sorted by group, in their own order within each group.
 
-        Returns the start of each group and the end of the last, (size + 1,), and the rows, (K,)
-        int32.
+        Returns the start of each group and the end of the last, (size + 1,), and the rows, (K,);
+        both int32.
         """
+        owner, on_cpu = self.owner, self.owner.device.type == "cpu"
+        if self.ordered or (on_cpu and bool((owner[1:] >= owner[:-1]).all())):
+            rows = torch.arange(owner.numel(), dtype=torch.int32, device=owner.device)
+        elif on_cpu:
+            return self._order_in_linear_time()
+        else:
+            owner, rows = torch.sort(owner, stable=True)
+        group = torch.arange(self.size + 1, device=owner.device)
+        return torch.searchsorted(owner, group, out_int32=True), rows.int()
+
+    def _order_in_linear_time(self) -> tuple[Tensor, Tensor]:
+        """`order` on the CPU, where a sort would cost more than all the sums of a solve."""
+        # imported where it is used: it takes longer to load than torchfilm itself
+        from scipy.sparse import csc_array
+
         count = self.owner.numel()
-        if bool((self.owner[1:] >= self.owner[:-1]).all()):
-            return offsets(self.counts).int(), torch.arange(count, dtype=torch.int32)
-        # linear time and stable; a sort would cost more than all the sums of a solve
         entries = (
             np.ones(count, np.int8),
             self.owner.int().numpy(),
             np.arange(count + 1, dtype=np.int32),
         )
-        from scipy.sparse import (
-            csc_array,
-        )  # imported where it is used: it takes longer to load than torchfilm itself
-
         found = csc_array(entries, shape=(self.size, count)).tocsr()
         return torch.from_numpy(found.indptr), torch.from_numpy(found.indices)
 
@@ -110,19 +129,60 @@ class Groups:
 
     def sum_into(self, value: Tensor, out: Tensor) -> Tensor:
         """Like `sum` for (K, D) into (size, D), without gradient or allocation on the CPU."""
-        if self.owner.numel() == 0 or value.device.type != "cpu":
-            return out.zero_().index_add_(0, self.owner, value)
-        return torch.mm(self._incidence(value.dtype), value, out=out)
+        if self.owner.numel() == 0:
+            return out.zero_()
+        if value.device.type == "cpu":
+            return torch.mm(self._incidence(value.dtype), value, out=out)
+        value = self._sorted(value)
+        for start in self._tree:
+            value = torch.segment_reduce(value, "sum", offsets=start, unsafe=True)
+        return out.copy_(value)
+
+    def spread(self, value: Tensor) -> Tensor:
+        """The value of its group for each row, (size, …) -> (K, …); its gradient is a `sum`."""
+        if torch.is_grad_enabled() and value.requires_grad:
+            return _GroupSpread.apply(value, self)
+        return value.index_select(0, self.owner)
+
+    def _sorted(self, value: Tensor) -> Tensor:
+        """The rows of `value` (K, …), sorted by group."""
+        return value if self.ordered else value.index_select(0, self.order[1])
+
+    @cached_property
+    def _tree(self) -> list[Tensor]:
+        """Starts of the segments that a sum adds up, level by level; those of the last are groups.
+
+        Their number depends on all rows, but a group that is one sum already stays as it is. So its
+        bits depend on its own rows only.
+        """
+        start, rows, levels = self.order[0].long(), self.owner.numel(), []
+        most = rows  # of one group
+        while most > FAN:
+            sums = offsets((start.diff() + FAN - 1) // FAN)
+            segments = rows // FAN + self.size  # at least; those left over are empty
+            number = torch.arange(segments + 1, device=start.device)
+            group = torch.searchsorted(sums, number, right=True) - 1
+            own = start.index_select(0, group) + (number - sums.index_select(0, group)) * FAN
+            levels.append(torch.where(group < self.size, own, start[-1]))
+            start, rows, most = sums, segments, -(-most // FAN)
+        return [*levels, start]
 
     def max(self, value: Tensor, empty: float = 0.0) -> Tensor:
         """The maximum of each group, (K,) -> (size,); `empty` where a group has no row.
 
         It is exact, so the order of rows has no effect. No gradient.
         """
+        value = value.detach()
         if self.size == 1 and value.numel():
-            return value.detach().amax(0, keepdim=True)
-        out = torch.full((self.size,), empty, dtype=value.dtype, device=value.device)
-        return out.scatter_reduce(0, self.owner, value.detach(), "amax", include_self=False)
+            return value.amax(0, keepdim=True)
+        if value.device.type == "cpu":
+            out = torch.full((self.size,), empty, dtype=value.dtype)
+            return out.scatter_reduce(0, self.owner, value, "amax", include_self=False)
+        # whole numbers are exact in float64
+        of_kind = value if value.is_floating_point() else value.double()
+        start = self.order[0].long()
+        out = torch.segment_reduce(self._sorted(of_kind), "max", offsets=start, unsafe=True)
+        return torch.where(self.counts == 0, empty, out).to(value.dtype)
 
     def any(self, flag: Tensor) -> Tensor:
         """Whether any flag of each group is set: (K,) bool -> (size,) bool."""
@@ -140,54 +200,51 @@ def _bag(rows: Tensor, which: Tensor, start: Tensor, weight: Tensor) -> Tensor:
     )[0]
 
 
-def _bags_are_fast(value: Tensor) -> bool:
-    """Whether `_bag` is faster than a sum of products for this tensor."""
-    return FAST_BAGS and value.device.type == "cpu" and value.dtype == torch.float32
-
-
 class WeightedRows:
     """Rows `value` (K, D) of groups, for repeated sums with different weights. No gradient."""
 
     def __init__(self, value: Tensor, groups: Groups):
-        self.groups, self.value = groups, value
-        self.fast = _bags_are_fast(value)
-        if self.fast:
-            start, self.order = groups.order
-            # sorted by group, so that reads are contiguous
-            self.value = value.index_select(0, self.order)
-            self._bags = torch.arange(value.shape[0], dtype=torch.int32), start
+        start, self.order = groups.order
+        # sorted by group, so that reads are contiguous
+        self.value = value.index_select(0, self.order)
+        self._bags = torch.arange(len(self.order), dtype=torch.int32, device=value.device), start
 
     def sum(self, weight: Tensor) -> Tensor:
         """Σ weight · row over each group, (size, D). weight: (K,), in the order of `self.value`."""
-        if self.fast:
-            return _bag(self.value, *self._bags, weight)
-        return self.groups.sum_into(
-            self.value * weight.unsqueeze(1),
-            weight.new_empty(self.groups.size, self.value.shape[1]),
-        )
+        return _bag(self.value, *self._bags, weight)
 
     def sorted(self, given: Tensor) -> Tensor:
         """`given` (K,), in the order of the original rows, in the order of `self.value`."""
-        return given.index_select(0, self.order) if self.fast else given
+        return given.index_select(0, self.order)
 
 
 class Blocks:
-    """Symmetric blocks `value` (N, D, D), for repeated products with rows (N, D). No gradient."""
+    """Symmetric blocks `value` (N, D, D), for repeated products with rows (N, D). No gradient.
+
+    A product of many small matrices by a library may pick a kernel by their number. A bag does not,
+    and takes a third of the time in float32.
+    """
 
     def __init__(self, value: Tensor):
-        self.value, self.fast = value, _bags_are_fast(value)
-        if self.fast:
-            count, width = value.shape[:2]
-            self._bags = (
-                torch.arange(count * width, dtype=torch.int32),
-                torch.arange(count + 1, dtype=torch.int32) * width,
-            )
+        self.value = value
+        count, width = value.shape[:2]
+        whole = lambda count: torch.arange(count, dtype=torch.int32, device=value.device)
+        self._bags = whole(count * width), whole(count + 1) * width
 
     def times(self, r: Tensor) -> Tensor:
         """Each block times its own row, (N, D) -> (N, D)."""
-        if self.fast:  # a third of the time of many small products
-            return _bag(self.value.reshape(-1, r.shape[1]), *self._bags, r.reshape(-1))
-        return torch.bmm(self.value, r.unsqueeze(2)).squeeze(2)
+        return _bag(self.value.reshape(-1, r.shape[1]), *self._bags, r.reshape(-1))
+
+
+class _GroupSpread(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, value: Tensor, groups: Groups) -> Tensor:
+        ctx.groups = groups
+        return value.index_select(0, groups.owner)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        return ctx.groups.sum(grad), None
 
 
 class _GroupSum(torch.autograd.Function):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
+# Modules between a user's line and a warning: torch runs steps again for a gradient.
+WITHIN = ("torchfilm", "torch", "contextlib")
 # What has been said so far; None outside `once`. A context variable, so that threads do not silence
 # each other.
 _SAID: ContextVar[set[str] | None] = ContextVar("said", default=None)
@@ -38,13 +41,27 @@ def quietly() -> Iterator[None]:
         _QUIET.reset(token)
 
 
-def warn(text: str, *, stacklevel: int) -> None:
+def warn(
+    text: str, *, stacklevel: int | None = None, category: type[Warning] = UserWarning
+) -> None:
     """Warn of what is probably a mistake, unless a surrounding `once` has said so already.
-    stacklevel: as for `warnings.warn`, counted from the caller."""
+    stacklevel: as for `warnings.warn`, counted from the caller; by default, of the user's line."""
     if _QUIET.get():
         return
     said = _SAID.get()
     if said is None or text not in said:
-        warnings.warn(text, stacklevel=stacklevel + 1)
+        level = _users_level() if stacklevel is None else stacklevel
+        warnings.warn(text, category, stacklevel=level + 1)
     if said is not None:
         said.add(text)
+
+
+def _users_level() -> int:
+    """The stacklevel, counted from the caller of `warn`, of the nearest line that is neither
+    torchfilm's nor of what runs in between."""
+    frame, level = sys._getframe(2), 1
+    while frame.f_globals.get("__name__", "").partition(".")[0] in WITHIN:
+        if frame.f_back is None:
+            return 1
+        frame, level = frame.f_back, level + 1
+    return level

@@ -1,0 +1,38 @@
+"""Reads of the host from the device: each waits until a GPU has done all it was given.
+
+So a step reads as rarely as it can, and several numbers at once. `tests/test_host_reads.py` counts.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# Iterations of many systems at once between two reads whether all are done. A read never changes a
+# result, because a finished system does not move.
+READ_EVERY = 8
+
+
+def reads_are_free(device: torch.device) -> bool:
+    """Whether the host may look at a number at any time."""
+    return device.type == "cpu"
+
+
+def numbers(*values: Tensor) -> list[int]:
+    """Flags or whole numbers (), by one read."""
+    return torch.stack([value.long() for value in values]).tolist()
+
+
+def places(*masks: Tensor) -> list[Tensor]:
+    """Where each mask (K,) is true, ascending, by one read."""
+    if not masks:
+        return []
+    if len(masks) == 1:
+        return [torch.nonzero(masks[0]).squeeze(1)]
+    counts = numbers(*(mask.sum() for mask in masks))
+    return [places_of(mask, count) for mask, count in zip(masks, counts, strict=True)]
+
+
+def places_of(mask: Tensor, count: int) -> Tensor:
+    """Where a mask (K,) is true, ascending, if it is so `count` times: no read."""
+    return torch.nonzero_static(mask, size=count).squeeze(1)
