@@ -113,19 +113,16 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     n = len(x)
     axis, half, radius = np.tile([1.0, 0.0], (n, 1)), np.full(n, 1.5), np.full(n, 0.5)
     scale = np.ones((n, 4))
-    first, second = neighbours.near_pairs(x, axis, half, radius, 0.3)
-    keep, points, _ = rows.near_contacts(x, axis, half, radius, first, second, 0.3)
-    room = 2 * len(keep)
+    first, second = neighbours.near_pairs(x, axis, half, radius, 0.3, dof)
+    contacts = rows.near_contacts(x, axis, half, radius, first, second, 0.3)
+    found = (first, second, *contacts)
+    room = 2 * len(contacts[0])
     H, gaps = np.empty((2 * room, 4), np.float32), np.empty(room, np.float32)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
-    count = rows.pair_rows(
-        x, axis, half, radius, scale, first, second, keep, points, H, gaps, one, two, dof
-    )
-    p, out, act = (
-        np.ones((n, 4), np.float32),
-        np.zeros((n, 4), np.float32),
-        np.ones(count, np.uint8),
-    )
+    places = H, gaps, one, two, one
+    count = rows.pair_rows(x, axis, half, radius, scale, found, 0, places, dof)
+    p, out = np.ones((n, 4), np.float32), np.zeros((n, 4), np.float32)
+    on = np.arange(count, dtype=np.int32)
     H = H[: 2 * count].copy()
     target = np.empty_like(H)
 
@@ -137,7 +134,7 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
             times.append(time.perf_counter() - begin)
         return min(times)
 
-    product = best(lambda: solve.add_product(H, one, two, count, act, p, out, dof))
+    product = best(lambda: solve.add_product(H, one, two, on, p, out, dof))
     copy = best(lambda: np.copyto(target, H))
     return {"rows": count, "product_us": round(1e6 * product, 1), "copy_us": round(1e6 * copy, 1)}
 

@@ -143,10 +143,12 @@ class Problem:
         for colony in range(self.colonies):
             mine, its = self.colony == colony, self.alone(colony)
             rows = np.concatenate([mine[self.first], mine[self.at_wall]])
-            pairs, cells = len(its.first), np.zeros(its.scale.shape, dtype)
-            halves = np.zeros((2 * len(its.gap), cells.shape[1]), dtype)
-            halves[: 2 * pairs : 2], halves[1 : 2 * pairs : 2] = its.half_rows.swapaxes(0, 1)
-            halves[2 * pairs :: 2] = its.wall_rows
+            degrees, lanes = its.scale.shape[1], 4 if its.scale.shape[1] == 4 else 8
+            pairs, cells = len(its.first), np.zeros((len(its.scale), lanes), dtype)
+            halves = np.zeros((2 * len(its.gap), lanes), dtype)
+            ours = halves[:, :degrees]
+            ours[: 2 * pairs : 2], ours[1 : 2 * pairs : 2] = its.half_rows.swapaxes(0, 1)
+            ours[2 * pairs :: 2] = its.wall_rows
             spent = np.zeros(len(rows)) if applied_force is None else -applied_force
             iterations, error, _ = solve.minimise(
                 halves,
@@ -161,9 +163,9 @@ class Problem:
                 tolerance,
                 np.inf,
                 limit,
-                (0,) * cells.shape[1],
+                (0,) * lanes,
             )
-            y[mine] = cells
+            y[mine] = cells[:, :degrees]
             errors.append(error)
             counts.append(iterations)
         return y, np.array(errors), np.array(counts)

@@ -124,7 +124,7 @@ import numpy as np
 from torchfilm.kernels import compiling, neighbours
 x = np.random.default_rng(0).random((50, 2)) * 20
 axis, half, radius = np.tile([1.0, 0.0], (50, 1)), np.ones(50), np.full(50, 0.5)
-first, second = neighbours.near_pairs(x, axis, half, radius, 0.3)
+first, second = neighbours.near_pairs(x, axis, half, radius, 0.3, (0,) * 4)
 print(compiling.FOLDER is not None, first.size)
 """
 

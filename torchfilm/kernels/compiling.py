@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -63,12 +64,20 @@ def keep(name: str) -> None:
         mark.touch()
 
 
-def kernel(function):
-    """Compile a function at its first call with new types; without the interpreter's lock, and
-    without reordering of sums."""
+def kernel(function=None, *, any_order: bool = False):
+    """Compile a function at its first call with new types, without the interpreter's lock.
+
+    Sums keep their order, unless any_order: then the compiler may choose one, the same for all
+    calls with as many terms.
+    """
+    if function is None:
+        return partial(kernel, any_order=any_order)
     before = config.CACHE_DIR
     config.CACHE_DIR = "" if FOLDER is None else str(FOLDER)
+    fast = {"reassoc", "contract", "nsz"} if any_order else False
     try:
-        return numba.njit(nogil=True, cache=FOLDER is not None, error_model="numpy")(function)
+        return numba.njit(nogil=True, cache=FOLDER is not None, error_model="numpy", fastmath=fast)(
+            function
+        )
     finally:
         config.CACHE_DIR = before

@@ -10,30 +10,33 @@ from torchfilm.kernels.compiling import kernel
 
 
 @kernel
-def _bins(x, axis, half, radius, margin, low, high):
-    """The first and last bin of each cell's box, along each axis; returns the number of bins."""
-    n, d = x.shape
+def _boxes(x, axis, half, radius, margin, box, low, high, dof):
+    """Each cell's box (n, 2 d), from the colony's corner, with half of margin around it, and the
+    first and last bin of it along each axis; returns the number of bins."""
+    n, d = x.shape[0], 2 if len(dof) == 4 else 3
     size = 0.0
     least = np.full(d, np.inf)
     for i in range(n):
         for k in range(d):
             e = abs(axis[i, k]) * half[i] + radius[i] + 0.5 * margin
             size += e
-            least[k] = min(least[k], x[i, k] - e)
+            box[i, k], box[i, d + k] = x[i, k] - e, x[i, k] + e
+            least[k] = min(least[k], box[i, k])
     width = 2.0 * size / (n * d)
     top = np.zeros(3, np.int64)
     for i in range(n):
         for k in range(d):
-            e = abs(axis[i, k]) * half[i] + radius[i] + 0.5 * margin
-            low[i, k] = math.floor((x[i, k] - e - least[k]) / width)
-            high[i, k] = math.floor((x[i, k] + e - least[k]) / width)
+            box[i, k] -= least[k]
+            box[i, d + k] -= least[k]
+            low[i, k], high[i, k] = math.floor(box[i, k] / width), math.floor(box[i, d + k] / width)
             top[k] = max(top[k], high[i, k] + 1)
     return top
 
 
 @kernel
 def _fill_table(low, high, top, slots):
-    """Members and their bins' numbers, sorted by slot; where each slot begins."""
+    """Members sorted by slot, and where each slot begins. Each has 8 times the number of its bin,
+    and a bit for each axis along which this is the first bin of its box."""
     n, d = low.shape
     rows, layers = top[0], top[0] * top[1]
     begin = np.zeros(slots + 1, np.int64)
@@ -53,50 +56,44 @@ def _fill_table(low, high, top, slots):
                         if turn == 0:
                             begin[s + 1] += 1
                         else:
-                            member[fill[s]], key[fill[s]] = i, own
+                            firsts = (bx == low[i, 0]) + 2 * (by == low[i, 1]) + 4 * (bz == z0)
+                            member[fill[s]], key[fill[s]] = i, 8 * own + firsts
                             fill[s] += 1
     return begin, member, key
 
 
 @kernel
-def near_pairs(x, axis, half, radius, margin):
+def near_pairs(x, axis, half, radius, margin, dof):
     """Pairs (i < j) whose boxes come nearer than margin, each once, sorted by i.
 
     Cells of any size: a long cell lies in many bins. A pair is found in the first bin that both
-    cover.
+    cover: along each axis it is the first of one of them.
     """
-    n, d = x.shape
+    n, d = x.shape[0], 2 if len(dof) == 4 else 3
     low, high = np.empty((n, d), np.int64), np.empty((n, d), np.int64)
-    top = _bins(x, axis, half, radius, margin, low, high)
-    rows, layers = top[0], top[0] * top[1]
+    box = np.empty((n, 2 * d))
+    top = _boxes(x, axis, half, radius, margin, box, low, high, dof)
     slots = 16
     while slots < 2 * n:
         slots *= 2
     begin, member, key = _fill_table(low, high, top, slots)
-    room, found = 8 * n + 16, 0
-    first, second = np.empty(room, np.int32), np.empty(room, np.int32)
+    found, most = 0, 0
+    for s in range(slots):
+        most = max(most, begin[s + 1] - begin[s])
+    first, second = np.empty(8 * n + most, np.int32), np.empty(8 * n + most, np.int32)
     for s in range(slots):
         for p in range(begin[s], begin[s + 1]):
-            i, own = member[p], key[p]
-            for q in range(p + 1, begin[s + 1]):
-                j = member[q]
-                if key[q] != own:
-                    continue
-                home = max(low[i, 0], low[j, 0]) + max(low[i, 1], low[j, 1]) * rows
-                if d == 3:
-                    home += max(low[i, 2], low[j, 2]) * layers
-                apart = home != own
+            if found + most > first.shape[0]:
+                first, second = _longer(first), _longer(second)
+            i, own = np.uint64(member[p]), key[p]
+            for q in range(p + 1, begin[s + 1]):  # without branches: their outcome is not foreseen
+                j = np.uint64(member[q])
+                apart = ((own ^ key[q]) >> 3) | (((own | key[q]) & 7) ^ 7)
+                near = apart == 0
                 for k in range(d):
-                    reach = abs(axis[i, k]) * half[i] + abs(axis[j, k]) * half[j]
-                    if abs(x[j, k] - x[i, k]) > reach + radius[i] + radius[j] + margin:
-                        apart = True
-                if apart:
-                    continue
-                if found == room:
-                    first, second = _longer(first), _longer(second)
-                    room *= 2
-                first[found], second[found] = i, j
-                found += 1
+                    near &= (box[i, k] <= box[j, d + k]) & (box[j, k] <= box[i, d + k])
+                first[found], second[found] = member[p], member[q]
+                found += near
     return _by_first(first[:found], second[:found], n)
 
 

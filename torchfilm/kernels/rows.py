@@ -25,6 +25,13 @@ HARD, STIFF, LIGHT = 0, 1, 2  # walls: rigid, with a stiffness, with a weight be
 
 
 @kernel
+def degrees(dof):
+    """The degrees of freedom of a cell, of which the last is its length: 4 in the plane, 7 in
+    space. `dof` is a tuple of as many entries as rows have columns, 4 or 8: see `lanes`."""
+    return 4 if len(dof) == 4 else 7
+
+
+@kernel
 def near_contacts(x, axis, half, radius, first, second, margin):
     """The pairs nearer than margin: their number, closest points and gap, µm."""
     m, d = first.shape[0], x.shape[1]
@@ -68,7 +75,7 @@ def _apart(ax, ay, az, cx, cy, cz, d):
 @kernel
 def _put_half(H, h, i, weight, s, end, nx, ny, nz, axis, scale, dof):
     """One half of a row: weight · (n, q × n, ∂) · M^(−½) for a point at arc length s."""
-    D = len(dof)
+    D = degrees(dof)
     ax, ay = axis[i, 0], axis[i, 1]
     H[h, 0], H[h, 1] = weight * nx * scale[i, 0], weight * ny * scale[i, 1]
     if D == 4:
@@ -81,6 +88,7 @@ def _put_half(H, h, i, weight, s, end, nx, ny, nz, axis, scale, dof):
         H[h, 4] = weight * s * (az * nx - ax * nz) * scale[i, 4]
         H[h, 5] = weight * s * (ax * ny - ay * nx) * scale[i, 5]
         along = nx * ax + ny * ay + nz * az
+        H[h, 7] = 0.0
     H[h, D - 1] = weight * 0.5 * end * along * scale[i, D - 1]
 
 
@@ -113,10 +121,16 @@ def _put_pair(H, gaps, r, i, j, x, axis, half, radius, scale, s, t, end_a, end_b
 
 
 @kernel
-def pair_rows(x, axis, half, radius, scale, first, second, keep, points, H, gaps, one, two, dof):
-    """Rows of the pairs; a line of contact has two rows of weight ½. Returns their number."""
-    d = 2 if len(dof) == 4 else 3
-    r = 0
+def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
+    """Rows of the contacts `found`, after `walls` others; a line of contact has two rows of weight
+    ½. Returns how many there are in all.
+
+    found: pairs (first, second), and of their contacts the place among these, the closest points
+    and the gap, µm: see `near_contacts`.
+    """
+    first, second, keep, points, _ = found
+    H, gaps, one, two, _ = rows
+    d, r = 2 if len(dof) == 4 else 3, walls
     for k in range(keep.shape[0]):
         i, j = first[keep[k]], second[keep[k]]
         s0, t0 = points[k, 0], points[k, 1]
@@ -192,9 +206,8 @@ def wall_gap(kind, place, size, px, py, pz):
 
 
 @kernel
-def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, rows,
-              H, gaps, one, two, soft, is_soft, dof):  # fmt: skip
-    """Rows of cells nearer to a wall than reach (n,), after the first `rows`.
+def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, rows, is_soft, dof):
+    """Rows (H, gaps, one, two, soft) of cells nearer to a wall than reach (n,).
 
     roots: (S, n) D of each wall and cell. A plane, or a sphere from inside, has a row for each end
     of a cell; a sphere met from outside one for the nearest point, and one that its ends share.
@@ -202,7 +215,8 @@ def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, 
     number of rows and the deepest gap.
     """
     d = 2 if len(dof) == 4 else 3
-    deepest = 0.0
+    H, gaps, one, two, soft = rows
+    r, deepest = 0, 0.0
     for w in range(kinds.shape[0]):
         for i in range(x.shape[0]):
             ax, ay, h = axis[i, 0], axis[i, 1], half[i]
@@ -230,10 +244,10 @@ def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, 
                 if kind == HARD:
                     deepest = min(deepest, gap)
                 weight = share * roots[w, i]
-                _put_half(H, 2 * rows, i, weight, s, end, nx, ny, nz, axis, scale, dof)
-                gaps[rows], one[rows], two[rows], soft[rows] = weight * gap, i, -1, kind
-                rows += 1
-    return rows, deepest
+                _put_half(H, 2 * r, i, weight, s, end, nx, ny, nz, axis, scale, dof)
+                gaps[r], one[r], two[r], soft[r] = weight * gap, i, -1, kind
+                r += 1
+    return r, deepest
 
 
 @kernel

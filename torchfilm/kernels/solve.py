@@ -13,176 +13,96 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.rows import rows_of_cells
+from torchfilm.kernels.lanes import add_scaled, add_square, dot, invert, put_product
+from torchfilm.kernels.rows import degrees, rows_of_cells
 from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS, ROUNDING
 
 
 @kernel
-def times_rows(H, one, two, rows, p, q, dof):
-    """q = J p."""
-    D = len(dof)
-    for r in range(rows):
-        i, j, h = one[r], two[r], 2 * r
-        if D == 4:
-            t = H[h, 0] * p[i, 0] + H[h, 1] * p[i, 1] + H[h, 2] * p[i, 2] + H[h, 3] * p[i, 3]
-        else:
-            t = H[h, 0] * p[i, 0]
-            for k in range(1, 7):
-                t += H[h, k] * p[i, k]
-        if j >= 0:
-            for k in range(D):
-                t += H[h + 1, k] * p[j, k]
-        q[r] = t
+def times_rows(H, one, two, p, q, dof):
+    """q = J p. Here and below two[r] is one[r] for rows of one cell, whose second half is 0."""
+    for r in range(q.shape[0]):
+        q[r] = dot(H, 2 * r, p, one[r], dof) + dot(H, 2 * r + 1, p, two[r], dof)
 
 
 @kernel
-def add_forces(H, one, two, rows, v, out, dof):
+def add_forces(H, one, two, v, out, dof):
     """out += Jᵀ v."""
-    D = len(dof)
-    for r in range(rows):
-        f = v[r]
-        if f == 0:
-            continue
-        i, j, h = one[r], two[r], 2 * r
-        for k in range(D):
-            out[i, k] += H[h, k] * f
-        if j >= 0:
-            for k in range(D):
-                out[j, k] += H[h + 1, k] * f
+    for r in range(v.shape[0]):
+        add_scaled(out, one[r], v[r], H, 2 * r, dof)
+        add_scaled(out, two[r], v[r], H, 2 * r + 1, dof)
 
 
 @kernel
-def add_product(H, one, two, rows, act, p, out, dof):
-    """out += Jᵀ A J p, in one pass over the rows, which are sorted by their first cell."""
-    D = len(dof)
-    if D == 4:
-        last = -1
-        a = b = c = d = pa = pb = pc = pd = p[0, 0] * 0
-        for r in range(rows):
-            if not act[r]:
-                continue
-            i, j, h = one[r], two[r], 2 * r
-            if i != last:
-                if last >= 0:
-                    out[last, 0], out[last, 1], out[last, 2], out[last, 3] = a, b, c, d
-                a, b, c, d = out[i, 0], out[i, 1], out[i, 2], out[i, 3]
-                pa, pb, pc, pd = p[i, 0], p[i, 1], p[i, 2], p[i, 3]
-                last = i
-            t = H[h, 0] * pa + H[h, 1] * pb + H[h, 2] * pc + H[h, 3] * pd
-            if j >= 0:
-                g = h + 1
-                t += H[g, 0] * p[j, 0] + H[g, 1] * p[j, 1] + H[g, 2] * p[j, 2] + H[g, 3] * p[j, 3]
-                out[j, 0] += H[g, 0] * t
-                out[j, 1] += H[g, 1] * t
-                out[j, 2] += H[g, 2] * t
-                out[j, 3] += H[g, 3] * t
-            a += H[h, 0] * t
-            b += H[h, 1] * t
-            c += H[h, 2] * t
-            d += H[h, 3] * t
-        if last >= 0:
-            out[last, 0], out[last, 1], out[last, 2], out[last, 3] = a, b, c, d
-        return
-    for r in range(rows):
-        if not act[r]:
-            continue
+def add_product(H, one, two, on, p, out, dof):
+    """out += Jᵀ J p of the rows `on`."""
+    for r in on:
         i, j, h = one[r], two[r], 2 * r
-        t = H[h, 0] * p[i, 0]
-        for k in range(1, 7):
-            t += H[h, k] * p[i, k]
-        if j >= 0:
-            for k in range(7):
-                t += H[h + 1, k] * p[j, k]
-            for k in range(7):
-                out[j, k] += H[h + 1, k] * t
-        for k in range(7):
-            out[i, k] += H[h, k] * t
+        t = dot(H, h, p, i, dof) + dot(H, h + 1, p, j, dof)
+        add_scaled(out, i, t, H, h, dof)
+        add_scaled(out, j, t, H, h + 1, dof)
 
 
 @kernel
-def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, L, dof):
-    """The inverse of cell i's own block of JᵀAJ + α, by Cholesky in float64; without its last row
+def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, dof):
+    """The inverse of cell i's own block of JᵀAJ + α, worked out in B in float64; 0 in its last row
     and column where the length is held. Returns the entry of the length."""
-    D = len(dof)
-    inverse[i, D - 1] = 0.0
-    inverse[i, :, D - 1] = 0.0
-    for k in range(D):
-        for m in range(k + 1):
-            B[k, m] = 0.0
+    end = degrees(dof) - 1
+    B[:] = 0.0
     for q in range(begin[i], begin[i + 1]):
         h = halves[q]
         if act[h >> 1]:
-            for k in range(D):
-                for m in range(k + 1):
-                    B[k, m] += H[h, k] * H[h, m]
-    for k in range(D):
+            add_square(B, H, h, dof)
+    for k in range(end + 1):
         B[k, k] = B[k, k] * (1 + 1e-9) + alpha
-    own = B[D - 1, D - 1]
+    own = B[end, end]
     if held:
-        D -= 1
-    for k in range(D):
-        for m in range(k + 1):
-            t = B[k, m]
-            for u in range(m):
-                t -= L[k, u] * L[m, u]
-            L[k, m] = math.sqrt(t) if k == m else t / L[m, m]
-    for k in range(D):
-        L[k, k] = 1.0 / L[k, k]
-        for m in range(k):
-            t = 0.0
-            for u in range(m, k):
-                t -= L[k, u] * L[u, m]
-            L[k, m] = t * L[k, k]
-    for k in range(D):
-        for m in range(k + 1):
-            t = 0.0
-            for u in range(k, D):
-                t += L[u, k] * L[u, m]
-            inverse[i, k, m] = t
-            inverse[i, m, k] = t
+        B[end], B[:, end] = 0.0, 0.0
+        B[end, end] = 1.0
+    invert(B, dof)
+    if held:
+        B[end, end] = 0.0
+    block, found = inverse[i].reshape(-1), B.reshape(-1)
+    for k in range(block.shape[0]):
+        block[k] = found[k]
     return own
 
 
 @kernel
 def precondition(inverse, g, z, dof):
     """z = P⁻¹ g; returns g · z."""
-    D = len(dof)
     total = 0.0
     for i in range(g.shape[0]):
-        for k in range(D):
-            t = inverse[i, k, 0] * g[i, 0]
-            for m in range(1, D):
-                t += inverse[i, k, m] * g[i, m]
-            z[i, k] = t
-            total += t * g[i, k]
+        put_product(z, i, inverse, g, dof)
+        total += dot(g, i, z, i, dof)
     return total
 
 
-@kernel
-def _slope(e, q, rows, t):
+@kernel(any_order=True)
+def _slope(e, q, t):
     """The slope of the rows' energy after a share t of a step that changes them by −q, and its
     derivative."""
     slope, curvature = 0.0, 0.0
-    for r in range(rows):
+    for r in range(e.shape[0]):
         left = e[r] - t * q[r]
-        if left < 0:
-            slope -= left * q[r]
-            curvature += q[r] * q[r]
+        push = q[r] if left < 0 else 0.0 * q[r]
+        slope -= left * push
+        curvature += push * push
     return slope, curvature
 
 
 @kernel
-def search_line(e, q, rows, c0, c1, most):
+def search_line(e, q, c0, c1, most):
     """How far to go along a step, at most `most`: until the slope is at most LEVEL of that at 0.
     And how far E falls."""
-    slope0, curvature = _slope(e, q, rows, 0.0)
+    slope0, curvature = _slope(e, q, 0.0)
     slope0 += c0
     if not (slope0 < 0 and curvature + c1 > 0):
         return 0.0, 0.0
     t = min(-slope0 / (curvature + c1), most)
     least, end = 0.0, np.inf
     for _ in range(MOST_LOOKS):
-        slope, curvature = _slope(e, q, rows, t)
+        slope, curvature = _slope(e, q, t)
         slope += c0 + c1 * t
         if abs(slope) <= -LEVEL * slope0 or (slope < 0 and t == most):
             break
@@ -198,11 +118,11 @@ def search_line(e, q, rows, c0, c1, most):
 
 
 @kernel
-def _stop_at_bounds(y, d, low, lengths, slope, own):
+def _stop_at_bounds(y, d, low, lengths, slope, own, dof):
     """Shorten the step d (n, D) of the lengths that would pass their bound; those that step alone
     follow their slope. Returns how far all may go along the step."""
     alone, stopped = lengths[1], lengths[2]
-    last, most = y.shape[1] - 1, np.inf
+    last, most = degrees(dof) - 1, np.inf
     for i in range(y.shape[0]):
         room = low[i] - y[i, last]
         if alone[i]:
@@ -216,58 +136,66 @@ def _stop_at_bounds(y, d, low, lengths, slope, own):
 
 
 @kernel
-def _conjugate_gradients(H, one, two, rows, act, alpha, inverse, g, z, p, d, gz, limit, dof):
+def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit, dof):
     """d = −(JᵀAJ + α)⁻¹ g, to FORCING of the residual; g becomes the residual. Iterations."""
-    n, D = g.shape[0], len(dof)
-    box = np.zeros(1, g.dtype)  # a scalar of the same precision
-    for i in range(n):
-        for k in range(D):
-            d[i, k] = 0
-            p[i, k] = -z[i, k]
+    n = g.shape[0]
+    t = np.zeros(1, g.dtype)  # a scalar of the same precision
+    d[:], p[:] = 0, 0
+    _next_direction(p, z, t[0])
     rz, count = gz, 0
     while count < limit and rz > 0:
-        for i in range(n):
-            for k in range(D):
-                z[i, k] = alpha[i] * p[i, k]
-        add_product(H, one, two, rows, act, p, z, dof)
+        add_product(H, one, two, on, p, z, dof)
         curvature = 0.0
         for i in range(n):
-            for k in range(D):
-                curvature += p[i, k] * z[i, k]
-        box[0] = rz / curvature
-        t = box[0]
+            add_scaled(z, i, alpha[i], p, i, dof)
+            curvature += dot(p, i, z, i, dof)
+        t[0], new = rz / curvature, 0.0
         for i in range(n):
-            for k in range(D):
-                d[i, k] += t * p[i, k]
-                g[i, k] += t * z[i, k]
-        new = precondition(inverse, g, z, dof)
+            add_scaled(d, i, t[0], p, i, dof)
+            add_scaled(g, i, t[0], z, i, dof)
+            put_product(z, i, inverse, g, dof)
+            new += dot(g, i, z, i, dof)
         count += 1
         if not (new > FORCING * FORCING * gz and new < np.inf):
             break
-        box[0] = new / rz
-        t, rz = box[0], new
-        for i in range(n):
-            for k in range(D):
-                p[i, k] = t * p[i, k] - z[i, k]
+        t[0], rz = new / rz, new
+        _next_direction(p, z, t[0])
     return count
 
 
 @kernel
-def _switch_rows(e, pushed, cap, one, two, act, v, stale):
-    """Which rows push, and with what force; cells whose rows change are stale. Returns the sum of
-    squared overlaps, each counted up to `cap`."""
+def _next_direction(p, z, t):
+    """p = t p − z, and z = 0."""
+    p, z = p.reshape(-1), z.reshape(-1)
+    for k in range(p.shape[0]):
+        p[k] = t * p[k] - z[k]
+        z[k] = 0
+
+
+@kernel(any_order=True)
+def _forces(e, pushed, cap, v):
+    """v = the force of each row. Returns the sum of squared overlaps, each counted up to `cap`."""
     overlap = 0.0
-    for r in range(act.shape[0]):
-        on = e[r] < 0
-        v[r] = -e[r] - pushed[r] if on else -pushed[r]
-        if on:
-            overlap += min(e[r] * e[r], cap * cap)
-        if on != act[r]:
-            act[r] = on
-            stale[one[r]] = 1
-            if two[r] >= 0:
-                stale[two[r]] = 1
+    for r in range(e.shape[0]):
+        depth = max(-e[r], 0 * e[r])
+        v[r] = depth - pushed[r]
+        overlap += min(depth * depth, cap * cap)
     return overlap
+
+
+@kernel
+def _switch_rows(e, one, two, act, on, stale):
+    """Mark which rows push; cells whose rows change are stale. Puts the rows that push into `on`;
+    returns how many."""
+    count = 0
+    for r in range(act.shape[0]):
+        push = e[r] < 0
+        on[count] = r
+        count += push
+        if push != act[r]:
+            act[r] = push
+            stale[one[r]] = stale[two[r]] = 1
+    return count
 
 
 @kernel
@@ -275,8 +203,7 @@ def _refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inver
     """Hold the lengths at their bound that are pushed further, and those that step alone; invert
     the blocks of the cells that changed. own: (n,) of lengths, their diagonal."""
     held, alone = lengths[0], lengths[1]
-    D = len(dof)
-    B, L = np.empty((D, D)), np.empty((D, D))
+    D, B = degrees(dof), np.empty((len(dof), len(dof)))
     for i in range(y.shape[0]):
         at_bound = y[i, D - 1] <= low[i] and g[i, D - 1] >= 0
         alone[i] = alone[i] and not at_bound
@@ -284,19 +211,18 @@ def _refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inver
             held[i] = at_bound or alone[i]
             stale[i] = 1
         if stale[i]:
-            own[i] = put_inverse(H, begin, halves, act, i, alpha[i], held[i], inverse, B, L, dof)
+            own[i] = put_inverse(H, begin, halves, act, i, alpha[i], held[i], inverse, B, dof)
             stale[i] = 0
 
 
 @kernel
-def _advance(y, d, low, e, q, share):
+def _advance(y, d, low, e, q, share, dof):
     """Go `share` of the step d; lengths at their bound are put on it."""
     box = np.zeros(1, y.dtype)
     box[0] = share
-    last = y.shape[1] - 1
+    last = degrees(dof) - 1
     for i in range(y.shape[0]):
-        for k in range(last + 1):
-            y[i, k] += box[0] * d[i, k]
+        add_scaled(y, i, box[0], d, i, dof)
         if y[i, last] <= low[i] + ROUNDING * (abs(low[i]) + abs(d[i, last])):
             y[i, last] = low[i]
     for r in range(e.shape[0]):
@@ -313,28 +239,30 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
     counted up to `cap` (µm), so that what has not converged does not loosen the rule. Returns
     iterations, that relative error, and each row's gap after the move.
     """
-    n, D = y.shape[0], len(dof)
+    n, D = y.shape[0], degrees(dof)
     if not np.any(gaps[:rows] < 0):  # nothing pushes: such a colony does not move at all
         y[:] = 0
         return 0, 0.0, gaps[:rows].copy()
     v, q = np.empty(rows, y.dtype), np.empty(rows, y.dtype)
-    act, stale = np.zeros(rows, np.uint8), np.ones(n, np.uint8)
+    act, stale, on = np.zeros(rows, np.uint8), np.ones(n, np.uint8), np.empty(rows, np.int32)
     lengths = np.zeros((3, n), np.uint8)  # held, alone, stopped
     slope, own = np.empty(n, y.dtype), np.empty(n, y.dtype)  # of lengths
     g, z, d, p = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
-    inverse = np.empty((n, D, D), y.dtype)
+    inverse = np.empty((n, len(dof), len(dof)), y.dtype)
     begin, halves = rows_of_cells(one, two, rows, n)
+    one, two = one[:rows], _second_cells(H, one, two, rows)
     for i in range(n):
         y[i, D - 1] = max(y[i, D - 1], low[i])
-    times_rows(H, one, two, rows, y, q, dof)
+    times_rows(H, one, two, y, q, dof)
     e = gaps[:rows] - q
     total, fall, error, stuck = 0, np.inf, 0.0, 0
     for round_ in range(MOST_ROUNDS + 1):
-        overlap = _switch_rows(e, pushed, cap, one, two, act, v, stale)
+        overlap = _forces(e, pushed, cap, v)
+        pushing = _switch_rows(e, one, two, act, on, stale)
+        g[:] = 0
         for i in range(n):
-            for k in range(D):
-                g[i, k] = alpha[i] * y[i, k]
-        add_forces(H, one, two, rows, v, g, dof)
+            add_scaled(g, i, alpha[i], y, i, dof)
+        add_forces(H, one, two, v, g, dof)
         _refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, dof)
         gz, of_alone = precondition(inverse, g, z, dof), 0.0
         for i in range(n):
@@ -352,20 +280,31 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
         if done or total >= limit or round_ == MOST_ROUNDS:
             break
         total += _conjugate_gradients(
-            H, one, two, rows, act, alpha, inverse, g, z, p, d, gz, limit - total, dof
+            H, one, two, on[:pushing], alpha, inverse, g, z, p, d, gz, limit - total, dof
         )
-        most = _stop_at_bounds(y, d, low, lengths, slope, own)
-        times_rows(H, one, two, rows, d, q, dof)
+        most = _stop_at_bounds(y, d, low, lengths, slope, own, dof)
+        times_rows(H, one, two, d, q, dof)
         c0, c1 = 0.0, 0.0
         for i in range(n):
-            for k in range(D):
-                c0 += alpha[i] * y[i, k] * d[i, k]
-                c1 += alpha[i] * d[i, k] * d[i, k]
+            c0 += alpha[i] * dot(y, i, d, i, dof)
+            c1 += alpha[i] * dot(d, i, d, i, dof)
         for r in range(rows):
             c0 -= pushed[r] * q[r]
-        share, fall = search_line(e, q, rows, c0, c1, most)
+        share, fall = search_line(e, q, c0, c1, most)
         stuck = stuck + 1 if share == 0 else 0
         for i in range(n):
             lengths[1, i] = share < CREEP and (lengths[1, i] or lengths[2, i])
-        _advance(y, d, low, e, q, share)
+        _advance(y, d, low, e, q, share, dof)
     return total, error, e
+
+
+@kernel
+def _second_cells(H, one, two, rows):
+    """The second cell of each row; the first where there is no second, whose half of the row is
+    made 0. So all rows are alike."""
+    other = two[:rows].copy()
+    for r in range(rows):
+        if two[r] < 0:
+            other[r] = one[r]
+            H[2 * r + 1] = 0.0
+    return other

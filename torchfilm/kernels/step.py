@@ -8,8 +8,17 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.moves import approach, drags, move_cells
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
-from torchfilm.kernels.rows import HARD, STIFF, near_contacts, pair_rows, rows_among, wall_rows
+from torchfilm.kernels.rows import (
+    HARD,
+    STIFF,
+    degrees,
+    near_contacts,
+    pair_rows,
+    rows_among,
+    wall_rows,
+)
 from torchfilm.kernels.scheme import (
     DEEP_IN_SUBSTEPS,
     HARDEST,
@@ -17,7 +26,6 @@ from torchfilm.kernels.scheme import (
     ITERATION_LIMIT,
     LAG,
     MARGIN,
-    MAX_TURN,
     MOST_SOFTER,
     NOT_FINITE,
     OVERLAP,
@@ -36,77 +44,13 @@ REPORT = 6
 
 
 @kernel
-def drags(length, radius, viscosity, length_drag, growth, scale, dof):
-    """M^(−½) of each cell, (n, D). A cell that does not grow is rigid: its length cannot move."""
-    D = len(dof)
-    d = 2 if D == 4 else 3
-    for i in range(length.shape[0]):
-        whole = length[i] + 2 * radius[i]
-        across = 1.0 / math.sqrt(viscosity[i] * whole)
-        turn = 1.0 / math.sqrt(viscosity[i] * whole * whole * whole / 12.0)
-        for k in range(D - 1):
-            scale[i, k] = across if k < d else turn
-        scale[i, D - 1] = 1.0 / math.sqrt(length_drag[i]) if growth[i] > 0 else 0.0
-
-
-@kernel
-def move_cells(x, axis, length, y, scale, about, bound, least, dof):
-    """Carry out the move y, its translation at most `bound` from `about` (n, D), and its rotation
-    at most `bound` at the ends. Returns how many were cut short."""
-    D = len(dof)
-    d = 2 if D == 4 else 3
-    clipped = 0
-    for i in range(x.shape[0]):
-        way = 0.0
-        for k in range(d):
-            way += (y[i, k] * scale[i, k] - about[i, k]) ** 2
-        part = bound / math.sqrt(way) if way > bound * bound else 1.0
-        angle = 0.0
-        for k in range(d, D - 1):
-            angle += (y[i, k] * scale[i, k]) ** 2
-        angle = math.sqrt(angle)
-        most = min(2.0 * bound / max(length[i], 1e-9), MAX_TURN)
-        turn = most / angle if angle > most else 1.0
-        if part < 1.0 or turn < 1.0:
-            clipped += 1
-        for k in range(d):
-            step = about[i, k] + part * (y[i, k] * scale[i, k] - about[i, k])
-            y[i, k] = step
-            x[i, k] += step
-        for k in range(d, D - 1):
-            y[i, k] *= turn * scale[i, k]
-        y[i, D - 1] *= scale[i, D - 1]
-        angle *= turn
-        sinc, versine = 1.0, 0.5
-        if angle > 1e-4:
-            sinc, versine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
-        ax, ay = axis[i, 0], axis[i, 1]
-        if d == 2:
-            t = y[i, 2]
-            bx, by = (
-                ax - sinc * t * ay - versine * t * t * ax,
-                ay + sinc * t * ax - versine * t * t * ay,
-            )
-            size = math.sqrt(bx * bx + by * by)
-            axis[i, 0], axis[i, 1] = bx / size, by / size
-        else:
-            az = axis[i, 2]
-            tx, ty, tz = y[i, 3], y[i, 4], y[i, 5]
-            ux, uy, uz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
-            wx, wy, wz = ty * uz - tz * uy, tz * ux - tx * uz, tx * uy - ty * ux
-            bx = ax + sinc * ux + versine * wx
-            by = ay + sinc * uy + versine * wy
-            bz = az + sinc * uz + versine * wz
-            size = math.sqrt(bx * bx + by * by + bz * bz)
-            axis[i, 0], axis[i, 1], axis[i, 2] = bx / size, by / size, bz / size
-        length[i] = max(length[i] + y[i, D - 1], least[i])
-    return clipped
-
-
-@kernel
-def _deep_cells(first, second, keep, gap, deep, n):
-    """Numbers of the cells deeper than `deep` in others and of those up to HOPS contacts away, in
-    order, −1 for the others; and how many."""
+def _deep_cells(found, rows, walls, deep, n):
+    """Numbers of those of n cells that lie deeper than `deep` in others, of those up to HOPS
+    contacts away, and of those so deep in a hard wall; −1 for the others; and how many."""
+    first, second, keep, _, gap = found
+    _, gaps, one, _, soft = rows
+    if n == 0:
+        return np.empty(0, np.int32), 0
     mark = np.zeros(n, np.int64)
     for k in range(keep.shape[0]):
         if gap[k] < -deep:
@@ -119,44 +63,67 @@ def _deep_cells(first, second, keep, gap, deep, n):
                     mark[j] = hop + 1
                 elif mark[j] == hop and mark[i] == 0:
                     mark[i] = hop + 1
-    number, count = np.full(n, -1, np.int32), 0
+    numbers, count = np.full(n, -1, np.int32), 0
     for i in range(n):
         if mark[i] > 0:
-            number[i] = count
+            numbers[i] = count
             count += 1
-    return number, count
+    for r in range(walls):
+        if soft[r] == HARD and gaps[r] < -deep and numbers[one[r]] < 0:
+            numbers[one[r]] = count
+            count += 1
+    return numbers, count
 
 
 @kernel
-def _rows(
-    x, axis, half, radius, scale, margin, kinds, places, sizes, root, reach, is_soft, like, dof
-):
-    """All rows of a colony. Returns near pairs, which of them are contacts with which gap, the rows
-    (see `rows`), how many are of pairs, how many there are, and the deepest gap."""
-    n, D = x.shape[0], len(dof)
-    first, second = near_pairs(x, axis, half, radius, margin)
+def _contacts(x, axis, half, radius, margin, deep, found, listed, dof):
+    """Near pairs (first, second), and the contacts among them: see `near_contacts`.
+
+    found: those before the last move. listed: whether only its pairs can lie deeper than `deep`;
+    where they do not, they are all that is looked at.
+    """
+    first, second = found[0], found[1]
     keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin)
-    room = 2 * keep.shape[0] + 3 * kinds.shape[0] * n
-    H, gaps = np.empty((2 * room, D), like.dtype), np.empty(room, like.dtype)
-    one, two = np.empty(room, np.int32), np.empty(room, np.int32)
-    soft = np.zeros(room, np.uint8)
-    pairs = pair_rows(
-        x, axis, half, radius, scale, first, second, keep, points, H, gaps, one, two, dof
-    )
-    rows, deepest = wall_rows(
-        x, axis, half, radius, scale, kinds, places, sizes, root, reach, pairs,
-        H, gaps, one, two, soft, is_soft, dof,
-    )  # fmt: skip
+    if not (listed and _deepest(gap) >= -deep):
+        first, second = near_pairs(x, axis, half, radius, margin, dof)
+        keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin)
+    return first, second, keep, points, gap
+
+
+@kernel
+def _no_contacts():
+    none = np.empty(0, np.int32)
+    return none, none, none, np.empty((0, 2)), np.empty(0)
+
+
+@kernel
+def _deepest(gap):
+    deepest = 0.0
     for k in range(gap.shape[0]):
         deepest = min(deepest, gap[k])
-    return first, second, keep, gap, H, gaps, one, two, soft, pairs, rows, deepest
+    return deepest
+
+
+@kernel
+def _wall_contacts(x, axis, half, radius, scale, kinds, places, sizes, root, reach, is_soft, found,
+                   like, dof):  # fmt: skip
+    """Rows (H, gaps, one, two, soft) of cells at walls, with room for those of the contacts
+    `found`; how many there are, and the deepest gap."""
+    room = 2 * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
+    H, gaps = np.empty((2 * room, len(dof)), like.dtype), np.empty(room, like.dtype)
+    one, two = np.empty(room, np.int32), np.empty(room, np.int32)
+    rows = H, gaps, one, two, np.zeros(room, np.uint8)
+    walls, deepest = wall_rows(
+        x, axis, half, radius, scale, kinds, places, sizes, root, reach, rows, is_soft, dof
+    )
+    return rows, walls, deepest
 
 
 @kernel
 def _numbers(x, length, scale, growth, least, last, first_pass, hardness, softer, roots, is_soft,
-             alphas, margin, alpha, low, half, reach, root):  # fmt: skip
+             alphas, margin, alpha, low, half, reach, root, dof):  # fmt: skip
     """α, the least scaled Δl, half length, reach of walls and weight of walls of each cell."""
-    end = scale.shape[1] - 1
+    end = degrees(dof) - 1
     for i in range(x.shape[0]):
         alpha[i] = softer * (alphas[i] if alphas.shape[0] > 0 else hardness)
         low[i] = min((least[i] - length[i]) / scale[i, end], 0.0) if growth[i] > 0 else 0.0
@@ -170,18 +137,18 @@ def _numbers(x, length, scale, growth, least, last, first_pass, hardness, softer
 
 
 @kernel
-def _minimise_some(H, one, two, rows, gaps, soft, numbers, count, alpha, low, y, tolerance, cap,
-                   limit, dof):  # fmt: skip
-    """Minimise from y: for all cells, where no numbers are given; or, in a later pass, in which
-    soft walls have already pushed, for the numbered cells among the others at rest. Puts the move
-    into y, 0 for cells at rest."""
-    D = len(dof)
+def _minimise_some(rows, m, numbers, count, alpha, low, y, tolerance, cap, limit, dof):
+    """Minimise from y with the first m of the rows: for all cells, where no numbers are given; or,
+    in a later pass, in which soft walls have already pushed, for the numbered cells among the
+    others at rest. Puts the move into y, 0 for cells at rest."""
+    H, gaps, one, two, soft = rows
+    D, limit = degrees(dof), int(limit)
     if numbers.shape[0] == 0:
-        none = np.zeros(rows, y.dtype)
-        return minimise(H, one, two, rows, gaps, none, alpha, low, y, tolerance, cap, limit, dof)
-    rows = rows_among(H, gaps, one, two, soft, rows, numbers)
-    pushed, part = np.zeros(rows, y.dtype), np.zeros((count, D), y.dtype)
-    for r in range(rows):
+        none = np.zeros(m, y.dtype)
+        return minimise(H, one, two, m, gaps, none, alpha, low, y, tolerance, cap, limit, dof)
+    m = rows_among(H, gaps, one, two, soft, m, numbers)
+    pushed, part = np.zeros(m, y.dtype), np.zeros((count, len(dof)), y.dtype)
+    for r in range(m):
         if soft[r] == STIFF and gaps[r] < 0:
             pushed[r] = -gaps[r]
     some_alpha, some_low = np.empty(count, y.dtype), np.empty(count, y.dtype)
@@ -190,7 +157,7 @@ def _minimise_some(H, one, two, rows, gaps, soft, numbers, count, alpha, low, y,
             some_alpha[numbers[i]], some_low[numbers[i]] = alpha[i], low[i]
             part[numbers[i]] = y[i]
     iterations, error, e = minimise(
-        H, one, two, rows, gaps, pushed, some_alpha, some_low, part, tolerance, cap, limit, dof
+        H, one, two, m, gaps, pushed, some_alpha, some_low, part, tolerance, cap, limit, dof
     )
     for i in range(y.shape[0]):
         for k in range(D):
@@ -209,37 +176,36 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, har
     """
     margin, target, deep, softest = _of_colony(base, growth, radius, viscosity, settings)
     tolerance, passes, given = settings[TOLERANCE], settings[MOST_PASSES], alphas.shape[0] > 0
-    if hardness[0] <= 0:
-        hardness[0] = softest
-    length, scale = base + growth, np.empty(last.shape)
+    hardness[0] = hardness[0] if hardness[0] > 0 else softest
+    length, scale = base + growth, np.zeros(last.shape)
     least = base - SHRINK * np.maximum(growth, 0.0)
     half, reach, root = np.empty_like(base), np.empty_like(base), np.empty(roots.shape)
     alpha, low, y = np.empty_like(last[:, 0]), np.empty_like(last[:, 0]), np.empty_like(last)
     number, softer, rising, kept, held, kept_alpha = 0, 1.0, True, y, 0.0, 0.0
+    found, moved, listed = _no_contacts(), True, False
     while True:
         drags(length, radius, viscosity, length_drag, growth, scale, dof)
         _numbers(
             x, length, scale, growth, least, last, number == 0, hardness[0], softer, roots,
-            is_soft, alphas, margin, alpha, low, half, reach, root,
+            is_soft, alphas, margin, alpha, low, half, reach, root, dof,
         )  # fmt: skip
         if rising:
             y[:] = np.where(scale > 0, last / np.maximum(scale, 1e-300), 0.0) * (number == 0)
-        first, second, keep, gap, H, gaps, one, two, soft, pairs, rows, deepest = _rows(
-            x, axis, half, radius, scale, margin, kinds, places, sizes, root, reach, is_soft, last,
+        if moved:
+            found = _contacts(x, axis, half, radius, margin, deep, found, listed, dof)
+        rows, walls, deepest = _wall_contacts(
+            x, axis, half, radius, scale, kinds, places, sizes, root, reach, is_soft, found, last,
             dof,
         )  # fmt: skip
         if number == 0:
-            report[DEEPLY] = 0 if settings[SOFT] > 0 else _deeply(first, second, keep, gap, radius)
-            numbers, count = np.empty(0, np.int32), 0
-        elif deepest >= -deep or number == passes or settings[SOFT] > 0:
+            report[DEEPLY] = 0 if settings[SOFT] > 0 else _deeply(found, radius)
+        elif min(deepest, _deepest(found[4])) >= -deep or number == passes or settings[SOFT] > 0:
             break
-        else:
-            numbers, count = _deep_cells(first, second, keep, gap, deep, base.shape[0])
-            count = _deep_in_walls(gaps, one, soft, pairs, rows, deep, numbers, count)
+        numbers, count = _deep_cells(found, rows, walls, deep, 0 if number == 0 else y.shape[0])
+        moved, m = False, pair_rows(x, axis, half, radius, scale, found, walls, rows, dof)
         iterations, error, e = _minimise_some(
-            H, one, two, rows, gaps, soft, numbers, count, alpha, low, y, tolerance,
-            2 * target, int(settings[LIMIT]), dof,
-        )  # fmt: skip
+            rows, m, numbers, count, alpha, low, y, tolerance, 2 * target, settings[LIMIT], dof
+        )
         report[ITERATIONS] += iterations
         failed = error > tolerance and error < np.inf
         if failed and rising and softer < MOST_SOFTER:
@@ -255,15 +221,16 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, har
             break
         if error <= tolerance and number == 0 and not given:
             before = hardness[0]
-            hardness[0] = kept_alpha if failed else _following(e, soft, before, target, softest)
+            hardness[0] = kept_alpha if failed else _following(e, rows[4], before, target, softest)
             if hardness[0] < LAG * before and not failed:  # the force has grown: solve again
                 kept, held, kept_alpha, rising = y.copy(), error, before, False
                 continue
-        about = last * (number == 0 and np.any(gaps[:rows] < 0))  # without a push nothing moves
+        about = last * (number == 0 and np.any(rows[1][:m] < 0))  # without a push nothing moves
         report[CLIPPED] = move_cells(x, axis, length, y, scale, about, margin, least, dof)
         if number == 0:
             last[:] = y
-        number, softer, rising = number + 1, 1.0, True
+        listed = approach(x, length, radius, y, dof) <= margin + deep
+        moved, number, softer, rising = True, number + 1, 1.0, True
     return length
 
 
@@ -293,18 +260,9 @@ def _of_colony(base, growth, radius, viscosity, settings):
 
 
 @kernel
-def _deep_in_walls(gaps, one, soft, pairs, rows, deep, numbers, count):
-    """Number the cells deeper than `deep` in a hard wall, too. Returns how many have numbers."""
-    for r in range(pairs, rows):
-        if soft[r] == HARD and gaps[r] < -deep and numbers[one[r]] < 0:
-            numbers[one[r]] = count
-            count += 1
-    return count
-
-
-@kernel
-def _deeply(first, second, keep, gap, radius):
+def _deeply(found, radius):
     """How many cells lie deeper in another than a radius."""
+    first, second, keep, _, gap = found
     deeply = np.zeros(radius.shape[0], np.int64)
     for k in range(keep.shape[0]):
         i, j = first[keep[k]], second[keep[k]]
@@ -339,7 +297,7 @@ def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosit
     Cells of colony b are begin[b] … begin[b + 1] − 1. x: (N, d) float64. length: before growth.
     places: (S, B, 3); sizes: (S, B). reports: (B, REPORT). For the others see `step_colony`.
     """
-    D = len(dof)
+    D = degrees(dof)
     d = 2 if D == 4 else 3
     for b in which:
         n = begin[b + 1] - begin[b]
@@ -347,7 +305,7 @@ def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosit
             continue
         of = spatial_order(x[begin[b] : begin[b + 1]], 6.0 * radius[begin[b]]) + begin[b]
         own_x, own_axis = np.empty((n, d)), np.empty((n, d))
-        own_last = np.empty((n, D), last.dtype)
+        own_last = np.zeros((n, len(dof)), last.dtype)
         own_roots = np.empty((roots.shape[0], n))
         for i in range(n):
             for k in range(d):

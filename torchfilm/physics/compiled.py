@@ -90,7 +90,7 @@ def contact_steps(given: StepInput) -> StepResult:
         contiguous(given.growth), contiguous(given.radius), contiguous(given.viscosity),
         contiguous(given.length_drag), move.numpy(), hardness.numpy(), *_walls(given),
         contiguous(given.radius[:0] if given.alpha is None else given.alpha), numbers, reports,
-        (0,) * settings.degrees,
+        (0,) * (4 if settings.dim == 2 else 8),
     )  # fmt: skip
     for done in _started(kernels.step_colonies, begin, counts.numpy(), arguments):
         done()

@@ -1,0 +1,177 @@
+"""Whole rows of the contact problem at once, as vectors of the processor.
+
+Arrays have `len(dof)` columns: 4 in the plane; 8 in space, of which the last stays 0. They are
+contiguous, of one type, and their indices are not checked. A loop over so few columns would be
+compiled to single operations, three times slower.
+"""
+
+from __future__ import annotations
+
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+INDEX = ir.IntType(32)
+
+
+class _Rows:
+    """Loads and stores of rows of one array while a function is being emitted."""
+
+    def __init__(self, context, builder, kind, array, width):
+        self.builder, self.width, self.context = builder, width, context
+        self.data = context.make_array(kind)(context, builder, array).data
+        self.vector = ir.VectorType(context.get_data_type(kind.dtype), width)
+        self.bytes = kind.dtype.bitwidth // 8
+
+    def _at(self, i):
+        builder = self.builder
+        first = builder.gep(self.data, [builder.mul(i, ir.Constant(i.type, self.width))])
+        return builder.bitcast(first, self.vector.as_pointer())
+
+    def load(self, i):
+        return self.builder.load(self._at(i), align=self.bytes)
+
+    def store(self, i, value):
+        self.builder.store(value, self._at(i), align=self.bytes)
+
+
+def _lane(k):
+    return ir.Constant(INDEX, k)
+
+
+def _spread(builder, vector, k):
+    """A vector that has lane k everywhere."""
+    places = ir.Constant(ir.VectorType(INDEX, vector.type.count), [k] * vector.type.count)
+    return builder.shuffle_vector(vector, vector, places)
+
+
+def _filled(builder, vector_type, value):
+    empty = ir.Constant(vector_type, ir.Undefined)
+    return _spread(builder, builder.insert_element(empty, value, _lane(0)), 0)
+
+
+def _multiply_add(builder, a, b, c):
+    return builder.fadd(builder.fmul(a, b, flags=("contract",)), c, flags=("contract",))
+
+
+def _sum(builder, vector):
+    parts = [builder.extract_element(vector, _lane(k)) for k in range(vector.type.count)]
+    while len(parts) > 1:
+        half = len(parts) // 2
+        parts = [builder.fadd(parts[k], parts[k + half]) for k in range(half)]
+    return parts[0]
+
+
+def _check(*arrays):
+    """Raise where arrays are not of one type, contiguous."""
+    if any(a.layout != "C" or a.dtype != arrays[0].dtype for a in arrays):
+        raise TypeError(f"rows of {arrays} are not contiguous, or not of one type")
+
+
+def _long(context, builder, signature, arguments, k):
+    return context.cast(builder, arguments[k], signature.args[k], types.int64)
+
+
+@intrinsic
+def dot(typing, a, i, b, j, dof):
+    """a[i] · b[j]."""
+    _check(a, b)
+
+    def emit(context, builder, signature, given):
+        kinds = signature.args
+        left = _Rows(context, builder, kinds[0], given[0], len(dof))
+        right = _Rows(context, builder, kinds[2], given[2], len(dof))
+        x = left.load(_long(context, builder, signature, given, 1))
+        y = right.load(_long(context, builder, signature, given, 3))
+        return _sum(builder, builder.fmul(x, y))
+
+    return a.dtype(a, i, b, j, dof), emit
+
+
+@intrinsic
+def add_scaled(typing, a, i, t, b, j, dof):
+    """a[i] += t · b[j], with t rounded to the type of a."""
+    _check(a, b)
+
+    def emit(context, builder, signature, given):
+        kinds = signature.args
+        left = _Rows(context, builder, kinds[0], given[0], len(dof))
+        right = _Rows(context, builder, kinds[3], given[3], len(dof))
+        place = _long(context, builder, signature, given, 1)
+        factor = context.cast(builder, given[2], kinds[2], kinds[0].dtype)
+        x = right.load(_long(context, builder, signature, given, 4))
+        many = _filled(builder, left.vector, factor)
+        left.store(place, _multiply_add(builder, x, many, left.load(place)))
+        return context.get_dummy_value()
+
+    return types.void(a, i, t, b, j, dof), emit
+
+
+@intrinsic
+def put_product(typing, z, i, blocks, g, dof):
+    """z[i] = blocks[i] @ g[i], for symmetric blocks (n, len(dof), len(dof)). z may be g."""
+    _check(z, blocks, g)
+
+    def emit(context, builder, signature, given):
+        kinds, width = signature.args, len(dof)
+        out = _Rows(context, builder, kinds[0], given[0], width)
+        rows = _Rows(context, builder, kinds[2], given[2], width)
+        place = _long(context, builder, signature, given, 1)
+        first = builder.mul(place, ir.Constant(place.type, width))
+        x = _Rows(context, builder, kinds[3], given[3], width).load(place)
+        total = builder.fmul(rows.load(first), _spread(builder, x, 0))
+        for k in range(1, width):
+            row = rows.load(builder.add(first, ir.Constant(place.type, k)))
+            total = _multiply_add(builder, row, _spread(builder, x, k), total)
+        out.store(place, total)
+        return context.get_dummy_value()
+
+    return types.void(z, i, blocks, g, dof), emit
+
+
+@intrinsic
+def add_square(typing, B, H, h, dof):
+    """B += H[h] H[h]ᵀ, for B (len(dof), len(dof)) in float64."""
+
+    def emit(context, builder, signature, given):
+        kinds, width = signature.args, len(dof)
+        out = _Rows(context, builder, kinds[0], given[0], width)
+        half = _Rows(context, builder, kinds[1], given[1], width)
+        x = half.load(_long(context, builder, signature, given, 2))
+        if x.type != out.vector:
+            x = builder.fpext(x, out.vector)
+        for k in range(width):
+            row = ir.Constant(ir.IntType(64), k)
+            out.store(row, _multiply_add(builder, _spread(builder, x, k), x, out.load(row)))
+        return context.get_dummy_value()
+
+    return types.void(B, H, h, dof), emit
+
+
+@intrinsic
+def invert(typing, B, dof):
+    """Invert B in place, symmetric and positive in its degrees of freedom: Gauss and Jordan's
+    elimination, which needs no pivots there. A row and column of padding stay as they are."""
+
+    def emit(context, builder, signature, given):
+        width = len(dof)
+        rows = _Rows(context, builder, signature.args[0], given[0], width)
+        places = [ir.Constant(ir.IntType(64), k) for k in range(width)]
+        B = [rows.load(k) for k in places]
+        one = ir.Constant(rows.vector.element, 1.0)
+        nothing = ir.Constant(rows.vector.element, 0.0)
+        degrees = range(4 if width == 4 else 7)
+        for k in degrees:
+            pivot = builder.fdiv(one, builder.extract_element(B[k], _lane(k)))
+            row = builder.insert_element(B[k], one, _lane(k))
+            B[k] = builder.fmul(row, _filled(builder, rows.vector, pivot))
+            for m in degrees:
+                if m != k:
+                    factor = _spread(builder, builder.fneg(B[m]), k)
+                    rest = builder.insert_element(B[m], nothing, _lane(k))
+                    B[m] = _multiply_add(builder, factor, B[k], rest)
+        for k in degrees:
+            rows.store(places[k], B[k])
+        return context.get_dummy_value()
+
+    return types.void(B, dof), emit
