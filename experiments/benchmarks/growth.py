@@ -65,7 +65,10 @@ def grow(name: str, regime: str, backend: str | None, device: str, seed: int) ->
         cell_steps += state.cells
         if state.cells >= 100 * 2 ** len(marks) * colonies:
             seconds = time.perf_counter() - begin - looked
-            marks.append({"cells": state.cells, "seconds": round(seconds, 3)})
+            marks.append({
+                "cells": state.cells, "seconds": round(seconds, 3), "steps": state.step,
+                "cell_steps": cell_steps, "iterations": iterations,
+            })  # fmt: skip
         if state.step % LOOK == 0:
             stop = time.perf_counter()
             found = tf.measure.overlaps(state)
@@ -177,6 +180,50 @@ def table(records: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def cost_of_size(record: dict) -> np.ndarray:
+    """Returns rows of cells, µs a cell and step, and iterations a step, from mark to mark."""
+    names = ("cells", "seconds", "steps", "cell_steps", "iterations")
+    marks = np.array([[m[n] for n in names] for m in record["marks"]], float)
+    (_, seconds, steps, cell_steps, iterations), cells = np.diff(marks, axis=0).T, marks[:, 0]
+    middle = np.sqrt(cells[1:] * cells[:-1])
+    return np.stack([middle, 1e6 * seconds / cell_steps, iterations / steps])
+
+
+def picture(records: list[dict], file: Path) -> str:
+    """Draws the cost of a cell and step, and iterations a step, against the number of cells, for
+    the largest colony of each regime in 2-D. Returns the measured exponents, in words."""
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    words = []
+    for regime, color in (("free", "tab:blue"), ("pressed", "tab:orange")):
+        mine = [
+            r
+            for r in records
+            if r.get("regime") == regime and r["case"].startswith("2d") and r["colonies"] == 1
+            and r["backend"] == "compiled" and r["threads"] == 1 and "steps" in r["marks"][0]
+        ]  # fmt: skip
+        if not mine:
+            continue
+        record = max(reversed(mine), key=lambda r: r["cells"])
+        cells, time_, iterations = cost_of_size(record)
+        large = cells >= 1000
+        for ax, y in zip(axes, (time_, iterations), strict=True):
+            ax.loglog(cells, y, "o-", color=color, label=f"{regime}, to {record['cells']} cells")
+        slopes = [
+            np.polyfit(np.log(cells[large]), np.log(y[large]), 1)[0] for y in (time_, iterations)
+        ]
+        words.append(
+            f"{regime}: from 1,000 cells on, time as N^{1 + slopes[0]:.2f} and iterations as"
+            f" N^{slopes[1]:.2f}"
+        )
+    axes[0].set(xlabel="cells N", ylabel="µs a cell and step")
+    axes[1].set(xlabel="cells N", ylabel="iterations a step")
+    axes[0].legend()
+    figure.savefig(file, dpi=120)
+    return "; ".join(words)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -201,6 +248,9 @@ def main() -> None:
     if options.page:
         page = Path(__file__).parents[2] / "docs" / "performance.md"
         write_page(page, table(records), "experiments/benchmarks/growth.py --page")
+        law = picture(records, page.parent / "pictures" / "performance.png")
+        image = "![Cost of a cell and step against the number of cells](pictures/performance.png)"
+        write_page(page, f"{image}\n\nOne step of N cells, {law}.", "cost against size")
         return
     if options.device == "cpu" and options.backend != "torch":
         records.append(machine() | {"case": "product with JᵀJ"} | product_over_copy())

@@ -104,7 +104,7 @@ def test_no_draw_is_zero_or_one(dtype, word, monkeypatch):
     """The docstring promises the open interval (0, 1), also for the least and the greatest word, in
     both precisions.
     """
-    monkeypatch.setattr(random, "words", lambda *key: (torch.tensor([word]),) * 4)
+    monkeypatch.setattr(random, "words", lambda *key: torch.full((4, 1), word))
     none = torch.tensor([0])
     assert 0 < float(random.uniform(0, none, none, 0, "test", dtype)) < 1
     assert bool(torch.isfinite(random.normal(0, none, none, 0, "test", dtype)).all())

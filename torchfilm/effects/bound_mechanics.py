@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchfilm.effect import Binding, BoundEffect
-from torchfilm.effects.mechanics_report import BURIED, LONG, MANY, MOST_SUBSTEPS, MechanicsReport
-from torchfilm.physics import compiled, one_sided
+from torchfilm.effects.mechanics_report import BURIED, LONG, MANY, MechanicsReport
+from torchfilm.physics import compiled, one_sided, substeps
 from torchfilm.physics.contact_records import (
     CLOSE,
     DEEP,
@@ -21,7 +23,7 @@ from torchfilm.physics.contact_records import (
 )
 from torchfilm.physics.contact_step import contact_step
 from torchfilm.physics.one_sided_records import OneSidedSettings, StepInput
-from torchfilm.physics.problem import BAD_DRAG, COLLAPSED, CONVERGED, NOT_FINITE, TOO_FAST
+from torchfilm.physics.problem import COLLAPSED, CONVERGED
 from torchfilm.physics.surfaces import Surface
 from torchfilm.resolver import snapshot
 from torchfilm.state import State
@@ -51,13 +53,23 @@ class BoundMechanics(BoundEffect):
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
             return state
-        elongation = state.fields.get("elongation", torch.zeros_like(state.length))
-        steps, status = self._substeps(state, elongation)
-        own_dt = dt / steps.index_select(0, state.colony).to(state.dtype)
+        elongation = state.fields.get("elongation")
+        elongation = torch.zeros_like(state.length) if elongation is None else elongation
+        drags = self._drags(state)
+        steps, status = (compiled if self.compiled else substeps).substeps(
+            state.groups, state.position, state.axis, state.displacement, state.length,
+            elongation, *drags, longest=self.effect.max_elongation,
+        )  # fmt: skip
+        own_dt = partial(self._own_dt, state, dt, steps)
         base = state.length - elongation
         if isinstance(self.settings, OneSidedSettings):
-            return self._one_sided(state, base, elongation, steps, status, own_dt)
-        return self._bilateral(state, base, elongation, steps, status, own_dt)
+            return self._one_sided(state, base, elongation, drags, steps, status, own_dt)
+        return self._bilateral(state, base, elongation, drags, steps, status, own_dt)
+
+    @staticmethod
+    def _own_dt(state: State, dt: float, steps: Tensor) -> Tensor:
+        """The sub-step of each cell, h, (N,)."""
+        return dt / steps.index_select(0, state.colony).to(state.dtype)
 
     # --- one-sided contacts --------------------------------------------------------------------
 
@@ -66,16 +78,16 @@ class BoundMechanics(BoundEffect):
         state: State,
         base: Tensor,
         elongation: Tensor,
+        drags: tuple[Tensor, Tensor],
         steps: Tensor,
         status: Tensor,
-        own_dt: Tensor,
+        own_dt: Callable[[], Tensor],
     ) -> State:
-        viscosity, length_drag = self._drags(state)
         surfaces, walls = self._surfaces(state, own_dt)
         assert isinstance(self.settings, OneSidedSettings)
         given = StepInput(
             self.settings, state.groups, state.position, state.axis, base, elongation,
-            state.radius, viscosity, length_drag, torch.where(status == CONVERGED, steps, 0),
+            state.radius, *drags, torch.where(status == CONVERGED, steps, 0),
             state.displacement, _of_colonies(state.contact_alpha, state.groups).double(),
             self._alpha(state, own_dt), state.own_colony_id, surfaces, walls,
         )  # fmt: skip
@@ -90,10 +102,10 @@ class BoundMechanics(BoundEffect):
         alpha = state.groups.spread(found.hardness.to(state.dtype))
         return state.with_fields(contact_alpha=alpha)
 
-    def _alpha(self, state: State, own_dt: Tensor) -> Tensor | None:
+    def _alpha(self, state: State, own_dt: Callable[[], Tensor]) -> Tensor | None:
         """α of each cell where it is given, (N,); else None."""
         if self.values.stiffness is not None:
-            return 1.0 / (self.values.stiffness.of_cells(state) * own_dt)
+            return 1.0 / (self.values.stiffness.of_cells(state) * own_dt())
         if self.values.alpha is not None:
             return self.values.alpha.of_cells(state).expand(state.cells)
         return None
@@ -105,13 +117,14 @@ class BoundMechanics(BoundEffect):
         state: State,
         base: Tensor,
         elongation: Tensor,
+        drags: tuple[Tensor, Tensor],
         steps: Tensor,
         status: Tensor,
-        own_dt: Tensor,
+        own_dt: Callable[[], Tensor],
     ) -> State:
         settings, none = self.settings, torch.zeros_like(state.counts)
         assert isinstance(settings, ContactSettings)
-        viscosity, length_drag = self._drags(state)
+        viscosity, length_drag = drags
         alpha = self._alpha(state, own_dt)
         alpha = PENALTY / length_drag if alpha is None else alpha
         first = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
@@ -193,7 +206,7 @@ class BoundMechanics(BoundEffect):
         return viscosity.expand(state.cells), length_drag.expand(state.cells)
 
     def _surfaces(
-        self, state: State, own_dt: Tensor
+        self, state: State, own_dt: Callable[[], Tensor]
     ) -> tuple[list[Surface], list[tuple[str, Tensor | None]]]:
         """The surfaces of all walls; the kind of each, and its stiffness · Δt or weight (N,)."""
         surfaces: list[Surface] = []
@@ -202,26 +215,11 @@ class BoundMechanics(BoundEffect):
             value = None
             if kind != "hard":
                 value = self.values[f"walls[{k}].{kind}"].of_cells(state)
-                value = value * own_dt if kind == "stiffness" else value.expand(state.cells)
+                value = value * own_dt() if kind == "stiffness" else value.expand(state.cells)
             made = wall.surfaces(self.effect.dim)
             surfaces += made
             walls += [(kind, value)] * len(made)
         return surfaces, walls
-
-    @torch.no_grad()
-    def _substeps(self, state: State, elongation: Tensor) -> tuple[Tensor, Tensor]:
-        """How many sub-steps each colony takes, (B,), so that no cell grows by more than
-        `max_elongation` in one; and the status (B,) of colonies that cannot be stepped."""
-        columns = [state.length.unsqueeze(1), elongation.unsqueeze(1)]
-        every = torch.cat([state.position, state.axis, state.displacement, *columns], 1)
-        broken = state.groups.any(~torch.isfinite(every).all(1))
-        drags = torch.stack([x.to(state.dtype) for x in self._drags(state)])
-        no_drag = state.groups.any(~(torch.isfinite(drags) & (drags > 0)).all(0))
-        steps = torch.ceil(state.groups.max(elongation) / self.effect.max_elongation * (1 - 1e-6))
-        status = torch.where(steps > MOST_SUBSTEPS, TOO_FAST, CONVERGED)
-        status = torch.where(broken, NOT_FINITE, status)
-        status = torch.where(no_drag, BAD_DRAG, status)
-        return torch.where(status == CONVERGED, steps.clamp(min=1), 1).long(), status
 
 
 def _of_colonies(value: Tensor, groups: Groups) -> Tensor:

@@ -288,8 +288,9 @@ def _new_ids(new: State, daughters: Tensor, parents: State) -> tuple[Tensor, Ten
     is_new = torch.zeros(new.cells, dtype=torch.int64, device=new.device)
     is_new[daughters] = 1
     before = torch.cumsum(is_new, 0) - is_new
-    # number of new cells in the colonies before each colony
-    per_colony = new.groups.sum(is_new.double()).long()
+    # new cells in each colony; offsets gives those in the colonies before
+    ends = torch.cat([before.new_zeros(1), before + is_new])
+    per_colony = ends.index_select(0, offsets(new.counts)).diff()
     base = new.next_uid - offsets(per_colony)[:-1]
     uid = torch.where(is_new > 0, base.index_select(0, new.colony) + before, new.uid)
     parent = new.parent.clone()

@@ -7,10 +7,13 @@ compiled to single operations, three times slower.
 
 from __future__ import annotations
 
+from typing import Any
+
+import numba.extending
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
 
+intrinsic: Any = numba.extending.intrinsic  # calls leave out its first argument
 INDEX = ir.IntType(32)
 
 

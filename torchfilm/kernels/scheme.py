@@ -37,5 +37,7 @@ MOST_ROUNDS, MOST_LOOKS = 200, 30
 ROUNDING = 1e-6
 # Lengths that stop at their bound step alone in the round after one that went less than this share.
 CREEP = 0.5
-# The status of a solve; `physics.problem` has the words, and what only a step can end with.
-CONVERGED, ITERATION_LIMIT, NOT_FINITE = 0, 1, 2
+# Sub-steps at most.
+MOST_SUBSTEPS = 1000
+# The status of a solve or of a step; `physics.problem` has the words.
+CONVERGED, ITERATION_LIMIT, NOT_FINITE, TOO_FAST, BAD_DRAG, COLLAPSED = range(6)

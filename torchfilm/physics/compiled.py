@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilm.physics.one_sided_records import StepInput, StepResult
 from torchfilm.physics.surfaces import FlatSurface
-from torchfilm.tools.ragged import offsets
+from torchfilm.tools.ragged import Groups, offsets
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
 WORTH_THREADS = 300
@@ -58,6 +58,25 @@ def _announce(name: str) -> bool:
 
 
 @torch.no_grad()
+def substeps(groups: Groups, position: Tensor, *of_cells: Tensor, longest: float):
+    """As `physics.substeps.substeps`."""
+    from torchfilm.kernels.substeps import substeps as put
+
+    steps, status = torch.ones_like(groups.counts), torch.zeros_like(groups.counts)
+    dtype = of_cells[0].dtype
+    arrays = [_array(position, torch.float64), *(_array(x, dtype) for x in of_cells)]
+    put(groups.owner.numpy(), *arrays, longest, steps.numpy(), status.numpy())
+    return steps, status
+
+
+def _array(value: Tensor, dtype: torch.dtype) -> np.ndarray:
+    """A contiguous array of this type, which shares the tensor's memory where it can."""
+    value = value.detach() if value.requires_grad else value
+    value = value if value.dtype == dtype else value.to(dtype)
+    return (value if value.is_contiguous() else value.contiguous()).numpy()
+
+
+@torch.no_grad()
 def contact_steps(given: StepInput) -> StepResult:
     """As `one_sided.contact_steps`."""
     from torchfilm.kernels import step as kernels
@@ -71,7 +90,6 @@ def contact_steps(given: StepInput) -> StepResult:
     position, axis = given.position.clone(), given.axis.clone()
     length, move = given.length.clone(), given.start.clone()
     hardness = given.hardness.clone()
-    contiguous = lambda x: x.to(dtype).contiguous().numpy()
     settings = given.settings
     numbers = np.array(
         [
@@ -87,9 +105,9 @@ def contact_steps(given: StepInput) -> StepResult:
     reports = np.zeros((counts.numel(), kernels.REPORT))
     arguments = (
         begin, steps, position.numpy(), axis.numpy(), length.numpy(),
-        contiguous(given.growth), contiguous(given.radius), contiguous(given.viscosity),
-        contiguous(given.length_drag), move.numpy(), hardness.numpy(), *_walls(given),
-        contiguous(given.radius[:0] if given.alpha is None else given.alpha), numbers, reports,
+        *(_array(x, dtype) for x in (given.growth, given.radius, given.viscosity,
+        given.length_drag)), move.numpy(), hardness.numpy(), *_walls(given),
+        _array(given.radius[:0] if given.alpha is None else given.alpha, dtype), numbers, reports,
         (0,) * (4 if settings.dim == 2 else 8),
     )  # fmt: skip
     for done in _started(kernels.step_colonies, begin, counts.numpy(), arguments):

@@ -9,13 +9,15 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.scheme import BAD_DRAG as BAD_DRAG
+from torchfilm.kernels.scheme import COLLAPSED as COLLAPSED
 from torchfilm.kernels.scheme import CONVERGED as CONVERGED
 from torchfilm.kernels.scheme import ITERATION_LIMIT as ITERATION_LIMIT
 from torchfilm.kernels.scheme import NOT_FINITE as NOT_FINITE
+from torchfilm.kernels.scheme import TOO_FAST as TOO_FAST
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.tools.ragged import Groups
 
-TOO_FAST, BAD_DRAG, COLLAPSED = 3, 4, 5
 STATUS = {
     CONVERGED: "converged",
     ITERATION_LIMIT: "reached its iteration limit",

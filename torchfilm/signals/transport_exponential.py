@@ -70,8 +70,10 @@ def multiply(factors: tuple[Tensor | None, ...], u: Tensor) -> Tensor:
 def products(a: Tensor, b: Tensor) -> Tensor:
     """The matrix product of each colony, (B, r, k), (B, k, c) -> (B, r, c).
 
-    One by one: a library may pick a method for all at once by their number.
+    On CUDA one by one: the library there may pick a method for all at once by their number.
     """
+    if a.device.type == "cpu":
+        return torch.bmm(a, b)
     return torch.stack([torch.mm(x, y) for x, y in zip(a, b, strict=True)])
 
 

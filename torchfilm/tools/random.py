@@ -43,8 +43,8 @@ def purpose_code(purpose: str) -> int:
     return zlib.crc32(purpose.encode())
 
 
-def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> tuple[Tensor, ...]:
-    """Four independent 32-bit words for each cell: stream, uid (M,) int64 -> four (M,) int64."""
+def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> Tensor:
+    """Four independent 32-bit words for each cell: stream, uid (M,) int64 -> (4, M) int64."""
     of_cells = (uid & MASK, (uid >> 32) & MASK, stream & MASK)
     mixed = (seed ^ (purpose_code(purpose) << 32)) & (2**64 - 1)
     key = (mixed & MASK, (mixed >> 32) & MASK)
@@ -53,8 +53,8 @@ def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> tu
 
         constant = [np.uint64(x) for x in (step & MASK, *key)]
         given = [x.expand(uid.shape).contiguous().numpy() for x in of_cells]
-        return torch.from_numpy(philox_words(*given, *constant)).unbind(0)
-    return philox((*of_cells, torch.full_like(uid, step & MASK)), key)
+        return torch.from_numpy(philox_words(*given, *constant))
+    return torch.stack(philox((*of_cells, torch.full_like(uid, step & MASK)), key))
 
 
 def uniform(
@@ -70,9 +70,7 @@ def normal(
     seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype
 ) -> Tensor:
     """Four standard normal draws per cell, (M, 4), by the Box–Muller method from four words."""
-    w = [(x.to(torch.float64) + 0.5) * 2.0**-32 for x in words(seed, stream, uid, step, purpose)]
-    out = []
-    for u, v in ((w[0], w[1]), (w[2], w[3])):
-        size = torch.sqrt(-2.0 * torch.log(u))
-        out += [size * torch.cos(2 * math.pi * v), size * torch.sin(2 * math.pi * v)]
-    return torch.stack(out, 1).to(dtype)
+    w = (words(seed, stream, uid, step, purpose).to(torch.float64) + 0.5) * 2.0**-32
+    size, angle = torch.sqrt(-2.0 * torch.log(w[::2])), 2 * math.pi * w[1::2]
+    pairs = torch.stack([size * torch.cos(angle), size * torch.sin(angle)], 1)
+    return pairs.reshape(4, -1).T.to(dtype).contiguous()

@@ -1,0 +1,159 @@
+"""The parts of the compiled kernels, each against the same in numpy or torch."""
+
+from __future__ import annotations
+
+import itertools
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from torchfilm.kernels import lanes, moves, neighbours, rows
+from torchfilm.physics import compiled, substeps
+from torchfilm.physics.problem import BAD_DRAG, CONVERGED, NOT_FINITE, TOO_FAST
+from torchfilm.tools.ragged import Groups
+
+DOF = {2: (0,) * 4, 3: (0,) * 8}
+
+
+def crowd(rng: np.random.Generator, count: int, dim: int, apart: float = 1.5):
+    """Places, axes, half lengths and radii of cells of very different size."""
+    size = apart * count ** (1 / dim)
+    axis = rng.normal(size=(count, dim))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    return (
+        rng.random((count, dim)) * size,
+        axis,
+        rng.gamma(1.0, 1.0, count),
+        rng.random(count) + 0.1,
+    )
+
+
+@numba.njit
+def dots(a, b, dof):
+    return np.array([lanes.dot(a, i, b, a.shape[0] - 1 - i, dof) for i in range(a.shape[0])])
+
+
+@numba.njit
+def sums(a, t, b, dof):
+    for i in range(a.shape[0]):
+        lanes.add_scaled(a, i, t[i], b, a.shape[0] - 1 - i, dof)
+
+
+@numba.njit
+def products(z, blocks, g, dof):
+    for i in range(z.shape[0]):
+        lanes.put_product(z, i, blocks, g, dof)
+
+
+@numba.njit
+def inverse_of_squares(H, dof):
+    B = np.zeros((len(dof), len(dof)))
+    for h in range(H.shape[0]):
+        lanes.add_square(B, H, h, dof)
+    before = B.copy()
+    lanes.invert(B, dof)
+    return before, B
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@pytest.mark.parametrize("kind", (np.float32, np.float64))
+def test_whole_rows_as_vectors(dim, kind):
+    """Sums of 4 or 8 terms, to a few units in the last place; padding stays 0."""
+    rng, dof, near = np.random.default_rng(0), DOF[dim], 20 * np.finfo(kind).eps
+    width, degrees = len(dof), 4 if dim == 2 else 7
+    draw = lambda *shape: (rng.normal(size=shape) * (np.arange(width) < degrees)).astype(kind)
+    a, b, t = draw(9, width), draw(9, width), rng.normal(size=9)
+    np.testing.assert_allclose(dots(a, b, dof), (a * b[::-1]).sum(1), rtol=near, atol=near)
+    wanted = a + t.astype(kind)[:, None] * b[::-1]
+    sums(a, t, b, dof)
+    np.testing.assert_allclose(a, wanted, rtol=near, atol=near)
+    blocks = draw(9, width, width)
+    blocks = blocks * blocks.swapaxes(1, 2)  # symmetric
+    z = np.ones_like(b)
+    products(z, blocks, b, dof)
+    np.testing.assert_allclose(z, np.einsum("nij,nj->ni", blocks, b), rtol=near, atol=10 * near)
+    assert not a[:, degrees:].any() and not z[:, degrees:].any()
+    H = draw(12, width)
+    square, inverse = inverse_of_squares(H, dof)
+    wide = H.astype(float)
+    np.testing.assert_allclose(square, wide.T @ wide, rtol=1e-12, atol=1e-12)
+    one = inverse[:degrees, :degrees] @ square[:degrees, :degrees]
+    np.testing.assert_allclose(one, np.eye(degrees), atol=1e-9)
+
+
+def test_rows_of_two_types_are_refused():
+    a, b = np.zeros((2, 4)), np.zeros((2, 4), np.float32)
+    with pytest.raises(TypeError, match="not of one type"):
+        dots(a, b, DOF[2])
+    with pytest.raises(TypeError, match="not contiguous"):
+        dots(np.zeros((4, 2)).T, np.zeros((4, 2)).T, DOF[2])
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@pytest.mark.parametrize("count", (1, 2, 40, 300))
+def test_near_pairs_are_those_whose_boxes_meet(dim, count):
+    """Against all pairs; lengths differ a hundredfold."""
+    rng = np.random.default_rng(count)
+    x, axis, half, radius = crowd(rng, count, dim)
+    first, second = neighbours.near_pairs(x, axis, half, radius, 0.3, DOF[dim])
+    side = np.abs(axis) * half[:, None] + radius[:, None] + 0.15
+    away = np.abs(x[:, None] - x[None]) - side[:, None] - side[None]
+    wanted = np.argwhere(np.triu((away <= 0).all(2), 1))
+    assert (np.diff(first) >= 0).all()
+    order = np.lexsort((second, first))
+    np.testing.assert_array_equal(np.stack([first, second], 1)[order], wanted)
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@pytest.mark.parametrize("spread", (0.0, 0.02))
+@pytest.mark.parametrize("own", (0.0, 0.1, 0.4))
+def test_no_cells_come_nearer_than_told(dim, spread, own):
+    """Colonies that expand, while each cell moves, turns and changes its length: no gap that may
+    matter shrinks by more than `approach`, and where all is still by nearly as much."""
+    rng, dof = np.random.default_rng(1), DOF[dim]
+    x, axis, half, radius = crowd(rng, 60, dim)
+    y = np.zeros((60, len(dof)))
+    turns = slice(dim, 3 if dim == 2 else 6)
+    y[:, :dim] = spread * (x - x.mean(0)) * 3 + own * rng.uniform(-1, 1, (60, dim))
+    y[:, turns] = 0.3 * own * rng.normal(size=y[:, turns].shape)
+    y[:, turns.stop] = 0.1 * own * rng.uniform(-1, 1, 60)
+    margin, every = 100.0, np.array(list(itertools.combinations(range(60), 2)), np.int32)
+    first, second = every.T.copy()
+    gaps = lambda: rows.near_contacts(x, axis, half, radius, first, second, margin)[2]
+    before, length = gaps(), 2 * half
+    scale, least = np.ones_like(y), np.zeros(60)
+    moves.move_cells(x, axis, length, y, scale, np.zeros_like(y), 1e9, least, dof)
+    half = 0.5 * length
+    told, after = moves.approach(x, length, radius, y, dof), gaps()
+    near = before - told < 0.3
+    assert near.sum() > 50
+    assert ((before - after)[near] <= told + 1e-9).all()
+    if spread == own == 0.0:
+        assert told == 0.0
+
+
+def test_substeps_by_kernels_and_by_torch():
+    """Colonies that grow slowly, fast and too fast, with no number, without drag, and no cells."""
+    counts = [3, 4, 2, 3, 3, 0, 3, 2]
+    owner = torch.repeat_interleave(torch.arange(8), torch.tensor(counts))
+    count, generator = owner.numel(), torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.rand(*shape, generator=generator) + 0.5
+    position, axis, move = draw(count, 2).double(), draw(count, 2), draw(count, 4)
+    length, elongation, viscosity = draw(count), 0.1 * draw(count), draw(count)
+    length_drag = torch.tensor(10.0).expand(count)
+    at = lambda colony: counts[:colony] and sum(counts[:colony])
+    elongation[at(1)], elongation[at(2)] = 2.0, 1e6
+    position[at(3), 1], move[at(4), 3] = torch.nan, torch.inf
+    viscosity[at(6)], length[at(7)] = 0.0, -torch.inf
+    given = (position, axis, move, length, elongation, viscosity, length_drag)
+    found = [
+        by.substeps(Groups(owner, 8, ordered=True), *given, longest=0.5)
+        for by in (compiled, substeps)
+    ]
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+    assert found[0][0].tolist() == [1, 4, 1, 1, 1, 1, 1, 1]
+    wanted = [CONVERGED] * 2 + [TOO_FAST] + [NOT_FINITE] * 2 + [CONVERGED, BAD_DRAG, NOT_FINITE]
+    assert found[1][1].tolist() == wanted
