@@ -212,7 +212,7 @@ def test_a_rate_may_ask_for_everything_about_its_cell(device):
     scene = tf.Scene(
         tf.Growth(rate=1.0),
         tf.Rules(idle_rule, variables={"mark": 2.0}),
-        tf.Circuit({0: asks}, species=("u",)),
+        tf.Circuit({0: asks}, species=("u",), backend="torch"),  # so that it is called in steps
         founders=tf.Cells([[3.0, 4.0]], [1.0, 0]),
     )
     model = scene.bind(2, dtype=F64, device=device)

@@ -10,21 +10,25 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchfilm.circuits.tracing import named
 from torchfilm.tools.deterministic_math import power as steady_power
 
 
+@named
 def activation(x: Tensor, half: float | Tensor, power: float | Tensor = 1.0) -> Tensor:
     """xⁿ/(Kⁿ + xⁿ), with K = half and n = power."""
     big, p = _ratio(x, half, power)
     return torch.where(big, torch.ones_like(p), p) / (1.0 + p)
 
 
+@named
 def repression(x: Tensor, half: float | Tensor, power: float | Tensor = 1.0) -> Tensor:
     """Kⁿ/(Kⁿ + xⁿ) = 1 − activation, but accurate also where it is small."""
     big, p = _ratio(x, half, power)
     return torch.where(big, p, torch.ones_like(p)) / (1.0 + p)
 
 
+@named
 def michaelis_menten(x: Tensor, half: float | Tensor) -> Tensor:
     """x/(K + x), with K = half."""
     return activation(x, half, 1.0)

@@ -45,11 +45,8 @@ class Network:
             if callable(reaction.rate):
                 out.append(reaction.rate(u, s, p, cell))
                 continue
-            rate = torch.as_tensor(
-                per_cell(reaction.rate, p, cell, cell.volume),
-                dtype=cell.volume.dtype,
-                device=cell.volume.device,
-            ).expand_as(cell.volume)
+            constant = per_cell(reaction.rate, p, cell, cell.volume)
+            rate = torch.zeros_like(cell.volume) + constant
             for name, order in reaction.consumes.items():
                 x = concentration(name, u, s)
                 for _ in range(order):

@@ -41,6 +41,7 @@ STATUS = {
 }
 SAFETY, SHRINK, GROW = 0.9, 0.1, 5.0
 LEAST_STEP = 1e-20  # as a share of dt; a cell that needs a shorter step has failed
+MAX_STEPS = 10_000
 # A cell fails after this many steps with a non-finite result.
 MAX_NONFINITE_STEPS = 60
 
@@ -65,9 +66,10 @@ def rodas3(
     *,
     rtol: float = 1e-4,
     atol: float | Tensor = 1e-9,
-    max_steps: int = 10_000,
+    max_steps: int = MAX_STEPS,
     first_step: float | None = None,
     nonnegative: bool = True,
+    slopes: Rates | None = None,
 ) -> tuple[Tensor, RosenbrockReport]:
     """Concentrations (N, S) after dt hours, and the report; each cell takes its own steps.
 
@@ -79,6 +81,9 @@ def rodas3(
     default dt. nonnegative: a species that starts at or above 0 stays there. The rates are
     continued linearly below 0, and a step that ends below 0 is moved towards two steps of backward
     Euler.
+
+    slopes: ∂ rates/∂u, (S, S, M), at u (S, M), differentiable; by default from derivatives of
+    `rates` by torch.
 
     Gradients with respect to u and the tensors in `rates` pass through the accepted steps, with the
     step sizes held fixed. The function raises nothing; failures are in the report.
@@ -95,7 +100,7 @@ def rodas3(
         u.requires_grad or rates(u.index_select(0, one), one).requires_grad
     )
     method = _Tableau(
-        rates, u.dtype, max(rtol, 4 * torch.finfo(u.dtype).eps), scale, nonnegative, tracked
+        rates, u.dtype, max(rtol, 4 * torch.finfo(u.dtype).eps), scale, nonnegative, tracked, slopes
     )
     first = whole if first_step is None else whole.clamp(max=first_step)
     at, report = _advance(method, start, whole, first, max_steps)
@@ -128,22 +133,21 @@ class _Tableau:
         atol: Tensor,
         nonnegative: bool,
         tracked: bool,
+        slopes: Rates | None,
     ):
-        self.rates, self.dtype, self.rtol, self.atol, self.nonnegative, self.tracked = (
-            rates,
-            dtype,
-            rtol,
-            atol,
-            nonnegative,
-            tracked,
-        )
+        self.rates, self.dtype, self.rtol, self.atol = rates, dtype, rtol, atol
+        self.nonnegative, self.tracked, self.slopes = nonnegative, tracked, slopes
 
     def evaluate(self, u: Tensor, rows: Tensor) -> Tensor:
         """The rates, (S, M)."""
         return self.rates(u.t(), rows).t().to(torch.float64)
 
     def linearise(self, u: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ, from one call with S copies of the cells."""
+        """f (S, M) and J (S, S, M), J[i, k] = ∂fᵢ/∂uₖ: where its formulas are not known, from one
+        call with S copies of the cells."""
+        if self.slopes is not None:
+            f, jacobian = self.evaluate(u, rows), self.slopes(u, rows)
+            return f, torch.nan_to_num(jacobian, 0.0, 0.0, 0.0)
         f, jacobian = self._forward(u, rows) if self.tracked else self._backward(u, rows)
         # the slope of a root at 0 is infinite; any finite value will do, since only the error
         # grows, and the error is controlled
@@ -297,8 +301,10 @@ def _advance(
         good = (error <= 1.0) & ~broken
         ends = good & (h >= left)
         start, left = h, torch.where(good, left - h, left)
-        # a cube root by exp and log, whose bits do not depend on the batch
+        # a cube root by exp and log, in steps of 1/1024: so their last bits, which differ from
+        # library to library, do not matter
         factor = (SAFETY * torch.exp(torch.log(error) / -3.0)).clamp(SHRINK, GROW)
+        factor = torch.floor(factor * 1024.0 + 0.5) / 1024.0
         factor = torch.where(torch.isfinite(error), factor, 0.25)
         factor = torch.where(broken, factor.clamp(max=0.5), factor)
         h = torch.minimum(h * factor, left)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchfilm.circuits import integrators, rosenbrock, stochastic
 from torchfilm.circuits.columns import Columns, column
+from torchfilm.circuits.compiled import CompiledCircuit
 from torchfilm.circuits.draws import Draw
 from torchfilm.circuits.names import Names, unknown
 from torchfilm.circuits.network import Network
@@ -46,7 +47,8 @@ class CircuitCells:
 
     part: a rate function, or a network of reactions. species: its variables. given: the signals
     that it exchanges. rows: the M cells, (M,) int64. cell, p: columns over the N cells by name.
-    signals: the concentration outside each cell, (N,) by name. pool: (N,) µm³, each cell's part of
+    compiled: the same as compiled functions, where it could be traced. signals: the concentration
+    outside each cell, (N,) by name. pool: (N,) µm³, each cell's part of
     the medium, if the circuit exchanges a signal. in_reservoir: (N,) bool, cells whose pool is a
     reservoir of constant concentration, or None.
     """
@@ -61,6 +63,7 @@ class CircuitCells:
     pool: Tensor | None = None
     in_reservoir: Tensor | None = None
     label: str = "circuit"
+    compiled: CompiledCircuit | None = None
     seen: dict[str, set[str]] = field(default_factory=dict)
 
     def names(self, u: Tensor, rows: Tensor) -> tuple[Names, Names, Names, Names]:
@@ -159,6 +162,11 @@ class CircuitCells:
                 columns += [torch.where(away, (-x).clamp(min=0.0), 0.0) for x in flux]
         return torch.stack(columns, 1)
 
+    def slopes(self, u: Tensor, rows: Tensor) -> Tensor:
+        """∂ rates/∂u, (V, V, m), at u (V, m) of the cells `rows` (m,) among the M."""
+        assert self.compiled is not None
+        return self.compiled.slopes_by_torch(self, u, self.rows.index_select(0, rows))
+
     def start(self, concentrations: Tensor) -> Tensor:
         """The variables at the start: concentrations (M, S), then pools, then the amounts given to
         a reservoir and the amounts taken from it."""
@@ -203,9 +211,12 @@ def step(
     count = start.shape[0]
     steps = torch.full((count,), settings.steps, dtype=torch.int64, device=start.device)
     if settings.method == "rosenbrock":
-        end, report = rosenbrock.rodas3(
-            circuit.rates, start, dt, rtol=settings.rtol, atol=settings.atol
-        )
+        compiled, rtol, atol = circuit.compiled, settings.rtol, settings.atol
+        found = None if compiled is None else compiled.rodas3(circuit, start, dt, rtol, atol)
+        if found is None:
+            slopes = None if compiled is None else circuit.slopes
+            found = rosenbrock.rodas3(circuit.rates, start, dt, rtol=rtol, atol=atol, slopes=slopes)
+        end, report = found
         code, steps = report.status, report.accepted + report.rejected
     else:
         if settings.method == "euler":

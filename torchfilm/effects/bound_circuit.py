@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import math
 from collections.abc import Mapping
@@ -14,9 +15,11 @@ from torch import Tensor
 
 from torchfilm.circuits import run
 from torchfilm.circuits.columns import Lazy
+from torchfilm.circuits.compiled import CompiledCircuit, compiled_circuit
 from torchfilm.circuits.draws import keyed_draws
 from torchfilm.circuits.names import unknown
 from torchfilm.circuits.network import build_network
+from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect, number_range
 from torchfilm.medium_exchange import MediumExchange
@@ -47,6 +50,7 @@ OPTIONS = (
     "molecules_per_unit",
     "name",
     "shared",
+    "backend",
 )
 
 
@@ -80,6 +84,9 @@ class BoundCircuit(BoundEffect):
         self.rates = snapshot(effect.rates, "Circuit.rates", binding.batch)
         self.networks: dict[int | str, run.Network] = {}
         self.exchanged: dict[int | str, tuple[str, ...]] = {}
+        # by cell type and whether there is a reservoir: the compiled circuit, or why there is none
+        self.compiled: dict[tuple[int | str, bool], CompiledCircuit | str] = {}
+        self.by_torch = effect.why_torch(binding.batch.device)
         self.traced_reads: tuple[str, ...] = ()
         self.signals: tuple[str, ...] = ()  # that rates read or change
         self.fields = tuple(effect.variables.values())
@@ -159,7 +166,25 @@ class BoundCircuit(BoundEffect):
             geometry.add("position")
         outside = {OUTSIDE + n for n in self.signals}
         self.traced_reads = tuple(sorted({*geometry, *outside}))
+        self.compiled = {}
+        medium = MediumExchange.of(state, self.signals)
+        found = {} if medium is None else medium.found
+        for kind in self.rates:
+            self._cells(state, _cells_of(state, kind), kind, self.exchanged[kind], found, medium)
         return state
+
+    def _compiled(self, kind: int | str, cells: run.CircuitCells) -> run.CircuitCells:
+        """The cells with their circuit compiled, where it can be."""
+        key = (kind, cells.in_reservoir is not None)
+        if self.by_torch or cells.rows.numel() == 0:
+            return cells
+        if key not in self.compiled:
+            try:
+                self.compiled[key] = compiled_circuit(cells)
+            except Untraceable as why:
+                self.compiled[key] = f"{cells.label}: {why}"
+        found = self.compiled[key]
+        return cells if isinstance(found, str) else dataclasses.replace(cells, compiled=found)
 
     def _check_constants(self, read: set[str]) -> None:
         """Raise InputError for a constant that looks like another name, and warn of one that no
@@ -215,6 +240,13 @@ class BoundCircuit(BoundEffect):
             f"{c.method}, {c.steps} equal step(s) of {dt / c.steps:g} h; nothing controls its error"
         )
         lines = [said.get(c.method, explicit)]
+        if c.method == "rosenbrock":
+            why = [x for x in self.compiled.values() if isinstance(x, str)]
+            lines += [
+                f"computed by torch: {x}" for x in ([self.by_torch] * bool(self.by_torch) or why)
+            ]
+            if not self.by_torch and not why:
+                lines.append("computed by compiled functions of its equations")
         if self._signals():
             names = ", ".join(self._signals())
             lines.append(
@@ -305,7 +337,7 @@ class BoundCircuit(BoundEffect):
             exchanged = part.signals
         own = None if isinstance(kind, str) else kind
         p = {n: Lazy(partial(self.values[n].of_cells, state, own)) for n in self.effect.parameters}
-        return run.CircuitCells(
+        cells = run.CircuitCells(
             part,
             tuple(self.effect.variables),
             exchanged,
@@ -316,8 +348,9 @@ class BoundCircuit(BoundEffect):
             pool,
             in_reservoir,
             label,
-            seen or {},
+            seen=seen or {},
         )
+        return cells if seen else self._compiled(kind, cells)
 
 
 def _draw(

@@ -7,6 +7,7 @@ import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from numbers import Integral
 from typing import Any
 
@@ -14,11 +15,14 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits import integrators, run
+from torchfilm.circuits.graph import CircuitGraph, graph_of
 from torchfilm.circuits.names import unknown
 from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
+from torchfilm.circuits.tracing import Untraceable
 from torchfilm.effect import CIRCUIT, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_circuit import BoundCircuit
+from torchfilm.physics import compiled
 from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks
@@ -30,6 +34,7 @@ STIFF, LEAP, DIRECT = "rosenbrock", "tau_leap", "direct"
 EXPLICIT = ("euler", *integrators.METHODS)
 METHODS = (STIFF, *EXPLICIT, LEAP, DIRECT)
 GEOMETRY = ("volume", "area", "x", "y", "z")
+BACKENDS = ("compiled", "torch")
 EVERY = "every cell"  # where a circuit runs that is not given by type
 EACH_CELL = "initial[{!r}]"  # by which name the first value of a species is resolved
 
@@ -53,7 +58,9 @@ class Circuit(Effect):
     `molecules_per_unit` of them in a unit of concentration × µm³ (0.6022 for nM). rtol, atol: of
     the adaptive method. name: of one circuit among several in a scene; its species are then the
     fields NAME_SPECIES. shared: species of another circuit that this one reads and changes too, as
-    field names, or {name here: field}. Circuits act one after the other. Growth dilutes: amounts
+    field names, or {name here: field}. backend: "compiled" functions of its equations (for
+    "rosenbrock", on the CPU) or "torch"; by default compiled where the rates can be written as
+    equations: see `graph`. Circuits act one after the other. Growth dilutes: amounts
     stay, concentrations are multiplied by V_old/V_new. Further keywords are constants of the rates:
     each a number, one per colony, one per cell type, or a distribution drawn for each cell at birth
     (extrinsic noise). Where rates are given by cell type, cells of other types need no constants.
@@ -70,6 +77,7 @@ class Circuit(Effect):
     molecules_per_unit: Value = 1.0
     name: str = ""
     shared: Mapping[str, str] = field(default_factory=dict)
+    backend: str | None = None
     parameters: Mapping[str, Value] = field(default_factory=dict)
 
     stage = CIRCUIT
@@ -88,6 +96,7 @@ class Circuit(Effect):
         molecules_per_unit: Value = 1.0,
         name: str = "",
         shared: Sequence[str] | Mapping[str, str] = (),
+        backend: str | None = None,
         **parameters: Value,
     ):
         by_type: dict[int | str, Part] = (
@@ -100,6 +109,8 @@ class Circuit(Effect):
         _check_initial(initial, names)
         _check_constants(parameters, [f.name for f in dataclasses.fields(self)])
         _check_method(method, steps, by_type)
+        if backend is not None:
+            checks.choice("Circuit.backend", backend, BACKENDS)
         checks.choice("Circuit.daughters", daughters, ("concentration", "amount"))
         if name and not (isinstance(name, str) and name.isidentifier()):
             raise checks.input_error("Circuit.name", name, 'an identifier, such as "toggle"')
@@ -109,6 +120,7 @@ class Circuit(Effect):
             "species": names,
             "name": name,
             "shared": others,
+            "backend": backend,
             "daughters": daughters,
             "method": method,
             "steps": steps,
@@ -159,6 +171,44 @@ class Circuit(Effect):
     def resets(self) -> bool:
         """Whether daughters' concentrations are computed again from their parent's amounts."""
         return self.is_stochastic or self.daughters == "amount"
+
+    @property
+    def graph(self) -> CircuitGraph:
+        """Its equations, to print, to differentiate and to look into. Of rates by cell type:
+        `graphs`. Raises InputError where the rates cannot be written as equations."""
+        if EVERY not in self.rates:
+            kinds = ", ".join(map(str, self.rates))
+            raise checks.InputError(
+                f"{self.value_owner()} has rates by cell type ({kinds}): ask graphs[type]."
+            )
+        return self.graphs[EVERY]
+
+    @cached_property
+    def graphs(self) -> Mapping[int | str, CircuitGraph]:
+        """Its equations by cell type."""
+        found = {}
+        for kind, part in self.rates.items():
+            label = getattr(part, "__name__", "the list of reactions")
+            try:
+                found[kind] = graph_of(part, tuple(self.variables), tuple(self.parameters), label)
+            except Untraceable as why:
+                raise checks.InputError(
+                    f"{self.value_owner()}: {label} cannot be written as equations: {why}. It runs"
+                    " all the same, by torch."
+                ) from why
+        return found
+
+    def why_torch(self, device: torch.device) -> str:
+        """Why torch computes the circuit on a device, or "" where compiled functions may."""
+        why = (
+            "backend='torch'" if self.backend == "torch"
+            else f"method={self.method!r}" if self.method != STIFF
+            else f"the device is {device.type}" if device.type != "cpu"
+            else compiled.unavailable()
+        )  # fmt: skip
+        if self.backend == "compiled" and why:
+            raise checks.InputError(f"Circuit.backend = 'compiled', but {why}: leave backend out.")
+        return why
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         first = Rule(least=0.0, drawn_by_effect=True)

@@ -1,0 +1,206 @@
+"""Circuits by compiled functions: traced once, then run cell by cell without torch."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.circuits.emission import Equations, functions
+from torchfilm.circuits.expressions import NAME, Builder, Expression, walk
+from torchfilm.circuits.graph import Leaves, evaluated, traced_rates
+from torchfilm.circuits.names import Names
+from torchfilm.circuits.rosenbrock import MAX_STEPS, RosenbrockReport
+from torchfilm.circuits.stiff_text import HEAD, method
+from torchfilm.circuits.tracing import Column, Kind, Untraceable, apply, lowered
+from torchfilm.tools.threads import shares_of
+
+if TYPE_CHECKING:
+    from torchfilm.circuits.run import CircuitCells
+
+# A thread takes this many cells at least.
+WORTH_A_THREAD = 512
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledCircuit:
+    """The equations of a circuit in cells of one type, and the functions compiled from them."""
+
+    equations: Equations
+    slopes: Mapping[tuple[int, int], Expression]
+    columns: tuple[str, ...]  # names that have a number for each cell
+    numbers: tuple[str, ...]  # names that have one number
+
+    @cached_property
+    def module(self) -> ModuleType:
+        return _module(source(self))
+
+    def values(self, circuit: CircuitCells, rows: Tensor) -> dict[str, Tensor]:
+        """The columns (M,) and numbers () of the names that are no variables, of the cells `rows`
+        (M,) among all."""
+        _, s, p, cell = circuit.names(torch.empty(0, len(circuit.species)), rows)
+        own = {"pool": circuit.pool, "away": circuit.in_reservoir}
+        homes = {"s": s, "p": p, "cell": cell}
+
+        def value(name: str) -> Tensor:
+            kind, _, inner = name.partition(".")
+            if kind == "own":
+                found = own[inner]
+                assert found is not None
+                return found.index_select(0, rows)
+            return torch.as_tensor(homes[kind][inner])
+
+        return {name: value(name) for name in self.equations.leaves}
+
+    def slopes_by_torch(self, circuit: CircuitCells, u: Tensor, rows: Tensor) -> Tensor:
+        """∂fᵢ/∂uₖ (V, V, M) at u (V, M) of the cells `rows` (M,) among all."""
+        values = self.values(circuit, rows)
+        values |= dict(zip(self.equations.variables, u, strict=True))
+        found = evaluated(list(self.slopes.values()), lambda leaf: values[leaf.name])
+        zero = torch.zeros_like(u[0])
+        at = dict(zip(self.slopes, found, strict=True))
+        count = u.shape[0]
+        entry = lambda i, k: zero + at[i, k] if (i, k) in at else zero
+        return torch.stack([torch.stack([entry(i, k) for k in range(count)]) for i in range(count)])
+
+    def rodas3(
+        self, circuit: CircuitCells, start: Tensor, dt: float, rtol: float, atol: float
+    ) -> tuple[Tensor, RosenbrockReport] | None:  # fmt: skip
+        """As `rosenbrock.rodas3`, of the cells `circuit.rows`; None where gradients are wanted."""
+        values = self.values(circuit, circuit.rows)
+        every = (start, *values.values())
+        if torch.is_grad_enabled() and any(x.requires_grad for x in every):
+            return None
+        wide = lambda names: [values[n].detach().to(torch.float64) for n in names]
+        count = start.shape[0]
+        columns, numbers = wide(self.columns), wide(self.numbers)
+        packed = torch.stack(columns).numpy() if columns else np.zeros((1, count))
+        given = torch.stack(numbers).numpy() if numbers else np.zeros(1)
+        # a copy, also of float64: the state must not change
+        at = torch.empty(start.shape, dtype=torch.float64).copy_(start)
+        report = torch.zeros(3, count, dtype=torch.int64)
+        limits = torch.finfo(start.dtype)
+        run, arrays = self.module.run, (at.numpy(), packed, given)
+        rest = (dt, max(rtol, 4 * limits.eps), atol, limits.eps, limits.max, MAX_STEPS)
+        shares_of(
+            count, WORTH_A_THREAD,
+            lambda first, last: run(first, last, *arrays, *rest, *report.numpy()),
+        )  # fmt: skip
+        return at.to(start.dtype), RosenbrockReport(*report)
+
+
+def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
+    """The circuit in these cells, of which one is enough. Raises Untraceable."""
+    builder, one = Builder(), circuit.rows[:1]
+    u, s, p, cell = circuit.names(torch.zeros(1, len(circuit.species)), one)
+    variables = [f"u.{n}" for n in circuit.species] + [f"s.{n}" for n in circuit.given]
+    kinds: dict[str, Kind] = {n: (torch.float64, 1) for n in variables}
+
+    def kind_in(prefix: str, home: Names):
+        def kind(name: str) -> Kind | None:
+            if f"{prefix}.{name}" not in kinds:
+                if name not in home:
+                    return None
+                value = torch.as_tensor(home[name])
+                if value.requires_grad or value.dim() > 1:
+                    raise Untraceable(f"{prefix}.{name} has a gradient, or more than one number")
+                kinds[f"{prefix}.{name}"] = (value.dtype, value.dim())
+            return kinds[f"{prefix}.{name}"]
+
+        return kind
+
+    homes = {"u": u, "s": s, "p": p, "cell": cell}
+    leaves = [Leaves(k, h._label, builder, kind_in(k, h), list(h)) for k, h in homes.items()]
+    inside, outside = traced_rates(circuit.part, tuple(leaves), circuit.species)  # type: ignore
+    zero = Column.of(builder.number(0.0), builder, torch.float64)
+    as_column = lambda x: x if type(x) is Column else _spread(zero, x)
+    rates = [as_column(inside.get(n, zero)) for n in circuit.species]
+    flux = [as_column(outside.get(n, zero)) for n in circuit.given]
+    roots = [*rates, *flux]
+    columns = {builder.name(n): Column.of(builder.name(n), builder, *k) for n, k in kinds.items()}
+    simple = lowered([r.expression for r in roots], columns, builder)
+    # a rate is of the variables' type
+    wide = [x if x.dtype == torch.float64 else apply("cast64", x) for x in simple]
+    final, given = wide[: len(rates)], wide[len(rates) :]
+    if given:
+        final += _exchange(given, circuit, builder, kinds)
+        if circuit.in_reservoir is not None:
+            variables += [f"own.{way}_{n}" for way in ("to", "from") for n in circuit.given]
+            kinds |= {n: (torch.float64, 1) for n in variables}
+    made = tuple(x.expression for x in final)
+    read = {e.name for e in walk(made) if e.op == NAME} | set(variables)
+    equations = Equations(
+        made, tuple(variables), {n: k for n, k in kinds.items() if n in read}, builder
+    )
+    functions(equations)  # raises where an operation has no compiled form
+    by_dim = lambda dim: tuple(n for n in equations.leaves if kinds[n][1] == dim)
+    return CompiledCircuit(equations, equations.slopes(), by_dim(1), by_dim(0))
+
+
+def _spread(like: Column, value: Any) -> Column:
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        raise Untraceable("it returns a tensor from outside")
+    return Column.of(like.builder.number(float(value)), like.builder, torch.float64)
+
+
+def _exchange(
+    flux: Sequence[Column], circuit: CircuitCells, builder: Builder, kinds: dict[str, Kind]
+) -> list[Column]:
+    """Rates of the pools' concentrations, and of what a reservoir is given and gives, as
+    `CircuitCells.rates` has them."""
+    assert circuit.pool is not None
+    kinds["own.pool"] = (circuit.pool.dtype, 1)
+    pool = Column.of(builder.name("own.pool"), builder, *kinds["own.pool"])
+    into = [apply("div", x, pool) for x in flux]
+    if circuit.in_reservoir is None:
+        return into
+    kinds["own.away"] = (torch.bool, 1)
+    away = Column.of(builder.name("own.away"), builder, *kinds["own.away"])
+    up = [apply("where", away, apply("maximum", x, 0.0), 0.0) for x in flux]
+    down = [apply("where", away, apply("maximum", apply("neg", x), 0.0), 0.0) for x in flux]
+    return [*(apply("where", away, 0.0, x) for x in into), *up, *down]
+
+
+def source(circuit: CompiledCircuit) -> str:
+    """The text of the module."""
+    place = {n: f"columns[{k}, n]" for k, n in enumerate(circuit.columns)}
+    place |= {n: f"numbers[{k}]" for k, n in enumerate(circuit.numbers)}
+    leaves = [place[n] for n in circuit.equations.leaves] or ["0.0"]
+    names = ", ".join(circuit.equations.variables)
+    head = HEAD.format(what=f"A circuit of {names}")
+    size = len(circuit.equations.variables)
+    return head + functions(circuit.equations) + method(size, f"({', '.join(leaves)},)")
+
+
+@cache
+def _module(text: str) -> ModuleType:
+    """The module of this text: from a file beside the compiled functions, so that they are found
+    again; from memory where nothing can be written."""
+    from torchfilm.kernels.compiling import FOLDER
+
+    name = f"circuit_{hashlib.sha256(text.encode()).hexdigest()[:24]}"
+    if FOLDER is None:
+        module = ModuleType(name)
+        exec(compile(text, name, "exec"), module.__dict__)
+        return module
+    file = FOLDER / f"{name}.py"
+    if not file.exists() or file.read_text() != text:
+        draft = file.with_suffix(f".{os.getpid()}")
+        draft.write_text(text)
+        draft.replace(file)
+    spec = importlib.util.spec_from_file_location(f"torchfilm.kernels.{name}", file)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,261 @@
+"""Expressions as the text of compiled functions: rates, their derivatives, and the linear solves of
+a circuit, each operation written out.
+
+Numbers keep the type that torch would compute in, and operations their order, so that arithmetic
+gives the same bits as torch. What does not depend on concentrations is worked out once a cell.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from torchfilm.circuits.expressions import (
+    COMPARISONS,
+    LOGICAL,
+    NAME,
+    NUMBER,
+    Builder,
+    Expression,
+    derivatives,
+    walk,
+)
+from torchfilm.circuits.tracing import Kind, Untraceable, common_type, kind_of
+
+SIGNS = {
+    "add": "+", "sub": "-", "mul": "*", "div": "/", "gt": ">", "ge": ">=", "lt": "<", "le": "<=",
+    "eq": "==", "ne": "!=", "and": "and", "or": "or",
+}  # fmt: skip
+CALLS = {
+    "exp": "math.exp", "expm1": "math.expm1", "log": "_log", "log1p": "_log1p", "sqrt": "_sqrt",
+    "log2": "_log2", "log10": "_log10", "sin": "math.sin", "cos": "math.cos", "tan": "math.tan",
+    "tanh": "math.tanh", "atan": "math.atan", "floor": "math.floor", "abs": "abs",
+    "sign": "_sign", "minimum": "_least", "maximum": "_most", "remainder": "_remainder",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """du/dt of V variables, as simple operations.
+
+    rates: V expressions. variables: the name of each variable. kinds: the kind of every name that
+    occurs. builder: that made them.
+    """
+
+    rates: tuple[Expression, ...]
+    variables: tuple[str, ...]
+    kinds: Mapping[str, Kind]
+    builder: Builder
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """The names that are no variables, in order."""
+        found = [e.name for e in walk(self.rates) if e.op == NAME]
+        return tuple(n for n in found if n not in self.variables)
+
+    def slopes(self) -> dict[tuple[int, int], Expression]:
+        """∂fᵢ/∂uₖ, without those that are 0, and without those that nothing depends on."""
+        found: dict[tuple[int, int], Expression] = {}
+        for k, name in enumerate(self.variables):
+            of = derivatives(self.builder, self.rates, self.builder.name(name))
+            found |= {(i, k): of[f] for i, f in enumerate(self.rates) if f in of}
+        return found
+
+
+class Emitter:
+    """Writes expressions as lines of assignments."""
+
+    def __init__(self, equations: Equations, roots: Iterable[Expression]):
+        self.equations = equations
+        self.kinds: dict[Expression, Kind | None] = {}
+        self.varies: dict[Expression, bool] = {}
+        self.number: dict[Expression, int] = {}
+        for node in walk(roots):
+            if node.op == NUMBER:
+                kind: Kind | None = None
+            elif node.op == NAME:
+                kind = equations.kinds[node.name]
+            else:
+                kind = kind_of(node.op, [self.kinds[a] for a in node.args])
+                if all(self.kinds[a] is None for a in node.args):
+                    kind = (torch.float64, 0)  # numbers alone, as Python computes
+            self.kinds[node] = kind
+            own = node.op == NAME and node.name in equations.variables
+            self.varies[node] = own or any(self.varies[a] for a in node.args)
+            self.number[node] = len(self.number)
+
+    def constants(self, roots: Iterable[Expression]) -> list[Expression]:
+        """What does not depend on variables and is read by what does, or is a root."""
+        read = {a for node in walk(roots) if self.varies[node] for a in node.args}
+        read |= set(roots)
+        return [n for n in walk(roots) if n in read and not self.varies[n] and n.op != NUMBER]
+
+    def lines(self, roots: Iterable[Expression], known: Iterable[Expression]) -> list[str]:
+        """Assignments of all below the roots that is not known yet."""
+        have, out = set(known), []
+        for root in roots:
+            stack = [(root, False)]
+            while stack:
+                node, ready = stack.pop()
+                if node in have or node.op == NUMBER:
+                    continue
+                if ready:
+                    have.add(node)
+                    out.append(f"{self.of(node)} = {self._value(node)}")
+                else:
+                    stack += [(node, True), *((a, False) for a in reversed(node.args))]
+        return out
+
+    def of(self, node: Expression) -> str:
+        """How to refer to a node."""
+        if node.op == NUMBER:
+            return _literal(node.value)
+        if node.op == NAME and node.name in self.equations.variables:
+            return f"u{self.equations.variables.index(node.name)}"
+        return f"x{self.number[node]}"
+
+    def _as(self, node: Expression, dtype: torch.dtype) -> str:
+        kind = self.kinds[node]
+        if kind is None and dtype == torch.float64:
+            return self.of(node)
+        same = kind is not None and kind[0] == dtype
+        names = {torch.float32: "np.float32", torch.float64: "np.float64"}
+        return self.of(node) if same else f"{names[dtype]}({self.of(node)})"
+
+    def _value(self, node: Expression) -> str:
+        op, args = node.op, node.args
+        if op in ("and", "or"):
+            return f"{self.of(args[0])} {SIGNS[op]} {self.of(args[1])}"
+        if op == "not":
+            return f"not {self.of(args[0])}"
+        if op in ("detach", "cast32", "cast64"):
+            return self._as(args[0], kind_of(op, [self.kinds[args[0]]])[0])
+        kind = self.kinds[node]
+        assert kind is not None
+        dtype = common_type([self.kinds[a] for a in args]) if op in COMPARISONS else kind[0]
+        if op in LOGICAL and all(self.kinds[a] is None for a in args):
+            dtype = torch.float64
+        if op == "where":
+            yes, no = (self._as(a, dtype) for a in args[1:])
+            return f"{yes} if {self.of(args[0])} else {no}"
+        given = [self._as(a, dtype) for a in args]
+        if op in SIGNS:
+            return f"{given[0]} {SIGNS[op]} {given[1]}"
+        if op == "neg":
+            return f"-{given[0]}"
+        if op not in CALLS:
+            raise Untraceable(f"it uses {op}, which has no compiled form")
+        call = f"{CALLS[op]}({', '.join(given)})"
+        return f"np.float32({call})" if dtype == torch.float32 else call
+
+
+def _literal(value: float) -> str:
+    if math.isnan(value):
+        return "np.nan"
+    if math.isinf(value):
+        return "np.inf" if value > 0 else "-np.inf"
+    return repr(value) if value >= 0 and math.copysign(1, value) > 0 else f"({value!r})"
+
+
+def _tuple(parts: Sequence[str]) -> str:
+    return f"({', '.join(parts)}{',' * (len(parts) == 1)})" if parts else "(0.0,)"
+
+
+def _function(name: str, given: str, lines: Sequence[str], result: str) -> str:
+    body = "".join(f"    {line}\n" for line in lines)
+    return f"@kernel\ndef {name}({given}):\n{body}    return {result}\n\n\n"
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Where the matrix 2/h − J has entries, after elimination too."""
+
+    size: int
+    slopes: tuple[tuple[int, int], ...]
+    filled: frozenset[tuple[int, int]]
+
+    @staticmethod
+    def of(size: int, slopes: Sequence[tuple[int, int]]) -> Pattern:
+        filled = {*slopes, *((i, i) for i in range(size))}
+        for k in range(size - 1):
+            for i in range(k + 1, size):
+                if (i, k) in filled:
+                    filled |= {(i, j) for j in range(k + 1, size) if (k, j) in filled}
+        return Pattern(size, tuple(slopes), frozenset(filled))
+
+
+def functions(equations: Equations) -> str:
+    """The text of `prepared`, `rates`, `linearised`, `times_slopes`, `factored`, `solved`."""
+    slopes = equations.slopes()
+    order = sorted(slopes)
+    emitter = Emitter(equations, [*equations.rates, *slopes.values()])
+    roots = [*equations.rates, *(slopes[k] for k in order)]
+    hoisted = emitter.constants(roots)
+    leaves = [equations.builder.name(n) for n in equations.leaves]
+    kinds = [equations.kinds[n] for n in equations.leaves]
+    read = [_leaf(emitter, e, k, i) for i, (e, k) in enumerate(zip(leaves, kinds, strict=True))]
+    own = [f"u{k}" for k in range(len(equations.variables))]
+    unpack = [f"{_tuple(own)} = u"]
+    if hoisted:
+        unpack.append(f"{_tuple([emitter.of(e) for e in hoisted])} = c")
+    known = [*hoisted, *(equations.builder.name(n) for n in equations.variables)]
+    prepare = [*read, *emitter.lines(hoisted, leaves)]
+    text = _function("prepared", "leaf", prepare, _tuple([emitter.of(e) for e in hoisted]))
+    wide = lambda e: emitter._as(e, torch.float64)
+    values = _tuple([wide(e) for e in equations.rates])
+    lines = [*unpack, *emitter.lines(equations.rates, known)]
+    text += _function("rates", "u, c", lines, values)
+    lines = [*unpack, *emitter.lines(roots, known)]
+    safe = _tuple([f"_finite({wide(slopes[k])})" for k in order])
+    text += _function("linearised", "u, c", lines, f"{values}, {safe}")
+    return text + _linear(Pattern.of(len(own), order))
+
+
+def _leaf(emitter: Emitter, leaf: Expression, kind: Kind, place: int) -> str:
+    casts = {torch.float32: "np.float32(leaf[{}])", torch.bool: "leaf[{}] != 0.0"}
+    return f"{emitter.of(leaf)} = {casts.get(kind[0], 'leaf[{}]').format(place)}"
+
+
+def _linear(pattern: Pattern) -> str:
+    """The matrix 2/h − J: products with J, elimination without pivoting, and substitution, in the
+    order of `circuits.linear`."""
+    size, at = pattern.size, {k: n for n, k in enumerate(pattern.slopes)}
+    x = [f"b{i}" for i in range(size)]
+    slopes = [f"j{i}_{k}" for i, k in pattern.slopes]
+    unpack_j = [f"{_tuple(slopes)} = j"] if slopes else []
+    rows = []
+    for i in range(size):
+        terms = [f"j{i}_{k} * b{k}" for k in range(size) if (i, k) in at]
+        rows.append(" + ".join(terms) if terms else "0.0")
+    text = _function("times_slopes", "j, b", [*unpack_j, f"{_tuple(x)} = b"], _tuple(rows))
+    lines = list(unpack_j)
+    for i, k in sorted(pattern.filled):
+        slope = f"-j{i}_{k}" if (i, k) in at else "0.0"
+        lines.append(f"m{i}_{k} = {slope}" + (" + w" if i == k else ""))
+    for k in range(size - 1):
+        for i in range(k + 1, size):
+            if (i, k) in pattern.filled:
+                lines.append(f"m{i}_{k} /= m{k}_{k}")
+                lines += [
+                    f"m{i}_{n} -= m{i}_{k} * m{k}_{n}"
+                    for n in range(k + 1, size) if (k, n) in pattern.filled
+                ]  # fmt: skip
+    sound = [
+        f"abs(m{k}_{k}) > LEAST_PIVOT * (w" + (f" + abs(j{k}_{k}))" if (k, k) in at else ")")
+        for k in range(size)
+    ]
+    lines.append("sound = " + " and ".join(sound))
+    entries = _tuple([f"m{i}_{k}" for i, k in sorted(pattern.filled)])
+    text += _function("factored", "j, w", lines, f"{entries}, sound")
+    lines = [f"{entries} = m", f"{_tuple(x)} = b"]
+    for k in range(size):
+        lines += [
+            f"b{i} -= m{i}_{k} * b{k}" for i in range(k + 1, size) if (i, k) in pattern.filled
+        ]
+    for k in range(size - 1, -1, -1):
+        lines.append(f"b{k} /= m{k}_{k}")
+        lines += [f"b{i} -= m{i}_{k} * b{k}" for i in range(k) if (i, k) in pattern.filled]
+    return text + _function("solved", "m, b", lines, _tuple(x))

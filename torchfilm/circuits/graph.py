@@ -1,0 +1,321 @@
+"""A circuit as an object to look at: its equations, what each depends on, its derivatives, and what
+it conserves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.circuits.expressions import NAME, NUMBER, Builder, Expression, derivatives, walk
+from torchfilm.circuits.formulas import latex, text
+from torchfilm.circuits.names import Names, UnknownName, unknown
+from torchfilm.circuits.network import Network, build_network
+from torchfilm.circuits.reactions import OUTSIDE
+from torchfilm.circuits.tracing import LAWS, Column
+from torchfilm.tools import checks
+from torchfilm.tools.deterministic_math import deterministic_functions
+
+Kinds = Callable[[str], tuple[torch.dtype, int] | None]
+
+
+class Leaves(Names):
+    """Columns by name, made when they are read.
+
+    kinds: the type and the dimensions of a name, or None where there is no such name. known: those
+    to tell of then.
+    """
+
+    __slots__ = ("_kinds", "_known", "_make", "_prefix")
+
+    def __init__(
+        self, prefix: str, label: str, builder: Builder, kinds: Kinds, known: Sequence[str]
+    ):
+        super().__init__((), (), label)
+        for name, value in (
+            ("_prefix", prefix), ("_kinds", kinds), ("_known", tuple(known)), ("_make", builder),
+        ):  # fmt: skip
+            object.__setattr__(self, name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        kind = self._kinds(name)
+        if kind is None:
+            raise UnknownName(unknown(f"{self._label} has no {name!r}", name, list(self._known)))
+        made = Column.of(self._make.name(f"{self._prefix}.{name}"), self._make, *kind)
+        self.__dict__[name] = made
+        return made
+
+    def __contains__(self, name: str) -> bool:
+        return self._kinds(name) is not None
+
+    def __iter__(self):
+        return iter(self._known)
+
+
+def traced_rates(
+    part: Any, names: tuple[Names, Names, Names, Names], species: Sequence[str]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a rate function, or a network, gives for traced columns (u, s, p, cell): rates of
+    species, conc/h, and amounts released to signals, conc·µm³/h: columns or numbers."""
+    if isinstance(part, Network):
+        found = part.changes(part.concentration_rates(*names))
+        split = len(species)
+        released = zip(part.signals, found[split:], strict=True)
+        return dict(zip(species, found[:split], strict=True)), {
+            n: x * names[3].volume for n, x in released
+        }
+    returned = part(*names)
+    both = isinstance(returned, tuple) and len(returned) == 2
+    return returned if both else (returned, {})
+
+
+@dataclass(frozen=True, eq=False)
+class CircuitGraph:
+    """The equations of a circuit in the cells of one type.
+
+    rates: of each species, conc/h. releases: what a cell releases to each signal, conc·µm³/h.
+    parameters: the constants that the circuit was given. Printed, it shows its equations; a
+    notebook shows them typeset.
+    """
+
+    species: tuple[str, ...]
+    parameters: tuple[str, ...]
+    rates: Mapping[str, Expression]
+    releases: Mapping[str, Expression]
+    builder: Builder
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The signals that the circuit reads or changes."""
+        read = [n for e in self._all() for n in e.names("s")]
+        return tuple(dict.fromkeys((*self.releases, *read)))
+
+    def _all(self) -> list[Expression]:
+        return [*self.rates.values(), *self.releases.values()]
+
+    # --- to look at ----------------------------------------------------------------------------
+
+    def __str__(self) -> str:
+        left = {n: f"d {n}/dt" for n in self.rates} | {
+            f"out.{n}": f"to out.{n}" for n in self.releases
+        }
+        right = [text(e) for e in self._all()]
+        width = max(map(len, left.values()), default=0)
+        lines = [f"{a:<{width}} = {b}" for a, b in zip(left.values(), right, strict=True)]
+        still = [n for n in self.species if n not in self.rates]
+        lines += [f"{'d ' + n + '/dt':<{width}} = 0" for n in still]
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_latex_(self) -> str:
+        tex = lambda n: rf"\mathrm{{{n.replace('_', chr(92) + '_')}}}"
+        lines = [rf"\frac{{d\,{tex(n)}}}{{dt}} &= {latex(e)}" for n, e in self.rates.items()]
+        lines += [rf"{tex(n)} \to \mathrm{{out}} &= {latex(e)}" for n, e in self.releases.items()]
+        return "$$\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}$$"
+
+    # --- to work with --------------------------------------------------------------------------
+
+    @property
+    def reads(self) -> dict[str, tuple[str, ...]]:
+        """What each rate depends on, by species, and by "out.name" for what is released."""
+        found = {}
+        for name, expression in [
+            *self.rates.items(),
+            *((f"out.{n}", e) for n, e in self.releases.items()),
+        ]:
+            found[name] = tuple(text(e) for e in expression.walk() if e.op == NAME)
+        return found
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Constants that nothing reads."""
+        read = {n for e in self._all() for n in e.names("p")}
+        return tuple(n for n in self.parameters if n not in read)
+
+    def jacobian(self, by: str = "species") -> dict[tuple[str, str], Expression]:
+        """∂ rate/∂ x for each rate and each x that it depends on: "species" (also signals outside,
+        as "out.name"), or "parameters". Entries that are 0 are left out."""
+        checks.choice("by", by, ("species", "parameters"))
+        kinds = {"species": ("u", "s"), "parameters": ("p",)}[by]
+        rows = {**self.rates, **{f"out.{n}": e for n, e in self.releases.items()}}
+        leaves = [e for e in walk(rows.values()) if e.op == NAME and e.name.split(".")[0] in kinds]
+        found: dict[tuple[str, str], Expression] = {}
+        for leaf in leaves:
+            slopes = derivatives(self.builder, rows.values(), leaf)
+            found |= {(n, text(leaf)): slopes[e] for n, e in rows.items() if e in slopes}
+        return found
+
+    def evaluate(self, values: Mapping[str, Any]) -> dict[str, Tensor]:
+        """The rates, and as "out.name" what is released, at values by name: of species and
+        constants by their own names, "out.name" for signals, "cell.volume" and the like."""
+        given = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in values.items()}
+        leaves = {e: e.name for e in walk(self._all()) if e.op == NAME}
+        for leaf in leaves:
+            if text(leaf) not in given:
+                raise checks.InputError(
+                    unknown(f"values lack {text(leaf)!r}", text(leaf), list(given))
+                )
+        found = evaluated(self._all(), lambda leaf: given[text(leaf)])
+        return dict(zip([*self.rates, *(f"out.{n}" for n in self.releases)], found, strict=True))
+
+    @property
+    def conserved(self) -> list[dict[str, int]]:
+        """Sums of amounts that never change, as numbers by species and "out.name": found at random
+        concentrations, and checked at others."""
+        rows = [*self.rates, *(f"out.{n}" for n in self.releases)]
+        rates = self._at_random(0)
+        basis = _null_space(rates)
+        sums = [dict(zip(rows, w, strict=True)) for w in basis]
+        check, scale = self._at_random(1), np.abs(rates).max(initial=1e-300)
+        sound = [
+            s for s in sums if np.abs(check @ np.array([s[n] for n in rows])).max() <= 1e-9 * scale
+        ]
+        still = [{n: 1} for n in self.species if n not in self.rates]
+        return still + [{n: k for n, k in s.items() if k} for s in sound]
+
+    def _at_random(self, seed: int) -> np.ndarray:
+        """Rates at 64 random places, (64, rows), of amounts in a cell of volume 1."""
+        rng = np.random.default_rng(seed)
+        names = {text(e) for e in walk(self._all()) if e.op == NAME}
+        values = {n: rng.uniform(0.2, 2.0, 64) for n in names} | {"cell.volume": np.ones(64)}
+        found = self.evaluate(values).values()
+        columns = [np.broadcast_to(x.numpy(), (64,)) for x in found]
+        return np.stack(columns, 1) if columns else np.zeros((64, 0))
+
+
+def evaluated(roots: Sequence[Expression], leaf: Callable[[Expression], Tensor]) -> list[Tensor]:
+    """Expressions as tensors, each part once, by the functions with which circuits run."""
+    made: dict[Expression, Any] = {}
+    with deterministic_functions():
+        for node in walk(roots):
+            if node.op == NUMBER:
+                made[node] = torch.tensor(node.value, dtype=torch.float64)
+            elif node.op == NAME:
+                made[node] = leaf(node)
+            else:
+                made[node] = OPERATIONS[node.op](*(made[a] for a in node.args))
+    return [made[r] for r in roots]
+
+
+OPERATIONS: dict[str, Callable[..., Tensor]] = {
+    **{
+        name: getattr(torch, name)
+        for name in [
+            "add",
+            "sub",
+            "mul",
+            "div",
+            "neg",
+            "abs",
+            "exp",
+            "expm1",
+            "log",
+            "log1p",
+            "log2",
+            "log10",
+            "sqrt",
+            "sin",
+            "cos",
+            "tan",
+            "tanh",
+            "atan",
+            "floor",
+            "sign",
+            "where",
+            "minimum",
+            "maximum",
+            "remainder",
+            "gt",
+            "ge",
+            "lt",
+            "le",
+            "eq",
+            "ne",
+        ]
+    },
+    **LAWS,
+    "and": torch.logical_and,
+    "or": torch.logical_or,
+    "not": torch.logical_not,
+    "detach": Tensor.detach,
+    "cast32": Tensor.float,
+    "cast64": Tensor.double,
+}
+
+
+def _null_space(rates: np.ndarray) -> list[list[int]]:
+    """Whole numbers w with rates @ w = 0, a basis: (K, n) -> vectors of n."""
+    if rates.shape[1] == 0:
+        return []
+    _, size, rows = np.linalg.svd(rates / np.abs(rates).max(initial=1e-300), full_matrices=True)
+    rank = int((size > 1e-10).sum())
+    basis = rows[rank:].copy()
+    for k, pivot in enumerate(range(basis.shape[0])):  # each has a 1 where the others have 0
+        place = int(np.abs(basis[k]).argmax())
+        basis[k] /= basis[k, place]
+        for other in range(basis.shape[0]):
+            if other != pivot:
+                basis[other] -= basis[other, place] * basis[k]
+    found = []
+    for row in basis:
+        shares = [Fraction(float(x)).limit_denominator(24) for x in row]
+        least = np.lcm.reduce([s.denominator for s in shares])
+        whole = [int(s * int(least)) for s in shares]
+        common = np.gcd.reduce(whole)
+        sign = -1 if sum(whole) < 0 else 1
+        found.append([sign * w // max(int(common), 1) for w in whole])
+    return found
+
+
+def graph_of(
+    part: Any, species: Sequence[str], parameters: Sequence[str], label: str
+) -> CircuitGraph:
+    """The graph of a rate function, or of a list of reactions, that nobody has bound: any signal
+    and any property of a cell may be read. Raises Untraceable."""
+    builder = Builder()
+    if not callable(part) and not isinstance(part, Network):
+        part = build_network(part, species, _signals_in(part))
+    any_name = lambda name: (torch.float64, 1)
+    among = lambda names: lambda name: (torch.float64, 1) if name in names else None
+    own = (
+        Leaves("u", "u", builder, among(species), species),
+        Leaves("s", "s", builder, any_name, ()),
+        Leaves("p", "p", builder, among(parameters), parameters),
+        Leaves("cell", "cell", builder, any_name, ()),
+    )
+    try:
+        inside, outside = traced_rates(part, own, species)
+    except UnknownName as error:
+        raise UnknownName(f"{label}: {error}") from error
+    as_expression = lambda x: x.expression if type(x) is Column else builder.number(float(x))
+    of_names = lambda found: {n: as_expression(x) for n, x in found.items()}
+    for name in inside:
+        if name not in species:
+            what = f"{label} returned a rate for {name!r}, which is no species"
+            raise checks.InputError(unknown(what, name, list(species)))
+    made = of_names(inside)
+    ordered = {n: made[n] for n in species if n in made}
+    return CircuitGraph(tuple(species), tuple(parameters), ordered, of_names(outside), builder)
+
+
+def _signals_in(reactions: Any) -> tuple[str, ...]:
+    """The signals that reactions name, in order."""
+    found: dict[str, None] = {}
+    stack = list(reversed(list(reactions)))
+    while stack:
+        entry = stack.pop()
+        if isinstance(entry, (list, tuple)):
+            stack += reversed(entry)
+            continue
+        names = (*entry.consumes, *entry.produces, *getattr(entry.rate, "reads", ()))
+        found |= {n.removeprefix(OUTSIDE): None for n in names if n.startswith(OUTSIDE)}
+    return tuple(found)
