@@ -197,22 +197,23 @@ def test_defaults_reported_of_contacts_are_those_used(dim, contacts):
         assert f"residual of {TOLERANCE:g} (default)" in said
 
 
-@pytest.mark.parametrize("backend", [None, "torch"])
-def test_who_computes_contacts_is_who_is_reported(backend, monkeypatch):
+@pytest.mark.parametrize("contacts", ["bilateral", "one-sided"])
+@pytest.mark.parametrize("backend", [None, "compiled", "torch"])
+def test_who_computes_contacts_is_who_is_reported(backend, contacts, monkeypatch):
     called = []
-    for name in ("compiled", "one_sided"):
+    for name in ("compiled", "one_sided", "bilateral"):
         part = getattr(bound_mechanics, name)
         steps = lambda given, name=name, usual=part.contact_steps: (
             called.append(name) or usual(given)
         )
         monkeypatch.setattr(part, "contact_steps", steps)
-    effect = tf.Mechanics(dim=2, backend=backend)
+    effect = tf.Mechanics(dim=2, backend=backend, contacts=contacts)
     model = tf.Scene(effect, tf.Growth(rate=1.0)).bind()
     model.step(model.start(), 0.025)
-    who = {"compiled": "compiled", "one_sided": "torch"}[called[0]]
-    assert len(called) == 1 and f"conjugate gradients, {who}" in " ".join(
-        effect.numerics(0.025, model.start())
-    )
+    by_torch = backend == "torch"
+    assert called == [contacts.replace("-", "_") if by_torch else "compiled"]
+    said = "torch," if by_torch else "compiled; by torch where gradients are required,"
+    assert f"conjugate gradients, {said}" in " ".join(effect.numerics(0.025, model.start()))
 
 
 def test_what_is_exchanged_is_named():

@@ -194,7 +194,8 @@ def test_what_is_left_deep_is_found_wherever_it_is(dtype, limit, monkeypatch):
         tf.Plane(z=-0.5, facing="+z", stiffness=16.0),
     ]
     scene = tf.Scene(
-        tf.Growth(rate=1.0), tf.Mechanics(dim=3, walls=walls, **BILATERAL, **LIMITS[limit])
+        tf.Growth(rate=1.0),
+        tf.Mechanics(dim=3, walls=walls, backend="torch", **BILATERAL, **LIMITS[limit]),
     )
     state = seeded(scene, cells, "cpu", dtype)
     for _ in range(4):

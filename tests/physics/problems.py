@@ -9,11 +9,11 @@ import torch
 from helpers import array
 from scipy.optimize import minimize
 
-from torchfilm.kernels import solve
+from torchfilm.kernels import bilateral_solve, solve
 from torchfilm.physics import one_sided_solve
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.one_sided_solve import Minimum
-from torchfilm.physics.problem import ContactProblem
+from torchfilm.physics.problem import ContactProblem, SolveReport
 from torchfilm.physics.solve import solve_contacts
 from torchfilm.tools.ragged import Groups
 
@@ -78,19 +78,19 @@ class Problem:
 
     def alone(self, colony: int) -> Problem:
         """The problem of one of its colonies."""
-        mine, own = self.colony == colony, np.flatnonzero(self.colony == colony)
+        mine, before = self.colony == colony, int((self.colony < colony).sum())
         pairs, walls = mine[self.first], mine[self.at_wall]
         return Problem(
-            self.first[pairs] - own[0],
-            self.second[pairs] - own[0],
-            self.at_wall[walls] - own[0],
+            self.first[pairs] - before,
+            self.second[pairs] - before,
+            self.at_wall[walls] - before,
             self.half_rows[pairs],
             self.wall_rows[walls],
             self.gap[np.concatenate([pairs, walls])],
             self.alpha[mine],
             self.lower[mine],
             self.scale[mine],
-            np.zeros(len(own), dtype=int),
+            np.zeros(mine.sum(), dtype=int),
             1,
         )
 
@@ -140,6 +140,32 @@ class Problem:
     ):
         """As `pushed` by compiled kernels: y (N, D), errors and iterations, (B,)."""
         y, errors, counts = np.zeros(self.scale.shape), [], []
+        for mine, rows, (alpha, low), cells, dof in self.of_kernels(dtype, applied_force):
+            iterations, error, _ = solve.minimise(
+                *rows, alpha, low, cells, tolerance, np.inf, limit, dof
+            )
+            y[mine] = cells[:, : y.shape[1]]
+            errors.append(error)
+            counts.append(iterations)
+        return y, np.array(errors), np.array(counts)
+
+    def solved_by_kernels(
+        self, tolerance: float = 1e-12, limit: int = 5000, dtype=np.float64, applied_force=None
+    ):
+        """As `solved` by compiled kernels: y (N, D), and the report of the solve."""
+        y, found = np.zeros(self.scale.shape), []
+        for mine, rows, (alpha, low), cells, dof in self.of_kernels(dtype, applied_force):
+            rigid = np.zeros(len(cells), dtype=bool)
+            found.append(
+                bilateral_solve.minimise(*rows, alpha, low, rigid, cells, tolerance, limit, dof)
+            )
+            y[mine] = cells[:, : y.shape[1]]
+        iterations, residual, status = (torch.tensor(np.array(x)) for x in zip(*found, strict=True))
+        return y, SolveReport(status, iterations, residual)
+
+    def of_kernels(self, dtype, applied_force=None):
+        """For each colony its cells, (N,) bool, and what kernels take: the rows, α and least scaled
+        Δl, y = 0 and its width."""
         for colony in range(self.colonies):
             mine, its = self.colony == colony, self.alone(colony)
             rows = np.concatenate([mine[self.first], mine[self.at_wall]])
@@ -150,25 +176,16 @@ class Problem:
             ours[: 2 * pairs : 2], ours[1 : 2 * pairs : 2] = its.half_rows.swapaxes(0, 1)
             ours[2 * pairs :: 2] = its.wall_rows
             spent = np.zeros(len(rows)) if applied_force is None else -applied_force
-            iterations, error, _ = solve.minimise(
+            of_rows = (
                 halves,
                 np.concatenate([its.first, its.at_wall]).astype(np.int32),
                 np.concatenate([its.second, np.full(len(its.at_wall), -1)]).astype(np.int32),
                 len(its.gap),
                 its.gap.astype(dtype),
                 spent[rows].astype(dtype),
-                its.alpha.astype(dtype),
-                its.lower.astype(dtype),
-                cells,
-                tolerance,
-                np.inf,
-                limit,
-                (0,) * lanes,
             )
-            y[mine] = cells[:, :degrees]
-            errors.append(error)
-            counts.append(iterations)
-        return y, np.array(errors), np.array(counts)
+            of_cells = its.alpha.astype(dtype), its.lower.astype(dtype)
+            yield mine, of_rows, of_cells, cells, (0,) * lanes
 
     @property
     def weight(self) -> np.ndarray:

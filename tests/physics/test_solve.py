@@ -9,7 +9,7 @@ from helpers import array
 from problems import WIDE, Problem, least_energy, pushing_energy
 
 from torchfilm.kernels.scheme import TOLERANCE
-from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT
+from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE
 from torchfilm.physics.solve import solve_contacts
 
 PATHS = pytest.mark.parametrize("path", ["torch", "compiled"])
@@ -23,16 +23,22 @@ def pushed(p: Problem, path: str, tolerance: float = 1e-12, limit: int = 5000, *
     return array(found.y), array(found.error), array(found.iterations)
 
 
+def solved(p: Problem, path: str, **options):
+    """The solution of bilateral contacts: y (N, D), and the report of the solve."""
+    return p.solved_by_kernels(**options) if path == "compiled" else p.solved(**options)
+
+
+@PATHS
 @pytest.mark.parametrize("degrees", [4, 7])
 @pytest.mark.parametrize("seed", range(3))
-def test_bilateral_solve_against_dense(seed, degrees):
+def test_bilateral_solve_against_dense(seed, degrees, path):
     """(JᵀJ + α) y = Jᵀ g by a dense factorisation.
 
     At a tolerance of 1e-12 the two agree to 1e-12 times the condition of the system, which is below
     1e3.
     """
     p = Problem.random(seed, [12, 1, 7, 0, 20], degrees)
-    y, report = p.solved()
+    y, report = solved(p, path)
     j = p.dense
     expected = np.linalg.solve(j.T @ j + np.diag(p.weight), j.T @ p.gap).reshape(y.shape)
     assert (report.status == CONVERGED).all()
@@ -53,8 +59,9 @@ def test_a_tolerance_for_each_colony():
         assert np.array_equal(found[p.colony == colony], alike[p.colony == colony])
 
 
+@PATHS
 @pytest.mark.parametrize("seed", range(5))
-def test_bilateral_solve_within_bounds(seed):
+def test_bilateral_solve_within_bounds(seed, path):
     """Some lengths are at their bound.
 
     The problem is convex, so y is the minimum if and only if the slope is 0 where y is free and not
@@ -62,7 +69,7 @@ def test_bilateral_solve_within_bounds(seed):
     of 1e-12 and forces of about 1.
     """
     p = Problem.random(seed, [12, 20], 7, lower=-0.05)
-    y, report = p.solved()
+    y, report = solved(p, path)
     j = p.dense
     slope = (p.weight * y.ravel() - j.T @ (p.gap - j @ y.ravel())).reshape(y.shape)
     bound = np.zeros(y.shape, dtype=bool)
@@ -132,15 +139,16 @@ def test_contacts_that_just_touch_are_cleared(seed, degrees, lower, path):
     assert least < 0.01 * at_rest, "contacts must be hard enough to be cleared"
 
 
-@pytest.mark.parametrize("path", ["bilateral", "torch", "compiled"])
-def test_force_already_spent_is_not_spent_again(path):
+@PATHS
+@pytest.mark.parametrize("contacts", ["bilateral", "one-sided"])
+def test_force_already_spent_is_not_spent_again(path, contacts):
     """Rows whose `applied_force` acted in an earlier pass: the minimum is that of the function with
     their work added.
     """
     p = Problem.random(5, [15], 7)
     spent = np.where(np.arange(len(p.gap)) % 3 == 0, 0.5 * p.gap, 0.0)
-    if path == "bilateral":
-        y, report = p.solved(applied_force=spent)
+    if contacts == "bilateral":
+        y, report = solved(p, path, applied_force=spent)
         assert (report.status == CONVERGED).all()
         j = p.dense
         slope = p.weight * y.ravel() - j.T @ (p.gap - j @ y.ravel() - spent)
@@ -163,22 +171,39 @@ def preconditioned(p: Problem, slope: np.ndarray, active: np.ndarray) -> np.ndar
 
 
 def test_reported_residual_is_the_true_one(dtype, device):
-    """Computed here independently: the worst preconditioned residual of each colony relative to the
-    worst at rest. float32 sums of twenty terms have an error of 1e-5 of the start.
-    """
+    """float32 sums of twenty terms have an error of 1e-5 of the start."""
     p = Problem.random(6, [15, 10], 7)
     y, report = p.solved(tolerance=1e-3, dtype=dtype, device=device)
+    check_residual(p, y, report, {torch.float32: 1e-5, torch.float64: 1e-12}[dtype])
+
+
+@pytest.mark.parametrize("dtype, near", [(np.float32, 1e-5), (np.float64, 1e-12)])
+def test_kernels_report_the_true_residual(dtype, near):
+    p = Problem.random(6, [15, 10], 7)
+    check_residual(p, *p.solved_by_kernels(tolerance=1e-3, dtype=dtype), near)
+
+
+def check_residual(p: Problem, y: np.ndarray, report, near: float) -> None:
+    """Computed here independently: the worst preconditioned residual of each colony relative to the
+    worst at rest."""
     j, every = p.dense, np.ones(len(p.gap), dtype=bool)
     slope = (p.weight * y.ravel() - j.T @ (p.gap - j @ y.ravel())).reshape(y.shape)
     worst = np.abs(preconditioned(p, slope, every)).max(1)
     rest = np.abs(preconditioned(p, (-j.T @ p.gap).reshape(y.shape), every)).max(1)
     for colony in range(2):
         expected = worst[p.colony == colony].max() / rest[p.colony == colony].max()
-        assert float(report.residual[colony]) == pytest.approx(
-            expected, rel=1e-3, abs={torch.float32: 1e-5, torch.float64: 1e-12}[dtype]
-        )
+        assert float(report.residual[colony]) == pytest.approx(expected, rel=1e-3, abs=near)
         assert expected <= 1e-3 * 1.01
     assert (report.status == CONVERGED).all()
+
+
+def test_what_is_no_number_is_reported_by_kernels_of_its_colony():
+    """Bilateral contacts; a colony with a gap that is no number, and a sound one."""
+    p = Problem.random(6, [15, 10], 7)
+    p.gap[0] = np.nan
+    y, report = p.solved_by_kernels()
+    assert report.status.tolist() == [NOT_FINITE, CONVERGED]
+    assert bool(report.residual[0].isnan()) and np.isfinite(y[p.colony == 1]).all()
 
 
 @PATHS

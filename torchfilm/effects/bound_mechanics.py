@@ -11,23 +11,16 @@ from torch import Tensor
 
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.mechanics_report import BURIED, LONG, MANY, MechanicsReport
-from torchfilm.physics import compiled, one_sided, substeps
-from torchfilm.physics.contact_records import (
-    CLOSE,
-    DEEP,
-    PENALTY,
-    CellProperties,
-    ContactReport,
-    ContactSettings,
-    Moved,
-)
-from torchfilm.physics.contact_step import contact_step
-from torchfilm.physics.one_sided_records import OneSidedSettings, StepInput
+from torchfilm.kernels.bilateral_scheme import PENALTY
+from torchfilm.physics import bilateral, compiled, one_sided, substeps
+from torchfilm.physics.contact_records import ContactReport, ContactSettings
+from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.problem import COLLAPSED, CONVERGED
+from torchfilm.physics.step_records import StepInput, StepResult
 from torchfilm.physics.surfaces import Surface
 from torchfilm.resolver import snapshot
 from torchfilm.state import State
-from torchfilm.tools.ragged import Groups, offsets
+from torchfilm.tools.ragged import Groups
 
 if TYPE_CHECKING:
     from torchfilm.effects.mechanics import Mechanics
@@ -62,18 +55,25 @@ class BoundMechanics(BoundEffect):
         )  # fmt: skip
         own_dt = partial(self._own_dt, state, dt, steps)
         base = state.length - elongation
-        if isinstance(self.settings, OneSidedSettings):
-            return self._one_sided(state, base, elongation, drags, steps, status, own_dt)
-        return self._bilateral(state, base, elongation, drags, steps, status, own_dt)
+        given = self._input(state, base, elongation, drags, steps, status, own_dt)
+        found = self._taken(given)
+        report = ContactReport(
+            torch.maximum(status, found.status), found.iterations, found.error, found.passes,
+            found.clipped, found.deeply_overlapping,
+        )  # fmt: skip
+        at = (found.position, found.axis, found.length, found.move)
+        state = self._placed(state, at, base, report, steps)
+        if not self.effect.one_sided:
+            return state
+        alpha = state.groups.spread(found.hardness.to(state.dtype))
+        return state.with_fields(contact_alpha=alpha)
 
     @staticmethod
     def _own_dt(state: State, dt: float, steps: Tensor) -> Tensor:
         """The sub-step of each cell, h, (N,)."""
         return dt / steps.index_select(0, state.colony).to(state.dtype)
 
-    # --- one-sided contacts --------------------------------------------------------------------
-
-    def _one_sided(
+    def _input(
         self,
         state: State,
         base: Tensor,
@@ -82,25 +82,25 @@ class BoundMechanics(BoundEffect):
         steps: Tensor,
         status: Tensor,
         own_dt: Callable[[], Tensor],
-    ) -> State:
+    ) -> StepInput:
         surfaces, walls = self._surfaces(state, own_dt)
-        assert isinstance(self.settings, OneSidedSettings)
-        given = StepInput(
+        alpha = self._alpha(state, own_dt)
+        if self.effect.one_sided:
+            hardness = _of_colonies(state.contact_alpha, state.groups).double()
+        else:
+            hardness = torch.zeros_like(state.counts, dtype=torch.float64)
+            alpha = PENALTY / drags[1] if alpha is None else alpha
+        return StepInput(
             self.settings, state.groups, state.position, state.axis, base, elongation,
             state.radius, *drags, torch.where(status == CONVERGED, steps, 0),
-            state.displacement, _of_colonies(state.contact_alpha, state.groups).double(),
-            self._alpha(state, own_dt), state.own_colony_id, surfaces, walls,
+            state.displacement, hardness, alpha, state.own_colony_id, surfaces, walls,
         )  # fmt: skip
-        steps_of = compiled if self.compiled and not _tracked(given) else one_sided
-        found = steps_of.contact_steps(given)
-        report = ContactReport(
-            torch.maximum(status, found.status), found.iterations, found.error, found.passes,
-            found.clipped, found.deeply_overlapping,
-        )  # fmt: skip
-        at = (found.position, found.axis, found.length, found.move)
-        state = self._placed(state, at, base, report, steps)
-        alpha = state.groups.spread(found.hardness.to(state.dtype))
-        return state.with_fields(contact_alpha=alpha)
+
+    def _taken(self, given: StepInput) -> StepResult:
+        """The contact steps, by kernels or by torch."""
+        if self.compiled and not _tracked(given):
+            return compiled.contact_steps(given)
+        return (one_sided if self.effect.one_sided else bilateral).contact_steps(given)
 
     def _alpha(self, state: State, own_dt: Callable[[], Tensor]) -> Tensor | None:
         """α of each cell where it is given, (N,); else None."""
@@ -109,67 +109,6 @@ class BoundMechanics(BoundEffect):
         if self.values.alpha is not None:
             return self.values.alpha.of_cells(state).expand(state.cells)
         return None
-
-    # --- bilateral contacts --------------------------------------------------------------------
-
-    def _bilateral(
-        self,
-        state: State,
-        base: Tensor,
-        elongation: Tensor,
-        drags: tuple[Tensor, Tensor],
-        steps: Tensor,
-        status: Tensor,
-        own_dt: Callable[[], Tensor],
-    ) -> State:
-        settings, none = self.settings, torch.zeros_like(state.counts)
-        assert isinstance(settings, ContactSettings)
-        viscosity, length_drag = drags
-        alpha = self._alpha(state, own_dt)
-        alpha = PENALTY / length_drag if alpha is None else alpha
-        first = offsets(state.counts)[:-1].clamp(max=state.cells - 1)
-        reference = state.position.detach().index_select(0, first).index_select(0, state.colony)
-        surfaces, walls = self._surfaces(state, own_dt)
-        walls = [(k, v if v is None or k != "stiffness" else v * alpha) for k, v in walls]
-        cells = CellProperties(
-            settings,
-            state.radius,
-            viscosity,
-            length_drag,
-            alpha,
-            self._overlap(state, alpha, length_drag, steps),
-            state.own_colony_id,
-            reference,
-            state.displacement,
-            state.groups,
-            surfaces,
-            walls,
-        )
-        passes = torch.where(steps > 1, settings.coarse_passes, settings.passes)
-        report = ContactReport(
-            status, none, torch.zeros_like(none, dtype=state.dtype), none, none, none
-        )
-        clipped = torch.zeros_like(state.colony, dtype=torch.bool)
-        reach = torch.zeros_like(state.radius)
-        at = Moved(state.position, state.axis, base, clipped, reach, state.displacement)
-        share = elongation / steps.index_select(0, state.colony)
-        for k in range(int(steps.max())):
-            at, report = contact_step(
-                cells, at, report, share, (k < steps) & (status == CONVERGED), passes
-            )
-        placed = (at.position, at.axis, at.length, at.first_move)
-        return self._placed(state, placed, base, report, steps)
-
-    @torch.no_grad()
-    def _overlap(self, state: State, alpha: Tensor, length_drag: Tensor, steps: Tensor) -> Tensor:
-        """How deep a contact of each cell may be left, (N,) µm."""
-        if self.settings.overlap is not None:
-            return torch.full_like(state.radius, self.settings.overlap)
-        coarse = (steps > 1).index_select(0, state.colony)
-        usual = torch.where(coarse, CLOSE, DEEP * state.radius)
-        return usual * (alpha * length_drag / PENALTY).clamp(max=1.0)
-
-    # --- both ----------------------------------------------------------------------------------
 
     def _placed(
         self,

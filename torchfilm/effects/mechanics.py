@@ -11,10 +11,11 @@ import torch
 
 from torchfilm.effect import MECHANICS, Binding, BoundEffect, Effect, number_range
 from torchfilm.effects.bound_mechanics import BoundMechanics
+from torchfilm.kernels.bilateral_scheme import CLOSE, PENALTY, TOLERANCE
 from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.physics import compiled
-from torchfilm.physics.contact_records import CLOSE, PENALTY, TOLERANCE, ContactSettings
+from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.initial_overlaps import check_apart
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.surfaces import Surface
@@ -56,7 +57,7 @@ class Mechanics(Effect):
     residual relative to that at rest, default 0.05 or, where α γ is below 0.1, 0.05 · (α γ/0.1)^¼.
     max_iterations: CG iterations a solve. max_elongation: µm; a colony whose cells would grow more
     in a step takes sub-steps. backend: "compiled" kernels or "torch". Default: compiled where the
-    device is the CPU, contacts are one-sided and no gradient is required.
+    device is the CPU and no gradient is required.
     """
 
     walls: Sequence[Wall] = ()
@@ -123,11 +124,6 @@ class Mechanics(Effect):
                 "Mechanics.contact_overlap is for one-sided contacts that follow their force: leave"
                 " it out, or leave out alpha, stiffness and contacts='bilateral'."
             )
-        if (self.contacts, self.backend) == ("bilateral", "compiled"):
-            raise checks.InputError(
-                "Mechanics.backend = 'compiled' is for one-sided contacts; bilateral ones are"
-                " computed by torch. Leave backend out, or take contacts='one-sided'."
-            )
         object.__setattr__(self, "walls", tuple(self.walls))
         self.surfaces()  # raises for a wall that does not fit the dimension
         self.physical_values()  # raises for a wall value that is not allowed
@@ -171,7 +167,7 @@ class Mechanics(Effect):
 
     def backend_on(self, device: torch.device) -> str:
         """Who computes the contacts on a device: "compiled" or "torch"."""
-        if not self.one_sided or self.backend == "torch":
+        if self.backend == "torch":
             return "torch"
         reason = (
             f"the device is {device.type}, and kernels are for the CPU"
@@ -271,7 +267,7 @@ class Mechanics(Effect):
         if isinstance(settings, OneSidedSettings):
             lines = self._one_sided_numerics(settings, kind, state.device)
         else:
-            lines = self._bilateral_numerics(settings, kind)
+            lines = self._bilateral_numerics(settings, kind, state.device)
         soft = [
             wall for wall in self.walls if wall.stiffness is not None or wall.weight is not None
         ]
@@ -291,8 +287,6 @@ class Mechanics(Effect):
             else f"at most {settings.passes} a step, more than one only around cells deeper than"
             f" {deep}"
         )
-        who = self.backend_on(device)
-        also = "; by torch where gradients are required" if who == "compiled" else ""
         return [
             f"contacts: one-sided, they only push; {kind}",
             (
@@ -300,12 +294,18 @@ class Mechanics(Effect):
                 f" {self.max_elongation:g} µm takes sub-steps"
             ),
             (
-                f"solver: Newton and conjugate gradients, {who}{also}, contact forces to"
-                f" {settings.tolerance:g}, at most {self.max_iterations} iterations a solve"
+                f"solver: Newton and conjugate gradients, {self._who(device)}, contact forces"
+                f" to {settings.tolerance:g}, at most {self.max_iterations} iterations a solve"
             ),
         ]
 
-    def _bilateral_numerics(self, settings: ContactSettings, kind: str) -> list[str]:
+    def _who(self, device: torch.device) -> str:
+        who = self.backend_on(device)
+        return f"{who}; by torch where gradients are required" if who == "compiled" else who
+
+    def _bilateral_numerics(
+        self, settings: ContactSettings, kind: str, device: torch.device
+    ) -> list[str]:
         over = (
             ""
             if self.overlap is None
@@ -319,8 +319,8 @@ class Mechanics(Effect):
                 f" {settings.coarse_passes} passes"
             ),
             (
-                "solver: conjugate gradients, torch, each colony to a worst residual of"
-                f" {self._tolerance()}, at most {self.max_iterations} iterations"
+                f"solver: conjugate gradients, {self._who(device)}, each colony to a worst residual"
+                f" of {self._tolerance()}, at most {self.max_iterations} iterations"
             ),
         ]
 

@@ -111,6 +111,27 @@ def add_scaled(typing, a, i, t, b, j, dof):
 
 
 @intrinsic
+def keep_greatest(typing, most, z, i, dof):
+    """most[0] = the greater of it and |z[i]|, lane by lane; what is no number is the greatest."""
+    _check(most, z)
+
+    def emit(context, builder, signature, given):
+        out = _Rows(context, builder, signature.args[0], given[0], len(dof))
+        rows = _Rows(context, builder, signature.args[1], given[1], len(dof))
+        # without their sign, numbers are in the order of their bits, and NaN comes after infinity
+        bits = ir.VectorType(ir.IntType(8 * out.bytes), len(dof))
+        sizes = ir.Constant(bits, [2 ** (8 * out.bytes - 1) - 1] * len(dof))
+        x = builder.bitcast(rows.load(_long(context, builder, signature, given, 2)), bits)
+        first = ir.Constant(ir.IntType(64), 0)
+        old, new = builder.bitcast(out.load(first), bits), builder.and_(x, sizes)
+        greater = builder.select(builder.icmp_signed(">", new, old), new, old)
+        out.store(first, builder.bitcast(greater, out.vector))
+        return context.get_dummy_value()
+
+    return types.void(most, z, i, dof), emit
+
+
+@intrinsic
 def put_product(typing, z, i, blocks, g, dof):
     """z[i] = blocks[i] @ g[i], for symmetric blocks (n, len(dof), len(dof)). z may be g."""
     _check(z, blocks, g)

@@ -26,6 +26,34 @@ def drags(length, radius, viscosity, length_drag, growth, scale, dof):
 
 
 @kernel
+def rotate(axis, turn, angle):
+    """Rotate a unit axis (d,) in place by a rotation vector, (3,), or (1,) in the plane, of this
+    size."""
+    sinc, versine = 1.0, 0.5
+    if angle > 1e-4:
+        sinc, versine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
+    ax, ay = axis[0], axis[1]
+    if axis.shape[0] == 2:
+        t = turn[0]
+        bx, by = (
+            ax - sinc * t * ay - versine * t * t * ax,
+            ay + sinc * t * ax - versine * t * t * ay,
+        )
+        size = math.sqrt(bx * bx + by * by)
+        axis[0], axis[1] = bx / size, by / size
+    else:
+        az = axis[2]
+        tx, ty, tz = turn[0], turn[1], turn[2]
+        ux, uy, uz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
+        wx, wy, wz = ty * uz - tz * uy, tz * ux - tx * uz, tx * uy - ty * ux
+        bx = ax + sinc * ux + versine * wx
+        by = ay + sinc * uy + versine * wy
+        bz = az + sinc * uz + versine * wz
+        size = math.sqrt(bx * bx + by * by + bz * bz)
+        axis[0], axis[1], axis[2] = bx / size, by / size, bz / size
+
+
+@kernel
 def move_cells(x, axis, length, y, scale, about, bound, least, dof):
     """Carry out the move y, its translation at most `bound` from `about` (n, D), and its rotation
     at most `bound` at the ends. Returns how many were cut short."""
@@ -52,29 +80,7 @@ def move_cells(x, axis, length, y, scale, about, bound, least, dof):
         for k in range(d, D - 1):
             y[i, k] *= turn * scale[i, k]
         y[i, D - 1] *= scale[i, D - 1]
-        angle *= turn
-        sinc, versine = 1.0, 0.5
-        if angle > 1e-4:
-            sinc, versine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
-        ax, ay = axis[i, 0], axis[i, 1]
-        if d == 2:
-            t = y[i, 2]
-            bx, by = (
-                ax - sinc * t * ay - versine * t * t * ax,
-                ay + sinc * t * ax - versine * t * t * ay,
-            )
-            size = math.sqrt(bx * bx + by * by)
-            axis[i, 0], axis[i, 1] = bx / size, by / size
-        else:
-            az = axis[i, 2]
-            tx, ty, tz = y[i, 3], y[i, 4], y[i, 5]
-            ux, uy, uz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
-            wx, wy, wz = ty * uz - tz * uy, tz * ux - tx * uz, tx * uy - ty * ux
-            bx = ax + sinc * ux + versine * wx
-            by = ay + sinc * uy + versine * wy
-            bz = az + sinc * uz + versine * wz
-            size = math.sqrt(bx * bx + by * by + bz * bz)
-            axis[i, 0], axis[i, 1], axis[i, 2] = bx / size, by / size, bz / size
+        rotate(axis[i], y[i, d : D - 1], angle * turn)
         length[i] = max(length[i] + y[i, D - 1], least[i])
     return clipped
 

@@ -55,6 +55,18 @@ def near_contacts(x, axis, half, radius, first, second, margin):
 
 
 @kernel
+def deeply_overlapping(found, radius):
+    """How many cells lie deeper in another than a radius."""
+    first, second, keep, _, gap = found
+    deeply = np.zeros(radius.shape[0], np.int64)
+    for k in range(keep.shape[0]):
+        i, j = first[keep[k]], second[keep[k]]
+        if gap[k] < -0.5 * (radius[i] + radius[j]):
+            deeply[i] = deeply[j] = 1
+    return deeply.sum()
+
+
+@kernel
 def _apart(ax, ay, az, cx, cy, cz, d):
     """A direction that separates two cells whose centrelines cross."""
     nx, ny, nz = -ay, ax, 0.0
@@ -206,13 +218,15 @@ def wall_gap(kind, place, size, px, py, pz):
 
 
 @kernel
-def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, rows, is_soft, dof):
+def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, rows, is_soft, hold,
+              dof):  # fmt: skip
     """Rows (H, gaps, one, two, soft) of cells nearer to a wall than reach (n,).
 
     roots: (S, n) D of each wall and cell. A plane, or a sphere from inside, has a row for each end
     of a cell; a sphere met from outside one for the nearest point, and one that its ends share.
-    soft: HARD, STIFF where the wall has a stiffness, LIGHT where its weight is below 1. Returns the
-    number of rows and the deepest gap.
+    soft: HARD, STIFF where the wall has a stiffness, LIGHT where its weight is below 1. hold: cells
+    that are apart are held there, by rows of a weight that falls to 0 at their reach, instead of
+    let come. Returns the number of rows and the deepest gap.
     """
     d = 2 if len(dof) == 4 else 3
     H, gaps, one, two, soft = rows
@@ -244,6 +258,8 @@ def wall_rows(x, axis, half, radius, scale, kinds, places, sizes, roots, reach, 
                 if kind == HARD:
                     deepest = min(deepest, gap)
                 weight = share * roots[w, i]
+                if hold and gap > 0.0:
+                    weight, gap = weight * (1.0 - gap / reach[i]), 0.0
                 _put_half(H, 2 * r, i, weight, s, end, nx, ny, nz, axis, scale, dof)
                 gaps[r], one[r], two[r], soft[r] = weight * gap, i, -1, kind
                 r += 1

@@ -25,7 +25,7 @@ LAG = 0.5
 SOFTER, MOST_SOFTER = 8.0, 8.0**5
 # A repeated pass moves the cells that lie deep and those up to HOPS contacts away.
 HOPS = 3
-# No cell turns by more than this in one pass, rad.
+# No cell turns by more than this in one pass, rad. Bilateral contacts have the same bound.
 MAX_TURN = 0.5
 # Relative error of the contact forces that a solve leaves, root mean square; passes at most.
 TOLERANCE, PASSES = 0.07, 8

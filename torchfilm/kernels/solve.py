@@ -44,9 +44,10 @@ def add_product(H, one, two, on, p, out, dof):
 
 
 @kernel
-def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, dof):
+def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, floor, dof):
     """The inverse of cell i's own block of JᵀAJ + α, worked out in B in float64; 0 in its last row
-    and column where the length is held. Returns the entry of the length."""
+    and column where the length is held. The diagonal is raised by its share `floor`: rounding must
+    leave it positive definite. Returns the entry of the length."""
     end = degrees(dof) - 1
     B[:] = 0.0
     for q in range(begin[i], begin[i + 1]):
@@ -54,7 +55,7 @@ def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, dof):
         if act[h >> 1]:
             add_square(B, H, h, dof)
     for k in range(end + 1):
-        B[k, k] = B[k, k] * (1 + 1e-9) + alpha
+        B[k, k] = B[k, k] * (1 + floor) + alpha
     own = B[end, end]
     if held:
         B[end], B[:, end] = 0.0, 0.0
@@ -136,35 +137,43 @@ def _stop_at_bounds(y, d, low, lengths, slope, own, dof):
 
 
 @kernel
+def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
+    """Go along the direction p: d += t p, and g becomes the gradient there and z = P⁻¹ g. z is 0
+    before; rz: g · P⁻¹ g before. Returns g · z."""
+    n = g.shape[0]
+    add_product(H, one, two, on, p, z, dof)
+    curvature = 0.0
+    for i in range(n):
+        add_scaled(z, i, alpha[i], p, i, dof)
+        curvature += dot(p, i, z, i, dof)
+    t[0], new = rz / curvature, 0.0
+    for i in range(n):
+        add_scaled(d, i, t[0], p, i, dof)
+        add_scaled(g, i, t[0], z, i, dof)
+        put_product(z, i, inverse, g, dof)
+        new += dot(g, i, z, i, dof)
+    return new
+
+
+@kernel
 def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit, dof):
     """d = −(JᵀAJ + α)⁻¹ g, to FORCING of the residual; g becomes the residual. Iterations."""
-    n = g.shape[0]
     t = np.zeros(1, g.dtype)  # a scalar of the same precision
     d[:], p[:] = 0, 0
-    _next_direction(p, z, t[0])
+    next_direction(p, z, t[0])
     rz, count = gz, 0
     while count < limit and rz > 0:
-        add_product(H, one, two, on, p, z, dof)
-        curvature = 0.0
-        for i in range(n):
-            add_scaled(z, i, alpha[i], p, i, dof)
-            curvature += dot(p, i, z, i, dof)
-        t[0], new = rz / curvature, 0.0
-        for i in range(n):
-            add_scaled(d, i, t[0], p, i, dof)
-            add_scaled(g, i, t[0], z, i, dof)
-            put_product(z, i, inverse, g, dof)
-            new += dot(g, i, z, i, dof)
+        new = cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof)
         count += 1
         if not (new > FORCING * FORCING * gz and new < np.inf):
             break
         t[0], rz = new / rz, new
-        _next_direction(p, z, t[0])
+        next_direction(p, z, t[0])
     return count
 
 
 @kernel
-def _next_direction(p, z, t):
+def next_direction(p, z, t):
     """p = t p − z, and z = 0."""
     p, z = p.reshape(-1), z.reshape(-1)
     for k in range(p.shape[0]):
@@ -211,7 +220,7 @@ def _refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inver
             held[i] = at_bound or alone[i]
             stale[i] = 1
         if stale[i]:
-            own[i] = put_inverse(H, begin, halves, act, i, alpha[i], held[i], inverse, B, dof)
+            own[i] = put_inverse(H, begin, halves, act, i, alpha[i], held[i], inverse, B, 1e-9, dof)
             stale[i] = 0
 
 
@@ -250,7 +259,7 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
     g, z, d, p = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
     inverse = np.empty((n, len(dof), len(dof)), y.dtype)
     begin, halves = rows_of_cells(one, two, rows, n)
-    one, two = one[:rows], _second_cells(H, one, two, rows)
+    one, two = one[:rows], second_cells(H, one, two, rows)
     for i in range(n):
         y[i, D - 1] = max(y[i, D - 1], low[i])
     times_rows(H, one, two, y, q, dof)
@@ -299,7 +308,7 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
 
 
 @kernel
-def _second_cells(H, one, two, rows):
+def second_cells(H, one, two, rows):
     """The second cell of each row; the first where there is no second, whose half of the row is
     made 0. So all rows are alike."""
     other = two[:rows].copy()

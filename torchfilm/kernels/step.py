@@ -7,12 +7,14 @@ import math
 
 import numpy as np
 
+from torchfilm.kernels.batch import cells_of, put_back
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.moves import approach, drags, move_cells
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
 from torchfilm.kernels.rows import (
     HARD,
     STIFF,
+    deeply_overlapping,
     degrees,
     near_contacts,
     pair_rows,
@@ -114,8 +116,8 @@ def _wall_contacts(x, axis, half, radius, scale, kinds, places, sizes, root, rea
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
     rows = H, gaps, one, two, np.zeros(room, np.uint8)
     walls, deepest = wall_rows(
-        x, axis, half, radius, scale, kinds, places, sizes, root, reach, rows, is_soft, dof
-    )
+        x, axis, half, radius, scale, kinds, places, sizes, root, reach, rows, is_soft, False, dof,
+    )  # fmt: skip
     return rows, walls, deepest
 
 
@@ -198,7 +200,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, har
             dof,
         )  # fmt: skip
         if number == 0:
-            report[DEEPLY] = 0 if settings[SOFT] > 0 else _deeply(found, radius)
+            report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(found, radius)
         elif min(deepest, _deepest(found[4])) >= -deep or number == passes or settings[SOFT] > 0:
             break
         numbers, count = _deep_cells(found, rows, walls, deep, 0 if number == 0 else y.shape[0])
@@ -260,18 +262,6 @@ def _of_colony(base, growth, radius, viscosity, settings):
 
 
 @kernel
-def _deeply(found, radius):
-    """How many cells lie deeper in another than a radius."""
-    first, second, keep, _, gap = found
-    deeply = np.zeros(radius.shape[0], np.int64)
-    for k in range(keep.shape[0]):
-        i, j = first[keep[k]], second[keep[k]]
-        if gap[k] < -0.5 * (radius[i] + radius[j]):
-            deeply[i] = deeply[j] = 1
-    return deeply.sum()
-
-
-@kernel
 def _following(e, soft, hardness, target, softest):
     """α at which the mean overlap of the contacts that push, with cells and with hard walls, is
     `target`, µm: harder at once, softer by a factor of two a step."""
@@ -297,23 +287,11 @@ def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosit
     Cells of colony b are begin[b] … begin[b + 1] − 1. x: (N, d) float64. length: before growth.
     places: (S, B, 3); sizes: (S, B). reports: (B, REPORT). For the others see `step_colony`.
     """
-    D = degrees(dof)
-    d = 2 if D == 4 else 3
     for b in which:
-        n = begin[b + 1] - begin[b]
-        if n == 0 or steps[b] == 0:
+        if begin[b + 1] == begin[b] or steps[b] == 0:
             continue
         of = spatial_order(x[begin[b] : begin[b + 1]], 6.0 * radius[begin[b]]) + begin[b]
-        own_x, own_axis = np.empty((n, d)), np.empty((n, d))
-        own_last = np.zeros((n, len(dof)), last.dtype)
-        own_roots = np.empty((roots.shape[0], n))
-        for i in range(n):
-            for k in range(d):
-                own_x[i, k], own_axis[i, k] = x[of[i], k], axis[of[i], k]
-            for k in range(D):
-                own_last[i, k] = last[of[i], k]
-            for w in range(roots.shape[0]):
-                own_roots[w, i] = roots[w, of[i]]
+        own_x, own_axis, own_last, own_roots = cells_of(of, x, axis, last, roots, dof)
         own_length = length[of].astype(np.float64)
         share = growth[of].astype(np.float64) / steps[b]
         own_settings = settings.copy()
@@ -333,9 +311,4 @@ def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosit
                 break
         if reports[b, STATUS] == NOT_FINITE:
             continue
-        for i in range(n):
-            for k in range(d):
-                x[of[i], k], axis[of[i], k] = own_x[i, k], own_axis[i, k]
-            for k in range(D):
-                last[of[i], k] = own_last[i, k]
-            length[of[i]] = own_length[i]
+        put_back(of, own_x, own_axis, own_last, own_length, x, axis, last, length, dof)

@@ -1,4 +1,4 @@
-"""Steps of one-sided contacts by compiled kernels: the same as `one_sided`, on the CPU."""
+"""Contact steps by compiled kernels: the same as `one_sided` and `bilateral`, on the CPU."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.physics.one_sided_records import StepInput, StepResult
+from torchfilm.physics.contact_records import ContactSettings
+from torchfilm.physics.one_sided_records import OneSidedSettings
+from torchfilm.physics.step_records import StepInput, StepResult
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.tools.ragged import Groups, offsets
 
@@ -78,39 +80,30 @@ def _array(value: Tensor, dtype: torch.dtype) -> np.ndarray:
 
 @torch.no_grad()
 def contact_steps(given: StepInput) -> StepResult:
-    """As `one_sided.contact_steps`."""
+    """As `one_sided.contact_steps` and `bilateral.contact_steps`."""
     from torchfilm.kernels import step as kernels
     from torchfilm.kernels.compiling import keep
 
     dtype = given.radius.dtype
     name = f"{given.settings.dim}-D, {str(dtype).removeprefix('torch.')}"
+    step_colonies, numbers = _kernel_of(given.settings)
+    if isinstance(given.settings, ContactSettings):
+        name = f"{name}, bilateral"
     new = _announce(name)
     counts = given.groups.counts
     begin, steps = offsets(counts).numpy(), given.steps.numpy()
     position, axis = given.position.clone(), given.axis.clone()
     length, move = given.length.clone(), given.start.clone()
     hardness = given.hardness.clone()
-    settings = given.settings
-    numbers = np.array(
-        [
-            -1.0 if settings.overlap is None else settings.overlap,
-            settings.tolerance,
-            settings.passes,
-            settings.max_iterations,
-            settings.soft,
-            settings.contact_overlap,
-        ],
-        dtype=np.float64,
-    )
     reports = np.zeros((counts.numel(), kernels.REPORT))
     arguments = (
         begin, steps, position.numpy(), axis.numpy(), length.numpy(),
         *(_array(x, dtype) for x in (given.growth, given.radius, given.viscosity,
         given.length_drag)), move.numpy(), hardness.numpy(), *_walls(given),
         _array(given.radius[:0] if given.alpha is None else given.alpha, dtype), numbers, reports,
-        (0,) * (4 if settings.dim == 2 else 8),
+        (0,) * (4 if given.settings.dim == 2 else 8),
     )  # fmt: skip
-    for done in _started(kernels.step_colonies, begin, counts.numpy(), arguments):
+    for done in _started(step_colonies, begin, counts.numpy(), arguments):
         done()
     if new:
         keep(name)
@@ -121,6 +114,25 @@ def contact_steps(given: StepInput) -> StepResult:
         column(kernels.ITERATIONS), torch.from_numpy(reports[:, kernels.ERROR].copy()),
         column(kernels.PASSES), column(kernels.CLIPPED), column(kernels.DEEPLY),
     )  # fmt: skip
+
+
+def _kernel_of(settings: OneSidedSettings | ContactSettings):
+    """The kernel of this kind of contacts, and its settings as numbers."""
+    overlap = -1.0 if settings.overlap is None else settings.overlap
+    if isinstance(settings, ContactSettings):
+        from torchfilm.kernels.bilateral import step_colonies as of_bilateral
+
+        tolerance = -1.0 if settings.tolerance is None else settings.tolerance
+        passes = settings.passes, settings.coarse_passes
+        numbers = [overlap, tolerance, *passes, settings.max_iterations, settings.soft]
+        return of_bilateral, np.array(numbers, dtype=np.float64)
+    from torchfilm.kernels.step import step_colonies
+
+    numbers = [
+        overlap, settings.tolerance, settings.passes, settings.max_iterations, settings.soft,
+        settings.contact_overlap,
+    ]  # fmt: skip
+    return step_colonies, np.array(numbers, dtype=np.float64)
 
 
 def _started(kernel, begin: np.ndarray, counts: np.ndarray, arguments: tuple):

@@ -9,24 +9,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.bilateral_scheme import COARSE_PASSES
 from torchfilm.physics.problem import SolveReport
 from torchfilm.physics.surfaces import Surface
 from torchfilm.tools.ragged import Groups
-
-# What a pass leaves overlapping by more than DEEP radii is solved again in the next one, among all
-# the others at rest. It is a few cells in a hundred, which slip or turn. For the others one solve
-# already reaches the overlap that the penalty allows, and solving for them again takes twice the
-# time.
-DEEP = 0.2
-# The overlap, µm, that colonies which take sub-steps are solved to: their steps are coarse.
-CLOSE = 0.02
-COARSE_PASSES = 6
-# Tolerance of the solve at the default penalty α γ. Overlaps hardly depend on it, growth under
-# pressure does: at 0.2 a twentieth of what a colony grows is wrong, at 0.05 less than a hundredth.
-# The harder contacts are, the farther from rest is what moves with none of them at the same
-# residual: a tolerance that falls as (α γ)^¼ is enough from 0.1 down to 1e-6 (0.02 is needed at
-# 0.01), and one that falls faster is out of reach of float32.
-PENALTY, TOLERANCE = 0.1, 0.05
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.bilateral_scheme import NEAR
 from torchfilm.physics.contact_records import CellProperties, ContactReport, Moved
-from torchfilm.physics.contacts import NEAR, CandidateContacts, Capsules, contact_gaps
+from torchfilm.physics.contacts import CandidateContacts, Capsules, contact_gaps
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
 from torchfilm.tools.ragged import marked

@@ -18,14 +18,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.bilateral_scheme import PENALTY, TOLERANCE
+from torchfilm.kernels.scheme import MAX_TURN
 from torchfilm.physics import capsule
-from torchfilm.physics.contact_records import (
-    PENALTY,
-    TOLERANCE,
-    CellProperties,
-    ContactReport,
-    Moved,
-)
+from torchfilm.physics.contact_records import CellProperties, ContactReport, Moved
 from torchfilm.physics.contact_search import (
     find_contacts,
     note_deeply_overlapping,
@@ -38,10 +34,6 @@ from torchfilm.physics.problem import NOT_FINITE, ContactProblem, SolveReport
 from torchfilm.physics.solve import solve_contacts
 from torchfilm.physics.wall_contacts import WallContacts, share_to_walls
 from torchfilm.tools.reads import numbers, places, places_of
-
-# No cell turns by more than this in one solve, rad: beyond it the linearised contacts mean nothing.
-# A cell that would turn further makes a part of its move, and takes part in the next pass.
-MAX_TURN = 0.5
 
 
 def contact_step(
@@ -185,8 +177,9 @@ def move_cells(
 @torch.no_grad()
 def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tensor]:
     """How far the surface of each cell would come with the whole of its move, (N,) µm, and which
-    share of it the cell makes, (N,): see MAX_TURN; and no farther than its radius behind a wall
-    that it may not have touched before.
+    share of it the cell makes, (N,): it turns by MAX_TURN at most, beyond which the linearised
+    contacts mean nothing, and then takes part in the next pass; and it comes no farther than its
+    radius behind a wall that it may not have touched before.
     """
     dim, radius = cells.settings.dim, cells.radius
     turn, way = (x.square().sum(1).sqrt() for x in (move[:, dim:-1], move[:, :dim]))

@@ -12,6 +12,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.bilateral_scheme import CANDIDATE, NEAR
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.tools.reads import places
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
@@ -19,9 +20,6 @@ from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_s
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see
 # `contact_points`).
 LINE_CONTACT_SINE = 0.4
-# Distance of two surfaces, in radii, within which a later pass keeps them at least as far apart as
-# they are (see `contacts_of`).
-NEAR = 0.1
 
 
 @dataclass(frozen=True)
@@ -241,9 +239,7 @@ class CandidateContacts:
     ) -> CandidateContacts:
         """The given pairs, each (P,), that overlap; with include_near also those within NEAR."""
         found = CandidateContacts.all_of(capsules, first, second)
-        # no point of a line is nearer than the closest one, except for rounding; this margin is
-        # many times larger
-        most = max(1e-3, 0.5 * NEAR * include_near) * (found.a.radius + found.b.radius)
+        most = max(CANDIDATE, 0.5 * NEAR * include_near) * (found.a.radius + found.b.radius)
         return found.nearer_than(most)
 
     @property

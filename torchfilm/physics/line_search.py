@@ -5,13 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.bilateral_scheme import BEYOND_BOUND, DOWNHILL, MAX_HALVINGS, STEEP
 from torchfilm.physics.problem import ContactProblem
-
-# A step is kept if its upward slope at the end is at most STEEP of the slope at the start.
-STEEP = 0.5
-# With lengths stopped at their bounds, a step must keep DOWNHILL of its slope, or it is halved. A
-# step is shortened at most MAX_HALVINGS times.
-DOWNHILL, MAX_HALVINGS = 0.01, 30
 
 
 def search_line(problem: ContactProblem, y, after, gradient, direction, going):
@@ -62,8 +57,8 @@ def _share_to_bound(problem: ContactProblem, y: Tensor, direction: Tensor) -> Te
     """
     room, way = y[:, -1] - problem.lower, direction[:, -1]
     shrinks = (room > 0) & (way < 0)
-    # slightly more, so that the length is stopped at the bound and not just before it
-    share = torch.where(shrinks, room / torch.where(shrinks, -way, 1.0), torch.inf) * (1 + 1e-5)
+    share = torch.where(shrinks, room / torch.where(shrinks, -way, 1.0), torch.inf)
+    share = share * (1 + BEYOND_BOUND)
     return -problem.colonies.max(-share, empty=-torch.inf)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.bilateral_scheme import FINISH, NEWTON_LIMIT, ROUNDING_UNITS, STALLED
 from torchfilm.physics.line_search import search_line
 from torchfilm.physics.preconditioner import FreeDofPreconditioner, Map, block_inverse
 from torchfilm.physics.problem import (
@@ -25,15 +26,6 @@ from torchfilm.physics.problem import (
 from torchfilm.tools.cg import conjugate_gradients, worst_of
 from torchfilm.tools.ragged import Blocks
 from torchfilm.tools.reads import numbers, places_of
-
-# The share of its target that CG must reach. It is below 1, since lengths that meet their bound
-# undo part of the progress, and the true residual differs by rounding from the recurred one.
-# Measured: 0.5 costs as much as 0.8, in fewer rounds of more iterations, and leaves a smaller
-# residual.
-FINISH = 0.5
-# A solve is limited by its CG iterations, and each round takes at least one. This many rounds is
-# the last resort.
-NEWTON_LIMIT = 200
 
 
 @dataclass(frozen=True)
@@ -134,7 +126,7 @@ def _newton_rounds(
         worst = worst_of(precondition(gradient), colonies)
         target = tolerance * scale
         going = (worst > target) & (worst < torch.inf) & (iterations < max_iterations)
-        stalled = going & (worst > 0.9 * previous)
+        stalled = going & (worst > STALLED * previous)
         some_stalled, *left = numbers(stalled.any(), *_sizes(problem, going))
         if some_stalled:
             # where opposing forces on a cell cancel, rounding limits the residual that can be
@@ -197,13 +189,14 @@ def _minority(
 def _rounding_residual(problem: ContactProblem, precondition: Map, y: Tensor) -> Tensor:
     """The residual that rounding alone may leave in each colony, (B,).
 
-    It is a few units in the last place of the sum of the absolute forces on a cell.
+    It is some units in the last place of the sum of the absolute forces on a cell.
     """
     forces = (
         problem.rows.transpose_of_sizes(problem.gap.abs() + problem.rows.sizes_of(y))
         + problem.alpha * y.abs()
     )
-    return 2 * torch.finfo(y.dtype).eps * worst_of(precondition(forces), problem.colonies)
+    rounding = ROUNDING_UNITS * torch.finfo(y.dtype).eps
+    return rounding * worst_of(precondition(forces), problem.colonies)
 
 
 def _free_dofs(y: Tensor, gradient: Tensor, problem: ContactProblem) -> Tensor:

@@ -33,10 +33,10 @@ from torchfilm.physics.contacts import (
 )
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.neighbours import Neighbourhood
-from torchfilm.physics.one_sided_records import StepInput, StepResult
 from torchfilm.physics.one_sided_solve import Minimum, minimise
 from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
 from torchfilm.physics.solve import warn_if_loose
+from torchfilm.physics.step_records import StepInput, StepResult
 from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
 from torchfilm.tools.ragged import marked, offsets
 from torchfilm.tools.reads import numbers, places

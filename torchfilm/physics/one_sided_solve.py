@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.bilateral_scheme import BLOCK_FLOOR
 from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS, ROUNDING
-from torchfilm.physics.preconditioner import BLOCK_FLOOR, symmetric_inverse
+from torchfilm.physics.preconditioner import symmetric_inverse
 from torchfilm.physics.problem import ContactProblem
 from torchfilm.tools.cg import conjugate_gradients
 from torchfilm.tools.ragged import Blocks, Groups

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.bilateral_scheme import BLOCK_FLOOR
 from torchfilm.physics.problem import ContactProblem
 from torchfilm.tools.ragged import Blocks
 
@@ -14,8 +15,6 @@ Map = Callable[[Tensor], Tensor]
 # The inverse block of a cell with a fixed length follows from a subtraction. The subtraction must
 # leave this share of each diagonal entry.
 LEAST_LEFT = 1e-3
-# Each cell's block is raised by this many units in the last place of its diagonal before inversion.
-BLOCK_FLOOR = 64
 
 
 def block_inverse(problem: ContactProblem) -> Tensor:

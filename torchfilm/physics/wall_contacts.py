@@ -8,16 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfilm.physics.contacts import NEAR
+from torchfilm.kernels.bilateral_scheme import NEAR, POINTS_ON_MOVE
 from torchfilm.physics.surfaces import FlatSurface, Surface
 from torchfilm.tools.reads import places
 from torchfilm.tools.vectors import cross, dot, safe_sqrt
 
 # Position (P, d) float64, axis (P, d) and half length (P,) of some capsules.
 Pose = tuple[Tensor, Tensor, Tensor]
-# The number of points along a move where a sphere met from outside is looked for. Other walls have
-# all cells on one side, so the end of the move is enough.
-POINTS_ON_MOVE = 8
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,38 @@
+"""The cells of one colony, taken out of a batch and put back."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.rows import degrees
+
+
+@kernel
+def cells_of(of, x, axis, last, roots, dof):
+    """x and axis (n, d) in float64, last (n, len(dof)) and roots (S, n) of the cells `of`."""
+    D = degrees(dof)
+    n, d = of.shape[0], 2 if D == 4 else 3
+    own_x, own_axis = np.empty((n, d)), np.empty((n, d))
+    own_last, own_roots = np.zeros((n, len(dof)), last.dtype), np.empty((roots.shape[0], n))
+    for i in range(n):
+        for k in range(d):
+            own_x[i, k], own_axis[i, k] = x[of[i], k], axis[of[i], k]
+        for k in range(D):
+            own_last[i, k] = last[of[i], k]
+        for w in range(roots.shape[0]):
+            own_roots[w, i] = roots[w, of[i]]
+    return own_x, own_axis, own_last, own_roots
+
+
+@kernel
+def put_back(of, own_x, own_axis, own_last, own_length, x, axis, last, length, dof):
+    """Write what the cells `of` have become into the batch."""
+    D = degrees(dof)
+    d = 2 if D == 4 else 3
+    for i in range(of.shape[0]):
+        for k in range(d):
+            x[of[i], k], axis[of[i], k] = own_x[i, k], own_axis[i, k]
+        for k in range(D):
+            last[of[i], k] = own_last[i, k]
+        length[of[i]] = own_length[i]

@@ -1,0 +1,250 @@
+"""Contact steps with bilateral rows, each colony by itself: as in `physics.contact_step`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from torchfilm.kernels.batch import cells_of, put_back
+from torchfilm.kernels.bilateral_moves import make_moves
+from torchfilm.kernels.bilateral_scheme import CANDIDATE, CLOSE, DEEP, NEAR, PENALTY
+from torchfilm.kernels.bilateral_scheme import TOLERANCE as USUAL_TOLERANCE
+from torchfilm.kernels.bilateral_solve import minimise
+from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.moves import drags
+from torchfilm.kernels.neighbours import near_pairs, spatial_order
+from torchfilm.kernels.rows import (
+    STIFF,
+    deeply_overlapping,
+    degrees,
+    near_contacts,
+    pair_rows,
+    rows_among,
+    wall_rows,
+)
+from torchfilm.kernels.scheme import NOT_FINITE
+from torchfilm.kernels.step import CLIPPED, DEEPLY, ERROR, ITERATIONS, PASSES, STATUS
+
+# Places in the settings. OVERLAP, TOLERANCE: below 0 where they are not given.
+OVERLAP, TOLERANCE, MOST_PASSES, COARSE_PASSES, LIMIT, SOFT = range(6)
+
+
+@kernel
+def _keep(rows, r, new, root, soft):
+    """Row r becomes row `new`, its weight multiplied by `root`, its gap at most 0."""
+    H, gaps, one, two, stiff = rows
+    for k in range(H.shape[1]):
+        H[2 * new, k] = root * H[2 * r, k]
+        H[2 * new + 1, k] = root * H[2 * r + 1, k]
+    gaps[new] = root * min(gaps[r], 0 * gaps[r])
+    one[new], two[new] = one[r], two[r]
+    if soft:
+        stiff[new] = STIFF
+    return new + 1
+
+
+@kernel
+def _root(gap, margin):
+    """The root of a row's weight: 1 for an overlap, 0 from a distance of `margin`."""
+    if gap < 0:
+        return 1.0
+    return max(1.0 - gap / margin, 0.0) if margin > 0 else 0.0
+
+
+@kernel
+def _holding_rows(rows, walls, m, radius, hold, soft):
+    """Of the rows after the first `walls` ones, keep those that overlap, and hold what else
+    `physics.contacts.contacts_of` holds: the other end of a line, and with `hold` what is near.
+    Returns how many are left."""
+    _, gaps, one, two, _ = rows
+    half, r, new = math.sqrt(0.5), walls, walls
+    while r < m:
+        margin = 0.5 * NEAR * (radius[one[r]] + radius[two[r]]) if hold else 0.0
+        if r + 1 == m or one[r + 1] != one[r] or two[r + 1] != two[r]:
+            if gaps[r] < margin:
+                new = _keep(rows, r, new, _root(gaps[r], margin), soft)
+            r += 1
+            continue
+        low, high = gaps[r] / half, gaps[r + 1] / half  # a line has two rows of weight ½
+        touches = (low < margin or high < margin) and low + high < 0
+        deepest = min(low, high)
+        held = min(max((low + high) / deepest, 0.0), 1.0) if deepest < 0 else 0.0
+        for k in range(2):
+            end = high if k else low
+            if end < margin or touches:
+                new = _keep(rows, r + k, new, max(_root(end, margin), math.sqrt(held)), soft)
+        r += 2
+    return new
+
+
+@kernel
+def _contacts(x, axis, half, radius, hold, dof):
+    """Pairs that overlap, with `hold` also those that are near, and some more: see
+    `near_contacts`."""
+    margin = 2.0 * max(CANDIDATE, 0.5 * NEAR * hold) * radius.max()
+    first, second = near_pairs(x, axis, half, radius, margin, dof)
+    keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin)
+    return first, second, keep, points, gap
+
+
+@kernel
+def _wall_contacts(x, axis, half, radius, scale, alpha, kinds, places, sizes, roots, is_soft, hold,
+                   overlap, found, left, like, dof):  # fmt: skip
+    """Rows of cells at walls, with room for those of the contacts `found`; how many there are.
+    Marks in `left` the cells that lie too deep in a wall."""
+    n, number = x.shape[0], 0
+    room = 2 * found[2].shape[0] + 3 * kinds.shape[0] * n
+    H, gaps = np.empty((2 * room, len(dof)), like.dtype), np.empty(room, like.dtype)
+    one, two = np.empty(room, np.int32), np.empty(room, np.int32)
+    soft = np.zeros(room, np.uint8)
+    for w in range(kinds.shape[0]):
+        root = np.sqrt(roots[w] * alpha) if is_soft[w] else roots[w].copy()
+        reach = NEAR * radius * (hold and not is_soft[w])
+        rows = H[2 * number :], gaps[number:], one[number:], two[number:], soft[number:]
+        of, root_of = slice(w, w + 1), root.reshape(1, n)
+        more, _ = wall_rows(
+            x, axis, half, radius, scale, kinds[of], places[of], sizes[of], root_of, reach, rows,
+            is_soft[of], hold, dof,
+        )  # fmt: skip
+        for r in range(number, number + more):
+            i = one[r]
+            if not is_soft[w] and root[i] * gaps[r] < -overlap[i]:
+                left[i] = 1
+        number += more
+    return (H, gaps, one, two, soft), number
+
+
+@kernel
+def _mark_deep(found, overlap, left):
+    """Mark in `left` the cells of contacts that are too deep."""
+    first, second, keep, _, gap = found
+    for k in range(keep.shape[0]):
+        i, j = first[keep[k]], second[keep[k]]
+        if gap[k] < -0.5 * (overlap[i] + overlap[j]):
+            left[i] = left[j] = 1
+
+
+@kernel
+def _contacts_of(found, left):
+    """The contacts of marked cells."""
+    first, second, keep, points, gap = found
+    which = (left[first[keep]] | left[second[keep]]) > 0
+    return first, second, keep[which], points[which], gap[which]
+
+
+@kernel
+def _solved(rows, m, left, count, start, growth, alpha, low, tolerance, limit, again, dof):
+    """The scaled move (n, len(dof)) of the `count` marked cells among the others at rest, by the
+    first m of the rows. again: whether soft rows have already pushed. Also iterations, error and
+    status."""
+    H, gaps, one, two, soft = rows
+    numbers = np.where(left > 0, np.cumsum(left), 0).astype(np.int32) - 1
+    if count < left.shape[0]:
+        m = rows_among(H, gaps, one, two, soft, m, numbers)
+    pushed = np.zeros(m, H.dtype)
+    for r in range(m):
+        if again and soft[r] == STIFF:
+            pushed[r] = -min(gaps[r], 0 * gaps[r])
+    which = np.flatnonzero(left)
+    part, rigid = start[which], growth[which] <= 0
+    iterations, error, status = minimise(
+        H, one, two, m, gaps, pushed, alpha[which], low[which], rigid, part, tolerance, limit, dof
+    )
+    y = np.zeros_like(start)
+    for p in range(count):
+        for k in range(y.shape[1]):
+            y[which[p], k] = part[p, k]
+    return y, iterations, error, status
+
+
+@kernel
+def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, start, last, overlap,
+                kinds, places, sizes, roots, is_soft, passes, tolerance, limit, soft, report,
+                dof):  # fmt: skip
+    """Grow one colony by `growth` and part what overlaps, in up to `passes` passes; x and axis in
+    place. Returns lengths.
+
+    x, axis: (n, d) float64. base, growth, radius, viscosity, length_drag, overlap: (n,) float64.
+    alpha: (n,). start: (n, len(dof)) the move from which the first pass starts; last: the move that
+    it solves for.
+    """
+    n, end = base.shape[0], degrees(dof) - 1
+    length, scale, grows = base + growth, np.zeros(last.shape), np.ones(n)
+    left, clipped, y = np.ones(n, np.uint8), np.zeros(n, np.uint8), np.zeros_like(start)
+    for number in range(passes):
+        again = number > 0
+        hold, half = again and not soft, 0.5 * length
+        drags(length, radius, viscosity, length_drag, grows, scale, dof)
+        found = _contacts(x, axis, half, radius, hold, dof)
+        if again:
+            left[:] = clipped
+            if not soft:
+                _mark_deep(found, overlap, left)
+        elif not soft:
+            report[DEEPLY] = deeply_overlapping(found, radius)
+        rows, walls = _wall_contacts(
+            x, axis, half, radius, scale, alpha, kinds, places, sizes, roots, is_soft, hold,
+            overlap, found, left, last, dof,
+        )  # fmt: skip
+        count = int(left.sum())
+        if count == 0:
+            break
+        if again:
+            found, y[:] = _contacts_of(found, left), 0
+        else:
+            y[:, : end + 1] = start[:, : end + 1] / scale[:, : end + 1]
+        m = pair_rows(x, axis, half, radius, scale, found, walls, rows, dof)
+        m = _holding_rows(rows, walls, m, radius, hold, soft)
+        low = ((base - length) / scale[:, end]).astype(last.dtype)
+        y, iterations, error, status = _solved(
+            rows, m, left, count, y, growth, alpha, low, tolerance, limit, again, dof
+        )
+        report[ITERATIONS] += iterations
+        report[PASSES] += 1
+        report[ERROR] = error if not error <= report[ERROR] else report[ERROR]
+        report[STATUS] = max(report[STATUS], status)
+        if not again:
+            last[:, : end + 1] = y[:, : end + 1] * scale[:, : end + 1]
+        if status == NOT_FINITE:
+            y[:] = 0
+        report[CLIPPED] = make_moves(
+            x, axis, length, radius, y, scale, base, kinds, places, sizes, clipped, dof
+        )
+    return length
+
+
+@kernel
+def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosity, length_drag,
+                  last, hardness, kinds, places, sizes, roots, is_soft, alphas, settings, reports,
+                  dof):  # fmt: skip
+    """Steps of the colonies `which`: arguments as in `kernels.step.step_colonies`; hardness is not
+    used."""
+    soft, limit = settings[SOFT] > 0, int(settings[LIMIT])
+    for b in which:
+        if begin[b + 1] == begin[b] or steps[b] == 0:
+            continue
+        of = spatial_order(x[begin[b] : begin[b + 1]], 6.0 * radius[begin[b]]) + begin[b]
+        own_x, own_axis, own_start, own_roots = cells_of(of, x, axis, last, roots, dof)
+        own_length = length[of].astype(np.float64)
+        share = growth[of].astype(np.float64) / steps[b]
+        own_radius = radius[of].astype(np.float64)
+        own_viscosity = viscosity[of].astype(np.float64)
+        own_drag = length_drag[of].astype(np.float64)
+        own_alpha, own_last = alphas[of], own_start.copy()
+        coarse = steps[b] > 1
+        penalty = np.minimum(own_alpha * own_drag / PENALTY, 1.0)
+        overlap = np.full(of.shape[0], settings[OVERLAP])
+        if settings[OVERLAP] < 0:
+            overlap = (np.full_like(own_radius, CLOSE) if coarse else DEEP * own_radius) * penalty
+        tolerance = settings[TOLERANCE]
+        if tolerance < 0:
+            tolerance = USUAL_TOLERANCE * math.sqrt(math.sqrt(penalty.min()))
+        passes = int(settings[COARSE_PASSES] if coarse else settings[MOST_PASSES])
+        for _ in range(steps[b]):
+            own_length = step_colony(
+                own_x, own_axis, own_length, share, own_radius, own_viscosity, own_drag, own_alpha,
+                own_start, own_last, overlap, kinds, places[:, b], sizes[:, b], own_roots, is_soft,
+                passes, tolerance, limit, soft, reports[b], dof,
+            )  # fmt: skip
+        put_back(of, own_x, own_axis, own_last, own_length, x, axis, last, length, dof)
