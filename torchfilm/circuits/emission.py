@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 
@@ -50,7 +51,7 @@ class Equations:
     kinds: Mapping[str, Kind]
     builder: Builder
 
-    @property
+    @cached_property
     def leaves(self) -> tuple[str, ...]:
         """The names that are no variables, in order."""
         found = [e.name for e in walk(self.rates) if e.op == NAME]

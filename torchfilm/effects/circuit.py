@@ -152,12 +152,12 @@ class Circuit(Effect):
     def is_stochastic(self) -> bool:
         return self.method in (LEAP, DIRECT)
 
-    @property
+    @cached_property
     def variables(self) -> dict[str, str]:
         """The species of the rates by name, own ones first, and the field of each."""
         return {n: f"{self.name}_{n}" if self.name else n for n in self.species} | dict(self.shared)
 
-    @property
+    @cached_property
     def own_fields(self) -> tuple[str, ...]:
         """The fields of its own species."""
         return tuple(self.variables[n] for n in self.species)
