@@ -6,7 +6,7 @@ import hashlib
 import importlib.util
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from types import ModuleType
@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 WORTH_A_THREAD = 512
 
 
+_compiled: set[str] = set()  # modules that this process has run
+
+
 @dataclass(frozen=True, eq=False)
 class CompiledCircuit:
     """The equations of a circuit in cells of one type, and the functions compiled from them."""
@@ -44,6 +47,17 @@ class CompiledCircuit:
     @cached_property
     def module(self) -> ModuleType:
         return _module(source(self))
+
+    def _compile(self, work: Callable[[int, int], object]) -> None:
+        """By one thread, without cells; and say so where it takes time."""
+        from torchfilm.kernels.compiling import announce, keep
+
+        names = ", ".join(n.partition(".")[2] for n in self.equations.variables)
+        said = announce(self.module.__name__, f"a circuit ({names}), some seconds")
+        work(0, 0)
+        _compiled.add(self.module.__name__)
+        if said:
+            keep(self.module.__name__)
 
     def values(self, circuit: CircuitCells, rows: Tensor) -> dict[str, Tensor]:
         """The columns (M,) and numbers () of the names that are no variables, of the cells `rows`
@@ -92,10 +106,10 @@ class CompiledCircuit:
         limits = torch.finfo(start.dtype)
         run, arrays = self.module.run, (at.numpy(), packed, given)
         rest = (dt, max(rtol, 4 * limits.eps), atol, limits.eps, limits.max, MAX_STEPS)
-        shares_of(
-            count, WORTH_A_THREAD,
-            lambda first, last: run(first, last, *arrays, *rest, *report.numpy()),
-        )  # fmt: skip
+        work = lambda first, last: run(first, last, *arrays, *rest, *report.numpy())
+        if self.module.__name__ not in _compiled:
+            self._compile(work)
+        shares_of(count, WORTH_A_THREAD, work)
         return at.to(start.dtype), RosenbrockReport(*report)
 
 

@@ -29,7 +29,9 @@ def stencil(
     from torchfilm.kernels.medium import put_stencil
 
     count = position.shape[0]
-    used = torch.tensor([k for k in range(3) if any(s[k] > 1 for s in grid.shapes)], dtype=int)
+    used = torch.tensor(
+        [k for k in range(3) if any(s[k] > 1 for s in grid.shapes)], dtype=torch.int64
+    )
     node = torch.empty(count, 2 ** used.numel(), dtype=torch.int64)
     weight = torch.empty(node.shape, dtype=dtype)
     outside, blocked = torch.zeros(2, count, dtype=torch.bool)
