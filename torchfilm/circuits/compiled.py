@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits.emission import Equations, functions
-from torchfilm.circuits.expressions import NAME, Builder, Expression, walk
+from torchfilm.circuits.expressions import NAME, NUMBER, Builder, Expression, walk
 from torchfilm.circuits.graph import Leaves, evaluated, traced_rates
 from torchfilm.circuits.names import Names
 from torchfilm.circuits.rosenbrock import MAX_STEPS, RosenbrockReport
@@ -40,6 +40,7 @@ class CompiledCircuit:
     """The equations of a circuit in cells of one type, and the functions compiled from them."""
 
     equations: Equations
+    literals: Mapping[str, float]  # numbers in the rates, by the names that stand for them
     slopes: Mapping[tuple[int, int], Expression]
     columns: tuple[str, ...]  # names that have a number for each cell
     numbers: tuple[str, ...]  # names that have one number
@@ -67,6 +68,8 @@ class CompiledCircuit:
         homes = {"s": s, "p": p, "cell": cell}
 
         def value(name: str) -> Tensor:
+            if name in self.literals:
+                return torch.tensor(self.literals[name], dtype=torch.float64)
             kind, _, inner = name.partition(".")
             if kind == "own":
                 found = own[inner]
@@ -118,7 +121,7 @@ def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
     builder, one = Builder(), circuit.rows[:1]
     u, s, p, cell = circuit.names(torch.zeros(1, len(circuit.species)), one)
     variables = [f"u.{n}" for n in circuit.species] + [f"s.{n}" for n in circuit.given]
-    kinds: dict[str, Kind] = {n: (torch.float64, 1) for n in variables}
+    kinds: dict[str, Kind | None] = {n: (torch.float64, 1) for n in variables}
 
     def kind_in(prefix: str, home: Names):
         def kind(name: str) -> Kind | None:
@@ -141,7 +144,9 @@ def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
     rates = [as_column(inside.get(n, zero)) for n in circuit.species]
     flux = [as_column(outside.get(n, zero)) for n in circuit.given]
     roots = [*rates, *flux]
-    columns = {builder.name(n): Column.of(builder.name(n), builder, *k) for n, k in kinds.items()}
+    columns = {
+        builder.name(n): Column.of(builder.name(n), builder, *k) for n, k in kinds.items() if k
+    }
     simple = lowered([r.expression for r in roots], columns, builder)
     # a rate is of the variables' type
     wide = [x if x.dtype == torch.float64 else apply("cast64", x) for x in simple]
@@ -151,14 +156,39 @@ def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
         if circuit.in_reservoir is not None:
             variables += [f"own.{way}_{n}" for way in ("to", "from") for n in circuit.given]
             kinds |= {n: (torch.float64, 1) for n in variables}
-    made = tuple(x.expression for x in final)
+    literals, made = _without_literals([x.expression for x in final], builder)
+    kinds |= dict.fromkeys(literals)
     read = {e.name for e in walk(made) if e.op == NAME} | set(variables)
     equations = Equations(
         made, tuple(variables), {n: k for n, k in kinds.items() if n in read}, builder
     )
     functions(equations)  # raises where an operation has no compiled form
-    by_dim = lambda dim: tuple(n for n in equations.leaves if kinds[n][1] == dim)
-    return CompiledCircuit(equations, equations.slopes(), by_dim(1), by_dim(0))
+    each = [n for n in equations.leaves if (kinds[n] or (None, 0))[1] == 1]
+    once = [n for n in equations.leaves if n not in each]
+    return CompiledCircuit(equations, literals, equations.slopes(), tuple(each), tuple(once))
+
+
+# Numbers that belong to the form of an equation.
+PLAIN = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 3.0)
+
+
+def _without_literals(
+    roots: Sequence[Expression], builder: Builder
+) -> tuple[dict[str, float], tuple[Expression, ...]]:
+    """The expressions with names in place of numbers, and the number of each name: so circuits that
+    differ in numbers only are compiled once."""
+    made: dict[Expression, Expression] = {}
+    names: dict[str, float] = {}
+    for node in walk(roots):
+        if node.op == NUMBER and node.value not in PLAIN and np.isfinite(node.value):
+            name = f"own.number{len(names)}"
+            names[name] = node.value
+            made[node] = builder.name(name)
+        elif node.args:
+            made[node] = builder.make(node.op, *(made[a] for a in node.args))
+        else:
+            made[node] = node
+    return names, tuple(made[r] for r in roots)
 
 
 def _spread(like: Column, value: Any) -> Column:
@@ -168,18 +198,18 @@ def _spread(like: Column, value: Any) -> Column:
 
 
 def _exchange(
-    flux: Sequence[Column], circuit: CircuitCells, builder: Builder, kinds: dict[str, Kind]
+    flux: Sequence[Column], circuit: CircuitCells, builder: Builder, kinds: dict[str, Kind | None]
 ) -> list[Column]:
     """Rates of the pools' concentrations, and of what a reservoir is given and gives, as
     `CircuitCells.rates` has them."""
     assert circuit.pool is not None
-    kinds["own.pool"] = (circuit.pool.dtype, 1)
-    pool = Column.of(builder.name("own.pool"), builder, *kinds["own.pool"])
+    kinds["own.pool"] = kind = (circuit.pool.dtype, 1)
+    pool = Column.of(builder.name("own.pool"), builder, *kind)
     into = [apply("div", x, pool) for x in flux]
     if circuit.in_reservoir is None:
         return into
-    kinds["own.away"] = (torch.bool, 1)
-    away = Column.of(builder.name("own.away"), builder, *kinds["own.away"])
+    kinds["own.away"] = kind = (torch.bool, 1)
+    away = Column.of(builder.name("own.away"), builder, *kind)
     up = [apply("where", away, apply("maximum", x, 0.0), 0.0) for x in flux]
     down = [apply("where", away, apply("maximum", apply("neg", x), 0.0), 0.0) for x in flux]
     return [*(apply("where", away, 0.0, x) for x in into), *up, *down]

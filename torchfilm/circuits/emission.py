@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 
@@ -43,12 +44,12 @@ class Equations:
     """du/dt of V variables, as simple operations.
 
     rates: V expressions. variables: the name of each variable. kinds: the kind of every name that
-    occurs. builder: that made them.
+    occurs, None of a name for a plain number. builder: that made them.
     """
 
     rates: tuple[Expression, ...]
     variables: tuple[str, ...]
-    kinds: Mapping[str, Kind]
+    kinds: Mapping[str, Kind | None]
     builder: Builder
 
     @cached_property
@@ -82,7 +83,7 @@ class Emitter:
             else:
                 kind = kind_of(node.op, [self.kinds[a] for a in node.args])
                 if all(self.kinds[a] is None for a in node.args):
-                    kind = (torch.float64, 0)  # numbers alone, as Python computes
+                    kind = (torch.float64, 0)  # numbers alone, as Python computes them
             self.kinds[node] = kind
             own = node.op == NAME and node.name in equations.variables
             self.varies[node] = own or any(self.varies[a] for a in node.args)
@@ -215,9 +216,9 @@ def functions(equations: Equations) -> str:
     return text + _linear(Pattern.of(len(own), order))
 
 
-def _leaf(emitter: Emitter, leaf: Expression, kind: Kind, place: int) -> str:
-    casts = {torch.float32: "np.float32(leaf[{}])", torch.bool: "leaf[{}] != 0.0"}
-    return f"{emitter.of(leaf)} = {casts.get(kind[0], 'leaf[{}]').format(place)}"
+def _leaf(emitter: Emitter, leaf: Expression, kind: Kind | None, place: int) -> str:
+    casts: dict[Any, str] = {torch.float32: "np.float32(leaf[{}])", torch.bool: "leaf[{}] != 0.0"}
+    return f"{emitter.of(leaf)} = {casts.get(kind and kind[0], 'leaf[{}]').format(place)}"
 
 
 def _linear(pattern: Pattern) -> str:
