@@ -86,6 +86,8 @@ class _Plain:
             return self._in(args[0], SUM) + sign + right, SUM
         if op == "mul" and args[0].op == "div" and args[0].args[0].is_number(1):
             return self.fraction(args[1], _bare(args[0].args[1]))  # as torch divides a number
+        if op == "mul" and args[1].op == NUMBER and args[0].op != NUMBER:
+            args = args[::-1]  # 2·a, also where torch was given (a, 2)
         if op == "mul":
             right = self._in(args[1], PRODUCT)
             return self._in(args[0], SIGN) + self.between(right) + right, self._signed(args[0])
@@ -126,7 +128,9 @@ class _Plain:
 
     def hill(self, op: str, x: Expression, half: Expression, *more: Expression) -> tuple[str, int]:
         raised = lambda z: (
-            self._in(z, PRODUCT) if not more or more[0].is_number(1) else self.power(z, more[0])
+            self._in(z, PRODUCT)
+            if not more or more[0].is_number(1) or z.is_number(1)
+            else self.power(z, more[0])
         )
         over = raised(half if op == "repression" else x)
         return f"{over}/({raised(half)} + {raised(x)})", PRODUCT
@@ -164,7 +168,9 @@ class _Tex(_Plain):
 
     def hill(self, op: str, x: Expression, half: Expression, *more: Expression) -> tuple[str, int]:
         raised = lambda z: (
-            self.made[z][0] if not more or more[0].is_number(1) else self.power(z, more[0])
+            self.made[z][0]
+            if not more or more[0].is_number(1) or z.is_number(1)
+            else self.power(z, more[0])
         )
         over = raised(half if op == "repression" else x)
         return rf"\frac{{{over}}}{{{raised(half)} + {raised(x)}}}", POWER
