@@ -21,8 +21,9 @@ from torchfilm.circuits.expressions import NAME, NUMBER, Builder, Expression, wa
 from torchfilm.circuits.graph import Leaves, evaluated, traced_rates
 from torchfilm.circuits.names import Names
 from torchfilm.circuits.rosenbrock import MAX_STEPS, RosenbrockReport
-from torchfilm.circuits.stiff_text import HEAD, method
+from torchfilm.circuits.stiff_text import CONSTANTS, HEAD, method
 from torchfilm.circuits.tracing import Column, Kind, Untraceable, apply, lowered
+from torchfilm.tools import checks
 from torchfilm.tools.threads import shares_of
 
 if TYPE_CHECKING:
@@ -93,7 +94,10 @@ class CompiledCircuit:
     def rodas3(
         self, circuit: CircuitCells, start: Tensor, dt: float, rtol: float, atol: float
     ) -> tuple[Tensor, RosenbrockReport] | None:  # fmt: skip
-        """As `rosenbrock.rodas3`, of the cells `circuit.rows`; None where gradients are wanted."""
+        """As `rosenbrock.rodas3`, of the cells `circuit.rows`; None where gradients are wanted, and
+        over no time."""
+        if dt == 0:
+            return None
         values = self.values(circuit, circuit.rows)
         every = (start, *values.values())
         if torch.is_grad_enabled() and any(x.requires_grad for x in every):
@@ -129,8 +133,10 @@ def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
                 if name not in home:
                     return None
                 value = torch.as_tensor(home[name])
-                if value.requires_grad or value.dim() > 1:
-                    raise Untraceable(f"{prefix}.{name} has a gradient, or more than one number")
+                if value.requires_grad:
+                    raise Untraceable(f"{prefix}.{name} requires a gradient")
+                if value.dim() > 1:
+                    raise Untraceable(f"{prefix}.{name} has several numbers for each cell")
                 kinds[f"{prefix}.{name}"] = (value.dtype, value.dim())
             return kinds[f"{prefix}.{name}"]
 
@@ -138,9 +144,16 @@ def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
 
     homes = {"u": u, "s": s, "p": p, "cell": cell}
     leaves = [Leaves(k, h._label, builder, kind_in(k, h), list(h)) for k, h in homes.items()]
-    inside, outside = traced_rates(circuit.part, tuple(leaves), circuit.species)  # type: ignore
-    zero = Column.of(builder.number(0.0), builder, torch.float64)
-    as_column = lambda x: x if type(x) is Column else _spread(zero, x)
+    try:
+        inside, outside = traced_rates(circuit.part, tuple(leaves), circuit.species)  # type: ignore
+    except (Untraceable, checks.InputError):
+        raise
+    except Exception as error:  # of a user's function, which has worked with numbers
+        raise Untraceable(
+            f"called with columns that have no numbers, it raised {error!r}"
+        ) from error
+    zero = _spread(0.0, builder)
+    as_column = lambda x: x if type(x) is Column else _spread(x, builder)
     rates = [as_column(inside.get(n, zero)) for n in circuit.species]
     flux = [as_column(outside.get(n, zero)) for n in circuit.given]
     roots = [*rates, *flux]
@@ -191,10 +204,12 @@ def _without_literals(
     return names, tuple(made[r] for r in roots)
 
 
-def _spread(like: Column, value: Any) -> Column:
+def _spread(value: Any, builder: Builder) -> Column:
+    """A rate that is a number, as a column."""
     if not isinstance(value, (int, float)) or isinstance(value, bool):
-        raise Untraceable("it returns a tensor from outside")
-    return Column.of(like.builder.number(float(value)), like.builder, torch.float64)
+        raise Untraceable("it returns a tensor that is made of no column")
+    made = builder.make("full64", builder.number(value))
+    return Column.of(made, builder, torch.float64)
 
 
 def _exchange(
@@ -221,7 +236,9 @@ def source(circuit: CompiledCircuit) -> str:
     place |= {n: f"numbers[{k}]" for k, n in enumerate(circuit.numbers)}
     leaves = [place[n] for n in circuit.equations.leaves] or ["0.0"]
     names = ", ".join(circuit.equations.variables)
-    head = HEAD.format(what=f"A circuit of {names}")
+    # constants by value: the text then says all that it depends on, and finds its compiled form
+    constants = "\n".join(f"{n} = {x!r}" for n, x in CONSTANTS.items())
+    head = HEAD.format(what=f"A circuit of {names}", constants=constants)
     size = len(circuit.equations.variables)
     return head + functions(circuit.equations) + method(size, f"({', '.join(leaves)},)")
 

@@ -25,7 +25,7 @@ from torchfilm.circuits.expressions import (
     derivatives,
     walk,
 )
-from torchfilm.circuits.tracing import Kind, Untraceable, common_type, kind_of
+from torchfilm.circuits.tracing import CASTS, FULL, Kind, Untraceable, common_type, kind_of
 
 SIGNS = {
     "add": "+", "sub": "-", "mul": "*", "div": "/", "gt": ">", "ge": ">=", "lt": "<", "le": "<=",
@@ -34,7 +34,7 @@ SIGNS = {
 CALLS = {
     "exp": "math.exp", "expm1": "math.expm1", "log": "_log", "log1p": "_log1p", "sqrt": "_sqrt",
     "log2": "_log2", "log10": "_log10", "sin": "math.sin", "cos": "math.cos", "tan": "math.tan",
-    "tanh": "math.tanh", "atan": "math.atan", "floor": "math.floor", "abs": "abs",
+    "tanh": "math.tanh", "atan": "math.atan", "floor": "np.floor", "abs": "abs",
     "sign": "_sign", "minimum": "_least", "maximum": "_most", "remainder": "_remainder",
 }  # fmt: skip
 
@@ -82,7 +82,7 @@ class Emitter:
                 kind = equations.kinds[node.name]
             else:
                 kind = kind_of(node.op, [self.kinds[a] for a in node.args])
-                if all(self.kinds[a] is None for a in node.args):
+                if node.op not in CASTS and all(self.kinds[a] is None for a in node.args):
                     kind = (torch.float64, 0)  # numbers alone, as Python computes them
             self.kinds[node] = kind
             own = node.op == NAME and node.name in equations.variables
@@ -93,7 +93,10 @@ class Emitter:
         """What does not depend on variables and is read by what does, or is a root."""
         read = {a for node in walk(roots) if self.varies[node] for a in node.args}
         read |= set(roots)
-        return [n for n in walk(roots) if n in read and not self.varies[n] and n.op != NUMBER]
+        return [
+            n for n in walk(roots)
+            if n in read and not self.varies[n] and n.op not in (NUMBER, *FULL)
+        ]  # fmt: skip
 
     def lines(self, roots: Iterable[Expression], known: Iterable[Expression]) -> list[str]:
         """Assignments of all below the roots that is not known yet."""
@@ -102,7 +105,7 @@ class Emitter:
             stack = [(root, False)]
             while stack:
                 node, ready = stack.pop()
-                if node in have or node.op == NUMBER:
+                if node in have or node.op in (NUMBER, *FULL):
                     continue
                 if ready:
                     have.add(node)
@@ -115,6 +118,8 @@ class Emitter:
         """How to refer to a node."""
         if node.op == NUMBER:
             return _literal(node.value)
+        if node.op in FULL:
+            return self._as(node.args[0], CASTS[node.op])
         if node.op == NAME and node.name in self.equations.variables:
             return f"u{self.equations.variables.index(node.name)}"
         return f"x{self.number[node]}"
@@ -133,13 +138,13 @@ class Emitter:
             return f"{self.of(args[0])} {SIGNS[op]} {self.of(args[1])}"
         if op == "not":
             return f"not {self.of(args[0])}"
-        if op in ("detach", "cast32", "cast64"):
+        if op == "detach" or op in CASTS:
             return self._as(args[0], kind_of(op, [self.kinds[args[0]]])[0])
         kind = self.kinds[node]
         assert kind is not None
         dtype = common_type([self.kinds[a] for a in args]) if op in COMPARISONS else kind[0]
-        if op in LOGICAL and all(self.kinds[a] is None for a in args):
-            dtype = torch.float64
+        if op in LOGICAL and not any(_is_floating(self.kinds[a]) for a in args):
+            dtype = torch.float64  # holds whole numbers as they are
         if op == "where":
             yes, no = (self._as(a, dtype) for a in args[1:])
             return f"{yes} if {self.of(args[0])} else {no}"
@@ -152,6 +157,10 @@ class Emitter:
             raise Untraceable(f"it uses {op}, which has no compiled form")
         call = f"{CALLS[op]}({', '.join(given)})"
         return f"np.float32({call})" if dtype == torch.float32 else call
+
+
+def _is_floating(kind: Kind | None) -> bool:
+    return kind is not None and kind[0].is_floating_point
 
 
 def _literal(value: float) -> str:

@@ -193,8 +193,8 @@ class Circuit(Effect):
                 found[kind] = graph_of(part, tuple(self.variables), tuple(self.parameters), label)
             except Untraceable as why:
                 raise checks.InputError(
-                    f"{self.value_owner()}: {label} cannot be written as equations: {why}. It runs"
-                    " all the same, by torch."
+                    f"{self.value_owner()}: {label} cannot be written as equations: {why}. It still"
+                    " runs, by torch, if torch can compute it for all cells at once."
                 ) from why
         return found
 
