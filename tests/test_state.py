@@ -261,3 +261,18 @@ def test_repr_is_one_line_of_what_matters():
         == "State(4 colonies, 6 cells, 2-D, t = 0 h, step 0, float32 on cpu, fields: growth_rate,"
         " elongation)"
     )
+
+
+def test_volumes_that_were_asked_for_without_gradients_still_have_them():
+    """A volume is worked out once for a state: not so that `no_grad` takes its gradient away, nor
+    after the length has changed."""
+    state = tf.Scene(tf.Growth(rate=1.0)).bind(dtype=torch.float64).start()
+    first = state.volume
+    assert state.volume is first
+    longer = state.replace(length=state.length.clone().requires_grad_())
+    with torch.no_grad():
+        assert float(longer.volume) == float(first) and not longer.area.requires_grad
+    (slope,) = torch.autograd.grad((longer.volume + longer.area).sum(), longer.length)
+    r = float(state.radius)
+    assert float(slope) == pytest.approx(math.pi * r * r + 2 * math.pi * r)
+    assert float(state.replace(length=2 * state.length).volume) > float(first)

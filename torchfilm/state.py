@@ -185,12 +185,20 @@ class State:
     @property
     def volume(self) -> Tensor:
         """(N,) µm³."""
-        return capsule.volume(self.length, self.radius)
+        return self._of_shape("volume", capsule.volume)
 
     @property
     def area(self) -> Tensor:
         """(N,) µm²."""
-        return capsule.area(self.length, self.radius)
+        return self._of_shape("area", capsule.area)
+
+    def _of_shape(self, name: str, law: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Worked out once; but each time where a gradient may pass, which `no_grad` would stop."""
+        if self.length.requires_grad or self.radius.requires_grad:
+            return law(self.length, self.radius)
+        if name not in self.__dict__:
+            self.__dict__[name] = law(self.length, self.radius)
+        return self.__dict__[name]
 
     @property
     def signals(self) -> dict[str, Tensor]:
@@ -229,9 +237,9 @@ class State:
             raise TypeError(f"a state has no part {', '.join(sorted(unknown))}")
         # as dataclasses.replace, which takes twenty times as long; a step makes ten states
         made, parts = object.__new__(type(self)), dict(self.__dict__)
-        if "colony" in changes or "colony_id" in changes:
-            parts.pop("groups", None)
-            parts.pop("counts", None)
+        for name, of in DERIVED.items():
+            if name in parts and not changes.keys().isdisjoint(of):
+                del parts[name]
         for name, value in changes.items():
             parts[name] = MappingProxyType(dict(value)) if name in MAPPINGS else value
         made.__dict__.update(parts)
@@ -388,6 +396,13 @@ class State:
 
 PER_CELL = ("colony", "uid", "parent", "position", "axis", "length", "radius")
 PER_COLONY = ("colony_id", "stream", "next_uid")
+# What is worked out once for a state, and from which of its parts.
+DERIVED = {
+    "groups": ("colony", "colony_id"),
+    "counts": ("colony", "colony_id"),
+    "volume": ("length", "radius"),
+    "area": ("length", "radius"),
+}
 PARTS = frozenset(part.name for part in dataclasses.fields(State))
 RESERVED = PARTS | {n for n in vars(State) if not n.startswith("__")}
 # A field that first cells may bring and rules may set.

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import torch
 
@@ -23,7 +25,7 @@ from torchfilm.circuits.expressions import (
     derivatives,
     walk,
 )
-from torchfilm.circuits.tracing import Kind, Untraceable, common_type, kind_of
+from torchfilm.circuits.tracing import CASTS, FULL, Kind, Untraceable, common_type, kind_of
 
 SIGNS = {
     "add": "+", "sub": "-", "mul": "*", "div": "/", "gt": ">", "ge": ">=", "lt": "<", "le": "<=",
@@ -32,7 +34,7 @@ SIGNS = {
 CALLS = {
     "exp": "math.exp", "expm1": "math.expm1", "log": "_log", "log1p": "_log1p", "sqrt": "_sqrt",
     "log2": "_log2", "log10": "_log10", "sin": "math.sin", "cos": "math.cos", "tan": "math.tan",
-    "tanh": "math.tanh", "atan": "math.atan", "floor": "math.floor", "abs": "abs",
+    "tanh": "math.tanh", "atan": "math.atan", "floor": "np.floor", "abs": "abs",
     "sign": "_sign", "minimum": "_least", "maximum": "_most", "remainder": "_remainder",
 }  # fmt: skip
 
@@ -42,15 +44,15 @@ class Equations:
     """du/dt of V variables, as simple operations.
 
     rates: V expressions. variables: the name of each variable. kinds: the kind of every name that
-    occurs. builder: that made them.
+    occurs, None of a name for a plain number. builder: that made them.
     """
 
     rates: tuple[Expression, ...]
     variables: tuple[str, ...]
-    kinds: Mapping[str, Kind]
+    kinds: Mapping[str, Kind | None]
     builder: Builder
 
-    @property
+    @cached_property
     def leaves(self) -> tuple[str, ...]:
         """The names that are no variables, in order."""
         found = [e.name for e in walk(self.rates) if e.op == NAME]
@@ -80,8 +82,8 @@ class Emitter:
                 kind = equations.kinds[node.name]
             else:
                 kind = kind_of(node.op, [self.kinds[a] for a in node.args])
-                if all(self.kinds[a] is None for a in node.args):
-                    kind = (torch.float64, 0)  # numbers alone, as Python computes
+                if node.op not in CASTS and all(self.kinds[a] is None for a in node.args):
+                    kind = (torch.float64, 0)  # numbers alone, as Python computes them
             self.kinds[node] = kind
             own = node.op == NAME and node.name in equations.variables
             self.varies[node] = own or any(self.varies[a] for a in node.args)
@@ -91,7 +93,10 @@ class Emitter:
         """What does not depend on variables and is read by what does, or is a root."""
         read = {a for node in walk(roots) if self.varies[node] for a in node.args}
         read |= set(roots)
-        return [n for n in walk(roots) if n in read and not self.varies[n] and n.op != NUMBER]
+        return [
+            n for n in walk(roots)
+            if n in read and not self.varies[n] and n.op not in (NUMBER, *FULL)
+        ]  # fmt: skip
 
     def lines(self, roots: Iterable[Expression], known: Iterable[Expression]) -> list[str]:
         """Assignments of all below the roots that is not known yet."""
@@ -100,7 +105,7 @@ class Emitter:
             stack = [(root, False)]
             while stack:
                 node, ready = stack.pop()
-                if node in have or node.op == NUMBER:
+                if node in have or node.op in (NUMBER, *FULL):
                     continue
                 if ready:
                     have.add(node)
@@ -113,6 +118,8 @@ class Emitter:
         """How to refer to a node."""
         if node.op == NUMBER:
             return _literal(node.value)
+        if node.op in FULL:
+            return self._as(node.args[0], CASTS[node.op])
         if node.op == NAME and node.name in self.equations.variables:
             return f"u{self.equations.variables.index(node.name)}"
         return f"x{self.number[node]}"
@@ -131,13 +138,13 @@ class Emitter:
             return f"{self.of(args[0])} {SIGNS[op]} {self.of(args[1])}"
         if op == "not":
             return f"not {self.of(args[0])}"
-        if op in ("detach", "cast32", "cast64"):
+        if op == "detach" or op in CASTS:
             return self._as(args[0], kind_of(op, [self.kinds[args[0]]])[0])
         kind = self.kinds[node]
         assert kind is not None
         dtype = common_type([self.kinds[a] for a in args]) if op in COMPARISONS else kind[0]
-        if op in LOGICAL and all(self.kinds[a] is None for a in args):
-            dtype = torch.float64
+        if op in LOGICAL and not any(_is_floating(self.kinds[a]) for a in args):
+            dtype = torch.float64  # holds whole numbers as they are
         if op == "where":
             yes, no = (self._as(a, dtype) for a in args[1:])
             return f"{yes} if {self.of(args[0])} else {no}"
@@ -150,6 +157,10 @@ class Emitter:
             raise Untraceable(f"it uses {op}, which has no compiled form")
         call = f"{CALLS[op]}({', '.join(given)})"
         return f"np.float32({call})" if dtype == torch.float32 else call
+
+
+def _is_floating(kind: Kind | None) -> bool:
+    return kind is not None and kind[0].is_floating_point
 
 
 def _literal(value: float) -> str:
@@ -214,9 +225,9 @@ def functions(equations: Equations) -> str:
     return text + _linear(Pattern.of(len(own), order))
 
 
-def _leaf(emitter: Emitter, leaf: Expression, kind: Kind, place: int) -> str:
-    casts = {torch.float32: "np.float32(leaf[{}])", torch.bool: "leaf[{}] != 0.0"}
-    return f"{emitter.of(leaf)} = {casts.get(kind[0], 'leaf[{}]').format(place)}"
+def _leaf(emitter: Emitter, leaf: Expression, kind: Kind | None, place: int) -> str:
+    casts: dict[Any, str] = {torch.float32: "np.float32(leaf[{}])", torch.bool: "leaf[{}] != 0.0"}
+    return f"{emitter.of(leaf)} = {casts.get(kind and kind[0], 'leaf[{}]').format(place)}"
 
 
 def _linear(pattern: Pattern) -> str:

@@ -154,28 +154,65 @@ _derivative("maximum")(
 )
 
 
+_derivative("remainder")(
+    lambda b, y, u, v: {0: b.number(1), 1: b.make("neg", b.make("floor", b.make("div", u, v)))}
+)
+_derivative("hypot")(lambda b, y, u, v: {0: b.make("div", u, y), 1: b.make("div", v, y)})
+_derivative("logaddexp")(
+    lambda b, y, u, v: {
+        0: b.make("sigmoid", b.make("sub", u, v)),
+        1: b.make("sigmoid", b.make("sub", v, u)),
+    }
+)
+_derivative("exp2")(lambda b, y, u: {0: b.make("mul", y, math.log(2))})
+_derivative("sinh")(lambda b, y, u: {0: b.make("cosh", u)})
+_derivative("cosh")(lambda b, y, u: {0: b.make("sinh", u)})
+_derivative("atanh")(lambda b, y, u: {0: b.make("div", 1, b.make("sub", 1, b.make("mul", u, u)))})
+_derivative("sigmoid")(lambda b, y, u: {0: b.make("mul", y, b.make("sub", 1, y))})
+_derivative("softplus")(lambda b, y, u: {0: b.make("sigmoid", u)})
+_derivative("elu")(lambda b, y, u: {0: b.make("where", b.make("gt", u, 0), 1, b.make("exp", u))})
+
+
+@_derivative("silu")
+def _of_silu(b: Builder, y: Expression, u: Expression):
+    s = b.make("sigmoid", u)
+    return {0: b.make("mul", s, b.make("add", 1, b.make("mul", u, b.make("sub", 1, s))))}
+
+
+def _less_one(b: Builder, x: Expression, n: Expression) -> Expression:
+    """xⁿ⁻¹."""
+    less = b.number(n.value - 1) if n.op == NUMBER else b.make("sub", n, 1)
+    plain = {0.0: b.number(1), 1.0: x} if less.op == NUMBER else {}
+    return plain.get(less.value) or b.make("pow", x, less)
+
+
+def _log_or_0(b: Builder, x: Expression, of: Expression) -> Expression:
+    """The logarithm in a derivative by an exponent: at x = 0 a power does not depend on it."""
+    return b.make("where", b.make("eq", x, 0), 0, b.make("log", of))
+
+
 @_derivative("pow")
 def _of_power(b: Builder, y: Expression, u: Expression, n: Expression):
-    less = b.number(n.value - 1) if n.op == NUMBER else b.make("sub", n, 1)
-    power = u if less.is_number(1) else b.make("pow", u, less)
-    return {0: b.simple("mul", n, power), 1: b.make("mul", y, b.make("log", u))}
-
-
-@_derivative("sigmoid")
-def _of_sigmoid(b: Builder, y: Expression, u: Expression):
-    return {0: b.make("mul", y, b.make("sub", 1, y))}
+    log = b.make("log", u) if u.op == NUMBER else _log_or_0(b, u, u)
+    return {0: b.simple("mul", n, _less_one(b, u, n)), 1: b.make("mul", y, log)}
 
 
 @_derivative("activation", "repression", "michaelis_menten")
 def _of_hill(b: Builder, y: Expression, x: Expression, half: Expression, *more: Expression):
-    """y (1 − y) times the derivative of ± n log(x/K)."""
+    """Of xⁿ/(Kⁿ + xⁿ), or of 1 − that, for x ≥ 0."""
     n = more[0] if more else b.number(1)
-    both = b.make("mul", y, b.make("sub", 1, y))
-    both = b.make("neg", both) if y.op == "repression" else both
-    by = lambda z: b.make("div", b.simple("mul", n, both), z)
-    found = {0: by(x), 1: b.make("neg", by(half))}
+    raised = lambda z: z if n.is_number(1) else b.make("pow", z, n)
+    under = b.make("pow", b.make("add", raised(half), raised(x)), 2)
+    sign = "neg" if y.op == "repression" else "pos"
+    signed = lambda e, s: b.simple("neg", e) if s == sign else e
+    by = lambda z, other: b.make(
+        "div", b.simple("mul", b.simple("mul", n, raised(other)), _less_one(b, z, n)), under
+    )
+    found = {0: signed(by(x, half), "neg"), 1: signed(by(half, x), "pos")}
     if more:
-        found[2] = b.make("mul", both, b.make("log", b.make("div", x, half)))
+        both = b.make("div", b.make("mul", raised(half), raised(x)), under)
+        log = _log_or_0(b, x, b.make("div", x, half))
+        found[2] = signed(b.make("mul", both, log), "neg")
     return found
 
 

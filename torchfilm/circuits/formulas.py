@@ -5,14 +5,16 @@ from __future__ import annotations
 from torchfilm.circuits.expressions import NAME, NUMBER, Expression
 
 # How strongly an operation binds; what binds less stands in brackets.
-SUM, PRODUCT, SIGN, POWER, ATOM = range(5)
+TRUTH, SUM, SIGN, PRODUCT, POWER, ATOM = range(6)
 SIGNS = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤", "eq": "=", "ne": "≠", "and": "and", "or": "or"}
 TEX_SIGNS = SIGNS | {"ge": r"\ge", "le": r"\le", "ne": r"\ne", "and": r"\wedge", "or": r"\vee"}
-QUIET = ("cast32", "cast64", "detach")  # operations on the type of a number
+QUIET = ("cast32", "cast64", "full32", "full64", "detach")  # operations on the type of a number
 
 
-def _number(value: float) -> str:
-    return f"{value:.6g}"
+def _bare(node: Expression) -> Expression:
+    while node.op in QUIET:
+        node = node.args[0]
+    return node
 
 
 def _plain_name(name: str) -> str:
@@ -58,27 +60,37 @@ class _Plain:
         return found if binds >= at_least else self.brackets(found)
 
     def _of(self, node: Expression) -> tuple[str, int]:
-        op, args = node.op, node.args
+        op, args = node.op, tuple(map(_bare, node.args))
         if op == NUMBER:
-            return _number(node.value), ATOM if node.value >= 0 else SIGN
+            found, binds = self.number(abs(node.value))
+            return (found, binds) if node.value >= 0 else (self.minus + found, SIGN)
         if op == NAME:
             return self.name(node.name), ATOM
         if op in QUIET:
             return self.made[args[0]]
         if op == "add" and (args[0].is_number(0) or args[1].is_number(0)):
             return self.made[args[1] if args[0].is_number(0) else args[0]]
+        if op == "sub" and args[1].is_number(0):
+            return self.made[args[0]]
         if op == "mul" and (args[0].is_number(1) or args[1].is_number(1)):
             return self.made[args[1] if args[0].is_number(1) else args[0]]
         if op in ("add", "sub"):
             if op == "sub" and args[0].is_number(0):
                 return f"{self.minus}{self._in(args[1], PRODUCT)}", SIGN
+            if op == "sub" and args[1].op == NUMBER and args[1].value < 0:
+                return f"{self._in(args[0], SUM)} + {self.made[args[1]][0][1:]}", SUM
             sign = " + " if op == "add" else f" {self.minus} "
             right = self._in(args[1], SUM if op == "add" else PRODUCT)
             if op == "add" and right.startswith(self.minus):
                 sign, right = f" {self.minus} ", right[1:]
             return self._in(args[0], SUM) + sign + right, SUM
+        if op == "mul" and args[0].op == "div" and args[0].args[0].is_number(1):
+            return self.fraction(args[1], _bare(args[0].args[1]))  # as torch divides a number
+        if op == "mul" and args[1].op == NUMBER and args[0].op != NUMBER:
+            args = args[::-1]  # 2·a, also where torch was given (a, 2)
         if op == "mul":
-            return f"{self._in(args[0], PRODUCT)}{self.times}{self._in(args[1], PRODUCT)}", PRODUCT
+            right = self._in(args[1], PRODUCT)
+            return self._in(args[0], SIGN) + self.between(right) + right, self._signed(args[0])
         if op == "div":
             return self.fraction(args[0], args[1])
         if op == "neg":
@@ -88,25 +100,37 @@ class _Plain:
         if op in ("activation", "repression", "michaelis_menten"):
             return self.hill(op, *args)
         if op in self.signs:
-            return f"{self._in(args[0], SIGN)} {self.signs[op]} {self._in(args[1], SIGN)}", SUM
+            return f"{self._in(args[0], SUM)} {self.signs[op]} {self._in(args[1], SUM)}", TRUTH
         return self.call(op, [self.made[a][0] for a in args]), ATOM
+
+    def _signed(self, first: Expression) -> int:
+        """How a product binds that begins with this factor."""
+        return SIGN if self.made[first][1] == SIGN else PRODUCT
 
     # --- as text -------------------------------------------------------------------------------
 
     name = staticmethod(_plain_name)  # type: ignore[assignment]
 
+    def number(self, value: float) -> tuple[str, int]:
+        return f"{value:.6g}", ATOM
+
+    def between(self, right: str) -> str:
+        return self.times
+
     def brackets(self, inner: str) -> str:
         return f"({inner})"
 
     def fraction(self, over: Expression, under: Expression) -> tuple[str, int]:
-        return f"{self._in(over, PRODUCT)}/{self._in(under, POWER)}", PRODUCT
+        return f"{self._in(over, SIGN)}/{self._in(under, POWER)}", self._signed(over)
 
     def power(self, base: Expression, exponent: Expression) -> str:
         return f"{self._in(base, ATOM)}^{self._in(exponent, ATOM)}"
 
     def hill(self, op: str, x: Expression, half: Expression, *more: Expression) -> tuple[str, int]:
         raised = lambda z: (
-            self._in(z, SUM) if not more or more[0].is_number(1) else self.power(z, more[0])
+            self._in(z, PRODUCT)
+            if not more or more[0].is_number(1) or z.is_number(1)
+            else self.power(z, more[0])
         )
         over = raised(half if op == "repression" else x)
         return f"{over}/({raised(half)} + {raised(x)})", PRODUCT
@@ -123,21 +147,33 @@ class _Tex(_Plain):
 
     signs, times, minus, name = TEX_SIGNS, r"\,", "-", staticmethod(_tex_name)
 
+    def number(self, value: float) -> tuple[str, int]:
+        found, _, exponent = f"{value:.6g}".partition("e")
+        if not exponent:
+            return (r"\infty" if found == "inf" else found), ATOM
+        power = f"10^{{{int(exponent)}}}"
+        return (power, POWER) if found == "1" else (rf"{found} \cdot {power}", PRODUCT)
+
+    def between(self, right: str) -> str:
+        return r" \cdot " if right[0].isdigit() else self.times
+
     def brackets(self, inner: str) -> str:
         return rf"\left({inner}\right)"
 
     def fraction(self, over: Expression, under: Expression) -> tuple[str, int]:
-        return rf"\frac{{{self.made[over][0]}}}{{{self.made[under][0]}}}", ATOM
+        return rf"\frac{{{self.made[over][0]}}}{{{self.made[under][0]}}}", POWER
 
     def power(self, base: Expression, exponent: Expression) -> str:
         return rf"{{{self._in(base, ATOM)}}}^{{{self.made[exponent][0]}}}"
 
     def hill(self, op: str, x: Expression, half: Expression, *more: Expression) -> tuple[str, int]:
         raised = lambda z: (
-            self.made[z][0] if not more or more[0].is_number(1) else self.power(z, more[0])
+            self.made[z][0]
+            if not more or more[0].is_number(1) or z.is_number(1)
+            else self.power(z, more[0])
         )
         over = raised(half if op == "repression" else x)
-        return rf"\frac{{{over}}}{{{raised(half)} + {raised(x)}}}", ATOM
+        return rf"\frac{{{over}}}{{{raised(half)} + {raised(x)}}}", POWER
 
     def call(self, op: str, given: list[str]) -> str:
         if op == "where":

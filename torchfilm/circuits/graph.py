@@ -12,15 +12,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.expressions import NAME, NUMBER, Builder, Expression, derivatives, walk
+from torchfilm.circuits.expressions import (
+    LOGICAL,
+    NAME,
+    NUMBER,
+    Builder,
+    Expression,
+    derivatives,
+    walk,
+)
 from torchfilm.circuits.formulas import latex, text
 from torchfilm.circuits.names import Names, UnknownName, unknown
 from torchfilm.circuits.network import Network, build_network
 from torchfilm.circuits.reactions import OUTSIDE
-from torchfilm.circuits.tracing import LAWS, Column
+from torchfilm.circuits.tracing import LAWS, Column, common_type
 from torchfilm.tools import checks
 from torchfilm.tools.deterministic_math import deterministic_functions
 
+F64 = torch.float64
 Kinds = Callable[[str], tuple[torch.dtype, int] | None]
 
 
@@ -71,9 +80,21 @@ def traced_rates(
         return dict(zip(species, found[:split], strict=True)), {
             n: x * names[3].volume for n, x in released
         }
-    returned = part(*names)
-    both = isinstance(returned, tuple) and len(returned) == 2
-    return returned if both else (returned, {})
+    return both_of(part(*names))
+
+
+def both_of(returned: Any) -> tuple[Any, Any]:
+    """What a rate function returned, as rates of species and amounts released."""
+    pair = isinstance(returned, tuple) and len(returned) == 2
+    return returned if pair else (returned, {})
+
+
+def check_returned(found: object, label: str) -> None:
+    if not isinstance(found, Mapping):
+        raise checks.InputError(
+            f"{label} returned {type(found).__name__}: it must return a dict of rates by species,"
+            " and, for signals, a second one."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +140,8 @@ class CircuitGraph:
     def _repr_latex_(self) -> str:
         tex = lambda n: rf"\mathrm{{{n.replace('_', chr(92) + '_')}}}"
         lines = [rf"\frac{{d\,{tex(n)}}}{{dt}} &= {latex(e)}" for n, e in self.rates.items()]
+        still = [n for n in self.species if n not in self.rates]
+        lines += [rf"\frac{{d\,{tex(n)}}}{{dt}} &= 0" for n in still]
         lines += [rf"{tex(n)} \to \mathrm{{out}} &= {latex(e)}" for n, e in self.releases.items()]
         return "$$\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}$$"
 
@@ -172,15 +195,15 @@ class CircuitGraph:
         """Sums of amounts that never change, as numbers by species and "out.name": found at random
         concentrations, and checked at others."""
         rows = [*self.rates, *(f"out.{n}" for n in self.releases)]
-        rates = self._at_random(0)
-        basis = _null_space(rates)
-        sums = [dict(zip(rows, w, strict=True)) for w in basis]
-        check, scale = self._at_random(1), np.abs(rates).max(initial=1e-300)
-        sound = [
-            s for s in sums if np.abs(check @ np.array([s[n] for n in rows])).max() <= 1e-9 * scale
-        ]
+        check = self._at_random(1)
         still = [{n: 1} for n in self.species if n not in self.rates]
-        return still + [{n: k for n, k in s.items() if k} for s in sound]
+        found = []
+        for weights in _null_space(self._at_random(0)):
+            parts = check * np.array(weights)
+            # relative to what cancels, so that slow reactions count beside fast ones
+            if (np.abs(parts.sum(1)) <= 1e-12 * np.abs(parts).max(1)).all():
+                found.append({n: w for n, w in zip(rows, weights, strict=True) if w})
+        return still + found
 
     def _at_random(self, seed: int) -> np.ndarray:
         """Rates at 64 random places, (64, rows), of amounts in a cell of volume 1."""
@@ -198,12 +221,26 @@ def evaluated(roots: Sequence[Expression], leaf: Callable[[Expression], Tensor])
     with deterministic_functions():
         for node in walk(roots):
             if node.op == NUMBER:
-                made[node] = torch.tensor(node.value, dtype=torch.float64)
+                made[node] = node.value
             elif node.op == NAME:
                 made[node] = leaf(node)
             else:
-                made[node] = OPERATIONS[node.op](*(made[a] for a in node.args))
-    return [made[r] for r in roots]
+                made[node] = OPERATIONS[node.op](*_given(node.op, [made[a] for a in node.args]))
+    return [
+        torch.as_tensor(made[r], dtype=None if isinstance(made[r], Tensor) else F64) for r in roots
+    ]
+
+
+def _given(op: str, args: list[Any]) -> list[Any]:
+    """Arguments with numbers as tensors of the type that torch would give them; laws and powers
+    take numbers as they are."""
+    tensors = [a for a in (args[1:] if op == "where" else args) if isinstance(a, Tensor)]
+    if len(tensors) == len(args) or (op in LAWS and tensors):
+        return args
+    whole = op in LOGICAL and not any(a.is_floating_point() for a in tensors)
+    bare = not tensors and op != "where"
+    dtype = F64 if whole or bare else common_type([(a.dtype, min(a.dim(), 1)) for a in tensors])
+    return [a if isinstance(a, Tensor) else torch.tensor(a, dtype=dtype) for a in args]
 
 
 OPERATIONS: dict[str, Callable[..., Tensor]] = {
@@ -249,6 +286,8 @@ OPERATIONS: dict[str, Callable[..., Tensor]] = {
     "detach": Tensor.detach,
     "cast32": Tensor.float,
     "cast64": Tensor.double,
+    "full32": lambda x: x.float().reshape(1),
+    "full64": lambda x: x.double().reshape(1),
 }
 
 
@@ -256,9 +295,10 @@ def _null_space(rates: np.ndarray) -> list[list[int]]:
     """Whole numbers w with rates @ w = 0, a basis: (K, n) -> vectors of n."""
     if rates.shape[1] == 0:
         return []
-    _, size, rows = np.linalg.svd(rates / np.abs(rates).max(initial=1e-300), full_matrices=True)
-    rank = int((size > 1e-10).sum())
-    basis = rows[rank:].copy()
+    scale = np.abs(rates).max(0)
+    scale[scale == 0] = 1.0
+    _, size, rows = np.linalg.svd(rates / scale, full_matrices=True)
+    basis = rows[int((size > 1e-12).sum()) :] / scale
     for k, pivot in enumerate(range(basis.shape[0])):  # each has a 1 where the others have 0
         place = int(np.abs(basis[k]).argmax())
         basis[k] /= basis[k, place]
@@ -298,6 +338,8 @@ def graph_of(
         raise UnknownName(f"{label}: {error}") from error
     as_expression = lambda x: x.expression if type(x) is Column else builder.number(float(x))
     of_names = lambda found: {n: as_expression(x) for n, x in found.items()}
+    for found in (inside, outside):
+        check_returned(found, label)
     for name in inside:
         if name not in species:
             what = f"{label} returned a rate for {name!r}, which is no species"

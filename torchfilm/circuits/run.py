@@ -19,6 +19,7 @@ from torchfilm.circuits import integrators, rosenbrock, stochastic
 from torchfilm.circuits.columns import Columns, column
 from torchfilm.circuits.compiled import CompiledCircuit
 from torchfilm.circuits.draws import Draw
+from torchfilm.circuits.graph import both_of, check_returned
 from torchfilm.circuits.names import Names, unknown
 from torchfilm.circuits.network import Network
 from torchfilm.tools.checks import InputError
@@ -47,7 +48,8 @@ class CircuitCells:
 
     part: a rate function, or a network of reactions. species: its variables. given: the signals
     that it exchanges. rows: the M cells, (M,) int64. cell, p: columns over the N cells by name.
-    compiled: the same as compiled functions, where it could be traced. signals: the concentration
+    compiled: the same as equations, where it could be traced; by_torch: whether torch evaluates
+    them. signals: the concentration
     outside each cell, (N,) by name. pool: (N,) µm³, each cell's part of
     the medium, if the circuit exchanges a signal. in_reservoir: (N,) bool, cells whose pool is a
     reservoir of constant concentration, or None.
@@ -64,6 +66,7 @@ class CircuitCells:
     in_reservoir: Tensor | None = None
     label: str = "circuit"
     compiled: CompiledCircuit | None = None
+    by_torch: bool = False
     seen: dict[str, set[str]] = field(default_factory=dict)
 
     def names(self, u: Tensor, rows: Tensor) -> tuple[Names, Names, Names, Names]:
@@ -100,22 +103,15 @@ class CircuitCells:
                     n: x * cell.volume
                     for n, x in zip(self.part.signals, found[split:], strict=True)
                 }
-            returned = self.part(u_, s, p, cell)
-        inside, outside = (
-            returned if isinstance(returned, tuple) and len(returned) == 2 else (returned, {})
-        )
+            inside, outside = both_of(self.part(u_, s, p, cell))
         return self._checked(inside, self.species, "species", u, rows), self._checked(
             outside, tuple(self.signals), "signal", u, rows
         )
 
     def _checked(
-        self, found: object, known: Sequence[str], what: str, u: Tensor, rows: Tensor
+        self, found: Any, known: Sequence[str], what: str, u: Tensor, rows: Tensor
     ) -> dict[str, Tensor]:
-        if not isinstance(found, Mapping):
-            raise InputError(
-                f"{self.label} returned {type(found).__name__}: it must return a dict of rates by"
-                " species, and, for signals, a second one."
-            )
+        check_returned(found, self.label)
         out = {}
         for name, value in found.items():
             if name not in known:
@@ -212,7 +208,9 @@ def step(
     steps = torch.full((count,), settings.steps, dtype=torch.int64, device=start.device)
     if settings.method == "rosenbrock":
         compiled, rtol, atol = circuit.compiled, settings.rtol, settings.atol
-        found = None if compiled is None else compiled.rodas3(circuit, start, dt, rtol, atol)
+        found = None
+        if compiled is not None and not circuit.by_torch:
+            found = compiled.rodas3(circuit, start, dt, rtol, atol)
         if found is None:
             slopes = None if compiled is None else circuit.slopes
             found = rosenbrock.rodas3(circuit.rates, start, dt, rtol=rtol, atol=atol, slopes=slopes)

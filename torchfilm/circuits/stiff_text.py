@@ -5,21 +5,31 @@ The order of operations is that of `rosenbrock`, and so are its constants.
 
 from __future__ import annotations
 
+from torchfilm.circuits import linear, rosenbrock
+
+CONSTANTS = {
+    **{
+        name: getattr(rosenbrock, name)
+        for name in (
+            "DONE", "TOO_MANY_STEPS", "NOT_FINITE", "BELOW_ZERO", "SAFETY", "SHRINK", "GROW",
+            "LEAST_STEP", "MAX_NONFINITE_STEPS",
+        )
+    },
+    "LEAST_PIVOT": linear.LEAST_PIVOT,
+}  # fmt: skip
+
 HEAD = '''"""{what}, written by torchfilm."""
 
 import math
 
 import numpy as np
 
-from torchfilm.circuits.rosenbrock import (
-    BELOW_ZERO, DONE, GROW, LEAST_STEP, MAX_NONFINITE_STEPS, NOT_FINITE, SAFETY, SHRINK,
-    TOO_MANY_STEPS,
-)
-from torchfilm.circuits.linear import LEAST_PIVOT
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.functions import (
     _finite, _least, _log, _log1p, _log2, _log10, _most, _remainder, _sign, _sqrt,
 )
+
+{constants}
 
 
 '''

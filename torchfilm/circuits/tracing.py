@@ -7,9 +7,10 @@ that arithmetic gives the same bits.
 
 from __future__ import annotations
 
-import operator
+import math
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -47,8 +48,7 @@ class Column(Tensor):
                 return f"Column({args[0].expression.op})"
         rule = RULES.get(func)
         if rule is None:
-            name = getattr(func, "__name__", str(func))
-            raise Untraceable(f"it uses {WORDS.get(name, name)}{_place()}")
+            raise Untraceable(f"it uses {_said(getattr(func, '__name__', str(func)))}{_place()}")
         try:
             return rule(*args, **(kwargs or {}))
         except TypeError as error:
@@ -61,27 +61,58 @@ SHAPE = {
     getattr(Tensor, n).__get__ for n in ("dtype", "device", "requires_grad", "is_sparse", "layout")
 } | {Tensor.is_floating_point, torch.is_floating_point, Tensor.is_complex, Tensor.dim}
 # What a user meant by calling these.
+_ONE, _ALL = "a column as one number", "a sum or the like over all cells"
+_COUNT, _APART, _CHANCE = "the number of cells", "the cells one by one", "random numbers"
 WORDS = {
-    "__bool__": "the value of a column in `if`, `and`, `or`, `not`, `min` or `max`",
-    "__len__": "the number of cells",
-    "__iter__": "the cells one by one",
-    "__getitem__": "some of the cells",
+    "__bool__": (
+        "the value of a column in `if`, `and`, `or`, `not`, `min` or `max`: write torch.where,"
+        " torch.minimum or torch.maximum"
+    ),
+    **dict.fromkeys(
+        ("__float__", "__int__", "__complex__", "__index__", "item"),
+        f"{_ONE} (float, .item() or a function of math): write torch.exp and the like",
+    ),
+    **dict.fromkeys(("__array__", "numpy"), "numpy: write torch.exp and the like"),
+    **dict.fromkeys(("__len__", "size", "numel"), _COUNT),
+    **dict.fromkeys(("__iter__", "unbind", "tolist"), _APART),
+    **dict.fromkeys(("__getitem__", "masked_select", "take", "gather"), "some of the cells"),
+    "index_select": (
+        "some of the cells, or a constant per colony inside a reaction: name the constant, and give"
+        " it to Circuit"
+    ),
     "__setitem__": "a change in place",
     "__get__": "the shape or another property of a column",
-    "item": "the value of a column",
-    "__float__": "the value of a column",
-    "tolist": "the values of a column",
+    **{n: f"{_ALL} ({n})" for n in ("sum", "mean", "prod", "cumsum", "std", "var", "any", "all")},
+    **{n: f"{_ALL} ({n})" for n in ("amax", "amin", "argmax", "argmin", "max", "min", "median")},
+    **{n: f"{n}, which puts columns together" for n in ("stack", "cat", "hstack", "vstack")},
+    **{n: f"{n}, which mixes columns or cells" for n in ("linear", "matmul", "__matmul__", "dot")},
+    **{n: f"{_CHANCE} ({n})" for n in ("rand_like", "randn_like", "bernoulli", "poisson")},
 }
+
+
+def _said(name: str) -> str:
+    """What a function does, for a message."""
+    in_place = name.endswith("_") and not name.endswith("__")
+    return WORDS.get(name, f"a change in place ({name})" if in_place else name)
+
+
+# Where the user's own code is not: here, where powers are replaced, and in torch.
+_HERE = Path(__file__).resolve().parent
+_INSIDE = tuple(str(p) for p in (_HERE, _HERE.parent / "tools", Path(torch.__file__).parent))
 
 
 def _place() -> str:
     """Where in the user's code, for a message."""
-    inside = ("torchfilm", "torch")
     for frame in reversed(traceback.extract_stack()[:-2]):
-        parts = frame.filename.replace("\\", "/").split("/")
-        if not any(f"{name}" in parts for name in inside):
-            return f" (line {frame.lineno} of {parts[-1]}: {frame.line})"
+        if frame.name == TRACING:
+            break
+        if not str(Path(frame.filename).resolve()).startswith(_INSIDE):
+            line = (frame.line or "").strip()
+            return f" (line {frame.lineno} of {Path(frame.filename).name}: {line})"
     return ""
+
+
+TRACING = "traced_rates"  # the function that calls the user's
 
 
 def named(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -99,9 +130,22 @@ def named(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return law
 
 
+def _power(x: Any, n: Any) -> Tensor:
+    """xⁿ as circuits evaluate it; x or n may be a number."""
+    if not isinstance(x, Tensor):
+        return steady.exp_base(x, n) if x > 0 else steady.power(torch.full_like(n, x), n)
+    if type(x) is not Column or isinstance(n, Tensor):
+        return steady.power(x, n)
+    if n < 0:
+        return _power(x, -n).reciprocal()
+    if n > steady.MAX_SQUARED or not math.isfinite(n):
+        n = _constant(x, n, 0)  # where `steady.power` makes a tensor of it
+    return steady.power(x, n)
+
+
 # Functions made of others, by name: as rate laws, and as circuits evaluate powers and their like.
 LAWS: dict[str, Callable[..., Tensor]] = {
-    "pow": steady.power,
+    "pow": _power,
     "exp2": lambda x: steady.exp_base(2.0, x),
     **{
         name: getattr(steady, name)
@@ -117,14 +161,26 @@ def apply(op: str, *args: Any) -> Column:
     columns = [a for a in args if type(a) is Column]
     first = columns[0]
     if not all(type(a) is Column or isinstance(a, (int, float)) for a in args):
-        raise Untraceable(f"it uses a tensor from outside{_place()}")
+        raise Untraceable(
+            "it uses a tensor or an array that is no column: a draw, or one from outside, to be"
+            f" given to Circuit as a constant and read as p.name{_place()}"
+        )
     parts = [a.expression if type(a) is Column else first.builder.number(float(a)) for a in args]
     kinds = [(a.dtype, a.dim()) if type(a) is Column else None for a in args]
-    whole = not any(a.is_floating_point() for a in columns)
-    if whole and op not in (*LOGICAL, "where", "cast32", "cast64", "detach"):
-        raise Untraceable(f"it reckons with whole numbers ({op}){_place()}")
+    counted = columns[:0] if op in (*LOGICAL, *CASTS, "detach") else columns
+    if op == "where":
+        counted = [a for a in args[1:] if type(a) is Column]
+    if counted and not any(a.is_floating_point() for a in counted):
+        raise Untraceable(
+            f"it calculates with whole numbers or truth values ({op}): write torch.where, or"
+            f" .to(u.name.dtype){_place()}"
+        )
     return Column.of(first.builder.make(op, *parts), first.builder, *kind_of(op, kinds))
 
+
+# Numbers as a type; "full": as a column of that type, one value for each cell.
+CASTS = {f"{n}{k}": getattr(torch, f"float{k}") for n in ("cast", "full") for k in (32, 64)}
+FULL = ("full32", "full64")
 
 # The type of a column, and 1, or 0 where it is one number for all cells; None for a plain number.
 Kind = tuple[torch.dtype, int]
@@ -136,8 +192,8 @@ def kind_of(op: str, kinds: Sequence[Kind | None]) -> Kind:
     dim = max((k[1] for k in kinds if k is not None), default=0)
     if op in LOGICAL:
         return torch.bool, dim
-    if op in ("cast32", "cast64"):
-        return (torch.float32 if op == "cast32" else torch.float64), dim
+    if op in CASTS:
+        return CASTS[op], 1 if op in FULL else dim
     return common_type(kinds[1:] if op == "where" else kinds), dim
 
 
@@ -178,11 +234,17 @@ def _clamp(x: Any, min: Any = None, max: Any = None) -> Column:
 def _like(value: float) -> Callable[..., Column]:
     """A column of one number, of the type of another."""
 
-    def rule(x: Column, *, dtype: Any = None) -> Column:
-        made = x.builder.number(value)
-        return Column.of(made, x.builder, x.dtype if dtype is None else dtype, x.dim())
+    return lambda x, *, dtype=None: _constant(x, value, x.dim(), dtype)
 
-    return rule
+
+def _constant(x: Column, value: Any, dim: int, dtype: Any = None) -> Column:
+    """One number as a column like x, or with dim 0 as one of all cells."""
+    dtype = x.dtype if dtype is None else dtype
+    names = {t: n for n, t in CASTS.items() if (n in FULL) == bool(dim)}
+    if not isinstance(value, (int, float)) or dtype not in names:
+        raise TypeError(str(value))
+    made = x.builder.make(names[dtype], x.builder.number(value))
+    return Column.of(made, x.builder, dtype, dim)
 
 
 def _to(x: Column, *given: Any, dtype: Any = None, device: Any = None) -> Column:
@@ -196,9 +258,43 @@ def _to(x: Column, *given: Any, dtype: Any = None, device: Any = None) -> Column
     return apply(names[wanted[0]], x)
 
 
+def _logical(op: str) -> Callable[..., Column]:
+    """Of truth values; other numbers are true where they are not 0."""
+    truth = lambda x: apply("ne", x, 0.0) if type(x) is Column and x.dtype != torch.bool else x
+    return lambda *args: apply(op, *map(truth, args))
+
+
+def _of_bits(op: str) -> Callable[..., Column]:
+    """&, | and ~: of truth values only, since they mean bits elsewhere."""
+
+    def rule(*args: Any) -> Column:
+        if not all(type(a) is Column and a.dtype == torch.bool for a in args):
+            raise Untraceable(f"it uses &, | or ~ with other than truth values{_place()}")
+        return apply(op, *args)
+
+    return rule
+
+
 def _two(op: str) -> Callable[..., Column]:
-    """min and max of two columns, as torch.min(x, y)."""
-    return lambda x, y: apply(op, x, y)
+    """min and max of two columns, as torch.min(x, y); of one they are over all cells."""
+
+    def rule(x: Any, *y: Any) -> Column:
+        if len(y) != 1 or type(y[0]) is not Column:
+            raise Untraceable(f"it uses {WORDS[op[:3]]}{_place()}")
+        return apply(op, x, y[0])
+
+    return rule
+
+
+def _as_module(rule: Callable[[Any], Column], **defaults: Any) -> Callable[..., Column]:
+    """A function with options that a torch.nn module passes along: their defaults only."""
+
+    def plain(x: Any, **options: Any) -> Column:
+        if any(options[n] != defaults.get(n, False) for n in options):
+            raise TypeError(str(options))
+        return rule(x)
+
+    return plain
 
 
 RULES: dict[Any, Callable[..., Any]] = {}
@@ -206,7 +302,8 @@ RULES: dict[Any, Callable[..., Any]] = {}
 
 def _note(rule: Callable[..., Any], *names: str) -> None:
     for name in names:
-        for home in (torch, Tensor, torch.special, torch.nn.functional):
+        own = name.startswith("__")  # modules have methods of these names, too
+        for home in (Tensor,) if own else (torch, Tensor, torch.special, torch.nn.functional):
             found = getattr(home, name, None)
             if callable(found):
                 RULES[found] = rule
@@ -218,21 +315,25 @@ for _op, _names in {
     "pow": "pow __pow__", "minimum": "minimum", "maximum": "maximum",
     "gt": "gt greater __gt__", "ge": "ge greater_equal __ge__", "lt": "lt less __lt__",
     "le": "le less_equal __le__", "eq": "eq __eq__", "ne": "ne not_equal __ne__",
-    "and": "logical_and __and__", "or": "logical_or __or__", "logaddexp": "logaddexp",
-    "hypot": "hypot",
+    "logaddexp": "logaddexp", "hypot": "hypot",
 }.items():  # fmt: skip
     _note(_binary(_op), *_names.split())
 for _op, _names in {
     "neg": "neg negative __neg__", "abs": "abs absolute __abs__", "exp": "exp", "expm1": "expm1",
     "log": "log", "log1p": "log1p", "log2": "log2", "log10": "log10", "sqrt": "sqrt", "sin": "sin",
     "cos": "cos", "tan": "tan", "tanh": "tanh", "atan": "atan arctan", "floor": "floor",
-    "sign": "sign sgn", "not": "logical_not __invert__", "detach": "detach",
-    "sigmoid": "sigmoid expit", "exp2": "exp2", "sinh": "sinh", "cosh": "cosh",
-    "atanh": "atanh arctanh", "softplus": "softplus", "silu": "silu", "elu": "elu",
+    "sign": "sign sgn", "detach": "detach", "sigmoid": "sigmoid expit", "exp2": "exp2",
+    "sinh": "sinh", "cosh": "cosh", "atanh": "atanh arctanh",
 }.items():  # fmt: skip
     _note(_unary(_op), *_names.split())
+for _op, _sign in {"and": "__and__", "or": "__or__", "not": "__invert__"}.items():
+    _note(_logical(_op), f"logical_{_op}")
+    _note(_of_bits(_op), _sign)
+_note(_as_module(_unary("softplus"), beta=1, threshold=20), "softplus")
+_note(_as_module(_unary("elu"), alpha=1), "elu")
+_note(_as_module(_unary("silu")), "silu")
 _note(_swapped("sub"), "rsub", "__rsub__")
-_note(_swapped("div"), "__rtruediv__", "__rdiv__")
+_note(lambda x, y: apply("mul", apply("div", 1.0, x), y), "__rtruediv__", "__rdiv__")
 _note(_swapped("pow"), "__rpow__")
 _note(_two("minimum"), "min")
 _note(_two("maximum"), "max")
@@ -242,13 +343,13 @@ RULES[Tensor.where] = lambda x, c, y: apply("where", c, x, y)
 _note(_clamp, "clamp", "clip")
 _note(lambda x, min: _clamp(x, min=min), "clamp_min")
 _note(lambda x, max: _clamp(x, max=max), "clamp_max")
-_note(lambda x: _clamp(x, min=0.0), "relu")
+_note(_as_module(lambda x: _clamp(x, min=0.0)), "relu")
 _note(lambda x: apply("div", 1.0, x), "reciprocal")
 _note(lambda x: apply("div", 1.0, apply("sqrt", x)), "rsqrt")
 _note(lambda x: apply("mul", x, x), "square")
 _note(_like(0.0), "zeros_like")
 _note(_like(1.0), "ones_like")
-_note(lambda x, value: _like(value)(x), "full_like")
+_note(lambda x, fill_value, **dtype: _like(fill_value)(x, **dtype), "full_like")
 _note(lambda x: x, "clone", "contiguous", "positive", "__pos__")
 _note(_to, "to")
 _note(lambda x: _to(x, torch.float64), "double")
@@ -269,21 +370,10 @@ def lowered(
             made[node] = leaves[node]
         elif node.op == NUMBER:
             made[node] = node.value
+        elif node.op in CASTS and node.args[0].op == NUMBER:
+            again = builder.make(node.op, builder.number(node.args[0].value))
+            made[node] = Column.of(again, builder, *kind_of(node.op, [None]))
         else:
             args = [made[a] for a in node.args]
-            made[node] = _evaluated(node.op, args)
-    like = next(iter(leaves.values()))
-    return [
-        made[r] if type(made[r]) is Column else _like(made[r])(like)  # a rate that is a number
-        for r in roots
-    ]
-
-
-def _evaluated(op: str, args: list[Any]) -> Any:
-    """An operation on columns, or on numbers alone."""
-    if any(type(a) is Column for a in args):
-        return LAWS[op](*args) if op in LAWS else apply(op, *args)
-    numbers = {"add": operator.add, "sub": operator.sub, "mul": operator.mul}
-    if op in numbers:
-        return numbers[op](*args)
-    return float(getattr(torch, op)(*(torch.tensor(a, dtype=torch.float64) for a in args)))
+            made[node] = LAWS[node.op](*args) if node.op in LAWS else apply(node.op, *args)
+    return [made[r] for r in roots]

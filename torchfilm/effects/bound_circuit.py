@@ -174,9 +174,10 @@ class BoundCircuit(BoundEffect):
         return state
 
     def _compiled(self, kind: int | str, cells: run.CircuitCells) -> run.CircuitCells:
-        """The cells with their circuit compiled, where it can be."""
+        """The cells with their circuit's equations, where it can be written so. Torch takes its
+        derivatives from them, too, so that both backends give the same."""
         key = (kind, cells.in_reservoir is not None)
-        if self.by_torch or cells.rows.numel() == 0:
+        if self.effect.method != "rosenbrock" or cells.rows.numel() == 0:
             return cells
         if key not in self.compiled:
             try:
@@ -184,7 +185,9 @@ class BoundCircuit(BoundEffect):
             except Untraceable as why:
                 self.compiled[key] = f"{cells.label}: {why}"
         found = self.compiled[key]
-        return cells if isinstance(found, str) else dataclasses.replace(cells, compiled=found)
+        if isinstance(found, str):
+            return cells
+        return dataclasses.replace(cells, compiled=found, by_torch=bool(self.by_torch))
 
     def _check_constants(self, read: set[str]) -> None:
         """Raise InputError for a constant that looks like another name, and warn of one that no

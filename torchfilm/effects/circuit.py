@@ -152,12 +152,12 @@ class Circuit(Effect):
     def is_stochastic(self) -> bool:
         return self.method in (LEAP, DIRECT)
 
-    @property
+    @cached_property
     def variables(self) -> dict[str, str]:
         """The species of the rates by name, own ones first, and the field of each."""
         return {n: f"{self.name}_{n}" if self.name else n for n in self.species} | dict(self.shared)
 
-    @property
+    @cached_property
     def own_fields(self) -> tuple[str, ...]:
         """The fields of its own species."""
         return tuple(self.variables[n] for n in self.species)
@@ -193,8 +193,8 @@ class Circuit(Effect):
                 found[kind] = graph_of(part, tuple(self.variables), tuple(self.parameters), label)
             except Untraceable as why:
                 raise checks.InputError(
-                    f"{self.value_owner()}: {label} cannot be written as equations: {why}. It runs"
-                    " all the same, by torch."
+                    f"{self.value_owner()}: {label} cannot be written as equations: {why}. It still"
+                    " runs, by torch, if torch can compute it for all cells at once."
                 ) from why
         return found
 

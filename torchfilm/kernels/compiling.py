@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,15 @@ def keep(name: str) -> None:
     mark = _mark(name)
     if mark is not None:
         mark.touch()
+
+
+def announce(name: str, what: str) -> bool:
+    """Say that `what` has to be compiled first, unless the kernels of this name are kept; whether
+    it was said. Call `keep` once they are."""
+    if is_kept(name):
+        return False
+    print(f"torchfilm: compiling {what}, once for this installation", file=sys.stderr)
+    return True
 
 
 def kernel(function=None, *, any_order: bool = False):

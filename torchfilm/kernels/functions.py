@@ -29,7 +29,7 @@ def _most(a, b):
 
 @kernel
 def _sign(x):
-    return (x > 0) * 1.0 - (x < 0) * 1.0 if x == x else np.nan
+    return (x > 0) * 1.0 - (x < 0) * 1.0
 
 
 @kernel

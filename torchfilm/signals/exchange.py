@@ -13,55 +13,18 @@ In a uniform field the two ways to share are the same.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from torchfilm.signals import compiled
 from torchfilm.signals.grid import Grid
+from torchfilm.signals.stencil import SLACK, Stencil
 from torchfilm.tools import checks
-from torchfilm.tools.ragged import Groups
 
-# A cell beyond a face by at most this part of a voxel counts as inside. Positions are float64: 1e5
-# µm from the origin they are rounded by 1e-11 µm, and so is the corner of an extended box. A cell
-# that really is outside is outside by far more.
-SLACK = 1e-6
 # Where several cells empty a voxel together, their parts add up to 1 except for rounding. A sum
 # within this many units in the last place counts as 1.
 ULPS = 64
-
-
-@dataclass(frozen=True, eq=False)
-class Stencil:
-    """The voxels at which N cells read and write.
-
-    node: (N, K) int64 voxels, the nearest first. weight: (N, K) ≥ 0, with sum 1, or 0 for a cell
-    that is wholly inside an obstacle. outside: (N,) bool, cells beyond the box or wholly inside an
-    obstacle. Beyond the box a cell reads and writes at the edge. Inside an obstacle it reads 0 and
-    its writing is lost. The caller decides what to do with either. blocked: (N,) bool, cells wholly
-    inside an obstacle, or None without obstacles.
-    """
-
-    node: Tensor
-    weight: Tensor
-    outside: Tensor
-    voxel_volume: float
-    nodes: int
-    blocked: Tensor | None = None
-
-    @cached_property
-    def groups(self) -> Groups:
-        """The voxel of each entry of `node`, row by row."""
-        return Groups(self.node.reshape(-1), self.nodes)
-
-    def gather(self, values: Tensor) -> Tensor:
-        """Values (nodes,) at the stencil's voxels, (N, K)."""
-        return values.index_select(0, self.node.reshape(-1)).view(self.node.shape)
-
-    def sum(self, entry: Tensor) -> Tensor:
-        """Entries (N, K) summed over each voxel, (nodes,)."""
-        return self.groups.sum(entry.reshape(-1, 1)).squeeze(1)
 
 
 def outside_box(
@@ -88,7 +51,9 @@ def _outside_scaled(scaled: Tensor, shape: Tensor, periodic: tuple[bool, bool, b
         at, size = scaled[:, axis], shape[:, axis]
         # this form makes a NaN outside
         outside |= (
-            ~torch.isfinite(at) if periodic[axis] else ~((at >= -SLACK) & (at <= size + SLACK))
+            ~torch.isfinite(at)
+            if periodic[axis]
+            else ~((at >= -SLACK) & (at <= size.to(at.dtype) + SLACK))
         )
     return outside
 
@@ -121,6 +86,8 @@ def stencil(
         raise checks.input_error(
             "mask", (tuple(mask.shape), mask.dtype), f"bool of shape ({grid.nodes},)"
         )
+    if compiled.may_run(position):
+        return compiled.stencil(grid, position, colony, periodic, mask, dtype)
     shape = grid.shape.index_select(0, colony)
     # in voxels from the lower corner
     scaled = (position - grid.origin.index_select(0, colony)) / grid.step
@@ -227,6 +194,8 @@ def read(values: Tensor, stencil: Stencil) -> Tensor:
     whose weight is at least 1/K. So a uniform field is read exactly, and a non-negative field gives
     a non-negative value.
     """
+    if compiled.may_run(values, stencil.weight):
+        return compiled.read(values, stencil)
     found, weight = stencil.gather(values).unbind(1), stencil.weight.to(values.dtype).unbind(1)
     nearest = torch.where(weight[0] > 0, found[0], 0.0)
     out = nearest
@@ -243,6 +212,8 @@ def pool_volume(stencil: Stencil) -> Tensor:
     weight / W of the content. A cell away from the middle of its voxel reads, and shares, more than
     one voxel. Then W may be below 1 and its pool larger than a voxel.
     """
+    if compiled.may_run(stencil.weight):
+        return compiled.pool_volume(stencil)
     weight_sums = stencil.gather(stencil.sum(stencil.weight))
     worst = torch.where(stencil.weight > 0, weight_sums, 0.0).amax(1)
     return stencil.voxel_volume / torch.where(worst > 0, worst, 1.0)
@@ -257,9 +228,11 @@ def write(values: Tensor, amount: Tensor, stencil: Stencil) -> Tensor:
     larger uptake shows as a value below 0, or as NaN where the voxel was empty. Uptake is taken
     from the values before secretion.
     """
+    there = read(values, stencil)
+    if compiled.may_run(values, amount, there):
+        return compiled.write(values, amount, there, stencil, ULPS)
     weight = stencil.weight.to(values.dtype)
     volume = stencil.voxel_volume
-    there = read(values, stencil)
     wanted = (-amount).clamp(min=0.0)
     # the part of a voxel's content that a cell takes if all its weight is there
     part = wanted / (torch.where(there > 0, there, 1.0) * volume)

@@ -1,0 +1,124 @@
+"""Cells and the grids around them, cell by cell: the same as `signals.exchange`, to the bit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchfilm.kernels.compiling import kernel
+
+
+@kernel
+def _two_voxels(at, size, periodic):
+    """The nearest voxel along an axis, the next one, and the weight of that."""
+    at = at if abs(at) < np.inf else 0.0
+    at = np.remainder(at, float(size)) if periodic else max(min(at, size - 1.0), 0.0)
+    near = np.rint(at)
+    side = 1.0 if at >= near else -1.0
+    nearest, other = np.int64(near), np.int64(near + side)
+    if periodic:
+        return nearest % size, other % size, (at - near) * side
+    return nearest, max(min(other, size - 1), 0), (at - near) * side
+
+
+@kernel
+def put_stencil(position, colony, origin, step, shape, first, used, periodic, slack, mask, node,
+                weight, outside, blocked):  # fmt: skip
+    """Puts the voxels of each cell, the nearest first, and their weights into node and weight,
+    (N, K). used: the axes with more than one voxel. mask: (nodes,), or empty."""
+    corners, zero, one = node.shape[1], weight.dtype.type(0), weight.dtype.type(1)
+    pairs, far = np.zeros((3, 2), np.int64), np.zeros((3, 2), weight.dtype)
+    for i in range(position.shape[0]):
+        b = colony[i]
+        for k in range(3):
+            at, size = (position[i, k] - origin[b, k]) / step[k], shape[b, k]
+            if periodic[k]:
+                outside[i] |= not abs(at) < np.inf
+            else:
+                outside[i] |= not (at >= -slack and at <= size + slack)
+            nearest, other, share = _two_voxels(at - 0.5, size, periodic[k])
+            stride = shape[b, 1] * shape[b, 2] if k == 0 else shape[b, 2] if k == 1 else 1
+            pairs[k, 0], pairs[k, 1] = nearest * stride, other * stride
+            far[k, 1] = share
+            far[k, 0] = one - far[k, 1]
+        for c in range(corners):
+            n, w, left = first[b], one, corners
+            for k in used:
+                left //= 2
+                side = (c // left) % 2
+                n += pairs[k, side]
+                w *= far[k, side]
+            node[i, c], weight[i, c] = n, w
+        if mask.shape[0]:
+            _mask(i, node, weight, mask, outside, blocked)
+        if corners > 1:
+            rest = weight[i, 1]
+            for c in range(2, corners):
+                rest += weight[i, c]
+            weight[i, 0] = one - rest if weight[i, 0] > 0 else zero
+
+
+@kernel
+def _mask(i, node, weight, mask, outside, blocked):
+    """Weights of a cell without those in an obstacle, the greatest first."""
+    corners, best = node.shape[1], 0
+    total = weight.dtype.type(0)
+    for c in range(corners):
+        if not mask[node[i, c]]:
+            weight[i, c] = 0
+        total += weight[i, c]
+    blocked[i] = total <= 0
+    outside[i] |= blocked[i]
+    for c in range(corners):
+        if total > 0:
+            weight[i, c] /= total
+        if weight[i, c] > weight[i, best]:
+            best = c
+    first, heavy = node[i, 0], weight[i, 0]
+    node[i, 0], weight[i, 0] = node[i, best], weight[i, best]
+    node[i, best], weight[i, best] = first, heavy
+
+
+@kernel
+def read(values, node, weight, out):
+    """The concentration at each cell."""
+    for i in range(node.shape[0]):
+        nearest = values[node[i, 0]] if weight[i, 0] > 0 else values.dtype.type(0)
+        found = nearest
+        for c in range(1, node.shape[1]):
+            found += weight[i, c] * (values[node[i, c]] - nearest)
+        out[i] = found
+
+
+@kernel
+def pools(node, weight, volume, sums, out):
+    """The voxel's volume over the greatest sum of weights at each cell's voxels. sums: (nodes,) of
+    0."""
+    for i in range(node.shape[0]):
+        for c in range(node.shape[1]):
+            sums[node[i, c]] += weight[i, c]
+    for i in range(node.shape[0]):
+        worst = weight.dtype.type(0)
+        for c in range(node.shape[1]):
+            if weight[i, c] > 0:
+                worst = max(worst, sums[node[i, c]])
+        out[i] = volume / (worst if worst > 0 else weight.dtype.type(1))
+
+
+@kernel
+def write(values, amount, there, node, weight, volume, near_one, taken, given, out):
+    """Values after secretion and uptake; there: what each cell reads. taken, given: (nodes,) of
+    0."""
+    zero, one = values.dtype.type(0), values.dtype.type(1)
+    for i in range(node.shape[0]):
+        wanted, more = max(-amount[i], zero), max(amount[i], zero) / volume
+        part = wanted / ((there[i] if there[i] > 0 else one) * volume)
+        if wanted > 0 and there[i] <= 0:
+            part = values.dtype.type(np.inf)
+        for c in range(node.shape[1]):
+            taken[node[i, c]] += weight[i, c] * part
+            given[node[i, c]] += weight[i, c] * more
+    for k in range(values.shape[0]):
+        share = taken[k]
+        if share > 1 and share < near_one:
+            share = one
+        out[k] = values[k] - values[k] * share + given[k]

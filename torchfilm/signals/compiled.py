@@ -1,0 +1,86 @@
+"""Exchange between cells and grid by compiled kernels, on the CPU where no gradient is wanted."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchfilm.physics.compiled import unavailable
+from torchfilm.signals.grid import Grid
+from torchfilm.signals.stencil import SLACK, Stencil
+
+
+def may_run(*given: Tensor) -> bool:
+    """Whether kernels may take these tensors."""
+    if given[0].device.type != "cpu" or unavailable():
+        return False
+    return not (torch.is_grad_enabled() and any(x.requires_grad for x in given))
+
+
+def stencil(
+    grid: Grid,
+    position: Tensor,
+    colony: Tensor,
+    periodic: tuple[bool, bool, bool],
+    mask: Tensor | None,
+    dtype: torch.dtype,
+) -> Stencil:
+    """As `exchange.stencil`."""
+    from torchfilm.kernels.medium import put_stencil
+
+    count = position.shape[0]
+    used = torch.tensor(
+        [k for k in range(3) if any(s[k] > 1 for s in grid.shapes)], dtype=torch.int64
+    )
+    node = torch.empty(count, 2 ** used.numel(), dtype=torch.int64)
+    weight = torch.empty(node.shape, dtype=dtype)
+    outside, blocked = torch.zeros(2, count, dtype=torch.bool)
+    put_stencil(
+        position.detach().contiguous().numpy(), colony.contiguous().numpy(), grid.origin.numpy(),
+        grid.step.numpy(), grid.shape.numpy(), grid.offsets.numpy(), used.numpy(),
+        torch.tensor(periodic).numpy(), SLACK,
+        torch.empty(0, dtype=torch.bool).numpy() if mask is None else mask.numpy(),
+        node.numpy(), weight.numpy(), outside.numpy(), blocked.numpy(),
+    )  # fmt: skip
+    return Stencil(
+        node, weight, outside, grid.voxel_volume, grid.nodes, None if mask is None else blocked
+    )
+
+
+def read(values: Tensor, stencil: Stencil) -> Tensor:
+    """As `exchange.read`."""
+    from torchfilm.kernels.medium import read as put
+
+    values, weight = values.detach(), stencil.weight.detach().to(values.dtype)
+    out = torch.empty_like(weight[:, 0])
+    put(values.contiguous().numpy(), stencil.node.numpy(), weight.numpy(), out.numpy())
+    return out
+
+
+def pool_volume(stencil: Stencil) -> Tensor:
+    """As `exchange.pool_volume`."""
+    from torchfilm.kernels.medium import pools
+
+    weight = stencil.weight.detach()
+    out, sums = torch.empty_like(weight[:, 0]), weight.new_zeros(stencil.nodes)
+    volume = torch.tensor(stencil.voxel_volume, dtype=weight.dtype).numpy()[()]
+    pools(stencil.node.numpy(), weight.numpy(), volume, sums.numpy(), out.numpy())
+    return out
+
+
+def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps: int) -> Tensor:
+    """As `exchange.write`; there: what `read` gives."""
+    from torchfilm.kernels.medium import write as put
+
+    dtype = values.dtype
+    near_one = torch.tensor(1 + ulps * torch.finfo(dtype).eps, dtype=dtype).numpy()[()]
+    volume = torch.tensor(stencil.voxel_volume, dtype=dtype).numpy()[()]
+    taken, given = torch.zeros(2, values.numel(), dtype=dtype)
+    out = torch.empty_like(values)
+    put(
+        values.detach().contiguous().numpy(), amount.detach().to(dtype).contiguous().numpy(),
+        there.detach().to(dtype).numpy(), stencil.node.numpy(),
+        stencil.weight.detach().to(dtype).numpy(), volume, near_one, taken.numpy(), given.numpy(),
+        out.numpy(),
+    )  # fmt: skip
+    return out
