@@ -20,6 +20,7 @@ from mock_cuda import pretended_cuda  # noqa: F401
 
 import torchfilm as tf
 from torchfilm.physics import compiled
+from torchfilm.tools import numba_calls
 
 F64 = torch.float64
 FILM = [tf.Plane(z=-0.5, facing="+z", stiffness=16.0), tf.Plane(z=0.5, facing="-z")]
@@ -102,7 +103,7 @@ def test_the_number_of_threads_and_the_batch_change_no_bit(dim, monkeypatch):
 
 
 def test_without_numba_contacts_are_computed_by_torch_and_it_is_said_once(monkeypatch):
-    compiled.unavailable.cache_clear()
+    numba_calls.unavailable.cache_clear()
     loaded = [name for name in sys.modules if name.startswith("torchfilm.kernels.")]
     for name in (*loaded, "numba"):
         monkeypatch.delitem(sys.modules, name, raising=False)
@@ -116,7 +117,7 @@ def test_without_numba_contacts_are_computed_by_torch_and_it_is_said_once(monkey
         with pytest.raises(tf.InputError, match="backend = 'compiled', but Numba"):
             tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, backend="compiled")).bind()
     finally:
-        compiled.unavailable.cache_clear()
+        numba_calls.unavailable.cache_clear()
 
 
 COMPILE = """

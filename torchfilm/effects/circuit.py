@@ -22,10 +22,10 @@ from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.effect import CIRCUIT, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_circuit import BoundCircuit
-from torchfilm.physics import compiled
 from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.numba_calls import unavailable
 from torchfilm.values import COLONY, FORMS, Rule, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
@@ -204,7 +204,7 @@ class Circuit(Effect):
             "backend='torch'" if self.backend == "torch"
             else f"method={self.method!r}" if self.method != STIFF
             else f"the device is {device.type}" if device.type != "cpu"
-            else compiled.unavailable()
+            else unavailable()
         )  # fmt: skip
         if self.backend == "compiled" and why:
             raise checks.InputError(f"Circuit.backend = 'compiled', but {why}: leave backend out.")

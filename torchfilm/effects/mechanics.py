@@ -14,7 +14,6 @@ from torchfilm.effects.bound_mechanics import BoundMechanics
 from torchfilm.kernels.bilateral_scheme import CLOSE, PENALTY, TOLERANCE
 from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
-from torchfilm.physics import compiled
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.initial_overlaps import check_apart
 from torchfilm.physics.one_sided_records import OneSidedSettings
@@ -23,6 +22,7 @@ from torchfilm.physics.walls import Wall
 from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.numba_calls import unavailable
 from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, smallest
 
 # The default length drag: free growth, but for bilateral contacts, which do not hold in it.
@@ -172,7 +172,7 @@ class Mechanics(Effect):
         reason = (
             f"the device is {device.type}, and kernels are for the CPU"
             if device.type != "cpu"
-            else compiled.unavailable()
+            else unavailable()
         )
         if self.backend == "compiled" and reason:
             raise checks.InputError(

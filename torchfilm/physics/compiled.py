@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import warnings
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -16,47 +10,15 @@ from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.step_records import StepInput, StepResult
 from torchfilm.physics.surfaces import FlatSurface
+from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.ragged import Groups, offsets
+from torchfilm.tools.threads import pool
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
 WORTH_THREADS = 300
 
 
-@cache
-def unavailable() -> str:
-    """Why kernels cannot be compiled here, or "" where they can."""
-    try:
-        import numba  # noqa: F401
-    except ImportError as error:
-        reason = f"Numba cannot be imported ({error})"
-        warnings.warn(
-            f"{reason}: contacts are computed by torch, ten times slower or more. Install numba.",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-        return reason
-    return ""
-
-
-@cache
-def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="torchfilm")
-
-
 _called: set[str] = set()  # names of kernels that this process has called
-
-
-def _announce(name: str) -> bool:
-    """Say, once, that the kernels of this name have to be compiled first; whether it was said."""
-    from torchfilm.kernels.compiling import is_kept
-
-    if name in _called or is_kept(name):
-        return False
-    print(
-        f"torchfilm: compiling contacts ({name}), some 20 s, once for this installation",
-        file=sys.stderr,
-    )
-    return True
 
 
 @torch.no_grad()
@@ -66,30 +28,23 @@ def substeps(groups: Groups, position: Tensor, *of_cells: Tensor, longest: float
 
     steps, status = torch.ones_like(groups.counts), torch.zeros_like(groups.counts)
     dtype = of_cells[0].dtype
-    arrays = [_array(position, torch.float64), *(_array(x, dtype) for x in of_cells)]
+    arrays = [as_array(position, torch.float64), *(as_array(x, dtype) for x in of_cells)]
     put(groups.owner.numpy(), *arrays, longest, steps.numpy(), status.numpy())
     return steps, status
-
-
-def _array(value: Tensor, dtype: torch.dtype) -> np.ndarray:
-    """A contiguous array of this type, which shares the tensor's memory where it can."""
-    value = value.detach() if value.requires_grad else value
-    value = value if value.dtype == dtype else value.to(dtype)
-    return (value if value.is_contiguous() else value.contiguous()).numpy()
 
 
 @torch.no_grad()
 def contact_steps(given: StepInput) -> StepResult:
     """As `one_sided.contact_steps` and `bilateral.contact_steps`."""
     from torchfilm.kernels import step as kernels
-    from torchfilm.kernels.compiling import keep
+    from torchfilm.kernels.compiling import announce, keep
 
     dtype = given.radius.dtype
     name = f"{given.settings.dim}-D, {str(dtype).removeprefix('torch.')}"
     step_colonies, numbers = _kernel_of(given.settings)
     if isinstance(given.settings, ContactSettings):
         name = f"{name}, bilateral"
-    new = _announce(name)
+    new = name not in _called and announce(name, f"contacts ({name}), some 20 s")
     counts = given.groups.counts
     begin, steps = offsets(counts).numpy(), given.steps.numpy()
     position, axis = given.position.clone(), given.axis.clone()
@@ -98,9 +53,9 @@ def contact_steps(given: StepInput) -> StepResult:
     reports = np.zeros((counts.numel(), kernels.REPORT))
     arguments = (
         begin, steps, position.numpy(), axis.numpy(), length.numpy(),
-        *(_array(x, dtype) for x in (given.growth, given.radius, given.viscosity,
+        *(as_array(x, dtype) for x in (given.growth, given.radius, given.viscosity,
         given.length_drag)), move.numpy(), hardness.numpy(), *_walls(given),
-        _array(given.radius[:0] if given.alpha is None else given.alpha, dtype), numbers, reports,
+        as_array(given.radius[:0] if given.alpha is None else given.alpha, dtype), numbers, reports,
         (0,) * (4 if given.settings.dim == 2 else 8),
     )  # fmt: skip
     for done in _started(step_colonies, begin, counts.numpy(), arguments):
@@ -149,8 +104,9 @@ def _started(kernel, begin: np.ndarray, counts: np.ndarray, arguments: tuple):
         least = work.index(min(work))
         work[least] += int(counts[colony])
         shares[least].append(colony)
-    pool = _pool(os.getpid(), threads)
-    return [pool.submit(kernel, np.array(s, np.int64), *arguments).result for s in shares if s]
+    return [
+        pool(threads).submit(kernel, np.array(s, np.int64), *arguments).result for s in shares if s
+    ]
 
 
 def _walls(given: StepInput) -> tuple[np.ndarray, ...]:

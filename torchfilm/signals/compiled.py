@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchfilm.physics.compiled import unavailable
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.stencil import SLACK, Stencil
+from torchfilm.tools.numba_calls import as_array, unavailable
 
 
 def may_run(*given: Tensor) -> bool:
@@ -36,7 +36,7 @@ def stencil(
     weight = torch.empty(node.shape, dtype=dtype)
     outside, blocked = torch.zeros(2, count, dtype=torch.bool)
     put_stencil(
-        position.detach().contiguous().numpy(), colony.contiguous().numpy(), grid.origin.numpy(),
+        as_array(position, torch.float64), as_array(colony, torch.int64), grid.origin.numpy(),
         grid.step.numpy(), grid.shape.numpy(), grid.offsets.numpy(), used.numpy(),
         torch.tensor(periodic).numpy(), SLACK,
         torch.empty(0, dtype=torch.bool).numpy() if mask is None else mask.numpy(),
@@ -51,9 +51,10 @@ def read(values: Tensor, stencil: Stencil) -> Tensor:
     """As `exchange.read`."""
     from torchfilm.kernels.medium import read as put
 
-    values, weight = values.detach(), stencil.weight.detach().to(values.dtype)
-    out = torch.empty_like(weight[:, 0])
-    put(values.contiguous().numpy(), stencil.node.numpy(), weight.numpy(), out.numpy())
+    dtype = values.dtype
+    out = torch.empty(stencil.node.shape[0], dtype=dtype)
+    weight = as_array(stencil.weight, dtype)
+    put(as_array(values, dtype), stencil.node.numpy(), weight, out.numpy())
     return out
 
 
@@ -78,9 +79,8 @@ def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps:
     taken, given = torch.zeros(2, values.numel(), dtype=dtype)
     out = torch.empty_like(values)
     put(
-        values.detach().contiguous().numpy(), amount.detach().to(dtype).contiguous().numpy(),
-        there.detach().to(dtype).numpy(), stencil.node.numpy(),
-        stencil.weight.detach().to(dtype).numpy(), volume, near_one, taken.numpy(), given.numpy(),
+        *(as_array(x, dtype) for x in (values, amount, there)), stencil.node.numpy(),
+        as_array(stencil.weight, dtype), volume, near_one, taken.numpy(), given.numpy(),
         out.numpy(),
     )  # fmt: skip
     return out

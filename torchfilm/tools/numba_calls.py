@@ -1,0 +1,34 @@
+"""What calls of compiled kernels need: whether there can be any, and arrays."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@cache
+def unavailable() -> str:
+    """Why kernels cannot be compiled here, or "" where they can."""
+    try:
+        import numba  # noqa: F401
+    except ImportError as error:
+        reason = f"Numba cannot be imported ({error})"
+        warnings.warn(
+            f"{reason}: torch computes contacts, circuits and exchange, ten times slower or more."
+            " Install numba.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return reason
+    return ""
+
+
+def as_array(value: Tensor, dtype: torch.dtype) -> np.ndarray:
+    """A contiguous array of this type, which shares the tensor's memory where it can."""
+    value = value.detach() if value.requires_grad else value
+    value = value if value.dtype == dtype else value.to(dtype)
+    return (value if value.is_contiguous() else value.contiguous()).numpy()
