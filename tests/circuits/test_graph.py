@@ -285,13 +285,9 @@ def beside(u, s, p, cell):
 
 def test_conserved_sums():
     same = lambda found, *sums: sorted(map(repr, found)) == sorted(map(repr, sums))
-    two = enzyme().graph.conserved
-    assert len(two) == 2
-    for held in ({"e": 1, "es": 1}, {"s": 1, "es": 1, "pr": 1}):
-        weights = [[sums.get(n, 0) for n in ("s", "e", "es", "pr")] for sums in (*two, held)]
-        assert np.linalg.matrix_rank(weights) == 2, (two, held)
-    assert same(tf.Circuit(robertson, species="a b c".split()).graph.conserved, dict(a=1, b=1, c=1))
-    assert same(tf.Circuit(beside, species="a b slow".split()).graph.conserved, {"a": 1, "b": 1})
+    assert enzyme().graph.conserved == [{"s": 1, "es": 1, "pr": 1}, {"e": 1, "es": 1}]
+    assert same(tf.Circuit(robertson, species=["a", "b", "c"]).graph.conserved, dict(a=1, b=1, c=1))
+    assert same(tf.Circuit(beside, species=["a", "b", "slow"]).graph.conserved, {"a": 1, "b": 1})
     # what leaves the cell enters the medium; here LuxI does not change, and makes AHL
     assert signalling().graph.conserved == [{"luxi": 1}]
     exchange = tf.Circuit([*parts.exchange("ahl", "D"), *parts.degradation("lacz", 1.0)],
@@ -325,9 +321,7 @@ def test_both_forms_of_a_circuit_have_the_same_rates():
         *parts.degradation("red", 1.0), *parts.degradation("green", 1.0),
     ]  # fmt: skip
     one, other = (tf.Circuit(x, species=("red", "green"), k=4.0).graph for x in (switch, listed))
-    assert str(one) == (
-        "d red/dt   = k·1/(1 + green^2) − red\nd green/dt = k·1/(1 + red^2) − green"
-    )
+    assert str(one) == ("d red/dt   = k/(1 + green^2) − red\nd green/dt = k/(1 + red^2) − green")
     values = {"red": [0.3, 2.0], "green": [1.0, 0.0], "k": 4.0}
     for name, rate in one.evaluate(values).items():
         assert array(other.evaluate(values)[name]) == pytest.approx(array(rate), rel=1e-14)
