@@ -50,9 +50,12 @@ SMOOTH = {
         kinetics.activation(x, y, 2.5) + kinetics.activation(x, 0.5) + kinetics.activation(x, y, x)
     ),
     "repression": lambda x, y: (
-        kinetics.repression(x, y, 2) * kinetics.repression(y, x) + kinetics.repression(x, 0.5, y + 1)
+        kinetics.repression(x, y, 2) * kinetics.repression(y, x)
+        + kinetics.repression(x, 0.5, y + 1)
     ),
-    "michaelis_menten": lambda x, y: kinetics.michaelis_menten(x, y) * kinetics.michaelis_menten(y, 2.0),
+    "michaelis_menten": lambda x, y: (
+        kinetics.michaelis_menten(x, y) * kinetics.michaelis_menten(y, 2.0)
+    ),
 }  # fmt: skip
 FLAT = {*LOGICAL, "floor", "sign", "where", "detach", "full32", "full64"}
 
@@ -162,7 +165,7 @@ WRITTEN = {
     "a − (−b)": lambda a, b, c: a - -b,
     "a − b": lambda a, b, c: a + -b,
     "−2·a − 1": lambda a, b, c: a * -2.0 + -1.0,
-    "−(−a)": lambda a, b, c: -(-a),
+    "−(−a)": lambda a, b, c: (-a).neg(),
     "(a + b)^c": lambda a, b, c: (a + b) ** c,
     "a^(b + c)": lambda a, b, c: a ** (b + c),
     "(a^2)^c": lambda a, b, c: (a**2) ** c,
@@ -252,7 +255,7 @@ def test_a_circuit_printed():
     assert repr(signalling().graph) == str(signalling().graph)
 
 
-# --- what is conserved, and what is read -----------------------------------------------------------
+# --- what is conserved, and what is read ----------------------------------------------------------
 
 
 def enzyme() -> tf.Circuit:
