@@ -50,9 +50,12 @@ SMOOTH = {
         kinetics.activation(x, y, 2.5) + kinetics.activation(x, 0.5) + kinetics.activation(x, y, x)
     ),
     "repression": lambda x, y: (
-        kinetics.repression(x, y, 2) * kinetics.repression(y, x) + kinetics.repression(x, 0.5, y + 1)
+        kinetics.repression(x, y, 2) * kinetics.repression(y, x)
+        + kinetics.repression(x, 0.5, y + 1)
     ),
-    "michaelis_menten": lambda x, y: kinetics.michaelis_menten(x, y) * kinetics.michaelis_menten(y, 2.0),
+    "michaelis_menten": lambda x, y: (
+        kinetics.michaelis_menten(x, y) * kinetics.michaelis_menten(y, 2.0)
+    ),
 }  # fmt: skip
 FLAT = {*LOGICAL, "floor", "sign", "where", "detach", "full32", "full64"}
 
@@ -162,7 +165,7 @@ WRITTEN = {
     "a − (−b)": lambda a, b, c: a - -b,
     "a − b": lambda a, b, c: a + -b,
     "−2·a − 1": lambda a, b, c: a * -2.0 + -1.0,
-    "−(−a)": lambda a, b, c: -(-a),
+    "−(−a)": lambda a, b, c: (-a).neg(),
     "(a + b)^c": lambda a, b, c: (a + b) ** c,
     "a^(b + c)": lambda a, b, c: a ** (b + c),
     "(a^2)^c": lambda a, b, c: (a**2) ** c,
@@ -252,7 +255,7 @@ def test_a_circuit_printed():
     assert repr(signalling().graph) == str(signalling().graph)
 
 
-# --- what is conserved, and what is read -----------------------------------------------------------
+# --- what is conserved, and what is read ----------------------------------------------------------
 
 
 def enzyme() -> tf.Circuit:
@@ -285,13 +288,9 @@ def beside(u, s, p, cell):
 
 def test_conserved_sums():
     same = lambda found, *sums: sorted(map(repr, found)) == sorted(map(repr, sums))
-    two = enzyme().graph.conserved
-    assert len(two) == 2
-    for held in ({"e": 1, "es": 1}, {"s": 1, "es": 1, "pr": 1}):
-        weights = [[sums.get(n, 0) for n in ("s", "e", "es", "pr")] for sums in (*two, held)]
-        assert np.linalg.matrix_rank(weights) == 2, (two, held)
-    assert same(tf.Circuit(robertson, species="a b c".split()).graph.conserved, dict(a=1, b=1, c=1))
-    assert same(tf.Circuit(beside, species="a b slow".split()).graph.conserved, {"a": 1, "b": 1})
+    assert enzyme().graph.conserved == [{"s": 1, "es": 1, "pr": 1}, {"e": 1, "es": 1}]
+    assert same(tf.Circuit(robertson, species=["a", "b", "c"]).graph.conserved, dict(a=1, b=1, c=1))
+    assert same(tf.Circuit(beside, species=["a", "b", "slow"]).graph.conserved, {"a": 1, "b": 1})
     # what leaves the cell enters the medium; here LuxI does not change, and makes AHL
     assert signalling().graph.conserved == [{"luxi": 1}]
     exchange = tf.Circuit([*parts.exchange("ahl", "D"), *parts.degradation("lacz", 1.0)],
@@ -325,9 +324,7 @@ def test_both_forms_of_a_circuit_have_the_same_rates():
         *parts.degradation("red", 1.0), *parts.degradation("green", 1.0),
     ]  # fmt: skip
     one, other = (tf.Circuit(x, species=("red", "green"), k=4.0).graph for x in (switch, listed))
-    assert str(one) == (
-        "d red/dt   = k·1/(1 + green^2) − red\nd green/dt = k·1/(1 + red^2) − green"
-    )
+    assert str(one) == ("d red/dt   = k/(1 + green^2) − red\nd green/dt = k/(1 + red^2) − green")
     values = {"red": [0.3, 2.0], "green": [1.0, 0.0], "k": 4.0}
     for name, rate in one.evaluate(values).items():
         assert array(other.evaluate(values)[name]) == pytest.approx(array(rate), rel=1e-14)

@@ -12,8 +12,11 @@ QUIET = ("cast32", "cast64", "full32", "full64", "detach")  # operations on the 
 
 
 def _bare(node: Expression) -> Expression:
+    """The expression without what does not show: types of numbers, and zeros that are added."""
     while node.op in QUIET:
         node = node.args[0]
+    if node.op == "add" and any(_bare(a).is_number(0) for a in node.args):
+        return _bare(node.args[1] if _bare(node.args[0]).is_number(0) else node.args[0])
     return node
 
 
@@ -66,10 +69,8 @@ class _Plain:
             return (found, binds) if node.value >= 0 else (self.minus + found, SIGN)
         if op == NAME:
             return self.name(node.name), ATOM
-        if op in QUIET:
-            return self.made[args[0]]
-        if op == "add" and (args[0].is_number(0) or args[1].is_number(0)):
-            return self.made[args[1] if args[0].is_number(0) else args[0]]
+        if _bare(node) is not node:
+            return self.made[_bare(node)]
         if op == "sub" and args[1].is_number(0):
             return self.made[args[0]]
         if op == "mul" and (args[0].is_number(1) or args[1].is_number(1)):
@@ -90,6 +91,8 @@ class _Plain:
             args = args[::-1]  # 2·a, also where torch was given (a, 2)
         if op == "mul":
             right = self._in(args[1], PRODUCT)
+            if right.startswith("1/"):
+                return self._in(args[0], SIGN) + right[1:], self._signed(args[0])
             return self._in(args[0], SIGN) + self.between(right) + right, self._signed(args[0])
         if op == "div":
             return self.fraction(args[0], args[1])

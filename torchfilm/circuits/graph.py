@@ -208,7 +208,7 @@ class CircuitGraph:
     def _at_random(self, seed: int) -> np.ndarray:
         """Rates at 64 random places, (64, rows), of amounts in a cell of volume 1."""
         rng = np.random.default_rng(seed)
-        names = {text(e) for e in walk(self._all()) if e.op == NAME}
+        names = dict.fromkeys(text(e) for e in walk(self._all()) if e.op == NAME)
         values = {n: rng.uniform(0.2, 2.0, 64) for n in names} | {"cell.volume": np.ones(64)}
         found = self.evaluate(values).values()
         columns = [np.broadcast_to(x.numpy(), (64,)) for x in found]
@@ -298,13 +298,22 @@ def _null_space(rates: np.ndarray) -> list[list[int]]:
     scale = np.abs(rates).max(0)
     scale[scale == 0] = 1.0
     _, size, rows = np.linalg.svd(rates / scale, full_matrices=True)
-    basis = rows[int((size > 1e-12).sum()) :] / scale
-    for k, pivot in enumerate(range(basis.shape[0])):  # each has a 1 where the others have 0
-        place = int(np.abs(basis[k]).argmax())
-        basis[k] /= basis[k, place]
-        for other in range(basis.shape[0]):
-            if other != pivot:
-                basis[other] -= basis[other, place] * basis[k]
+    basis = rows[int((size > 1e-12).sum()) :].copy()
+    done: list[int] = []  # reduced echelon form: one basis, whichever was found
+    for column in range(basis.shape[1]):
+        k = len(done)
+        if k == len(basis):
+            break
+        best = k + int(np.abs(basis[k:, column]).argmax())
+        if abs(basis[best, column]) < 1e-8:
+            continue
+        basis[[k, best]] = basis[[best, k]]
+        basis[k] /= basis[k, column]
+        for other in range(len(basis)):
+            if other != k:
+                basis[other] -= basis[other, column] * basis[k]
+        done.append(column)
+    basis = basis * (scale[done].reshape(-1, 1) / scale)
     found = []
     for row in basis:
         shares = [Fraction(float(x)).limit_denominator(24) for x in row]

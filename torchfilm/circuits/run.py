@@ -49,10 +49,9 @@ class CircuitCells:
     part: a rate function, or a network of reactions. species: its variables. given: the signals
     that it exchanges. rows: the M cells, (M,) int64. cell, p: columns over the N cells by name.
     compiled: the same as equations, where it could be traced; by_torch: whether torch evaluates
-    them. signals: the concentration
-    outside each cell, (N,) by name. pool: (N,) µm³, each cell's part of
-    the medium, if the circuit exchanges a signal. in_reservoir: (N,) bool, cells whose pool is a
-    reservoir of constant concentration, or None.
+    them. signals: the concentration outside each cell, (N,) by name. pool: (N,) µm³, each cell's
+    part of the medium, if the circuit exchanges a signal. in_reservoir: (N,) bool, cells whose pool
+    is a reservoir of constant concentration, or None.
     """
 
     part: RateFunction | Network

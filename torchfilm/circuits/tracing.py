@@ -108,7 +108,8 @@ def _place() -> str:
             break
         if not str(Path(frame.filename).resolve()).startswith(_INSIDE):
             line = (frame.line or "").strip()
-            return f" (line {frame.lineno} of {Path(frame.filename).name}: {line})"
+            at = f" (line {frame.lineno} of {Path(frame.filename).name}"
+            return f"{at}: {line})" if line else f"{at})"
     return ""
 
 

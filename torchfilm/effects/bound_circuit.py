@@ -174,8 +174,7 @@ class BoundCircuit(BoundEffect):
         return state
 
     def _compiled(self, kind: int | str, cells: run.CircuitCells) -> run.CircuitCells:
-        """The cells with their circuit's equations, where it can be written so. Torch takes its
-        derivatives from them, too, so that both backends give the same."""
+        """The cells with their circuit's equations, where there are: torch's derivatives, too."""
         key = (kind, cells.in_reservoir is not None)
         if self.effect.method != "rosenbrock" or cells.rows.numel() == 0:
             return cells

@@ -1,0 +1,496 @@
+"""Circuits by compiled functions against torch: the same bits where only + − × ÷ occur, the
+same failures, and circuits at random.
+
+Compiling takes seconds a circuit, so most texts run as plain Python (`plain`): that is the same
+text. Those that are compiled for real are the ready scenes' and the ones named so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from helpers import array
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from traced import by, plain_module
+
+import torchfilm as tf
+from torchfilm import parts
+from torchfilm.circuits import compiled, run
+from torchfilm.circuits.rosenbrock import SAFETY, rodas3
+from torchfilm.tools.deterministic_math import deterministic_functions
+
+F32, F64 = torch.float32, torch.float64
+
+
+@pytest.fixture
+def plain(monkeypatch):
+    """Texts are run as Python."""
+    monkeypatch.setattr(compiled, "_module", plain_module)
+
+
+def row_of(count: int, types: int = 1) -> tf.Cells:
+    """Cells apart from each other on a line."""
+    return tf.Cells(
+        [[5.0 * k, 0.0] for k in range(count)], [[1.0, 0.0]] * count,
+        cell_type=[k % types for k in range(count)],
+    )  # fmt: skip
+
+
+def alone(*circuits: tf.Effect, count: int = 12, types: int = 1) -> tf.Scene:
+    """Cells that grow, with circuits."""
+    growth = tf.Growth(rate=tf.Uniform(0.5, 1.0))
+    return tf.Scene(growth, *circuits, founders=row_of(count, types), dt=0.1)
+
+
+def ends(scene: tf.Scene, steps: int = 3, dt: float = 0.1, **bind) -> list[tf.State]:
+    """The state after some steps by both backends."""
+    out = []
+    for backend in ("compiled", "torch"):
+        model = by(backend, scene).bind(**{"seed": 3, "dtype": F64, **bind})
+        assert all("circuit" not in e.title or e.compiled for e in model.effects)
+        state = model.start()
+        for _ in range(steps):
+            state = model.step(state, dt)
+        out.append(state)
+    return out
+
+
+def equal(a: tf.State, b: tf.State) -> None:
+    assert torch.equal(a.uid, b.uid)
+    for name, x in a.fields.items():
+        assert torch.equal(x, b.fields[name]), name
+    for name, x in a.signals.items():
+        assert torch.equal(x, b.signals[name]), name
+
+
+def close(a: tf.State, b: tf.State, rel: float, least: float = 0.0) -> None:
+    """Concentrations of the circuits: relative to each, or at least `least`."""
+    assert torch.equal(a.uid, b.uid)
+    for name, x in a.fields.items():
+        assert array(x) == pytest.approx(array(b.fields[name]), rel=rel, abs=least), name
+
+
+# --- ready scenes, compiled for real --------------------------------------------------------------
+
+READY = {
+    "toggle_switch": {"noise": False, "power": 2},
+    "repressilator": {"noise": False},
+    "random_partition": {},
+    "quorum_sensing": {"size": 64.0, "k3": [0.5, 2.0]},
+    "boundary_detector": {},
+}
+
+
+def test_all_ready_scenes_with_circuits_are_compared():
+    found = {
+        name for name in tf.scenes.READY
+        if any(isinstance(e, tf.Circuit) for e in tf.scenes.build(name).effects)
+    }  # fmt: skip
+    assert found == set(READY)
+
+
+@pytest.mark.parametrize("name", list(READY))
+def test_ready_scenes_give_the_same_bits(name, dtype, plain):
+    """Powers are squares and cubes; growth, division and exchange act between."""
+    a, b = ends(tf.scenes.build(name, READY[name]), 12, dtype=dtype, colonies=2, per_colony=True)
+    equal(a, b)
+    assert a.cells >= 4 and float(sum(a.fields[n].sum() for n in species_of(name))) > 0
+
+
+def species_of(name: str) -> list[str]:
+    effects = tf.scenes.build(name, READY[name]).effects
+    return [n for e in effects if isinstance(e, tf.Circuit) for n in e.own_fields]
+
+
+def test_compiled_for_real_is_the_same_as_plain_python(monkeypatch, dtype):
+    """The boundary detector: two circuits, exchange, a run with divisions."""
+    scene = tf.scenes.boundary_detector()
+    a, b = ends(scene, 30, dtype=dtype)
+    monkeypatch.setattr(compiled, "_module", plain_module)
+    c, _ = ends(scene, 30, dtype=dtype)
+    assert a.cells > 4
+    equal(a, b)
+    equal(a, c)
+
+
+# --- kinds of circuits ----------------------------------------------------------------------------
+
+
+def switch(u, s, p, cell):
+    return {
+        "red": p.k / (1 + u.green**2) - p.loss * u.red,
+        "green": p.k / (1 + u.red * u.red) - u.green * p.loss + 0.1 * cell.volume,
+    }
+
+
+def toggle(**constants) -> tf.Circuit:
+    return tf.Circuit(
+        switch, species=("red", "green"), initial={"red": tf.Uniform(0.0, 3.0), "green": 0.5},
+        **{"k": 4.0, "loss": 1.0, **constants},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "constants",
+    [
+        {},
+        {"k": torch.tensor([2.0, 4.0, 8.0])},
+        {"k": tf.LogNormal(4.0, 0.3)},
+        {"loss": {0: 0.5, 1: 2.0}},
+    ],
+    ids=["numbers", "per colony", "drawn", "by type"],
+)
+def test_constants_of_all_kinds(constants, dtype, plain):
+    a, b = ends(alone(toggle(**constants), types=2), colonies=3, dtype=dtype)
+    equal(a, b)
+    assert len(a.red.unique()) > 6
+
+
+def exchanging(u, s, p, cell):
+    into = p.D * (s.ahl - u.ahl) * cell.area
+    made = torch.where(cell.cell_type == 1, 0.0, p.k)
+    return {"ahl": made + into / cell.volume - 0.1 * u.ahl}, {"ahl": -into}
+
+
+@pytest.mark.parametrize("D", [1.0, 1e5])
+def test_exchange_with_a_medium_and_a_reservoir(D, dtype, plain):
+    """Half of the cells are outside the box."""
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=10.0, reservoir=0.5), box=((-8.0, -8.0), (24.0, 8.0)),
+        spacing=4.0, outside="reservoir",
+    )  # fmt: skip
+    circuit = tf.Circuit(exchanging, species="ahl", D=D, k=2.0)
+    a, b = ends(alone(circuit, medium, types=2), dtype=dtype)
+    equal(a, b)
+    assert float(a.ahl[-1]) != float(a.ahl[0]) > 0
+
+
+def test_cell_types_and_shared_species(dtype, plain):
+    first = tf.Circuit(
+        {
+            0: lambda u, s, p, cell: {"a": p.k - u.a * u.b},
+            1: lambda u, s, p, cell: {"b": u.a - u.b},
+        },
+        species=("a", "b"), initial={"a": 1.0, "b": tf.Uniform(0.0, 1.0)}, k=2.0,
+    )  # fmt: skip
+    second = tf.Circuit(
+        [*parts.degradation("a", "loss"), tf.Reaction.of("a + c -> 0", 0.3),
+         *parts.constitutive("c", 0.1)],
+        species="c", name="more", shared=("a",), loss=tf.LogNormal(1.0, 0.2),
+    )  # fmt: skip
+    a, b = ends(alone(first, second, types=3), dtype=dtype)
+    equal(a, b)
+    assert float(a.more_c.min()) > 0
+
+
+def clock(u, s, p, cell):
+    return {"a": 0.1 + cell.time * 0.1 / 3 - u.a * cell.growth_rate, "b": 1, "c": 0.0 * u.a}
+
+
+def test_time_is_that_of_each_step(dtype, plain):
+    """Read anew in each step; rates that are numbers, and one that is always 0."""
+    circuit = tf.Circuit(clock, species=("a", "b", "c", "still"))
+    a, b = ends(alone(circuit), 5, dtype=dtype)
+    equal(a, b)
+    model = alone(tf.Circuit(clock, species=("a", "b", "c"))).bind(seed=3, dtype=dtype)
+    late = model.step(model.start().replace(time=5.0), 0.1)
+    assert (late.a > model.step(model.start(), 0.1).a).all()
+
+
+def test_lists_of_reactions_give_the_same_bits(dtype, plain):
+    """Constants that are numbers take the type of the cells, as torch has it."""
+    listed = [
+        *parts.constitutive("a", 0.1), *parts.degradation("a", 0.7),
+        tf.Reaction.of("2 a + b -> 3 c", 0.3),
+        *parts.conversion("c", "b", enzyme="a", rate=0.1, half=0.3),
+        *parts.activated("b", by="c", rate="k", half=0.3, power=2),
+        *parts.repressed("a", by="b", rate=0.9, half=0.7, power=3),
+    ]  # fmt: skip
+    circuit = tf.Circuit(listed, species=("a", "b", "c"), initial={"a": 1.0}, k=0.1)
+    a, b = ends(alone(circuit), dtype=dtype)
+    equal(a, b)
+
+
+def test_functions_differ_by_rounding_only(dtype, plain):
+    """exp, log and powers of another library, in the last place; steps are chosen alike."""
+
+    def rates(u, s, p, cell):
+        return {
+            "a": p.k * torch.exp(-u.b) - u.a**1.5 + tf.kinetics.activation(u.a, 0.5, p.n),
+            "b": torch.tanh(u.a) + torch.log1p(u.b) - torch.sin(u.b) - u.b,
+        }
+
+    circuit = tf.Circuit(
+        rates, species=("a", "b"), initial={"a": tf.Uniform(0.0, 2.0)}, k=2.0, n=2.3
+    )
+    a, b = ends(alone(circuit), dtype=dtype)
+    close(a, b, rel=1e-12 if dtype == F64 else 1e-6)
+    assert torch.equal(a.reports["circuit"].steps, b.reports["circuit"].steps)
+
+
+# --- independence of how the work is divided ------------------------------------------------------
+
+
+def test_same_bits_for_any_number_of_threads():
+    """Compiled for real: 1,200 cells are two threads' worth."""
+    found = []
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            model = alone(toggle(), count=2 * compiled.WORTH_A_THREAD + 7).bind(seed=1, dtype=F64)
+            found.append(model.step(model.start(), 0.5))
+    finally:
+        torch.set_num_threads(before)
+    equal(*found)
+
+
+def test_same_bits_in_any_batch(plain):
+    scene = alone(toggle(k=tf.LogNormal(4.0, 0.3)))
+    runs = {}
+    for count in (3, 2, 1):
+        model = scene.bind(count, seed=5, dtype=F64)
+        runs[count] = model.step(model.start(), 0.3).red
+    for count in (2, 1):
+        assert torch.equal(runs[count], runs[3][: len(runs[count])]) and len(runs[count])
+
+
+def one_step(scene: tf.Scene, dtype: torch.dtype = F64):
+    """The circuit of a scene and the concentrations at the start of its first step."""
+    seen = []
+    step = run.step
+    try:
+        run.step = lambda *args: seen.append(args) or step(*args)
+        model = scene.bind(seed=1, dtype=dtype)
+        model.step(model.start(), 0.1)
+    finally:
+        run.step = step
+    return seen[0][0], seen[0][1]
+
+
+def test_same_bits_in_any_order(plain):
+    cells, concentrations = one_step(alone(toggle(k=tf.LogNormal(4.0, 0.3))))
+    order = torch.tensor([7, 2, 9, 0])
+    some = dataclasses.replace(cells, rows=cells.rows.index_select(0, order))
+    whole, _ = cells.compiled.rodas3(cells, concentrations, 0.4, 1e-4, 1e-9)
+    part, report = some.compiled.rodas3(some, concentrations[order], 0.4, 1e-4, 1e-9)
+    assert torch.equal(part, whole[order]) and len(report.status) == 4
+
+
+def test_a_restart_gives_the_same_bits(plain):
+    scene = alone(toggle(k=tf.LogNormal(4.0, 0.3)))
+    *_, whole = tf.simulate(scene, scene.bind(seed=2).start(), until=0.5)
+    *_, half = tf.simulate(scene, scene.bind(seed=2).start(), until=0.2)
+    *_, rest = tf.simulate(scene, half, until=0.5)
+    equal(whole, rest)
+
+
+def test_no_time_changes_nothing(plain):
+    cells, concentrations = one_step(alone(toggle()))
+    settings = run.IntegrationSettings("rosenbrock", 1, 1e-4, 1e-9, 1.0)
+    found = run.step(cells, concentrations, 0.0, settings)
+    assert torch.equal(found.concentrations, concentrations) and not found.failed.any()
+
+
+# --- failures -------------------------------------------------------------------------------------
+
+
+def nan_above(u, s, p, cell):
+    return {"a": p.k + 0 * torch.sqrt(1.0 - u.a)}
+
+
+def draining(u, s, p, cell):
+    return {"a": p.k - 1.0 + 0 * u.a}
+
+
+def exploding(u, s, p, cell):
+    return {"a": p.k * u.a * u.a}
+
+
+@pytest.mark.parametrize(
+    "rates, k, said",
+    [
+        (nan_above, [0.0, 9.0, 9.0], "is not a finite number"),
+        (draining, [2.0, 0.0, 0.5], "below zero, 'a' first, from"),
+        (exploding, [0.1, 40.0, 30.0], "circuit of cell"),
+    ],
+)
+def test_failures_are_the_same(rates, k, said, dtype, plain):
+    circuit = tf.Circuit(rates, species="a", initial={"a": 0.5}, k=torch.tensor(k))
+    a, b = ends(alone(circuit, count=3), 1, dt=1.0, colonies=3, dtype=dtype)
+    one, other = (state.reports["circuit"] for state in (a, b))
+    assert one.status.tolist() == [0, 1, 1] == other.status.tolist()
+    assert one.words == other.words and torch.equal(one.steps, other.steps)
+    assert all(said in words for words in one.words.values()), one.words
+    equal(a, b)
+
+
+# --- derivatives in the torch path, and gradients -------------------------------------------------
+
+
+def test_equations_and_autograd_agree():
+    """The torch path takes the derivatives of its equations; those of autograd give the same."""
+    cells, start = one_step(by("torch", alone(toggle(k=tf.LogNormal(4.0, 0.3)))))
+    assert cells.by_torch and cells.compiled is not None
+    one, _ = rodas3(cells.rates, start, 0.5, slopes=cells.slopes)
+    other, _ = rodas3(cells.rates, start, 0.5)
+    assert array(one) == pytest.approx(array(other), rel=1e-12)
+    with deterministic_functions():
+        for k in range(2):
+            u = start.t().clone().requires_grad_()
+            (grad,) = torch.autograd.grad(cells.rates(u.t(), torch.arange(12))[:, k].sum(), u)
+            slopes = cells.slopes(start.t(), torch.arange(12))[k]
+            assert array(slopes) == pytest.approx(array(grad), rel=1e-13)
+
+
+@pytest.mark.parametrize("wanted", ["constant", "first value"])
+def test_gradients_need_torch_and_get_it(wanted, plain):
+    def loss(backend, more=0.0):
+        value = torch.tensor(2.0 + more, dtype=F64, requires_grad=True)
+        constants = {"k": value} if wanted == "constant" else {}
+        first = value if wanted == "first value" else 1.0
+        circuit = tf.Circuit(switch, species=("red", "green"), initial={"red": first, "green": 0.5},
+                             backend=backend, **{"k": 4.0, "loss": 1.0, **constants})  # fmt: skip
+        model = alone(circuit).bind(seed=1, dtype=F64)
+        end = model.step(model.start(), 0.1)
+        (grad,) = torch.autograd.grad(end.red.sum(), value)
+        return float(end.red.sum().detach()), float(grad)
+
+    (value, grad), (_, other) = loss(None), loss("torch")
+    assert grad == pytest.approx(other, rel=1e-12)
+    assert (loss("torch", 1e-5)[0] - value) / 1e-5 == pytest.approx(grad, rel=1e-4)
+
+
+# --- what is said, and where compiled functions are kept ------------------------------------------
+
+
+def branching(u, s, p, cell):
+    return {"a": u.a.cumsum(0) * 0 - u.a}
+
+
+def test_it_is_explained_who_computes():
+    said = lambda circuit: tf.explain(alone(circuit))
+    assert "computed by compiled functions of its equations" in said(toggle())
+    assert "computed by torch: backend='torch'" in said(toggle(backend="torch"))
+    words = said(tf.Circuit(branching, species="a"))
+    assert (
+        "computed by torch: branching: it uses a sum or the like over all cells (cumsum)" in words
+    )
+    learnt = said(toggle(k=torch.tensor(2.0, requires_grad=True)))
+    assert "computed by torch: switch: p.k requires a gradient" in learnt
+    with pytest.raises(tf.InputError, match="backend = 'compiled', but method='rk4'"):
+        said(toggle(method="rk4", backend="compiled"))
+
+
+def test_what_cannot_be_traced_runs_by_torch():
+    scene = alone(tf.Circuit(branching, species="a", initial={"a": 1.0}))
+    model = scene.bind(dtype=F64)
+    assert float(model.step(model.start(), 0.1).a[0]) < 1.0
+
+
+def careless(u, s, p, cell):
+    return {"a": {torch.Tensor: -u.a}[type(u.a)]}
+
+
+def test_functions_that_fail_on_traced_columns_run_by_torch():
+    scene = alone(tf.Circuit(careless, species="a", initial={"a": 1.0}))
+    assert "torch: careless: called with columns that have no numbers, it raised KeyError" in (
+        tf.explain(scene)
+    )
+    model = scene.bind(dtype=F64)
+    assert float(model.step(model.start(), 0.1).a[0]) < 1.0
+
+
+def test_a_text_says_all_that_it_depends_on(monkeypatch):
+    """Constants by value: so compiled functions of other constants are never found."""
+    cells, _ = one_step(by("torch", alone(toggle())))
+    text = compiled.source(cells.compiled)
+    assert f"SAFETY = {SAFETY!r}\n" in text and "rosenbrock" not in text
+    monkeypatch.setattr("torchfilm.kernels.compiling.FOLDER", None)
+    made = compiled._module.__wrapped__(text)
+    assert made.times_slopes((1.0, 2.0, 3.0, 4.0), (1.0, 10.0)) == (21.0, 43.0)
+
+
+# --- circuits at random ---------------------------------------------------------------------------
+
+NAMES = tuple("abcdefgh")
+
+
+@st.composite
+def circuits(draw) -> dict:
+    """A circuit of up to eight species as reactions, and the same as a function."""
+    names = NAMES[: draw(st.integers(1, 8))]
+    number = st.floats(0.05, 3.0).map(lambda x: float(f"{x:.3g}"))
+    one = st.sampled_from(names)
+    listed, terms = [], []
+    for k in range(draw(st.integers(1, 2 * len(names)))):
+        kind = draw(st.sampled_from(["made", "lost", "pair", "hill", "turned", "out"]))
+        a, b, rate = draw(one), draw(one), draw(number)
+        if kind == "made":
+            listed.append(tf.Reaction({}, {a: 1}, rate, f"{k}"))
+            terms.append(({a: 1}, lambda u, s, c, r=rate: r))
+        elif kind == "lost":
+            listed.append(tf.Reaction({a: 1}, {}, rate, f"{k}"))
+            terms.append(({a: -1}, lambda u, s, c, r=rate, a=a: r * u[a]))
+        elif kind == "pair" and a != b:
+            listed.append(tf.Reaction({a: 1, b: 1}, {}, rate, f"{k}"))
+            terms.append(({a: -1, b: -1}, lambda u, s, c, r=rate, a=a, b=b: r * u[a] * u[b]))
+        elif kind == "turned" and a != b:
+            listed.append(tf.Reaction({a: 2}, {b: 1}, rate, f"{k}"))
+            terms.append(({a: -2, b: 1}, lambda u, s, c, r=rate, a=a: r * u[a] * u[a]))
+        elif kind == "hill":
+            half, power = draw(number), draw(st.sampled_from([1, 2, 3]))
+            law = draw(st.sampled_from(["activated", "repressed"]))
+            (made,) = getattr(parts, law)(a, b, rate, half, power)
+            listed.append(tf.Reaction({}, {a: 1}, made.rate, f"{k}"))
+            use = tf.kinetics.activation if law == "activated" else tf.kinetics.repression
+            terms.append(
+                ({a: 1}, lambda u, s, c, r=rate, b=b, h=half, n=power, f=use: r * f(u[b], h, n))
+            )
+        elif kind == "out":
+            gone, back = parts.exchange(a, rate, "x0")
+            listed += [tf.Reaction(r.consumes, r.produces, r.rate, f"{k} {n}")
+                       for n, r in enumerate((gone, back))]  # fmt: skip
+            net = lambda u, s, c, r=rate, a=a: r * c.area / c.volume * (u[a] - s.x0)
+            terms.append(({a: -1, "out.x0": 1}, net))
+    if not listed:
+        listed.append(tf.Reaction({}, {names[0]: 1}, 1.0))
+        terms.append(({names[0]: 1}, lambda u, s, c: 1.0))
+
+    def rates(u, s, p, cell):
+        inside, outside = {}, {}
+        for change, rate in terms:
+            value = rate(u, s, cell)
+            for name, n in change.items():
+                into = outside if name.startswith("out.") else inside
+                key = name.removeprefix("out.")
+                size = value * cell.volume if name.startswith("out.") else value
+                into[key] = into.get(key, 0.0) + n * size
+        return inside, outside
+
+    typed = draw(st.booleans())
+    wrap = lambda part: {0: part} if typed else part
+    return {"function": wrap(rates), "reactions": wrap(listed), "species": names}
+
+
+@given(circuits(), st.sampled_from([F32, F64]))
+@settings(max_examples=60, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate],
+          suppress_health_check=list(HealthCheck))  # fmt: skip
+def test_circuits_at_random(plain, made, dtype):
+    """Compiled text and torch: the same bits. Functions and reactions: the same to the solver's
+    tolerance, which is what their different rounding is allowed."""
+    x0 = tf.Signal(diffusion=5.0, initial=0.3)
+    medium = tf.Medium(x0=x0, box=((-16.0, -8.0), (32.0, 8.0)), spacing=8.0)
+    first = {n: tf.Uniform(0.0, 2.0) for n in made["species"]}
+    found = []
+    for form in ("function", "reactions"):
+        circuit = tf.Circuit(made[form], species=made["species"], initial=first, rtol=1e-6)
+        scene = alone(circuit, medium, count=4, types=2)
+        a, b = ends(scene, 1, dt=0.3, dtype=dtype)
+        equal(a, b)
+        assert not a.reports["circuit"].status.any()
+        found.append(a)
+    close(*found, rel=1e-5, least=1e-8)
