@@ -113,7 +113,8 @@ class CompiledCircuit:
         limits = torch.finfo(start.dtype)
         run, arrays = self.module.run, (at.numpy(), packed, given)
         rest = (dt, max(rtol, 4 * limits.eps), atol, limits.eps, limits.max, MAX_STEPS)
-        work = lambda first, last: run(first, last, *arrays, *rest, *report.numpy())
+        counts = report.numpy()
+        work = lambda first, last: run(first, last, *arrays, *rest, *counts)
         if self.module.__name__ not in _compiled:
             self._compile(work)
         shares_of(count, WORTH_A_THREAD, work)
