@@ -301,7 +301,7 @@ def test_what_a_scene_does_not_list_is_never_called(case, monkeypatch):
 @pytest.mark.parametrize(
     ("listed", "room"),
     [
-        ("circuit", "circuits.rosenbrock"),
+        ("circuit", "circuits.compiled"),
         ("molecules", "circuits.stochastic"),
         ("medium", "signals.transport"),
     ],

@@ -22,7 +22,7 @@ from torchfilm.circuits.graph import Leaves, evaluated, traced_rates
 from torchfilm.circuits.names import Names
 from torchfilm.circuits.rosenbrock import MAX_STEPS, RosenbrockReport
 from torchfilm.circuits.stiff_text import CONSTANTS, HEAD, method
-from torchfilm.circuits.tracing import Column, Kind, Untraceable, apply, lowered
+from torchfilm.circuits.tracing import FULL, Column, Kind, Untraceable, apply, lowered
 from torchfilm.tools import checks
 from torchfilm.tools.threads import shares_of
 
@@ -186,6 +186,10 @@ def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
 PLAIN = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 3.0)
 
 
+def _is_plain(value: float) -> bool:
+    return value in PLAIN or not np.isfinite(value)
+
+
 def _without_literals(
     roots: Sequence[Expression], builder: Builder
 ) -> tuple[dict[str, float], tuple[Expression, ...]]:
@@ -193,8 +197,9 @@ def _without_literals(
     differ in numbers only are compiled once."""
     made: dict[Expression, Expression] = {}
     names: dict[str, float] = {}
+    fixed = {a for node in walk(roots) if node.op in FULL for a in node.args}
     for node in walk(roots):
-        if node.op == NUMBER and node.value not in PLAIN and np.isfinite(node.value):
+        if node.op == NUMBER and node not in fixed and not _is_plain(node.value):
             name = f"own.number{len(names)}"
             names[name] = node.value
             made[node] = builder.name(name)
