@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from hypothesis import strategies as st
@@ -10,6 +10,18 @@ from hypothesis import strategies as st
 import torchfilm as tf
 
 FLOATS = {"float32": torch.float32, "float64": torch.float64}
+WALLS = (
+    "plane",
+    "tilted plane",
+    "box",
+    "half a box",
+    "a box for each colony",
+    "channel",
+    "closed channel",
+    "inside a sphere",
+    "outside a sphere",
+    "a post in a box",
+)
 
 
 @dataclass(frozen=True)
@@ -17,13 +29,13 @@ class Capsules:
     """Cells at the start.
 
     counts: in each colony. within: half the side of the cube that contains the centres, µm.
-    lengths: lower and upper bound, µm. radius: µm. place: seed of the positions.
+    lengths, radii: lower and upper bound, µm. place: seed of the positions.
     """
 
     counts: tuple[int, ...]
     within: float
     lengths: tuple[float, float]
-    radius: float
+    radii: tuple[float, float]
     dim: int
     place: int
 
@@ -32,8 +44,11 @@ class Capsules:
 class Contacts:
     """Mechanics.
 
-    give: α, or minus the stiffness, or None for the default. wall: kind of wall. margin: distance
-    of the wall from the cube of centres, µm. wall_stiffness: None for a hard wall.
+    give: α, or minus the stiffness, or None for the default. passes: None for the default. wall:
+    kind of wall. margin: distance of the wall from the cube of centres, µm. wall_give: stiffness of
+    the wall, or minus its weight, or None for a hard wall. uneven: each cell has its own viscosity,
+    length drag and softness. elongation: µm in a sub-step, one-sided contacts only. tolerance: None
+    for the default.
     """
 
     give: float | None
@@ -43,7 +58,10 @@ class Contacts:
     passes: int | None
     wall: str | None
     margin: float
-    wall_stiffness: float | None
+    wall_give: float | None
+    uneven: bool = False
+    elongation: float = 0.25
+    tolerance: float | None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +106,7 @@ class Beside:
     """Other effects.
 
     eating: cells grow on the signal, if there is one and growth is by volume. rule: action of a
-    user rule. leaving: remove cells outside 0.7 of the cube in which they start.
+    user rule. leaving: remove cells outside the cube in which they start.
     """
 
     eating: bool
@@ -136,23 +154,26 @@ def powers(low: int, high: int) -> st.SearchStrategy[float]:
 
 CAPSULES = st.builds(
     Capsules,
-    counts=st.lists(st.sampled_from([1, 2, 0, 3, 7, 12]), min_size=1, max_size=3).map(tuple),
+    counts=st.lists(st.sampled_from([1, 2, 0, 3, 7, 12, 40]), min_size=1, max_size=3).map(tuple),
     within=st.sampled_from([5.0, 20.0, 2.0, 1.0, 1e4]),
     lengths=st.sampled_from([(2.0, 3.0), (0.0, 0.0), (0.0, 4.0), (1.0, 12.0)]),
-    radius=st.sampled_from([0.5, 0.05, 2.0]),
+    radii=st.sampled_from([(0.5, 0.5), (0.05, 0.05), (2.0, 2.0), (0.4, 0.6), (0.05, 2.0)]),
     dim=st.sampled_from([2, 3]),
     place=st.integers(0, 99),
 )
 CONTACTS = st.builds(
     Contacts,
     give=st.sampled_from([None, 0.1, 1e-6, 10.0, -1.0, -1e6]),
-    length_drag=powers(-3, 5),
+    length_drag=powers(-3, 7),
     viscosity=powers(-3, 3),
-    contacts=st.sampled_from(("one-sided", "bilateral")),
+    contacts=st.sampled_from(("one-sided", "one-sided", "bilateral")),
     passes=st.sampled_from([None, 1, 4]),
-    wall=st.sampled_from([None, "plane", "box", "channel", "inside a sphere", "outside a sphere"]),
+    wall=st.sampled_from([None, *WALLS]),
     margin=st.sampled_from([1.0, 0.3, 1e-3, 10.0]),
-    wall_stiffness=st.sampled_from([None, 1.0, 1e4]),
+    wall_give=st.sampled_from([None, 1.0, 1e4, -0.1, -1.0]),
+    uneven=st.booleans(),
+    elongation=st.sampled_from([0.25, 0.04, 2.0]),
+    tolerance=st.sampled_from([None, 1e-6]),
 )
 GROWING = st.builds(
     Growing,
@@ -200,7 +221,7 @@ BESIDE = st.builds(
     rule=st.sampled_from([None, "grow", "divide", "remove", "read"]),
     leaving=st.sampled_from([False, False, True]),
 )
-DRAWS = st.builds(
+SCENES = st.builds(
     Draw,
     capsules=CAPSULES,
     contacts=st.none() | CONTACTS,
@@ -213,3 +234,15 @@ DRAWS = st.builds(
     dtype=st.sampled_from(list(FLOATS)),
     seed=st.integers(0, 2**40),
 ).filter(lambda d: any(x is not None for x in (d.contacts, d.growing, d.outside, d.inside)))
+# mechanics alone, in the precision in which both paths must agree
+PUSHING = SCENES.filter(lambda d: d.contacts is not None).map(
+    lambda d: replace(
+        d,
+        contacts=replace(d.contacts, contacts="one-sided"),
+        outside=None,
+        inside=None,
+        beside=Beside(False, None, False),
+        dtype="float64",
+    )
+)
+DRAWS = st.sampled_from([SCENES, SCENES, PUSHING]).flatmap(lambda drawn: drawn)

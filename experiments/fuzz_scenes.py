@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
 from fuzz_draws import BOUNDARIES, FLOATS, Capsules, Contacts, Draw, Inside, Outside
 
 import torchfilm as tf
+from torchfilm.physics.walls import Wall
 
 # cells grow by a factor of e^1.5 = 4.5 at most: the number of sub-steps costs time, not the rate
 GROWN = 1.5
@@ -22,40 +24,66 @@ def cells(draw: Capsules, within: float) -> tf.Cells:
         rng.normal(size=(count, draw.dim)),
         np.repeat(np.arange(len(draw.counts)), draw.counts),
     )
-    return tf.Cells(position, axis, rng.uniform(*draw.lengths, count), draw.radius, colony=colony)
+    length, (thin, wide) = rng.uniform(*draw.lengths, count), draw.radii
+    radius = thin * (wide / thin) ** rng.uniform(size=count)
+    return tf.Cells(position, axis, length, radius, colony=colony)
+
+
+def walls(draw: Contacts, capsules: Capsules) -> list[Wall]:
+    """Returns the walls of a draw, all `margin` from the cube of centres."""
+    dim, side = capsules.dim, capsules.within + draw.margin
+    give: dict[str, Any] = {}
+    if draw.wall_give is not None and draw.wall_give < 0:
+        give = {"weight": -draw.wall_give}
+    elif draw.wall_give is not None:
+        give = {"stiffness": each(draw, draw.wall_give)}
+    low, high = (-side,) * dim, (side,) * dim
+    sides = side * (1 + 0.5 * torch.arange(len(capsules.counts), dtype=torch.float64))
+    ends: dict[str, Any] = {"low_end": -side, "high_end": side}
+    if dim == 3:
+        ends["height"] = 2 * side
+    post = (-side - 3.0, *(0.0,) * (dim - 1))
+    made: dict[str | None, list[Wall]] = {
+        None: [],
+        "plane": [tf.Plane(x=-side, facing="+x", **give)],
+        "tilted plane": [tf.Plane(point=low, normal=(1.0, 0.3, 0.2)[:dim], **give)],
+        "box": [tf.Box(low, high, **give)],
+        "half a box": [tf.Box(low, (math.inf, *high[1:]), **give)],
+        "a box for each colony": [tf.Box((-sides,) * dim, (sides,) * dim, **give)],
+        "channel": [tf.Channel(2 * side, low_end=-side, **give)],
+        "closed channel": [tf.Channel(2 * side, **ends, **give)],
+        "inside a sphere": [tf.Sphere((0.0,) * dim, math.sqrt(dim) * side, inside=True, **give)],
+        "outside a sphere": [tf.Sphere(post, 3.0, inside=False, **give)],
+        # the box is hard
+        "a post in a box": [tf.Box(low, high), tf.Sphere(low, draw.margin, inside=False, **give)],
+    }
+    return made[draw.wall]
+
+
+def each(draw: Contacts, value: float) -> Any:
+    """Returns the value of all cells, or a value for each around it."""
+    return tf.LogNormal(value, 1.0) if draw.uneven else value
 
 
 def mechanics(draw: Contacts, capsules: Capsules) -> tf.Mechanics:
     """Returns the contact mechanics of a draw."""
-    dim, side, soft = capsules.dim, capsules.within + draw.margin, draw.wall_stiffness
-    walls: dict[str | None, list] = {
-        None: [],
-        "plane": [tf.Plane(x=-side, facing="+x", stiffness=soft)],
-        "box": [tf.Box((-side,) * dim, (side,) * dim, stiffness=soft)],
-        "channel": [tf.Channel(2 * side, low_end=-side, stiffness=soft)],
-        "inside a sphere": [
-            tf.Sphere((0.0,) * dim, math.sqrt(dim) * side, inside=True, stiffness=soft)
-        ],
-        "outside a sphere": [
-            tf.Sphere((-side - 3.0,) + (0.0,) * (dim - 1), 3.0, inside=False, stiffness=soft)
-        ],
-    }
-    accuracy = (
-        {}
-        if draw.give is None
-        else {"alpha": draw.give}
-        if draw.give > 0
-        else {"stiffness": -draw.give}
-    )
+    given: dict[str, Any] = {}
+    if draw.give is not None:
+        given["alpha" if draw.give > 0 else "stiffness"] = each(draw, abs(draw.give))
+    if draw.contacts == "one-sided":
+        given |= {"passes": draw.passes, "max_elongation": draw.elongation}
     made = tf.Mechanics(
-        walls=walls[draw.wall],
-        dim=dim,
-        viscosity=draw.viscosity,
-        length_drag=draw.length_drag,
+        walls=walls(draw, capsules),
+        dim=capsules.dim,
+        viscosity=each(draw, draw.viscosity),
+        length_drag=each(draw, draw.length_drag),
         contacts=draw.contacts,
         max_iterations=300,
-        **accuracy,
+        tolerance=draw.tolerance,
+        **given,
     )
+    if draw.contacts == "one-sided":
+        return made
     # with the overlap that goes with a number of passes
     return made.with_settings(tf.Settings(passes=draw.passes))
 
@@ -63,7 +91,7 @@ def mechanics(draw: Contacts, capsules: Capsules) -> tf.Mechanics:
 def growing(draw: Draw) -> list[tf.Effect]:
     """Returns growth and division of a draw."""
     assert draw.growing is not None
-    g, r = draw.growing, draw.capsules.radius
+    g, r = draw.growing, draw.capsules.radii[1]
     # any rate is allowed; the bound limits the number of cells
     rate = min(g.rate, GROWN / (draw.dt * draw.steps))
     if eats(draw):
@@ -198,7 +226,7 @@ def scene_of(draw: Draw) -> tuple[tf.Scene, tf.State]:
     effects += [] if draw.inside is None else [circuit(draw.inside, draw.outside)]
     effects += rules(draw)
     if draw.beside.leaving:
-        side = 0.7 * draw.capsules.within
+        side = draw.capsules.within
         effects.append(tf.Removal((-side,) * draw.capsules.dim, (side,) * draw.capsules.dim))
     scene = tf.Scene(*effects, founders=tf.Cells.single(draw.capsules.dim))
     # growing grids of scattered cells need much memory; tests/test_fuzz.py tests this

@@ -69,7 +69,10 @@ def deeply_overlapping(found, radius):
 @kernel
 def _apart(ax, ay, az, cx, cy, cz, d):
     """A direction that separates two cells whose centrelines cross."""
-    nx, ny, nz = -ay, ax, 0.0
+    sign = -1.0 if ax * cx + ay * cy < 0 else 1.0
+    mx, my = ax + sign * cx, ay + sign * cy
+    size = math.sqrt(mx * mx + my * my)
+    nx, ny, nz = -my / size, mx / size, 0.0
     if d == 3:
         mx, my, mz = ay * cz - az * cy, az * cx - ax * cz, ax * cy - ay * cx
         size = math.sqrt(mx * mx + my * my + mz * mz)

@@ -33,6 +33,8 @@ TOLERANCE, PASSES = 0.07, 8
 # leaves; rounds a solve, and looks a line search, at most.
 FORCING, LEVEL = 0.2, 0.1
 MOST_ROUNDS, MOST_LOOKS = 200, 30
+# A block's diagonal is raised by this share before it is inverted, in float64.
+RAISED = 1e-9
 # A length nearer to its bound than this, relative to the bound and the step, is at it.
 ROUNDING = 1e-6
 # Lengths that stop at their bound step alone in the round after one that went less than this share.

@@ -15,7 +15,15 @@ import numpy as np
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.lanes import add_scaled, add_square, dot, invert, put_product
 from torchfilm.kernels.rows import degrees, rows_of_cells
-from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS, ROUNDING
+from torchfilm.kernels.scheme import (
+    CREEP,
+    FORCING,
+    LEVEL,
+    MOST_LOOKS,
+    MOST_ROUNDS,
+    RAISED,
+    ROUNDING,
+)
 
 
 @kernel
@@ -220,7 +228,9 @@ def _refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inver
             held[i] = at_bound or alone[i]
             stale[i] = 1
         if stale[i]:
-            own[i] = put_inverse(H, begin, halves, act, i, alpha[i], held[i], inverse, B, 1e-9, dof)
+            own[i] = put_inverse(
+                H, begin, halves, act, i, alpha[i], held[i], inverse, B, RAISED, dof
+            )
             stale[i] = 0
 
 

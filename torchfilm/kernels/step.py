@@ -180,7 +180,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, har
     tolerance, passes, given = settings[TOLERANCE], settings[MOST_PASSES], alphas.shape[0] > 0
     hardness[0] = hardness[0] if hardness[0] > 0 else softest
     length, scale = base + growth, np.zeros(last.shape)
-    least = base - SHRINK * np.maximum(growth, 0.0)
+    least = np.maximum(base - SHRINK * np.maximum(growth, 0.0), 0.0)
     half, reach, root = np.empty_like(base), np.empty_like(base), np.empty(roots.shape)
     alpha, low, y = np.empty_like(last[:, 0]), np.empty_like(last[:, 0]), np.empty_like(last)
     number, softer, rising, kept, held, kept_alpha = 0, 1.0, True, y, 0.0, 0.0
@@ -226,11 +226,11 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, har
             hardness[0] = kept_alpha if failed else _following(e, rows[4], before, target, softest)
             if hardness[0] < LAG * before and not failed:  # the force has grown: solve again
                 kept, held, kept_alpha, rising = y.copy(), error, before, False
+                report[PASSES] -= 1  # it is the same pass
                 continue
         about = last * (number == 0 and np.any(rows[1][:m] < 0))  # without a push nothing moves
         report[CLIPPED] = move_cells(x, axis, length, y, scale, about, margin, least, dof)
-        if number == 0:
-            last[:] = y
+        last[:] = y if number == 0 else last
         listed = approach(x, length, radius, y, dof) <= margin + deep
         moved, number, softer, rising = True, number + 1, 1.0, True
     return length

@@ -422,8 +422,12 @@ def _fallback_normal(a: Capsules, b: Capsules) -> Tensor:
 
     It is the common perpendicular of the axes, or any perpendicular if they are parallel or in 2-D.
     """
-    way = perpendicular(a.axis)
-    if a.axis.shape[0] == 3:
+    if a.axis.shape[0] == 2:
+        # of both axes alike: which cell is the first of the two must not matter
+        mean = a.axis + torch.where(dot(a.axis, b.axis) < 0, -1.0, 1.0) * b.axis
+        way = perpendicular(mean / safe_norm(mean))
+    else:
+        way = perpendicular(a.axis)
         common = cross(a.axis, b.axis)
         size = safe_norm(common)
         parallel = size < 1e-6

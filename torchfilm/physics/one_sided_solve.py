@@ -11,8 +11,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfilm.kernels.bilateral_scheme import BLOCK_FLOOR
-from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS, ROUNDING
+from torchfilm.kernels.scheme import (
+    CREEP,
+    FORCING,
+    LEVEL,
+    MOST_LOOKS,
+    MOST_ROUNDS,
+    RAISED,
+    ROUNDING,
+)
 from torchfilm.physics.preconditioner import symmetric_inverse
 from torchfilm.physics.problem import ContactProblem
 from torchfilm.tools.cg import conjugate_gradients
@@ -166,7 +173,7 @@ def _inverse_blocks(problem: ContactProblem, active: Tensor, held: Tensor) -> tu
     column where the length is held, (N,) bool; and the diagonal of the lengths, (N,)."""
     blocks = problem.rows.blocks(active).double()
     diagonal = blocks.diagonal(dim1=1, dim2=2)
-    diagonal.mul_(1.0 + BLOCK_FLOOR * torch.finfo(active.dtype).eps).add_(problem.alpha)
+    diagonal.mul_(1.0 + RAISED).add_(problem.alpha)
     own = blocks[:, -1, -1].to(active.dtype)
     free = (~held).double().unsqueeze(1)
     blocks[:, -1, :-1] *= free
