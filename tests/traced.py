@@ -43,14 +43,17 @@ def plain_module(text: str) -> ModuleType:
         if name in module.__dict__ and hasattr(made, "py_func"):
             module.__dict__[name] = made.py_func
     module.__dict__["math"] = MATH
-    run = module.__dict__["run"]
+    for name in {"run", "run_moved"} & set(module.__dict__):
+        module.__dict__[name] = _quiet(module.__dict__[name])
+    return module
 
+
+def _quiet(run: Callable) -> Callable:
     def quiet(*args: object) -> None:
         with np.errstate(all="ignore"):
             run(*args)
 
-    module.__dict__["run"] = quiet
-    return module
+    return quiet
 
 
 def by(backend: str | None, scene: tf.Scene) -> tf.Scene:

@@ -7,7 +7,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -16,14 +16,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.emission import Equations, functions
+from torchfilm.circuits.emission import Equations, functions, tangent_functions
 from torchfilm.circuits.expressions import NAME, NUMBER, Builder, Expression, walk
 from torchfilm.circuits.graph import Leaves, evaluated, traced_rates
 from torchfilm.circuits.names import Names
 from torchfilm.circuits.rosenbrock import MAX_STEPS, RosenbrockReport
 from torchfilm.circuits.stiff_text import CONSTANTS, HEAD, method
+from torchfilm.circuits.tangent_text import tangent_method
 from torchfilm.circuits.tracing import FULL, Column, Kind, Untraceable, apply, lowered
 from torchfilm.tools import checks
+from torchfilm.tools.tangents import both, has_tangent, with_tangent
 from torchfilm.tools.threads import shares_of
 
 if TYPE_CHECKING:
@@ -46,20 +48,23 @@ class CompiledCircuit:
     columns: tuple[str, ...]  # names that have a number for each cell
     numbers: tuple[str, ...]  # names that have one number
 
+    # by the columns and numbers that carry tangents
+    _tangent_modules: dict[Any, ModuleType] = field(default_factory=dict, repr=False)
+
     @cached_property
     def module(self) -> ModuleType:
         return _module(source(self))
 
-    def _compile(self, work: Callable[[int, int], object]) -> None:
+    def _compile(self, module: ModuleType, work: Callable[[int, int], object]) -> None:
         """By one thread, without cells; and say so where it takes time."""
         from torchfilm.kernels.compiling import announce, keep
 
         names = ", ".join(n.partition(".")[2] for n in self.equations.variables)
-        said = announce(self.module.__name__, f"a circuit ({names}), some seconds")
+        said = announce(module.__name__, f"a circuit ({names}), some seconds")
         work(0, 0)
-        _compiled.add(self.module.__name__)
+        _compiled.add(module.__name__)
         if said:
-            keep(self.module.__name__)
+            keep(module.__name__)
 
     def values(self, circuit: CircuitCells, rows: Tensor) -> dict[str, Tensor]:
         """The columns (M,) and numbers () of the names that are no variables, of the cells `rows`
@@ -94,31 +99,79 @@ class CompiledCircuit:
     def rodas3(
         self, circuit: CircuitCells, start: Tensor, dt: float, rtol: float, atol: float
     ) -> tuple[Tensor, RosenbrockReport] | None:  # fmt: skip
-        """As `rosenbrock.rodas3`, of the cells `circuit.rows`; None where gradients are wanted, and
-        over no time."""
+        """As `rosenbrock.rodas3`, of the cells `circuit.rows`, with tangents in forward mode; None
+        where a backward pass is wanted, and over no time."""
         if dt == 0:
             return None
         values = self.values(circuit, circuit.rows)
         every = (start, *values.values())
         if torch.is_grad_enabled() and any(x.requires_grad for x in every):
             return None
-        wide = lambda names: [values[n].detach().to(torch.float64) for n in names]
+        moving = {n for n, x in values.items() if x.is_floating_point() and has_tangent(x)}
+        if moving or has_tangent(start):
+            return self._with_tangents(values, moving, start, (dt, rtol, atol))
         count = start.shape[0]
-        columns, numbers = wide(self.columns), wide(self.numbers)
-        packed = torch.stack(columns).numpy() if columns else np.zeros((1, count))
-        given = torch.stack(numbers).numpy() if numbers else np.zeros(1)
         # a copy, also of float64: the state must not change
         at = torch.empty(start.shape, dtype=torch.float64).copy_(start)
         report = torch.zeros(3, count, dtype=torch.int64)
-        limits = torch.finfo(start.dtype)
-        run, arrays = self.module.run, (at.numpy(), packed, given)
-        rest = (dt, max(rtol, 4 * limits.eps), atol, limits.eps, limits.max, MAX_STEPS)
-        counts = report.numpy()
-        work = lambda first, last: run(first, last, *arrays, *rest, *counts)
-        if self.module.__name__ not in _compiled:
-            self._compile(work)
-        shares_of(count, WORTH_A_THREAD, work)
+        run, arrays = self.module.run, (
+            at.numpy(), _packed(values, self.columns, count), _packed(values, self.numbers)
+        )  # fmt: skip
+        rest, counts = _limits(dt, rtol, atol, start.dtype), report.numpy()
+        self._share(self.module, count, lambda a, b: run(a, b, *arrays, *rest, *counts))
         return at.to(start.dtype), RosenbrockReport(*report)
+
+    def _with_tangents(
+        self,
+        values: Mapping[str, Tensor],
+        moving: set[str],
+        start: Tensor,
+        settings: tuple[float, float, float],
+    ) -> tuple[Tensor, RosenbrockReport]:
+        """The same where the values `moving`, or the start, carry tangents."""
+        columns, numbers = ([n for n in x if n in moving] for x in (self.columns, self.numbers))
+        module = self._tangent_module(tuple(columns), tuple(numbers))
+        count, (first, tangent) = start.shape[0], both(start)
+        at = torch.empty(start.shape, dtype=torch.float64).copy_(first)
+        turned = torch.zeros(start.shape, dtype=torch.float64)
+        if tangent is not None:
+            turned.copy_(tangent)
+        still = {n: both(x)[0] for n, x in values.items()}
+        turns = {n: both(values[n])[1] for n in moving}
+        report = torch.zeros(3, count, dtype=torch.int64)
+        arrays = (
+            at.numpy(), turned.numpy(),
+            _packed(still, self.columns, count), _packed(turns, columns, count),
+            _packed(still, self.numbers), _packed(turns, numbers),
+        )  # fmt: skip
+        rest, counts = _limits(*settings, start.dtype), report.numpy()
+        run = module.run_moved
+        self._share(module, count, lambda a, b: run(a, b, *arrays, *rest, *counts))
+        dtype = start.dtype
+        return with_tangent(at.to(dtype), turned.to(dtype)), RosenbrockReport(*report)
+
+    def _share(self, module: ModuleType, count: int, work: Callable[[int, int], object]) -> None:
+        """The work by threads, a share of the cells each; compiled before, where it is not yet."""
+        if module.__name__ not in _compiled:
+            self._compile(module, work)
+        shares_of(count, WORTH_A_THREAD, work)
+
+    def _tangent_module(self, columns: tuple[str, ...], numbers: tuple[str, ...]) -> ModuleType:
+        key = (columns, numbers)
+        if key not in self._tangent_modules:
+            self._tangent_modules[key] = _module(tangent_source(self, *key))
+        return self._tangent_modules[key]
+
+
+def _packed(values: Mapping[str, Tensor | None], names: Sequence[str], *size: int) -> np.ndarray:
+    """The values of these names, (names, *size), of which there is one at least."""
+    wide = [values[n].detach().to(torch.float64) for n in names]  # type: ignore[union-attr]
+    return torch.stack(wide).numpy() if wide else np.zeros((1, *size))
+
+
+def _limits(dt: float, rtol: float, atol: float, dtype: torch.dtype) -> tuple[float, ...]:
+    limits = torch.finfo(dtype)
+    return dt, max(rtol, 4 * limits.eps), atol, limits.eps, limits.max, MAX_STEPS
 
 
 def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
@@ -238,15 +291,43 @@ def _exchange(
 
 def source(circuit: CompiledCircuit) -> str:
     """The text of the module."""
-    place = {n: f"columns[{k}, n]" for k, n in enumerate(circuit.columns)}
-    place |= {n: f"numbers[{k}]" for k, n in enumerate(circuit.numbers)}
-    leaves = [place[n] for n in circuit.equations.leaves] or ["0.0"]
+    leaves = _leaves(circuit.equations.leaves, circuit.columns, circuit.numbers)
+    return _common(circuit) + method(len(circuit.equations.variables), leaves)
+
+
+def tangent_source(
+    circuit: CompiledCircuit, columns: tuple[str, ...], numbers: tuple[str, ...]
+) -> str:
+    """The text of the module that carries tangents, where these columns and numbers have them."""
+    equations, size = circuit.equations, len(circuit.equations.variables)
+    leaves = _leaves(equations.leaves, circuit.columns, circuit.numbers)
+    moving = [n for n in equations.leaves if n in columns or n in numbers]
+    turns = _leaves(moving, columns, numbers, "turning", "turned")
+    return "".join((
+        _common(circuit), tangent_functions(equations, moving), method(size, leaves),
+        tangent_method(size, leaves, turns),
+    ))  # fmt: skip
+
+
+def _common(circuit: CompiledCircuit) -> str:
     names = ", ".join(circuit.equations.variables)
     # constants by value: the text then says all that it depends on, and finds its compiled form
     constants = "\n".join(f"{n} = {x!r}" for n, x in CONSTANTS.items())
     head = HEAD.format(what=f"A circuit of {names}", constants=constants)
-    size = len(circuit.equations.variables)
-    return head + functions(circuit.equations) + method(size, f"({', '.join(leaves)},)")
+    return head + functions(circuit.equations)
+
+
+def _leaves(
+    names: Sequence[str],
+    columns: Sequence[str],
+    numbers: Sequence[str],
+    each: str = "columns",
+    once: str = "numbers",
+) -> str:
+    """The text of a cell's values of these names, as a tuple."""
+    place = {n: f"{each}[{k}, n]" for k, n in enumerate(columns)}
+    place |= {n: f"{once}[{k}]" for k, n in enumerate(numbers)}
+    return f"({', '.join([place[n] for n in names] or ['0.0'])},)"
 
 
 @cache

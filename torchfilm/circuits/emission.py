@@ -23,6 +23,7 @@ from torchfilm.circuits.expressions import (
     Builder,
     Expression,
     derivatives,
+    tangents,
     walk,
 )
 from torchfilm.circuits.tracing import CASTS, FULL, Kind, Untraceable, common_type, kind_of
@@ -225,9 +226,45 @@ def functions(equations: Equations) -> str:
     return text + _linear(Pattern.of(len(own), order))
 
 
-def _leaf(emitter: Emitter, leaf: Expression, kind: Kind | None, place: int) -> str:
-    casts: dict[Any, str] = {torch.float32: "np.float32(leaf[{}])", torch.bool: "leaf[{}] != 0.0"}
-    return f"{emitter.of(leaf)} = {casts.get(kind and kind[0], 'leaf[{}]').format(place)}"
+def _leaf(
+    emitter: Emitter, leaf: Expression, kind: Kind | None, place: int, home: str = "leaf"
+) -> str:
+    casts: dict[Any, str] = {torch.float32: "np.float32({})", torch.bool: "{} != 0.0"}
+    value = casts.get(kind and kind[0], "{}").format(f"{home}[{place}]")
+    return f"{emitter.of(leaf)} = {value}"
+
+
+def tangent_functions(equations: Equations, moving: Sequence[str]) -> str:
+    """The text of `rates_moved` and `linearised_moved`: the tangents of the rates, and of their
+    slopes in the order of `linearised`, for the tangents t of the variables and `turn` of the
+    leaves `moving`."""
+    b, names, slopes = equations.builder, equations.variables, equations.slopes()
+    named = {n: b.name(f"tangent.{n}") for n in (*names, *moving)}
+    kinds = {**equations.kinds, **{e.name: equations.kinds[n] for n, e in named.items()}}
+    of = {b.name(n): e for n, e in named.items()}
+    at_rest = b.number(0)
+    rates = [tangents(b, equations.rates, of).get(r, at_rest) for r in equations.rates]
+    bent = tangents(b, slopes.values(), of)
+    turned = [bent.get(slopes[k], at_rest) for k in sorted(slopes)]
+    wider = Equations(equations.rates, names, kinds, b)
+    emitter = Emitter(wider, [*rates, *turned])
+    read = emitter.number
+    lines = [f"{_tuple([f'u{k}' for k in range(len(names))])} = u"]
+    for home, leaves in (("leaf", [b.name(n) for n in equations.leaves]),
+                         ("t", [named[n] for n in names]),
+                         ("turn", [named[n] for n in moving])):  # fmt: skip
+        lines += [
+            _leaf(emitter, e, kinds[e.name], i, home) for i, e in enumerate(leaves) if e in read
+        ]
+    known = [e for e in read if e.op == NAME]
+    given, text = "u, leaf, t, turn", ""
+    # slopes that are no numbers count as 0, in `linearised` too
+    for name, roots, form in (("rates_moved", rates, "{}"),
+                              ("linearised_moved", turned, "_finite({})")):  # fmt: skip
+        body = [*lines, *emitter.lines(roots, known)]
+        values = [form.format(emitter._as(e, torch.float64)) for e in roots]
+        text += _function(name, given, body, _tuple(values))
+    return text
 
 
 def _linear(pattern: Pattern) -> str:

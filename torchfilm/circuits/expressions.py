@@ -220,10 +220,20 @@ def derivatives(
     b: Builder, roots: Iterable[Expression], by: Expression
 ) -> dict[Expression, Expression]:
     """∂/∂by of every node below the roots that has one other than 0."""
+    return tangents(b, roots, {by: b.number(1)})
+
+
+def tangents(
+    b: Builder, roots: Iterable[Expression], of: Mapping[Expression, Expression]
+) -> dict[Expression, Expression]:
+    """The tangent of every node below the roots that has one other than 0: Σ ∂/∂x · tangent of x.
+
+    of: the tangents of names.
+    """
     found: dict[Expression, Expression] = {}
     for node in walk(roots):
-        if node is by:
-            found[node] = b.number(1)
+        if node in of:
+            found[node] = of[node]
             continue
         inner = [k for k, a in enumerate(node.args) if a in found]
         if not inner or node.op in ("detach", "floor", "sign", *LOGICAL):

@@ -12,6 +12,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchfilm.tools.tangents import tracked
+
 # A pivot smaller than this share of its scale has lost half of its digits in a difference.
 LEAST_PIVOT = 1e-8
 
@@ -63,6 +65,7 @@ class _LinearSolve(torch.autograd.Function):
     def forward(ctx, matrix: Tensor, lu: Tensor, b: Tensor) -> Tensor:
         x = substitute(lu, b)
         ctx.save_for_backward(lu, x)
+        ctx.save_for_forward(lu, x)
         return x
 
     @staticmethod
@@ -72,10 +75,16 @@ class _LinearSolve(torch.autograd.Function):
         y = substitute_transposed(lu, grad)
         return -y.unsqueeze(1) * x.unsqueeze(0), None, y
 
+    @staticmethod
+    def jvp(ctx, matrix: Tensor | None, _, b: Tensor | None):
+        lu, x = ctx.saved_tensors
+        moved = torch.zeros_like(x) if b is None else b
+        return substitute(lu, moved if matrix is None else moved - multiply(matrix, x))
+
 
 def solve(matrix: Tensor, lu: Tensor, b: Tensor) -> Tensor:
     """W⁻¹ b, differentiable in the matrix and in b; `lu` is from `factor`."""
-    if torch.is_grad_enabled() and (matrix.requires_grad or b.requires_grad):
+    if tracked(matrix, b):
         return _LinearSolve.apply(matrix, lu, b)
     return substitute(lu, b)
 

@@ -16,10 +16,8 @@ float32 W would lose 2/h, and with it the conserved sum, or it would magnify the
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -27,6 +25,7 @@ from torch import Tensor
 
 from torchfilm.circuits import linear
 from torchfilm.tools.reads import numbers, places, places_of, reads_are_free
+from torchfilm.tools.tangents import both, forward_mode, with_tangent
 
 # rates(u, rows): du/dt (M, S), conc/h, of the cells `rows` (M,) at concentrations u (M, S). Row i
 # of the result depends on row i of u only.
@@ -107,18 +106,6 @@ def rodas3(
     return at.t().to(u.dtype), report
 
 
-@cache
-def _prepare_forward_mode() -> None:
-    """Compile torch's forward derivatives, without torch's own deprecation warning.
-
-    Torch compiles them on first use, with a function that torch itself calls deprecated.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        with forward_ad.dual_level():
-            forward_ad.make_dual(torch.ones(1), torch.ones(1)).exp()
-
-
 class _Tableau:
     """One step of the method for some cells; arrays are (S, M) in float64, species first.
 
@@ -159,7 +146,7 @@ class _Tableau:
         with torch.enable_grad():
             copies = u.repeat(1, size).requires_grad_()
             out = self.rates(copies.t(), rows.repeat(size))
-            f = out.detach()[:count].t().to(torch.float64)
+            f = with_tangent(*both(out))[:count].t().to(torch.float64)
             slope = None
             if out.requires_grad:
                 own = torch.diagonal(out.view(size, count, size), dim1=0, dim2=2)
@@ -175,7 +162,6 @@ class _Tableau:
         every step from the start. Otherwise it is the slower way, since Python computes products
         with constants.
         """
-        _prepare_forward_mode()
         size, count = u.shape
         copies = u.repeat(1, size)
         directions = (
@@ -184,8 +170,8 @@ class _Tableau:
             .expand(size, size, count)
             .reshape(size, size * count)
         )
-        with forward_ad.dual_level():
-            out = self.rates(forward_ad.make_dual(copies.t(), directions.t()), rows.repeat(size))
+        with forward_mode():
+            out = self.rates(with_tangent(copies.t(), directions.t()), rows.repeat(size))
             value, slope = forward_ad.unpack_dual(out)
         f = value[:count].t().to(torch.float64)
         if slope is None:

@@ -24,6 +24,7 @@ from torchfilm.circuits.names import Names, unknown
 from torchfilm.circuits.network import Network
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.deterministic_math import deterministic_functions
+from torchfilm.tools.tangents import has_tangent
 
 # Returns the rates of species by name, conc/h, and the amounts per hour that the cell releases to
 # signals by name, conc·µm³/h.
@@ -277,13 +278,14 @@ def _molecules(
             else molecules_per_unit
         )
         with deterministic_functions():
-            return network.propensities(
+            found = network.propensities(
                 counts,
                 p,
                 cell,
                 molecules_per_unit=scale,
                 pool=None if pool is None else pool.index_select(0, mine),
             )
+        return _without_tangent(found, circuit.label, settings.method)
 
     if settings.method == "direct":
         end, report = stochastic.direct(start, propensities, network.stoichiometry, dt, draw)
@@ -305,6 +307,15 @@ def _molecules(
         torch.where(report.reaction >= 0, MOLECULES + report.reaction, report.status),
     )
     return CircuitOutcome(found, pools, reservoir, report.status != 0, code, report.steps)
+
+
+def _without_tangent(value: Tensor, label: str, method: str) -> Tensor:
+    if has_tangent(value):
+        raise InputError(
+            f"{label}: a derivative is wanted of a circuit with method={method!r}, and numbers of"
+            ' molecules have none. Use method="rosenbrock", or differences between runs.'
+        )
+    return value
 
 
 def _split(

@@ -5,6 +5,8 @@ The order of operations is that of `rosenbrock`, and so are its constants.
 
 from __future__ import annotations
 
+from functools import partial
+
 from torchfilm.circuits import linear, rosenbrock
 
 CONSTANTS = {
@@ -16,6 +18,7 @@ CONSTANTS = {
         )
     },
     "LEAST_PIVOT": linear.LEAST_PIVOT,
+    "GOES_ON": -1,
 }  # fmt: skip
 
 HEAD = '''"""{what}, written by torchfilm."""
@@ -98,51 +101,65 @@ def step(u, c, h, rtol, atol, eps, largest):
 
 
 @kernel
+def controlled(error, broken, left, h, dt):
+    """After an attempt of length h: whether it is good, the last one, and no shorter one is left;
+    the time that is left, and the length of the next attempt."""
+    good = error <= 1.0 and not broken
+    ends = good and h >= left
+    if good:
+        left -= h
+    factor = 0.25
+    if abs(error) < np.inf:
+        factor = GROW
+        if error > 0.0:
+            factor = SAFETY * math.exp(math.log(error) / -3.0)
+            factor = math.floor(min(max(factor, SHRINK), GROW) * 1024.0 + 0.5) / 1024.0
+    if broken:
+        factor = min(factor, 0.5)
+    h = min(h * factor, left)
+    if left - h < 1e-10 * left:
+        h = left
+    return good, ends, not good and h < LEAST_STEP * dt, left, h
+
+
+@kernel
+def verdict(u, c, error, broken, ends, lost, bad):
+    """The code of a cell that is done or has failed, or GOES_ON; how many attempts had no number
+    for a result."""
+    if error != error:
+        bad += 1
+        {f} = rates(u, c)
+        lost = lost or bad > MAX_NONFINITE_STEPS or not ({all_finite})
+    if ends:
+        return DONE, bad
+    if not lost:
+        return GOES_ON, bad
+    if abs(error) < np.inf:
+        return BELOW_ZERO if broken else TOO_MANY_STEPS, bad
+    return NOT_FINITE, bad
+
+
+@kernel
 def run(first, last, at, columns, numbers, dt, rtol, atol, eps, largest, most_steps, accepted,
         rejected, status):
     """Cells first … last − 1 over dt hours; at (M, V) in place. columns (K, M), numbers (L,)."""
     for n in range(first, last):
         c = prepared({leaves})
         u = {start}
-        left, h, bad, code = dt, dt, 0, TOO_MANY_STEPS
+        left, h, bad, code = dt, dt, 0, GOES_ON
         for _ in range(most_steps):
             new, error, broken = step(u, c, h, rtol, atol, eps, largest)
-            good = error <= 1.0 and not broken
-            ends = good and h >= left
+            good, ends, lost, left, h = controlled(error, broken, left, h, dt)
             if good:
-                left -= h
+                u = new
                 accepted[n] += 1
             else:
                 rejected[n] += 1
-            factor = 0.25
-            if abs(error) < np.inf:
-                factor = GROW
-                if error > 0.0:
-                    factor = SAFETY * math.exp(math.log(error) / -3.0)
-                    factor = math.floor(min(max(factor, SHRINK), GROW) * 1024.0 + 0.5) / 1024.0
-            if broken:
-                factor = min(factor, 0.5)
-            h = min(h * factor, left)
-            if left - h < 1e-10 * left:
-                h = left
-            lost = not good and h < LEAST_STEP * dt
-            if good:
-                u = new
-            if error != error:
-                bad += 1
-                lost = lost or bad > MAX_NONFINITE_STEPS
-                {f} = rates(u, c)
-                lost = lost or not ({all_finite})
-            if ends:
-                code = DONE
-                break
-            if lost:
-                code = NOT_FINITE
-                if abs(error) < np.inf:
-                    code = BELOW_ZERO if broken else TOO_MANY_STEPS
+            code, bad = verdict(u, c, error, broken, ends, lost, bad)
+            if code != GOES_ON:
                 break
         {store}
-        status[n] = code
+        status[n] = code if code != GOES_ON else TOO_MANY_STEPS
 '''
 
 
@@ -152,50 +169,58 @@ NAMES = (
 )  # fmt: skip
 
 
+def each(form: str, size: int, between: str = "\n    ") -> str:
+    """The form for each variable, with its number in place of #."""
+    return between.join(form.replace("#", str(i)) for i in range(size))
+
+
+def tuple_of(form: str, size: int) -> str:
+    return f"({each(form, size, ', ')}{',' * (size == 1)})"
+
+
 def method(size: int, leaves: str) -> str:
     """The step and the loop over cells, for so many variables. leaves: the text of a cell's."""
+    return substituted(STEP, size, leaves=leaves)
 
-    def each(form: str, between: str = "\n    ") -> str:
-        return between.join(form.replace("#", str(i)) for i in range(size))
 
-    def many(form: str) -> str:
-        return f"({each(form, ', ')}{',' * (size == 1)})"
-
+def substituted(form: str, size: int, **more: str) -> str:
+    """The text of a form for so many variables; more: parts of its own."""
+    lines, many = partial(each, size=size), partial(tuple_of, size=size)
     round_up = "{x}# = low# if {x}# < low# and {x}# >= low# - noise# else {x}#"
-    return STEP.format(
+    return form.format(
+        **more,
         **{x: many(f"{x}#") for x in NAMES},
-        any_below=each("y# < low#", " or "),
-        inside_of=each("inside# = low# if y# < low# else y#"),
+        any_below=lines("y# < low#", between=" or "),
+        inside_of=lines("inside# = low# if y# < low# else y#"),
         y_less_inside=many("y# - inside#"),
         f_plus_g=many("f# + g#"),
-        middle_of=each("middle# = u# + a#"),
-        s_of=each("s# = middle# + s#"),
-        safe_of=each(round_up.format(x="s")),
-        share_of=each(
+        middle_of=lines("middle# = u# + a#"),
+        s_of=lines("s# = middle# + s#"),
+        safe_of=lines(round_up.format(x="s")),
+        share_of=lines(
             "valid = valid and s# >= low#\n    if new# < low#:\n"
             "        share = _least(share, (s# - low#) / (s# - new#))"
         ),
         moved=many("_most(s# + share * (new# - s#), low#)"),
-        low_of=each("low# = min(u#, 0.0)"),
+        low_of=lines("low# = min(u#, 0.0)"),
         second=many("f# + 4.0 * p * a#"),
-        y_of=each("y# = u# + 2.0 * a#"),
+        y_of=lines("y# = u# + 2.0 * a#"),
         third=many("r# + p * (a# - b#)"),
-        y_more=each("y# = y# + d#"),
+        y_more=lines("y# = y# + d#"),
         fourth=many("r# + p * (a# - b# - (8.0 / 3.0) * d#)"),
-        new_of=each("new# = y# + e#"),
-        error_of=each(
+        new_of=lines("new# = y# + e#"),
+        error_of=lines(
             "allowed# = atol + rtol * _most(abs(u#), abs(new#))\n"
             "    error = _most(error, abs(e#) / allowed#)\n"
             "    size = _most(size, abs(new#))"
         ),
-        noise_of=each("noise# = 8 * eps * (abs(u#) + 2 * abs(a#) + abs(d#) + abs(e#))"),
-        noisy=each(round_up.format(x="new")),
-        new_below=each("new# < low#", " or "),
-        worse_of=each("worse# = new#"),
-        new_pattern=each("new#", ", ") + "," * (size == 1),
-        moved_of=each("moved = _most(moved, abs(new# - worse#) / allowed#)"),
-        leaves=leaves,
+        noise_of=lines("noise# = 8 * eps * (abs(u#) + 2 * abs(a#) + abs(d#) + abs(e#))"),
+        noisy=lines(round_up.format(x="new")),
+        new_below=lines("new# < low#", between=" or "),
+        worse_of=lines("worse# = new#"),
+        new_pattern=lines("new#", between=", ") + "," * (size == 1),
+        moved_of=lines("moved = _most(moved, abs(new# - worse#) / allowed#)"),
         start=many("at[n, #]"),
-        all_finite=each("abs(f#) < np.inf", " and "),
+        all_finite=lines("abs(f#) < np.inf", between=" and "),
         store=many("at[n, #]") + " = u",
     )

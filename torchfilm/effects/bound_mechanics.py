@@ -20,7 +20,9 @@ from torchfilm.physics.step_records import StepInput, StepResult
 from torchfilm.physics.surfaces import Surface
 from torchfilm.resolver import snapshot
 from torchfilm.state import State
+from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
+from torchfilm.tools.tangents import has_tangent, tracked
 
 if TYPE_CHECKING:
     from torchfilm.effects.mechanics import Mechanics
@@ -98,7 +100,7 @@ class BoundMechanics(BoundEffect):
 
     def _taken(self, given: StepInput) -> StepResult:
         """The contact steps, by kernels or by torch."""
-        if self.compiled and not _tracked(given):
+        if not _tracked(given) and self.compiled:
             return compiled.contact_steps(given)
         return (one_sided if self.effect.one_sided else bilateral).contact_steps(given)
 
@@ -164,7 +166,7 @@ class BoundMechanics(BoundEffect):
 def _of_colonies(value: Tensor, groups: Groups) -> Tensor:
     """The greatest value in each colony, (N,) -> (B,), with its gradient; 0 without cells."""
     most = groups.max(value)
-    if not (torch.is_grad_enabled() and value.requires_grad):
+    if not tracked(value):
         return most
     place = torch.arange(value.numel(), device=value.device)
     first = groups.max(torch.where(value.detach() == most[groups.owner], place, -1), -1)
@@ -172,12 +174,16 @@ def _of_colonies(value: Tensor, groups: Groups) -> Tensor:
 
 
 def _tracked(given: StepInput) -> bool:
-    """Whether gradients are required through the step."""
-    if not torch.is_grad_enabled():
-        return False
+    """Whether gradients are required through the step. Raises InputError for forward mode."""
     parts = [v for v in vars(given).values() if isinstance(v, Tensor)]
     parts += [value for _, value in given.walls if value is not None]
     for surface in given.surfaces:
         for entry in vars(surface).values():
             parts += entry if isinstance(entry, tuple) else [entry]
-    return any(isinstance(part, Tensor) and part.requires_grad for part in parts)
+    tensors = [part for part in parts if isinstance(part, Tensor)]
+    if has_tangent(*tensors):
+        raise checks.InputError(
+            "Mechanics: contacts have a backward pass and no forward mode. Use backward(), or"
+            " recorded growth, which does not depend on what is differentiated."
+        )
+    return tracked(*tensors)

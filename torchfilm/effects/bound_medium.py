@@ -22,6 +22,7 @@ from torchfilm.signals.transport import Stepper, choose, prepare
 from torchfilm.signals.transport_rates import build_operator
 from torchfilm.state import GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.tangents import tracked
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Flow, Medium, OnGrid, Signal
@@ -157,16 +158,16 @@ class Transport:
         assert state.layout is not None
         numbers = [x for x in self._numbers(name) if isinstance(x, Tensor)]
         numbers += _closure_tensors(self.signals[name], self.flows[name])
-        if torch.is_grad_enabled() and any(x.requires_grad for x in numbers):
+        if tracked(*numbers):
             return self._prepare(name, state, batch, dt)[0]
         known = self.steppers.setdefault(state.layout.grid, {})
         key = (name, batch.shape, dt, state.dtype, torch.is_grad_enabled())
         found = known.get(key)
         if found is None:
-            found, tracked = self._prepare(name, state, batch, dt)
+            found, own = self._prepare(name, state, batch, dt)
             # a function may use a tensor that requires a gradient; such a stepper serves one
             # backward pass only, so it is not kept
-            if not tracked:
+            if not own:
                 known[key] = found
         return found
 
@@ -180,7 +181,7 @@ class Transport:
     def _prepare(
         self, name: str, state: State, batch: GridBatch, dt: float
     ) -> tuple[Stepper, bool]:
-        """The stepper, and whether its coefficients require a gradient."""
+        """The stepper, and whether derivatives by its coefficients are wanted."""
         signal, layout = self.signals[name], state.layout
         assert layout is not None
         ids = state.colony_id.index_select(0, batch.places)
@@ -216,9 +217,7 @@ class Transport:
             made.source,
             *(x for axis in made.axes for x in (axis.up, axis.down, axis.low, axis.high)),
         )
-        return prepare(made, dt, self.medium.method or choose(made)), any(
-            x is not None and x.requires_grad for x in coefficients
-        )
+        return prepare(made, dt, self.medium.method or choose(made)), tracked(*coefficients)
 
 
 class _MediumPart(BoundEffect):

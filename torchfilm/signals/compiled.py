@@ -8,13 +8,14 @@ from torch import Tensor
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.stencil import SLACK, Stencil
 from torchfilm.tools.numba_calls import as_array, unavailable
+from torchfilm.tools.tangents import tracked
 
 
 def may_run(*given: Tensor) -> bool:
     """Whether kernels may take these tensors."""
     if given[0].device.type != "cpu" or unavailable():
         return False
-    return not (torch.is_grad_enabled() and any(x.requires_grad for x in given))
+    return not tracked(*given)
 
 
 def stencil(

@@ -246,6 +246,10 @@ class _GroupSpread(torch.autograd.Function):
     def backward(ctx, grad: Tensor):
         return ctx.groups.sum(grad), None
 
+    @staticmethod
+    def jvp(ctx, tangent: Tensor, _):
+        return tangent.index_select(0, ctx.groups.owner)
+
 
 class _GroupSum(torch.autograd.Function):
     @staticmethod
@@ -256,3 +260,7 @@ class _GroupSum(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad: Tensor):
         return grad.index_select(0, ctx.groups.owner), None
+
+    @staticmethod
+    def jvp(ctx, tangent: Tensor, _):
+        return ctx.groups.sum_into(tangent, tangent.new_empty(ctx.groups.size, tangent.shape[1]))

@@ -1,0 +1,65 @@
+"""Which derivatives are wanted of a tensor: torch's backward pass, or its forward mode.
+
+In forward mode a tensor carries its tangent, ∂/∂θ of each number along one direction θ, and torch
+works out the tangent of a result together with the result. `numpy()` drops it without a word, so
+that every function that leaves torch asks here first.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+
+@contextmanager
+def forward_mode() -> Iterator[None]:
+    """Within it tensors may carry tangents."""
+    _prepare_forward_mode()
+    with forward_ad.dual_level():
+        yield
+
+
+@cache
+def _prepare_forward_mode() -> None:
+    """Compile torch's forward derivatives, without torch's own deprecation warning.
+
+    Torch compiles them on first use, with a function that torch itself calls deprecated.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        with forward_ad.dual_level():
+            forward_ad.make_dual(torch.ones(1), torch.ones(1)).exp()
+
+
+def tangent(value: Tensor) -> Tensor | None:
+    """What a tensor carries in forward mode, or None."""
+    return forward_ad.unpack_dual(value).tangent
+
+
+def has_tangent(*values: Tensor | None) -> bool:
+    """Whether one of them carries a tangent."""
+    return any(x is not None and tangent(x) is not None for x in values)
+
+
+def tracked(*values: Tensor | None) -> bool:
+    """Whether a derivative of a result of these is wanted, of either kind."""
+    if torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in values):
+        return True
+    return has_tangent(*values)
+
+
+def both(value: Tensor) -> tuple[Tensor, Tensor | None]:
+    """The tensor without its tangent, and the tangent or None."""
+    found = forward_ad.unpack_dual(value)
+    return found.primal.detach(), found.tangent
+
+
+def with_tangent(value: Tensor, moved: Tensor | None) -> Tensor:
+    """The tensor with a tangent, where there is one."""
+    return value if moved is None else forward_ad.make_dual(value, moved)
