@@ -277,14 +277,9 @@ def _molecules(
             if isinstance(molecules_per_unit, Tensor) and molecules_per_unit.dim()
             else molecules_per_unit
         )
+        own = None if pool is None else pool.index_select(0, mine)
         with deterministic_functions():
-            found = network.propensities(
-                counts,
-                p,
-                cell,
-                molecules_per_unit=scale,
-                pool=None if pool is None else pool.index_select(0, mine),
-            )
+            found = network.propensities(counts, p, cell, molecules_per_unit=scale, pool=own)
         return _without_tangent(found, circuit.label, settings.method)
 
     if settings.method == "direct":
