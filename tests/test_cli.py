@@ -243,11 +243,12 @@ def started(folder: Path, results: str, *arguments: str) -> subprocess.Popen:
         stderr=subprocess.PIPE,
         text=True,
     )
-    for _ in range(500):
+    for _ in range(5000):
         time.sleep(0.02)
         if (folder / results).exists():
-            break
-    return child
+            return child
+    child.kill()
+    raise AssertionError(f"no {results} after 100 s: {child.communicate()}")
 
 
 @pytest.mark.slow
