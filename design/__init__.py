@@ -5,13 +5,14 @@
 It uses torchfilm's public names only, as any user can.
 """
 
-from design.methods import CMAES, Batch, Bayesian, Method, Racing, Sobol
+from design.methods import CMAES, Batch, Bayesian, Local, Method, Racing, Sobol
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
 from design.robustness import Robustness
 from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
 from design.search import Best, Search
+from design.slopes import Slopes
 from design.study import Study
 from design.targets import (
     Bands,
@@ -39,6 +40,7 @@ __all__ = [
     "FinishedColonies",
     "Gradient",
     "Image",
+    "Local",
     "Method",
     "Objective",
     "OnFraction",
@@ -49,6 +51,7 @@ __all__ = [
     "Ring",
     "Robustness",
     "Search",
+    "Slopes",
     "Sobol",
     "Space",
     "Stripe",

@@ -5,14 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from design import executors
+from design.derivatives import along, differences, neighbours
 from design.parameters import Value
 from design.rollout import FinishedColonies
 from design.scoring import cut_work_items, finished_colonies, run_work_item
+from design.slopes import Slopes
 from design.task import Task
 from torchfilm import checks
 
@@ -24,7 +27,8 @@ class Evaluation:
     points (n, D); values: their parameters by name; losses (n, R), of each replicate; loss (n,);
     cells (n, R), of each colony at its end; reasons, by (row, replicate), why a colony failed;
     size: share of the full size; why_regrown: the reason why colonies did not follow recorded
-    growth, or ""; seconds.
+    growth, or ""; seconds; slopes: of the n designs, where they were asked for; copies: colonies
+    that were grown for each loss (n, R).
     """
 
     points: np.ndarray
@@ -36,6 +40,8 @@ class Evaluation:
     size: float
     why_regrown: str
     seconds: float
+    slopes: Slopes | None = None
+    copies: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +58,15 @@ class Objective:
         size: float = 1.0,
         executor: Executor | None = None,
         work_items: int = 1,
+        slopes: bool = False,
     ) -> Evaluation:
         """Grow and score designs, (n, D) coordinates in [0, 1]. All replicates of all designs share
         as few batches as fit into memory.
 
         streams: of random numbers, one for each replicate; by default 0 … replicates − 1. size:
-        share of `cells` and `until`, for a cheap first look. executor: of the `concurrent.futures`
+        share of `cells` and `until`, for a cheap first look. slopes: also derivatives by the
+        parameters without levels: exact where `why_differences` is "", else from differences.
+        executor: of the `concurrent.futures`
         kind, for other processes or machines. work_items: the least number of parts for it. This
         process runs what the executor loses, and warns. The losses are the same to the bit however
         the designs are divided, on machines of the same kind. Raises InputError for points, streams
@@ -75,16 +84,48 @@ class Objective:
                 "points", points.shape, f"(n, {task.space.size}) coordinates in [0, 1]"
             )
         checks.number("size", size, above=0.0, most=1.0)
-        chosen = task.streams(streams)
+        chosen, run = task.streams(streams), (size, executor, work_items)
+        if not slopes:
+            found = self._grow(points, None, chosen, *run)
+        elif self.why_differences:
+            found = self._differences(points, chosen, *run)
+        else:
+            found = self._grow(points, [along(task.space, p) for p in points], chosen, *run)
+        return replace(found, seconds=time.perf_counter() - begun)
+
+    @property
+    def why_differences(self) -> str:
+        """Why slopes are differences between runs, and not exact; "" where they are exact."""
+        task = self.task
+        if not task.space.moving:
+            raise checks.InputError(
+                "there are no derivatives: every parameter is whole or a choice. Use another"
+                ' method, such as "racing".'
+            )
+        if task.tried.why_regrown:
+            return f"growth depends on the design ({task.tried.why_regrown})"
+        return task.tried.why_rough
+
+    def _grow(
+        self,
+        points: np.ndarray,
+        turns: list[list[dict[str, float]]] | None,
+        streams: tuple[int, ...],
+        size: float,
+        executor: Executor | None,
+        work_items: int,
+    ) -> Evaluation:
+        task, count = self.task, len(streams)
         values = [task.space.values(point) for point in points]
-        items = cut_work_items(task, values, len(chosen), size, work_items)
+        items = cut_work_items(task, values, count, size, work_items, turns)
         results = (
-            ((item, run_work_item(task, item, chosen, size)) for item in items)
+            ((item, run_work_item(task, item, streams, size)) for item in items)
             if executor is None
-            else executors.run_work_items(task, items, chosen, size, executor)
+            else executors.run_work_items(task, items, streams, size, executor)
         )
-        losses = np.full((len(points), len(chosen)), np.nan)
-        cells = np.zeros((len(points), len(chosen)), np.int64)
+        losses = np.full((len(points), count), np.nan)
+        cells = np.zeros((len(points), count), np.int64)
+        gathered = Slopes.none(len(points) * count, task.space.size)
         reasons: dict[tuple[int, int], str] = {}
         why_regrown = ""
         for item, found in results:
@@ -92,8 +133,30 @@ class Objective:
             losses[rows], cells[rows] = found.losses, found.cells
             reasons |= {(rows[row], k): words for (row, k), words in found.reasons.items()}
             why_regrown = why_regrown or found.why_regrown
-        loss, seconds = task.reduced(losses), time.perf_counter() - begun
-        return Evaluation(points, values, losses, loss, cells, reasons, size, why_regrown, seconds)
+            if found.slopes is not None:
+                gathered.put([row * count + k for row in rows for k in range(count)], found.slopes)
+        slopes = None if turns is None else gathered.reduced(task.shares(losses))
+        copies = 1 if turns is None else len(turns[0])
+        return Evaluation(
+            points, values, losses, task.reduced(losses), cells, reasons, size, why_regrown, 0.0,
+            slopes, copies,
+        )  # fmt: skip
+
+    def _differences(self, points: np.ndarray, streams: tuple[int, ...], *run: Any) -> Evaluation:
+        """Of each point and of its neighbours, grown side by side."""
+        space = self.task.space
+        beside = [neighbours(space, point) for point in points]
+        each = 1 + len(beside[0])
+        every = np.concatenate([np.vstack([p, b]) for p, b in zip(points, beside, strict=True)])
+        found = self._grow(every, None, streams, *run)
+        first = slice(None, None, each)
+        slopes = differences(space, found.loss.reshape(-1, each)[:, 1:])
+        return replace(
+            found,
+            points=points, values=found.values[first], losses=found.losses[first],
+            loss=found.loss[first], cells=found.cells[first], slopes=slopes, copies=each,
+            reasons={(r // each, k): w for (r, k), w in found.reasons.items() if not r % each},
+        )  # fmt: skip
 
     def colonies(
         self, point: np.ndarray, *, streams: Sequence[int] | None = None

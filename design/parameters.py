@@ -82,6 +82,12 @@ class Parameter:
         # rounding must not exceed a bound
         return min(max(math.exp(found) if self.log else found, self.low), self.high)
 
+    def slope(self, unit: float) -> float:
+        """The derivative of the value by the coordinate, for a parameter without levels."""
+        if self.log:
+            return float(self.value(unit)) * (math.log(self.high) - math.log(self.low))
+        return self.high - self.low
+
     def coordinate(self, value: Value) -> float:
         """The coordinate, in [0, 1], of a value within the bounds."""
         number = checks.number(self.name, value, least=self.low, most=self.high)
@@ -175,6 +181,11 @@ class Space:
             raise checks.input_error("parameters", twice[0], "named once")
         self.size = len(self.parameters)
         self.levels = tuple(p.levels for p in self.parameters)
+
+    @property
+    def moving(self) -> list[int]:
+        """The dimensions without levels, by which losses have derivatives."""
+        return [k for k, levels in enumerate(self.levels) if levels is None]
 
     def values(self, point: np.ndarray) -> dict[str, Value]:
         """The values of one design by name, from its coordinates (D,)."""

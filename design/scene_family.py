@@ -34,24 +34,33 @@ class SceneFamily:
     def name(self) -> str:
         return getattr(self.function, "__name__", "the scene")
 
-    def scene(self, values: Sequence[Mapping[str, Value]], repeat: int = 1) -> tf.Scene:
+    def scene(
+        self,
+        values: Sequence[Mapping[str, Value]],
+        repeat: int = 1,
+        turns: Sequence[Mapping[str, float]] | None = None,
+    ) -> tf.Scene:
         """One scene for several designs whose structure is the same. A number becomes one value per
-        colony; each design has `repeat` colonies."""
+        colony; each design has `repeat` colonies. turns: for each design, the derivatives that
+        its values carry as tangents, by name; those that are not named carry 0."""
         arguments = dict(self.fixed)
         for parameter in self.space.parameters:
-            column = [design[parameter.name] for design in values]
-            structural = parameter.levels is not None
-            arguments[parameter.name] = (
-                column[0]
-                if structural
-                else torch.tensor(
-                    column, dtype=torch.float64, device=self.device
-                ).repeat_interleave(repeat)
-            )
+            name = parameter.name
+            if parameter.levels is not None:
+                arguments[name] = values[0][name]
+                continue
+            arguments[name] = self._column([design[name] for design in values], repeat)
+            if turns is not None:
+                turn = self._column([turn.get(name, 0.0) for turn in turns], repeat)
+                arguments[name] = tf.tangents.with_tangent(arguments[name], turn)
         made = self.function(**arguments)
         if not isinstance(made, tf.Scene):
             raise checks.input_error("scene", made, "a function that returns a tf.Scene")
         return made
+
+    def _column(self, numbers: Sequence[float], repeat: int) -> torch.Tensor:
+        column = torch.tensor(numbers, dtype=torch.float64, device=self.device)
+        return column.repeat_interleave(repeat)
 
     def check_names(self) -> None:
         """Raises InputError for a parameter or fixed argument that the function does not have."""
@@ -97,7 +106,8 @@ class TriedScenes:
     founders: cells at the start of a colony; placed: whether the founders of each colony are given;
     dt (h): of the scene. recipe: name and arguments of a ready scene, or None. listing: its effects
     as text. digest: of what a listing does not show, the founders and the code of functions.
-    why_regrown: the reason why colonies cannot follow recorded growth, or "".
+    why_regrown: the reason why colonies cannot follow recorded growth, or "". why_rough: the reason
+    why losses on recorded growth have no derivatives, or "".
     """
 
     founders: int
@@ -107,6 +117,7 @@ class TriedScenes:
     listing: list[str]
     digest: str
     why_regrown: str
+    why_rough: str
 
 
 def try_scenes(
@@ -161,7 +172,13 @@ def try_scenes(
         listing=scene.listing(),
         digest=tf.digest(made_of),
         why_regrown=why_regrown,
+        why_rough=_why_rough(scene),
     )
+
+
+def _why_rough(scene: tf.Scene) -> str:
+    circuits = [e for e in scene.effects if isinstance(e, tf.Circuit) and e.is_stochastic]
+    return "molecules are counted one by one" if circuits else ""
 
 
 def _trial_values(space: Space, middle: dict[str, Value]) -> list[dict[str, Value]]:

@@ -13,8 +13,10 @@ import torch
 
 import torchfilm as tf
 from design import colonies, memory
+from design.derivatives import Gathered
 from design.parameters import Value
 from design.rollout import FinishedColonies, grow
+from design.slopes import Slopes, joined
 from design.targets.base import Target
 from design.task import Task
 
@@ -22,28 +24,46 @@ from design.task import Task
 @dataclass(frozen=True)
 class WorkItem:
     """Part of an evaluation: the rows of designs whose scenes have the same structure, and the
-    values of their parameters."""
+    values of their parameters. turns: for the derivatives, of each design the tangents of its
+    copies (`derivatives.along`); None where only losses are wanted."""
 
     rows: tuple[int, ...]
     values: tuple[dict[str, Value], ...]
+    turns: tuple[list[dict[str, float]], ...] | None = None
+
+    def take(self, places: Sequence[int]) -> WorkItem:
+        """The designs at some places."""
+        of = lambda x: tuple(x[k] for k in places)
+        return WorkItem(of(self.rows), of(self.values), self.turns and of(self.turns))
 
 
 @dataclass(frozen=True, eq=False)
 class WorkResult:
     """The result of a work item: losses and cells (n, R), and the reasons of failures by (row of
-    the item, replicate). why_regrown: the reason why no recorded growth was used, or ""."""
+    the item, replicate). why_regrown: the reason why no recorded growth was used, or "". slopes: of
+    the n · R colonies, where they were asked for."""
 
     losses: np.ndarray
     cells: np.ndarray
     reasons: dict[tuple[int, int], str]
     why_regrown: str
+    slopes: Slopes | None = None
 
 
 def cut_work_items(
-    task: Task, values: Sequence[dict[str, Value]], replicates: int, size: float, least: int
+    task: Task,
+    values: Sequence[dict[str, Value]],
+    replicates: int,
+    size: float,
+    least: int,
+    turns: Sequence[list[dict[str, float]]] | None = None,
 ) -> list[WorkItem]:
     """Cut designs into at least `least` parts, where there are as many designs. One scene can hold
-    each part, and one batch fits into memory."""
+    each part, and one batch fits into memory. turns: as `WorkItem` has them."""
+    whole = WorkItem(
+        tuple(range(len(values))), tuple(values), None if turns is None else tuple(turns)
+    )
+    colonies_each = replicates * (1 if turns is None else len(turns[0]))
     structural = [p.name for p in task.space.parameters if p.levels is not None]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row, design in enumerate(values):
@@ -52,15 +72,12 @@ def cut_work_items(
     for rows in groups.values():
         most = task.most or _max_colonies(task, [values[r] for r in rows], size)
         wanted = max(
-            math.ceil(len(rows) / max(1, most // replicates)),
+            math.ceil(len(rows) / max(1, most // colonies_each)),
             math.ceil(least * len(rows) / len(values)),
         )
         count = min(len(rows), wanted)
         cuts = [len(rows) * k // count for k in range(count + 1)]  # as even as possible
-        out += [
-            WorkItem(tuple(rows[a:b]), tuple(values[r] for r in rows[a:b]))
-            for a, b in itertools.pairwise(cuts)
-        ]
+        out += [whole.take(rows[a:b]) for a, b in itertools.pairwise(cuts)]
     return out
 
 
@@ -87,14 +104,15 @@ def run_work_item(task: Task, item: WorkItem, streams: tuple[int, ...], size: fl
                 np.zeros((1, replicates), np.int64),
                 {(0, k): str(error) for k in range(replicates)},
                 "",
+                None if item.turns is None else Slopes.none(replicates, task.space.size),
             )
     except (MemoryError, RuntimeError) as error:
         if count == 1 or not memory.is_lack_of_memory(error):
             raise
     half = count // 2
     first, second = (
-        run_work_item(task, WorkItem(item.rows[part], item.values[part]), streams, size)
-        for part in (slice(0, half), slice(half, count))
+        run_work_item(task, item.take(part), streams, size)
+        for part in (range(half), range(half, count))
     )
     moved = {(row + half, k): reason for (row, k), reason in second.reasons.items()}
     return WorkResult(
@@ -102,6 +120,7 @@ def run_work_item(task: Task, item: WorkItem, streams: tuple[int, ...], size: fl
         np.concatenate([first.cells, second.cells]),
         first.reasons | moved,
         first.why_regrown or second.why_regrown,
+        None if first.slopes is None else joined([first.slopes, second.slopes]),
     )
 
 
@@ -109,26 +128,50 @@ def run_work_item(task: Task, item: WorkItem, streams: tuple[int, ...], size: fl
 def _grow_and_score(
     task: Task, item: WorkItem, streams: tuple[int, ...], size: float
 ) -> WorkResult:
+    """Copies of a colony, one for each derivative, stand side by side in the batch."""
     count, replicates = len(item.rows), len(streams)
-    scene = task.family.scene(item.values, repeat=replicates)
-    prepared = colonies.prepare(scene, streams * count, task.settings)
-    losses = np.full(count * replicates, task.target.failed, np.float64)
-    cells = np.zeros(count * replicates, np.int64)
-    reasons: dict[tuple[int, int], str] = {}
-    most_cells, until = task.end(size)
-    for event in grow(prepared, cells=most_cells, until=until, note=task.target.note):
-        if not isinstance(event, FinishedColonies):
-            reasons[divmod(event.colony_id, replicates)] = event.reason
-            continue
-        ids = event.state.colony_id.tolist()
-        score = _scores(task.target, event)
-        for colony_id, number in zip(ids, score.tolist(), strict=True):
-            if not math.isfinite(number):
-                reasons[divmod(colony_id, replicates)] = f"the target's loss was {number}"
-        losses[ids] = np.where(np.isfinite(score), score, task.target.failed)
-        cells[ids] = event.state.counts.cpu().numpy()
-    shape = (count, replicates)
-    return WorkResult(losses.reshape(shape), cells.reshape(shape), reasons, prepared.why_regrown)
+    copies = 1 if item.turns is None else len(item.turns[0])
+    with tf.tangents.forward_mode() if item.turns else contextlib.nullcontext():
+        prepared = colonies.prepare(
+            _scene(task, item, replicates),
+            [stream for _ in item.rows for stream in streams for _ in range(copies)],
+            task.settings,
+        )
+        losses = np.full(count * replicates, task.target.failed, np.float64)
+        cells = np.zeros(count * replicates, np.int64)
+        gathered = Gathered(task.space, count * replicates) if item.turns else None
+        reasons: dict[tuple[int, int], str] = {}
+        most_cells, until = task.end(size)
+        for event in grow(prepared, cells=most_cells, until=until, note=task.target.note):
+            if not isinstance(event, FinishedColonies):
+                reasons[divmod(event.colony_id // copies, replicates)] = event.reason
+                continue
+            ids = [k // copies for k in event.state.colony_id.tolist()[::copies]]
+            score = _scores(task.target, event)[::copies]
+            for k, number in zip(ids, score.tolist(), strict=True):
+                if not math.isfinite(number):
+                    reasons[divmod(k, replicates)] = f"the target's loss was {number}"
+            losses[ids] = np.where(np.isfinite(score), score, task.target.failed)
+            cells[ids] = event.state.counts.cpu().numpy()[::copies]
+            if gathered is not None:
+                gathered.add(task.target, event, ids)
+    shape, slopes = (count, replicates), None if gathered is None else gathered.slopes
+    return WorkResult(
+        losses.reshape(shape), cells.reshape(shape), reasons, prepared.why_regrown, slopes
+    )
+
+
+def _scene(task: Task, item: WorkItem, replicates: int) -> tf.Scene:
+    """The scene of all colonies of a work item."""
+    if item.turns is None:
+        return task.family.scene(item.values, repeat=replicates)
+    each = [
+        (values, turn)
+        for values, turns in zip(item.values, item.turns, strict=True)
+        for _ in range(replicates)
+        for turn in turns
+    ]
+    return task.family.scene([v for v, _ in each], turns=[t for _, t in each])
 
 
 def _scores(target: Target, finished: FinishedColonies) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from design.progress import advance, open_bar
 from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
 from design.saved_design import write_design
+from design.slopes import Slopes
 from design.study import Entry, Study
 from design.task import Task, TaskOptions
 from torchfilm import checks
@@ -117,9 +118,10 @@ class Search(TaskOptions):
                         size=batch.size,
                         executor=executor,
                         work_items=work_items,
+                        slopes=batch.slopes,
                     )
                     self._keep(found)
-                    method.tell(batch, found.loss)
+                    _tell(method, batch, found.loss, found.slopes)
                     _show(bar, self.study)
         except KeyboardInterrupt:
             self._report_interrupt(colonies)
@@ -167,6 +169,8 @@ class Search(TaskOptions):
             found.losses.shape[1],
             found.seconds,
             found.values,
+            found.slopes,
+            found.copies,
         )
         self.study.add(entry)
         self._progress.why_regrown = found.why_regrown
@@ -256,7 +260,16 @@ def _repeat_study(method: Method, study: Study) -> None:
                 f"{study.path}: the method proposes other points than its batch {k} holds; another"
                 " version of the method may have made the file. Start a new study."
             )
-        method.tell(Batch(entry.points, batch.size, batch.replicates), entry.loss)
+        same = replace(batch, points=entry.points)
+        _tell(method, same, entry.loss, entry.slopes)
+
+
+def _tell(method: Method, batch: Batch, loss: np.ndarray, slopes: Slopes | None) -> None:
+    """Methods that never ask for slopes need not take any."""
+    if batch.slopes:
+        method.tell(batch, loss, slopes)  # type: ignore[call-arg]
+    else:
+        method.tell(batch, loss)
 
 
 def _ask(method: Method, task: Task) -> Batch:

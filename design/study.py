@@ -4,9 +4,10 @@ results as if it had never stopped.
     /             attributes: format, version, torchfilm, torch, about (JSON: scene, parameters,
                   target, method, …)
     /streams      (R,) streams of random numbers, one for each replicate
-    /batches/     rows, size, replicates, seconds: a row for each batch
+    /batches/     rows, size, replicates, seconds, copies: a row for each batch
     /designs/     point (N, D), loss (N,), losses (N, R), cells (N, R); NaN and 0 where a replicate
-                  was not grown; reasons, JSON by replicate
+                  was not grown; reasons, JSON by replicate; gradient (N, D), curvature (N, D, D),
+                  NaN where no derivatives were wanted
     /values/NAME  (N,) the values of each parameter
 
 After each batch a new file is written beside the old one and then replaces it, so that a kill at
@@ -29,9 +30,10 @@ import torch
 
 import torchfilm as tf
 from design.parameters import Value
+from design.slopes import Slopes
 from torchfilm import checks
 
-FORMAT, VERSION = "torchfilm study", 1
+FORMAT, VERSION = "torchfilm study", 2
 DIGESTS = ("founders and functions", "code of the target")
 LONGEST, SHORT = 300, 48  # characters of a refusal, and of one value in it
 
@@ -42,7 +44,8 @@ class Entry:
 
     points (n, D); loss (n,); losses and cells (n, R); reasons of failures, by (row, replicate);
     size: share of the full size; replicates: how many were grown; seconds; values: the parameters
-    of each point.
+    of each point. slopes: where the method asked for them; copies: colonies that were grown for
+    each loss, for its derivatives.
     """
 
     points: np.ndarray
@@ -54,11 +57,13 @@ class Entry:
     replicates: int
     seconds: float
     values: Sequence[dict[str, Value]]
+    slopes: Slopes | None = None
+    copies: int = 1
 
     @property
     def colonies(self) -> float:
         """Colonies simulated; a smaller one counts as its share of the full size."""
-        return len(self.points) * self.replicates * self.size
+        return len(self.points) * self.replicates * self.size * self.copies
 
 
 @dataclass(eq=False)
@@ -164,7 +169,7 @@ class Study:
     def _write_tables(self, file: h5py.File) -> None:
         replicates = len(self.streams)
         file["batches/rows"] = [len(e.points) for e in self.entries]
-        for name in ("size", "replicates", "seconds"):
+        for name in ("size", "replicates", "seconds", "copies"):
             file[f"batches/{name}"] = [getattr(e, name) for e in self.entries]
         wide = lambda x, fill: np.concatenate(
             [x, np.full((len(x), replicates - x.shape[1]), fill, x.dtype)], 1
@@ -173,6 +178,12 @@ class Study:
         file["designs/loss"] = np.concatenate([e.loss for e in self.entries])
         file["designs/losses"] = np.concatenate([wide(e.losses, np.nan) for e in self.entries])
         file["designs/cells"] = np.concatenate([wide(e.cells, 0) for e in self.entries])
+        size = len(self.names)
+        for name, shape in (("gradient", (size,)), ("curvature", (size, size))):
+            file[f"designs/{name}"] = np.concatenate([
+                np.full((len(e.points), *shape), np.nan) if e.slopes is None
+                else getattr(e.slopes, name) for e in self.entries
+            ])  # fmt: skip
         words = [
             json.dumps(
                 {str(k): e.reasons[r, k] for k in range(e.replicates) if (r, k) in e.reasons}
@@ -291,8 +302,10 @@ def _entries(file: h5py.File) -> list[Entry]:
     }
     values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     out, at = [], 0
-    for rows, size, replicates, seconds in zip(
-        *(batches[n].tolist() for n in ("rows", "size", "replicates", "seconds")), strict=True
+    columns_of = ("rows", "size", "replicates", "seconds", "copies")
+    batches.setdefault("copies", np.ones_like(batches["rows"]))  # version 1 has none
+    for rows, size, replicates, seconds, copies in zip(
+        *(batches[n].tolist() for n in columns_of), strict=True
     ):
         mine = slice(at, at + rows)
         reasons = {
@@ -312,9 +325,16 @@ def _entries(file: h5py.File) -> list[Entry]:
                 replicates,
                 seconds,
                 values[mine],
+                _slopes(designs, mine),
+                copies,
             )
         )
         at += rows
     if at != len(designs["point"]):
         raise ValueError(f"its batches have {at} designs, but it lists {len(designs['point'])}")
     return out
+
+
+def _slopes(designs: Mapping[str, np.ndarray], rows: slice) -> Slopes | None:
+    gradient = designs["gradient"][rows] if "gradient" in designs else np.full(1, np.nan)
+    return None if np.isnan(gradient).all() else Slopes(gradient, designs["curvature"][rows])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -146,6 +147,19 @@ class Task(TaskOptions):
         if self.reduce == "worst":
             return losses.max(1)
         return np.quantile(losses, float(self.reduce), axis=1)
+
+    def shares(self, losses: np.ndarray) -> np.ndarray:
+        """The derivative of `reduced` by the losses, (n, R)."""
+        count = losses.shape[1]
+        if self.reduce == "mean":
+            return np.full(losses.shape, 1.0 / count)
+        quantile = 1.0 if self.reduce == "worst" else float(self.reduce)
+        order, place = np.argsort(losses, 1, kind="stable"), quantile * (count - 1)
+        below, above = math.floor(place), math.ceil(place)
+        out, row = np.zeros(losses.shape), np.arange(len(losses))
+        out[row, order[:, below]] += 1.0 - (place - below)
+        out[row, order[:, above]] += place - below
+        return out
 
     def describe(self) -> dict[str, Any]:
         """Everything that the losses depend on, as plain data. A study can be resumed only by a

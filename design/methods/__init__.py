@@ -7,6 +7,7 @@ from typing import Any
 from design.methods.base import Batch, Method
 from design.methods.bayesian import Bayesian
 from design.methods.cmaes import CMAES
+from design.methods.local import Local
 from design.methods.racing import Racing
 from design.methods.sobol import Sobol
 from torchfilm import checks
@@ -16,9 +17,20 @@ METHODS: dict[str, type[Any]] = {
     "cmaes": CMAES,
     "bayesian": Bayesian,
     "racing": Racing,
+    "local": Local,
 }
 
-__all__ = ["CMAES", "METHODS", "Batch", "Bayesian", "Method", "Racing", "Sobol", "method_of"]
+__all__ = [
+    "CMAES",
+    "METHODS",
+    "Batch",
+    "Bayesian",
+    "Local",
+    "Method",
+    "Racing",
+    "Sobol",
+    "method_of",
+]
 
 
 def method_of(given: str | Method) -> Method:

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.stats import qmc
 
+from design.slopes import Slopes
 from torchfilm import checks
 
 SAME_ORDER = (
@@ -33,13 +34,14 @@ class Batch:
     """The points that a method proposes.
 
     points: (n, D), each coordinate in [0, 1]. size: the share of the full colony size to grow,
-    above 0, at most 1. replicates: how many replicates of each point to grow; None is all. Raises
-    InputError for values that are not allowed.
+    above 0, at most 1. replicates: how many replicates of each point to grow; None is all. slopes:
+    whether `tell` needs derivatives too. Raises InputError for values that are not allowed.
     """
 
     points: np.ndarray
     size: float = 1.0
     replicates: int | None = None
+    slopes: bool = False
 
     def __post_init__(self) -> None:
         points = np.array(self.points, dtype=np.float64)
@@ -62,7 +64,7 @@ class Batch:
 
 class Method(Protocol):
     """How a search chooses points. Any object with these three functions can be the method of a
-    search.
+    search. `tell` gets a third argument, `Slopes`, where the batch asked for them.
 
     The result of `ask` must depend only on the arguments of `start`, the method's settings, and all
     calls of `tell`: a new method resumes a stopped search from the batches and losses of its study.
@@ -128,16 +130,21 @@ class Turns:
             self._batch = self._next()
         return self._batch
 
-    def tell(self, batch: Batch, loss: np.ndarray) -> None:
+    def tell(self, batch: Batch, loss: np.ndarray, slopes: Slopes | None = None) -> None:
         """Learn the losses of a batch: (n,), lower is better, finite (a design that failed has a
-        bad but finite loss).
+        bad but finite loss); slopes: where the batch asked for them.
 
         Batches are given in the order of `ask`. Raises InputError for a batch that `ask` did not
         return.
         """
         self._started()
         self._meet(batch)
-        self._take(batch, scores(batch, loss))
+        if not batch.slopes:
+            self._take(batch, scores(batch, loss))
+        elif slopes is None:
+            raise checks.input_error("slopes", None, "given, since the batch asked for them")
+        else:
+            self._descend(scores(batch, loss), slopes)
         self._batch = None
 
     def describe(self) -> str:
@@ -165,6 +172,10 @@ class Turns:
         raise NotImplementedError
 
     def _take(self, batch: Batch, loss: np.ndarray) -> None:
+        raise NotImplementedError
+
+    def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:
+        """Learn from a batch with slopes."""
         raise NotImplementedError
 
 

@@ -50,6 +50,12 @@ class Target:
         """The loss of each colony, (B,) float64. history: the notes of all steps, (T, B, k)."""
         raise NotImplementedError(f"{type(self).__name__}.loss")
 
+    def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor | None:
+        """Numbers whose squares add up to the loss, (B, K) float64 with 0 where a colony has fewer,
+        with gradients as the loss has; None where a target has no such form. Least squares use
+        them."""
+        return None
+
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """Measures of the pattern that a colony has, (B,) by name; NaN where one is not
         defined."""
@@ -130,6 +136,16 @@ def total(state: tf.State, value: Tensor) -> Tensor:
         if value.dim() == 1
         else state.groups.sum(value)
     )
+
+
+def rows_of_colonies(state: tf.State, value: Tensor) -> Tensor:
+    """(N, k) as one row for each colony, (B, k · most cells), 0 beyond a colony's own cells."""
+    most, columns = int(state.counts.max()), value.shape[1]
+    first = torch.cumsum(state.counts, 0) - state.counts
+    within = torch.arange(state.cells, device=value.device) - first.index_select(0, state.colony)
+    flat = value.new_zeros(state.colonies * most, columns)
+    flat = flat.index_copy(0, state.colony * most + within, value)
+    return flat.reshape(state.colonies, most * columns)
 
 
 def ratio(above: Tensor, below: Tensor, otherwise: float) -> Tensor:

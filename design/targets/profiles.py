@@ -17,6 +17,7 @@ from design.targets.base import (
     Target,
     ratio,
     require,
+    rows_of_colonies,
     species_name,
     species_names,
     total,
@@ -85,17 +86,44 @@ class ProfileTarget(Target):
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         y, sound = valid_levels(state, self.names)
-        w = torch.where(self.counted(state), weights(state), 0.0).unsqueeze(1)
-        m = self.target_profile(state)
-        m = torch.where(m < LEAST, 0.0, m)
+        w, m = self._weights_and_profile(state)
         both, lit, light = (total(state, part) for part in (w * m * y, w * m * m, w * y * y))
         each = 1.0 - ratio(both * both, lit * (light + self.floor**2 * lit), 0.0)
-        # the soft tail of an edge does not count where the colony does not reach the edge
-        each = torch.where(total(state, w * (m > self.least)) > 0, each, 1.0)
+        each = torch.where(self._reached(state, w, m), each, 1.0)
         # rounding may take a perfect colony below 0. The species are added one by one, because a
         # sum along a tensor may depend on the batch
         mean = sum(each.clamp(min=0.0).unbind(1), torch.zeros_like(each[:, 0])) / each.shape[1]
         return torch.where(sound, mean, self.failed)
+
+    def _weights_and_profile(self, state: tf.State) -> tuple[Tensor, Tensor]:
+        """w (N, 1) and m (N, k)."""
+        w = torch.where(self.counted(state), weights(state), 0.0).unsqueeze(1)
+        m = self.target_profile(state)
+        return w, torch.where(m < LEAST, 0.0, m)
+
+    def _reached(self, state: tf.State, w: Tensor, m: Tensor) -> Tensor:
+        """Whether a colony reaches the pattern, (B, k): the soft tail of an edge does not count
+        where the colony does not reach the edge."""
+        return total(state, w * (m > self.least)) > 0
+
+    def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        """√w (m/|m| − cos φ · y/|y|) of each cell, and cos φ · floor |m|/|y|, where cos φ =
+        Σ w m y/(|m| |y|), |m|² = Σ w m² and |y|² = Σ w y² + floor² |m|²: the part of m that is at
+        right angles to y, whose square is the loss."""
+        y, sound = valid_levels(state, self.names)
+        w, m = self._weights_and_profile(state)
+        both, lit, light = (total(state, part) for part in (w * m * y, w * m * m, w * y * y))
+        reached = self._reached(state, w, m) & sound.unsqueeze(1)
+        light = light + self.floor**2 * lit
+        of_cells = lambda x: x.index_select(0, state.colony)
+        root = lambda x: torch.where(x > 0, x, 1.0).sqrt()
+        there = m / of_cells(root(lit)) - of_cells(ratio(both, lit.sqrt() * light, 0.0)) * y
+        each = torch.where(of_cells(reached), w.sqrt() * there, 0.0)
+        beyond = torch.where(reached, ratio(self.floor * both, light, 0.0), 1.0)
+        found = torch.cat([rows_of_colonies(state, each), beyond], 1) / len(self.names) ** 0.5
+        failed = torch.zeros_like(found)
+        failed[:, 0] = self.failed**0.5
+        return torch.where(sound.unsqueeze(1), found, failed)
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:

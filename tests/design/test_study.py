@@ -356,7 +356,7 @@ def test_foreign_files_are_refused(tmp_path, kept):
     for name, words in (
         ("a.h5", "cannot be read"),
         ("b.h5", r"is not a torchfilm study \(its format is 'torchfilm results'"),
-        ("c.h5", "format version 99; this torchfilm reads versions up to 1"),
+        ("c.h5", "format version 99; this torchfilm reads versions up to 2"),
         ("", r"a study file\. This path is a folder"),
         ("no/such.h5", "in a folder that exists"),
     ):

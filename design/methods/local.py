@@ -1,0 +1,158 @@
+"""Local search with derivatives: Levenberg and Marquardt's least squares from many starts, or
+quasi-Newton where a target has no residuals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from design.methods.base import Batch, Turns, sobol_points, whole
+from design.slopes import Slopes
+
+# Damping, as a share of the curvature: at the start, and from which a descent is given up.
+FIRST, MOST = 1e-2, 1e6
+LONGEST = 0.3  # of a step, in each coordinate
+LEAST_STEP, LEAST_GAIN = 1e-4, 1e-4  # coordinates; share of the loss
+# Steps in a row whose decrease is not what the derivatives promised, after which they mislead.
+MISSES = 4
+FAIR = 0.1  # share of the promised decrease that a step should bring at least
+
+
+@dataclass(eq=False)
+class Descent:
+    """A way down from one start: the best point (D,) so far with its loss and slopes, and the
+    point that was proposed last, with the decrease that it promised."""
+
+    point: np.ndarray
+    loss: float = np.inf
+    gradient: np.ndarray = field(default_factory=lambda: np.empty(0))
+    curvature: np.ndarray = field(default_factory=lambda: np.empty(0))
+    damping: float = FIRST
+    growth: float = 2.0
+    misses: int = 0
+    over: str = ""
+    proposed: np.ndarray = field(default_factory=lambda: np.empty(0))
+    promised: float = 0.0
+
+    def propose(self) -> np.ndarray:
+        """The next point to evaluate, (D,)."""
+        if not np.isfinite(self.loss):
+            self.proposed = self.point
+            return self.point
+        step = self._step()
+        self.proposed = np.clip(self.point + step, 0.0, 1.0)
+        moved = self.proposed - self.point
+        self.promised = -float(self.gradient @ moved + 0.5 * moved @ self.curvature @ moved)
+        return self.proposed
+
+    def _step(self) -> np.ndarray:
+        """(H + λ diag H) δ = −g in the coordinates that no bound stops."""
+        point, gradient = self.point, self.gradient
+        free = ~(
+            ((point <= 0) & (gradient > 0)) | ((point >= 1) & (gradient < 0)) | (gradient == 0)
+        )
+        step = np.zeros(len(point))
+        if free.any():
+            inner = self.curvature[np.ix_(free, free)]
+            scale = np.diag(inner).copy()
+            scale = np.maximum(scale, 1e-6 * max(scale.max(), 1e-12))
+            step[free] = -np.linalg.solve(inner + self.damping * np.diag(scale), gradient[free])
+        longest = np.abs(step).max()
+        return step * min(1.0, LONGEST / longest) if longest > 0 else step
+
+    def learn(self, loss: float, gradient: np.ndarray, curvature: np.ndarray) -> None:
+        """What was found at the proposed point."""
+        if not np.isfinite(self.loss):
+            self._take(loss, gradient, curvature, np.zeros_like(gradient))
+            return
+        moved = self.proposed - self.point
+        gain = self.loss - loss
+        ratio = gain / self.promised if self.promised > 0 else -1.0
+        self.misses = 0 if ratio > FAIR else self.misses + 1
+        if gain > 0:
+            before = self.loss
+            self._take(loss, gradient, curvature, moved)
+            # Nielsen (1999)
+            self.damping *= max(1 / 3, 1 - (2 * min(ratio, 1.5) - 1) ** 3)
+            self.growth = 2.0
+            if gain < LEAST_GAIN * before and ratio > FAIR:
+                self.over = "converged"
+        else:
+            self.damping, self.growth = self.damping * self.growth, 2 * self.growth
+        if self.misses >= MISSES:
+            self.over = "derivatives mislead"
+        if np.abs(moved).max() < LEAST_STEP or self.damping > MOST:
+            self.over = "converged"
+
+    def _take(
+        self, loss: float, gradient: np.ndarray, curvature: np.ndarray, moved: np.ndarray
+    ) -> None:
+        if not np.isfinite(curvature).all():
+            curvature = self._quasi_newton(gradient, moved)
+        self.point, self.loss = self.proposed, loss
+        self.gradient, self.curvature = gradient, curvature
+
+    def _quasi_newton(self, gradient: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """The curvature after a step by BFGS's formula, damped as by Powell (1978)."""
+        if not moved.any():
+            return max(float(np.linalg.norm(gradient)), 1e-12) / LONGEST * np.eye(len(gradient))
+        known, change = self.curvature, gradient - self.gradient
+        across = known @ moved
+        bent, turned = float(moved @ across), float(moved @ change)
+        if turned < 0.2 * bent:
+            share = 0.8 * bent / (bent - turned)
+            change = share * change + (1 - share) * across
+        return (
+            known
+            - np.outer(across, across) / bent
+            + np.outer(change, change) / float(moved @ change)
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class Local(Turns):
+    """Least squares by Levenberg and Marquardt (Moré 1978) from several starts side by side.
+
+    starts: how many descents at a time. first: Sobol designs, whose best are the starts; None is 16
+    for each start. A descent ends where it gains nothing more, or where four steps in a row bring
+    less than a tenth of the decrease that the derivatives promised. The next best design of the
+    first ones follows it, and then new Sobol designs. The bounds hold, and dimensions with levels
+    keep the level of their start. Targets without residuals have quasi-Newton steps (BFGS).
+
+    Each design is grown once for each parameter, or twice and once more where the derivatives are
+    differences (`Objective.why_differences` says why); all these colonies count.
+    """
+
+    starts: int = 4
+    first: int | None = None
+
+    def __post_init__(self) -> None:
+        whole("Local.starts", self.starts, least=1)
+        if self.first is not None:
+            whole("Local.first", self.first, least=self.starts)
+
+    def _begin(self) -> None:
+        self._tried = 0
+        self._waiting: list[np.ndarray] = []
+        self._descents: list[Descent] = []
+
+    def _next(self) -> Batch:
+        self._descents = [d for d in self._descents if not d.over]
+        while self._waiting and len(self._descents) < self.starts:
+            self._descents.append(Descent(self._waiting.pop(0)))
+        if not self._descents:
+            count = self.first or 16 * self.starts
+            points = sobol_points(self._started(), self._seed, self._tried, count)
+            self._tried += count
+            return Batch(points)
+        return Batch(np.array([d.propose() for d in self._descents]), slopes=True)
+
+    def _take(self, batch: Batch, loss: np.ndarray) -> None:
+        # a quarter of the designs: the others are worse than where a descent would end
+        best = np.argsort(loss, kind="stable")[: max(self.starts, len(loss) // 4)]
+        self._waiting = [batch.points[k] for k in best]
+
+    def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:
+        for k, descent in enumerate(self._descents):
+            descent.learn(float(loss[k]), slopes.gradient[k], slopes.curvature[k])

@@ -1,0 +1,196 @@
+"""Derivatives of losses by parameters, and the local search that uses them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from asking import Room
+from patterned import crowded
+from searching import lit, objective_of, paced
+
+import torchfilm as tf
+from design import Choice, Parameter, Search, Study
+from design.methods import Local
+from design.slopes import Slopes
+from design.targets import Bands, Gradient, Ring, Stripe
+
+TARGETS = {
+    "bands": Bands(("yfp", "cfp"), (-6.0, 0.0, 6.0), floor=0.3),
+    "ring": Ring("yfp", 4.0, 3.0),
+    "gradient": Gradient("cfp", "x", -5.0, 5.0, floor=1.0),
+    "stripe": Stripe("yfp", width=4.0, cell_type=1),
+    "out of reach": Stripe("yfp", at=500.0, width=4.0),
+}
+EDGES = Bands(("gfp",), (-3.0, 3.0), floor=0.5)
+TWO = [Parameter("make", 0.1, 10.0, log=True), Parameter("decay", 0.1, 5.0)]
+POINTS = np.array([[0.3, 0.6], [0.8, 0.2]])
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_squares_of_residuals_add_up_to_the_loss(name):
+    state, target = crowded(), TARGETS[name]
+    found = target.residuals(state)
+    assert found.shape[0] == state.colonies
+    assert found.square().sum(1).numpy() == pytest.approx(target.loss(state).numpy(), abs=1e-12)
+
+
+def test_a_colony_that_cannot_be_scored_has_the_residual_of_its_loss():
+    state = crowded()
+    broken = torch.where(state.colony == 1, torch.nan, state.fields["yfp"])
+    state = state.with_fields(yfp=broken)
+    target = TARGETS["ring"]
+    found = target.residuals(state).square().sum(1)
+    assert found.numpy() == pytest.approx(target.loss(state).numpy(), abs=1e-12)
+    assert float(found[1]) == pytest.approx(target.failed)
+
+
+@pytest.mark.parametrize("reduce", ["mean", "worst", 0.75])
+def test_slopes_are_differences_of_losses(reduce):
+    objective = objective_of(
+        lit, TWO, EDGES, cells=8, replicates=3, reduce=reduce, dtype=torch.float64
+    )
+    assert objective.why_differences == ""
+    found = objective.evaluate(POINTS, slopes=True)
+    plain = objective.evaluate(POINTS)
+    assert found.copies == 2 and plain.copies == 1 and plain.slopes is None
+    assert found.losses == pytest.approx(plain.losses, rel=1e-9)
+    for k in range(2):
+        step = np.eye(2)[k] * 2e-4
+        more, less = (objective.evaluate(POINTS + s).loss for s in (step, -step))
+        difference = (more - less) / 4e-4
+        assert np.abs(difference).max() > 1e-3, "the loss should depend on it"
+        assert found.slopes.gradient[:, k] == pytest.approx(difference, rel=0.02, abs=1e-5)
+
+
+def test_curvature_is_that_of_the_residuals():
+    """2 JᵀJ by finite differences of the residuals themselves."""
+    objective = objective_of(lit, TWO, EDGES, cells=8, replicates=2, dtype=torch.float64)
+    found = objective.evaluate(POINTS[:1], slopes=True).slopes
+
+    def residuals(point):
+        return [EDGES.residuals(c.state, c.history) for c in objective.colonies(point)]
+
+    columns = []
+    for k in range(2):
+        step = np.eye(2)[k] * 2e-4
+        ends = zip(residuals(POINTS[0] + step), residuals(POINTS[0] - step), strict=True)
+        columns.append(torch.cat([((a - b) / 4e-4).reshape(-1) for a, b in ends]).numpy())
+    j = np.stack(columns, 1)
+    assert found.curvature[0] == pytest.approx(2 * j.T @ j / 2, rel=0.03)
+    own = np.linalg.eigvalsh(found.curvature[0])
+    assert own.min() >= -1e-12
+
+
+def test_parameters_with_levels_have_no_slope():
+    parameters = [TWO[0], Parameter("decay", 1, 4, whole=True)]
+    objective = objective_of(lit, parameters, EDGES, cells=6, replicates=2)
+    found = objective.evaluate(POINTS, slopes=True)
+    assert found.copies == 1
+    assert (found.slopes.gradient[:, 1] == 0).all() and (found.slopes.gradient[:, 0] != 0).all()
+
+
+def test_where_growth_depends_on_the_design_there_are_differences():
+    parameters = [Parameter("rate", 0.5, 2.0), Parameter("make", 0.1, 10.0, log=True)]
+    objective = objective_of(paced, parameters, EDGES, until=1.0, replicates=2)
+    assert "growth depends on the design" in objective.why_differences
+    found = objective.evaluate(POINTS, slopes=True)
+    assert found.copies == 5 and np.isnan(found.slopes.curvature).all()
+    assert found.losses.shape == (2, 2) and len(found.values) == 2
+    assert found.loss == pytest.approx(objective.evaluate(POINTS).loss, rel=1e-6)
+    step = np.array([0.0, 0.01])
+    more, less = (objective.evaluate(POINTS + s).loss for s in (step, -step))
+    assert found.slopes.gradient[:, 1] == pytest.approx((more - less) / 0.02, rel=1e-6)
+
+
+def test_derivatives_by_nothing_are_refused():
+    parameters = [Parameter("decay", 1, 4, whole=True), Choice("make", (1.0, 2.0))]
+    objective = objective_of(lit, parameters, EDGES, cells=4, replicates=1)
+    with pytest.raises(tf.InputError, match="every parameter is whole or a choice"):
+        objective.evaluate(POINTS, slopes=True)
+
+
+# --- the method ----------------------------------------------------------------------------------
+
+
+def descend(local, function, dimensions=3, batches=60, residuals=True):
+    """All points that a local search asks for, their losses, and the colonies that it took. A
+    function gives residuals and their Jacobian at a point."""
+    local.start(Room((None,) * dimensions), 1, 1)
+    points, losses, cost = [], [], 0
+    for _ in range(batches):
+        batch = local.ask()
+        found = [function(p) for p in batch.points]
+        loss = np.array([float(r @ r) for r, _ in found])
+        if batch.slopes:
+            curvature = np.array([2 * j.T @ j for _, j in found])
+            if not residuals:
+                curvature = np.full_like(curvature, np.nan)
+            gradient = np.array([2 * j.T @ r for r, j in found])
+            local.tell(batch, loss, Slopes(gradient, curvature))
+        else:
+            local.tell(batch, loss)
+        cost += len(loss) * (dimensions if batch.slopes else 1)
+        points += list(batch.points)
+        losses += loss.tolist()
+    return np.array(points), np.array(losses), cost
+
+
+def valley(point):
+    """Rosenbrock's function, its least value 0 at (0.6, 0.36) and the third coordinate 0.5."""
+    x, y, z = point
+    j = np.array([[-20 * x, 10.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return np.array([10 * (y - x * x), 0.6 - x, z - 0.5]), j
+
+
+@pytest.mark.parametrize("residuals, least", [(True, 1e-12), (False, 1e-6)])
+def test_it_finds_the_bottom_of_a_bent_valley(residuals, least):
+    _, losses, _ = descend(Local(starts=2), valley, residuals=residuals)
+    assert losses.min() < least
+
+
+def test_it_stops_at_a_bound():
+    target = np.array([0.3, 1.4, -0.2])
+    points, losses, _ = descend(Local(starts=1), lambda p: (p - target, np.eye(3)), batches=20)
+    best = points[losses.argmin()]
+    assert best == pytest.approx([0.3, 1.0, 0.0], abs=1e-4)
+
+
+def test_derivatives_that_mislead_end_a_descent():
+    """The slopes point the wrong way: a new start is taken, and the bounds still hold."""
+    wrong = lambda p: (p - 0.5, -np.eye(3))
+    local = Local(starts=1, first=8)
+    points, _, _ = descend(local, wrong, batches=30)
+    ends = {d.over for d in local._descents if d.over}
+    assert ends <= {"derivatives mislead"}
+    # eight first designs, of which two are descended from; each gives up after four misses
+    assert len(np.unique(points, axis=0)) > 16
+
+
+def test_a_search_with_slopes_resumes(tmp_path):
+    make = lambda: Search(
+        lit, TWO, EDGES, cells=6, replicates=2, method=Local(starts=2, first=4)
+    )  # fmt: skip
+    whole = make()
+    whole.run(colonies=60, progress=False)
+    first = make()
+    first.run(colonies=20, study=tmp_path / "a.h5", progress=False)
+    again = make()
+    best = again.run(colonies=60, study=tmp_path / "a.h5", progress=False)
+    assert best.loss == whole.best().loss
+    kept = Study.read(tmp_path / "a.h5")
+    assert [e.copies for e in kept.entries] == [e.copies for e in whole.study.entries]
+    assert kept.colonies == whole.study.colonies
+    # 4 first designs × 2 replicates, then 2 descents × 2 replicates × 2 parameters
+    assert [e.colonies for e in kept.entries][:2] == [8.0, 8.0]
+    for one, other in zip(kept.entries, whole.study.entries, strict=True):
+        assert (one.slopes is None) == (other.slopes is None)
+        if one.slopes is not None:
+            assert (one.slopes.gradient == other.slopes.gradient).all()
+
+
+def test_a_search_by_derivatives_reaches_what_a_plain_one_reaches():
+    """The loss is flat along a valley of equal levels; both find it, derivatives at once."""
+    plain = Search(lit, TWO, EDGES, cells=8, replicates=2, method="sobol")
+    local = Search(lit, TWO, EDGES, cells=8, replicates=2, method=Local(starts=2, first=8))
+    assert local.run(colonies=80, progress=False).loss <= plain.run(80, progress=False).loss
