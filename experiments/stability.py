@@ -184,11 +184,11 @@ def summary(collector: Collector, ships: Collector) -> str:
     tests = {name.split("::")[-1].split("[")[0] for name in ships.failed}
     cases = sorted({int(found[1]) for name in tests if (found := CASE.match(name))})
     listed = ", ".join(map(str, cases)) or "none"
+    ran = (f"{run.passed} tests passed, {len(run.failed)} failed" for run in (collector, ships))
     return (
         f"Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']},"
-        f" {noted['processor']}, {where}. {collector.passed} tests passed,"
-        f" {len(collector.failed)} failed. With the accuracy that ships {ships.passed} tests passed,"
-        f" {len(ships.failed)} failed: of cases {listed}."
+        f" {noted['processor']}, {where}. {next(ran)}. With the accuracy that ships {next(ran)}:"
+        f" of cases {listed}."
     )
 
 
