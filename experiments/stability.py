@@ -170,8 +170,9 @@ def table(collector: Collector, extra: Values) -> str:
 def run(ships: bool = False) -> Collector:
     """Runs the tests of tests/laws, all or those of `ships`, and returns what they measured."""
     collector = Collector(ships)
+    traces = ["--tb=no"] if ships else []
     pytest.main(
-        ["-q", "-p", "no:cacheprovider", "-n", "0", str(ROOT / "tests" / "laws")],
+        ["-q", "-p", "no:cacheprovider", "-n", "0", *traces, str(ROOT / "tests" / "laws")],
         plugins=[collector],
     )
     return collector
