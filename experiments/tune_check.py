@@ -117,7 +117,7 @@ class TestRun:
             for scene, settings in (
                 (self.probe.scene, make(penalty / 3, more, tolerance)),
                 (self.probe.scene, make(penalty, more, tolerance / 3)),
-                (other_contacts(usual.apply(self.probe.scene)), tf.Settings(dt=usual.dt)),
+                (other_contacts(self.probe.scene, usual), tf.Settings(dt=usual.dt)),
             )
         ]
 
@@ -134,33 +134,38 @@ class TestRun:
         return min(self.probe.observed(settings).seconds for _ in range(3))
 
 
-def other_contacts(scene: tf.Scene) -> tf.Scene:
-    """Returns the scene with bilateral contacts under pressure, else with contacts of constant α.
-
-    Bilateral contacts have the penalty of the reference, a third of the usual one.
-    """
+def other_contacts(scene: tf.Scene, tight: tf.Settings) -> tf.Scene:
+    """Returns the scene with the settings of the reference, and with bilateral contacts under
+    pressure, else with contacts of constant α."""
     made = []
     for effect in scene.effects:
-        if isinstance(effect, tf.Mechanics):
-            drag = float(effect.length_drag)
-            other = {"contacts": "bilateral", "alpha": 0.03 / drag} if drag < PRESSED else {}
-            given = {"contact_overlap": None, "alpha": CONSTANT} | other
-            effect = dataclasses.replace(effect, **given)
+        if isinstance(effect, tf.Mechanics) and effect.length_drag < PRESSED:
+            _, passes, _ = TIGHT_CONTACTS
+            effect = dataclasses.replace(effect, contacts="bilateral")
+            more = dataclasses.replace(tight, passes=effect.settings.passes + passes)
+            effect = effect.with_settings(more)
+        elif isinstance(effect, tf.Mechanics):
+            effect = effect.with_settings(tight)
+            effect = dataclasses.replace(effect, contact_overlap=None, alpha=CONSTANT)
+        else:
+            effect = effect.with_settings(tight)
         made.append(effect)
     return scene.replace(*made)
 
 
 def cancelling(tuned: tf.Tuned) -> str:
     """Returns the observables in which a part of the error exceeds the whole by more than chance
-    (two standard errors)."""
-    exceeds = lambda part, whole: part.value - whole.value > 2 * max(part.noise, whole.noise)
-    names = {
-        n
-        for part in tuned.parts.values()
-        for n, whole in tuned.chosen.errors.items()
-        if n in part and exceeds(part[n], whole)
-    }
-    return ", ".join(sorted(names)) or "none"
+    (two standard errors), with that part."""
+    words = []
+    for name, whole in tuned.chosen.errors.items():
+        parts = {knob: errors[name] for knob, errors in tuned.parts.items() if name in errors}
+        knob = max(parts, key=lambda k: parts[k].value, default=None)
+        if knob is None:
+            continue
+        part = parts[knob]
+        if part.value - whole.value > 2 * max(part.noise, whole.noise):
+            words.append(f"{name}: {knob} {100 * part.value:.2g} %, all {100 * whole.value:.2g} %")
+    return "; ".join(words) or "none"
 
 
 def sweep(run: TestRun, steps: Sequence[int]) -> list[tf.Settings]:
@@ -207,7 +212,8 @@ def check(name: str, error: float) -> dict[str, str]:
             f"{over:.2f}",
         )
     doubts = (*few.doubts(tuned.finest, names), cancelling(tuned))
-    row = (name, words(tuned.settings), str(worst), observable, *swept, *doubts)
+    value = f"{100 * worst.value:.3g} ± {100 * worst.noise:.1g} %"
+    row = (name, words(tuned.settings), value, observable, *swept, *doubts)
     return dict(zip(COLUMNS, row, strict=True))
 
 
