@@ -77,6 +77,7 @@ COLUMNS = (
 )
 PRESSED = 100.0  # length drag below which pressure limits growth, so that bilateral contacts hold
 CONSTANT = 0.0003  # α of contacts that do not follow the force
+MOST_ITERATIONS = 20_000  # of a solve with so small an α
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,8 @@ def other_contacts(scene: tf.Scene, tight: tf.Settings) -> tf.Scene:
             effect = effect.with_settings(more)
         elif isinstance(effect, tf.Mechanics):
             effect = effect.with_settings(tight)
-            effect = dataclasses.replace(effect, contact_overlap=None, alpha=CONSTANT)
+            given = {"alpha": CONSTANT, "max_iterations": MOST_ITERATIONS}
+            effect = dataclasses.replace(effect, contact_overlap=None, **given)
         else:
             effect = effect.with_settings(tight)
         made.append(effect)
