@@ -93,6 +93,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("boundary_band.json"))
     parser.add_argument("--record", type=Path, help="folder for results files, one per condition")
     options = parser.parse_args()
+    if options.record:
+        options.record.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
     found = json.loads(options.out.read_text()) if options.out.exists() else {}
     print(

@@ -20,6 +20,7 @@ from __future__ import annotations
 import json
 import statistics
 import sys
+import textwrap
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -191,13 +192,15 @@ def scene_rows(record: dict) -> list[str]:
 def tables(noted: dict, records: list[dict]) -> str:
     """Returns the tables of the page in Markdown."""
     scenes, body = ([r for r in records if r["case"] == case] for case in ("scene", "beside"))
+    head = textwrap.fill(
+        f"Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']},"
+        f" Python {noted['python']}, {noted['threads']} thread{'s' * (noted['threads'] > 1)},"
+        f" {noted['processor']}, float32. Means over {STEPS} steps of {scenes[0]['colonies']}"
+        " colonies; times are medians, as shares of the step.",
+        100,
+    )
     lines = [
-        (
-            f"Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']},"
-            f" Python {noted['python']}, {noted['threads']} thread(s), {noted['processor']},"
-            f" float32. Means over {STEPS} steps of {scenes[0]['colonies']} colonies; times are"
-            " medians, as shares of the step."
-        ),
+        head,
         "",
         "| scene, effect | time of a step | operators a step | MB allocated a step |",
         "|---|---|---|---|",

@@ -13,13 +13,21 @@ colonies that begin with 100 cells, and 48 that begin with half as many again. A
 run gives a comparison: six steps (and three finer ones, if none of those holds the error), eight
 settings of contacts and two tolerances of circuits. The settings that hold the error there are run
 in the second run as well, in order of their time, until one holds the error in both. Of so many
-settings some hold the error by chance, and some at one size only. The last column is the time of
-the chosen settings over that of the cheapest ones.
+settings some hold the error by chance, and some at one size only. One column is the time of the
+chosen settings over that of the cheapest ones.
+
+The reference is varied, too: a third of its penalty, a third of its tolerance, and other contacts.
+The columns have the largest difference from the reference in an observable. Other contacts are
+bilateral ones where pressure limits growth. Bilateral contacts do not hold in free growth; there
+contacts have a constant α instead of one that follows the force. The last column has observables in
+which errors of the chosen settings cancel: one part, of the step or of contacts, is larger than the
+whole error.
 """
 
 from __future__ import annotations
 
 import csv
+import dataclasses
 import itertools
 import sys
 from collections.abc import Sequence
@@ -62,7 +70,14 @@ COLUMNS = (
     "settings swept",
     "that hold the error in one run",
     "time over the cheapest",
+    "reference, penalty / 3",
+    "reference, tolerance / 3",
+    "reference, other contacts",
+    "errors that cancel in",
 )
+PRESSED = 100.0  # length drag below which pressure limits growth, so that bilateral contacts hold
+CONSTANT = 0.0003  # α of contacts that do not follow the force
+MOST_ITERATIONS = 20_000  # of a solve with so small an α
 
 
 @dataclass(frozen=True)
@@ -91,9 +106,68 @@ class TestRun:
         name = max(errors, key=lambda n: errors[n].value)
         return errors[name], name, run.seconds
 
+    def doubts(self, finest: int, names: Sequence[str]) -> list[str]:
+        """Returns the largest difference of each variation of the reference, as text."""
+        if "tolerance" not in self.search.knobs:
+            return ["", "", ""]
+        penalty, more, tolerance = TIGHT_CONTACTS
+        make = lambda *contacts: self.search.settings(finest, contacts, self.search.tight)
+        usual = make(penalty, more, tolerance)
+        return [
+            self._off(scene, settings, names)
+            for scene, settings in (
+                (self.probe.scene, make(penalty / 3, more, tolerance)),
+                (self.probe.scene, make(penalty, more, tolerance / 3)),
+                (other_contacts(self.probe.scene, usual), tf.Settings(dt=usual.dt)),
+            )
+        ]
+
+    def _off(self, scene: tf.Scene, settings: tf.Settings, names: Sequence[str]) -> str:
+        """Returns how far a run of this scene is from the reference, as text."""
+        found = dataclasses.replace(self.probe, scene=scene).observed(settings).found
+        right = {n: self.reference[n] for n in names}
+        errors = self.probe.errors(found, right, apart=True)
+        name = max(errors, key=lambda n: errors[n].value)
+        return f"{errors[name]}, {name}"
+
     def seconds(self, settings: tf.Settings) -> float:
         """Returns the shortest of three times."""
         return min(self.probe.observed(settings).seconds for _ in range(3))
+
+
+def other_contacts(scene: tf.Scene, tight: tf.Settings) -> tf.Scene:
+    """Returns the scene with the settings of the reference, and with bilateral contacts under
+    pressure, else with contacts of constant α."""
+    made = []
+    for effect in scene.effects:
+        if isinstance(effect, tf.Mechanics) and effect.length_drag < PRESSED:
+            _, passes, _ = TIGHT_CONTACTS
+            effect = dataclasses.replace(effect, contacts="bilateral")
+            more = dataclasses.replace(tight, passes=effect.settings.passes + passes)
+            effect = effect.with_settings(more)
+        elif isinstance(effect, tf.Mechanics):
+            effect = effect.with_settings(tight)
+            given = {"alpha": CONSTANT, "max_iterations": MOST_ITERATIONS}
+            effect = dataclasses.replace(effect, contact_overlap=None, **given)
+        else:
+            effect = effect.with_settings(tight)
+        made.append(effect)
+    return scene.replace(*made)
+
+
+def cancelling(tuned: tf.Tuned) -> str:
+    """Returns the observables in which a part of the error exceeds the whole by more than chance
+    (two standard errors), with that part."""
+    words = []
+    for name, whole in tuned.chosen.errors.items():
+        parts = {knob: errors[name] for knob, errors in tuned.parts.items() if name in errors}
+        knob = max(parts, key=lambda k: parts[k].value, default=None)
+        if knob is None:
+            continue
+        part = parts[knob]
+        if part.value - whole.value > 2 * max(part.noise, whole.noise):
+            words.append(f"{name}: {knob} {100 * part.value:.2g} %, all {100 * whole.value:.2g} %")
+    return "; ".join(words) or "none"
 
 
 def sweep(run: TestRun, steps: Sequence[int]) -> list[tf.Settings]:
@@ -139,7 +213,9 @@ def check(name: str, error: float) -> dict[str, str]:
             str(len(holding)),
             f"{over:.2f}",
         )
-    row = (name, words(tuned.settings), str(worst), observable, *swept)
+    doubts = (*few.doubts(tuned.finest, names), cancelling(tuned))
+    value = f"{100 * worst.value:.3g} ± {100 * worst.noise:.1g} %"
+    row = (name, words(tuned.settings), value, observable, *swept, *doubts)
     return dict(zip(COLUMNS, row, strict=True))
 
 

@@ -37,9 +37,11 @@ class DomainSize(Target):
     runs in one domain.
 
     The state of a cell is z = (a − b)/(a + b), from −1 to 1, of the levels of two species (0 where
-    both are 0). Neighbours are cells with a gap under 0.5 µm. Of the n pairs of neighbours, the
-    share p = Σ (1 − zᵢzⱼ)/2 / n is unlike; with their mean centre distance d, the domains are d/p
-    wide. Loss: 1 − exp(−ln²(d/p / size)); 1 where no pair is unlike or no cell has a neighbour.
+    both are 0). Neighbours are cells with a gap under 0.5 µm. Over the pairs of neighbours, q is
+    the mean (zᵢ² + zⱼ²)/2: 1 where all cells are decided. The share p = mean (zᵢ − zⱼ)²/4 / q of
+    the pairs is unlike; with their mean centre distance d, the domains are d/p wide. Loss: 1 −
+    q·exp(−ln²(d/p / size)); 1 where no pair is unlike or no cell has a neighbour. So a colony of
+    one kind has no domains, however weakly its cells are decided.
 
     Derivation: the borders of the domains have length A per area. A short segment of length d, at a
     random place and angle, crosses them 2dA/π times on average (Buffon). So does each length d of a
@@ -65,17 +67,18 @@ class DomainSize(Target):
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         _, sound = valid_levels(state, self.species)
-        unlike, distance, _ = self._pairs(state)
+        unlike, decided, distance, _ = self._pairs(state)
         # with the clamp the logarithm is finite, and the loss is exactly 1 with zero gradient
         log = torch.log(
             torch.where(distance > 0, distance, 1.0) / (unlike.clamp(min=FEWEST) * self.size)
         )
-        loss = torch.where(distance > 0, -torch.expm1(-log * log), 1.0)
+        # exactly 0 at the target size of decided cells
+        loss = torch.where(distance > 0, 1.0 - decided * torch.exp(-log * log), 1.0)
         return torch.where(sound, loss, self.failed)
 
-    def _pairs(self, state: tf.State) -> tuple[Tensor, Tensor, Tensor]:
-        """The share of unlike neighbours, their mean centre distance (µm, 0 without neighbours) and
-        the number of pairs of each colony, (B,) float64 each."""
+    def _pairs(self, state: tf.State) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The share of unlike neighbours, how decided they are, their mean centre distance (µm, 0
+        without neighbours) and the number of pairs of each colony, (B,) float64 each."""
         a, b = valid_levels(state, self.species)[0].unbind(1)
         z = ratio(a - b, a + b, 0.0)
         i, j, apart = tf.measure.neighbours(state, GAP)
@@ -84,17 +87,20 @@ class DomainSize(Target):
             0, colony, v
         )
         count = add(torch.ones_like(apart))
-        unlike = add(0.5 * (1.0 - z.index_select(0, i) * z.index_select(0, j)))
-        return ratio(unlike, count, 0.0), ratio(add(apart), count, 0.0), count
+        one, other = z.index_select(0, i), z.index_select(0, j)
+        unlike, decided = add(0.25 * (one - other) ** 2), add(0.5 * (one**2 + other**2))
+        share = ratio(unlike, decided, 0.0)
+        return share, ratio(decided, count, 0.0), ratio(add(apart), count, 0.0), count
 
     @torch.no_grad()
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
-        """domain_size_um; unlike_share, of the pairs of neighbours; pairs, their number; (B,)
-        each."""
-        unlike, distance, count = self._pairs(state)
+        """domain_size_um; unlike_share, of the pairs of neighbours; decided, from 0 to 1; pairs,
+        their number; (B,) each."""
+        unlike, decided, distance, count = self._pairs(state)
         return {
             "domain_size_um": ratio(distance, unlike, math.nan),
             "unlike_share": torch.where(count > 0, unlike, math.nan),
+            "decided": torch.where(count > 0, decided, math.nan),
             "pairs": count,
         }
 

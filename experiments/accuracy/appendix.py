@@ -3,8 +3,9 @@
 The records are in experiments/benchmarks/accuracy: one CSV file for each study and records.json.
 records.json has the title, the plotted errors, the machine and further figures of each study.
 The prose is in appendix_template.md. Lines of two kinds are replaced there: `[study NAME]` by the
-picture and the table of a study, `[tune]` by the table of experiments/tune_check.py. Figures in
-braces, such as {mechanics_order.cells}, come from records.json.
+picture and the table of a study, `[tune]` and `[presets]` by the tables of
+experiments/tune_check.py and preset_check.py. Figures in braces, such as {mechanics_order.cells},
+come from records.json.
 """
 
 from __future__ import annotations
@@ -67,8 +68,9 @@ def write(pictures: bool = False) -> Path:
             if pictures:
                 plot(study, picture(study.name))
             blocks += _study(study, records[study.name]["measured"])
-        elif block.strip() == "[tune]":
-            blocks += _tune(records["tune"])
+        elif block.strip() in ("[tune]", "[presets]"):
+            name = block.strip()[1:-1]
+            blocks += _plain(name, records[name])
         else:
             blocks.append(_wrapped(block))
     PAGE.write_text("\n\n".join(blocks) + "\n")
@@ -108,13 +110,15 @@ def _outside_band(p: Point) -> str:
     return f"- {p.setting}: {'; '.join(names) or 'none'}"
 
 
-def _tune(record: dict[str, Any]) -> list[str]:
-    with (RECORDS / "tune.csv").open(newline="") as file:
+def _plain(name: str, record: dict[str, Any]) -> list[str]:
+    """Returns the table of a CSV file, and when it was measured."""
+    with (RECORDS / f"{name}.csv").open(newline="") as file:
         rows = list(csv.reader(file))
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     lines.insert(1, "|---" * len(rows[0]) + "|")
-    heading = f"Requested error: {record['facts']['error']}. {_measured(record['measured'])}"
-    return [_wrapped(heading), "\n".join(lines)]
+    error = record.get("facts", {}).get("error")
+    requested = "" if error is None else f"Requested error: {error}. "
+    return [_wrapped(requested + _measured(record["measured"])), "\n".join(lines)]
 
 
 def _wrapped(block: str) -> str:

@@ -84,13 +84,36 @@ def test_one_domain_has_loss_1_and_a_gradient(a, b):
     assert math.isnan(DOMAINS.measures(state)["domain_size_um"])
 
 
-def test_cells_with_neither_species_are_half_like_any():
-    """z = 0: a pair of them is unlike by half, and the gradient is finite."""
+def test_cells_with_neither_species_are_in_no_domain():
+    """z = 0: loss 1, and the gradient is finite."""
     state = placed([(0, 0), (1, 0)], a=0.0, b=0.0)
     given = state.a.clone().requires_grad_()
     loss = DomainSize(("a", "b"), 2.0).loss(state.with_fields(a=given))
-    assert float(loss.detach()) == pytest.approx(0, abs=1e-15)  # 1 µm / ½
+    assert float(loss.detach()) == 1.0
     assert bool(torch.isfinite(torch.autograd.grad(loss.sum(), given)[0]).all())
+
+
+@pytest.mark.parametrize("less", [0.0, 0.1, 0.3])
+def test_weakly_decided_cells_of_one_kind_are_no_domains(less):
+    """Found by a search: cells all of one kind at |z| = 0.8 counted as domains of five distances,
+    since each pair was unlike by (1 − z²)/2."""
+    state = lattice(np.ones((9, 9)))
+    given = state.with_fields(b=less * state.a)
+    for size in (1.2, 6.0, 12.0):
+        assert float(DomainSize(("a", "b"), size).loss(given)) == 1.0
+
+
+@pytest.mark.parametrize("less", [0.1, 0.3])
+def test_weakly_decided_stripes_are_as_wide_as_decided_ones(less):
+    """Their loss at the right size is what they lack of being decided: 1 − z²."""
+    state = lattice(np.broadcast_to(np.arange(20) // 4 % 2, (20, 20)))
+    weak = state.with_fields(a=state.a + less * state.b, b=state.b + less * state.a)
+    size = float(DOMAINS.measures(state)["domain_size_um"])
+    found, z = DOMAINS.measures(weak), (1 - less) / (1 + less)
+    assert float(found["domain_size_um"]) == pytest.approx(size, rel=1e-6)
+    assert float(found["decided"]) == pytest.approx(z * z, rel=1e-6)
+    loss = float(DomainSize(("a", "b"), size).loss(weak))
+    assert loss == pytest.approx(1 - z * z, rel=1e-6)
 
 
 def test_without_neighbours_there_is_no_domain():
