@@ -6,9 +6,9 @@ import hashlib
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.emission import Equations, functions
+from torchfilm.circuits.emission import Equations, Functions, as_tuple, functions
 from torchfilm.circuits.expressions import NAME, NUMBER, Builder, Expression, walk
 from torchfilm.circuits.graph import Leaves, evaluated, traced_rates
 from torchfilm.circuits.names import Names
@@ -37,52 +37,100 @@ _compiled: set[str] = set()  # modules that this process has run
 
 
 @dataclass(frozen=True, eq=False)
-class CompiledCircuit:
-    """The equations of a circuit in cells of one type, and the functions compiled from them."""
+class Compiled:
+    """Equations of a circuit in cells of one type, and the functions compiled from them."""
 
     equations: Equations
     literals: Mapping[str, float]  # numbers in the rates, by the names that stand for them
-    slopes: Mapping[tuple[int, int], Expression]
     columns: tuple[str, ...]  # names that have a number for each cell
     numbers: tuple[str, ...]  # names that have one number
 
+    @property
+    def text(self) -> str:
+        """Of the module."""
+        raise NotImplementedError
+
     @cached_property
     def module(self) -> ModuleType:
-        return _module(source(self))
+        return _module(self.text)
 
-    def _compile(self, work: Callable[[int, int], object]) -> None:
-        """By one thread, without cells; and say so where it takes time."""
-        from torchfilm.kernels.compiling import announce, keep
+    def leaves(self) -> str:
+        """The text of what `prepared` is given for the cell n."""
+        place = {n: f"columns[{k}, n]" for k, n in enumerate(self.columns)}
+        place |= {n: f"numbers[{k}]" for k, n in enumerate(self.numbers)}
+        return as_tuple([place[n] for n in self.equations.leaves])
 
-        names = ", ".join(n.partition(".")[2] for n in self.equations.variables)
-        said = announce(self.module.__name__, f"a circuit ({names}), some seconds")
-        work(0, 0)
-        _compiled.add(self.module.__name__)
-        if said:
-            keep(self.module.__name__)
+    def head(self, constants: Mapping[str, object]) -> str:
+        """The text with which the module begins. constants: by value: the text then says all that
+        it depends on, and finds its compiled form."""
+        names = ", ".join(self.equations.variables)
+        listed = "\n".join(f"{n} = {x!r}" for n, x in constants.items())
+        return HEAD.format(what=f"A circuit of {names}", constants=listed)
 
-    def values(self, circuit: CircuitCells, rows: Tensor) -> dict[str, Tensor]:
+    def run(self, count: int, least: int, work: Callable[[int, int], object]) -> None:
+        """work(first, last) for all cells, in threads where each has `least` or more. It is
+        compiled by one thread, without cells; and that is said where it takes time."""
+        if self.module.__name__ not in _compiled:
+            from torchfilm.kernels.compiling import announce, keep
+
+            names = ", ".join(n.partition(".")[2] for n in self.equations.variables)
+            said = announce(self.module.__name__, f"a circuit ({names}), some seconds")
+            work(0, 0)
+            _compiled.add(self.module.__name__)
+            if said:
+                keep(self.module.__name__)
+        shares_of(count, least, work)
+
+    def values(
+        self, circuit: CircuitCells, rows: Tensor, own: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         """The columns (M,) and numbers () of the names that are no variables, of the cells `rows`
-        (M,) among all."""
+        (M,) among all. own: those that no rate function reads."""
         _, s, p, cell = circuit.names(torch.empty(0, len(circuit.species)), rows)
-        own = {"pool": circuit.pool, "away": circuit.in_reservoir}
-        homes = {"s": s, "p": p, "cell": cell}
+        homes = {"s": s, "p": p, "cell": cell, "own": own}
 
         def value(name: str) -> Tensor:
             if name in self.literals:
                 return torch.tensor(self.literals[name], dtype=torch.float64)
             kind, _, inner = name.partition(".")
-            if kind == "own":
-                found = own[inner]
-                assert found is not None
-                return found.index_select(0, rows)
             return torch.as_tensor(homes[kind][inner])
 
         return {name: value(name) for name in self.equations.leaves}
 
+    def packed(self, values: Mapping[str, Tensor], count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Columns (K, M) and numbers (L,) as compiled functions take them, float64."""
+        wide = lambda names: [values[n].detach().to(torch.float64) for n in names]
+        columns, numbers = wide(self.columns), wide(self.numbers)
+        return (
+            torch.stack(columns).numpy() if columns else np.zeros((1, count)),
+            torch.stack(numbers).numpy() if numbers else np.zeros(1),
+        )
+
+
+def wants_gradient(given: Iterable[Tensor]) -> bool:
+    return torch.is_grad_enabled() and any(x.requires_grad for x in given)
+
+
+def pools(circuit: CircuitCells, rows: Tensor) -> dict[str, Tensor]:
+    """What the equations of an exchange read: the pool, and whether it is a reservoir, (M,)."""
+    found = {"pool": circuit.pool, "away": circuit.in_reservoir}
+    return {n: x.index_select(0, rows) for n, x in found.items() if x is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledCircuit(Compiled):
+    """The stiff method."""
+
+    slopes: Mapping[tuple[int, int], Expression]
+
+    @property
+    def text(self) -> str:
+        size = len(self.equations.variables)
+        return self.head(CONSTANTS) + functions(self.equations) + method(size, self.leaves())
+
     def slopes_by_torch(self, circuit: CircuitCells, u: Tensor, rows: Tensor) -> Tensor:
         """∂fᵢ/∂uₖ (V, V, M) at u (V, M) of the cells `rows` (M,) among all."""
-        values = self.values(circuit, rows)
+        values = self.values(circuit, rows, pools(circuit, rows))
         values |= dict(zip(self.equations.variables, u, strict=True))
         found = evaluated(list(self.slopes.values()), lambda leaf: values[leaf.name])
         zero = torch.zeros_like(u[0])
@@ -98,88 +146,126 @@ class CompiledCircuit:
         over no time."""
         if dt == 0:
             return None
-        values = self.values(circuit, circuit.rows)
-        every = (start, *values.values())
-        if torch.is_grad_enabled() and any(x.requires_grad for x in every):
+        values = self.values(circuit, circuit.rows, pools(circuit, circuit.rows))
+        if wants_gradient([start, *values.values()]):
             return None
-        wide = lambda names: [values[n].detach().to(torch.float64) for n in names]
-        count = start.shape[0]
-        columns, numbers = wide(self.columns), wide(self.numbers)
-        packed = torch.stack(columns).numpy() if columns else np.zeros((1, count))
-        given = torch.stack(numbers).numpy() if numbers else np.zeros(1)
         # a copy, also of float64: the state must not change
         at = torch.empty(start.shape, dtype=torch.float64).copy_(start)
-        report = torch.zeros(3, count, dtype=torch.int64)
-        limits = torch.finfo(start.dtype)
-        run, arrays = self.module.run, (at.numpy(), packed, given)
+        report = torch.zeros(3, start.shape[0], dtype=torch.int64)
+        limits, counts = torch.finfo(start.dtype), report.numpy()
+        arrays = (at.numpy(), *self.packed(values, start.shape[0]))
         rest = (dt, max(rtol, 4 * limits.eps), atol, limits.eps, limits.max, MAX_STEPS)
-        counts = report.numpy()
+        run = self.module.run
         work = lambda first, last: run(first, last, *arrays, *rest, *counts)
-        if self.module.__name__ not in _compiled:
-            self._compile(work)
-        shares_of(count, WORTH_A_THREAD, work)
+        self.run(start.shape[0], WORTH_A_THREAD, work)
         return at.to(start.dtype), RosenbrockReport(*report)
+
+
+class Trace:
+    """A circuit in some cells, of which one is enough, called with columns that have no numbers."""
+
+    def __init__(self, circuit: CircuitCells, variables: Sequence[str], dtype: torch.dtype):
+        self.circuit, self.builder = circuit, Builder()
+        self.variables = list(variables)
+        self.kinds: dict[str, Kind | None] = {n: (dtype, 1) for n in variables}
+        u, s, p, cell = circuit.names(torch.zeros(1, len(circuit.species)), circuit.rows[:1])
+        homes = {"u": u, "s": s, "p": p, "cell": cell}
+        #: u, s, p, cell
+        self.names = tuple(
+            Leaves(k, h._label, self.builder, partial(self._kind, k, h), list(h))
+            for k, h in homes.items()
+        )
+
+    def _kind(self, prefix: str, home: Names, name: str) -> Kind | None:
+        if f"{prefix}.{name}" not in self.kinds:
+            if name not in home:
+                return None
+            value = torch.as_tensor(home[name])
+            if value.requires_grad:
+                raise Untraceable(f"{prefix}.{name} requires a gradient")
+            if value.dim() > 1:
+                raise Untraceable(f"{prefix}.{name} has several numbers for each cell")
+            self.kinds[f"{prefix}.{name}"] = (value.dtype, value.dim())
+        return self.kinds[f"{prefix}.{name}"]
+
+    def column(self, name: str, kind: Kind | None = None) -> Column:
+        """The column of a name, of this kind if it is a new one."""
+        if kind is not None:
+            self.kinds[name] = kind
+        found = self.kinds[name]
+        assert found is not None
+        return Column.of(self.builder.name(name), self.builder, *found)
+
+    def called(self, function: Callable[[], Any]) -> Any:
+        """What a function that calls the user's returns. Raises Untraceable."""
+        try:
+            return function()
+        except (Untraceable, checks.InputError):
+            raise
+        except Exception as error:  # of a user's function, which has worked with numbers
+            raise Untraceable(
+                f"called with columns that have no numbers, it raised {error!r}"
+            ) from error
+
+    def spread(self, value: Any) -> Column:
+        """A rate as a column, also one that is a number."""
+        if type(value) is Column:
+            return value
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            raise Untraceable("it returns a tensor that is made of no column")
+        made = self.builder.make("full64", self.builder.number(value))
+        return Column.of(made, self.builder, torch.float64)
+
+    def simple(self, rates: Sequence[Column], dtype: torch.dtype) -> list[Column]:
+        """The rates as simple operations, of this type."""
+        kinds = {n: k for n, k in self.kinds.items() if k}
+        columns = {self.builder.name(n): self.column(n) for n in kinds}
+        simple = lowered([r.expression for r in rates], columns, self.builder)
+        cast = "cast64" if dtype == torch.float64 else "cast32"
+        return [x if x.dtype == dtype else apply(cast, x) for x in simple]
+
+    def equations(
+        self, rates: Sequence[Column]
+    ) -> tuple[Equations, dict[str, float], tuple[str, ...], tuple[str, ...]]:
+        """As `Compiled` has them. Raises Untraceable where an operation has no compiled form."""
+        literals, made = _without_literals([x.expression for x in rates], self.builder)
+        kinds = self.kinds | dict.fromkeys(literals)
+        read = {e.name for e in walk(made) if e.op == NAME} | set(self.variables)
+        equations = Equations(
+            made, tuple(self.variables), {n: k for n, k in kinds.items() if n in read}, self.builder
+        )
+        Functions(equations).values()  # raises
+        each = tuple(n for n in equations.leaves if (kinds[n] or (None, 0))[1] == 1)
+        return equations, literals, each, tuple(n for n in equations.leaves if n not in each)
+
+
+def rates_of(
+    circuit: CircuitCells, dtype: torch.dtype
+) -> tuple[Equations, dict[str, float], tuple[str, ...], tuple[str, ...]]:
+    """du/dt of all variables, as `CircuitCells.rates` has them, in a type. Raises Untraceable."""
+    variables = [f"u.{n}" for n in circuit.species] + [f"s.{n}" for n in circuit.given]
+    trace = Trace(circuit, variables, dtype)
+    inside, outside = trace.called(
+        lambda: traced_rates(circuit.part, trace.names, circuit.species)  # type: ignore
+    )
+    rates = [trace.spread(inside.get(n, 0.0)) for n in circuit.species]
+    flux = [trace.spread(outside.get(n, 0.0)) for n in circuit.given]
+    simple = trace.simple([*rates, *flux], dtype)
+    final, given = simple[: len(rates)], simple[len(rates) :]
+    if given:
+        final += _exchange(given, circuit, trace)
+        if circuit.in_reservoir is not None:
+            more = [f"own.{way}_{n}" for way in ("to", "from") for n in circuit.given]
+            trace.variables += more
+            trace.kinds |= {n: (dtype, 1) for n in more}
+    return trace.equations(final)
 
 
 def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
     """The circuit in these cells, of which one is enough. Raises Untraceable."""
-    builder, one = Builder(), circuit.rows[:1]
-    u, s, p, cell = circuit.names(torch.zeros(1, len(circuit.species)), one)
-    variables = [f"u.{n}" for n in circuit.species] + [f"s.{n}" for n in circuit.given]
-    kinds: dict[str, Kind | None] = {n: (torch.float64, 1) for n in variables}
-
-    def kind_in(prefix: str, home: Names):
-        def kind(name: str) -> Kind | None:
-            if f"{prefix}.{name}" not in kinds:
-                if name not in home:
-                    return None
-                value = torch.as_tensor(home[name])
-                if value.requires_grad:
-                    raise Untraceable(f"{prefix}.{name} requires a gradient")
-                if value.dim() > 1:
-                    raise Untraceable(f"{prefix}.{name} has several numbers for each cell")
-                kinds[f"{prefix}.{name}"] = (value.dtype, value.dim())
-            return kinds[f"{prefix}.{name}"]
-
-        return kind
-
-    homes = {"u": u, "s": s, "p": p, "cell": cell}
-    leaves = [Leaves(k, h._label, builder, kind_in(k, h), list(h)) for k, h in homes.items()]
-    try:
-        inside, outside = traced_rates(circuit.part, tuple(leaves), circuit.species)  # type: ignore
-    except (Untraceable, checks.InputError):
-        raise
-    except Exception as error:  # of a user's function, which has worked with numbers
-        raise Untraceable(
-            f"called with columns that have no numbers, it raised {error!r}"
-        ) from error
-    zero = _spread(0.0, builder)
-    as_column = lambda x: x if type(x) is Column else _spread(x, builder)
-    rates = [as_column(inside.get(n, zero)) for n in circuit.species]
-    flux = [as_column(outside.get(n, zero)) for n in circuit.given]
-    roots = [*rates, *flux]
-    columns = {
-        builder.name(n): Column.of(builder.name(n), builder, *k) for n, k in kinds.items() if k
-    }
-    simple = lowered([r.expression for r in roots], columns, builder)
-    # a rate is of the variables' type
-    wide = [x if x.dtype == torch.float64 else apply("cast64", x) for x in simple]
-    final, given = wide[: len(rates)], wide[len(rates) :]
-    if given:
-        final += _exchange(given, circuit, builder, kinds)
-        if circuit.in_reservoir is not None:
-            variables += [f"own.{way}_{n}" for way in ("to", "from") for n in circuit.given]
-            kinds |= {n: (torch.float64, 1) for n in variables}
-    literals, made = _without_literals([x.expression for x in final], builder)
-    kinds |= dict.fromkeys(literals)
-    read = {e.name for e in walk(made) if e.op == NAME} | set(variables)
-    equations = Equations(
-        made, tuple(variables), {n: k for n, k in kinds.items() if n in read}, builder
-    )
-    functions(equations)  # raises where an operation has no compiled form
-    each = [n for n in equations.leaves if (kinds[n] or (None, 0))[1] == 1]
-    once = [n for n in equations.leaves if n not in each]
-    return CompiledCircuit(equations, literals, equations.slopes(), tuple(each), tuple(once))
+    found = rates_of(circuit, torch.float64)
+    functions(found[0])  # raises where a derivative has no compiled form
+    return CompiledCircuit(*found, slopes=found[0].slopes())
 
 
 # Numbers that belong to the form of an equation.
@@ -210,43 +296,18 @@ def _without_literals(
     return names, tuple(made[r] for r in roots)
 
 
-def _spread(value: Any, builder: Builder) -> Column:
-    """A rate that is a number, as a column."""
-    if not isinstance(value, (int, float)) or isinstance(value, bool):
-        raise Untraceable("it returns a tensor that is made of no column")
-    made = builder.make("full64", builder.number(value))
-    return Column.of(made, builder, torch.float64)
-
-
-def _exchange(
-    flux: Sequence[Column], circuit: CircuitCells, builder: Builder, kinds: dict[str, Kind | None]
-) -> list[Column]:
+def _exchange(flux: Sequence[Column], circuit: CircuitCells, trace: Trace) -> list[Column]:
     """Rates of the pools' concentrations, and of what a reservoir is given and gives, as
     `CircuitCells.rates` has them."""
     assert circuit.pool is not None
-    kinds["own.pool"] = kind = (circuit.pool.dtype, 1)
-    pool = Column.of(builder.name("own.pool"), builder, *kind)
+    pool = trace.column("own.pool", (circuit.pool.dtype, 1))
     into = [apply("div", x, pool) for x in flux]
     if circuit.in_reservoir is None:
         return into
-    kinds["own.away"] = kind = (torch.bool, 1)
-    away = Column.of(builder.name("own.away"), builder, *kind)
+    away = trace.column("own.away", (torch.bool, 1))
     up = [apply("where", away, apply("maximum", x, 0.0), 0.0) for x in flux]
     down = [apply("where", away, apply("maximum", apply("neg", x), 0.0), 0.0) for x in flux]
     return [*(apply("where", away, 0.0, x) for x in into), *up, *down]
-
-
-def source(circuit: CompiledCircuit) -> str:
-    """The text of the module."""
-    place = {n: f"columns[{k}, n]" for k, n in enumerate(circuit.columns)}
-    place |= {n: f"numbers[{k}]" for k, n in enumerate(circuit.numbers)}
-    leaves = [place[n] for n in circuit.equations.leaves] or ["0.0"]
-    names = ", ".join(circuit.equations.variables)
-    # constants by value: the text then says all that it depends on, and finds its compiled form
-    constants = "\n".join(f"{n} = {x!r}" for n, x in CONSTANTS.items())
-    head = HEAD.format(what=f"A circuit of {names}", constants=constants)
-    size = len(circuit.equations.variables)
-    return head + functions(circuit.equations) + method(size, f"({', '.join(leaves)},)")
 
 
 @cache
