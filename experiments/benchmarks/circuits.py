@@ -26,7 +26,7 @@ from torchfilm.circuits import run
 DT = 0.05
 BACKENDS = ("compiled", "torch")
 # by method: settings of the circuit
-CASES = {"tau_leap": {}, "direct": {}, "rosenbrock": {}}
+CASES = {"tau_leap": {}, "direct": {}, "rosenbrock": {}, "rk4": {"steps": 4}}
 
 
 def scene_of(method: str, backend: str) -> tf.Scene:

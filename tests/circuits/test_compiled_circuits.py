@@ -8,6 +8,7 @@ text. Those that are compiled for real are the ready scenes' and the ones named 
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import pytest
 import torch
@@ -285,14 +286,15 @@ def test_equations_and_autograd_agree():
             assert array(slopes) == pytest.approx(array(grad), rel=1e-13)
 
 
+@pytest.mark.parametrize("method", ["rosenbrock", "rk4"])
 @pytest.mark.parametrize("wanted", ["constant", "first value"])
-def test_gradients_need_torch_and_get_it(wanted, plain):
+def test_gradients_need_torch_and_get_it(wanted, method, plain):
     def loss(backend, more=0.0):
         value = torch.tensor(2.0 + more, dtype=F64, requires_grad=True)
-        constants = {"k": value} if wanted == "constant" else {}
-        first = value if wanted == "first value" else 1.0
-        circuit = tf.Circuit(switch, species=("red", "green"), initial={"red": first, "green": 0.5},
-                             backend=backend, **{"k": 4.0, "loss": 1.0, **constants})  # fmt: skip
+        k = value if wanted == "constant" else 4.0
+        first = {"red": value if wanted == "first value" else 1.0, "green": 0.5}
+        circuit = tf.Circuit(switch, species=("red", "green"), initial=first, method=method,
+                             backend=backend, k=k, loss=1.0)  # fmt: skip
         model = alone(circuit).bind(seed=1, dtype=F64)
         end = model.step(model.start(), 0.1)
         (grad,) = torch.autograd.grad(end.red.sum(), value)
@@ -318,10 +320,12 @@ def test_it_is_explained_who_computes():
     assert (
         "computed by torch: branching: it uses a sum or the like over all cells (cumsum)" in words
     )
+    with pytest.raises(tf.InputError, match="backend = 'compiled', but branching: it uses a sum"):
+        said(tf.Circuit(branching, species="a", backend="compiled"))
     learnt = said(toggle(k=torch.tensor(2.0, requires_grad=True)))
     assert "computed by torch: switch: p.k requires a gradient" in learnt
-    with pytest.raises(tf.InputError, match="backend = 'compiled', but method='rk4'"):
-        said(toggle(method="rk4", backend="compiled"))
+    assert "computed by compiled functions" in said(toggle(method="rk4"))
+    assert "computed by torch: backend='torch'" in said(toggle(method="rk4", backend="torch"))
 
 
 def test_what_cannot_be_traced_runs_by_torch():
@@ -374,3 +378,47 @@ def test_circuits_at_random(plain, made, dtype):
         assert not a.reports["circuit"].status.any()
         found.append(a)
     close(*found, rel=1e-5, least=1e-8)
+
+
+# --- methods with equal steps ---------------------------------------------------------------------
+
+EQUAL_STEPS = ["euler", "midpoint", "heun2", "heun3", "rk4"]
+
+
+@pytest.mark.parametrize("method", EQUAL_STEPS)
+@pytest.mark.parametrize("steps", [1, 7])
+def test_equal_steps_give_the_same_bits(method, steps, dtype, plain):
+    """Numbers of the state's own type: a seventh of the step is no number of either."""
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=10.0, reservoir=0.5), box=((-8.0, -8.0), (24.0, 8.0)),
+        spacing=4.0, outside="reservoir",
+    )  # fmt: skip
+    first = tf.Circuit(exchanging, species="ahl", D=0.3, k=2.0, method=method, steps=steps)
+    second = toggle(k=tf.LogNormal(4.0, 0.3), name="toggle", method=method, steps=steps)
+    a, b = ends(alone(first, second, medium, types=2), dtype=dtype)
+    equal(a, b)
+    assert float(a.ahl[-1]) != float(a.ahl[0]) > 0 and len(a.toggle_red.unique()) > 6
+
+
+@pytest.mark.parametrize("method", EQUAL_STEPS)
+@pytest.mark.parametrize(
+    "rates, k, said",
+    [
+        (nan_above, [0.0, 9.0, 9.0], "is not a finite number"),
+        (draining, [2.0, 0.0, 0.5], "below zero, 'a' first, from .* Take more steps"),
+        (exploding, [0.1, 1e300, 1e300], "is not a finite number"),
+    ],
+)
+def test_failures_of_equal_steps_are_the_same(method, rates, k, said, plain):
+    circuit = tf.Circuit(rates, species="a", initial={"a": 0.5}, k=torch.tensor(k, dtype=F64),
+                         method=method, steps=3)  # fmt: skip
+    a, b = ends(alone(circuit, count=3), 1, dt=1.0, colonies=3)
+    one, other = (state.reports["circuit"] for state in (a, b))
+    assert one.status.tolist() == [0, 1, 1] == other.status.tolist()
+    assert one.words == other.words
+    assert all(re.search(said, words) for words in one.words.values()), one.words
+
+
+def test_equal_steps_compiled_for_real(dtype):
+    a, b = ends(alone(toggle(method="rk4", steps=3)), dtype=dtype)
+    equal(a, b)

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchfilm.circuits import integrators, rosenbrock, stochastic
 from torchfilm.circuits.columns import Columns, column
 from torchfilm.circuits.compiled import Compiled, CompiledCircuit
+from torchfilm.circuits.compiled_explicit import CompiledExplicit
 from torchfilm.circuits.compiled_molecules import CompiledMolecules
 from torchfilm.circuits.draws import Draw, KeyedDraws
 from torchfilm.circuits.graph import both_of, check_returned
@@ -226,9 +227,12 @@ def step(
         end, report = found
         code, steps = report.status, report.accepted + report.rejected
     else:
-        if settings.method == "euler":
+        end = None
+        if isinstance(circuit.compiled, CompiledExplicit):
+            end = circuit.compiled.integrate(circuit, start, dt, settings.steps)
+        if end is None and settings.method == "euler":
             end = integrators.euler(circuit.rates, start, dt, settings.steps)
-        else:
+        elif end is None:
             end = integrators.runge_kutta(circuit.rates, start, dt, settings.steps, settings.method)
         # an exact solution stays above zero: the step is too long for an explicit method
         scale = start.abs() + end.abs()

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchfilm.circuits import run
 from torchfilm.circuits.columns import Lazy
 from torchfilm.circuits.compiled import Compiled, compiled_circuit
+from torchfilm.circuits.compiled_explicit import compiled_explicit
 from torchfilm.circuits.compiled_molecules import compiled_molecules
 from torchfilm.circuits.draws import KeyedDraws
 from torchfilm.circuits.names import unknown
@@ -183,7 +184,10 @@ class BoundCircuit(BoundEffect):
             try:
                 self.compiled[key] = self._equations(state, cells)
             except Untraceable as why:
-                self.compiled[key] = f"{cells.label}: {why}"
+                self.compiled[key] = said = f"{cells.label}: {why}"
+                if self.effect.backend == "compiled":
+                    wanted = f"Circuit.backend = 'compiled', but {said}: leave backend out."
+                    raise checks.InputError(wanted) from why
         found = self.compiled[key]
         if isinstance(found, str):
             return cells
@@ -194,7 +198,9 @@ class BoundCircuit(BoundEffect):
         if self.effect.is_stochastic:
             per_unit = cells.per_unit(self.values.molecules_per_unit.of_cells(state))
             return compiled_molecules(cells, per_unit)
-        return compiled_circuit(cells)
+        if self.effect.method == "rosenbrock":
+            return compiled_circuit(cells)
+        return compiled_explicit(cells, self.effect.method, state.dtype)
 
     def _check_constants(self, read: set[str]) -> None:
         """Raise InputError for a constant that looks like another name, and warn of one that no
@@ -297,13 +303,8 @@ class BoundCircuit(BoundEffect):
                 continue
             cells = self._cells(middle, rows, kind, self.exchanged[kind], found, medium)
             concentrations = self._concentrations(state, rows)
-            made = run.step(
-                cells,
-                concentrations,
-                dt,
-                settings,
-                None if keys is None else keys.of(rows, circuit.name),
-            )
+            draw = None if keys is None else keys.of(rows, circuit.name)
+            made = run.step(cells, concentrations, dt, settings, draw)
             report.note(cells, made, concentrations, circuit.method, dt)
             for name, value in zip(self.fields, made.concentrations.unbind(1), strict=True):
                 changed[name] = (
