@@ -277,7 +277,10 @@ WITHOUT = {
     ),
     "no noise": (
         lambda: [circuit()],
-        [f"torchfilm.circuits.{m}" for m in ("stochastic", "draws", "partition", "network")],
+        [
+            f"torchfilm.circuits.{m}"
+            for m in ("compiled_molecules", "stochastic", "draws", "partition", "network")
+        ],
     ),
     "no circuits": (lambda: [medium()], ("torchfilm.circuits",)),
     "nobody who exchanges": (
@@ -302,7 +305,7 @@ def test_what_a_scene_does_not_list_is_never_called(case, monkeypatch):
     ("listed", "room"),
     [
         ("circuit", "circuits.compiled"),
-        ("molecules", "circuits.stochastic"),
+        ("molecules", "circuits.compiled_molecules"),
         ("medium", "signals.transport"),
     ],
 )

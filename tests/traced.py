@@ -1,5 +1,5 @@
-"""Shared by the tests of traced circuits: compiled functions run as plain Python, and scenes of one
-circuit without growth."""
+"""Shared by the tests of traced circuits: compiled functions run as plain Python, scenes of cells
+with circuits by both backends, and circuits at random."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from functools import cache
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
+from helpers import array
+from hypothesis import strategies as st
 
 import torchfilm as tf
-from torchfilm.circuits import compiled, emission
+from torchfilm import parts
+from torchfilm.circuits import compiled, emission, run
 from torchfilm.circuits.emission import Equations
 from torchfilm.circuits.expressions import Builder
 from torchfilm.circuits.graph import evaluated
@@ -95,3 +99,122 @@ def emitted(function: Callable, **columns: torch.Tensor) -> np.ndarray:
             constants = module.prepared([at(name) for name in equations.leaves])
             out.append(module.rates((at("x"),), constants)[0])
     return np.array(out)
+
+
+def row_of(count: int, types: int = 1) -> tf.Cells:
+    """Cells apart from each other on a line."""
+    return tf.Cells(
+        [[5.0 * k, 0.0] for k in range(count)], [[1.0, 0.0]] * count,
+        cell_type=[k % types for k in range(count)],
+    )  # fmt: skip
+
+
+def alone(*circuits: tf.Effect, count: int = 12, types: int = 1) -> tf.Scene:
+    """Cells that grow, with circuits."""
+    growth = tf.Growth(rate=tf.Uniform(0.5, 1.0))
+    return tf.Scene(growth, *circuits, founders=row_of(count, types), dt=0.1)
+
+
+def ends(scene: tf.Scene, steps: int = 3, dt: float = 0.1, **bind) -> list[tf.State]:
+    """The state after some steps by both backends."""
+    out = []
+    for backend in ("compiled", "torch"):
+        model = by(backend, scene).bind(**{"seed": 3, "dtype": torch.float64, **bind})
+        found = [e for e in model.effects if "circuit" in e.title]
+        for one in found if backend == "compiled" else ():
+            assert one.compiled and not any(isinstance(x, str) for x in one.compiled.values())
+        state = model.start()
+        for _ in range(steps):
+            state = model.step(state, dt)
+        out.append(state)
+    return out
+
+
+def equal(a: tf.State, b: tf.State) -> None:
+    assert torch.equal(a.uid, b.uid)
+    for name, x in a.fields.items():
+        assert torch.equal(x, b.fields[name]), name
+    for name, x in a.signals.items():
+        assert torch.equal(x, b.signals[name]), name
+
+
+def close(a: tf.State, b: tf.State, rel: float, least: float = 0.0) -> None:
+    """Concentrations of the circuits: relative to each, or at least `least`."""
+    assert torch.equal(a.uid, b.uid)
+    for name, x in a.fields.items():
+        assert array(x) == pytest.approx(array(b.fields[name]), rel=rel, abs=least), name
+
+
+def one_step(scene: tf.Scene, dtype: torch.dtype = torch.float64):
+    """The circuit of a scene and the concentrations at the start of its first step."""
+    seen = []
+    step = run.step
+    try:
+        run.step = lambda *args: seen.append(args) or step(*args)
+        model = scene.bind(seed=1, dtype=dtype)
+        model.step(model.start(), 0.1)
+    finally:
+        run.step = step
+    return seen[0][0], seen[0][1]
+
+
+# --- circuits at random ---------------------------------------------------------------------------
+
+NAMES = tuple("abcdefgh")
+
+
+@st.composite
+def circuits(draw) -> dict:
+    """A circuit of up to eight species as reactions, and the same as a function."""
+    names = NAMES[: draw(st.integers(1, 8))]
+    number = st.floats(0.05, 3.0).map(lambda x: float(f"{x:.3g}"))
+    one = st.sampled_from(names)
+    listed, terms = [], []
+    for k in range(draw(st.integers(1, 2 * len(names)))):
+        kind = draw(st.sampled_from(["made", "lost", "pair", "hill", "turned", "out"]))
+        a, b, rate = draw(one), draw(one), draw(number)
+        if kind == "made":
+            listed.append(tf.Reaction({}, {a: 1}, rate, f"{k}"))
+            terms.append(({a: 1}, lambda u, s, c, r=rate: r))
+        elif kind == "lost":
+            listed.append(tf.Reaction({a: 1}, {}, rate, f"{k}"))
+            terms.append(({a: -1}, lambda u, s, c, r=rate, a=a: r * u[a]))
+        elif kind == "pair" and a != b:
+            listed.append(tf.Reaction({a: 1, b: 1}, {}, rate, f"{k}"))
+            terms.append(({a: -1, b: -1}, lambda u, s, c, r=rate, a=a, b=b: r * u[a] * u[b]))
+        elif kind == "turned" and a != b:
+            listed.append(tf.Reaction({a: 2}, {b: 1}, rate, f"{k}"))
+            terms.append(({a: -2, b: 1}, lambda u, s, c, r=rate, a=a: r * u[a] * u[a]))
+        elif kind == "hill":
+            half, power = draw(number), draw(st.sampled_from([1, 2, 3]))
+            law = draw(st.sampled_from(["activated", "repressed"]))
+            (made,) = getattr(parts, law)(a, b, rate, half, power)
+            listed.append(tf.Reaction({}, {a: 1}, made.rate, f"{k}"))
+            use = tf.kinetics.activation if law == "activated" else tf.kinetics.repression
+            terms.append(
+                ({a: 1}, lambda u, s, c, r=rate, b=b, h=half, n=power, f=use: r * f(u[b], h, n))
+            )
+        elif kind == "out":
+            gone, back = parts.exchange(a, rate, "x0")
+            listed += [tf.Reaction(r.consumes, r.produces, r.rate, f"{k} {n}")
+                       for n, r in enumerate((gone, back))]  # fmt: skip
+            net = lambda u, s, c, r=rate, a=a: r * c.area / c.volume * (u[a] - s.x0)
+            terms.append(({a: -1, "out.x0": 1}, net))
+    if not listed:
+        listed.append(tf.Reaction({}, {names[0]: 1}, 1.0))
+        terms.append(({names[0]: 1}, lambda u, s, c: 1.0))
+
+    def rates(u, s, p, cell):
+        inside, outside = {}, {}
+        for change, rate in terms:
+            value = rate(u, s, cell)
+            for name, n in change.items():
+                into = outside if name.startswith("out.") else inside
+                key = name.removeprefix("out.")
+                size = value * cell.volume if name.startswith("out.") else value
+                into[key] = into.get(key, 0.0) + n * size
+        return inside, outside
+
+    typed = draw(st.booleans())
+    wrap = lambda part: {0: part} if typed else part
+    return {"function": wrap(rates), "reactions": wrap(listed), "species": names}

@@ -8,13 +8,14 @@ text. Those that are compiled for real are the ready scenes' and the ones named 
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import pytest
 import torch
 from helpers import array
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from traced import by, plain_module
+from traced import alone, by, circuits, close, ends, equal, one_step, plain_module
 
 import torchfilm as tf
 from torchfilm import parts
@@ -23,54 +24,6 @@ from torchfilm.circuits.rosenbrock import SAFETY, rodas3
 from torchfilm.tools.deterministic_math import deterministic_functions
 
 F32, F64 = torch.float32, torch.float64
-
-
-@pytest.fixture
-def plain(monkeypatch):
-    """Texts are run as Python."""
-    monkeypatch.setattr(compiled, "_module", plain_module)
-
-
-def row_of(count: int, types: int = 1) -> tf.Cells:
-    """Cells apart from each other on a line."""
-    return tf.Cells(
-        [[5.0 * k, 0.0] for k in range(count)], [[1.0, 0.0]] * count,
-        cell_type=[k % types for k in range(count)],
-    )  # fmt: skip
-
-
-def alone(*circuits: tf.Effect, count: int = 12, types: int = 1) -> tf.Scene:
-    """Cells that grow, with circuits."""
-    growth = tf.Growth(rate=tf.Uniform(0.5, 1.0))
-    return tf.Scene(growth, *circuits, founders=row_of(count, types), dt=0.1)
-
-
-def ends(scene: tf.Scene, steps: int = 3, dt: float = 0.1, **bind) -> list[tf.State]:
-    """The state after some steps by both backends."""
-    out = []
-    for backend in ("compiled", "torch"):
-        model = by(backend, scene).bind(**{"seed": 3, "dtype": F64, **bind})
-        assert all("circuit" not in e.title or e.compiled for e in model.effects)
-        state = model.start()
-        for _ in range(steps):
-            state = model.step(state, dt)
-        out.append(state)
-    return out
-
-
-def equal(a: tf.State, b: tf.State) -> None:
-    assert torch.equal(a.uid, b.uid)
-    for name, x in a.fields.items():
-        assert torch.equal(x, b.fields[name]), name
-    for name, x in a.signals.items():
-        assert torch.equal(x, b.signals[name]), name
-
-
-def close(a: tf.State, b: tf.State, rel: float, least: float = 0.0) -> None:
-    """Concentrations of the circuits: relative to each, or at least `least`."""
-    assert torch.equal(a.uid, b.uid)
-    for name, x in a.fields.items():
-        assert array(x) == pytest.approx(array(b.fields[name]), rel=rel, abs=least), name
 
 
 # --- ready scenes, compiled for real --------------------------------------------------------------
@@ -258,19 +211,6 @@ def test_same_bits_in_any_batch(plain):
         assert torch.equal(runs[count], runs[3][: len(runs[count])]) and len(runs[count])
 
 
-def one_step(scene: tf.Scene, dtype: torch.dtype = F64):
-    """The circuit of a scene and the concentrations at the start of its first step."""
-    seen = []
-    step = run.step
-    try:
-        run.step = lambda *args: seen.append(args) or step(*args)
-        model = scene.bind(seed=1, dtype=dtype)
-        model.step(model.start(), 0.1)
-    finally:
-        run.step = step
-    return seen[0][0], seen[0][1]
-
-
 def test_same_bits_in_any_order(plain):
     cells, concentrations = one_step(alone(toggle(k=tf.LogNormal(4.0, 0.3))))
     order = torch.tensor([7, 2, 9, 0])
@@ -346,14 +286,15 @@ def test_equations_and_autograd_agree():
             assert array(slopes) == pytest.approx(array(grad), rel=1e-13)
 
 
+@pytest.mark.parametrize("method", ["rosenbrock", "rk4"])
 @pytest.mark.parametrize("wanted", ["constant", "first value"])
-def test_gradients_need_torch_and_get_it(wanted, plain):
+def test_gradients_need_torch_and_get_it(wanted, method, plain):
     def loss(backend, more=0.0):
         value = torch.tensor(2.0 + more, dtype=F64, requires_grad=True)
-        constants = {"k": value} if wanted == "constant" else {}
-        first = value if wanted == "first value" else 1.0
-        circuit = tf.Circuit(switch, species=("red", "green"), initial={"red": first, "green": 0.5},
-                             backend=backend, **{"k": 4.0, "loss": 1.0, **constants})  # fmt: skip
+        k = value if wanted == "constant" else 4.0
+        first = {"red": value if wanted == "first value" else 1.0, "green": 0.5}
+        circuit = tf.Circuit(switch, species=("red", "green"), initial=first, method=method,
+                             backend=backend, k=k, loss=1.0)  # fmt: skip
         model = alone(circuit).bind(seed=1, dtype=F64)
         end = model.step(model.start(), 0.1)
         (grad,) = torch.autograd.grad(end.red.sum(), value)
@@ -379,10 +320,12 @@ def test_it_is_explained_who_computes():
     assert (
         "computed by torch: branching: it uses a sum or the like over all cells (cumsum)" in words
     )
+    with pytest.raises(tf.InputError, match="backend = 'compiled', but branching: it uses a sum"):
+        said(tf.Circuit(branching, species="a", backend="compiled"))
     learnt = said(toggle(k=torch.tensor(2.0, requires_grad=True)))
     assert "computed by torch: switch: p.k requires a gradient" in learnt
-    with pytest.raises(tf.InputError, match="backend = 'compiled', but method='rk4'"):
-        said(toggle(method="rk4", backend="compiled"))
+    assert "computed by compiled functions" in said(toggle(method="rk4"))
+    assert "computed by torch: backend='torch'" in said(toggle(method="rk4", backend="torch"))
 
 
 def test_what_cannot_be_traced_runs_by_torch():
@@ -407,7 +350,7 @@ def test_functions_that_fail_on_traced_columns_run_by_torch():
 def test_a_text_says_all_that_it_depends_on(monkeypatch):
     """Constants by value: so compiled functions of other constants are never found."""
     cells, _ = one_step(by("torch", alone(toggle())))
-    text = compiled.source(cells.compiled)
+    text = cells.compiled.text
     assert f"SAFETY = {SAFETY!r}\n" in text and "rosenbrock" not in text
     monkeypatch.setattr("torchfilm.kernels.compiling.FOLDER", None)
     made = compiled._module.__wrapped__(text)
@@ -415,65 +358,6 @@ def test_a_text_says_all_that_it_depends_on(monkeypatch):
 
 
 # --- circuits at random ---------------------------------------------------------------------------
-
-NAMES = tuple("abcdefgh")
-
-
-@st.composite
-def circuits(draw) -> dict:
-    """A circuit of up to eight species as reactions, and the same as a function."""
-    names = NAMES[: draw(st.integers(1, 8))]
-    number = st.floats(0.05, 3.0).map(lambda x: float(f"{x:.3g}"))
-    one = st.sampled_from(names)
-    listed, terms = [], []
-    for k in range(draw(st.integers(1, 2 * len(names)))):
-        kind = draw(st.sampled_from(["made", "lost", "pair", "hill", "turned", "out"]))
-        a, b, rate = draw(one), draw(one), draw(number)
-        if kind == "made":
-            listed.append(tf.Reaction({}, {a: 1}, rate, f"{k}"))
-            terms.append(({a: 1}, lambda u, s, c, r=rate: r))
-        elif kind == "lost":
-            listed.append(tf.Reaction({a: 1}, {}, rate, f"{k}"))
-            terms.append(({a: -1}, lambda u, s, c, r=rate, a=a: r * u[a]))
-        elif kind == "pair" and a != b:
-            listed.append(tf.Reaction({a: 1, b: 1}, {}, rate, f"{k}"))
-            terms.append(({a: -1, b: -1}, lambda u, s, c, r=rate, a=a, b=b: r * u[a] * u[b]))
-        elif kind == "turned" and a != b:
-            listed.append(tf.Reaction({a: 2}, {b: 1}, rate, f"{k}"))
-            terms.append(({a: -2, b: 1}, lambda u, s, c, r=rate, a=a: r * u[a] * u[a]))
-        elif kind == "hill":
-            half, power = draw(number), draw(st.sampled_from([1, 2, 3]))
-            law = draw(st.sampled_from(["activated", "repressed"]))
-            (made,) = getattr(parts, law)(a, b, rate, half, power)
-            listed.append(tf.Reaction({}, {a: 1}, made.rate, f"{k}"))
-            use = tf.kinetics.activation if law == "activated" else tf.kinetics.repression
-            terms.append(
-                ({a: 1}, lambda u, s, c, r=rate, b=b, h=half, n=power, f=use: r * f(u[b], h, n))
-            )
-        elif kind == "out":
-            gone, back = parts.exchange(a, rate, "x0")
-            listed += [tf.Reaction(r.consumes, r.produces, r.rate, f"{k} {n}")
-                       for n, r in enumerate((gone, back))]  # fmt: skip
-            net = lambda u, s, c, r=rate, a=a: r * c.area / c.volume * (u[a] - s.x0)
-            terms.append(({a: -1, "out.x0": 1}, net))
-    if not listed:
-        listed.append(tf.Reaction({}, {names[0]: 1}, 1.0))
-        terms.append(({names[0]: 1}, lambda u, s, c: 1.0))
-
-    def rates(u, s, p, cell):
-        inside, outside = {}, {}
-        for change, rate in terms:
-            value = rate(u, s, cell)
-            for name, n in change.items():
-                into = outside if name.startswith("out.") else inside
-                key = name.removeprefix("out.")
-                size = value * cell.volume if name.startswith("out.") else value
-                into[key] = into.get(key, 0.0) + n * size
-        return inside, outside
-
-    typed = draw(st.booleans())
-    wrap = lambda part: {0: part} if typed else part
-    return {"function": wrap(rates), "reactions": wrap(listed), "species": names}
 
 
 @given(circuits(), st.sampled_from([F32, F64]))
@@ -494,3 +378,47 @@ def test_circuits_at_random(plain, made, dtype):
         assert not a.reports["circuit"].status.any()
         found.append(a)
     close(*found, rel=1e-5, least=1e-8)
+
+
+# --- methods with equal steps ---------------------------------------------------------------------
+
+EQUAL_STEPS = ["euler", "midpoint", "heun2", "heun3", "rk4"]
+
+
+@pytest.mark.parametrize("method", EQUAL_STEPS)
+@pytest.mark.parametrize("steps", [1, 7])
+def test_equal_steps_give_the_same_bits(method, steps, dtype, plain):
+    """Numbers of the state's own type: a seventh of the step is no number of either."""
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=10.0, reservoir=0.5), box=((-8.0, -8.0), (24.0, 8.0)),
+        spacing=4.0, outside="reservoir",
+    )  # fmt: skip
+    first = tf.Circuit(exchanging, species="ahl", D=0.3, k=2.0, method=method, steps=steps)
+    second = toggle(k=tf.LogNormal(4.0, 0.3), name="toggle", method=method, steps=steps)
+    a, b = ends(alone(first, second, medium, types=2), dtype=dtype)
+    equal(a, b)
+    assert float(a.ahl[-1]) != float(a.ahl[0]) > 0 and len(a.toggle_red.unique()) > 6
+
+
+@pytest.mark.parametrize("method", EQUAL_STEPS)
+@pytest.mark.parametrize(
+    "rates, k, said",
+    [
+        (nan_above, [0.0, 9.0, 9.0], "is not a finite number"),
+        (draining, [2.0, 0.0, 0.5], "below zero, 'a' first, from .* Take more steps"),
+        (exploding, [0.1, 1e300, 1e300], "is not a finite number"),
+    ],
+)
+def test_failures_of_equal_steps_are_the_same(method, rates, k, said, plain):
+    circuit = tf.Circuit(rates, species="a", initial={"a": 0.5}, k=torch.tensor(k, dtype=F64),
+                         method=method, steps=3)  # fmt: skip
+    a, b = ends(alone(circuit, count=3), 1, dt=1.0, colonies=3)
+    one, other = (state.reports["circuit"] for state in (a, b))
+    assert one.status.tolist() == [0, 1, 1] == other.status.tolist()
+    assert one.words == other.words
+    assert all(re.search(said, words) for words in one.words.values()), one.words
+
+
+def test_equal_steps_compiled_for_real(dtype):
+    a, b = ends(alone(toggle(method="rk4", steps=3)), dtype=dtype)
+    equal(a, b)

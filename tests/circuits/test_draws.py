@@ -8,7 +8,7 @@ import torch
 from helpers import array
 from scipy import stats
 
-from torchfilm.circuits.draws import keyed_draws, poisson
+from torchfilm.circuits.draws import KeyedDraws, poisson
 
 F64 = torch.float64
 
@@ -24,7 +24,7 @@ def test_uniforms_are_uniform_and_strangers(device):
     The draws never change, so p below 1e-3 would be a defect. Correlations are within 4.5/√n.
     """
     colony, uid = cells(20_000, device)
-    draw = keyed_draws(3, colony, uid, 7)
+    draw = KeyedDraws(3, colony, uid, 7)
     rows = torch.arange(20_000, device=device)
     u = array(draw(rows, 0, "leap", 5))
     assert u.shape == (5, 20_000) and u.min() > 0 and u.max() < 1
@@ -38,7 +38,7 @@ def test_uniforms_are_uniform_and_strangers(device):
         np.roll(u[0], 1000),
     ]
     others += [
-        array(keyed_draws(seed, colony, uid, step)(rows, 0, "leap", 1))[0]
+        array(KeyedDraws(seed, colony, uid, step)(rows, 0, "leap", 1))[0]
         for seed, step in ((4, 7), (3, 8), (3 + 2**40, 7))
     ]
     for other in others:
@@ -48,13 +48,13 @@ def test_uniforms_are_uniform_and_strangers(device):
 def test_a_draw_is_its_own(device):
     """The same for a cell alone or in a batch, and for one number or many."""
     colony, uid = cells(3000, device)
-    draw = keyed_draws(1, colony, uid, 2)
+    draw = KeyedDraws(1, colony, uid, 2)
     whole = draw(torch.arange(3000, device=device), 5, "x", 4)
     rows = torch.tensor([2999, 0, 1500], device=device)
     assert torch.equal(draw(rows, 5, "x", 4), whole[:, rows])
     assert torch.equal(draw(rows, 5, "x", 1), whole[:1, rows])
     assert torch.equal(
-        keyed_draws(1, colony[rows], uid[rows], 2)(
+        KeyedDraws(1, colony[rows], uid[rows], 2)(
             torch.tensor([0, 1, 2], device=device), 5, "x", 3
         ),
         whole[:3, rows],

@@ -10,7 +10,7 @@ import torch
 from helpers import array
 
 import torchfilm as tf
-from torchfilm.circuits.draws import keyed_draws
+from torchfilm.circuits.draws import KeyedDraws
 from torchfilm.circuits.names import Names
 from torchfilm.circuits.network import build_network
 from torchfilm.circuits.parts import (
@@ -259,7 +259,7 @@ def test_both_ways_of_running_agree():
 
     u, _ = rodas3(smooth, torch.tensor([[0.0, 0.0]], dtype=torch.float64), 1.0, rtol=1e-6)
     rows = torch.arange(cells)
-    draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
+    draw = KeyedDraws(1, torch.zeros_like(rows), rows, 0)
     counts, report = direct(
         torch.zeros(cells, 2, dtype=torch.float64),
         lambda n, rows: net.propensities(

@@ -9,7 +9,7 @@ from helpers import array
 from scipy import stats
 from scipy.linalg import expm
 
-from torchfilm.circuits.draws import keyed_draws
+from torchfilm.circuits.draws import KeyedDraws
 from torchfilm.circuits.stochastic import BAD_PROPENSITY, DONE, TOO_MANY_EVENTS, direct, tau_leap
 
 METHODS = {"direct": direct, "tau": tau_leap}
@@ -34,7 +34,7 @@ def run(
     **options,
 ):
     rows = torch.arange(cells, device=device)
-    draw = keyed_draws(seed, torch.zeros_like(rows), rows, 0)
+    draw = KeyedDraws(seed, torch.zeros_like(rows), rows, 0)
     counts = torch.tensor(start, dtype=dtype, device=device).repeat(cells, 1)
     out, report = METHODS[method](
         counts, propensities, torch.tensor(stoichiometry), t, draw, **options
@@ -236,7 +236,7 @@ def test_what_is_less_than_a_molecule_stays(device, method):
     react.
     """
     rows = torch.arange(300, device=device)
-    draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
+    draw = KeyedDraws(1, torch.zeros_like(rows), rows, 0)
     start = torch.tensor([[0.0, 4.75]], device=device).repeat(300, 1)
     out, report = METHODS[method](
         start, lambda n, rows: columns(100 * n[:, 1]), torch.tensor([[1.0, -1.0]]), 10.0, draw
@@ -259,7 +259,7 @@ def test_failures_stay_with_their_cell(device, dtype, method):
         )
 
     rows = torch.arange(6, device=device)
-    draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
+    draw = KeyedDraws(1, torch.zeros_like(rows), rows, 0)
     start = torch.full((6, 1), 10.0, dtype=dtype, device=device)
     out, report = METHODS[method](
         start, propensities, torch.tensor([[1.0], [-1.0]]), 1.0, draw, max_steps=100
@@ -301,7 +301,7 @@ def test_a_row_is_its_own(method, name):
                 BIRTH_DEATH,
                 [[50.0]],
             )
-        draw = keyed_draws(9, torch.zeros_like(k), cell[k], 3)
+        draw = KeyedDraws(9, torch.zeros_like(k), cell[k], 3)
         return METHODS[method](
             torch.tensor(start, dtype=torch.float64).repeat(len(k), 1),
             propensities,
@@ -324,13 +324,13 @@ def test_a_row_is_its_own(method, name):
 @both
 def test_nothing_to_do(device, dtype, method):
     rows = torch.arange(3, device=device)
-    draw = keyed_draws(1, torch.zeros_like(rows), rows, 0)
+    draw = KeyedDraws(1, torch.zeros_like(rows), rows, 0)
     start = torch.tensor([[0.0], [5.0], [7.0]], dtype=dtype, device=device)
     nothing = lambda n, rows: torch.zeros_like(n)
     out, report = METHODS[method](start, nothing, torch.tensor([[-1.0]]), 1.0, draw)
     assert torch.equal(out, start) and (report.status == DONE).all()
     out, _ = METHODS[method](
-        start[:0], nothing, torch.tensor([[-1.0]]), 1.0, keyed_draws(1, rows[:0], rows[:0], 0)
+        start[:0], nothing, torch.tensor([[-1.0]]), 1.0, KeyedDraws(1, rows[:0], rows[:0], 0)
     )
     assert out.shape == (0, 1)
     # the input is unchanged

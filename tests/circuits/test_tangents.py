@@ -9,19 +9,12 @@ from functools import partial
 import pytest
 import torch
 from torch.autograd import forward_ad
-from traced import by, plain_module
+from traced import by
 
 import torchfilm as tf
-from torchfilm.circuits import compiled
 from torchfilm.tools.tangents import both, forward_mode, has_tangent, tangent, tracked
 
 F64 = torch.float64
-
-
-@pytest.fixture
-def plain(monkeypatch):
-    """Texts are run as Python."""
-    monkeypatch.setattr(compiled, "_module", plain_module)
 
 
 def moved(value: float, *directions: float) -> torch.Tensor:

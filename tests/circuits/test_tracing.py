@@ -155,6 +155,13 @@ def test_whole_numbers_are_compared_exactly():
     assert emitted(rate, x=X, k=k).tolist() == [2.0, 0.4, 0.0, 2.0]
 
 
+@pytest.mark.parametrize("law", ["activation", "repression", "michaelis_menten"])
+def test_rate_laws_have_a_compiled_form(law):
+    x = torch.tensor([0.0, 0.2, 3.0], dtype=torch.float64)
+    rate = lambda x: getattr(tf.kinetics, law)(x, 0.5)
+    assert emitted(rate, x=x).tolist() == rate(x).tolist()
+
+
 def test_functions_where_there_is_no_number():
     """Roots and logarithms below zero and at zero, and their like, as torch has them."""
     x = torch.tensor([-2.0, -1.0, -0.0, 0.0, 0.5, math.inf, -math.inf, math.nan], dtype=F64)

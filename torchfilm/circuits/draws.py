@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -18,27 +20,41 @@ MAX_CORRECTIONS = 400
 SMALL, LARGE = 4.0, 1e6
 
 
-def keyed_draws(seed: int, stream: Tensor, uid: Tensor, step: int) -> Draw:
-    """Draws that depend only on (seed, stream, uid, step, event, what, k).
+@dataclass(frozen=True, eq=False)
+class KeyedDraws:
+    """Draws that depend only on (seed, stream, uid, step, name, event, what, k).
 
     stream, uid: (N,) int64. step: of the simulation. `stream` belongs to the colony and does not
-    depend on the batch. Each pair of uniforms takes one block of the generator, with 53 bits each.
+    depend on the batch. name: of the circuit, so that those of one scene differ. Each pair of
+    uniforms takes one block of the generator, with 53 bits each.
     """
 
-    def draw(rows: Tensor, event: int, what: str, count: int) -> Tensor:
-        own, cell = stream.index_select(0, rows), uid.index_select(0, rows)
+    seed: int
+    stream: Tensor
+    uid: Tensor
+    step: int
+    name: str = ""
+
+    def of(self, rows: Tensor, name: str) -> KeyedDraws:
+        """The draws of the cells `rows` (M,), for the circuit of this name."""
+        stream, uid = self.stream.index_select(0, rows), self.uid.index_select(0, rows)
+        return KeyedDraws(self.seed, stream, uid, self.step, name)
+
+    def codes(self, what: str, pairs: int) -> tuple[int, ...]:
+        """What stands for the purpose and the place of each pair of draws, words of 32 bits."""
+        return _codes(f"{self.name} {what}" if self.name else what, pairs)
+
+    def __call__(self, rows: Tensor, event: int, what: str, count: int) -> Tensor:
+        own, cell = self.stream.index_select(0, rows), self.uid.index_select(0, rows)
         pairs = (count + 1) // 2
-        codes = torch.tensor(
-            [purpose_code(f"{what} {k}") for k in range(pairs)], device=rows.device
-        ).unsqueeze(1)
+        codes = torch.tensor(self.codes(what, pairs), device=rows.device).unsqueeze(1)
         # The event number shares a word with the upper half of the uid. They stay apart for uids
         # below 2⁴⁸. Beyond 65,535 events the code takes the rest of the event number.
         codes = (codes ^ (((event + 1) >> 16) * 0x9E3779B9)) & MASK
         upper = ((cell >> 32) ^ ((event + 1) << 16)) & MASK
-        counter = (cell & MASK, upper, own & MASK, torch.full_like(cell, step & MASK))
-        words = philox(
-            counter, (torch.full_like(codes, seed & MASK), (((seed >> 32) & MASK) ^ codes) & MASK)
-        )
+        counter = (cell & MASK, upper, own & MASK, torch.full_like(cell, self.step & MASK))
+        lower, higher = self.seed & MASK, (self.seed >> 32) & MASK
+        words = philox(counter, (torch.full_like(codes, lower), (higher ^ codes) & MASK))
         # 53 bits and half a unit: between 2⁻⁵⁴ and 1 − 2⁻⁵³, never 0 or 1
         both = [
             ((a >> 5) << 26 | (b >> 6))
@@ -50,7 +66,10 @@ def keyed_draws(seed: int, stream: Tensor, uid: Tensor, step: int) -> Draw:
         ]
         return torch.stack(both, 1).reshape(2 * pairs, -1)[:count]
 
-    return draw
+
+@cache
+def _codes(what: str, pairs: int) -> tuple[int, ...]:
+    return tuple(purpose_code(f"{what} {k}") for k in range(pairs))
 
 
 def poisson(mean: Tensor, uniform: Tensor) -> Tensor:

@@ -172,7 +172,7 @@ def _literal(value: float) -> str:
     return repr(value) if value >= 0 and math.copysign(1, value) > 0 else f"({value!r})"
 
 
-def _tuple(parts: Sequence[str]) -> str:
+def as_tuple(parts: Sequence[str]) -> str:
     return f"({', '.join(parts)}{',' * (len(parts) == 1)})" if parts else "(0.0,)"
 
 
@@ -199,31 +199,52 @@ class Pattern:
         return Pattern(size, tuple(slopes), frozenset(filled))
 
 
+class Functions:
+    """The text of the functions of some equations: `prepared`, and of variables u and what was
+    prepared, `rates`. more: further expressions that functions return."""
+
+    def __init__(self, equations: Equations, more: Iterable[Expression] = ()):
+        roots = [*equations.rates, *more]
+        self.equations, self.emitter = equations, Emitter(equations, roots)
+        self.hoisted = self.emitter.constants(roots)
+        own = [f"u{k}" for k in range(len(equations.variables))]
+        self.unpack = [f"{as_tuple(own)} = u"]
+        if self.hoisted:
+            self.unpack.append(f"{self._of(self.hoisted)} = c")
+
+    def _of(self, nodes: Iterable[Expression], dtype: torch.dtype | None = None) -> str:
+        of = self.emitter.of if dtype is None else lambda e: self.emitter._as(e, dtype)
+        return as_tuple([of(e) for e in nodes])
+
+    def values(self, dtype: torch.dtype = torch.float64) -> str:
+        """The text of `prepared` and `rates`; dtype: of the rates."""
+        names = self.equations.leaves
+        leaves = [self.equations.builder.name(n) for n in names]
+        kinds = [self.equations.kinds[n] for n in names]
+        pairs = enumerate(zip(leaves, kinds, strict=True))
+        read = [_leaf(self.emitter, e, k, i) for i, (e, k) in pairs]
+        lines = [*read, *self.emitter.lines(self.hoisted, leaves)]
+        text = _function("prepared", "leaf", lines, self._of(self.hoisted))
+        rates = self.equations.rates
+        return text + _function("rates", "u, c", self.lines(rates), self._of(rates, dtype))
+
+    def lines(self, roots: Iterable[Expression]) -> list[str]:
+        """Assignments of all below the roots, from u and c."""
+        variables = [self.equations.builder.name(n) for n in self.equations.variables]
+        return [*self.unpack, *self.emitter.lines(roots, [*self.hoisted, *variables])]
+
+
 def functions(equations: Equations) -> str:
     """The text of `prepared`, `rates`, `linearised`, `times_slopes`, `factored`, `solved`."""
     slopes = equations.slopes()
     order = sorted(slopes)
-    emitter = Emitter(equations, [*equations.rates, *slopes.values()])
-    roots = [*equations.rates, *(slopes[k] for k in order)]
-    hoisted = emitter.constants(roots)
-    leaves = [equations.builder.name(n) for n in equations.leaves]
-    kinds = [equations.kinds[n] for n in equations.leaves]
-    read = [_leaf(emitter, e, k, i) for i, (e, k) in enumerate(zip(leaves, kinds, strict=True))]
-    own = [f"u{k}" for k in range(len(equations.variables))]
-    unpack = [f"{_tuple(own)} = u"]
-    if hoisted:
-        unpack.append(f"{_tuple([emitter.of(e) for e in hoisted])} = c")
-    known = [*hoisted, *(equations.builder.name(n) for n in equations.variables)]
-    prepare = [*read, *emitter.lines(hoisted, leaves)]
-    text = _function("prepared", "leaf", prepare, _tuple([emitter.of(e) for e in hoisted]))
-    wide = lambda e: emitter._as(e, torch.float64)
-    values = _tuple([wide(e) for e in equations.rates])
-    lines = [*unpack, *emitter.lines(equations.rates, known)]
-    text += _function("rates", "u, c", lines, values)
-    lines = [*unpack, *emitter.lines(roots, known)]
-    safe = _tuple([f"_finite({wide(slopes[k])})" for k in order])
-    text += _function("linearised", "u, c", lines, f"{values}, {safe}")
-    return text + _linear(Pattern.of(len(own), order))
+    made = Functions(equations, [*slopes.values()])
+    wide = lambda e: made.emitter._as(e, torch.float64)
+    lines = made.lines([*equations.rates, *(slopes[k] for k in order)])
+    safe = as_tuple([f"_finite({wide(slopes[k])})" for k in order])
+    values = as_tuple([wide(e) for e in equations.rates])
+    text = made.values() + _function("linearised", "u, c", lines, f"{values}, {safe}")
+    return text + _linear(Pattern.of(len(equations.variables), order))
 
 
 def _leaf(
@@ -249,7 +270,7 @@ def tangent_functions(equations: Equations, moving: Sequence[str]) -> str:
     wider = Equations(equations.rates, names, kinds, b)
     emitter = Emitter(wider, [*rates, *turned])
     read = emitter.number
-    lines = [f"{_tuple([f'u{k}' for k in range(len(names))])} = u"]
+    lines = [f"{as_tuple([f'u{k}' for k in range(len(names))])} = u"]
     for home, leaves in (("leaf", [b.name(n) for n in equations.leaves]),
                          ("t", [named[n] for n in names]),
                          ("turn", [named[n] for n in moving])):  # fmt: skip
@@ -263,7 +284,7 @@ def tangent_functions(equations: Equations, moving: Sequence[str]) -> str:
                               ("linearised_moved", turned, "_finite({})")):  # fmt: skip
         body = [*lines, *emitter.lines(roots, known)]
         values = [form.format(emitter._as(e, torch.float64)) for e in roots]
-        text += _function(name, given, body, _tuple(values))
+        text += _function(name, given, body, as_tuple(values))
     return text
 
 
@@ -273,12 +294,12 @@ def _linear(pattern: Pattern) -> str:
     size, at = pattern.size, {k: n for n, k in enumerate(pattern.slopes)}
     x = [f"b{i}" for i in range(size)]
     slopes = [f"j{i}_{k}" for i, k in pattern.slopes]
-    unpack_j = [f"{_tuple(slopes)} = j"] if slopes else []
+    unpack_j = [f"{as_tuple(slopes)} = j"] if slopes else []
     rows = []
     for i in range(size):
         terms = [f"j{i}_{k} * b{k}" for k in range(size) if (i, k) in at]
         rows.append(" + ".join(terms) if terms else "0.0")
-    text = _function("times_slopes", "j, b", [*unpack_j, f"{_tuple(x)} = b"], _tuple(rows))
+    text = _function("times_slopes", "j, b", [*unpack_j, f"{as_tuple(x)} = b"], as_tuple(rows))
     lines = list(unpack_j)
     for i, k in sorted(pattern.filled):
         slope = f"-j{i}_{k}" if (i, k) in at else "0.0"
@@ -296,9 +317,9 @@ def _linear(pattern: Pattern) -> str:
         for k in range(size)
     ]
     lines.append("sound = " + " and ".join(sound))
-    entries = _tuple([f"m{i}_{k}" for i, k in sorted(pattern.filled)])
+    entries = as_tuple([f"m{i}_{k}" for i, k in sorted(pattern.filled)])
     text += _function("factored", "j, w", lines, f"{entries}, sound")
-    lines = [f"{entries} = m", f"{_tuple(x)} = b"]
+    lines = [f"{entries} = m", f"{as_tuple(x)} = b"]
     for k in range(size):
         lines += [
             f"b{i} -= m{i}_{k} * b{k}" for i in range(k + 1, size) if (i, k) in pattern.filled
@@ -306,4 +327,4 @@ def _linear(pattern: Pattern) -> str:
     for k in range(size - 1, -1, -1):
         lines.append(f"b{k} /= m{k}_{k}")
         lines += [f"b{i} -= m{i}_{k} * b{k}" for i in range(k) if (i, k) in pattern.filled]
-    return text + _function("solved", "m, b", lines, _tuple(x))
+    return text + _function("solved", "m, b", lines, as_tuple(x))

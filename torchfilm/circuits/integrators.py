@@ -21,8 +21,8 @@ def euler(rates: Rates, u: Tensor, dt: float, steps: int = 1) -> Tensor:
     """
     _check_steps(steps)
     rows = torch.arange(u.shape[0], device=u.device)
-    for _ in range(steps):
-        u = u + (dt / steps) * rates(u, rows)
+    for h in lengths(dt, steps, "euler"):
+        u = u + h.item() * rates(u, rows)
     return u
 
 
@@ -42,8 +42,7 @@ def runge_kutta(rates: Rates, u: Tensor, dt: float, steps: int = 1, method: str 
     )  # imported where it is used: it takes longer to load than torchfilm itself
 
     rows = torch.arange(u.shape[0], device=u.device)
-    # times in float64 on the host: in float32 the last step could be tiny
-    grid = torch.linspace(0.0, dt, steps + 1, dtype=torch.float64)
+    grid = _grid(dt, steps)
     found = odeint(
         lambda t, y: rates(y, rows),
         u,
@@ -52,6 +51,18 @@ def runge_kutta(rates: Rates, u: Tensor, dt: float, steps: int = 1, method: str 
         options={"grid_constructor": lambda *_: grid},
     )
     return found[-1]
+
+
+def _grid(dt: float, steps: int) -> Tensor:
+    """The times between steps, in float64 on the host: in float32 the last step could be tiny."""
+    return torch.linspace(0.0, dt, steps + 1, dtype=torch.float64)
+
+
+def lengths(dt: float, steps: int, method: str) -> Tensor:
+    """The length of each step, (steps,) float64: equal but for rounding."""
+    if method == "euler":
+        return torch.full((steps,), dt / steps, dtype=torch.float64)
+    return _grid(dt, steps).diff()
 
 
 def _check_steps(steps: int) -> None:

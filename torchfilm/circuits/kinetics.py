@@ -17,8 +17,7 @@ from torchfilm.tools.deterministic_math import power as steady_power
 @named
 def activation(x: Tensor, half: float | Tensor, power: float | Tensor = 1.0) -> Tensor:
     """xⁿ/(Kⁿ + xⁿ), with K = half and n = power."""
-    big, p = _ratio(x, half, power)
-    return torch.where(big, torch.ones_like(p), p) / (1.0 + p)
+    return _activation(x, half, power)
 
 
 @named
@@ -31,7 +30,12 @@ def repression(x: Tensor, half: float | Tensor, power: float | Tensor = 1.0) -> 
 @named
 def michaelis_menten(x: Tensor, half: float | Tensor) -> Tensor:
     """x/(K + x), with K = half."""
-    return activation(x, half, 1.0)
+    return _activation(x, half, 1.0)  # no law by name: what a law is made of has simple operations
+
+
+def _activation(x: Tensor, half: float | Tensor, power: float | Tensor) -> Tensor:
+    big, p = _ratio(x, half, power)
+    return torch.where(big, torch.ones_like(p), p) / (1.0 + p)
 
 
 def _ratio(x: Tensor, half: float | Tensor, power: float | Tensor) -> tuple[Tensor, Tensor]:

@@ -84,19 +84,33 @@ class Network:
         Mass action counts combinations, k Ω n (n − 1)/Ω² for 2 a with Ω = volume ×
         molecules_per_unit. The rate of a function is multiplied by Ω only.
         """
+        if self.signals and pool is None:
+            raise checks.input_error(
+                "pool",
+                pool,
+                "the volume outside each cell, for the signals " + ", ".join(self.signals),
+            )
+        each = [
+            pool if pool is None or pool.dim() == 1 else pool[:, k]
+            for k in range(len(self.signals))
+        ]
+        found = self.propensity_columns(
+            counts.unbind(1), p, cell, molecules_per_unit=molecules_per_unit, pools=each
+        )
+        return torch.stack(found, 1)
+
+    def propensity_columns(
+        self,
+        columns: Sequence[Tensor],
+        p: Names,
+        cell: Names,
+        *,
+        molecules_per_unit: float | Tensor,
+        pools: Sequence[Any],
+    ) -> list[Tensor]:
+        """The same, R of (n,), for molecule numbers S + M of (n,) and a pool for each signal."""
         volumes = [cell.volume * molecules_per_unit] * len(self.species)
-        if self.signals:
-            if pool is None:
-                raise checks.input_error(
-                    "pool",
-                    pool,
-                    "the volume outside each cell, for the signals " + ", ".join(self.signals),
-                )
-            volumes += [
-                (pool if pool.dim() == 1 else pool[:, k]) * molecules_per_unit
-                for k in range(len(self.signals))
-            ]
-        columns = counts.unbind(1)
+        volumes += [pool * molecules_per_unit for pool in pools]
         density = [n / v for n, v in zip(columns, volumes, strict=True)]
         u = Names(self.species, density[: len(self.species)], "u")
         s = Names(self.signals, density[len(self.species) :], "s")
@@ -114,7 +128,7 @@ class Network:
                 for _ in range(order):
                     rate = rate / volumes[column[name]]
             out.append(rate)
-        return torch.stack(out, 1)
+        return out
 
 
 def _flatten(entry: Sequence[Any]) -> list[Reaction]:

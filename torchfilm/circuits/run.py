@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,14 +18,17 @@ from torch import Tensor
 
 from torchfilm.circuits import integrators, rosenbrock, stochastic
 from torchfilm.circuits.columns import Columns, column
-from torchfilm.circuits.compiled import CompiledCircuit
-from torchfilm.circuits.draws import Draw
+from torchfilm.circuits.compiled import Compiled
+from torchfilm.circuits.compiled_explicit import CompiledExplicit
+from torchfilm.circuits.compiled_molecules import CompiledMolecules
+from torchfilm.circuits.compiled_stiff import CompiledCircuit
+from torchfilm.circuits.draws import Draw, KeyedDraws
 from torchfilm.circuits.graph import both_of, check_returned
 from torchfilm.circuits.names import Names, unknown
 from torchfilm.circuits.network import Network
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.deterministic_math import deterministic_functions
-from torchfilm.tools.tangents import has_tangent
+from torchfilm.tools.tangents import has_tangent, in_forward_mode
 
 # Returns the rates of species by name, conc/h, and the amounts per hour that the cell releases to
 # signals by name, conc·µm³/h.
@@ -65,7 +69,7 @@ class CircuitCells:
     pool: Tensor | None = None
     in_reservoir: Tensor | None = None
     label: str = "circuit"
-    compiled: CompiledCircuit | None = None
+    compiled: Compiled | None = None
     by_torch: bool = False
     seen: dict[str, set[str]] = field(default_factory=dict)
 
@@ -158,9 +162,16 @@ class CircuitCells:
                 columns += [torch.where(away, (-x).clamp(min=0.0), 0.0) for x in flux]
         return torch.stack(columns, 1)
 
+    def per_unit(self, given: float | Tensor) -> Tensor:
+        """Molecules per unit of concentration × µm³, of `IntegrationSettings`: (M,) float64, or one
+        number ()."""
+        if not isinstance(given, Tensor):
+            return torch.tensor(given, dtype=torch.float64)
+        return given.index_select(0, self.rows).double() if given.dim() else given
+
     def slopes(self, u: Tensor, rows: Tensor) -> Tensor:
         """∂ rates/∂u, (V, V, m), at u (V, m) of the cells `rows` (m,) among the M."""
-        assert self.compiled is not None
+        assert isinstance(self.compiled, CompiledCircuit)
         return self.compiled.slopes_by_torch(self, u, self.rows.index_select(0, rows))
 
     def start(self, concentrations: Tensor) -> Tensor:
@@ -208,6 +219,7 @@ def step(
     steps = torch.full((count,), settings.steps, dtype=torch.int64, device=start.device)
     if settings.method == "rosenbrock":
         compiled, rtol, atol = circuit.compiled, settings.rtol, settings.atol
+        assert compiled is None or isinstance(compiled, CompiledCircuit)
         found = None
         if compiled is not None and not circuit.by_torch:
             found = compiled.rodas3(circuit, start, dt, rtol, atol)
@@ -217,9 +229,12 @@ def step(
         end, report = found
         code, steps = report.status, report.accepted + report.rejected
     else:
-        if settings.method == "euler":
+        end = None
+        if isinstance(circuit.compiled, CompiledExplicit):
+            end = circuit.compiled.integrate(circuit, start, dt, settings.steps)
+        if end is None and settings.method == "euler":
             end = integrators.euler(circuit.rates, start, dt, settings.steps)
-        else:
+        elif end is None:
             end = integrators.runge_kutta(circuit.rates, start, dt, settings.steps, settings.method)
         # an exact solution stays above zero: the step is too long for an explicit method
         scale = start.abs() + end.abs()
@@ -252,9 +267,7 @@ def _molecules(
     assert isinstance(circuit.part, Network)
     network, rows = circuit.part, circuit.rows
     volume = circuit.names(concentrations, rows)[3].volume.double()
-    given = settings.molecules_per_unit
-    each = isinstance(given, Tensor) and bool(given.dim())
-    molecules_per_unit = given.index_select(0, rows).double() if each else given  # type: ignore
+    molecules_per_unit = circuit.per_unit(settings.molecules_per_unit)
     parts = [torch.round(concentrations.double() * (volume * molecules_per_unit).unsqueeze(1))]
     pool = None
     if network.signals:
@@ -269,25 +282,21 @@ def _molecules(
             for n in network.signals
         ]
     start = torch.cat(parts, 1)
-
-    def propensities(counts: Tensor, mine: Tensor) -> Tensor:
-        _, _, p, cell = circuit.names(counts, rows.index_select(0, mine))
-        scale = (
-            molecules_per_unit.index_select(0, mine)
-            if isinstance(molecules_per_unit, Tensor) and molecules_per_unit.dim()
-            else molecules_per_unit
-        )
-        own = None if pool is None else pool.index_select(0, mine)
-        with deterministic_functions():
-            found = network.propensities(counts, p, cell, molecules_per_unit=scale, pool=own)
-        return _without_tangent(found, circuit.label, settings.method)
-
-    if settings.method == "direct":
-        end, report = stochastic.direct(start, propensities, network.stoichiometry, dt, draw)
+    own = {"molecules_per_unit": molecules_per_unit} | ({} if pool is None else {"pool": pool})
+    leaps = settings.method == "tau_leap"
+    if in_forward_mode():
+        _refuse_tangent(circuit, own, start)
+    if isinstance(circuit.compiled, CompiledMolecules):
+        assert isinstance(draw, KeyedDraws)
+        end, report = circuit.compiled.advance(circuit, start, own, dt, draw, leaps)
     else:
-        end, report = stochastic.tau_leap(
-            start, propensities, network.stoichiometry, dt, draw, orders=network.orders
-        )
+        propensities = partial(_propensities, circuit, own)
+        gain = network.stoichiometry
+        if leaps:
+            orders = network.orders
+            end, report = stochastic.tau_leap(start, propensities, gain, dt, draw, orders=orders)
+        else:
+            end, report = stochastic.direct(start, propensities, gain, dt, draw)
     size = len(circuit.species)
     amount = {
         n: (end[:, size + k] - start[:, size + k]) / molecules_per_unit
@@ -304,13 +313,26 @@ def _molecules(
     return CircuitOutcome(found, pools, reservoir, report.status != 0, code, report.steps)
 
 
-def _without_tangent(value: Tensor, label: str, method: str) -> Tensor:
-    if has_tangent(value):
+def _refuse_tangent(circuit: CircuitCells, own: Mapping[str, Tensor], start: Tensor) -> None:
+    every = torch.arange(len(start), device=start.device)
+    if has_tangent(_propensities(circuit, own, start, every)):
         raise InputError(
-            f"{label}: a derivative is wanted of a circuit with method={method!r}, and numbers of"
-            ' molecules have none. Use method="rosenbrock", or differences between runs.'
+            f"{circuit.label}: a derivative is wanted of a circuit that counts molecules, and"
+            ' numbers of molecules have none. Use method="rosenbrock", or differences between'
+            " runs."
         )
-    return value
+
+
+def _propensities(
+    circuit: CircuitCells, own: Mapping[str, Tensor], counts: Tensor, rows: Tensor
+) -> Tensor:
+    """Events per hour at molecule numbers (m, S) of the cells `rows` (m,) among the M. own: (M,) or
+    (), `molecules_per_unit` and `pool`."""
+    assert isinstance(circuit.part, Network)
+    _, _, p, cell = circuit.names(counts, circuit.rows.index_select(0, rows))
+    given = {n: x.index_select(0, rows) if x.dim() else x for n, x in own.items()}
+    with deterministic_functions():
+        return circuit.part.propensities(counts, p, cell, **given)
 
 
 def _split(

@@ -28,6 +28,10 @@ STATUS = {
 }
 FEW_EVENTS = 10.0  # a leap with fewer events costs more than single events
 MAX_LEAP_HALVINGS = 60
+# A leap changes no propensity by more than about EPSILON of it. A reaction that could fire fewer
+# than CRITICAL times fires alone.
+EPSILON, CRITICAL = 0.03, 10
+MOST_LEAPS, MOST_EVENTS = 100_000, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -50,17 +54,17 @@ def tau_leap(
     dt: float,
     draw: Draw,
     *,
-    epsilon: float = 0.03,
-    critical: int = 10,
+    epsilon: float = EPSILON,
+    critical: int = CRITICAL,
     orders: Tensor | None = None,
-    max_steps: int = 100_000,
+    max_steps: int = MOST_LEAPS,
 ) -> tuple[Tensor, StochasticReport]:
     """Molecule numbers (N, S) after dt hours by tau-leaping, or single events if they cost less.
 
     A reaction must be limited by a species that it consumes. So a gene that switches from "off" to
     "on" is two species, on and off; otherwise a leap could switch it on twice.
 
-    stoichiometry: (R, S), molecules gained by each event. draw: see `draws.keyed_draws`. epsilon:
+    stoichiometry: (R, S), molecules gained by each event. draw: see `draws.KeyedDraws`. epsilon:
     the relative change of a propensity that a leap may cause. critical: a reaction that could fire
     fewer times than this fires alone. orders: (S,), the highest order in which a propensity depends
     on each species, 0 for none; default 2. Numbers stay integer (a fractional part in the input
@@ -78,7 +82,7 @@ def direct(
     dt: float,
     draw: Draw,
     *,
-    max_steps: int = 1_000_000,
+    max_steps: int = MOST_EVENTS,
 ) -> tuple[Tensor, StochasticReport]:
     """Molecule numbers (N, S) after dt hours, event by event: exact, for all cells in parallel.
 

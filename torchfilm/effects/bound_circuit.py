@@ -15,8 +15,11 @@ from torch import Tensor
 
 from torchfilm.circuits import run
 from torchfilm.circuits.columns import Lazy
-from torchfilm.circuits.compiled import CompiledCircuit, compiled_circuit
-from torchfilm.circuits.draws import keyed_draws
+from torchfilm.circuits.compiled import Compiled
+from torchfilm.circuits.compiled_explicit import compiled_explicit
+from torchfilm.circuits.compiled_molecules import compiled_molecules
+from torchfilm.circuits.compiled_stiff import compiled_circuit
+from torchfilm.circuits.draws import KeyedDraws
 from torchfilm.circuits.names import unknown
 from torchfilm.circuits.network import build_network
 from torchfilm.circuits.tracing import Untraceable
@@ -85,7 +88,7 @@ class BoundCircuit(BoundEffect):
         self.networks: dict[int | str, run.Network] = {}
         self.exchanged: dict[int | str, tuple[str, ...]] = {}
         # by cell type and whether there is a reservoir: the compiled circuit, or why there is none
-        self.compiled: dict[tuple[int | str, bool], CompiledCircuit | str] = {}
+        self.compiled: dict[tuple[int | str, bool], Compiled | str] = {}
         self.by_torch = effect.why_torch(binding.batch.device)
         self.traced_reads: tuple[str, ...] = ()
         self.signals: tuple[str, ...] = ()  # that rates read or change
@@ -173,20 +176,32 @@ class BoundCircuit(BoundEffect):
             self._cells(state, _cells_of(state, kind), kind, self.exchanged[kind], found, medium)
         return state
 
-    def _compiled(self, kind: int | str, cells: run.CircuitCells) -> run.CircuitCells:
+    def _compiled(self, kind: int | str, state: State, cells: run.CircuitCells) -> run.CircuitCells:
         """The cells with their circuit's equations, where there are: torch's derivatives, too."""
-        key = (kind, cells.in_reservoir is not None)
-        if self.effect.method != "rosenbrock" or cells.rows.numel() == 0:
+        key, stiff = (kind, cells.in_reservoir is not None), self.effect.method == "rosenbrock"
+        if cells.rows.numel() == 0 or (self.by_torch and not stiff):
             return cells
         if key not in self.compiled:
             try:
-                self.compiled[key] = compiled_circuit(cells)
+                self.compiled[key] = self._equations(state, cells)
             except Untraceable as why:
-                self.compiled[key] = f"{cells.label}: {why}"
+                self.compiled[key] = said = f"{cells.label}: {why}"
+                if self.effect.backend == "compiled":
+                    wanted = f"Circuit.backend = 'compiled', but {said}: leave backend out."
+                    raise checks.InputError(wanted) from why
         found = self.compiled[key]
         if isinstance(found, str):
             return cells
         return dataclasses.replace(cells, compiled=found, by_torch=bool(self.by_torch))
+
+    def _equations(self, state: State, cells: run.CircuitCells) -> Compiled:
+        """Raises Untraceable."""
+        if self.effect.is_stochastic:
+            per_unit = cells.per_unit(self.values.molecules_per_unit.of_cells(state))
+            return compiled_molecules(cells, per_unit)
+        if self.effect.method == "rosenbrock":
+            return compiled_circuit(cells)
+        return compiled_explicit(cells, self.effect.method, state.dtype)
 
     def _check_constants(self, read: set[str]) -> None:
         """Raise InputError for a constant that looks like another name, and warn of one that no
@@ -242,13 +257,10 @@ class BoundCircuit(BoundEffect):
             f"{c.method}, {c.steps} equal step(s) of {dt / c.steps:g} h; nothing controls its error"
         )
         lines = [said.get(c.method, explicit)]
-        if c.method == "rosenbrock":
-            why = [x for x in self.compiled.values() if isinstance(x, str)]
-            lines += [
-                f"computed by torch: {x}" for x in ([self.by_torch] * bool(self.by_torch) or why)
-            ]
-            if not self.by_torch and not why:
-                lines.append("computed by compiled functions of its equations")
+        why = [x for x in self.compiled.values() if isinstance(x, str)]
+        lines += [f"computed by torch: {x}" for x in ([self.by_torch] * bool(self.by_torch) or why)]
+        if not self.by_torch and not why:
+            lines.append("computed by compiled functions of its equations")
         if self._signals():
             names = ", ".join(self._signals())
             lines.append(
@@ -280,7 +292,7 @@ class BoundCircuit(BoundEffect):
             self.values.molecules_per_unit.of_cells(state),
         )
         keys = (
-            keyed_draws(state.seed, state.own_stream, state.uid, state.step)
+            KeyedDraws(state.seed, state.own_stream, state.uid, state.step)
             if circuit.is_stochastic
             else None
         )
@@ -292,13 +304,8 @@ class BoundCircuit(BoundEffect):
                 continue
             cells = self._cells(middle, rows, kind, self.exchanged[kind], found, medium)
             concentrations = self._concentrations(state, rows)
-            made = run.step(
-                cells,
-                concentrations,
-                dt,
-                settings,
-                None if keys is None else partial(_draw, keys, rows, circuit.name),
-            )
+            draw = None if keys is None else keys.of(rows, circuit.name)
+            made = run.step(cells, concentrations, dt, settings, draw)
             report.note(cells, made, concentrations, circuit.method, dt)
             for name, value in zip(self.fields, made.concentrations.unbind(1), strict=True):
                 changed[name] = (
@@ -352,14 +359,7 @@ class BoundCircuit(BoundEffect):
             label,
             seen=seen or {},
         )
-        return cells if seen else self._compiled(kind, cells)
-
-
-def _draw(
-    keys: Any, rows: Tensor, name: str, mine: Tensor, event: int, what: str, count: int
-) -> Tensor:
-    """Random numbers of a circuit's own: circuits of one scene differ by their names."""
-    return keys(rows.index_select(0, mine), event, f"{name} {what}" if name else what, count)
+        return cells if seen else self._compiled(kind, state, cells)
 
 
 def _half_way(state: State, volume_field: str) -> State:

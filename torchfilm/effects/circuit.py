@@ -58,9 +58,9 @@ class Circuit(Effect):
     `molecules_per_unit` of them in a unit of concentration × µm³ (0.6022 for nM). rtol, atol: of
     the adaptive method. name: of one circuit among several in a scene; its species are then the
     fields NAME_SPECIES. shared: species of another circuit that this one reads and changes too, as
-    field names, or {name here: field}. backend: "compiled" functions of its equations (for
-    "rosenbrock", on the CPU) or "torch"; by default compiled where the rates can be written as
-    equations: see `graph`. Circuits act one after the other. Growth dilutes: amounts
+    field names, or {name here: field}. backend: "compiled" functions of its equations (on
+    the CPU) or "torch"; by default compiled where the rates can be written as equations: see
+    `graph`. Circuits act one after the other. Growth dilutes: amounts
     stay, concentrations are multiplied by V_old/V_new. Further keywords are constants of the rates:
     each a number, one per colony, one per cell type, or a distribution drawn for each cell at birth
     (extrinsic noise). Where rates are given by cell type, cells of other types need no constants.
@@ -202,7 +202,6 @@ class Circuit(Effect):
         """Why torch computes the circuit on a device, or "" where compiled functions may."""
         why = (
             "backend='torch'" if self.backend == "torch"
-            else f"method={self.method!r}" if self.method != STIFF
             else f"the device is {device.type}" if device.type != "cpu"
             else unavailable()
         )  # fmt: skip

@@ -37,6 +37,11 @@ def _prepare_forward_mode() -> None:
             forward_ad.make_dual(torch.ones(1), torch.ones(1)).exp()
 
 
+def in_forward_mode() -> bool:
+    """Whether a tensor may carry a tangent now."""
+    return forward_ad._current_level >= 0
+
+
 def tangent(value: Tensor) -> Tensor | None:
     """What a tensor carries in forward mode, or None."""
     return forward_ad.unpack_dual(value).tangent

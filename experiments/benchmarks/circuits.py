@@ -1,0 +1,121 @@
+"""Measures a step of circuits by compiled functions and by torch, in one run.
+
+    OMP_NUM_THREADS=1 python experiments/benchmarks/circuits.py      # about five minutes
+    python experiments/benchmarks/circuits.py --case "tau_leap" --colonies 64 --cells 100
+
+Each case is the repressilator, grown from one founder a colony to `cells` cells a colony in the
+mean. The same step of the same state is then taken by both backends in turn, so that a machine that
+does other work slows both. The table gives the least time of the whole step, of the circuit's
+solver alone, and their ratios, and whether all fields are the same to the bit. The script appends
+each run to a JSON file with its machine, versions and commit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import torch
+from record import machine
+
+import torchfilm as tf
+from torchfilm.circuits import run
+
+DT = 0.05
+BACKENDS = ("compiled", "torch")
+# by method: settings of the circuit
+CASES = {"tau_leap": {}, "direct": {}, "rosenbrock": {}, "rk4": {"steps": 4}}
+
+
+def scene_of(method: str, backend: str) -> tf.Scene:
+    """Returns the repressilator by a method and a backend."""
+    scene = tf.scenes.repressilator()
+    change = {"method": method, "backend": backend, **CASES[method]}
+    return scene.replace(
+        *(e._with(**change) if isinstance(e, tf.Circuit) else e for e in scene.effects)
+    )
+
+
+def timed_step(model: tf.Model, state: tf.State) -> tuple[float, float, tf.State]:
+    """Returns the seconds of a step, those of the circuit's solver, and the next state."""
+    inside, step = [], run.step
+
+    def solver(*args):
+        begin = time.perf_counter()
+        found = step(*args)
+        inside.append(time.perf_counter() - begin)
+        return found
+
+    run.step = solver
+    try:
+        begin = time.perf_counter()
+        after = model.step(state, DT)
+        return time.perf_counter() - begin, sum(inside), after
+    finally:
+        run.step = step
+
+
+def measure(method: str, options: argparse.Namespace) -> dict:
+    """Runs one case. Returns its record."""
+    models = {b: scene_of(method, b).bind(options.colonies, seed=1) for b in BACKENDS}
+    state = models["compiled"].start()
+    while state.cells < options.cells * options.colonies:
+        state = models["compiled"].step(state, DT)
+    times = {b: [timed_step(models[b], state) for _ in range(1)] for b in BACKENDS}  # warm
+    for _ in range(options.repeats):
+        for b in BACKENDS:
+            times[b].append(timed_step(models[b], state))
+    one, other = (times[b][0][2] for b in BACKENDS)
+    least = {b: [1e3 * min(t[k] for t in times[b][1:]) for k in (0, 1)] for b in BACKENDS}
+    return {
+        "method": method,
+        "colonies": options.colonies,
+        "cells": state.cells,
+        "events": int(one.reports["circuit"].steps.sum()),
+        "step_ms": {b: round(least[b][0], 2) for b in BACKENDS},
+        "solver_ms": {b: round(least[b][1], 2) for b in BACKENDS},
+        "step_ratio": round(least["torch"][0] / least["compiled"][0], 1),
+        "solver_ratio": round(least["torch"][1] / least["compiled"][1], 1),
+        "same_bits": all(torch.equal(x, other.fields[n]) for n, x in one.fields.items()),
+    }
+
+
+def row(record: dict) -> str:
+    """Returns a line of the printed table."""
+    step, solver = record["step_ms"], record["solver_ms"]
+    return (
+        f"{record['method']:<12}{record['cells']:>7}{record['events']:>10}"
+        f"{step['torch']:>11.1f}{step['compiled']:>10.1f}{record['step_ratio']:>7.1f}"
+        f"{solver['torch']:>11.1f}{solver['compiled']:>10.1f}{record['solver_ratio']:>7.1f}"
+        f"  {'same bits' if record['same_bits'] else 'other bits'}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--case", action="append", choices=tuple(CASES), help="one method; may be repeated"
+    )
+    parser.add_argument("--colonies", type=int, default=64)
+    parser.add_argument("--cells", type=int, default=100, help="cells a colony, in the mean")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("circuits.json"))
+    options = parser.parse_args()
+    tf.keep_memory()
+    print(
+        f"{'method':<12}{'cells':>7}{'steps':>10}{'step: torch':>11}{'compiled':>10}{'ratio':>7}"
+        f"{'solver':>11}{'compiled':>10}{'ratio':>7}   ms, {torch.get_num_threads()} threads"
+    )
+    records = json.loads(options.out.read_text()) if options.out.exists() else []
+    for method in options.case or CASES:
+        records.append(machine() | measure(method, options))
+        print(row(records[-1]), flush=True)
+        options.out.write_text(json.dumps(records, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Circuits by the stiff method as compiled functions: the numbers of `circuits.rosenbrock`, cell by
+cell without torch, and in forward mode their tangents."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.circuits.compiled import WORTH_A_THREAD, Compiled, packed, places, pools, rates_of
+from torchfilm.circuits.emission import functions, tangent_functions
+from torchfilm.circuits.expressions import Expression
+from torchfilm.circuits.graph import evaluated
+from torchfilm.circuits.rosenbrock import MAX_STEPS, RosenbrockReport
+from torchfilm.circuits.stiff_text import CONSTANTS, method
+from torchfilm.circuits.tangent_text import tangent_method
+from torchfilm.tools.tangents import both, has_tangent, with_tangent
+
+if TYPE_CHECKING:
+    from torchfilm.circuits.run import CircuitCells
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledCircuit(Compiled):
+    """The stiff method."""
+
+    slopes: Mapping[tuple[int, int], Expression]
+    # by the columns and numbers that carry tangents
+    _moved: dict[Any, CompiledTangents] = field(default_factory=dict, repr=False)
+
+    @property
+    def text(self) -> str:
+        size = len(self.equations.variables)
+        return self.head(CONSTANTS) + functions(self.equations) + method(size, self.leaves())
+
+    def slopes_by_torch(self, circuit: CircuitCells, u: Tensor, rows: Tensor) -> Tensor:
+        """∂fᵢ/∂uₖ (V, V, M) at u (V, M) of the cells `rows` (M,) among all."""
+        values = self.values(circuit, rows, pools(circuit, rows))
+        values |= dict(zip(self.equations.variables, u, strict=True))
+        found = evaluated(list(self.slopes.values()), lambda leaf: values[leaf.name])
+        zero = torch.zeros_like(u[0])
+        at = dict(zip(self.slopes, found, strict=True))
+        count = u.shape[0]
+        entry = lambda i, k: zero + at[i, k] if (i, k) in at else zero
+        return torch.stack([torch.stack([entry(i, k) for k in range(count)]) for i in range(count)])
+
+    def rodas3(
+        self, circuit: CircuitCells, start: Tensor, dt: float, rtol: float, atol: float
+    ) -> tuple[Tensor, RosenbrockReport] | None:  # fmt: skip
+        """As `rosenbrock.rodas3`, of the cells `circuit.rows`, with tangents in forward mode; None
+        where a backward pass is wanted, and over no time."""
+        if dt == 0:
+            return None
+        values = self.values(circuit, circuit.rows, pools(circuit, circuit.rows))
+        every = [start, *values.values()]
+        if torch.is_grad_enabled() and any(x.requires_grad for x in every):
+            return None
+        if has_tangent(*every):
+            return self._with_tangents(values, start, dt, rtol, atol)
+        # a copy, also of float64: the state must not change
+        at = torch.empty(start.shape, dtype=torch.float64).copy_(start)
+        report = torch.zeros(3, start.shape[0], dtype=torch.int64)
+        arrays = (at.numpy(), *self.packed(values, start.shape[0]))
+        rest, counts, run = _limits(dt, rtol, atol, start.dtype), report.numpy(), self.module.run
+        work = lambda first, last: run(first, last, *arrays, *rest, *counts)
+        self.run(start.shape[0], WORTH_A_THREAD, work)
+        return at.to(start.dtype), RosenbrockReport(*report)
+
+    def _with_tangents(
+        self, values: Mapping[str, Tensor], start: Tensor, dt: float, rtol: float, atol: float
+    ) -> tuple[Tensor, RosenbrockReport]:
+        moving = {n for n, x in values.items() if has_tangent(x)}
+        key = tuple(tuple(n for n in x if n in moving) for x in (self.columns, self.numbers))
+        if key not in self._moved:
+            self._moved[key] = CompiledTangents(
+                self.equations, self.literals, self.columns, self.numbers, *key
+            )
+        return self._moved[key].rodas3(values, start, dt, rtol, atol)
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledTangents(Compiled):
+    """The stiff method with tangents, where some columns and numbers carry them."""
+
+    moving: tuple[str, ...]
+    moving_numbers: tuple[str, ...]
+
+    @cached_property
+    def text(self) -> str:  # type: ignore[override]
+        equations, size = self.equations, len(self.equations.variables)
+        names = [n for n in equations.leaves if n in (*self.moving, *self.moving_numbers)]
+        turns = places(names, self.moving, self.moving_numbers, ("turning", "turned"))
+        return "".join((
+            self.head(CONSTANTS), functions(equations), tangent_functions(equations, names),
+            method(size, self.leaves()), tangent_method(size, self.leaves(), turns),
+        ))  # fmt: skip
+
+    def rodas3(
+        self, values: Mapping[str, Tensor], start: Tensor, dt: float, rtol: float, atol: float
+    ) -> tuple[Tensor, RosenbrockReport]:
+        count, dtype, (first, tangent) = start.shape[0], start.dtype, both(start)
+        at = torch.empty(start.shape, dtype=torch.float64).copy_(first)
+        moved = torch.zeros(start.shape, dtype=torch.float64)
+        if tangent is not None:
+            moved.copy_(tangent)
+        still, turns = {}, {}
+        for name, value in values.items():
+            still[name], turn = both(value)
+            if turn is not None:
+                turns[name] = turn
+        columns, numbers = self.packed(still, count)
+        report = torch.zeros(3, count, dtype=torch.int64)
+        arrays = (
+            at.numpy(), moved.numpy(), columns, packed(turns, self.moving, count), numbers,
+            packed(turns, self.moving_numbers),
+        )  # fmt: skip
+        rest, counts = _limits(dt, rtol, atol, dtype), report.numpy()
+        run = self.module.run_moved
+        work = lambda first, last: run(first, last, *arrays, *rest, *counts)
+        self.run(count, WORTH_A_THREAD, work)
+        return with_tangent(at.to(dtype), moved.to(dtype)), RosenbrockReport(*report)
+
+
+def _limits(dt: float, rtol: float, atol: float, dtype: torch.dtype) -> tuple[float, ...]:
+    limits = torch.finfo(dtype)
+    return dt, max(rtol, 4 * limits.eps), atol, limits.eps, limits.max, MAX_STEPS
+
+
+def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
+    """The circuit in these cells, of which one is enough. Raises Untraceable."""
+    found = rates_of(circuit, torch.float64)
+    functions(found[0])  # raises where a derivative has no compiled form
+    return CompiledCircuit(*found, slopes=found[0].slopes())
