@@ -18,8 +18,9 @@ from traced import alone, circuits, ends, equal, one_step, plain_module
 
 import torchfilm as tf
 from torchfilm import parts
-from torchfilm.circuits import compiled, compiled_molecules, stochastic
+from torchfilm.circuits import compiled, compiled_molecules, draws, stochastic
 from torchfilm.circuits.draws import KeyedDraws
+from torchfilm.kernels.poisson import poisson
 from torchfilm.kernels.random import two_uniforms
 
 F32, F64 = torch.float32, torch.float64
@@ -170,6 +171,19 @@ def test_a_draw_is_that_of_torch(name):
                         own = (uid.numpy().view("u8")[n], stream.numpy().view("u8")[n])
                         found = two_uniforms((*own, *words), event, np.uint64(code))
                         assert found == tuple(wanted[:, n].tolist())
+
+
+@pytest.mark.parametrize(
+    "mean", [0.0, 1e-9, 0.5, 4.1, 10.0, 10.1, 50.0, 99.0, 101.0, 3e3, 9e5, 1e8]
+)
+def test_a_poisson_number_is_that_of_torch(mean):
+    """Of 3,000 uniforms, some of them far out; nearer to 1 than 10⁻⁸ rounding decides."""
+    uniform = torch.rand(3000, generator=torch.Generator().manual_seed(1), dtype=F64)
+    uniform = torch.cat(
+        [uniform.clamp(1e-8, 1 - 1e-8), 10.0 ** -torch.arange(4.0, 16.0, dtype=F64)]
+    )
+    wanted = draws.poisson(torch.full_like(uniform, mean), uniform)
+    assert [poisson(mean, u) for u in uniform.tolist()] == wanted.tolist()
 
 
 # --- independence of how the work is divided ------------------------------------------------------

@@ -163,12 +163,16 @@ def _split(
     gain: Sequence[Sequence[float]], taken: Sequence[dict[int, float]], orders: Sequence[float]
 ) -> str:
     """Reactions that may leap and those that are critical; returns the longest leap, or 0 where it
-    would have few events, as most have: found out without a division, one species at a time."""
-    lines = []
+    would have few events, as most have: found out without divisions, and without branches, which
+    would be as good as random."""
+    count, size = len(gain), len(orders)
+    # everything is read first: what is read on a condition becomes a branch
+    lines = [f"{_many('x#', size)} = {_many('x[#]', size)}", "short = False"]
+    lines.append(f"{_many('a#', count)} = {_many('a[#]', count)}")
     for j, uses in enumerate(taken):
-        rare = " or ".join(f"x[{k}] < CRITICAL * {t!r}" for k, t in uses.items())
-        lines.append(f"a{j} = " + (f"0.0 if {rare} else a[{j}]" if rare else f"a[{j}]"))
-    times = ["longest = np.inf"]
+        rare = " or ".join(f"x{k} < CRITICAL * {t!r}" for k, t in uses.items())
+        lines += [f"a{j} = 0.0 if {rare} else a{j}"] if rare else []
+    times = ["if short:", "    return 0.0", "longest = np.inf"]
     for k, given in enumerate(orders):
         changes = [(j, row[k]) for j, row in enumerate(gain) if row[k]]
         if given <= 0 or not changes:
@@ -177,19 +181,19 @@ def _split(
         lines += [
             f"mean{k} = abs(" + " + ".join(f"{g!r} * a{j}" for j, g in changes) + ")",
             f"spread{k} = " + " + ".join(f"{g * g!r} * a{j}" for j, g in changes),
-            f"most = _most(EPSILON / {order!r} * x[{k}], 1.0)",
-            f"if (most * total < SHORT * mean{k}) | (most * most * total < SHORT * spread{k}):",
-            "    return 0.0",
+            f"most = _most(EPSILON / {order!r} * x{k}, 1.0)",
+            f"short |= most * total < SHORT * mean{k}",
+            f"short |= most * most * total < SHORT * spread{k}",
         ]
-        more = f" + {order - 1!r} / _most(x[{k}] - 1.0, 1.0)" if order > 1 else ""
+        more = f" + {order - 1!r} / _most(x{k} - 1.0, 1.0)" if order > 1 else ""
         times += [
-            f"change = _most(EPSILON * x[{k}] / ({order!r}{more}), 1.0)",
+            f"change = _most(EPSILON * x{k} / ({order!r}{more}), 1.0)",
             f"if spread{k} > 0:",
             f"    time = _least(change / mean{k}, change * change / spread{k})",
             "    longest = _least(longest, time)",
         ]
-    apart = [f"often[{j}] = a{j}" for j in range(len(gain))]
-    apart += [f"seldom[{j}] = a[{j}] - a{j}" for j in range(len(gain))]
+    apart = [f"often[{j}] = a{j}" for j in range(count)]
+    apart += [f"seldom[{j}] = a[{j}] - a{j}" for j in range(count)]
     return _written("split(x, a, often, seldom, total)", [*lines, *times, *apart, "return longest"])
 
 
