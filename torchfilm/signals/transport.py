@@ -12,12 +12,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
-from torchfilm.signals.transport_exponential import prepare_exponential
+from torchfilm.signals.compiled import may_run
+from torchfilm.signals.compiled_transport import CompiledExponential, compiled_exponential
+from torchfilm.signals.grid import Grid, Shape
+from torchfilm.signals.transport_exponential import Exponential, prepare_exponential
 from torchfilm.signals.transport_implicit import prepare_implicit
 from torchfilm.signals.transport_iterative import prepare_crank_nicolson, prepare_euler
 from torchfilm.signals.transport_operator import Operator
@@ -39,6 +45,9 @@ METHODS: dict[str, Callable[[Operator, float], Stepper]] = {
     "euler": prepare_euler,
 }
 
+# those that kernels compute, too
+COMPILED = {"exponential"}
+
 
 def choose(operator: Operator) -> str:
     """The suitable method: "exponential" where it is possible, else "implicit"."""
@@ -51,3 +60,31 @@ def prepare(operator: Operator, dt: float, method: str | None = None) -> Stepper
         checks.choice("method", method, tuple(METHODS))
     dt = checks.number("dt", dt, above=0.0, most=math.inf)
     return METHODS[choose(operator) if method is None else method](operator, dt)
+
+
+@dataclass(frozen=True, eq=False)
+class Carrier:
+    """A step of grids of one shape. may_compile: whether kernels may run it; else torch does."""
+
+    stepper: Stepper
+    shape: Shape
+    may_compile: bool = True
+
+    @cached_property
+    def compiled(self) -> CompiledExponential | None:
+        """The step by kernels, or None where there is none."""
+        if not (self.may_compile and isinstance(self.stepper, Exponential)):
+            return None
+        return compiled_exponential(self.stepper, self.shape)
+
+
+def carry(grid: Grid, carriers: Sequence[Carrier], values: Tensor) -> Tensor:
+    """Values (voxels,) of all colonies one step later. carriers: one for each of `grid.batches`."""
+    kernels = [carrier.compiled for carrier in carriers]
+    if None in kernels or not may_run(values):
+        pairs = zip(carriers, grid.batches, strict=True)
+        return grid.join([carrier.stepper.step(batch.of(values)) for carrier, batch in pairs])
+    out = torch.empty_like(values)
+    for kernel, batch in zip(kernels, grid.batches, strict=True):
+        kernel.step(values, batch.starts.numpy(), out)
+    return out
