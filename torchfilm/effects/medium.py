@@ -15,6 +15,7 @@ from torchfilm.effects.bound_medium import BLOCK, BoundMedium, FirstHalf, GridCo
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
 from torchfilm.signals.space import checked_box, checked_flow
 from torchfilm.signals.transport import COMPILED, METHODS
+from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.numba_calls import unavailable
@@ -28,6 +29,7 @@ Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
 SPLITTINGS = ("lie", "strang")
 BACKENDS = ("compiled", "torch")
+EXACT = ("exponential", "series")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +82,13 @@ class Medium(Effect):
     take.
 
     method: "exponential" (exact if there are no obstacles and flow and decay are uniform),
-    "implicit" (positive at any step), "crank_nicolson" (the paper's) or "euler". Default:
-    "exponential" if exact, else "implicit". steps: transport steps within one step of the scene,
-    for accuracy. splitting: "strang", half of transport before exchange with the cells and half
-    after, or "lie", exchange and then transport. Strang makes the error of the signal many times
-    smaller, for one more transport per step. backend: "compiled" kernels or "torch" for transport.
-    Default: compiled where the device is the CPU and Numba is there; gradients always by torch.
+    "series" (exact), "implicit" (one solve an axis), "crank_nicolson" (the paper's) or "euler".
+    Default: "exponential" where possible, else "series". steps: transport steps within one step of
+    the scene, for accuracy. splitting: "strang", half of transport before exchange with the cells
+    and half after, or "lie", exchange and then transport. Strang makes the error of the signal many
+    times smaller, for one more transport per step. backend: "compiled" kernels or "torch" for
+    transport. Default: compiled where the device is the CPU and Numba is there; gradients always by
+    torch.
     """
 
     signals: Mapping[str, Signal]
@@ -254,7 +257,9 @@ class Medium(Effect):
         for name, signal in self.signals.items():
             method, why = self.method_of(name)
             order = f"order {2 if method == 'crank_nicolson' else 1} in steps of {part:g} h"
-            order = "exact over a step" if method == "exponential" else order
+            order = "exact over a step" if method in EXACT else order
+            if method == "series":
+                order += f" (but one solve an axis where it exchanges over {MOST:g} times a step)"
             ratio = number_range(torch.as_tensor(signal.diffusion) * (dt / finest**2))
             who = self.backend_on(state.device) if method in COMPILED else "torch"
             who = "compiled; by torch where gradients are required" if who == "compiled" else who
@@ -273,7 +278,7 @@ class Medium(Effect):
         }
         against = [words for words, there in found.items() if there]
         if against:
-            return "implicit", "because of " + " and ".join(against)
+            return "series", "because of " + " and ".join(against)
         return "exponential", "no obstacle, and flow and decay the same everywhere"
 
     @property

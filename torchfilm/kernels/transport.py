@@ -18,6 +18,8 @@ WIDEST = len(SIXTEEN)
 # Rows of as many columns are so far apart in memory that they would displace each other from the
 # first cache; a panel is copied together first.
 FAR_APART = 128
+# Voxels whose exchange along all axes is summed while they are in the first cache.
+BLOCK = 1024
 
 
 @kernel
@@ -140,3 +142,67 @@ def carry(begin, end, starts, shape, axes, factors, firsts, lasts, gained, value
             own = c if gained.shape[0] > 1 else 0
             for i in range(size):
                 result[i] += gained[own, i]
+
+
+@kernel
+def exchanged(v, new, pad, strides, stay, ups, downs):
+    """new = P v for one grid, but for what passes between opposite faces; v, new: (pad + voxels +
+    pad,), 0 in the padding; stay: (voxels,), ups, downs: (axes, voxels), 0 at the faces."""
+    size = stay.size
+    for first in range(0, size, BLOCK):
+        last = min(size, first + BLOCK)
+        here, out, kept = (
+            v[pad + first : pad + last],
+            new[pad + first : pad + last],
+            stay[first:last],
+        )
+        for i in range(last - first):
+            out[i] = kept[i] * here[i]
+        for a in range(strides.size):
+            below = v[pad + first - strides[a] : pad + last - strides[a]]
+            above = v[pad + first + strides[a] : pad + last + strides[a]]
+            up, down = ups[a, first:last], downs[a, first:last]
+            for i in range(last - first):
+                out[i] = out[i] + up[i] * below[i] + down[i] * above[i]
+
+
+@kernel
+def mix(
+    begin, end, starts, strides, stay, ups, downs, wrap_to, wrap_from, wraps, weights, terms,
+    gained, values, out,
+):  # fmt: skip
+    """The grids begin … end of one shape after a step by the series, from values to out, (voxels,)
+    of all colonies, each number in float64.
+
+    starts: the first voxel of each grid. stay: (b or 1, voxels), ups, downs: (b or 1, axes, voxels)
+    as `exchanged` takes them; wraps: (b or 1, W), the parts that pass from voxel wrap_from to
+    wrap_to through periodic faces. weights: (b or 1, terms), of which a colony has `terms`, none
+    where it is carried by another method. gained: (b or 1 or 0, voxels).
+    """
+    size = stay.shape[1]
+    pad = 0
+    for stride in strides:
+        pad = max(pad, stride)
+    buffers, total = np.zeros((2, size + 2 * pad)), np.empty(size)
+    for c in range(begin, end):
+        own = c if stay.shape[0] > 1 else 0
+        weight = weights[own]
+        if terms[own] == 0:
+            continue
+        v, new = buffers[0], buffers[1]
+        for i in range(size):
+            v[pad + i] = values[starts[c] + i]
+            total[i] = weight[0] * v[pad + i]
+        for k in range(1, terms[own]):
+            exchanged(v, new, pad, strides, stay[own], ups[own], downs[own])
+            for w in range(wrap_to.size):
+                new[pad + wrap_to[w]] += wraps[own, w] * v[pad + wrap_from[w]]
+            for i in range(size):
+                total[i] += weight[k] * new[pad + i]
+            v, new = new, v
+        if gained.shape[0] > 0:
+            more = gained[c if gained.shape[0] > 1 else 0]
+            for i in range(size):
+                total[i] += more[i]
+        for i in range(size):
+            out[starts[c] + i] = total[i]

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchfilm.signals.compiled import may_run
 from torchfilm.signals.grid import Shape
 from torchfilm.signals.transport_exponential import Exponential
+from torchfilm.signals.transport_series import Series
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.threads import shares_of
 
@@ -71,3 +72,76 @@ def compiled_exponential(stepper: Exponential, shape: Shape) -> CompiledExponent
         shape, axes, tuple(factors), tuple(firsts), tuple(lasts),
         as_array(gained.flatten(1), dtype),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledSeries:
+    """`Series` for one shape of grid, in arrays as `kernels.transport.mix` takes them."""
+
+    stepper: Series
+    shape: Shape
+    arrays: tuple[np.ndarray, ...]
+
+    def step(self, values: Tensor, starts: np.ndarray, out: Tensor) -> None:
+        """Put the grids that begin at `starts` of values (voxels,) into out, one step later."""
+        from torchfilm.kernels.transport import mix
+
+        source, target = as_array(values, values.dtype), out.numpy()
+        size = self.shape[0] * self.shape[1] * self.shape[2]
+        shares_of(
+            starts.size,
+            max(1, WORTH_A_THREAD // (size * self.stepper.weights.shape[0])),
+            lambda begin, end: mix(begin, end, starts, *self.arrays, source, target),
+        )
+        if self.stepper.far is None or self.stepper.split is None:
+            return
+        grids = [slice(s, s + size) for s in starts.tolist()]
+        u = torch.stack([values[grid] for grid in grids]).view(-1, *self.shape)
+        split = self.stepper.split.step(u).flatten(1)
+        for grid, far, found in zip(grids, self.stepper.far.expand(u.shape[0]), split, strict=True):
+            if far:
+                out[grid] = found
+
+
+def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
+    """The same step compiled, or None where kernels may not run it."""
+    mixing = stepper.mixing
+    given = [mixing.stay, *(x for _, up, down in mixing.gains for x in (up, down))]
+    given += [] if stepper.gained is None else [stepper.gained]
+    if not may_run(*given):
+        return None
+    count = max(stepper.weights.shape[1], *(x.shape[0] for x in given))
+    number = torch.arange(shape[0] * shape[1] * shape[2]).view(shape)
+    whole = lambda x: x.detach().expand(count, *shape).flatten(1).clone()
+    ups, downs, to, source, parts = [], [], [], [], []
+    for dim, up, down in mixing.gains:
+        for part, shift, face, kept in ((up, 1, 0, ups), (down, -1, -1, downs)):
+            at = number.select(dim - 1, face).reshape(-1)
+            made = whole(part)
+            to.append(at)
+            source.append(torch.roll(number, shift, dim - 1).select(dim - 1, face).reshape(-1))
+            parts.append(made[:, at])
+            made[:, at] = 0.0
+            kept.append(made)
+    nothing = torch.zeros(count, 0, number.numel(), dtype=torch.float64)
+    joined = lambda x: torch.stack(x, 1) if x else nothing
+    wraps = torch.cat(parts, 1) if parts else nothing[:, 0:0, 0]
+    there = (wraps > 0).any(0)  # elsewhere no face is periodic
+    places = [torch.cat(x)[there] if x else number[:0, 0, 0] for x in (to, source)]
+    terms = torch.as_tensor(stepper.terms).expand(count)
+    if stepper.far is not None:
+        terms = torch.where(stepper.far, 0, terms)
+    strides = [number.stride(dim - 1) for dim, _, _ in mixing.gains]
+    gained = (
+        nothing[:0].flatten(1) if stepper.gained is None else stepper.gained.detach().flatten(1)
+    )
+    weights = stepper.weights.t().expand(count, -1)
+    arrays = (
+        whole(mixing.stay), joined(ups), joined(downs), *places, wraps[:, there], weights, terms,
+        gained,
+    )  # fmt: skip
+    return CompiledSeries(
+        stepper,
+        shape,
+        (np.array(strides, np.int64), *(np.ascontiguousarray(x.numpy()) for x in arrays)),
+    )

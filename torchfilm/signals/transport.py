@@ -3,6 +3,8 @@
 | method           | order in Δt | positive, conserves at any Δt | works for                    |
 |------------------|-------------|-------------------------------|------------------------------|
 | "exponential"    | exact       | yes                           | no obstacle, uniform flow    |
+| "series"         | exact       | yes                           | everything, up to a number   |
+|                  |             |                               | of terms; then "implicit"    |
 | "implicit"       | 1           | yes                           | everything                   |
 | "crank_nicolson" | 2           | oscillates, goes below 0      | everything; the paper's, for |
 |                  |             |                               | comparison                   |
@@ -21,12 +23,18 @@ import torch
 from torch import Tensor
 
 from torchfilm.signals.compiled import may_run
-from torchfilm.signals.compiled_transport import CompiledExponential, compiled_exponential
+from torchfilm.signals.compiled_transport import (
+    CompiledExponential,
+    CompiledSeries,
+    compiled_exponential,
+    compiled_series,
+)
 from torchfilm.signals.grid import Grid, Shape
 from torchfilm.signals.transport_exponential import Exponential, prepare_exponential
 from torchfilm.signals.transport_implicit import prepare_implicit
 from torchfilm.signals.transport_iterative import prepare_crank_nicolson, prepare_euler
 from torchfilm.signals.transport_operator import Operator
+from torchfilm.signals.transport_series import Series, prepare_series
 from torchfilm.tools import checks
 
 
@@ -40,18 +48,19 @@ class Stepper(Protocol):
 
 METHODS: dict[str, Callable[[Operator, float], Stepper]] = {
     "exponential": prepare_exponential,
+    "series": prepare_series,
     "implicit": prepare_implicit,
     "crank_nicolson": prepare_crank_nicolson,
     "euler": prepare_euler,
 }
 
 # those that kernels compute, too
-COMPILED = {"exponential"}
+COMPILED = {"exponential", "series"}
 
 
 def choose(operator: Operator) -> str:
-    """The suitable method: "exponential" where it is possible, else "implicit"."""
-    return "exponential" if operator.separable else "implicit"
+    """The suitable method: "exponential" where it is possible, else "series"."""
+    return "exponential" if operator.separable else "series"
 
 
 def prepare(operator: Operator, dt: float, method: str | None = None) -> Stepper:
@@ -71,11 +80,13 @@ class Carrier:
     may_compile: bool = True
 
     @cached_property
-    def compiled(self) -> CompiledExponential | None:
+    def compiled(self) -> CompiledExponential | CompiledSeries | None:
         """The step by kernels, or None where there is none."""
-        if not (self.may_compile and isinstance(self.stepper, Exponential)):
-            return None
-        return compiled_exponential(self.stepper, self.shape)
+        if self.may_compile and isinstance(self.stepper, Exponential):
+            return compiled_exponential(self.stepper, self.shape)
+        if self.may_compile and isinstance(self.stepper, Series):
+            return compiled_series(self.stepper, self.shape)
+        return None
 
 
 def carry(grid: Grid, carriers: Sequence[Carrier], values: Tensor) -> Tensor:
@@ -86,5 +97,6 @@ def carry(grid: Grid, carriers: Sequence[Carrier], values: Tensor) -> Tensor:
         return grid.join([carrier.stepper.step(batch.of(values)) for carrier, batch in pairs])
     out = torch.empty_like(values)
     for kernel, batch in zip(kernels, grid.batches, strict=True):
+        assert kernel is not None
         kernel.step(values, batch.starts.numpy(), out)
     return out
