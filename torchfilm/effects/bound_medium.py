@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchfilm.effect import BEFORE_CELLS, GRID_COVERAGE, Binding, BoundEffect
 from torchfilm.effects.medium_transport import Transport
+from torchfilm.signals.exchange import spans
 from torchfilm.signals.space import MOST_VOXELS
 from torchfilm.state import GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
@@ -168,31 +169,23 @@ class GridCoverage(_MediumPart):
         layout = state.layout
         if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
-        away = layout.outside_medium(state.position, state.colony)
-        left = state.groups.sum(away.double()).long()
-        number = torch.arange(state.cells, 0, -1, device=state.device)
-        first = state.cells - state.groups.max(torch.where(away, number, 0))
+        left, first = layout.outside_medium(state.position, state.groups)
         place = torch.nn.functional.pad(layout.places(state.position), (0, 0, 0, 1))  # none: 0
         return MediumReport((left > 0).long(), left, place.index_select(0, first))
 
     @torch.no_grad()
     def _span(self, state: State) -> tuple[Tensor, Tensor]:
         """The lower and upper corner of the box that the cells need, (B, 3) µm each."""
-        assert state.layout is not None
-        places, groups, step = (
-            state.layout.places(state.position),
-            state.groups,
-            state.layout.grid.step,
-        )
-        high = torch.stack([groups.max(x, empty=-torch.inf) for x in places.unbind(1)], 1)
-        low = -torch.stack([groups.max(-x, empty=-torch.inf) for x in places.unbind(1)], 1)
+        layout = state.layout
+        assert layout is not None
+        low, high = spans(layout.places(state.position), state.groups)
         corner, end, size = self.effect.corners
         # a box of one layer stays one layer
         flat = torch.tensor(
             [round((b - a) / h) == 1 for a, b, h in zip(corner, end, size, strict=True)],
             device=state.device,
         )
-        margin = torch.where(flat, 0.0, MARGIN * step)
+        margin = torch.where(flat, 0.0, MARGIN * layout.grid.step)
         fixed = torch.tensor(
             [letter not in self.effect.grows for letter in "xyz"], device=state.device
         )
@@ -204,6 +197,8 @@ class GridCoverage(_MediumPart):
         layout = state.layout
         assert layout is not None
         low, high = self._span(state)
+        if bool(((low >= layout.grid.origin) & (high <= layout.grid.high)).all()):
+            return state
         # a colony that needs more voxels than allowed, or whose positions are not finite, keeps its
         # grid; its cells are then outside the grid, which is reported
         size = (
