@@ -97,11 +97,13 @@ def test_tolerances_of_the_circuits_are_kept(found):
 
 @pytest.mark.slow
 def test_transport_in_time(found):
-    """The exponential is exact against a matrix that knows nothing of it, flow and open faces
-    included; implicit of order 1, which Strang halves."""
+    """The exponential and the series are exact against a matrix that knows nothing of them, flow
+    and open faces included; implicit of order 1, which Strang halves."""
     flow, obstacle = found["signals_flow"], found["signals_obstacle"]
     assert max(errors(flow, "Δt, exponential", "relative error")) < 1e-12
-    assert max(errors(flow, "Δt, default method, float32", "relative error")) < 1e-5
+    assert max(errors(obstacle, "Δt, series", "relative error")) < 1e-12
+    for study in (flow, obstacle):
+        assert max(errors(study, "Δt, default method, float32", "relative error")) < 1e-5
     for study in (flow, obstacle):
         turns, once = (
             errors(study, f"Δt, implicit{more}", "relative error") for more in ("", ", lie")

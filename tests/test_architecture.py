@@ -68,6 +68,8 @@ ROOMS = {
 ONE_EFFECT = {
     frozenset({"torchfilm.effects.circuit", "torchfilm.effects.bound_circuit"}),
     frozenset({"torchfilm.effects.medium", "torchfilm.effects.bound_medium"}),
+    frozenset({"torchfilm.effects.medium", "torchfilm.effects.medium_transport"}),
+    frozenset({"torchfilm.effects.bound_medium", "torchfilm.effects.medium_transport"}),
     frozenset({"torchfilm.effects.rules", "torchfilm.effects.bound_rules"}),
     frozenset({"torchfilm.effects.mechanics", "torchfilm.effects.bound_mechanics"}),
     frozenset({"torchfilm.effects.bound_mechanics", "torchfilm.effects.mechanics_report"}),

@@ -12,7 +12,7 @@ import torch
 
 import torchfilm as tf
 from torchfilm.cost_estimate import COLUMNS, ROWS, Block, CostProbe, Spending, crowd, state_bytes
-from torchfilm.effects import KNOWN, bound_mechanics, bound_medium
+from torchfilm.effects import KNOWN, bound_mechanics, medium_transport
 from torchfilm.effects.bound_medium import FirstHalf, GridCoverage
 from torchfilm.effects.mechanics import TOLERANCE
 from torchfilm.explanation import left_out, replayed
@@ -69,8 +69,10 @@ def graded(places):
     ],
 )
 def test_the_way_of_transport_reported_is_the_one_that_is_chosen(made, words, monkeypatch):
-    chosen, choose = [], bound_medium.choose
-    monkeypatch.setattr(bound_medium, "choose", lambda op: chosen.append(choose(op)) or chosen[-1])
+    chosen, choose = [], medium_transport.choose
+    monkeypatch.setattr(
+        medium_transport, "choose", lambda op: chosen.append(choose(op)) or chosen[-1]
+    )
     scene = tf.Scene(*BODY, made)
     model = scene.bind(2)
     model.step(model.start())

@@ -8,7 +8,7 @@ K = 1 µm²/h, h = 1 µm, no flux through the faces. A step is r = K Δt/h² = 1
 exact lattice solution is the maximum after 4 steps (τ = 1), over the exact value at the centre,
 0.0293630. `implicit, mask` blocks one voxel in ten and has no exact solution. Times are those of
 one step of one signal in one colony: minimum and median of many. The script appends each run to a
-JSON file with its machine, versions and commit.
+JSON file with its machine, versions and commit. `--part kernels` compares torch with kernels.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from record import machine
 from scipy.special import ive
 
 import torchfilm as tf
-from torchfilm.signals.transport import METHODS, prepare
+from torchfilm.signals.grid import Grid
+from torchfilm.signals.transport import COMPILED, METHODS, Carrier, carry, prepare
 from torchfilm.signals.transport_iterative import convolve
 from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.signals.transport_rates import build_operator
@@ -34,6 +35,8 @@ from torchfilm.signals.transport_rates import build_operator
 SIZES = (32, 64, 128)
 CASES = (*METHODS, "implicit, mask", "apply", "conv3d")
 R, STEPS = 0.25, 4
+# of `kernels`: shape of the grids, and colonies; the last are those of a search for a stripe
+GRIDS = (((64, 64, 64), 1), ((64, 64, 1), 64), ((64, 4, 12), 256))
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -161,7 +164,42 @@ def band(options: argparse.Namespace) -> list[dict]:
     ]
 
 
-PARTS = {"transport": transport, "band": band}
+def kernels(options: argparse.Namespace) -> list[dict]:
+    """Runs a step of transport by torch and by compiled kernels, in turn."""
+    dtype, records = DTYPES[options.dtype], []
+    for shape, colonies in GRIDS:
+        made = build_operator(shape, (1.0, 1.0, 1.0), diffusion=1.0, colonies=colonies, dtype=dtype)
+        grid = Grid(
+            torch.zeros(colonies, 3, dtype=torch.float64),
+            torch.tensor([shape] * colonies),
+            (1.0, 1.0, 1.0),
+        )
+        u = torch.rand(grid.nodes, generator=torch.Generator().manual_seed(2)).to(dtype)
+        for method in sorted(COMPILED):
+            stepper, record = prepare(made, R, method), {}
+            for who in ("torch", "compiled"):
+                carriers = [Carrier(stepper, shape, who == "compiled")]
+                step = lambda carriers=carriers: carry(grid, carriers, u)  # noqa: B023
+                record[who] = round(timed(step, "cpu", options.seconds)[0], 4)
+            records.append(
+                {
+                    "case": "kernels",
+                    "grids": f"{'x'.join(map(str, shape))}, {colonies}",
+                    "method": method,
+                    "dtype": options.dtype,
+                    "r": R,
+                    **{f"{who}_least_ms": ms for who, ms in record.items()},
+                }
+            )
+            print(
+                f"{records[-1]['grids']:>16} {method:<12} torch {record['torch']:8.3f} ms,"
+                f" kernels {record['compiled']:8.3f} ms",
+                flush=True,
+            )
+    return records
+
+
+PARTS = {"transport": transport, "kernels": kernels, "band": band}
 
 
 def main() -> None:

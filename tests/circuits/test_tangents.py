@@ -173,3 +173,27 @@ def test_what_counts_as_tracked():
     assert tracked(torch.ones(2, requires_grad=True))
     with torch.no_grad():
         assert not tracked(torch.ones(2, requires_grad=True))
+
+
+@pytest.mark.parametrize("method", ["exponential", "series", "implicit", "crank_nicolson", "euler"])
+def test_transport_carries_tangents(method):
+    """Of a decay, which every voxel feels, against differences."""
+
+    def end(decay):
+        still = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
+        initial = lambda places: torch.exp(-(places[:, 0] ** 2) / 10.0)
+        signal = tf.Signal(diffusion=10.0, decay=decay, initial=initial)
+        box = ((-10.0, -6.0), (10.0, 6.0))
+        medium = tf.Medium(a=signal, box=box, spacing=2.0, method=method)
+        model = tf.Scene(medium, founders=still, dt=0.05).bind(2, dtype=F64, per_colony=True)
+        state = model.start()
+        for _ in range(3):
+            state = model.step(state, 0.05)
+        return state.fields["out.a"]
+
+    with torch.no_grad(), forward_mode():
+        slope = tangent(end(moved(2.0, 1.0, 0.0)))
+    more, less = (end(torch.tensor([2.0 + h, 2.0], dtype=F64)) for h in (1e-5, -1e-5))
+    difference = (more - less) / 2e-5
+    assert float(difference.abs().max()) > 0.01
+    assert torch.allclose(slope, difference, rtol=1e-5, atol=1e-8)

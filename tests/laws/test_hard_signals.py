@@ -18,7 +18,7 @@ from torchfilm.signals.grid import Grid
 from torchfilm.signals.transport import METHODS, prepare
 from torchfilm.signals.transport_rates import build_operator
 
-CHOSEN = pytest.mark.parametrize("method", ["exponential", "implicit"])
+CHOSEN = pytest.mark.parametrize("method", ["exponential", "series", "implicit"])
 
 
 def cube(n: int, r: float, dtype, device, **options):
@@ -295,6 +295,7 @@ def test_case_40_flat_grids(device, dtype, measured, method, shape):
     steps = int(stepper.substeps) if method == "euler" else 1
     left = {
         "exponential": math.exp(x),
+        "series": math.exp(x),
         "implicit": 1 / (1 - x),
         "crank_nicolson": (1 + x / 2) / (1 - x / 2),
         "euler": (1 + x / steps) ** steps,

@@ -8,9 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchfilm.signals import exchange
 from torchfilm.signals.exchange import Stencil, pool_volume, read, stencil, write
 from torchfilm.signals.grid import Grid
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.ragged import Groups
 
 SPACING = (2.0, 1.0, 0.5)
 SHAPES = {"3-D": (5, 4, 6), "2-D": (5, 4, 1), "1-D": (7, 1, 1), "0-D": (1, 1, 1)}
@@ -320,3 +322,28 @@ def test_no_cells_at_all(device, dtype):
         and pool_volume(found).shape == (0,)
     )
     assert torch.equal(write(values, values[:0], found), values)
+
+
+@pytest.mark.parametrize("periodic", [(False, False, False), (True, False, False)])
+def test_kernels_see_the_cells_that_torch_sees(periodic, monkeypatch):
+    """The corners that cells need, and those outside: cells at faces, a colony without cells, and
+    coordinates that are no numbers."""
+    generator = torch.Generator().manual_seed(4)
+    position = torch.empty(60, 3, dtype=torch.float64).uniform_(-1, 9, generator=generator)
+    position[3], position[20, 1], position[40, 2] = 0.0, torch.nan, torch.inf
+    owner = torch.arange(6).repeat_interleave(10)
+    owner[owner >= 2] += 1  # colony 2 has no cells
+    grid = Grid(
+        torch.zeros(7, 3, dtype=torch.float64), torch.full((7, 3), 4), spacing=(2.0, 2.0, 2.0)
+    )
+    groups = Groups(owner, 7, ordered=True)
+    found = lambda: (*exchange.spans(position, groups), *exchange.beyond(
+        grid, position, groups, periodic
+    ))  # fmt: skip
+    by_kernels = found()
+    monkeypatch.setattr("torchfilm.signals.compiled.may_run", lambda *given: False)
+    by_torch = found()
+    assert 0 < int(by_torch[2].max()) < 10 and int(by_torch[3][2]) == 60
+    assert bool(by_torch[0].isnan().any())
+    for one, other in zip(by_torch, by_kernels, strict=True):
+        assert torch.equal(one.nan_to_num(nan=-7.0), other.nan_to_num(nan=-7.0))

@@ -33,25 +33,25 @@ def test_what_is_made_ready_belongs_to_one_grid():
     assert "mask" not in vars(other) and layout.mask is mask is not other.mask
 
 
-def test_steppers_belong_to_one_grid_and_go_with_it():
+def test_steps_belong_to_one_grid_and_go_with_it():
     """A model makes the step of a signal once for each grid; one that is no longer used takes its
-    steppers along."""
+    steps along."""
     medium = tf.Medium(a=tf.Signal(diffusion=5.0), box=((-8.0, -8.0), (8.0, 8.0)), spacing=4.0)
     model = tf.Scene(medium, dim=2).bind()
-    steppers = next(e for e in model.effects if e.title == "transport").transport.steppers
+    carriers = next(e for e in model.effects if e.title == "transport").transport.carriers
     first = model.step(model.start(), 0.1)
     gc.collect()
-    made = [list(of_grid.values()) for of_grid in steppers.values()]
+    made = [list(of_grid.values()) for of_grid in carriers.values()]
     assert len(made) == 1 and len(made[0]) == 1
     model.step(first, 0.1)
-    assert list(steppers[first.layout.grid].values()) == made[0]
+    assert list(carriers[first.layout.grid].values()) == made[0]
     second = model.step(model.start(), 0.1)
     gc.collect()
-    assert set(steppers) == {first.layout.grid, second.layout.grid}
-    assert next(iter(steppers[second.layout.grid].values())) is not made[0][0]
+    assert set(carriers) == {first.layout.grid, second.layout.grid}
+    assert next(iter(carriers[second.layout.grid].values())) is not made[0][0]
     del second
     gc.collect()
-    assert set(steppers) == {first.layout.grid}
+    assert set(carriers) == {first.layout.grid}
 
 
 def test_a_layout_of_other_colonies_finds_their_voxels(device):

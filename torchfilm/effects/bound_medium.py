@@ -1,31 +1,23 @@
-"""A medium bound to a batch: its grids, its transport steppers (built once), and its parts of a
-step, up to three."""
+"""A medium bound to a batch: its parts of a step, up to three."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchfilm.effect import BEFORE_CELLS, GRID_COVERAGE, Binding, BoundEffect
-from torchfilm.resolver import snapshot
-from torchfilm.signals.boundary_conditions import BoundaryConditions
-from torchfilm.signals.grid import Grid, GridBatch
-from torchfilm.signals.layout import Layout
+from torchfilm.effects.medium_transport import Transport
+from torchfilm.signals.exchange import spans
 from torchfilm.signals.space import MOST_VOXELS
-from torchfilm.signals.transport import Stepper, choose, prepare
-from torchfilm.signals.transport_rates import build_operator
 from torchfilm.state import GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.tangents import tracked
 
 if TYPE_CHECKING:
-    from torchfilm.effects.medium import Flow, Medium, OnGrid, Signal
+    from torchfilm.effects.medium import Medium
 
 # A growing grid grows by BLOCK voxels at a time, and keeps MARGIN voxels between the cells and its
 # faces.
@@ -52,172 +44,6 @@ class MediumReport:
             f"{int(self.left[place])} cell(s) are beyond the box of the medium or inside an"
             f" obstacle, one at ({where}) µm"
         )
-
-
-class Transport:
-    """What the parts of a medium share: the signals, with their values on the batch's device, and
-    the steppers of the grids in use."""
-
-    def __init__(self, medium: Medium, binding: Binding):
-        self.medium, batch = medium, binding.batch
-        self.signals: dict[str, Signal] = snapshot(medium.signals, "Medium.signals", batch)
-        self.flows: dict[str, Flow] = {
-            n: snapshot(medium.flow_of(n), f"flow of the signal {n!r}", batch)
-            for n in medium.signals
-        }
-        self.boundary: dict[str, BoundaryConditions] = {
-            n: snapshot(medium.boundary_of(n), f"boundary of the signal {n!r}", batch)
-            for n in medium.signals
-        }
-        # what of a layout the scene decides, whatever grid a state has
-        self.space: dict[str, Any] = {
-            "periodic": self.boundary[next(iter(self.signals))].periodic,
-            "height": medium.height,
-            "obstacle": medium.obstacles,
-            "reservoir": (
-                {name: s.reservoir for name, s in self.signals.items()}
-                if medium.outside == "reservoir"
-                else None
-            ),
-        }
-        # weak keys: a grid no longer in use releases its steppers
-        self.steppers: WeakKeyDictionary[Grid, dict[Any, Stepper]] = WeakKeyDictionary()
-
-    def lay(self, state: State) -> State:
-        """The state with one grid per colony, as `box` and `spacing` give it."""
-        low, high, step = self.medium.corners
-        count = [round((b - a) / h) for a, b, h in zip(low, high, step, strict=True)]
-        places = (state.colonies, 3)
-        grid = Grid(
-            torch.tensor(low, dtype=torch.float64, device=state.device).expand(places).clone(),
-            torch.tensor(count, device=state.device).expand(places).clone(),
-            step,
-        )
-        return state.replace(layout=Layout(grid, **self.space))
-
-    def opened(self, state: State) -> State:
-        """The state in the space of this medium, also where another model laid its grid."""
-        layout = state.layout
-        # the same layout where nothing differs: it keeps what it has found out about its grid
-        if layout is None or all(getattr(layout, n) is v for n, v in self.space.items()):
-            return state
-        return state.replace(layout=dataclasses.replace(layout, **self.space))
-
-    def first(self, name: str) -> Callable[[State, Tensor], Tensor]:
-        """The first values of a signal, as a field's `initial`."""
-        return lambda state, rows: self.values(name, "initial", state).index_select(0, rows)
-
-    def values(self, name: str, what: str, state: State) -> Tensor:
-        """The initial, source or decay of a signal on every voxel, (nodes,); 0 in obstacles."""
-        given: OnGrid = getattr(self.signals[name], what)
-        layout = state.layout
-        assert layout is not None
-        if callable(given):
-            found = given(layout.grid.centres())
-            label = f"{what}(places) of the signal {name!r}"
-            if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
-                shown = tuple(found.shape) if isinstance(found, Tensor) else found
-                raise checks.input_error(
-                    label,
-                    shown,
-                    f"a tensor of shape ({layout.grid.nodes},), one number for each place",
-                )
-            bad = torch.nonzero(~((found >= 0) & (found < torch.inf))).squeeze(1)
-            if bad.numel():
-                where = [round(x, 3) for x in layout.grid.centres()[bad[0]].tolist()]
-                raise checks.input_error(
-                    label,
-                    float(found[bad[0]]),
-                    "finite and at least 0 everywhere",
-                    f"It is not at {where} µm and {bad.numel() - 1} more places.",
-                )
-            value = found.to(dtype=state.dtype, device=state.device)
-        else:
-            value = (
-                _of_colonies(given, state).expand(state.colonies).index_select(0, layout.grid.owner)
-            )
-        return value if layout.mask is None else value * layout.mask
-
-    def carried(self, state: State, dt: float) -> State:
-        """The state after transport of the signals for dt hours; cells do not change."""
-        assert state.layout is not None
-        grid = state.layout.grid
-        changed = {}
-        for name in self.signals:
-            values = state.fields[OUTSIDE + name]
-            parts = [batch.of(values) for batch in grid.batches]
-            for k, batch in enumerate(grid.batches):
-                stepper = self.stepper(name, state, batch, dt / self.medium.steps)
-                for _ in range(self.medium.steps):
-                    parts[k] = stepper.step(parts[k])
-            changed[OUTSIDE + name] = grid.join(parts)
-        return state.with_fields(**changed)
-
-    def stepper(self, name: str, state: State, batch: GridBatch, dt: float) -> Stepper:
-        """The stepper of a signal on grids of one shape; it is reused while the grids stay."""
-        assert state.layout is not None
-        numbers = [x for x in self._numbers(name) if isinstance(x, Tensor)]
-        numbers += _closure_tensors(self.signals[name], self.flows[name])
-        if tracked(*numbers):
-            return self._prepare(name, state, batch, dt)[0]
-        known = self.steppers.setdefault(state.layout.grid, {})
-        key = (name, batch.shape, dt, state.dtype, torch.is_grad_enabled())
-        found = known.get(key)
-        if found is None:
-            found, own = self._prepare(name, state, batch, dt)
-            # a function may use a tensor that requires a gradient; such a stepper serves one
-            # backward pass only, so it is not kept
-            if not own:
-                known[key] = found
-        return found
-
-    def _numbers(self, name: str) -> list[Any]:
-        """The values that a signal's transport depends on; some are tensors."""
-        signal, flow = self.signals[name], self.flows[name]
-        faces = [face.outside_value() for pair in self.boundary[name].pairs for face in pair]
-        moving = [] if callable(flow) else list(flow or ())
-        return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
-
-    def _prepare(
-        self, name: str, state: State, batch: GridBatch, dt: float
-    ) -> tuple[Stepper, bool]:
-        """The stepper, and whether derivatives by its coefficients are wanted."""
-        signal, layout = self.signals[name], state.layout
-        assert layout is not None
-        ids = state.colony_id.index_select(0, batch.places)
-        own = lambda x: (
-            x.to(state.device).index_select(0, ids) if isinstance(x, Tensor) and x.dim() == 1 else x
-        )
-        spread = lambda x: (
-            batch.of(self.values(name, x, state))
-            if callable(getattr(signal, x))
-            else own(getattr(signal, x))
-        )
-        made = build_operator(
-            batch.shape,
-            layout.grid.spacing,
-            diffusion=own(signal.diffusion),
-            decay=spread("decay"),
-            velocity=_velocity(self.flows[name], layout, batch, own),
-            boundary=self.boundary[name].take(ids),
-            mask=None if layout.mask is None else batch.of(layout.mask),
-            source=(
-                None
-                if not callable(signal.source)
-                and not isinstance(signal.source, Tensor)
-                and signal.source == 0
-                else spread("source")
-            ),
-            colonies=batch.places.numel(),
-            dtype=state.dtype,
-            device=state.device,
-        )
-        coefficients = (
-            made.decay,
-            made.source,
-            *(x for axis in made.axes for x in (axis.up, axis.down, axis.low, axis.high)),
-        )
-        return prepare(made, dt, self.medium.method or choose(made)), tracked(*coefficients)
 
 
 class _MediumPart(BoundEffect):
@@ -281,7 +107,7 @@ class BoundMedium(_MediumPart):
             )
         assert state.layout is not None
         for name in medium.signals:
-            self.transport.stepper(name, state, state.layout.grid.batches[0], 1.0)
+            self.transport.carrier(name, state, state.layout.grid.batches[0], 1.0)
 
     def step(self, state: State, dt: float) -> State:
         return self.transport.carried(state, dt / 2 if self.effect.halves else dt)
@@ -343,31 +169,23 @@ class GridCoverage(_MediumPart):
         layout = state.layout
         if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
-        away = layout.outside_medium(state.position, state.colony)
-        left = state.groups.sum(away.double()).long()
-        number = torch.arange(state.cells, 0, -1, device=state.device)
-        first = state.cells - state.groups.max(torch.where(away, number, 0))
+        left, first = layout.outside_medium(state.position, state.groups)
         place = torch.nn.functional.pad(layout.places(state.position), (0, 0, 0, 1))  # none: 0
         return MediumReport((left > 0).long(), left, place.index_select(0, first))
 
     @torch.no_grad()
     def _span(self, state: State) -> tuple[Tensor, Tensor]:
         """The lower and upper corner of the box that the cells need, (B, 3) µm each."""
-        assert state.layout is not None
-        places, groups, step = (
-            state.layout.places(state.position),
-            state.groups,
-            state.layout.grid.step,
-        )
-        high = torch.stack([groups.max(x, empty=-torch.inf) for x in places.unbind(1)], 1)
-        low = -torch.stack([groups.max(-x, empty=-torch.inf) for x in places.unbind(1)], 1)
+        layout = state.layout
+        assert layout is not None
+        low, high = spans(layout.places(state.position), state.groups)
         corner, end, size = self.effect.corners
         # a box of one layer stays one layer
         flat = torch.tensor(
             [round((b - a) / h) == 1 for a, b, h in zip(corner, end, size, strict=True)],
             device=state.device,
         )
-        margin = torch.where(flat, 0.0, MARGIN * step)
+        margin = torch.where(flat, 0.0, MARGIN * layout.grid.step)
         fixed = torch.tensor(
             [letter not in self.effect.grows for letter in "xyz"], device=state.device
         )
@@ -379,6 +197,8 @@ class GridCoverage(_MediumPart):
         layout = state.layout
         assert layout is not None
         low, high = self._span(state)
+        if bool(((low >= layout.grid.origin) & (high <= layout.grid.high)).all()):
+            return state
         # a colony that needs more voxels than allowed, or whose positions are not finite, keeps its
         # grid; its cells are then outside the grid, which is reported
         size = (
@@ -403,37 +223,3 @@ class GridCoverage(_MediumPart):
                 for n, v, start in zip(names, values, first, strict=True)
             }
         )
-
-
-def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any], Any]) -> Any:
-    """The velocity for the operator: None, uniform (b, 3), or on the faces of the voxels, three
-    tensors."""
-    if flow is None:
-        return None
-    if not callable(flow):
-        parts = [
-            torch.as_tensor(own(v), dtype=torch.float64, device=layout.grid.origin.device)
-            .reshape(-1)
-            .expand(batch.places.numel())
-            for v in (*flow, 0.0)[:3]
-        ]
-        return torch.stack(parts, 1)
-    return layout.on_faces(flow, batch)
-
-
-def _closure_tensors(signal: Signal, flow: Flow) -> list[Tensor]:
-    """Tensors in the closures of functions of places."""
-    functions = [f for f in (signal.decay, signal.source, flow) if callable(f)]
-    cells = [
-        cell.cell_contents for f in functions for cell in getattr(f, "__closure__", None) or ()
-    ]
-    return [x for x in cells if isinstance(x, Tensor)]
-
-
-def _of_colonies(given: float | Tensor, state: State) -> Tensor:
-    """A value as a (B,) or 0-dim tensor of the state's dtype; one value per colony is taken by
-    colony id."""
-    if not isinstance(given, Tensor):
-        return torch.tensor(given, dtype=state.dtype, device=state.device)
-    value = given.to(dtype=state.dtype, device=state.device)
-    return value if value.dim() == 0 else value.index_select(0, state.colony_id)

@@ -14,9 +14,11 @@ from torchfilm.effect import TRANSPORT, Binding, BoundEffect, Effect, number_ran
 from torchfilm.effects.bound_medium import BLOCK, BoundMedium, FirstHalf, GridCoverage, Transport
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
 from torchfilm.signals.space import checked_box, checked_flow
-from torchfilm.signals.transport import METHODS
+from torchfilm.signals.transport import COMPILED, METHODS
+from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.numba_calls import unavailable
 from torchfilm.values import PerColony, Rule, checked
 
 # A value on the grid: a number, one per colony, or a function from places (M, 3) µm to (M,).
@@ -26,6 +28,8 @@ OnGrid = float | Tensor | Callable[[Tensor], Tensor]
 Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
 SPLITTINGS = ("lie", "strang")
+BACKENDS = ("compiled", "torch")
+EXACT = ("exponential", "series")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +82,13 @@ class Medium(Effect):
     take.
 
     method: "exponential" (exact if there are no obstacles and flow and decay are uniform),
-    "implicit" (positive at any step), "crank_nicolson" (the paper's) or "euler". Default:
-    "exponential" if exact, else "implicit". steps: transport steps within one step of the scene,
-    for accuracy. splitting: "strang", half of transport before exchange with the cells and half
-    after, or "lie", exchange and then transport. Strang makes the error of the signal many times
-    smaller, for one more transport per step.
+    "series" (exact), "implicit" (one solve an axis), "crank_nicolson" (the paper's) or "euler".
+    Default: "exponential" where possible, else "series". steps: transport steps within one step of
+    the scene, for accuracy. splitting: "strang", half of transport before exchange with the cells
+    and half after, or "lie", exchange and then transport. Strang makes the error of the signal many
+    times smaller, for one more transport per step. backend: "compiled" kernels or "torch" for
+    transport. Default: compiled where the device is the CPU and Numba is there; gradients always by
+    torch.
     """
 
     signals: Mapping[str, Signal]
@@ -98,6 +104,7 @@ class Medium(Effect):
     method: str | None = None
     steps: int = 1
     splitting: str = "strang"
+    backend: str | None = None
 
     stage = TRANSPORT
     title = "transport"
@@ -119,11 +126,14 @@ class Medium(Effect):
         method: str | None = None,
         steps: int = 1,
         splitting: str = "strang",
+        backend: str | None = None,
         **signals: Signal,
     ):
         _check_signals(signals)
         low, high, voxel = checked_box(box, spacing, depth, height)
         _check_medium(boundary, outside, grows, method, steps, splitting, obstacles)
+        if backend is not None:
+            checks.choice("Medium.backend", backend, BACKENDS)
         given = {
             "signals": dict(signals),
             "box": (low, high),
@@ -138,6 +148,7 @@ class Medium(Effect):
             "method": method,
             "steps": steps,
             "splitting": splitting,
+            "backend": backend,
         }
         for name, value in given.items():
             object.__setattr__(self, name, value)
@@ -214,6 +225,23 @@ class Medium(Effect):
         before = [FirstHalf(self, binding, transport)] if self.halves else []
         return (*before, GridCoverage(self, binding, transport), main)
 
+    def backend_on(self, device: torch.device) -> str:
+        """Who computes transport on a device: "compiled" or "torch"."""
+        why = self._why_torch(device)
+        if self.backend == "compiled" and why:
+            raise checks.InputError(f"Medium.backend = 'compiled', but {why}: leave backend out.")
+        return "torch" if why else "compiled"
+
+    def _why_torch(self, device: torch.device) -> str:
+        """Why torch computes transport on a device, or "" where kernels may."""
+        if self.backend == "torch":
+            return "backend='torch'"
+        return (
+            f"the device is {device.type}, and kernels are for the CPU"
+            if device.type != "cpu"
+            else unavailable()
+        )
+
     def numerics(self, dt: float, state: State) -> list[str]:
         assert state.layout is not None
         shape, spacing = state.layout.grid.shape[0].tolist(), state.layout.grid.spacing
@@ -229,9 +257,13 @@ class Medium(Effect):
         for name, signal in self.signals.items():
             method, why = self.method_of(name)
             order = f"order {2 if method == 'crank_nicolson' else 1} in steps of {part:g} h"
-            order = "exact over a step" if method == "exponential" else order
+            order = "exact over a step" if method in EXACT else order
+            if method == "series":
+                order += f" (but one solve an axis where it exchanges over {MOST:g} times a step)"
             ratio = number_range(torch.as_tensor(signal.diffusion) * (dt / finest**2))
-            lines.append(f"{name}: {method}, {order} ({why}); dt·K/h² = {ratio}")
+            who = self.backend_on(state.device) if method in COMPILED else "torch"
+            who = "compiled; by torch where gradients are required" if who == "compiled" else who
+            lines.append(f"{name}: {method}, {order} ({why}), {who}; dt·K/h² = {ratio}")
         return lines
 
     def method_of(self, name: str) -> tuple[str, str]:
@@ -246,7 +278,7 @@ class Medium(Effect):
         }
         against = [words for words, there in found.items() if there]
         if against:
-            return "implicit", "because of " + " and ".join(against)
+            return "series", "because of " + " and ".join(against)
         return "exponential", "no obstacle, and flow and decay the same everywhere"
 
     @property

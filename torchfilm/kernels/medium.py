@@ -122,3 +122,34 @@ def write(values, amount, there, node, weight, volume, near_one, taken, given, o
         if share > 1 and share < near_one:
             share = one
         out[k] = values[k] - values[k] * share + given[k]
+
+
+@kernel
+def spans(position, colony, low, high):
+    """Put the least and the greatest coordinates of each colony's cells into low and high (B, 3),
+    which hold inf and −inf; NaN where a coordinate is NaN."""
+    for i in range(position.shape[0]):
+        b = colony[i]
+        for k in range(3):
+            x = position[i, k]
+            if x < low[b, k] or x != x:
+                low[b, k] = x
+            if x > high[b, k] or x != x:
+                high[b, k] = x
+
+
+@kernel
+def beyond(position, colony, origin, step, shape, periodic, slack, left, first):
+    """Cells outside the box: their number and the first of them, into left and first (B,)."""
+    for i in range(position.shape[0]):
+        b, outside = colony[i], False
+        for k in range(3):
+            at = (position[i, k] - origin[b, k]) / step[k]
+            if periodic[k]:
+                outside |= not abs(at) < np.inf
+            else:
+                outside |= not (at >= -slack and at <= shape[b, k] + slack)
+        if outside:
+            if left[b] == 0:
+                first[b] = i
+            left[b] += 1

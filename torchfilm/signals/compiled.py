@@ -8,6 +8,7 @@ from torch import Tensor
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.stencil import SLACK, Stencil
 from torchfilm.tools.numba_calls import as_array, unavailable
+from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import tracked
 
 
@@ -85,3 +86,32 @@ def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps:
         out.numpy(),
     )  # fmt: skip
     return out
+
+
+def spans(position: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:
+    """As `exchange.spans`."""
+    from torchfilm.kernels.medium import spans as put
+
+    low = torch.full((groups.size, 3), torch.inf, dtype=torch.float64)
+    high = -low
+    put(
+        as_array(position, torch.float64), as_array(groups.owner, torch.int64), low.numpy(),
+        high.numpy(),
+    )  # fmt: skip
+    return low, high
+
+
+def beyond(
+    grid: Grid, position: Tensor, groups: Groups, periodic: tuple[bool, bool, bool]
+) -> tuple[Tensor, Tensor]:
+    """As `exchange.beyond`."""
+    from torchfilm.kernels.medium import beyond as put
+
+    left = torch.zeros(groups.size, dtype=torch.int64)
+    first = torch.full_like(left, position.shape[0])
+    put(
+        as_array(position, torch.float64), as_array(groups.owner, torch.int64), grid.origin.numpy(),
+        grid.step.numpy(), grid.shape.numpy(), torch.tensor(periodic).numpy(), SLACK, left.numpy(),
+        first.numpy(),
+    )  # fmt: skip
+    return left, first

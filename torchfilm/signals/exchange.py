@@ -21,6 +21,7 @@ from torchfilm.signals import compiled
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.stencil import SLACK, Stencil
 from torchfilm.tools import checks
+from torchfilm.tools.ragged import Groups
 
 # Where several cells empty a voxel together, their parts add up to 1 except for rounding. A sum
 # within this many units in the last place counts as 1.
@@ -39,6 +40,33 @@ def outside_box(
         grid.shape.index_select(0, colony),
         periodic,
     )
+
+
+def spans(position: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:
+    """The least and the greatest coordinates of the cells of each colony, (B, 3) each, from
+    position (N, 3); inf and −inf in a colony without cells, NaN where one is NaN."""
+    if compiled.may_run(position):
+        return compiled.spans(position, groups)
+    high = torch.stack([groups.max(x, empty=-torch.inf) for x in position.unbind(1)], 1)
+    low = -torch.stack([groups.max(-x, empty=-torch.inf) for x in position.unbind(1)], 1)
+    return low, high
+
+
+def beyond(
+    grid: Grid, position: Tensor, groups: Groups, periodic: tuple[bool, bool, bool]
+) -> tuple[Tensor, Tensor]:
+    """How many cells of each colony are beyond the box of its grid, (B,), and the first of them;
+    N where there is none."""
+    if compiled.may_run(position):
+        return compiled.beyond(grid, position, groups, periodic)
+    return counted(outside_box(grid, position, groups.owner, periodic), groups)
+
+
+def counted(away: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:
+    """How many rows of each group are `away`, (N,) bool, and the first of them; N without one."""
+    number = torch.arange(away.numel(), 0, -1, device=away.device)
+    first = away.numel() - groups.max(torch.where(away, number, 0))
+    return groups.sum(away.double()).long(), first
 
 
 def _outside_scaled(scaled: Tensor, shape: Tensor, periodic: tuple[bool, bool, bool]) -> Tensor:

@@ -25,11 +25,12 @@ Shape = tuple[int, int, int]
 class GridBatch:
     """Colonies with grids of one shape.
 
-    places: (b,) int64, their indices in the batch. index: the positions of their values in a flat
-    signal.
+    places: (b,) int64, their indices in the batch. starts: (b,) int64, their first voxels. index:
+    the positions of their values in a flat signal.
     """
 
     places: Tensor
+    starts: Tensor
     shape: Shape
     index: Tensor | slice
 
@@ -150,10 +151,9 @@ class Grid:
         for place, shape in enumerate(self.shapes):
             found.setdefault(shape, []).append(place)
         if len(found) == 1:
-            shape = self.shapes[0]
-            return (
-                GridBatch(torch.arange(self.colonies, device=device), shape, slice(0, self.nodes)),
-            )
+            everyone = torch.arange(self.colonies, device=device)
+            whole = slice(0, self.nodes)
+            return (GridBatch(everyone, self.offsets[:-1], self.shapes[0], whole),)
         out = []
         for shape, places in found.items():
             here, size = torch.tensor(places, device=device), shape[0] * shape[1] * shape[2]
@@ -163,7 +163,7 @@ class Grid:
                 index: Tensor | slice = slice(begin, begin + size * len(places))
             else:
                 index = (first.unsqueeze(1) + torch.arange(size, device=device)).reshape(-1)
-            out.append(GridBatch(here, shape, index))
+            out.append(GridBatch(here, first, shape, index))
         return tuple(out)
 
     def join(self, parts: Sequence[Tensor]) -> Tensor:

@@ -12,10 +12,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchfilm.signals.exchange import Stencil, outside_box, pool_volume, read, stencil
+from torchfilm.signals.exchange import Stencil, beyond, counted, pool_volume, read, stencil
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.tools import checks
-from torchfilm.tools.ragged import expand_ranges
+from torchfilm.tools.ragged import Groups, expand_ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,16 +99,17 @@ class Layout:
             dtype=dtype,
         )
 
-    def outside_medium(self, position: Tensor, colony: Tensor) -> Tensor:
-        """Which cells at (N, d) µm of colonies (N,) are outside the medium, (N,) bool.
+    def outside_medium(self, position: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:
+        """How many cells at (N, d) µm of each colony are outside the medium, (B,), and the first of
+        them; N where there is none. groups: the cells of each colony.
 
         They are in an obstacle, or beyond a box without a reservoir.
         """
         if self.obstacle is None:
-            return outside_box(self.grid, self.places(position), colony, self.periodic)
-        where = self.stencil(position, colony, torch.float64)
+            return beyond(self.grid, self.places(position), groups, self.periodic)
+        where = self.stencil(position, groups.owner, torch.float64)
         assert where.blocked is not None
-        return where.outside if self.reservoir is None else where.blocked
+        return counted(where.outside if self.reservoir is None else where.blocked, groups)
 
     def contact(
         self,

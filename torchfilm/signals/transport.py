@@ -3,6 +3,8 @@
 | method           | order in Δt | positive, conserves at any Δt | works for                    |
 |------------------|-------------|-------------------------------|------------------------------|
 | "exponential"    | exact       | yes                           | no obstacle, uniform flow    |
+| "series"         | exact       | yes                           | everything, up to a number   |
+|                  |             |                               | of terms; then "implicit"    |
 | "implicit"       | 1           | yes                           | everything                   |
 | "crank_nicolson" | 2           | oscillates, goes below 0      | everything; the paper's, for |
 |                  |             |                               | comparison                   |
@@ -12,15 +14,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
-from torchfilm.signals.transport_exponential import prepare_exponential
+from torchfilm.signals.compiled import may_run
+from torchfilm.signals.compiled_transport import (
+    CompiledExponential,
+    CompiledSeries,
+    compiled_exponential,
+    compiled_series,
+)
+from torchfilm.signals.grid import Grid, Shape
+from torchfilm.signals.transport_exponential import Exponential, prepare_exponential
 from torchfilm.signals.transport_implicit import prepare_implicit
 from torchfilm.signals.transport_iterative import prepare_crank_nicolson, prepare_euler
 from torchfilm.signals.transport_operator import Operator
+from torchfilm.signals.transport_series import Series, prepare_series
 from torchfilm.tools import checks
 
 
@@ -34,15 +48,19 @@ class Stepper(Protocol):
 
 METHODS: dict[str, Callable[[Operator, float], Stepper]] = {
     "exponential": prepare_exponential,
+    "series": prepare_series,
     "implicit": prepare_implicit,
     "crank_nicolson": prepare_crank_nicolson,
     "euler": prepare_euler,
 }
 
+# those that kernels compute, too
+COMPILED = {"exponential", "series"}
+
 
 def choose(operator: Operator) -> str:
-    """The suitable method: "exponential" where it is possible, else "implicit"."""
-    return "exponential" if operator.separable else "implicit"
+    """The suitable method: "exponential" where it is possible, else "series"."""
+    return "exponential" if operator.separable else "series"
 
 
 def prepare(operator: Operator, dt: float, method: str | None = None) -> Stepper:
@@ -51,3 +69,34 @@ def prepare(operator: Operator, dt: float, method: str | None = None) -> Stepper
         checks.choice("method", method, tuple(METHODS))
     dt = checks.number("dt", dt, above=0.0, most=math.inf)
     return METHODS[choose(operator) if method is None else method](operator, dt)
+
+
+@dataclass(frozen=True, eq=False)
+class Carrier:
+    """A step of grids of one shape. may_compile: whether kernels may run it; else torch does."""
+
+    stepper: Stepper
+    shape: Shape
+    may_compile: bool = True
+
+    @cached_property
+    def compiled(self) -> CompiledExponential | CompiledSeries | None:
+        """The step by kernels, or None where there is none."""
+        if self.may_compile and isinstance(self.stepper, Exponential):
+            return compiled_exponential(self.stepper, self.shape)
+        if self.may_compile and isinstance(self.stepper, Series):
+            return compiled_series(self.stepper, self.shape)
+        return None
+
+
+def carry(grid: Grid, carriers: Sequence[Carrier], values: Tensor) -> Tensor:
+    """Values (voxels,) of all colonies one step later. carriers: one for each of `grid.batches`."""
+    kernels = [carrier.compiled for carrier in carriers]
+    if None in kernels or not may_run(values):
+        pairs = zip(carriers, grid.batches, strict=True)
+        return grid.join([carrier.stepper.step(batch.of(values)) for carrier, batch in pairs])
+    out = torch.empty_like(values)
+    for kernel, batch in zip(kernels, grid.batches, strict=True):
+        assert kernel is not None
+        kernel.step(values, batch.starts.numpy(), out)
+    return out

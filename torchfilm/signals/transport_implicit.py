@@ -237,6 +237,7 @@ class _Recurrence(torch.autograd.Function):
                 rows[i].addcmul_(parts[i - 1], rows[i - 1])
         ctx.downward, ctx.shape = downward, b.shape
         ctx.save_for_backward(y, part)
+        ctx.save_for_forward(y, part)
         return y
 
     @staticmethod
@@ -248,6 +249,15 @@ class _Recurrence(torch.autograd.Function):
             pairs = (y[1:], adjoint[:-1]) if ctx.downward else (y[:-1], adjoint[1:])
             of_part = (pairs[0] * pairs[1]).sum_to_size(part.shape)
         return adjoint.sum_to_size(ctx.shape), of_part, None
+
+    @staticmethod
+    def jvp(ctx, b: Tensor | None, part: Tensor | None, _):
+        y, parts = ctx.saved_tensors
+        moved = torch.zeros_like(y) if b is None else b.expand(y.shape).clone()
+        if part is not None:
+            first, last = (moved[:-1], y[1:]) if ctx.downward else (moved[1:], y[:-1])
+            first.addcmul_(part.expand(first.shape), last)
+        return recurrence(moved, parts, ctx.downward)
 
 
 def weighted_sum(y: Tensor, part: Tensor, start: Tensor) -> Tensor:

@@ -1,0 +1,173 @@
+"""Transport by kernels: the same numbers as by torch, and the same bits in any company."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from test_operator import BOUNDARIES, FLOWS, SHAPES, make
+
+import torchfilm as tf
+from torchfilm.signals.boundary_conditions import BoundaryConditions, Periodic
+from torchfilm.signals.grid import Grid
+from torchfilm.signals.transport import COMPILED, Carrier, carry, prepare
+from torchfilm.signals.transport_rates import build_operator
+from torchfilm.tools.checks import InputError
+
+DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+# 70 voxels make tiles of every width, 130 a panel as well
+LONG = [(70, 5, 4), (4, 5, 70), (5, 130, 2), (70, 1, 130)]
+
+
+def grid_of(*shapes) -> Grid:
+    shape = torch.tensor(shapes)
+    return Grid(torch.zeros(len(shapes), 3, dtype=torch.float64), shape, (1.0, 1.0, 1.0))
+
+
+def by_kernel(stepper, values) -> torch.Tensor:
+    """Values (B, nx, ny, nz) after the step; an error where there is no kernel."""
+    carrier = Carrier(stepper, tuple(values.shape[1:]))
+    assert carrier.compiled is not None
+    grid = grid_of(*[values.shape[1:]] * values.shape[0])
+    return carry(grid, [carrier], values.reshape(-1)).view(values.shape)
+
+
+def roundings(shape) -> int:
+    """A value is one sum for each axis, of non-negative terms. Both ways round each product and
+    each partial sum at most once: a relative ε for each voxel of the three axes and way."""
+    return 2 * sum(shape) + 6
+
+
+@DTYPES
+@pytest.mark.parametrize("dt", [1e-3, 0.7, 40.0])
+@pytest.mark.parametrize("shape", [*SHAPES, *LONG], ids=str)
+@pytest.mark.parametrize("faces", BOUNDARIES)
+@pytest.mark.parametrize("kind", FLOWS[:2])
+def test_exponential_is_that_of_torch(dtype, shape, faces, kind, dt):
+    op, *_ = make(shape, faces, kind, dtype=dtype)
+    stepper = prepare(op, dt, "exponential")
+    u = torch.rand(1, *shape, dtype=dtype, generator=torch.Generator().manual_seed(1))
+    one, other = stepper.step(u), by_kernel(stepper, u)
+    allowed = roundings(shape) * torch.finfo(dtype).eps
+    assert bool(((one - other).abs() <= allowed * one).all())
+
+
+@DTYPES
+@pytest.mark.parametrize("dt", [1e-3, 0.7, 4.0])
+@pytest.mark.parametrize("shape", [*SHAPES, *LONG], ids=str)
+@pytest.mark.parametrize("faces", BOUNDARIES)
+@pytest.mark.parametrize("masked", [False, True])
+def test_series_is_that_of_torch(dtype, shape, faces, masked, dt):
+    """Both add in float64 in one order, but for what passes through periodic faces, and round once
+    to the type of the field. float64: two roundings more for each of up to 700 terms."""
+    op, _, _, mask = make(shape, faces, "varying", masked, dtype=dtype)
+    stepper = prepare(op, dt, "series")
+    u = torch.rand(1, *shape, dtype=dtype, generator=torch.Generator().manual_seed(1))
+    u = u * torch.as_tensor(mask)
+    one, other = stepper.step(u), by_kernel(stepper, u)
+    allowed = (1400 if dtype == torch.float64 else 1) * torch.finfo(dtype).eps
+    assert bool(((one - other).abs() <= allowed * one).all())
+
+
+def colonies(count: int, dtype, own: bool, method: str):
+    """Carriers and values of colonies with grids of three shapes, in a fixed mixture."""
+    generator = torch.Generator().manual_seed(3)
+    shapes = [[(7, 6, 5), (33, 1, 4), (5, 19, 1)][k % 3] for k in range(count)]
+    diffusion = 10.0 ** torch.empty(count).uniform_(-2, 2, generator=generator)
+    diffusion[3] = 1e4
+    values = [torch.rand(a * b * c, dtype=dtype, generator=generator) for a, b, c in shapes]
+
+    def after(places: list[int]) -> list[torch.Tensor]:
+        grid = grid_of(*[shapes[k] for k in places])
+        carriers = []
+        for batch in grid.batches:
+            ids = [places[k] for k in batch.places.tolist()]
+            op = build_operator(
+                batch.shape,
+                (1.0, 1.0, 1.0),
+                diffusion=diffusion[ids] if own else 2.0,
+                decay=0.1,
+                source=0.3,
+                boundary=BoundaryConditions(y=Periodic()),
+                colonies=len(ids),
+                dtype=dtype,
+            )
+            carriers.append(Carrier(prepare(op, 0.5, method), batch.shape))
+            assert carriers[-1].compiled is not None
+        found = torch.cat([values[k] for k in places])
+        for _ in range(3):
+            found = carry(grid, carriers, found)
+        return list(found.split([values[k].numel() for k in places]))
+
+    return after
+
+
+@DTYPES
+@pytest.mark.parametrize("own", [False, True], ids=["shared", "each its own"])
+@pytest.mark.parametrize("method", sorted(COMPILED))
+def test_the_bits_of_a_colony_depend_on_no_other(method, dtype, own, monkeypatch):
+    """Alone, among others in any order, on one thread and on three; one is too fast for a
+    series."""
+    after = colonies(9, dtype, own, method)
+    together = after(list(range(9)))
+    turned = after(list(range(8, -1, -1)))[::-1]
+    monkeypatch.setattr("torchfilm.signals.compiled_transport.WORTH_A_THREAD", 1)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 3)
+    shared = after(list(range(9)))
+    for k in range(9):
+        (alone,) = after([k])
+        for other in (together[k], turned[k], shared[k]):
+            assert torch.equal(alone, other)
+
+
+def scene(**options) -> tf.Scene:
+    medium = tf.Medium(
+        ahl=tf.Signal(diffusion=20.0, initial=lambda at: (at[:, 0] > 2.0).double(), source=0.1),
+        box=((-16, -16), (16, 16)),
+        spacing=4.0,
+        **options,
+    )
+    return tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), medium)
+
+
+def fields(made: tf.Scene) -> torch.Tensor:
+    state = made.bind(3).start()
+    for _ in range(4):
+        state = made.bind(3).step(state, 0.1)
+    return state.signals["ahl"]
+
+
+def test_binding_chooses_and_explain_says_it(monkeypatch):
+    """backend="torch" forces torch, which then runs: its steps are called, and only its."""
+    plain = fields(scene())
+    assert "compiled; by torch where gradients are required" in tf.explain(scene(), seconds=0)
+    assert "1), torch; dt·K/h²" not in tf.explain(scene(), seconds=0)
+    told = tf.explain(scene(backend="torch"), seconds=0)
+    assert "everywhere), torch; dt·K/h²" in " ".join(told.split())
+    torch.testing.assert_close(fields(scene(backend="torch")), plain, rtol=1e-5, atol=0)
+
+    def called(*_):
+        raise RuntimeError("by torch")
+
+    monkeypatch.setattr("torchfilm.signals.transport_exponential.Exponential.step", called)
+    assert torch.equal(fields(scene()), plain)
+    with pytest.raises(RuntimeError, match="by torch"):
+        fields(scene(backend="torch"))
+
+
+def test_a_kernel_that_cannot_be_had_is_refused(monkeypatch):
+    with pytest.raises(InputError, match=r"Medium\.backend"):
+        scene(backend="numba")
+    monkeypatch.setattr("torchfilm.effects.medium.unavailable", lambda: "there is no Numba")
+    with pytest.raises(InputError, match=r"compiled.*there is no Numba"):
+        scene(backend="compiled").bind()
+    assert scene().bind() is not None
+
+
+def test_gradients_go_through_torch():
+    diffusion = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    op = build_operator((4, 3, 1), (1.0, 1.0, 1.0), diffusion=diffusion, dtype=torch.float64)
+    carrier = Carrier(prepare(op, 0.5, "exponential"), (4, 3, 1))
+    assert carrier.compiled is None
+    values = torch.arange(12, dtype=torch.float64)
+    carry(grid_of((4, 3, 1)), [carrier], values)[0].backward()
+    assert float(diffusion.grad) > 0

@@ -1,0 +1,147 @@
+"""Transport by compiled kernels, on the CPU where no gradient is wanted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.signals.compiled import may_run
+from torchfilm.signals.grid import Shape
+from torchfilm.signals.transport_exponential import Exponential
+from torchfilm.signals.transport_series import Series
+from torchfilm.tools.numba_calls import as_array
+from torchfilm.tools.threads import shares_of
+
+# A thread is worth starting for as many voxels.
+WORTH_A_THREAD = 1 << 17
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledExponential:
+    """`Exponential` for one shape of grid, in arrays as `kernels.transport.carry` takes them."""
+
+    shape: Shape
+    axes: np.ndarray
+    factors: tuple[np.ndarray, ...]
+    firsts: tuple[np.ndarray, ...]
+    lasts: tuple[np.ndarray, ...]
+    gained: np.ndarray
+
+    def step(self, values: Tensor, starts: np.ndarray, out: Tensor) -> None:
+        """Put the grids that begin at `starts` of values (voxels,) into out, one step later."""
+        from torchfilm.kernels.transport import carry
+
+        source, target = as_array(values, values.dtype), out.numpy()
+        size = self.shape[0] * self.shape[1] * self.shape[2]
+        shares_of(
+            starts.size,
+            max(1, WORTH_A_THREAD // size),
+            lambda begin, end: carry(
+                begin, end, starts, self.shape, self.axes, self.factors, self.firsts, self.lasts,
+                self.gained, source, target,
+            ),
+        )  # fmt: skip
+
+
+def compiled_exponential(stepper: Exponential, shape: Shape) -> CompiledExponential | None:
+    """The same step compiled, or None where kernels may not run it."""
+    given = [x for x in (*stepper.factors, stepper.gained) if x is not None]
+    if not may_run(*given):
+        return None
+    last = max((k for k in range(3) if shape[k] > 1), default=0)
+    dtype = given[0].dtype
+    factors, firsts, lasts = [], [], []
+    for k, factor in enumerate(stepper.factors):
+        whole = torch.empty(0, 0, 0, dtype=dtype) if factor is None else factor.detach()
+        whole = whole[:, : shape[k], : shape[k]]
+        there = whole.transpose(1, 2) > 0
+        number = torch.arange(1, there.shape[2] + 1)
+        # from the first voxel that gives anything to a voxel, to the last
+        ends = torch.where(there, number, 0).amax(2) if there.numel() else number.reshape(0, 0)
+        begins = torch.where(there, number, shape[k] + 1)
+        begins = begins.amin(2) - 1 if there.numel() else ends
+        firsts.append(torch.minimum(begins, ends).numpy())
+        lasts.append(ends.numpy())
+        factors.append(as_array(whole if k == last else whole.transpose(1, 2), dtype))
+    axes = np.array([k for k, f in enumerate(stepper.factors) if f is not None], np.int64)
+    gained = torch.empty(0, 0, dtype=dtype) if stepper.gained is None else stepper.gained
+    return CompiledExponential(
+        shape, axes, tuple(factors), tuple(firsts), tuple(lasts),
+        as_array(gained.flatten(1), dtype),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledSeries:
+    """`Series` for one shape of grid, in arrays as `kernels.transport.mix` takes them."""
+
+    stepper: Series
+    shape: Shape
+    arrays: tuple[np.ndarray, ...]
+
+    def step(self, values: Tensor, starts: np.ndarray, out: Tensor) -> None:
+        """Put the grids that begin at `starts` of values (voxels,) into out, one step later."""
+        from torchfilm.kernels.transport import mix
+
+        source, target = as_array(values, values.dtype), out.numpy()
+        size = self.shape[0] * self.shape[1] * self.shape[2]
+        shares_of(
+            starts.size,
+            max(1, WORTH_A_THREAD // (size * self.stepper.weights.shape[0])),
+            lambda begin, end: mix(begin, end, starts, *self.arrays, source, target),
+        )
+        if self.stepper.far is None or self.stepper.split is None:
+            return
+        grids = [slice(s, s + size) for s in starts.tolist()]
+        u = torch.stack([values[grid] for grid in grids]).view(-1, *self.shape)
+        split = self.stepper.split.step(u).flatten(1)
+        for grid, far, found in zip(grids, self.stepper.far.expand(u.shape[0]), split, strict=True):
+            if far:
+                out[grid] = found
+
+
+def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
+    """The same step compiled, or None where kernels may not run it."""
+    mixing = stepper.mixing
+    given = [mixing.stay, *(x for _, up, down in mixing.gains for x in (up, down))]
+    given += [] if stepper.gained is None else [stepper.gained]
+    if not may_run(*given):
+        return None
+    count = max(stepper.weights.shape[1], *(x.shape[0] for x in given))
+    number = torch.arange(shape[0] * shape[1] * shape[2]).view(shape)
+    whole = lambda x: x.detach().expand(count, *shape).flatten(1).clone()
+    ups, downs, to, source, parts = [], [], [], [], []
+    for dim, up, down in mixing.gains:
+        for part, shift, face, kept in ((up, 1, 0, ups), (down, -1, -1, downs)):
+            at = number.select(dim - 1, face).reshape(-1)
+            made = whole(part)
+            to.append(at)
+            source.append(torch.roll(number, shift, dim - 1).select(dim - 1, face).reshape(-1))
+            parts.append(made[:, at])
+            made[:, at] = 0.0
+            kept.append(made)
+    nothing = torch.zeros(count, 0, number.numel(), dtype=torch.float64)
+    joined = lambda x: torch.stack(x, 1) if x else nothing
+    wraps = torch.cat(parts, 1) if parts else nothing[:, 0:0, 0]
+    there = (wraps > 0).any(0)  # elsewhere no face is periodic
+    places = [torch.cat(x)[there] if x else number[:0, 0, 0] for x in (to, source)]
+    terms = torch.as_tensor(stepper.terms).expand(count)
+    if stepper.far is not None:
+        terms = torch.where(stepper.far, 0, terms)
+    strides = [number.stride(dim - 1) for dim, _, _ in mixing.gains]
+    gained = (
+        nothing[:0].flatten(1) if stepper.gained is None else stepper.gained.detach().flatten(1)
+    )
+    weights = stepper.weights.t().expand(count, -1)
+    arrays = (
+        whole(mixing.stay), joined(ups), joined(downs), *places, wraps[:, there], weights, terms,
+        gained,
+    )  # fmt: skip
+    return CompiledSeries(
+        stepper,
+        shape,
+        (np.array(strides, np.int64), *(np.ascontiguousarray(x.numpy()) for x in arrays)),
+    )

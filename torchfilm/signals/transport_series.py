@@ -1,0 +1,150 @@
+"""Transport over a step of any operator, exact in time: exp(Δt T) as a series without subtractions.
+
+With λ at least the greatest loss rate of a voxel, P = I + T/λ has no negative entry, and
+
+    exp(Δt T) = Σ_k e^(−λΔt) (λΔt)^k/k! · P^k
+
+is a mean of its powers: what a random number of exchanges makes of the field. (Jensen's method, or
+uniformization, for Markov chains.) All axes exchange at once. So a steady state does not depend on
+Δt, as it does where one axis is solved after the other. Nothing becomes negative, and the weights
+add up to 1. The number of terms grows as λΔt; beyond MOST a colony takes a solve an axis instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.signals.transport_implicit import Implicit, prepare_implicit
+from torchfilm.signals.transport_operator import Operator
+
+# λΔt up to which a colony takes the series: some 1,200 terms.
+MOST = 1000.0
+# λ over the greatest loss rate: each voxel keeps a part of its content larger than all roundings.
+ABOVE = 1.01
+# Weights below this part of the precision of the values are left out.
+CUT = 1 / 64
+
+
+@dataclass(frozen=True, eq=False)
+class Mixing:
+    """P = I + T/λ in float64, without its gain: stay (B or 1, nx, ny, nz), the part of its content
+    that a voxel keeps; gains: for each axis with neighbours (dimension, from the voxel below, from
+    the voxel above). A voxel at a face gets from the opposite one, with a part of 0 unless the axis
+    is periodic."""
+
+    stay: Tensor
+    gains: tuple[tuple[int, Tensor, Tensor], ...]
+
+    def of(self, v: Tensor) -> Tensor:
+        """P v, for v (B, nx, ny, nz)."""
+        out = self.stay * v
+        for dim, up, down in self.gains:
+            out = out + up * torch.roll(v, 1, dim)
+            out = out + down * torch.roll(v, -1, dim)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """u ↦ Σ_k weights_k P^k u + gained, in float64.
+
+    weights: (terms, B or 1). gained: None or (B or 1, nx, ny, nz). far: (B or 1,) bool, colonies
+    with λΔt over MOST, which take a step of `split` instead; None without such colonies.
+    """
+
+    mixing: Mixing
+    weights: Tensor
+    gained: Tensor | None
+    far: Tensor | None
+    split: Implicit | None
+
+    def step(self, u: Tensor) -> Tensor:
+        """u (B, nx, ny, nz) one step later."""
+        out = _mean(self.mixing, self.weights, u.double())
+        out = (out if self.gained is None else out + self.gained).to(u.dtype)
+        if self.far is None or self.split is None:
+            return out
+        return torch.where(self.far.reshape(-1, 1, 1, 1), self.split.step(u), out)
+
+    @cached_property
+    def terms(self) -> np.ndarray:
+        """Terms that are not 0 of each colony, (B or 1,) int64."""
+        return (self.weights > 0).sum(0).cpu().numpy()
+
+
+def prepare_series(operator: Operator, dt: float) -> Series:
+    """The series of a step of `dt` hours."""
+    fastest = operator.loss.detach().flatten(1).amax(1)
+    rate = torch.where(fastest > 0, ABOVE * fastest, 1.0)
+    mean = (rate * dt).cpu().numpy()
+    far = mean > MOST
+    weights, tails = _poisson(np.where(far, 0.0, mean), torch.finfo(operator.dtype).eps * CUT)
+    mixing = _mixing(operator, rate.reshape(-1, 1, 1, 1))
+    on_device = lambda x: torch.as_tensor(x, device=operator.device)
+    gained = None
+    if operator.gain is not None:
+        each = on_device(tails) / rate
+        whole = operator.gain.expand(max(rate.numel(), operator.gain.shape[0]), *operator.shape)
+        gained = _mean(mixing, each, whole)
+    any_far = bool(far.any())
+    return Series(
+        mixing,
+        on_device(weights),
+        gained,
+        on_device(far) if any_far else None,
+        prepare_implicit(operator, dt) if any_far else None,
+    )
+
+
+def _mean(mixing: Mixing, weights: Tensor, v: Tensor) -> Tensor:
+    """Σ_k weights_k P^k v; weights (terms, B or 1)."""
+    out = weights[0].reshape(-1, 1, 1, 1) * v
+    for weight in weights[1:]:
+        v = mixing.of(v)
+        out = out + weight.reshape(-1, 1, 1, 1) * v
+    return out
+
+
+def _mixing(operator: Operator, rate: Tensor) -> Mixing:
+    """P of an operator; rate: λ, (B or 1, 1, 1, 1)."""
+    gains = []
+    for axis in operator.axes:
+        if axis.size == 1:
+            continue
+        n, dim = axis.size, axis.dim
+        up, down = axis.up.narrow(dim, 0, n) / rate, axis.down.narrow(dim, 1, n) / rate
+        if not axis.periodic:
+            inner = torch.ones(n, dtype=up.dtype, device=up.device)
+            inner[0] = 0.0
+            shape = [n if k == dim else 1 for k in range(4)]
+            up, down = up * inner.reshape(shape), down * inner.flip(0).reshape(shape)
+        gains.append((dim, up, down))
+    return Mixing(1 - operator.loss / rate, tuple(gains))
+
+
+def _poisson(mean: np.ndarray, cut: float) -> tuple[np.ndarray, np.ndarray]:
+    """The probabilities of 0, 1, … events of a Poisson distribution, and those of more events than
+    that, (terms, B) each.
+
+    Probabilities below `cut` beyond the mean are 0; the sums are exactly 1 and the mean, whatever
+    the other colonies.
+    """
+    count = int(mean.max() + 10 * np.sqrt(mean.max()) + 30)
+    number = np.arange(count)[:, None]
+    logs = np.concatenate([np.zeros((1, 1)), np.cumsum(np.log(number[1:]), 0)])
+    found = np.exp(number * np.log(np.where(mean > 0, mean, 1.0)) - mean - logs)
+    found = np.where(mean > 0, found, number == 0)
+    found[(found < cut) & (number > mean)] = 0.0
+    found = found / np.cumsum(found, 0)[-1]
+    # summed from the rarest: small numbers first
+    above = np.cumsum(found[::-1], 0)[::-1]
+    more = np.concatenate([above[1:], np.zeros((1, mean.size))])
+    total = np.cumsum(more[::-1], 0)[-1]
+    more = more * np.where(total > 0, mean / np.where(total > 0, total, 1.0), 1.0)
+    used = int((found > 0).any(1).nonzero()[0].max()) + 1
+    return found[:used], more[:used]
