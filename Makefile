@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 run: $(STAMP)  ## search for a circuit that draws a stripe (a minute or two)
 	$(BIN)/python experiments/boundary_stripe.py --colonies 800 --out runs/stripe
 
-colonies: $(STAMP)  ## grow 16 colonies of 500 cells in one batch (a minute)
+colonies: $(STAMP)  ## grow 16 colonies of 500 cells in one batch (half a minute)
 	$(BIN)/torchfilm run microcolony --colonies 16 --cells 500 --out runs/colonies.h5 --overwrite
 
 test: $(STAMP)  ## all tests

@@ -17,6 +17,7 @@ import json
 import os
 import re
 import sys
+import textwrap
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -186,10 +187,11 @@ def summary(collector: Collector, ships: Collector) -> str:
     cases = sorted({int(found[1]) for name in tests if (found := CASE.match(name))})
     listed = ", ".join(map(str, cases)) or "none"
     ran = (f"{run.passed} tests passed, {len(run.failed)} failed" for run in (collector, ships))
-    return (
+    return textwrap.fill(
         f"Measured {noted['date'][:10]} at commit {noted['commit']}, torch {noted['torch']},"
         f" {noted['processor']}, {where}. {next(ran)}. With the accuracy that ships {next(ran)}:"
-        f" of cases {listed}."
+        f" of cases {listed}.",
+        100,
     )
 
 

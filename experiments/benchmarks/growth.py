@@ -180,10 +180,11 @@ def table(records: list[dict]) -> str:
         r, (dim, colonies, cells) = newest[key], CASES[key[0]]
         who = f"{r['backend']}, {r['threads']} thread{'s' * (r['threads'] > 1)}, {r['device']}"
         worst = " / ".join(f"{r['overlap_worst_um'][q]:.3f}" for q in ("0.5", "0.99", "1"))
+        seconds = r.get("processor_s", r["seconds"]) if r["threads"] == 1 else r["seconds"]
         growth = "–" if r["growth_over_free"] is None else f"{r['growth_over_free']:.3f}"
         lines.append(
-            f"| {colonies} × {cells}, {dim}-D | {r['regime']} | {who} | {r['seconds']:.2f} |"
-            f" {r['us_per_cell_step']:.1f} | {r['iterations_per_step']:.0f} | {growth} |"
+            f"| {colonies} × {cells}, {dim}-D | {r['regime']} | {who} | {seconds:.2f} |"
+            f" {1e6 * seconds / r['cell_steps']:.1f} | {r['iterations_per_step']:.0f} | {growth} |"
             f" {r['overlap_course_um']:.4f} | {worst} |"
         )
     return "\n".join(lines)
