@@ -125,6 +125,20 @@ def test_case_43_a_closed_chamber_stalls_and_nothing_is_thrown_when_it_opens(mea
         before = after
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("length_drag", [10.0, 1e5])
+def test_case_43_a_full_chamber_stays_as_it_is(measured, length_drag):
+    """For 28 h more, which is 28 times the time in which free cells grow e-fold: the same cells, and
+    no cell shorter than 95 % of what it was."""
+    ends = dict(low_end=-8.0, high_end=8.0)
+    scene = colony(tf.Mechanics([tf.Channel(6.0, **ends)], dim=2, length_drag=length_drag))
+    *_, full = tf.simulate(scene, until=12.0, seed=1)
+    *_, late = tf.simulate(scene, full, until=40.0)
+    assert full.cells > 25 and torch.equal(late.uid, full.uid)
+    most = float((1.0 - (late.length + 1.0) / (full.length + 1.0)).max())
+    assert measured("lost in 28 h, most", most, "≤ 0.05") <= 0.05 + 1e-6
+
+
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
 @pytest.mark.parametrize("length_drag", [10.0, 100.0, 1000.0, 1e5])
 def test_case_44_every_overlap_of_a_pressed_chain_is_that_of_theory(measured, length_drag, backend):

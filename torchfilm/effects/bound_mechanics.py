@@ -12,6 +12,7 @@ from torch import Tensor
 from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.mechanics_report import BURIED, LONG, MANY, MechanicsReport
 from torchfilm.kernels.bilateral_scheme import PENALTY
+from torchfilm.kernels.scheme import COMPRESSION
 from torchfilm.physics import bilateral, compiled, one_sided, substeps
 from torchfilm.physics.contact_records import ContactReport, ContactSettings
 from torchfilm.physics.one_sided_records import OneSidedSettings
@@ -68,7 +69,8 @@ class BoundMechanics(BoundEffect):
         if not self.effect.one_sided:
             return state
         alpha = state.groups.spread(found.hardness.to(state.dtype))
-        return state.with_fields(contact_alpha=alpha)
+        lost = (state.fields["compression"] + base - found.length).detach().clamp(min=0.0)
+        return state.with_fields(contact_alpha=alpha, compression=lost)
 
     @staticmethod
     def _own_dt(state: State, dt: float, steps: Tensor) -> Tensor:
@@ -96,6 +98,7 @@ class BoundMechanics(BoundEffect):
             self.settings, state.groups, state.position, state.axis, base, elongation,
             state.radius, *drags, torch.where(status == CONVERGED, steps, 0),
             state.displacement, hardness, alpha, state.own_colony_id, surfaces, walls,
+            _shortest(state, base) if self.effect.one_sided else base,
         )  # fmt: skip
 
     def _taken(self, given: StepInput) -> StepResult:
@@ -161,6 +164,12 @@ class BoundMechanics(BoundEffect):
             surfaces += made
             walls += [(kind, value)] * len(made)
         return surfaces, walls
+
+
+def _shortest(state: State, base: Tensor) -> Tensor:
+    """The length below which pressure takes no cell, (N,) µm."""
+    left = COMPRESSION * (base + 2 * state.radius) - state.fields["compression"]
+    return (base - left.clamp(min=0.0)).clamp(min=0.0)
 
 
 def _of_colonies(value: Tensor, groups: Groups) -> Tensor:

@@ -204,7 +204,10 @@ class Mechanics(Effect):
         if not self.one_sided:
             return move, collapsed
         meaning = "α of the colony's contacts in the last step, 0 before the first"
-        return move, collapsed, Field("contact_alpha", meaning, "1/μ/µm")
+        alpha = Field("contact_alpha", meaning, "1/μ/µm")
+        meaning = "how much shorter pressure has made a cell than it once was"
+        compression = Field("compression", meaning, "µm", at_division="reset")
+        return move, collapsed, alpha, compression
 
     @property
     def _own_fields(self) -> tuple[str, ...]:

@@ -18,6 +18,9 @@ SOFTEST, HARDEST = 0.04, 1e-4
 # A pressed cell may lose this part of its growth in a step. Where a cell may lose none, overlaps in
 # closed chambers are twice as deep.
 SHRINK = 0.05
+# It becomes shorter than it once was by no more than this share of its whole length: else, in a
+# full chamber, some cells would grow for ever at the cost of others.
+COMPRESSION = 0.05
 # The first pass is solved again where α turns out to be less than this share of what it was.
 LAG = 0.5
 # Contacts of a pass whose solve has not converged are taken softer by this factor until it does, at

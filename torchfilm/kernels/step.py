@@ -168,11 +168,12 @@ def _minimise_some(rows, m, numbers, count, alpha, low, y, tolerance, cap, limit
 
 
 @kernel
-def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, hardness, kinds,
-                places, sizes, roots, is_soft, alphas, settings, report, dof):  # fmt: skip
+def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest, last, hardness,
+                kinds, places, sizes, roots, is_soft, alphas, settings, report, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps; x, axis, last and hardness in place.
 
-    x: (n, d) float64. axis (n, d), base, growth, radius, viscosity, length_drag (n,). last: (n, D)
+    x: (n, d) float64. axis (n, d), base, growth, radius, viscosity, length_drag (n,). shortest:
+    (n,) no cell becomes shorter. last: (n, D)
     the move of the first pass before, from which this one starts. hardness: (1,) α of the colony.
     roots: (S, n) D of each wall, or stiffness · Δt. alphas: (n,) given, or (0,). Returns lengths.
     """
@@ -180,7 +181,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, last, har
     tolerance, passes, given = settings[TOLERANCE], settings[MOST_PASSES], alphas.shape[0] > 0
     hardness[0] = hardness[0] if hardness[0] > 0 else softest
     length, scale = base + growth, np.zeros(last.shape)
-    least = np.maximum(base - SHRINK * np.maximum(growth, 0.0), 0.0)
+    least = np.maximum(base - SHRINK * np.maximum(growth, 0.0), shortest)
     half, reach, root = np.empty_like(base), np.empty_like(base), np.empty(roots.shape)
     alpha, low, y = np.empty_like(last[:, 0]), np.empty_like(last[:, 0]), np.empty_like(last)
     number, softer, rising, kept, held, kept_alpha = 0, 1.0, True, y, 0.0, 0.0
@@ -280,8 +281,8 @@ def _following(e, soft, hardness, target, softest):
 
 @kernel
 def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosity, length_drag,
-                  last, hardness, kinds, places, sizes, roots, is_soft, alphas, settings, reports,
-                  dof):  # fmt: skip
+                  last, hardness, kinds, places, sizes, roots, is_soft, alphas, shortest, settings,
+                  reports, dof):  # fmt: skip
     """Steps of the colonies `which`, steps[b] sub-steps each: everything is changed in place.
 
     Cells of colony b are begin[b] … begin[b + 1] − 1. x: (N, d) float64. length: before growth.
@@ -301,10 +302,11 @@ def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosit
         own_viscosity = viscosity[of].astype(np.float64)
         own_drag = length_drag[of].astype(np.float64)
         own_alphas = alphas[of] if alphas.shape[0] else alphas
+        own_shortest = shortest[of].astype(np.float64)
         for _ in range(steps[b]):
             own_length = step_colony(
-                own_x, own_axis, own_length, share, own_radius, own_viscosity, own_drag, own_last,
-                hardness[b : b + 1], kinds, places[:, b], sizes[:, b], own_roots, is_soft,
+                own_x, own_axis, own_length, share, own_radius, own_viscosity, own_drag,
+                own_shortest, own_last, hardness[b : b + 1], kinds, places[:, b], sizes[:, b], own_roots, is_soft,
                 own_alphas, own_settings, reports[b], dof,
             )  # fmt: skip
             if reports[b, STATUS] == NOT_FINITE:

@@ -55,8 +55,9 @@ def contact_steps(given: StepInput) -> StepResult:
         begin, steps, position.numpy(), axis.numpy(), length.numpy(),
         *(as_array(x, dtype) for x in (given.growth, given.radius, given.viscosity,
         given.length_drag)), move.numpy(), hardness.numpy(), *_walls(given),
-        as_array(given.radius[:0] if given.alpha is None else given.alpha, dtype), numbers, reports,
-        (0,) * (4 if given.settings.dim == 2 else 8),
+        as_array(given.radius[:0] if given.alpha is None else given.alpha, dtype),
+        *([] if isinstance(given.settings, ContactSettings) else [as_array(given.shortest, dtype)]),
+        numbers, reports, (0,) * (4 if given.settings.dim == 2 else 8),
     )  # fmt: skip
     for done in _started(step_colonies, begin, counts.numpy(), arguments):
         done()

@@ -87,7 +87,7 @@ class _OneStep:
         if not cells.numel():
             return at
         rows, base = cells, at.length
-        least = (base - SHRINK * self.growth.clamp(min=0.0)).clamp(min=0.0)
+        least = torch.maximum(base - SHRINK * self.growth.clamp(min=0.0), given.shortest)
         at = replace(at, length=torch.where(moving, base + self.growth, base))
         hardness = torch.where(at.hardness > 0, at.hardness, self.softest)
         at = replace(at, hardness=hardness)

@@ -25,7 +25,8 @@ class StepInput(Generic[Settings]):
     stepped; start (N, D) the last move; hardness (B,) float64 the α of the colony's last step, 0 at
     the start and for bilateral contacts; alpha (N,) where it is given, else None, and of bilateral
     contacts always; walls: for each surface its kind ("hard", "stiffness", "weight") and its
-    weight, or its stiffness · Δt of the sub-step, (N,).
+    weight, or its stiffness · Δt of the sub-step, (N,); shortest (N,) µm, of one-sided contacts: no
+    cell becomes shorter by pressure.
     """
 
     settings: Settings
@@ -44,6 +45,7 @@ class StepInput(Generic[Settings]):
     colony_ids: Tensor
     surfaces: Sequence[Surface]
     walls: Sequence[tuple[str, Tensor | None]]
+    shortest: Tensor
 
     @property
     def ids(self) -> Tensor:
