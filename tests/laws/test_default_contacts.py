@@ -128,8 +128,8 @@ def test_case_43_a_closed_chamber_stalls_and_nothing_is_thrown_when_it_opens(mea
 @pytest.mark.slow
 @pytest.mark.parametrize("length_drag", [10.0, 1e5])
 def test_case_43_a_full_chamber_stays_as_it_is(measured, length_drag):
-    """For 28 h more, which is 28 times the time in which free cells grow e-fold: the same cells, and
-    no cell shorter than 95 % of what it was."""
+    """For 28 h more, in which free cells would grow by e²⁸: the same cells, and none shorter than
+    95 % of what it was."""
     ends = dict(low_end=-8.0, high_end=8.0)
     scene = colony(tf.Mechanics([tf.Channel(6.0, **ends)], dim=2, length_drag=length_drag))
     *_, full = tf.simulate(scene, until=12.0, seed=1)

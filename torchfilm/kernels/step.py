@@ -306,8 +306,8 @@ def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosit
         for _ in range(steps[b]):
             own_length = step_colony(
                 own_x, own_axis, own_length, share, own_radius, own_viscosity, own_drag,
-                own_shortest, own_last, hardness[b : b + 1], kinds, places[:, b], sizes[:, b], own_roots, is_soft,
-                own_alphas, own_settings, reports[b], dof,
+                own_shortest, own_last, hardness[b : b + 1], kinds, places[:, b], sizes[:, b],
+                own_roots, is_soft, own_alphas, own_settings, reports[b], dof,
             )  # fmt: skip
             if reports[b, STATUS] == NOT_FINITE:
                 break
