@@ -158,6 +158,7 @@ def _grow_and_score(
             cells[ids] = event.state.counts.cpu().numpy()[::copies]
             if gathered is not None:
                 gathered.add(task.target, event, ids)
+                gathered.forget([k for k, well in zip(ids, good, strict=True) if not well])
     shape, slopes = (count, replicates), None if gathered is None else gathered.slopes
     return WorkResult(
         losses.reshape(shape), cells.reshape(shape), reasons, prepared.why_regrown, slopes
