@@ -167,14 +167,15 @@ def draw(report: SearchReport, path: Path) -> Path:
     designs = (report.first, report.best)
     grown = [_one_by_one(d.colonies)[:SHOWN] for d in designs]
     columns = max(1, *(len(g) for g in grown))
-    figure = Figure(figsize=(2.6 * columns + 4.2, 6.2), layout="constrained")
-    grid = figure.add_gridspec(
-        3, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 1.0, 0.05]
-    )
     target = report.task.target
     frames = [[tf.pictures.frame_of(d.state).colony(k) for d, k in g] for g in grown]
     every = [cells for row in frames for cells in row]
-    size = max(map(_extent, every), default=1.0)
+    size = tuple(np.max([_extent(cells) for cells in every], axis=0)) if every else (1.0, 1.0)
+    height = 6.2 if size[1] > 0.6 * size[0] else 4.6  # wide colonies leave room above
+    figure = Figure(figsize=(2.6 * columns + 4.2, height), layout="constrained")
+    grid = figure.add_gridspec(
+        3, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 1.0, 0.05]
+    )
     limits = _limits(target, every)
     scales: list[Any] = []
     for row, one in enumerate(designs):
@@ -200,14 +201,12 @@ def _one_by_one(finished: list[FinishedColonies]) -> list[tuple[FinishedColonies
     )
 
 
-def _extent(cells: dict[str, np.ndarray]) -> float:
-    """Half the side of a square that contains a colony, µm."""
+def _extent(cells: dict[str, np.ndarray]) -> np.ndarray:
+    """Half the sides of a rectangle that contains a colony, (2,) µm; neither below a third of the
+    other, so that a panel holds its title."""
     place = cells["position"][:, :2]
-    return (
-        float((place.max(0) - place.min(0)).max()) / 2
-        + float((cells["length"] / 2 + cells["radius"]).max())
-        + 0.5
-    )
+    half = np.ptp(place, axis=0) / 2 + (cells["length"] / 2 + cells["radius"]).max() + 0.5
+    return np.maximum(half, half.max() / 3)
 
 
 def _colour(name: str, place: int) -> str:
@@ -237,7 +236,7 @@ def _draw_row(
     grown: list[tuple[FinishedColonies, int]],
     frames: list[dict[str, np.ndarray]],
     target: Target,
-    size: float,
+    size: tuple[float, float],
     limits: dict[str, tuple[float, float]],
     title: str,
 ) -> list[Any]:
@@ -249,7 +248,7 @@ def _draw_row(
     scales: list[Any] = []
     for ax, (done, k), cells in zip(axes, grown, frames, strict=False):
         x, y = (cells["position"][:, :2].max(0) + cells["position"][:, :2].min(0)) / 2
-        window = (x - size, x + size, y - size, y + size)
+        window = (x - size[0], x + size[0], y - size[1], y + size[1])
         if channels:
             ax.set_facecolor("black")
         scales = tf.pictures.draw_cells(

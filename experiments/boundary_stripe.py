@@ -1,7 +1,7 @@
 """Searches constants of the boundary detector (Fig. 5) for a narrow, bright stripe where two
 populations meet.
 
-    python experiments/boundary_stripe.py                    # 2,000 colonies
+    python experiments/boundary_stripe.py                    # 2,000 colonies of 1,000 cells
     python experiments/boundary_stripe.py --colonies 800 --out runs/stripe
 
 You may stop the search at any time; running it again resumes it. Target: sinks (type 1) within 4 µm
@@ -32,9 +32,10 @@ PARAMETERS = [
     Parameter("dr", 0.1, 10.0, log=True),  # degradation of YFP, 1/h: a degradation tag
 ]
 TARGET = Stripe("yfp", at="border", width=4.0, cell_type=1, floor=0.2)
-# Colonies of 100 cells in a channel. A step of 0.05 h and rtol 0.01 change a loss by 0.003 at most
-# and take a third of the time.
-COLONY = {"cells": 100, "dt": 0.05, "fixed": {"width": 16.0, "rtol": 1e-2}}
+# Colonies of 1,000 cells in a channel: smaller ones have no place far from the border, which should
+# be dark. A step of 0.05 h and rtol 0.01 change a loss by 0.003 at most and take a third of the
+# time.
+COLONY = {"cells": 1000, "dt": 0.05, "fixed": {"width": 32.0, "rtol": 1e-2}}
 PUBLISHED = {
     "d1": 1e-3,
     "k1": 1.0,

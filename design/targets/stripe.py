@@ -214,7 +214,9 @@ class Stripe(ProfileTarget):
                 & (self.target_profile(state)[:, 0] > 0.5)
             )
             x, y = state.position[mine, :2].cpu().numpy().T
-            ax.plot(x, y, ".", color=COLOURS[0], ms=3)
+            # small enough to leave the colour of a cell to be seen
+            size = 3.0 * min(1.0, max(0.5, (100 / max(1, int(state.counts[place]))) ** 0.5))
+            ax.plot(x, y, ".", color=COLOURS[0], ms=size, mew=0)
             return
         at, middle = (float(v[place]) for v in self.reference(state)[:2])
         lines(

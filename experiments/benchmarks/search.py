@@ -42,7 +42,7 @@ TARGETS = {
         "boundary_detector",
         boundary_stripe.PARAMETERS,
         boundary_stripe.TARGET,
-        boundary_stripe.COLONY,
+        {"cells": 100, "dt": 0.05, "fixed": {"width": 16.0, "rtol": 1e-2}},
         0.07,
         10,
         2000,
