@@ -28,6 +28,10 @@ class Gathered:
     def __init__(self, space: Space, count: int):
         self.directions, self.slopes = space.moving, Slopes.none(count, space.size)
 
+    def forget(self, colonies: list[int]) -> None:
+        """Colonies that have failed, whose loss has no slope."""
+        self.slopes.gradient[colonies], self.slopes.curvature[colonies] = 0.0, np.nan
+
     def add(self, target: Target, finished: FinishedColonies, colony: list[int]) -> None:
         """The copies of colonies: of each, one after the other, all its copies. colony: the
         colony of each first copy."""

@@ -16,11 +16,13 @@ from design.rollout import FinishedColonies
 from design.study import Study
 from design.targets.base import Target
 from design.task import Task
+from design.trivial import trivial_losses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SHOWN = 3  # replicates side by side
+NEAR = 0.005  # of a bound, as a share of the range (of its logarithm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,22 +52,25 @@ class SearchReport:
 def table(report: SearchReport) -> str:
     """Parameters with bounds, first guess and best value; then losses and measures."""
     first, best, study = report.first, report.best, report.study
-    rows: list[tuple[str, ...]] = [("parameter", "bounds", first.title, best.title)]
+    rows: list[tuple[str, ...]] = [("parameter", "bounds", first.title, best.title, "")]
     for p in report.task.space.parameters:
         values = (show_value(design.values[p.name]) for design in (first, best))
-        rows.append((p.name, _bounds(p), *values))
-    rows.append(("loss", "", f"{first.loss:.4f}", f"{best.loss:.4f}"))
-    old, new = (measured(report.task.target, design.colonies) for design in (first, best))
+        rows.append((p.name, _bounds(p), *values, _at_bound(p, best.values[p.name])))
+    rows.append(("loss", "", f"{first.loss:.4f}", f"{best.loss:.4f}", ""))
+    rows.append(("cells", "", *(_cells(design.colonies) for design in (first, best)), ""))
+    target = report.task.target
+    old, new = (each_measured(target, design.colonies) for design in (first, best))
     for name in new:
-        rows.append((name, "", show_value(old.get(name, float("nan"))), show_value(new[name])))
-    wide = [max(len(r[k]) for r in rows) for k in range(4)]
+        rows.append((name, "", _mean(old.get(name, [])), _mean(new[name]), _spread(new[name])))
+    wide = [max(len(r[k]) for r in rows) for k in range(5)]
     lines = [
         "  ".join(
-            x.ljust(w) if k < 2 else x.rjust(w)
+            x.rjust(w) if k in (2, 3) else x.ljust(w)
             for k, (x, w) in enumerate(zip(r, wide, strict=True))
-        )
+        ).rstrip()
         for r in rows
     ]
+    lines += _warnings(report)
     failed = sum(len(e.reasons) for e in study.entries)
     lines += [
         f"most frequent failure: {reason} ({times} colonies)"
@@ -81,21 +86,74 @@ def table(report: SearchReport) -> str:
     return "\n".join(lines)
 
 
+def _warnings(report: SearchReport) -> list[str]:
+    """The losses of trivial answers, and what they and the bounds say of the best design."""
+    best, space = report.best, report.task.space
+    answers = trivial_losses(report.task.target, best.colonies)
+    lines = ["without a pattern: " + ", ".join(f"{n} {x:.3f}" for n, x in answers.items())]
+    least = min(answers, key=lambda n: answers[n], default="")
+    if least and best.loss >= answers[least]:
+        lines.append(
+            f"the best design is no better than {least!r}: it has found no pattern. Larger"
+            " colonies, or a narrower target, tell patterns apart."
+        )
+    bound = [p.name for p in space.parameters if _at_bound(p, best.values[p.name])]
+    if bound:
+        lines.append(f"at a bound: {', '.join(bound)}; better values may lie beyond it.")
+    return lines
+
+
+def _at_bound(parameter: Parameter | Choice, value: Value) -> str:
+    """Where a number lies on a bound of its own: within NEAR of its range."""
+    if isinstance(parameter, Choice) or parameter.whole:
+        return ""
+    place = parameter.coordinate(value)
+    return (
+        "at its lower bound" if place < NEAR else "at its upper bound" if place > 1 - NEAR else ""
+    )
+
+
+def _cells(finished: list[FinishedColonies]) -> str:
+    """The numbers of cells of some colonies."""
+    counts = [n for part in finished for n in part.state.counts.tolist()]
+    if not counts:
+        return "none"
+    return f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)}–{max(counts)}"
+
+
+def _mean(values: list[float]) -> str:
+    some = [x for x in values if not np.isnan(x)]
+    return show_value(float(np.mean(some))) if some else "nan"
+
+
+def _spread(values: list[float]) -> str:
+    """The standard deviation of a measure between colonies, and how many have it."""
+    some = np.array([x for x in values if np.isfinite(x)])
+    spread = f"± {float(some.std(ddof=1)):.2g}" if len(some) > 1 else ""
+    missing = sum(np.isnan(x) for x in values)
+    return spread + (f" (undefined in {missing} of {len(values)})" if missing else "")
+
+
 def _bounds(parameter: Parameter | Choice) -> str:
     if isinstance(parameter, Parameter):
         return f"{parameter.low:g} … {parameter.high:g}"
     return " | ".join(map(str, parameter.options))
 
 
-def measured(target: Target, finished: Iterable[FinishedColonies]) -> dict[str, float]:
-    """The mean of each measure of a target over the colonies that have it; NaN where none has."""
+def each_measured(target: Target, finished: Iterable[FinishedColonies]) -> dict[str, list[float]]:
+    """The measures of a target, of each colony."""
     found: dict[str, list[float]] = {}
     for part in finished:
         for name, value in target.measures(part.state, part.history).items():
             found.setdefault(name, []).extend(value.double().tolist())
+    return found
+
+
+def measured(target: Target, finished: Iterable[FinishedColonies]) -> dict[str, float]:
+    """The mean of each measure of a target over the colonies that have it; NaN where none has."""
     return {
-        name: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan")
-        for name, v in found.items()
+        name: float(np.nanmean(v)) if not np.isnan(v).all() else float("nan")
+        for name, v in each_measured(target, finished).items()
     }
 
 

@@ -151,14 +151,35 @@ def _grow_and_score(
             for k, number in zip(ids, score.tolist(), strict=True):
                 if not math.isfinite(number):
                     reasons[divmod(k, replicates)] = f"the target's loss was {number}"
-            losses[ids] = np.where(np.isfinite(score), score, task.target.failed)
+            unfit = _unfit(task, event.state, size)[::copies]
+            reasons |= {divmod(k, replicates): w for k, w in zip(ids, unfit, strict=True) if w}
+            good = np.isfinite(score) & np.array([not why for why in unfit])
+            losses[ids] = np.where(good, score, task.target.failed)
             cells[ids] = event.state.counts.cpu().numpy()[::copies]
             if gathered is not None:
                 gathered.add(task.target, event, ids)
+                gathered.forget([k for k, well in zip(ids, good, strict=True) if not well])
     shape, slopes = (count, replicates), None if gathered is None else gathered.slopes
     return WorkResult(
         losses.reshape(shape), cells.reshape(shape), reasons, prepared.why_regrown, slopes
     )
+
+
+def _unfit(task: Task, state: tf.State, size: float) -> list[str]:
+    """Why each finished colony cannot be scored, "" where it can."""
+    wanted = task.end(size)[0]
+    least = min(task.target.fewest, wanted or task.target.fewest)
+    if wanted is not None:
+        least = max(least, math.ceil(wanted / 2))
+    why = task.target.unfit(state) if size >= 1.0 else [""] * state.colonies
+    for k, count in enumerate(state.counts.tolist()):
+        if count < least:
+            of = f"half of {wanted}" if wanted else f"the least for {type(task.target).__name__}"
+            why[k] = (
+                f"it has {count} cells at {state.time:g} h, and {least}, {of}, are needed: a"
+                " smaller colony shows no pattern. Raise until."
+            )
+    return why
 
 
 def _scene(task: Task, item: WorkItem, replicates: int) -> tf.Scene:

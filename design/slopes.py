@@ -32,9 +32,10 @@ class Slopes:
         """Of n designs, from those of n · R colonies with weights (n, R)."""
         n, r = weight.shape
         size = self.gradient.shape[1]
-        gradient = (weight[:, :, None] * self.gradient.reshape(n, r, size)).sum(1)
-        curvature = self.curvature.reshape(n, r, size, size)
-        curvature = (weight[:, :, None, None] * curvature).sum(1)
+        each = weight[:, :, None]
+        counted = lambda w, x: np.where(w > 0, w * x, 0.0).sum(1)  # also where x is no number
+        gradient = counted(each, self.gradient.reshape(n, r, size))
+        curvature = counted(each[..., None], self.curvature.reshape(n, r, size, size))
         return Slopes(gradient, curvature)
 
 

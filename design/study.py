@@ -6,8 +6,8 @@ results as if it had never stopped.
     /streams      (R,) streams of random numbers, one for each replicate
     /batches/     rows, size, replicates, seconds, copies: a row for each batch
     /designs/     point (N, D), loss (N,), losses (N, R), cells (N, R); NaN and 0 where a replicate
-                  was not grown; reasons, JSON by replicate; gradient (N, D), curvature (N, D, D),
-                  NaN where no derivatives were wanted
+                  was not grown; reasons, JSON by replicate
+    /slopes/K/    gradient (n, D) and curvature (n, D, D) of batch K, where they were wanted
     /values/NAME  (N,) the values of each parameter
 
 After each batch a new file is written beside the old one and then replaces it, so that a kill at
@@ -178,12 +178,10 @@ class Study:
         file["designs/loss"] = np.concatenate([e.loss for e in self.entries])
         file["designs/losses"] = np.concatenate([wide(e.losses, np.nan) for e in self.entries])
         file["designs/cells"] = np.concatenate([wide(e.cells, 0) for e in self.entries])
-        size = len(self.names)
-        for name, shape in (("gradient", (size,)), ("curvature", (size, size))):
-            file[f"designs/{name}"] = np.concatenate([
-                np.full((len(e.points), *shape), np.nan) if e.slopes is None
-                else getattr(e.slopes, name) for e in self.entries
-            ])  # fmt: skip
+        for number, slopes in enumerate(e.slopes for e in self.entries):
+            if slopes is not None:
+                file[f"slopes/{number}/gradient"] = slopes.gradient
+                file[f"slopes/{number}/curvature"] = slopes.curvature
         words = [
             json.dumps(
                 {str(k): e.reasons[r, k] for k in range(e.replicates) if (r, k) in e.reasons}
@@ -325,7 +323,7 @@ def _entries(file: h5py.File) -> list[Entry]:
                 replicates,
                 seconds,
                 values[mine],
-                _slopes(designs, mine),
+                _slopes(file, len(out)),
                 copies,
             )
         )
@@ -335,6 +333,6 @@ def _entries(file: h5py.File) -> list[Entry]:
     return out
 
 
-def _slopes(designs: Mapping[str, np.ndarray], rows: slice) -> Slopes | None:
-    gradient = designs["gradient"][rows] if "gradient" in designs else np.full(1, np.nan)
-    return None if np.isnan(gradient).all() else Slopes(gradient, designs["curvature"][rows])
+def _slopes(file: h5py.File, batch: int) -> Slopes | None:
+    found = file.get(f"slopes/{batch}")
+    return None if found is None else Slopes(found["gradient"][...], found["curvature"][...])

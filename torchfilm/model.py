@@ -26,6 +26,7 @@ from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hashing import digest
+from torchfilm.tools.tangents import tracked
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.warn_once import once
 
@@ -297,8 +298,8 @@ def why_not_replayable(model: Model) -> str:
     for path, tensor in (x for k in model.recorded for x in parameters(model.scene.effects[k])):
         if tensor.dim() == 1:
             return f"{path} differs between colonies and acts on their growth"
-        if tensor.requires_grad:
-            return f"{path} requires a gradient, which recorded growth does not carry"
+        if tracked(tensor):
+            return f"a derivative by {path} is wanted, which recorded growth does not carry"
     return ""
 
 

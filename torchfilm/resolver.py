@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.tangents import has_tangent
 from torchfilm.values import ByType, Distribution, PerColony, is_drawn, is_inherited
 
 
@@ -119,7 +120,10 @@ class Resolved:
         """Whether it is the plain number 0."""
         value = self.value
         return (
-            value is not None and value.dim() == 0 and not self.requires_grad and float(value) == 0
+            value is not None
+            and value.dim() == 0
+            and not (self.requires_grad or has_tangent(value))
+            and float(value) == 0
         )
 
 

@@ -63,6 +63,9 @@ class Descent:
 
     def learn(self, loss: float, gradient: np.ndarray, curvature: np.ndarray) -> None:
         """What was found at the proposed point."""
+        if not np.isfinite(gradient).all():
+            self.over = "a derivative is no number"
+            return
         if not np.isfinite(self.loss):
             self._take(loss, gradient, curvature, np.zeros_like(gradient))
             return
@@ -100,6 +103,8 @@ class Descent:
         known, change = self.curvature, gradient - self.gradient
         across = known @ moved
         bent, turned = float(moved @ across), float(moved @ change)
+        if bent <= 0:
+            return known
         if turned < 0.2 * bent:
             share = 0.8 * bent / (bent - turned)
             change = share * change + (1 - share) * across

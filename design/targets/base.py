@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
@@ -32,6 +33,7 @@ class Target:
     """
 
     failed: ClassVar[float] = 1.5
+    fewest: ClassVar[int] = 1  # cells: a smaller colony is not scored
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -40,6 +42,11 @@ class Target:
 
     def check(self, state: tf.State) -> None:
         """Raises `tf.InputError` where a first state lacks something that the target reads."""
+
+    def unfit(self, state: tf.State) -> list[str]:
+        """Why each colony of full size cannot be scored, "" where it can: it lacks cells of which
+        the target speaks, so that its loss would say nothing. Such a colony has failed."""
+        return [""] * state.colonies
 
     def note(self, state: tf.State) -> Tensor | None:
         """What a target that needs the history keeps of a state after every step, (B, k); None:
@@ -152,6 +159,13 @@ def ratio(above: Tensor, below: Tensor, otherwise: float) -> Tensor:
     """above/below; where below is 0, `otherwise` with zero gradient."""
     some = below > 0
     return torch.where(some, above / torch.where(some, below, 1.0), otherwise)
+
+
+def contrast(inside: Tensor, outside: Tensor) -> Tensor:
+    """inside/outside; infinite where nothing is lit outside, and NaN where nothing is inside
+    either."""
+    dark = torch.where(inside > 0, torch.inf, torch.nan).to(inside.dtype)
+    return torch.where(outside == 0, dark, ratio(inside, outside, math.nan))
 
 
 def species_name(name: str, given: object) -> None:

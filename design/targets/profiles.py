@@ -15,6 +15,7 @@ from torch import Tensor
 import torchfilm as tf
 from design.targets.base import (
     Target,
+    contrast,
     ratio,
     require,
     rows_of_colonies,
@@ -62,6 +63,7 @@ class ProfileTarget(Target):
     """
 
     floor: float
+    fewest = 10
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,7 +142,7 @@ class ProfileTarget(Target):
         for k, name in enumerate(self.names):
             before = f"{name}_" if len(self.names) > 1 else ""
             found |= {f"{before}inside": inside[:, k], f"{before}outside": outside[:, k]}
-            found[f"{before}contrast"] = ratio(inside[:, k], outside[:, k], math.nan)
+            found[f"{before}contrast"] = contrast(inside[:, k], outside[:, k])
         return found
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.targets.base import ratio, species_name, total, valid_levels, weights
+from design.targets.base import contrast, ratio, species_name, total, valid_levels, weights
 from design.targets.geometry import COLOURS, between, check_profile, half, lines
 from design.targets.profiles import ProfileTarget
 from torchfilm import checks
@@ -38,7 +38,7 @@ class Stripe(ProfileTarget):
     this type count. place: of the middle of the stripe from `at`, µm towards the type that lies
     higher on the axis. The default is 0; with "border" and a cell_type, the stripe adjoins the
     border on the side of that type. floor: the level from which a cell counts as lit. edge_width:
-    µm, as for `Bands`. A colony that has lost one of its two types has no border, and loss 1.
+    µm, as for `Bands`. A colony that has lost one of its two types, or `cell_type`, has failed.
     """
 
     species: str
@@ -105,6 +105,20 @@ class Stripe(ProfileTarget):
         return (
             super().counted(state) if self.cell_type is None else state.cell_type == self.cell_type
         )
+
+    def unfit(self, state: tf.State) -> list[str]:
+        if self.at != "border" and self.cell_type is None:
+            return [""] * state.colonies
+        out = []
+        for k in range(state.colonies):
+            there = torch.unique(state.cell_type[state.colony == k]).tolist()
+            if self.at == "border" and len(there) != 2:
+                out.append(f"it has no border: only cells of type {there} are left")
+            elif self.cell_type is not None and self.cell_type not in there:
+                out.append(f"it has no cells of type {self.cell_type}, only of {there}")
+            else:
+                out.append("")
+        return out
 
     @property
     def least(self) -> float:
@@ -188,7 +202,7 @@ class Stripe(ProfileTarget):
             name: torch.as_tensor(v, device=state.device)
             for name, v in (("width_um", width), ("peak", peak), ("straightness_um", straight))
         }
-        return found | {"contrast": ratio(bright, dark, math.nan)}
+        return found | {"contrast": contrast(bright, dark)}
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """Draw the edges of the stripe and the border as lines or, where it winds, a dot on each

@@ -197,3 +197,63 @@ def test_transport_carries_tangents(method):
     difference = (more - less) / 2e-5
     assert float(difference.abs().max()) > 0.01
     assert torch.allclose(slope, difference, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_a_cell_that_gives_nothing_has_the_slope_of_giving(plain, backend):
+    """At a flux of exactly 0, into a pool and into a reservoir: taking and giving share it."""
+
+    def end(q, outside):
+        give = lambda u, s, p, cell: ({"a": 0 * u.a}, {"n": p.q * cell.volume})
+        still = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
+        far = {"outside": "reservoir"} if outside else {}
+        signal = tf.Signal(diffusion=0.0, initial=1.0, **({"reservoir": 1.0} if outside else {}))
+        box = ((50.0, 50.0), (60.0, 60.0)) if outside else ((-4.0, -4.0), (4.0, 4.0))
+        scene = tf.Scene(
+            tf.Circuit(give, species="a", q=q, backend=backend),
+            tf.Medium(n=signal, box=box, spacing=2.0, **far), founders=still, dt=0.1,
+        )  # fmt: skip
+        model = scene.bind(2, dtype=F64, per_colony=True)
+        state = model.step(model.start(), 0.1)
+        return state.fields["n_reservoir" if outside else "out.n"]
+
+    for outside in (False, True):
+        with torch.no_grad(), forward_mode():
+            slope = tangent(end(moved(0.0, 1.0, 0.0), outside))
+        more, less = (end(torch.tensor([h, 0.0], dtype=F64), outside) for h in (1e-6, -1e-6))
+        difference = (more - less) / 2e-6
+        assert float(difference.abs().max()) > 1e-3
+        assert torch.allclose(slope, difference, rtol=1e-6, atol=1e-9), outside
+
+
+def test_transport_at_rest_still_depends_on_its_coefficients():
+    """A uniform field in balance: no iteration of a solve is needed, and yet it moves."""
+
+    def end(decay, method):
+        still = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
+        signal = tf.Signal(diffusion=1.0, decay=decay, source=2.0, initial=1.0)
+        medium = tf.Medium(a=signal, box=((-4, -4), (4, 4)), spacing=2.0, method=method)
+        model = tf.Scene(medium, founders=still, dt=0.1).bind(2, dtype=F64, per_colony=True)
+        return model.step(model.start(), 0.1).fields["out.a"]
+
+    for method in ("exponential", "series", "implicit", "crank_nicolson", "euler"):
+        with torch.no_grad(), forward_mode():
+            slope = tangent(end(moved(2.0, 1.0, 1.0), method))
+        assert slope is not None and float(slope.max()) < -0.05, method
+
+
+def test_values_in_a_list_keep_their_tangents(plain):
+    decay = lambda u, s, p, cell: {"a": p.k - u.a}
+    with torch.no_grad(), forward_mode():
+        one = torch.tensor(1.0, dtype=F64)
+        k = [forward_ad.make_dual(one.clone(), one), one]
+        model = one_circuit(decay, species=("a",), k=k).bind(2, dtype=F64, per_colony=True)
+        slope = tangent(model.step(model.start(), 0.1).fields["a"])
+    assert float(slope[:3].min()) > 0.09 and float(slope[3:].abs().max()) == 0
+
+
+def test_recorded_growth_refuses_tangents():
+    with torch.no_grad(), forward_mode():
+        rate = forward_ad.make_dual(torch.tensor(1.0), torch.tensor(1.0))
+        model = tf.Scene(tf.Growth(rate=rate), tf.Circuit(roots, species=("a", "b"), k=1.0)).bind(1)
+        assert "a derivative by" in model.why_not_replayable

@@ -167,6 +167,31 @@ def test_derivatives_that_mislead_end_a_descent():
     assert len(np.unique(points, axis=0)) > 16
 
 
+def test_a_derivative_that_is_no_number_ends_a_descent():
+    def broken(point):
+        j = np.eye(3) * (np.nan if point[0] > 0.5 else 1.0)
+        return point - 0.2, j
+
+    points, losses, _ = descend(Local(starts=2, first=8), broken, batches=20)
+    assert np.isfinite(points).all() and losses.min() < 1e-6
+
+
+def test_a_replicate_that_does_not_count_may_lack_slopes():
+    slopes = Slopes(np.array([[1.0, 2.0], [np.nan, 0.0]]), np.full((2, 2, 2), np.nan))
+    slopes.curvature[0] = np.eye(2)
+    found = slopes.reduced(np.array([[1.0, 0.0]]))
+    assert found.gradient.tolist() == [[1.0, 2.0]] and found.curvature.tolist() == [
+        [[1.0, 0.0], [0.0, 1.0]]
+    ]
+
+
+def test_colonies_that_cannot_be_scored_have_no_slope():
+    objective = objective_of(lit, TWO, EDGES, cells=40, until=0.5, replicates=1)
+    found = objective.evaluate(POINTS, slopes=True)
+    assert len(found.reasons) == 2 and (found.slopes.gradient == 0).all()
+    assert np.isnan(found.slopes.curvature).all()
+
+
 def test_a_search_with_slopes_resumes(tmp_path):
     make = lambda: Search(
         lit, TWO, EDGES, cells=6, replicates=2, method=Local(starts=2, first=4)

@@ -9,10 +9,12 @@ import matplotlib.image
 import numpy as np
 import pytest
 import torch
+from patterned import crowded
 from searching import Level, Spread, banned, built, fragile, lit
 
 import torchfilm as tf
-from design import Bands, Batch, Choice, Parameter, Search, Sobol, Target
+from design import Bands, Batch, Choice, Objective, Parameter, Search, Sobol, Stripe, Target, Task
+from design.trivial import trivial_losses
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -74,7 +76,7 @@ def test_the_table_has_every_parameter_with_bounds_first_guess_and_best():
             for x in best.search.objective.task.target.measures(d.state)["mean_level"]
         ]
     )
-    assert found["mean_level"][-1] == f"{level:.4g}" and best.losses.mean() == pytest.approx(
+    assert found["mean_level"][2] == f"{level:.4g}" and best.losses.mean() == pytest.approx(
         abs(level - 3.0), rel=1e-9
     )
     assert best.table().splitlines()[-1].startswith("12 colonies in ") and best.table().endswith(
@@ -122,11 +124,12 @@ class Half(Level):
 
 def test_a_measure_is_the_mean_over_the_colonies_that_have_it():
     found = rows(searched(lit, LIT, Half()))
-    assert found["some_um"] == ["some_um", "2.5", "2.5"] and found["none_um"] == [
-        "none_um",
-        "nan",
-        "nan",
-    ]
+    best = searched(lit, LIT, Half())
+    count = len(best.losses)
+    some, none = ("".join(f"(undefined in {n} of {count})".split()) for n in (count - 1, count))
+    shown = {name: [*row[:3], "".join(row[3:])] for name, row in found.items()}
+    assert shown["some_um"] == ["some_um", "2.5", "2.5", some]
+    assert shown["none_um"] == ["none_um", "nan", "nan", none]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -241,3 +244,73 @@ def test_a_bad_picture_name_is_refused(tmp_path):
     best = searched(lit, LIT, Spread())
     with pytest.raises((tf.InputError, ValueError), match="Format 'xyz' is not supported"):
         best.plot(tmp_path / "best.xyz")
+
+
+# --- what a winner is worth -----------------------------------------------------------------------
+
+WIDE = Bands(("gfp",), (-50.0, 50.0), floor=0.5)  # every cell lies in the band
+PAIR = [Parameter("make", 1.0, 10.0), Parameter("decay", 0.1, 1.0)]
+
+
+def test_a_pattern_that_an_even_level_has_is_no_pattern():
+    text = searched(lit, PAIR, WIDE).table()
+    line = next(x for x in text.splitlines() if x.startswith("without a pattern"))
+    assert "all dark 1.000" in line and "all lit 0.000" in line
+    assert "no better than 'all lit'" in text or "no better than 'best even level'" in text
+
+
+def test_trivial_answers_are_those_of_the_target():
+    """Every second cell lit, and all lit, by the formula of the target, for each colony."""
+    half = Bands(("gfp",), (0.0, 50.0), edge_width=0.01)
+    best = searched(lit, PAIR, half)
+    found = trivial_losses(half, best.colonies())
+    lit_losses = []
+    for part in best.colonies():
+        state = part.state.with_fields(gfp=torch.ones_like(part.state.fields["gfp"]))
+        lit_losses += half.loss(state).tolist()
+    assert found["all lit"] == pytest.approx(np.mean(lit_losses))
+    assert found["best even level"] == pytest.approx(found["all lit"]) and found["all dark"] == 1.0
+    assert found["every second lit"] > found["all lit"]
+
+
+def test_numbers_on_a_bound_are_marked():
+    """The more is made, the nearer to 30: the best make lies at its bound."""
+    best = searched(lit, PAIR, Level("gfp", 30.0), 8, Given([0.5, 0.5], [1.0, 0.3]))
+    table = best.table()
+    line = next(x for x in table.splitlines() if x.startswith("make"))
+    assert line.endswith("at its upper bound")
+    assert "at a bound: make; better values may lie beyond it." in table
+    assert "at its" not in next(x for x in table.splitlines() if x.startswith("decay"))
+
+
+def test_the_table_shows_how_many_cells_the_colonies_have():
+    best = searched(lit, PAIR, WIDE)
+    counts = [n for d in best.colonies() for n in d.state.counts.tolist()]
+    line = next(x for x in best.table().splitlines() if x.startswith("cells"))
+    shown = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)}–{max(counts)}"
+    assert line.split()[-1] == shown
+
+
+def test_a_colony_that_stays_too_small_has_failed():
+    """It ends by its time with a fraction of the cells that were asked for."""
+    objective = Objective(Task(lit, PAIR, WIDE, cells=40, until=0.5, replicates=2))
+    found = objective.evaluate(np.array([[0.5, 0.5]]))
+    assert (found.losses == WIDE.failed).all() and len(found.reasons) == 2
+    assert "and 20, half of 40, are needed" in found.reasons[0, 0]
+    only_time = Objective(Task(lit, PAIR, WIDE, until=0.5, replicates=1))
+    reason = only_time.evaluate(np.array([[0.5, 0.5]])).reasons[0, 0]
+    assert "and 10, the least for Bands, are needed" in reason
+    # who asks for a few cells gets them
+    few = Objective(Task(lit, PAIR, WIDE, cells=4, replicates=1))
+    assert not few.evaluate(np.array([[0.5, 0.5]])).reasons
+
+
+def test_a_colony_without_the_type_that_a_stripe_needs_has_failed():
+    state = crowded()
+    lost = torch.where(state.colony == 2, 0, state.cell_type)
+    state = state.with_fields(cell_type=lost)
+    words = Stripe("yfp", width=4.0, cell_type=1).unfit(state)
+    assert [bool(w) for w in words] == [False, False, True, False]
+    assert "no border" in words[2]
+    words = Stripe("yfp", at=0.0, width=4.0, cell_type=1).unfit(state)
+    assert "no cells of type 1" in words[2] and not any(words[:2])

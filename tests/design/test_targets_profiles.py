@@ -287,7 +287,10 @@ def test_measures_say_how_bright_it_is_inside_and_outside():
     two = Bands(("yfp", "cfp"), (-9, 0, 9), edge_width=SHARP).measures(
         row([-4, 4], yfp=[1, 0], cfp=[1, 2])
     )
-    assert float(two["cfp_contrast"]) == 2 and bool(two["yfp_contrast"].isnan())
+    assert float(two["cfp_contrast"]) == 2
+    # nothing is lit outside: the contrast has no bound; nothing anywhere: there is none
+    assert float(two["yfp_contrast"]) == float("inf")
+    assert bool(LEFT.measures(row([-4, 4], yfp=[0, 0]))["contrast"].isnan())
 
 
 def test_a_signal_is_seen_where_the_cells_are():

@@ -235,3 +235,30 @@ def test_case_47_a_heap_parts(measured, dim, cells):
     last = states[-1][1]
     assert measured("mean overlap, µm", float(last.mean), "≤ 0.02") <= 0.02
     assert measured("worst overlap, µm", float(last.worst), "≤ 0.3") <= 0.3
+
+
+def test_gradients_go_through_the_bound_on_what_a_pressed_cell_loses():
+    """A cell that two walls press: before the bound acts, when it does, and after."""
+
+    def end(rate, steps):
+        walls = [tf.Plane(x=side, facing=f, weight=1.0) for side, f in ((-1.3, "+x"), (1.3, "-x"))]
+        scene = tf.Scene(
+            tf.Growth(rate=rate),
+            tf.Mechanics(walls, dim=2, length_drag=2.0, tolerance=1e-10, alpha=1e-3),
+            founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 2.0, 0.5), dt=0.05,
+        )  # fmt: skip
+        model = scene.bind(1, dtype=torch.float64)
+        state = model.start()
+        for _ in range(steps):
+            state = model.step(state)
+        return state
+
+    bounds = []
+    for steps in (15, 22, 25):
+        rate = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+        (slope,) = torch.autograd.grad(end(rate, steps).length.sum(), rate)
+        more, less = (end(1.0 + h, steps) for h in (1e-5, -1e-5))
+        difference = float(more.length - less.length) / 2e-5
+        assert float(slope) == pytest.approx(difference, rel=1e-3), steps
+        bounds.append(float(more.compression / (more.length + more.compression + 1.0)))
+    assert bounds[0] < 0.04 and bounds[1] > 0.045 and bounds[2] > 0.045

@@ -68,6 +68,25 @@ def test_series_is_that_of_torch(dtype, shape, faces, masked, dt):
     assert bool(((one - other).abs() <= allowed * one).all())
 
 
+@DTYPES
+@pytest.mark.parametrize("dt", [0.8, 0.9, 0.99])
+def test_a_long_series_loses_nothing(dtype, dt):
+    """λΔt up to nearly the most that is allowed: there the first terms are 0, too."""
+    op = build_operator(
+        (20, 20, 1), (1.0, 1.0, 1.0), diffusion=240.0, decay=0.0,
+        boundary=BoundaryConditions(), colonies=1, dtype=dtype,
+    )  # fmt: skip
+    stepper = prepare(op, dt, "series")
+    assert float(stepper.weights[0, 0]) == 0.0, "the first term should be 0"
+    u = torch.rand(1, 20, 20, 1, dtype=dtype, generator=torch.Generator().manual_seed(1))
+    one, other = stepper.step(u), by_kernel(stepper, u)
+    # up to 1,200 terms, each added with one rounding in float64
+    allowed = (2400 if dtype == torch.float64 else 1) * torch.finfo(dtype).eps
+    assert bool(((one - other).abs() <= allowed * one).all())
+    lost = 1.0 - float(other.double().sum() / u.double().sum())
+    assert abs(lost) < (1e-12 if dtype == torch.float64 else 1e-7)
+
+
 def colonies(count: int, dtype, own: bool, method: str):
     """Carriers and values of colonies with grids of three shapes, in a fixed mixture."""
     generator = torch.Generator().manual_seed(3)

@@ -260,8 +260,8 @@ def _exchange(flux: Sequence[Column], circuit: CircuitCells, trace: Trace) -> li
     if circuit.in_reservoir is None:
         return into
     away = trace.column("own.away", (torch.bool, 1))
-    up = [apply("where", away, apply("maximum", x, 0.0), 0.0) for x in flux]
-    down = [apply("where", away, apply("maximum", apply("neg", x), 0.0), 0.0) for x in flux]
+    part = lambda op, x: apply("mul", 0.5, apply(op, apply("abs", x), x))
+    up, down = ([apply("where", away, part(op, x), 0.0) for x in flux] for op in ("add", "sub"))
     return [*(apply("where", away, 0.0, x) for x in into), *up, *down]
 
 

@@ -158,8 +158,9 @@ class CircuitCells:
             else:
                 away = self.in_reservoir.index_select(0, rows)
                 columns += [torch.where(away, 0.0, x / pool) for x in flux]
-                columns += [torch.where(away, x.clamp(min=0.0), 0.0) for x in flux]
-                columns += [torch.where(away, (-x).clamp(min=0.0), 0.0) for x in flux]
+                # at 0 the derivatives of both add up to 1
+                columns += [torch.where(away, 0.5 * (x.abs() + x), 0.0) for x in flux]
+                columns += [torch.where(away, 0.5 * (x.abs() - x), 0.0) for x in flux]
         return torch.stack(columns, 1)
 
     def per_unit(self, given: float | Tensor) -> Tensor:

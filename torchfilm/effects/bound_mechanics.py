@@ -69,7 +69,7 @@ class BoundMechanics(BoundEffect):
         if not self.effect.one_sided:
             return state
         alpha = state.groups.spread(found.hardness.to(state.dtype))
-        lost = (state.fields["compression"] + base - found.length).detach().clamp(min=0.0)
+        lost = (state.fields["compression"] + base - found.length).clamp(min=0.0)
         return state.with_fields(contact_alpha=alpha, compression=lost)
 
     @staticmethod

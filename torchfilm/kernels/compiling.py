@@ -78,7 +78,8 @@ def kernel(function=None, *, any_order: bool = False):
     """Compile a function at its first call with new types, without the interpreter's lock.
 
     Sums keep their order, unless any_order: then the compiler may choose one, the same for all
-    calls with as many terms.
+    calls with as many terms. Such a function must not write to arrays: the order would depend on
+    how near to each other they lie in memory.
     """
     if function is None:
         return partial(kernel, any_order=any_order)

@@ -189,13 +189,19 @@ def next_direction(p, z, t):
         z[k] = 0
 
 
+@kernel
+def _put_forces(e, pushed, v):
+    """v = the force of each row."""
+    for r in range(e.shape[0]):
+        v[r] = max(-e[r], 0 * e[r]) - pushed[r]
+
+
 @kernel(any_order=True)
-def _forces(e, pushed, cap, v):
-    """v = the force of each row. Returns the sum of squared overlaps, each counted up to `cap`."""
+def _squared_overlap(e, cap):
+    """The sum of squared overlaps, each counted up to `cap`."""
     overlap = 0.0
     for r in range(e.shape[0]):
         depth = max(-e[r], 0 * e[r])
-        v[r] = depth - pushed[r]
         overlap += min(depth * depth, cap * cap)
     return overlap
 
@@ -276,7 +282,8 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
     e = gaps[:rows] - q
     total, fall, error, stuck = 0, np.inf, 0.0, 0
     for round_ in range(MOST_ROUNDS + 1):
-        overlap = _forces(e, pushed, cap, v)
+        overlap = _squared_overlap(e, cap)
+        _put_forces(e, pushed, v)
         pushing = _switch_rows(e, one, two, act, on, stale)
         g[:] = 0
         for i in range(n):

@@ -261,7 +261,8 @@ def write(values: Tensor, amount: Tensor, stencil: Stencil) -> Tensor:
         return compiled.write(values, amount, there, stencil, ULPS)
     weight = stencil.weight.to(values.dtype)
     volume = stencil.voxel_volume
-    wanted = (-amount).clamp(min=0.0)
+    # halves of amount ± |amount|: at 0 the derivatives of both then add up to 1
+    wanted, added = 0.5 * (amount.abs() - amount), 0.5 * (amount.abs() + amount)
     # the part of a voxel's content that a cell takes if all its weight is there
     part = wanted / (torch.where(there > 0, there, 1.0) * volume)
     part = torch.where((wanted > 0) & (there <= 0), torch.inf, part)
@@ -269,5 +270,5 @@ def write(values: Tensor, amount: Tensor, stencil: Stencil) -> Tensor:
     taken = torch.where(
         (taken > 1) & (taken < 1 + ULPS * torch.finfo(values.dtype).eps), 1.0, taken
     )
-    given = stencil.sum(weight * (amount.clamp(min=0.0) / volume).unsqueeze(1))
+    given = stencil.sum(weight * (added / volume).unsqueeze(1))
     return torch.addcmul(values, values, taken, value=-1.0) + given

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchfilm.signals.transport_operator import Operator, apply
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
+from torchfilm.tools.tangents import both, with_tangent
 
 Map = Callable[[Tensor], Tensor]
 # The residual allowed, relative to the norm of the right-hand side. The solve is in float64, where
@@ -88,7 +89,13 @@ class CrankNicolson:
         if self.operator.gain is not None:
             right = right + self.dt * self.operator.gain
         with torch.no_grad():
-            x, report = krylov(left, right, wide, self.operator.symmetric)
+            bare = lambda x: both(x)[0]
+            still = lambda x: bare(left(x))
+            x, report = krylov(still, bare(right), bare(wide), self.operator.symmetric)
+            moved = both(right - left(x))[1]
+            if moved is not None:  # x' = A⁻¹ (b' − A' x)
+                turned, _ = krylov(still, moved, torch.zeros_like(x), self.operator.symmetric)
+                return with_tangent(x, turned).to(u.dtype), report
         if torch.is_grad_enabled():
             remainder = right - left(x)
             if remainder.requires_grad:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.signals.grid import Shape
+from torchfilm.tools.tangents import tracked
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,9 @@ class Exchange:
     @cached_property
     def idle(self) -> bool:
         """Whether the axis has one voxel, and no amount leaves or enters through its faces."""
-        return self.size == 1 and (self.periodic or not bool(self.up.any() | self.down.any()))
+        if self.size > 1 or tracked(self.up, self.down):
+            return False
+        return self.periodic or not bool(self.up.any() | self.down.any())
 
     def out(self) -> Tensor:
         """The rate at which each voxel gives along this axis, 1/h; one layer less than `up`."""

@@ -73,8 +73,10 @@ class Series:
 
     @cached_property
     def terms(self) -> np.ndarray:
-        """Terms that are not 0 of each colony, (B or 1,) int64."""
-        return (self.weights > 0).sum(0).cpu().numpy()
+        """Terms up to the last that is not 0 of each colony, (B or 1,) int64. Where λΔt is large,
+        the first ones are 0, too."""
+        number = torch.arange(1, self.weights.shape[0] + 1, device=self.weights.device)
+        return torch.where(self.weights > 0, number.unsqueeze(1), 0).amax(0).cpu().numpy()
 
 
 def prepare_series(operator: Operator, dt: float) -> Series:

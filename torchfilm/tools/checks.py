@@ -151,8 +151,12 @@ def value(
     """
     if isinstance(given, (list, tuple)):
         try:
-            given = torch.tensor(given, dtype=torch.float64)
-        except (TypeError, ValueError) as error:
+            given = (
+                torch.stack([torch.as_tensor(x).to(torch.float64) for x in given])
+                if any(isinstance(x, Tensor) for x in given)
+                else torch.tensor(given, dtype=torch.float64)
+            )
+        except (TypeError, ValueError, RuntimeError) as error:
             raise input_error(name, given, "a number, or numbers", hint) from error
     if hasattr(given, "__array__") and not isinstance(given, Tensor):
         given = torch.as_tensor(given)

@@ -1,0 +1,55 @@
+"""Trivial answers: the losses of colonies that were told nothing of the target."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.rollout import FinishedColonies
+from design.targets.base import OUTSIDE, Target
+
+BRIGHT = 1e3  # a lit cell, relative to the greatest level that was found, or to 1
+LEVELS = 25  # even levels that are tried, over six orders of magnitude
+
+
+@torch.no_grad()
+def trivial_losses(target: Target, finished: Iterable[FinishedColonies]) -> dict[str, float]:
+    """The mean losses of some colonies if all cells were dark, if all were lit, if every second
+    one was, and at the even level that is best."""
+    found: dict[str, list[float]] = {}
+    even: list[np.ndarray] = []
+    for part in finished:
+        state, steps = part.state, 0 if part.history is None else part.history.shape[0]
+        bright = BRIGHT * max(1.0, *(_greatest(state, n) for n in target.names), 0.0)
+        loss = lambda level, state=state, steps=steps: _loss(target, state, steps, level)
+        second = lambda count, level=bright: level * (torch.arange(count) % 2)
+        for name, level in (("all dark", 0.0), ("all lit", bright), ("every second lit", second)):
+            found.setdefault(name, []).extend(loss(level))
+        even.append(np.array([loss(x) for x in np.geomspace(1e-6, 1.0, LEVELS) * bright]))
+    answers = {name: float(np.mean(values)) for name, values in found.items()}
+    if even:
+        answers["best even level"] = float(np.concatenate(even, 1).mean(1).min())
+    return answers
+
+
+def _greatest(state: tf.State, name: str) -> float:
+    values = state.fields[name]
+    return float(torch.nan_to_num(values, 0.0, 0.0, 0.0).max()) if values.numel() else 0.0
+
+
+def _loss(target: Target, state: tf.State, steps: int, level: object) -> list[float]:
+    """The losses of colonies whose cells, or voxels, all have these levels at all times."""
+    fields: dict[str, Tensor] = {}
+    for name in target.names:
+        field = name if name.startswith(OUTSIDE) or name in state.fields else f"{OUTSIDE}{name}"
+        old = state.fields[field]
+        made = level(old.shape[0]) if callable(level) else torch.full(old.shape, float(level))  # type: ignore[arg-type]
+        fields[field] = made.to(dtype=old.dtype, device=old.device)
+    even = state.with_fields(**fields)
+    note = target.note(even)
+    history = None if note is None else note.expand(max(steps, 1), *note.shape)
+    return target.loss(even, history).double().tolist()
