@@ -2,12 +2,14 @@
 
     OMP_NUM_THREADS=1 python experiments/benchmarks/circuits.py      # about five minutes
     python experiments/benchmarks/circuits.py --case "tau_leap" --colonies 64 --cells 100
+    python experiments/benchmarks/circuits.py --explicit     # explicit methods against the default
 
 Each case is the repressilator, grown from one founder a colony to `cells` cells a colony in the
 mean. The same step of the same state is then taken by both backends in turn, so that a machine that
 does other work slows both. The table gives the least time of the whole step, of the circuit's
 solver alone, and their ratios, and whether all fields are the same to the bit. The script appends
-each run to a JSON file with its machine, versions and commit.
+each run to a JSON file with its machine, versions and commit. With --explicit it steps two smooth
+circuits by the default method and by explicit ones in turn, compiled, and only prints.
 """
 
 from __future__ import annotations
@@ -27,12 +29,17 @@ DT = 0.05
 BACKENDS = ("compiled", "torch")
 # by method: settings of the circuit
 CASES = {"tau_leap": {}, "direct": {}, "rosenbrock": {}, "rk4": {"steps": 4}}
+EXPLICIT = (("rosenbrock", {}), *((m, {"steps": 1}) for m in ("euler", "heun2", "rk4")))
+EXPLICIT += (("rk4", {"steps": 4}),)
 
 
-def scene_of(method: str, backend: str) -> tf.Scene:
-    """Returns the repressilator by a method and a backend."""
-    scene = tf.scenes.repressilator()
-    change = {"method": method, "backend": backend, **CASES[method]}
+def scene_of(
+    method: str, backend: str, settings: dict | None = None, name: str = "repressilator"
+) -> tf.Scene:
+    """Returns a ready-made scene by a method and a backend."""
+    scene = tf.scenes.build(name)
+    settings = CASES[method] if settings is None else settings
+    change = {"method": method, "backend": backend, **settings}
     return scene.replace(
         *(e._with(**change) if isinstance(e, tf.Circuit) else e for e in scene.effects)
     )
@@ -82,6 +89,30 @@ def measure(method: str, options: argparse.Namespace) -> dict:
     }
 
 
+def print_explicit(name: str, options: argparse.Namespace) -> None:
+    """Prints the times of the default method and of explicit ones in a ready-made scene."""
+    models = [
+        scene_of(method, "compiled", settings, name).bind(options.colonies, seed=1)
+        for method, settings in EXPLICIT
+    ]
+    state = models[0].start()
+    while state.cells < options.cells * options.colonies:
+        state = models[0].step(state, DT)
+    times = [[timed_step(model, state)] for model in models]  # warm
+    for _ in range(options.repeats):
+        for model, found in zip(models, times, strict=True):
+            found.append(timed_step(model, state))
+    least = [[1e3 * min(t[k] for t in found[1:]) for k in (0, 1)] for found in times]
+    for (method, settings), found, (step, solver) in zip(EXPLICIT, times, least, strict=True):
+        steps = float(found[0][2].reports["circuit"].steps.float().mean())
+        print(
+            f"{name:<14}{method:<11}{steps:4.1f} steps a cell; solver {solver:6.2f} ms,"
+            f" {solver / least[0][1]:.2f} of the default's; step {step:6.1f} ms,"
+            f" {step / least[0][0]:.2f}{'' if settings else ', the default'}",
+            flush=True,
+        )
+
+
 def row(record: dict) -> str:
     """Returns a line of the printed table."""
     step, solver = record["step_ms"], record["solver_ms"]
@@ -100,12 +131,17 @@ def main() -> None:
     parser.add_argument(
         "--case", action="append", choices=tuple(CASES), help="one method; may be repeated"
     )
+    parser.add_argument("--explicit", action="store_true")
     parser.add_argument("--colonies", type=int, default=64)
     parser.add_argument("--cells", type=int, default=100, help="cells a colony, in the mean")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("circuits.json"))
     options = parser.parse_args()
     tf.keep_memory()
+    if options.explicit:
+        for name in ("toggle_switch", "repressilator"):
+            print_explicit(name, options)
+        return
     print(
         f"{'method':<12}{'cells':>7}{'steps':>10}{'step: torch':>11}{'compiled':>10}{'ratio':>7}"
         f"{'solver':>11}{'compiled':>10}{'ratio':>7}   ms, {torch.get_num_threads()} threads"

@@ -136,7 +136,7 @@ def test_case_43_a_full_chamber_stays_as_it_is(measured, length_drag):
     *_, late = tf.simulate(scene, full, until=40.0)
     assert full.cells > 25 and torch.equal(late.uid, full.uid)
     most = float((1.0 - (late.length + 1.0) / (full.length + 1.0)).max())
-    assert measured("lost in 28 h, most", most, "≤ 0.05") <= 0.05 + 1e-6
+    assert measured("length lost in 28 h when full", most, "≤ 0.05") <= 0.05 + 1e-6
 
 
 @pytest.mark.parametrize("backend", ["compiled", "torch"])

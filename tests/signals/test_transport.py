@@ -498,9 +498,9 @@ def test_the_method_that_suits():
     assert choose(make((3, 2, 2))[0]) == "exponential"
     assert choose(make((3, 2, 2), kind="varying")[0]) == "series"
     assert choose(make((3, 2, 2), masked=True)[0]) == "series"
-    with pytest.raises(InputError, match=r"exponential.*velocity is not uniform.*implicit"):
+    with pytest.raises(InputError, match=r"exponential.*velocity is not uniform.*series"):
         prepare(make((3, 2, 2), kind="varying")[0], 0.1, "exponential")
-    with pytest.raises(InputError, match=r"exponential.*obstacle.*implicit"):
+    with pytest.raises(InputError, match=r"exponential.*obstacle.*series"):
         prepare(make((3, 2, 2), masked=True)[0], 0.1, "exponential")
     with pytest.raises(InputError, match="method"):
         prepare(make((3, 2, 2))[0], 0.1, "leapfrog")

@@ -37,7 +37,7 @@ class Show:
     """Instead of --colour: several quantities, each with the colour of its light, as NAME=COLOUR,
     such as --channels cfp=cyan yfp=yellow."""
     background: str | None = None
-    """A signal to draw behind the cells, from black (lowest) to white (highest)."""
+    """A signal to draw behind the cells, from white (lowest) to black (highest)."""
     limits: list[str] = field(default_factory=list)
     """Ranges of colours, as NAME=LOW:HIGH, such as --limits yfp=0:2."""
     view: str = "xy"

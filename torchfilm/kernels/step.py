@@ -172,10 +172,9 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
                 kinds, places, sizes, roots, is_soft, alphas, settings, report, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps; x, axis, last and hardness in place.
 
-    x: (n, d) float64. axis (n, d), base, growth, radius, viscosity, length_drag (n,). shortest:
-    (n,) no cell becomes shorter. last: (n, D)
-    the move of the first pass before, from which this one starts. hardness: (1,) α of the colony.
-    roots: (S, n) D of each wall, or stiffness · Δt. alphas: (n,) given, or (0,). Returns lengths.
+    x: (n, d) float64. axis (n, d), base to length_drag (n,). No cell becomes shorter than shortest
+    (n,). last: (n, D) the first move before, from which this one starts. hardness: (1,) α. roots:
+    (S, n) D of each wall, or stiffness · Δt. alphas: (n,) given, or (0,). Returns lengths.
     """
     margin, target, deep, softest = _of_colony(base, growth, radius, viscosity, settings)
     tolerance, passes, given = settings[TOLERANCE], settings[MOST_PASSES], alphas.shape[0] > 0

@@ -103,7 +103,7 @@ def prepare_exponential(operator: Operator, dt: float) -> Exponential:
             "method",
             "exponential",
             f"another method, since {why}",
-            'Use method="implicit", or None for the automatic choice.',
+            'Use method="series", or None for the automatic choice.',
         )
     # decay multiplies the factor of the longest axis, which always exists
     carrier = operator.shape.index(max(operator.shape))
