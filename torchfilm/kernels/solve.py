@@ -189,13 +189,6 @@ def next_direction(p, z, t):
         z[k] = 0
 
 
-@kernel
-def _put_forces(e, pushed, v):
-    """v = the force of each row."""
-    for r in range(e.shape[0]):
-        v[r] = max(-e[r], 0 * e[r]) - pushed[r]
-
-
 @kernel(any_order=True)
 def _squared_overlap(e, cap):
     """The sum of squared overlaps, each counted up to `cap`."""
@@ -204,6 +197,14 @@ def _squared_overlap(e, cap):
         depth = max(-e[r], 0 * e[r])
         overlap += min(depth * depth, cap * cap)
     return overlap
+
+
+@kernel
+def _put_forces(e, pushed, cap, v):
+    """v = the force of each row. Returns the sum of squared overlaps."""
+    for r in range(e.shape[0]):
+        v[r] = max(-e[r], 0 * e[r]) - pushed[r]
+    return _squared_overlap(e, cap)
 
 
 @kernel
@@ -282,8 +283,7 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
     e = gaps[:rows] - q
     total, fall, error, stuck = 0, np.inf, 0.0, 0
     for round_ in range(MOST_ROUNDS + 1):
-        overlap = _squared_overlap(e, cap)
-        _put_forces(e, pushed, v)
+        overlap = _put_forces(e, pushed, cap, v)
         pushing = _switch_rows(e, one, two, act, on, stale)
         g[:] = 0
         for i in range(n):
