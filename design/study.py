@@ -29,7 +29,7 @@ import numpy as np
 import torch
 
 import torchfilm as tf
-from design.parameters import Value
+from design.parameters import Value, show_value
 from design.slopes import Slopes
 from torchfilm import checks
 
@@ -106,6 +106,25 @@ class Study:
         entry = min(full, key=lambda e: float(e.loss.min()))
         row = int(entry.loss.argmin())
         return entry.points[row], float(entry.loss[row]), entry.losses[row]
+
+    def table(self, most: int = 20) -> str:
+        """The best designs that were grown to full size, the first of equal ones first: loss, its
+        spread between replicates, cells, and the values of the parameters. most: rows."""
+        rows = [
+            (float(e.loss[k]), e.losses[k], e.cells[k], e.values[k])
+            for e in self.full()
+            for k in range(len(e.loss))
+        ]
+        rows.sort(key=lambda row: row[0])
+        text = [["loss", "±", "cells", *self.names]]
+        for loss, losses, cells, values in rows[: max(most, 0)]:
+            spread = f"{losses.std(ddof=1):.2g}" if len(losses) > 1 else ""
+            shown = [show_value(values[name]) for name in self.names]
+            text.append([f"{loss:.4f}", spread, f"{cells.mean():.0f}", *shown])
+        wide = [max(map(len, column)) for column in zip(*text, strict=True)]
+        lines = ["  ".join(x.rjust(w) for x, w in zip(r, wide, strict=True)) for r in text]
+        hidden = len(rows) - (len(text) - 1)
+        return "\n".join(lines + ([f"and {hidden} more"] if hidden else []))
 
     def failures(self) -> list[tuple[str, int]]:
         """The reasons of failures and how many colonies each has, the most frequent first.

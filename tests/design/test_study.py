@@ -364,3 +364,20 @@ def test_foreign_files_are_refused(tmp_path, kept):
             search().run(12, study=tmp_path / name, progress=False)
     with pytest.raises(tf.InputError, match=r"a study file\. There is no such file"):
         Study.read(tmp_path / "none.h5")
+
+
+def test_a_table_lists_the_best_designs_first():
+    made = search(Racing(inner=CMAES(population=4), sizes=(0.5, 1.0), keep=0.5))
+    made.run(40, progress=False)
+    study = made.study
+    lines = study.table(most=3).splitlines()
+    assert lines[0].split() == ["loss", "±", "cells", "make", "decay"]
+    losses = sorted(x for e in study.full() for x in e.loss.tolist())
+    assert [line.split()[0] for line in lines[1:4]] == [f"{x:.4f}" for x in losses[:3]]
+    assert lines[4] == f"and {len(losses) - 3} more" and len(losses) > 3
+    best = made.best()
+    cells = np.mean([n for d in best.colonies() for n in d.state.counts.tolist()])
+    values = (f"{best.values[name]:.4g}" for name in ("make", "decay"))
+    assert lines[1].split()[2:] == [f"{cells:.0f}", *values]
+    assert len(study.table(most=1000).splitlines()) == len(losses) + 1
+    assert Study({}, ("make",), (0,)).table() == "loss  ±  cells  make"
