@@ -66,11 +66,10 @@ class Objective:
         streams: of random numbers, one for each replicate; by default 0 … replicates − 1. size:
         share of `cells` and `until`, for a cheap first look. slopes: also derivatives by the
         parameters without levels: exact where `why_differences` is "", else from differences.
-        executor: of the `concurrent.futures`
-        kind, for other processes or machines. work_items: the least number of parts for it. This
-        process runs what the executor loses, and warns. The losses are the same to the bit however
-        the designs are divided, on machines of the same kind. Raises InputError for points, streams
-        or a size that are not allowed.
+        executor: of the `concurrent.futures` kind, for other processes or machines. work_items: the
+        least number of parts for it. This process runs what the executor loses, and warns. The
+        losses are the same to the bit however the designs are divided, on machines of the same
+        kind. Raises InputError for points, streams or a size that are not allowed.
         """
         begun, task = time.perf_counter(), self.task
         points = np.asarray(points, dtype=np.float64)

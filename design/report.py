@@ -61,7 +61,8 @@ def table(report: SearchReport) -> str:
     target = report.task.target
     old, new = (each_measured(target, design.colonies) for design in (first, best))
     for name in new:
-        rows.append((name, "", _mean(old.get(name, [])), _mean(new[name]), _spread(new[name])))
+        means = (show_value(_mean(values)) for values in (old.get(name, []), new[name]))
+        rows.append((name, "", *means, _spread(new[name])))
     wide = [max(len(r[k]) for r in rows) for k in range(5)]
     lines = [
         "  ".join(
@@ -121,9 +122,9 @@ def _cells(finished: list[FinishedColonies]) -> str:
     return f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)}–{max(counts)}"
 
 
-def _mean(values: list[float]) -> str:
-    some = [x for x in values if not np.isnan(x)]
-    return show_value(float(np.mean(some))) if some else "nan"
+def _mean(values: list[float]) -> float:
+    """Of the colonies that have a measure; NaN where none has."""
+    return float(np.nanmean(values)) if not np.isnan(values).all() else float("nan")
 
 
 def _spread(values: list[float]) -> str:
@@ -151,10 +152,7 @@ def each_measured(target: Target, finished: Iterable[FinishedColonies]) -> dict[
 
 def measured(target: Target, finished: Iterable[FinishedColonies]) -> dict[str, float]:
     """The mean of each measure of a target over the colonies that have it; NaN where none has."""
-    return {
-        name: float(np.nanmean(v)) if not np.isnan(v).all() else float("nan")
-        for name, v in each_measured(target, finished).items()
-    }
+    return {name: _mean(v) for name, v in each_measured(target, finished).items()}
 
 
 def draw(report: SearchReport, path: Path) -> Path:

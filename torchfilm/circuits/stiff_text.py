@@ -146,21 +146,25 @@ def run(first, last, at, columns, numbers, dt, rtol, atol, eps, largest, most_st
     for n in range(first, last):
         c = prepared({leaves})
         u = {start}
-        left, h, bad, code = dt, dt, 0, GOES_ON
+        {advance}
+        {store}
+'''
+
+# A cell's steps, which also a loop that carries tangents takes; {taken}: a good one, of length h.
+ADVANCE = """left, h, bad, code = dt, dt, 0, GOES_ON
         for _ in range(most_steps):
             new, error, broken = step(u, c, h, rtol, atol, eps, largest)
-            good, ends, lost, left, h = controlled(error, broken, left, h, dt)
+            good, ends, lost, left, next_h = controlled(error, broken, left, h, dt)
             if good:
-                u = new
+                {taken}
                 accepted[n] += 1
             else:
                 rejected[n] += 1
             code, bad = verdict(u, c, error, broken, ends, lost, bad)
             if code != GOES_ON:
                 break
-        {store}
-        status[n] = code if code != GOES_ON else TOO_MANY_STEPS
-'''
+            h = next_h
+        status[n] = code if code != GOES_ON else TOO_MANY_STEPS"""
 
 
 # The vectors of the text: a, b, d, e are k₁ … k₄ of the method.
@@ -180,7 +184,7 @@ def tuple_of(form: str, size: int) -> str:
 
 def method(size: int, leaves: str) -> str:
     """The step and the loop over cells, for so many variables. leaves: the text of a cell's."""
-    return substituted(STEP, size, leaves=leaves)
+    return substituted(STEP, size, leaves=leaves, advance=ADVANCE.format(taken="u = new"))
 
 
 def substituted(form: str, size: int, **more: str) -> str:

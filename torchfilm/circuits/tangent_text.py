@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from torchfilm.circuits.stiff_text import each, substituted, tuple_of
+from torchfilm.circuits.stiff_text import ADVANCE, each, substituted, tuple_of
 
 STEP = '''@kernel
 def rate_moved(y, ty, low, j, tj, c, leaf, turn):
@@ -114,23 +114,9 @@ def run_moved(first, last, at, moving, columns, turning, numbers, turned, dt, rt
         c = prepared(leaf)
         u = {start}
         t = {tstart}
-        left, h, bad, code = dt, dt, 0, GOES_ON
-        for _ in range(most_steps):
-            new, error, broken = step(u, c, h, rtol, atol, eps, largest)
-            used = h
-            good, ends, lost, left, h = controlled(error, broken, left, h, dt)
-            if good:
-                t = step_moved(u, t, c, leaf, turn, used, eps)
-                u = new
-                accepted[n] += 1
-            else:
-                rejected[n] += 1
-            code, bad = verdict(u, c, error, broken, ends, lost, bad)
-            if code != GOES_ON:
-                break
+        {advance}
         {store}
         {tstore}
-        status[n] = code if code != GOES_ON else TOO_MANY_STEPS
 '''
 
 
@@ -147,6 +133,7 @@ def tangent_method(size: int, leaves: str, turns: str) -> str:
         size,
         leaves=leaves,
         turns=turns,
+        advance=ADVANCE.format(taken="t, u = step_moved(u, t, c, leaf, turn, h, eps), new"),
         **{x: many(f"{x}#") for x in NAMES},
         ty_inside=many("(0.0 if y# < low# else ty#)"),
         ty_less_inside=many("(ty# if y# < low# else 0.0)"),
