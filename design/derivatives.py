@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 import torchfilm as tf
-from design.parameters import Space
+from design.parameters import Parameter, Space
 from design.rollout import FinishedColonies
 from design.slopes import Slopes
 from design.targets.base import Target
@@ -45,8 +45,8 @@ class Gathered:
             return
         value, tangent = tf.tangents.both(found)
         turned = torch.zeros_like(value) if tangent is None else tangent
-        turned = turned.double().cpu().numpy().reshape(-1, copies, value.shape[1])
-        for k, rows in zip(colony, turned, strict=True):
+        of_colonies = turned.double().cpu().numpy().reshape(-1, copies, value.shape[1])
+        for k, rows in zip(colony, of_colonies, strict=True):
             self.slopes.curvature[k] = 0.0
             self.slopes.curvature[np.ix_([k], self.directions, self.directions)] = 2 * rows @ rows.T
 
@@ -56,6 +56,7 @@ def along(space: Space, point: np.ndarray) -> list[dict[str, float]]:
     out = []
     for chosen in space.moving:
         parameter = space.parameters[chosen]
+        assert isinstance(parameter, Parameter)  # a choice has levels
         out.append({parameter.name: parameter.slope(float(point[chosen]))})
     return out
 

@@ -318,7 +318,8 @@ def _entries(file: h5py.File) -> list[Entry]:
         for name, d in file["values"].items()
     }
     values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    out, at = [], 0
+    out: list[Entry] = []
+    at = 0
     columns_of = ("rows", "size", "replicates", "seconds", "copies")
     batches.setdefault("copies", np.ones_like(batches["rows"]))  # version 1 has none
     for rows, size, replicates, seconds, copies in zip(

@@ -84,7 +84,7 @@ class Compiled:
         """The columns (M,) and numbers () of the names that are no variables, of the cells `rows`
         (M,) among all. own: those that no rate function reads."""
         _, s, p, cell = circuit.names(torch.empty(0, len(circuit.species)), rows)
-        homes = {"s": s, "p": p, "cell": cell, "own": own}
+        homes: dict[str, Any] = {"s": s, "p": p, "cell": cell, "own": own}
 
         def value(name: str) -> Tensor:
             if name in self.literals:

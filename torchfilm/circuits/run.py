@@ -230,13 +230,7 @@ def step(
         end, report = found
         code, steps = report.status, report.accepted + report.rejected
     else:
-        end = None
-        if isinstance(circuit.compiled, CompiledExplicit):
-            end = circuit.compiled.integrate(circuit, start, dt, settings.steps)
-        if end is None and settings.method == "euler":
-            end = integrators.euler(circuit.rates, start, dt, settings.steps)
-        elif end is None:
-            end = integrators.runge_kutta(circuit.rates, start, dt, settings.steps, settings.method)
+        end = _equal_steps(circuit, start, dt, settings)
         # an exact solution stays above zero: the step is too long for an explicit method
         scale = start.abs() + end.abs()
         below = (end < -(settings.atol + settings.rtol * scale.nan_to_num())) & (start >= 0)
@@ -254,6 +248,20 @@ def step(
         if circuit.in_reservoir is not None:
             reservoir[name] = end[:, size + more + k] - end[:, size + 2 * more + k]
     return CircuitOutcome(end[:, :size], pools, reservoir, code != 0, code, steps)
+
+
+def _equal_steps(
+    circuit: CircuitCells, start: Tensor, dt: float, settings: IntegrationSettings
+) -> Tensor:
+    """The variables after dt by an explicit method."""
+    found = None
+    if isinstance(circuit.compiled, CompiledExplicit):
+        found = circuit.compiled.integrate(circuit, start, dt, settings.steps)
+    if found is not None:
+        return found
+    if settings.method == "euler":
+        return integrators.euler(circuit.rates, start, dt, settings.steps)
+    return integrators.runge_kutta(circuit.rates, start, dt, settings.steps, settings.method)
 
 
 def _molecules(

@@ -113,7 +113,9 @@ def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
     count = max(stepper.weights.shape[1], *(x.shape[0] for x in given))
     number = torch.arange(shape[0] * shape[1] * shape[2]).view(shape)
     whole = lambda x: x.detach().expand(count, *shape).flatten(1).clone()
-    ups, downs, to, source, parts = [], [], [], [], []
+    ups: list[Tensor] = []
+    downs: list[Tensor] = []
+    to, source, parts = [], [], []
     for dim, up, down in mixing.gains:
         for part, shift, face, kept in ((up, 1, 0, ups), (down, -1, -1, downs)):
             at = number.select(dim - 1, face).reshape(-1)
