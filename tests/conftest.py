@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
+import hypothesis
 import pytest
 import torch
 
 # two workers share two cores: more threads each would only make them wait for one another
 torch.set_num_threads(1)
+
+# The suite draws the same examples on every run. TORCHFILM_EXPLORE=1 draws new ones.
+hypothesis.settings.register_profile(
+    "torchfilm", derandomize=os.environ.get("TORCHFILM_EXPLORE") is None, deadline=None
+)
+hypothesis.settings.load_profile("torchfilm")
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 
