@@ -5,13 +5,15 @@
 It uses torchfilm's public names only, as any user can.
 """
 
+from design.best import Best
+from design.finals import Finals
 from design.methods import CMAES, Batch, Bayesian, Local, Method, Racing, Sobol
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
 from design.robustness import Robustness
 from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
-from design.search import Best, Search
+from design.search import Search
 from design.slopes import Slopes
 from design.study import Study
 from design.targets import (
@@ -37,6 +39,7 @@ __all__ = [
     "Choice",
     "DomainSize",
     "Evaluation",
+    "Finals",
     "FinishedColonies",
     "Gradient",
     "Image",

@@ -12,6 +12,7 @@ import numpy as np
 
 from design import executors
 from design.derivatives import along, differences, neighbours
+from design.entries import Entry
 from design.parameters import Value
 from design.rollout import FinishedColonies
 from design.scoring import cut_work_items, finished_colonies, run_work_item
@@ -42,6 +43,23 @@ class Evaluation:
     seconds: float
     slopes: Slopes | None = None
     copies: int = 1
+
+    def entry(self, streams: tuple[int, ...], size: float | None = None) -> Entry:
+        """For a study. streams: that were evaluated; size: share of the full size of the search,
+        where the objective has another."""
+        return Entry(
+            points=self.points,
+            loss=self.loss,
+            losses=self.losses,
+            cells=self.cells,
+            reasons=self.reasons,
+            size=self.size if size is None else size,
+            seconds=self.seconds,
+            values=self.values,
+            streams=streams,
+            slopes=self.slopes,
+            copies=self.copies,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +122,11 @@ class Objective:
         if task.tried.why_regrown:
             return f"growth depends on the design ({task.tried.why_regrown})"
         return task.tried.why_rough
+
+    def copies(self, slopes: bool) -> int:
+        """Colonies that are grown for each loss."""
+        moving = len(self.task.space.moving)
+        return 1 if not slopes else 1 + 2 * moving if self.why_differences else moving
 
     def _grow(
         self,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import torchfilm as tf
+from design.finals import FreshLosses
 from design.parameters import Choice, Parameter, Value, show_value
 from design.rollout import FinishedColonies
 from design.study import Study
@@ -27,14 +28,15 @@ NEAR = 0.005  # of a bound, as a share of the range (of its logarithm)
 
 @dataclass(frozen=True, eq=False)
 class ReportedDesign:
-    """A design that a report shows: its values by name, its point (D,), its loss, and its colonies
-    at their ends."""
+    """A design that a report shows: its values by name, its point (D,), its loss in the search, its
+    colonies at their ends, and its losses on fresh seeds, where it was tested."""
 
     title: str
     values: dict[str, Value]
     point: np.ndarray
     loss: float
     colonies: list[FinishedColonies]
+    fresh: FreshLosses | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +59,10 @@ def table(report: SearchReport) -> str:
         values = (show_value(design.values[p.name]) for design in (first, best))
         rows.append((p.name, _bounds(p), *values, _at_bound(p, best.values[p.name])))
     rows.append(("loss", "", f"{first.loss:.4f}", f"{best.loss:.4f}", ""))
+    if best.fresh is not None:
+        low, high = best.fresh.band
+        seeds = f"{low:.4f} … {high:.4f}, {len(best.fresh.losses)} seeds"
+        rows.append(("loss on fresh seeds", "", "", f"{best.fresh.loss:.4f}", seeds))
     rows.append(("cells", "", *(_cells(design.colonies) for design in (first, best)), ""))
     target = report.task.target
     old, new = (each_measured(target, design.colonies) for design in (first, best))

@@ -32,7 +32,7 @@ class ScoredDesign(Protocol):
     def point(self) -> np.ndarray: ...
 
     @property
-    def losses(self) -> np.ndarray: ...
+    def searched(self) -> np.ndarray: ...
 
 
 def check_robustness(
@@ -92,7 +92,7 @@ def check_robustness(
         streams=streams,
         losses=losses[0],
         failed=sum(row == 0 for row, _ in found.reasons) / seeds,
-        searched=np.array(best.losses),
+        searched=np.array(best.searched),
         threshold=threshold,
         sizes=tuple(resized),
         changes=tuple(

@@ -1,28 +1,27 @@
 """A search: a method proposes designs, the objective scores them, and a study keeps the results,
-until the budget is used."""
+until the budget is used. Then the best designs are tested on fresh seeds."""
 
 from __future__ import annotations
 
 import sys
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 import torchfilm as tf
-from design import report
-from design.methods import Batch, Method, method_of
-from design.objective import Evaluation, Objective
-from design.parameters import Value
+from design.best import Best
+from design.finals import Finals, FinalsRun, fresh_losses, winner
+from design.known import KnownDesigns, Start, known_designs
+from design.methods import Method, method_of
+from design.objective import Objective
 from design.progress import advance, open_bar
-from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
-from design.saved_design import write_design
-from design.slopes import Slopes
-from design.study import Entry, Study
+from design.study import Study
 from design.task import Task, TaskOptions
+from design.turn import Turn, repeat_study
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -51,20 +50,32 @@ class Search(TaskOptions):
         )
         best = search.run(colonies=2000, study="stripe.h5")
 
-    method: "cmaes", "sobol", "racing", "bayesian", one of their objects with settings of its own,
-    or any object with start, ask and tell (`Method`). `TaskOptions` documents the other arguments;
+    method: "cmaes", "sobol", "racing", "bayesian", "local", one of their objects with settings of
+    its own, or any object with start, ask and tell (`Method`). finals: how the best designs are
+    tested on fresh seeds; None leaves this out. start: designs from which the search starts: their
+    values by name, a `Best`, the file of a saved design, or a `Study` or its file. A study of the
+    same task with other bounds, or without some of the parameters, keeps its losses; of any other
+    designs the best are grown again. `TaskOptions` documents the other arguments;
     `search.objective.task` holds them checked. Raises the errors of `Task`, and InputError for a
-    method that is not allowed.
+    method, finals or a start that are not allowed.
     """
 
     method: str | Method = field(default="cmaes", kw_only=True)
+    finals: Finals | None = field(default_factory=Finals, kw_only=True)
+    start: Start | None = field(default=None, kw_only=True, repr=False)
     objective: Objective = field(init=False, repr=False)
+    _known: KnownDesigns | None = field(init=False, repr=False)
     _progress: SearchProgress = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         task = Task.of(self)
-        object.__setattr__(self, "method", method_of(self.method))
-        object.__setattr__(self, "objective", Objective(task))
+        if not isinstance(self.finals, Finals | None):
+            raise checks.input_error("finals", self.finals, "Finals(…) or None")
+        known = None if self.start is None else known_designs(self.start, task)
+        for name, value in (
+            ("method", method_of(self.method)), ("objective", Objective(task)), ("_known", known)
+        ):  # fmt: skip
+            object.__setattr__(self, name, value)
         started = SearchProgress(self._open_study(None), task.tried.why_regrown)
         object.__setattr__(self, "_progress", started)
 
@@ -88,41 +99,31 @@ class Search(TaskOptions):
         work_items: int = 1,
         progress: bool = True,
     ) -> Best:
-        """Search until `colonies` have been simulated, or until the loss of a design is at most
-        `stop_at`; returns the best design.
+        """Search until `colonies` have been simulated, and return the best design.
 
         colonies: each replicate of each design counts as one, a smaller colony as its share of the
-        full size. The last batch may exceed the budget. study: the file that keeps every
-        evaluation. If it exists and belongs to this search, the search resumes from it, and its
-        colonies count. executor: of the `concurrent.futures` kind (processes, Dask, …). work_items:
-        the least number of parts into which a batch is cut for it. progress: show a bar with the
-        lowest loss so far. Raises InputError for an argument that is not allowed, for the study of
-        another search, and where no design was grown to full size.
+        full size; no more are grown. The last of them go to the finals: the best designs on fresh
+        seeds, of which the best is returned. stop_at: a loss that is good enough. As soon as a
+        design reaches it, and holds it on fresh seeds, the search ends. study: the file that keeps
+        every evaluation. If it exists and belongs to this search, the search resumes from it, and
+        its colonies count. executor: of the `concurrent.futures` kind (processes, Dask, …).
+        work_items: the least number of parts into which a batch is cut for it. progress: show a bar
+        with the lowest loss so far. Raises InputError for an argument that is not allowed, for the
+        study of another search, and where no design was grown to full size.
         """
-        if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < 1:
-            raise checks.input_error("colonies", colonies, "a whole number from 1")
-        if stop_at is not None:
-            checks.number("stop_at", stop_at)
+        self._check_run(colonies, stop_at)
         self._progress.study = self._open_study(study)
-        task, method = self.objective.task, method_of(self.method)
-        method.start(task.space, task.seed, task.replicates)
-        _repeat_study(method, self.study)
         try:
             with open_bar(colonies, progress) as bar:
                 _show(bar, self.study)
-                while self.study.colonies < colonies and not _reached(self.study, stop_at):
-                    batch = _ask(method, task)
-                    found = self.objective.evaluate(
-                        batch.points,
-                        streams=range(min(batch.replicates or task.replicates, task.replicates)),
-                        size=batch.size,
-                        executor=executor,
-                        work_items=work_items,
-                        slopes=batch.slopes,
-                    )
-                    self._keep(found)
-                    _tell(method, batch, found.loss, found.slopes)
-                    _show(bar, self.study)
+                finals = None
+                if self.finals is not None:
+                    run = (self.objective.task, self.study, colonies, executor, work_items)
+                    finals = FinalsRun(self.finals, *run)
+                holds = self._search(colonies, stop_at, finals, bar, executor, work_items)
+                if finals is not None and not holds:
+                    finals.run()
+                _show(bar, self.study)
         except KeyboardInterrupt:
             self._report_interrupt(colonies)
             raise
@@ -131,49 +132,108 @@ class Search(TaskOptions):
             print(f"every colony failed; the most frequent reason: {reason}", file=sys.stderr)
         return self.best()
 
+    def _check_run(self, colonies: int, stop_at: float | None) -> None:
+        least = self.objective.task.replicates
+        if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < least:
+            hint = "One design has so many replicates." if least > 1 else ""
+            raise checks.input_error("colonies", colonies, f"a whole number from {least}", hint)
+        if stop_at is not None:
+            checks.number("stop_at", stop_at)
+
+    def _search(
+        self,
+        colonies: int,
+        stop_at: float | None,
+        finals: FinalsRun | None,
+        bar: tqdm | None,
+        executor: Executor | None,
+        work_items: int,
+    ) -> bool:
+        """Search with the part of the budget that the finals leave. Returns whether a design holds
+        the wanted loss."""
+        task, method = self.objective.task, method_of(self.method)
+        limit = colonies - (self.finals.colonies(colonies) if self.finals else 0.0)
+        method.start(task.space, task.seed, task.replicates)
+        turn = repeat_study(method, self.study, self._known)
+        while not self._reached(stop_at, finals):
+            turn = turn or Turn.next_of(method, task, self.study, self._known)
+            room = min(limit - self.study.searched, colonies - self.study.colonies)
+            part = turn.part(self.objective, room)
+            if part is None:
+                return False
+            streams = task.streams(None)[: part.replicates]
+            found = self.objective.evaluate(
+                part.points,
+                streams=streams,
+                size=part.size,
+                executor=executor,
+                work_items=work_items,
+                slopes=part.slopes,
+            )
+            turn.take(found.entry(streams), self.study)
+            self._progress.why_regrown = found.why_regrown
+            if turn.complete:
+                turn.tell(method)
+                turn = None
+            _show(bar, self.study)
+        return True
+
+    def _reached(self, stop_at: float | None, finals: FinalsRun | None) -> bool:
+        """Whether the best design so far has the wanted loss, and holds it where it is tested."""
+        if stop_at is None or not self.study.entries:
+            return False
+        if finals is not None:
+            return finals.holds(stop_at)
+        found = self.study.best()
+        return found is not None and found[1] <= stop_at
+
     def best(self) -> Best:
-        """The best design so far. Raises InputError before a design was grown to full size."""
+        """The best design so far: on fresh seeds, where designs were tested on these. Raises
+        InputError before a design was grown to full size."""
         found = self.study.best()
         if found is None:
             raise _none_yet()
-        return self._design(*found)
+        chosen = None
+        if self.finals is not None:
+            chosen = winner(self.objective.task, self.study, self.finals.sizes)
+        return self._design(found[0] if chosen is None else chosen)
 
     def first(self) -> Best:
         """The first design that was grown to full size. Raises InputError before there is one."""
-        full = self.study.full()
-        if not full:
+        found = self.study.first()
+        if found is None:
             raise _none_yet()
-        return self._design(full[0].points[0], float(full[0].loss[0]), full[0].losses[0])
+        return self._design(found[0])
 
-    def _design(self, point: np.ndarray, loss: float, losses: np.ndarray) -> Best:
-        return Best(self, self.objective.task.space.values(point), point, loss, losses)
+    def colonies(self, point: np.ndarray) -> list[FinishedColonies]:
+        """The replicates of a design (D,) at their ends, grown again once: the same colonies as
+        were scored."""
+        grown, key = self._progress.grown, point.tobytes()
+        if key not in grown:
+            grown[key] = self.objective.colonies(point)
+        return grown[key]
+
+    def _design(self, point: np.ndarray) -> Best:
+        task = self.objective.task
+        fresh = None
+        if self.finals is not None:
+            fresh = fresh_losses(task, self.study, self.finals.sizes, point)
+        return Best(self, task.space.values(point), point, self.study.scored(point)[1], fresh)
 
     def _open_study(self, path: str | Path | None) -> Study:
         task = self.objective.task
         names = task.space.names
         about = task.describe() | {"names": list(names), "method": _describe(self.method)}
+        if self._known is not None:
+            about["start"] = self._known.describe()
         streams = task.streams(None)
         if path is None:
-            return Study(about, names, streams)
-        return Study.open(path, about, names, streams)
-
-    def _keep(self, found: Evaluation) -> None:
-        """Add an evaluation to the study."""
-        entry = Entry(
-            found.points,
-            found.loss,
-            found.losses,
-            found.cells,
-            found.reasons,
-            found.size,
-            found.losses.shape[1],
-            found.seconds,
-            found.values,
-            found.slopes,
-            found.copies,
-        )
-        self.study.add(entry)
-        self._progress.why_regrown = found.why_regrown
+            study = Study(about, names, streams)
+        else:
+            study = Study.open(path, about, names, streams)
+        if self._known is not None and self._known.entry and not study.entries:
+            study.entries.append(self._known.entry)
+        return study
 
     def _report_interrupt(self, colonies: int) -> None:
         study = self.study
@@ -183,109 +243,6 @@ class Search(TaskOptions):
             else "best() returns the best of them"
         )
         print(f"stopped at {study.colonies:.0f} of {colonies} colonies; {kept}.", file=sys.stderr)
-
-
-@dataclass(frozen=True, eq=False)
-class Best:
-    """The best design of a search: its parameters by name, their point (D,), its loss, and the
-    losses of its replicates (R,)."""
-
-    search: Search = field(repr=False)
-    values: dict[str, Value]
-    point: np.ndarray = field(repr=False)
-    loss: float
-    losses: np.ndarray
-
-    # `best.check(…)` is `check_robustness(best, …)`
-    check = check_robustness
-
-    @property
-    def objective(self) -> Objective:
-        """The objective that scored the design."""
-        return self.search.objective
-
-    def scene(self) -> tf.Scene:
-        """The scene with these parameters, for one colony or any number of them."""
-        family = self.objective.task.family
-        return family.function(**family.fixed, **self.values)
-
-    def save(self, path: str | Path) -> Path:
-        """Write the design as JSON, which `torchfilm run` takes. Replaces an older file."""
-        return write_design(
-            Path(path),
-            self.objective.task,
-            self.values,
-            loss=self.loss,
-            losses=self.losses,
-            colonies=self.search.study.colonies,
-        )
-
-    def plot(self, path: str | Path) -> Path:
-        """Draw the first guess, the best design, the target and the course of the search. Needs
-        matplotlib (the `app` extra)."""
-        return report.draw(self._report(), Path(path))
-
-    def table(self) -> str:
-        """The parameters with their bounds and the first guess, the losses and the measures."""
-        return report.table(self._report())
-
-    def colonies(self) -> list[FinishedColonies]:
-        """The replicates at their ends, grown again once: the same colonies as were scored."""
-        grown, key = self.search._progress.grown, self.point.tobytes()
-        if key not in grown:
-            grown[key] = self.objective.colonies(self.point)
-        return grown[key]
-
-    def _report(self) -> report.SearchReport:
-        first, best = (
-            report.ReportedDesign(title, d.values, d.point, d.loss, d.colonies())
-            for title, d in (("first guess", self.search.first()), ("best", self))
-        )
-        search = self.search
-        return report.SearchReport(
-            self.objective.task, search.study, search.why_regrown, first, best
-        )
-
-
-def _repeat_study(method: Method, study: Study) -> None:
-    """Bring a method to where the study ends: it proposes each batch again and learns its losses.
-    Raises InputError where it proposes other points."""
-    for k, entry in enumerate(study.entries):
-        batch = method.ask()
-        # another machine may round in another way
-        if batch.points.shape != entry.points.shape or not np.allclose(
-            batch.points, entry.points, rtol=0, atol=1e-6
-        ):
-            raise tf.InputError(
-                f"{study.path}: the method proposes other points than its batch {k} holds; another"
-                " version of the method may have made the file. Start a new study."
-            )
-        same = replace(batch, points=entry.points)
-        _tell(method, same, entry.loss, entry.slopes)
-
-
-def _tell(method: Method, batch: Batch, loss: np.ndarray, slopes: Slopes | None) -> None:
-    """Methods that never ask for slopes need not take any."""
-    if batch.slopes:
-        method.tell(batch, loss, slopes)  # type: ignore[call-arg]
-    else:
-        method.tell(batch, loss)
-
-
-def _ask(method: Method, task: Task) -> Batch:
-    """The next batch of a method."""
-    batch = method.ask()
-    if not isinstance(batch, Batch):
-        raise tf.InputError(
-            f"{type(method).__name__}.ask must return a design.Batch of points"
-            f" (n, {task.space.size}), not {type(batch).__name__}."
-        )
-    return batch
-
-
-def _reached(study: Study, stop_at: float | None) -> bool:
-    found = study.best()
-    return stop_at is not None and found is not None and found[1] <= stop_at
 
 
 def _show(bar: tqdm | None, study: Study) -> None:

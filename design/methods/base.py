@@ -68,7 +68,8 @@ class Method(Protocol):
 
     The result of `ask` must depend only on the arguments of `start`, the method's settings, and all
     calls of `tell`: a new method resumes a stopped search from the batches and losses of its study.
-    A method with `describe() -> str` is recognised when a search is resumed.
+    A method with `describe() -> str` is recognised when a search is resumed. One with `know(points,
+    loss)` learns before its first batch of the designs from which a search starts.
     """
 
     def start(self, space: Dimensions, seed: int, replicates: int) -> None: ...
@@ -146,6 +147,9 @@ class Turns:
         else:
             self._descend(scores(batch, loss), slopes)
         self._batch = None
+
+    def know(self, points: np.ndarray, loss: np.ndarray) -> None:
+        """Learn designs that were known before the first batch, (n, D), and their losses (n,)."""
 
     def describe(self) -> str:
         """The method and its settings, on one line."""

@@ -87,6 +87,12 @@ class CMAES(Turns):
     def fresh(self) -> bool:
         return self._cloud is None
 
+    def know(self, points: np.ndarray, loss: np.ndarray) -> None:
+        """The first cloud begins at the best of them, half as wide as others."""
+        best = int(loss.argmin())
+        self._start = float(loss[best])
+        self._cloud = self._new(points[best], self.sigma / 2)
+
     def draw(self, count: int) -> np.ndarray:
         space = self._started()
         if self._cloud is None:
@@ -105,7 +111,7 @@ class CMAES(Turns):
         if self._cloud is None:
             if loss.min() < loss.max():
                 self._cloud, self._start = (
-                    self._new(self._points[rows[int(loss.argmin())]]),
+                    self._new(self._points[rows[int(loss.argmin())]], self.sigma),
                     float(loss.min()),
                 )
             return
@@ -124,7 +130,7 @@ class CMAES(Turns):
     def _take(self, batch: Batch, loss: np.ndarray) -> None:
         self.take(np.arange(len(loss)), loss)
 
-    def _new(self, start: np.ndarray) -> Any:
+    def _new(self, start: np.ndarray, width: float) -> Any:
         """A cloud around a point."""
         import cma
 
@@ -148,7 +154,7 @@ class CMAES(Turns):
         }
         with self._quiet():
             return cma.CMAEvolutionStrategy(
-                [*(start[self._free] * self._scale - self._shift), *idle], self.sigma, settings
+                [*(start[self._free] * self._scale - self._shift), *idle], width, settings
             )
 
     @contextmanager

@@ -142,6 +142,10 @@ class Local(Turns):
         self._waiting: list[np.ndarray] = []
         self._descents: list[Descent] = []
 
+    def know(self, points: np.ndarray, loss: np.ndarray) -> None:
+        """The first descents begin at the best of them."""
+        self._keep_best(points, loss)
+
     def _next(self) -> Batch:
         self._descents = [d for d in self._descents if not d.over]
         while self._waiting and len(self._descents) < self.starts:
@@ -154,9 +158,12 @@ class Local(Turns):
         return Batch(np.array([d.propose() for d in self._descents]), slopes=True)
 
     def _take(self, batch: Batch, loss: np.ndarray) -> None:
-        # a quarter of the designs: the others are worse than where a descent would end
+        self._keep_best(batch.points, loss)
+
+    def _keep_best(self, points: np.ndarray, loss: np.ndarray) -> None:
+        """A quarter of the designs: the others are worse than where a descent would end."""
         best = np.argsort(loss, kind="stable")[: max(self.starts, len(loss) // 4)]
-        self._waiting = [batch.points[k] for k in best]
+        self._waiting = [points[k] for k in best]
 
     def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:
         for k, descent in enumerate(self._descents):

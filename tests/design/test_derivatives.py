@@ -194,7 +194,7 @@ def test_colonies_that_cannot_be_scored_have_no_slope():
 
 def test_a_search_with_slopes_resumes(tmp_path):
     make = lambda: Search(
-        lit, TWO, EDGES, cells=6, replicates=2, method=Local(starts=2, first=4)
+        lit, TWO, EDGES, cells=6, replicates=2, method=Local(starts=2, first=4), finals=None
     )  # fmt: skip
     whole = make()
     whole.run(colonies=60, progress=False)

@@ -39,13 +39,7 @@ def best(
     )
     point = search.objective.task.space.point(values)
     found = search.objective.evaluate(point[None])
-    return Best(
-        search,
-        search.objective.task.space.values(point),
-        point,
-        float(found.loss[0]),
-        found.losses[0],
-    )
+    return Best(search, search.objective.task.space.values(point), point, found.losses[0])
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +123,7 @@ def test_results_do_not_depend_on_the_work_items(held, spare, most, work_items):
     )
     with ThreadPoolExecutor(2) as pool:
         other = check_robustness(
-            Best(search, spare.values, spare.point, spare.loss, spare.losses),
+            Best(search, spare.values, spare.point, spare.searched),
             seeds=6,
             samples=8,
             executor=pool,

@@ -1,0 +1,124 @@
+"""The best design of a search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+import torchfilm as tf
+from design import report
+from design.finals import FreshLosses
+from design.objective import Objective
+from design.parameters import Value
+from design.robustness_check import check_robustness
+from design.rollout import FinishedColonies
+from design.saved_design import write_design
+from design.study import Study
+
+
+class SearchView(Protocol):
+    """What a design asks of the search that found it."""
+
+    @property
+    def objective(self) -> Objective: ...
+
+    @property
+    def study(self) -> Study: ...
+
+    @property
+    def why_regrown(self) -> str: ...
+
+    def first(self) -> Best: ...
+
+    def colonies(self, point: np.ndarray) -> list[FinishedColonies]: ...
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Best:
+    """The best design of a search.
+
+    search: that found it; values: its parameters by name; point: their coordinates (D,); searched:
+    the losses of its replicates in the search (R,); fresh: on seeds that the search did not use,
+    None where it was not tested.
+    """
+
+    search: SearchView
+    values: dict[str, Value]
+    point: np.ndarray
+    searched: np.ndarray
+    fresh: FreshLosses | None = None
+
+    # `best.check(…)` is `check_robustness(best, …)`
+    check = check_robustness
+
+    @property
+    def loss(self) -> float:
+        """On fresh seeds; where the design was not tested, in the search."""
+        return self.searched_loss if self.fresh is None else self.fresh.loss
+
+    @property
+    def objective(self) -> Objective:
+        """The objective that scored the design."""
+        return self.search.objective
+
+    @property
+    def searched_loss(self) -> float:
+        """In the search, where the lowest of many losses is low partly by luck."""
+        return float(self.objective.task.reduced(self.searched[None])[0])
+
+    @property
+    def losses(self) -> np.ndarray:
+        """Of each fresh seed (S,), or of each replicate in the search (R,)."""
+        return self.searched if self.fresh is None else self.fresh.losses
+
+    @property
+    def band(self) -> tuple[float, float] | None:
+        """Where the loss lies with a probability of 90 %; None where the design was not tested on
+        fresh seeds."""
+        return None if self.fresh is None else self.fresh.band
+
+    def __repr__(self) -> str:
+        tested = "" if self.fresh is None else f" on {len(self.losses)} fresh seeds"
+        return f"Best(values={self.values}, loss={self.loss:.4g}{tested})"
+
+    def scene(self) -> tf.Scene:
+        """The scene with these parameters, for one colony or any number of them."""
+        family = self.objective.task.family
+        return family.function(**family.fixed, **self.values)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the design as JSON, which `torchfilm run` takes. Replaces an older file."""
+        return write_design(
+            Path(path),
+            self.objective.task,
+            self.values,
+            loss=self.loss,
+            losses=self.losses,
+            colonies=self.search.study.colonies,
+        )
+
+    def plot(self, path: str | Path) -> Path:
+        """Draw the first guess, the best design, the target and the course of the search. Needs
+        matplotlib (the `app` extra)."""
+        return report.draw(self._report(), Path(path))
+
+    def table(self) -> str:
+        """The parameters with their bounds and the first guess, the losses and the measures."""
+        return report.table(self._report())
+
+    def colonies(self) -> list[FinishedColonies]:
+        """The replicates at their ends, grown again once: the same colonies as were scored."""
+        return self.search.colonies(self.point)
+
+    def _report(self) -> report.SearchReport:
+        search, first = self.search, self.search.first()
+        first_guess, best = (
+            report.ReportedDesign(title, d.values, d.point, d.searched_loss, d.colonies(), d.fresh)
+            for title, d in (("first guess", first), ("best", self))
+        )
+        return report.SearchReport(
+            self.objective.task, search.study, search.why_regrown, first_guess, best
+        )

@@ -1,0 +1,61 @@
+"""One batch of a search, and its results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from design.parameters import Value
+from design.slopes import Slopes, joined
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One batch and its results.
+
+    points (n, D); loss (n,); losses and cells (n, R); reasons of failures, by (row, replicate);
+    size: share of the full size; seconds; values: the parameters of each point; streams (R,): of
+    random numbers, one for each replicate. slopes: where the method asked for them; copies:
+    colonies that were grown for each loss: more than 1 for its derivatives, 0 where it was known
+    before.
+    """
+
+    points: np.ndarray
+    loss: np.ndarray
+    losses: np.ndarray
+    cells: np.ndarray
+    reasons: dict[tuple[int, int], str]
+    size: float
+    seconds: float
+    values: Sequence[dict[str, Value]]
+    streams: tuple[int, ...]
+    slopes: Slopes | None = None
+    copies: int = 1
+
+    @property
+    def replicates(self) -> int:
+        """How many colonies each design has."""
+        return len(self.streams)
+
+    @property
+    def colonies(self) -> float:
+        """Colonies simulated; one of another size counts as its share of the full size."""
+        return len(self.points) * self.replicates * self.size * self.copies
+
+    def followed_by(self, other: Entry) -> Entry:
+        """This batch with further designs, grown in the same way."""
+        join = lambda name: np.concatenate([getattr(self, name), getattr(other, name)])
+        rows = len(self.points)
+        return replace(
+            self,
+            points=join("points"),
+            loss=join("loss"),
+            losses=join("losses"),
+            cells=join("cells"),
+            reasons=self.reasons | {(r + rows, k): w for (r, k), w in other.reasons.items()},
+            seconds=self.seconds + other.seconds,
+            values=[*self.values, *other.values],
+            slopes=None if self.slopes is None else joined([self.slopes, other.slopes]),
+        )

@@ -1,0 +1,211 @@
+"""The finals of a search: its best designs on fresh seeds.
+
+The lowest of many losses is low partly by luck. So the last part of the budget goes to the best
+designs on seeds that the search has not used: half of them drop out after each round, and the
+seeds of the others double (successive halving; Karnin, Koren and Somekh, ICML 2013).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy.stats import t as student
+
+from design.methods.base import whole
+from design.objective import Objective
+from design.study import Study
+from design.task import Task
+from torchfilm import checks
+
+FIRST_STREAM = 1_000_000  # beyond the streams of searches and robustness checks
+LEAST = 4  # fresh seeds of a finalist
+ALIKE = 0.02  # designs that are nearer in every coordinate count as one
+HOLDS = (8, 24)  # fresh seeds of a design that may hold the wanted loss: first, then in all
+TESTED = 3  # designs of a batch that may hold it
+BAND = 0.9  # probability of a band
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finals:
+    """How the best designs of a search are tested on fresh seeds.
+
+    share: of the budget that the test takes, below 1. most: finalists; fewer where the budget is
+    small. sizes: of the colonies, as shares of the full size, such as (1, 2): each seed is grown at
+    each size, and its loss is the worst of them. Raises InputError for values that are not allowed.
+    """
+
+    share: float = 0.2
+    most: int = 8
+    sizes: Sequence[float] = (1.0,)
+
+    def __post_init__(self) -> None:
+        checks.number("Finals.share", self.share, above=0.0, most=0.9)
+        whole("Finals.most", self.most, least=1)
+        sizes = checks.vector("Finals.sizes", self.sizes)
+        if not sizes or min(sizes) <= 0 or len(set(sizes)) < len(sizes):
+            raise checks.input_error(
+                "Finals.sizes", self.sizes, "different shares of the full size, such as (1, 2)"
+            )
+        object.__setattr__(self, "sizes", tuple(sizes))
+
+    def rounds(self, budget: float) -> list[tuple[int, int]]:
+        """The finalists of each round and their fresh seeds so far, for a search of `budget`
+        colonies; [] where its share is too small for one design."""
+        count, colonies = self.most, self.share * budget / sum(self.sizes)
+        while count:
+            counts = [count]
+            while counts[-1] // 2 >= 2:
+                counts.append(counts[-1] // 2)
+            seeds = int(colonies / sum(c * 2**r for r, c in enumerate(counts)))
+            if seeds >= LEAST:
+                return [(c, seeds * (2 ** (r + 1) - 1)) for r, c in enumerate(counts)]
+            count //= 2
+        return []
+
+    def colonies(self, budget: float) -> float:
+        """Colonies of the finals of a search of `budget` colonies."""
+        total, before = 0, 0
+        for count, seeds in self.rounds(budget):
+            total, before = total + count * (seeds - before), seeds
+        return total * sum(self.sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class FreshLosses:
+    """A design on fresh seeds: losses (S,) of each, the worst of its sizes; loss: what they reduce
+    to; band: where that lies with a probability of 90 %."""
+
+    losses: np.ndarray
+    loss: float
+    band: tuple[float, float]
+
+
+def fresh_losses(
+    task: Task, study: Study, sizes: Sequence[float], point: np.ndarray
+) -> FreshLosses | None:
+    """Of a design (D,); None before it was grown on LEAST seeds at all sizes."""
+    each = [_tested(study, point, size) for size in sizes]
+    seeds = min(len(x) for x in each)
+    if seeds < LEAST:
+        return None
+    losses = np.max([x[:seeds] for x in each], axis=0)
+    return FreshLosses(losses, float(task.reduced(losses[None])[0]), _band(task, losses))
+
+
+def _tested(study: Study, point: np.ndarray, size: float) -> np.ndarray:
+    """The losses of a design (D,) on the first fresh seeds at a size, (S,)."""
+    found = [
+        e.losses[k]
+        for e in study.finals
+        if e.size == size
+        for k in np.flatnonzero((e.points == point).all(1))
+    ]
+    return np.concatenate(found) if found else np.empty(0)
+
+
+def _band(task: Task, losses: np.ndarray) -> tuple[float, float]:
+    """Student's interval of a mean; for a quantile, that of resampled losses."""
+    if task.reduce == "mean":
+        error = losses.std(ddof=1) / np.sqrt(len(losses))
+        wide = float(student.ppf(0.5 + BAND / 2, len(losses) - 1) * error)
+        return float(losses.mean()) - wide, float(losses.mean()) + wide
+    drawn = np.random.default_rng(0).choice(losses, (RESAMPLES, len(losses)))
+    low, high = np.quantile(task.reduced(drawn), [0.5 - BAND / 2, 0.5 + BAND / 2])
+    return float(low), float(high)
+
+
+def winner(task: Task, study: Study, sizes: Sequence[float]) -> np.ndarray | None:
+    """The point (D,) of the design whose band ends lowest: few seeds make a wide band. None before
+    a design was grown on fresh seeds."""
+    points = {p.tobytes(): p for e in study.finals for p in e.points}
+    found = ((fresh_losses(task, study, sizes, p), p) for p in points.values())
+    known = [(fresh.band[1], p) for fresh, p in found if fresh is not None]
+    return min(known, key=lambda x: x[0])[1] if known else None
+
+
+@dataclass(frozen=True, eq=False)
+class FinalsRun:
+    """The finals of one run of a search.
+
+    budget: colonies of the whole search; executor, work_items: as in `Objective.evaluate`. What is
+    chosen depends on the study and the budget alone, and what the study holds is not grown again.
+    So a stopped run goes on where it was.
+    """
+
+    finals: Finals
+    task: Task
+    study: Study
+    budget: int
+    executor: Executor | None = None
+    work_items: int = 1
+
+    def run(self) -> None:
+        """Play all rounds that the budget allows."""
+        chosen = self._finalists()
+        for count, seeds in self.finals.rounds(self.budget):
+            chosen = self._grow(chosen[:count], seeds)
+            chosen = sorted(chosen, key=partial(self._loss, seeds))
+
+    def holds(self, wanted: float) -> bool:
+        """Whether one of the best designs of the last batch holds a loss on fresh seeds: its band
+        ends there. A few seeds decide whether it is tested on more."""
+        entry = self.study.entries[-1]
+        best = np.argsort(entry.loss, kind="stable")[:TESTED]
+        rows = [k for k in best if entry.loss[k] <= wanted] if self.study.is_full(entry) else []
+        return any(self._holds(entry.points[k], wanted) for k in rows)
+
+    def _holds(self, point: np.ndarray, wanted: float) -> bool:
+        for seeds in HOLDS:
+            if not self._grow([point], seeds) or self._loss(seeds, point) > wanted:
+                return False
+        found = fresh_losses(self.task, self.study, self.finals.sizes, point)
+        return found is not None and found.band[1] <= wanted
+
+    def _finalists(self) -> list[np.ndarray]:
+        """The best designs of the search, no two of them alike."""
+        full = self.study.full()
+        rows = [(float(e.loss[k]), e.points[k]) for e in full for k in range(len(e.loss))]
+        out: list[np.ndarray] = []
+        for _, point in sorted(rows, key=lambda row: row[0]):
+            if all(np.abs(point - other).max() >= ALIKE for other in out):
+                out.append(point)
+                if len(out) == self.finals.most:
+                    break
+        return out
+
+    def _grow(self, points: Sequence[np.ndarray], seeds: int) -> list[np.ndarray]:
+        """Grow designs on as many of the first fresh seeds as they lack, the best first, while the
+        budget lasts. Returns those that have been grown on all."""
+        lacking: dict[tuple[float, int], list[np.ndarray]] = {}
+        done, spent = [], self.study.colonies
+        for point in points:
+            known = {size: len(_tested(self.study, point, size)) for size in self.finals.sizes}
+            cost = sum(size * max(0, seeds - n) for size, n in known.items())
+            if spent + cost > self.budget + 1e-9:
+                break
+            spent += cost
+            done.append(point)
+            for size, n in known.items():
+                if n < seeds:
+                    lacking.setdefault((size, n), []).append(point)
+        for (size, known_seeds), group in lacking.items():
+            self._add(np.array(group), size, range(known_seeds, seeds))
+        return done
+
+    def _add(self, points: np.ndarray, size: float, seeds: range) -> None:
+        objective = Objective(self.task if size == 1.0 else self.task.resized(size))
+        streams = tuple(FIRST_STREAM + k for k in seeds)
+        found = objective.evaluate(
+            points, streams=streams, executor=self.executor, work_items=self.work_items
+        )
+        self.study.add_final(found.entry(streams, size=size))
+
+    def _loss(self, seeds: int, point: np.ndarray) -> float:
+        """On the first fresh seeds, the worst of all sizes."""
+        each = [_tested(self.study, point, size)[:seeds] for size in self.finals.sizes]
+        return float(self.task.reduced(np.max(each, axis=0)[None])[0])

@@ -1,0 +1,198 @@
+"""Designs that are known before a search begins."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+import torchfilm as tf
+from design.entries import Entry
+from design.parameters import Choice, Parameter, Value
+from design.study import Study
+from design.task import Task, TaskOptions
+from torchfilm import checks
+
+MOST = 16  # designs of a study of another task that are grown again
+
+
+class HasValues(Protocol):
+    """A design, such as `Best`."""
+
+    @property
+    def values(self) -> Mapping[str, Value]: ...
+
+
+Start = HasValues | Mapping[str, Value] | Sequence[Any] | Study | str | Path
+
+
+@dataclass(frozen=True, eq=False)
+class KnownDesigns:
+    """points (n, D) from which a search starts. entry: with their losses, where these hold for the
+    task of the search; None: they are grown again. why: they are, or ""."""
+
+    points: np.ndarray
+    entry: Entry | None = None
+    why: str = ""
+
+    def describe(self) -> str:
+        """What a study says of them."""
+        kept = "with their losses" if self.entry else "grown again"
+        return f"{len(self.points)} designs, {kept}, {tf.digest(self.points.tolist())[:12]}"
+
+
+def known_designs(given: Start, task: Task) -> KnownDesigns:
+    """The designs that `Search.start` gives. Raises InputError for values that are missing, beyond
+    the bounds or of no parameter, and for a file that is not one of a study or of a design."""
+    if isinstance(given, str | Path):
+        path = Path(given)
+        given = _saved(path) if path.suffix == ".json" else Study.read(path)
+    if isinstance(given, Study):
+        return _of_study(given, task)
+    designs = given if isinstance(given, Sequence) else [given]
+    points = [_point(design, task) for design in designs]
+    if not points:
+        raise checks.input_error("start", given, "at least one design")
+    return KnownDesigns(np.array(points))
+
+
+def _saved(path: Path) -> Mapping[str, Value]:
+    """The parameters in the file of a saved design."""
+    try:
+        found = json.loads(path.read_text())["parameters"]
+        if not isinstance(found, dict):
+            raise TypeError("its parameters are no table")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise tf.InputError(f"start: {path} cannot be read as a saved design ({error}).") from error
+    return found
+
+
+def _point(design: Any, task: Task) -> np.ndarray:
+    """The coordinates (D,) of one design. What it says of arguments that are not searched is left
+    aside, but for names that the scene does not have."""
+    values = getattr(design, "values", None)
+    values = design if not isinstance(values, Mapping) else values
+    if not isinstance(values, Mapping):
+        raise checks.input_error(
+            "start", design, "values by name, such as {'k3': 1.0}, a Best, a study, or a file"
+        )
+    allowed = inspect.signature(task.family.function).parameters
+    if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in allowed.values()):
+        for name in values:
+            if name not in allowed:
+                raise checks.input_error(
+                    "start", name, f"a parameter of {task.family.name}: {', '.join(allowed)}"
+                )
+    space = task.space
+    return space.point(
+        {name: values[name] if name in values else _usual(task, name) for name in space.names}
+    )
+
+
+def _usual(task: Task, name: str) -> Value:
+    """The value that the scene function gives to an argument that is left out."""
+    found = inspect.signature(task.family.function).parameters.get(name)
+    usual = inspect.Parameter.empty if found is None else found.default
+    if isinstance(usual, bool | int | float | str):
+        return usual
+    raise checks.input_error(
+        "start", f"no {name!r}", f"a value for {name}", "The scene function has no default for it."
+    )
+
+
+def _of_study(study: Study, task: Task) -> KnownDesigns:
+    """The designs of a study within the bounds: with their losses, if a search of this task with
+    the study's own parameters would be that study."""
+    full = [(e, k) for e in study.full() for k in range(len(e.loss))]
+    points, rows, added = [], [], {}
+    fixed = _literals(study.about.get("fixed", {}))
+    for name in task.space.names:
+        if name not in study.names:
+            added[name] = fixed[name] if name in fixed else _usual(task, name)
+    for entry, k in full:
+        try:
+            values = {**entry.values[k], **added}
+            points.append(task.space.point({name: values[name] for name in task.space.names}))
+            rows.append((entry, k))
+        except tf.InputError:  # beyond the bounds
+            continue
+    if not points:
+        raise checks.input_error(
+            "start", f"a study of {len(full)} designs", "one with a design within the bounds"
+        )
+    why = _why_other(study, task, fixed, added)
+    if why:
+        best = np.argsort([e.loss[k] for e, k in rows], kind="stable")[:MOST]
+        return KnownDesigns(np.array(points)[best], why=why)
+    join = lambda name: np.array([getattr(e, name)[k] for e, k in rows])
+    values_of = [task.space.values(point) for point in points]
+    entry = Entry(
+        points=np.array(points),
+        loss=join("loss"),
+        losses=join("losses"),
+        cells=join("cells"),
+        reasons={
+            (row, replicate): words
+            for row, (e, k) in enumerate(rows)
+            for (of, replicate), words in e.reasons.items()
+            if of == k
+        },
+        size=1.0,
+        seconds=0.0,
+        values=values_of,
+        streams=study.streams,
+        copies=0,
+    )
+    return KnownDesigns(entry.points, entry)
+
+
+def _why_other(
+    study: Study, task: Task, fixed: Mapping[str, Value], added: Mapping[str, Value]
+) -> str:
+    """Why the losses of a study do not hold for a task; "" where they do."""
+    gone = [name for name in study.names if name not in task.space.names]
+    if gone:
+        return f"it varies {gone[0]}, and this search does not"
+    options = {f.name: getattr(task, f.name) for f in dataclasses.fields(TaskOptions)}
+    stated = {n: v for n, v in added.items() if n in fixed}
+    try:
+        options["parameters"] = [read_parameter(text) for text in study.about["parameters"]]
+        options["fixed"] = {**task.family.fixed, **stated}
+        then = Task(**options).describe()
+    except (tf.InputError, ValueError, KeyError) as error:
+        return str(error)
+    differ = [name for name, value in then.items() if study.about.get(name) != value]
+    return f"another {', '.join(differ)}" if differ else ""
+
+
+def _literals(texts: Mapping[str, str]) -> dict[str, Value]:
+    """The values of arguments that a study states as text, as far as they are plain."""
+    out = {}
+    for name, text in texts.items():
+        try:
+            out[name] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            continue
+    return out
+
+
+def read_parameter(text: str) -> Parameter | Choice:
+    """The parameter that `describe` has stated. Raises ValueError for another text."""
+    name, _, rest = text.partition(": ")
+    numbers = re.fullmatch(r"(\S+) to (\S+?)( log| whole)?", rest)
+    if numbers:
+        low, high, kind = numbers.groups()
+        return Parameter(name, float(low), float(high), log=kind == " log", whole=kind == " whole")
+    # "or" between texts, not within one
+    options = ast.parse(rest, mode="eval").body
+    if not isinstance(options, ast.BoolOp):
+        raise ValueError(f"{text!r} is no parameter")
+    return Choice(name, [ast.literal_eval(option) for option in options.values])

@@ -1,0 +1,187 @@
+"""The HDF5 file of a study.
+
+    /             attributes: format, version, torchfilm, torch, about (JSON: scene, parameters,
+                  target, method, …)
+    /streams      (R,) streams of random numbers, one for each replicate
+    /batches/     rows, size, replicates, first_stream, seconds, copies: a row for each batch
+    /designs/     point (N, D), loss (N,), losses (N, R), cells (N, R); NaN and 0 where a replicate
+                  was not grown; reasons, JSON by replicate
+    /slopes/K/    gradient (n, D) and curvature (n, D, D) of batch K, where they were wanted
+    /values/NAME  (N,) the values of each parameter
+    /finals/      the same of the finals, the designs on fresh seeds
+
+After each batch a new file is written beside the old one and then replaces it, so that a kill at
+any moment costs at most one batch. The file holds data only; nothing in it is executed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+import torchfilm as tf
+from design.entries import Entry
+from design.slopes import Slopes
+from torchfilm import checks
+
+FORMAT, VERSION = "torchfilm study", 3
+
+
+@dataclass(frozen=True, eq=False)
+class StudyData:
+    """What a study file holds: `Study` documents its parts."""
+
+    about: dict[str, Any]
+    streams: tuple[int, ...]
+    entries: list[Entry]
+    finals: list[Entry]
+
+
+def write_study(path: Path, data: StudyData) -> None:
+    """Write a study, in place of an older file. Raises SimulationError where that fails."""
+    beside = path.with_name(path.name + ".new")
+    try:
+        with h5py.File(beside, "w") as file:
+            file.attrs.update(
+                {
+                    "format": FORMAT,
+                    "version": VERSION,
+                    "about": json.dumps(data.about),
+                    "torchfilm": tf.__version__,
+                    "torch": str(torch.__version__),
+                }
+            )
+            file["streams"] = np.asarray(data.streams, np.int64)
+            names = data.about["names"]
+            _write_entries(file, data.entries, names, len(data.streams))
+            if data.finals:
+                most = max(e.replicates for e in data.finals)
+                _write_entries(file.create_group("finals"), data.finals, names, most)
+        os.replace(beside, path)
+    except OSError as error:
+        raise tf.SimulationError(
+            f"could not write {path}: {error}. Is the disk full? The file keeps the earlier"
+            " batches. Run the search again to resume it."
+        ) from error
+
+
+def _write_entries(
+    group: h5py.Group, entries: Sequence[Entry], names: Sequence[str], most: int
+) -> None:
+    """most: replicates of any batch."""
+    group["batches/rows"] = [len(e.points) for e in entries]
+    group["batches/first_stream"] = [e.streams[0] for e in entries]
+    for name in ("size", "replicates", "seconds", "copies"):
+        group[f"batches/{name}"] = [getattr(e, name) for e in entries]
+    wide = lambda x, fill: np.concatenate(
+        [x, np.full((len(x), most - x.shape[1]), fill, x.dtype)], 1
+    )
+    group["designs/point"] = np.concatenate([e.points for e in entries])
+    group["designs/loss"] = np.concatenate([e.loss for e in entries])
+    group["designs/losses"] = np.concatenate([wide(e.losses, np.nan) for e in entries])
+    group["designs/cells"] = np.concatenate([wide(e.cells, 0) for e in entries])
+    for number, slopes in enumerate(e.slopes for e in entries):
+        if slopes is not None:
+            group[f"slopes/{number}/gradient"] = slopes.gradient
+            group[f"slopes/{number}/curvature"] = slopes.curvature
+    words = [
+        json.dumps({str(k): e.reasons[r, k] for k in range(e.replicates) if (r, k) in e.reasons})
+        for e in entries
+        for r in range(len(e.points))
+    ]
+    group.create_dataset("designs/reasons", data=words, dtype=h5py.string_dtype())
+    for name in names:
+        column = [v[name] for e in entries for v in e.values]
+        if any(isinstance(v, str) for v in column):
+            text = [str(v) for v in column]
+            group.create_dataset(f"values/{name}", data=text, dtype=h5py.string_dtype())
+        else:
+            group[f"values/{name}"] = column
+
+
+def read_study(path: Path) -> StudyData:
+    """The study in a file. Raises InputError where the file cannot be read."""
+    if not path.is_file():
+        raise checks.input_error(
+            "study",
+            str(path),
+            "a study file",
+            "This path is a folder." if path.is_dir() else "There is no such file.",
+        )
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise tf.InputError(
+                    f"{path} is not a torchfilm study (its format is {file.attrs.get('format')!r})."
+                )
+            if int(file.attrs["version"]) > VERSION:
+                raise tf.InputError(
+                    f"{path} has format version {file.attrs['version']}; this torchfilm reads"
+                    f" versions up to {VERSION}. Update torchfilm."
+                )
+            about, streams = json.loads(file.attrs["about"]), tuple(file["streams"][...].tolist())
+            tuple(about["names"])
+            finals = _read_entries(file["finals"]) if "finals" in file else []
+            return StudyData(about, streams, _read_entries(file, streams), finals)
+    except tf.InputError:
+        raise
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise tf.InputError(
+            f"{path} cannot be read: it is truncated or not a study file ({error})."
+        ) from error
+
+
+def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> list[Entry]:
+    """streams: of the replicates; None: those that the file states."""
+    batches, designs = ({n: d[...] for n, d in group[g].items()} for g in ("batches", "designs"))
+    columns = {
+        name: (d.asstr() if h5py.check_string_dtype(d.dtype) else d)[...].tolist()
+        for name, d in group["values"].items()
+    }
+    values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    out: list[Entry] = []
+    at = 0
+    batches.setdefault("copies", np.ones_like(batches["rows"]))  # version 1 has none
+    batches.setdefault("first_stream", np.zeros_like(batches["rows"]))  # nor has version 2
+    columns_of = ("rows", "size", "replicates", "first_stream", "seconds", "copies")
+    for rows, size, replicates, first, seconds, copies in zip(
+        *(batches[n].tolist() for n in columns_of), strict=True
+    ):
+        mine = slice(at, at + rows)
+        reasons = {
+            (r, int(k)): words
+            for r, text in enumerate(designs["reasons"][mine])
+            for k, words in json.loads(text).items()
+        }
+        out.append(
+            Entry(
+                points=designs["point"][mine],
+                loss=designs["loss"][mine],
+                losses=designs["losses"][mine, :replicates],
+                cells=designs["cells"][mine, :replicates],
+                reasons=reasons,
+                size=size,
+                seconds=seconds,
+                values=values[mine],
+                streams=(streams or tuple(range(first, first + replicates)))[:replicates],
+                slopes=_read_slopes(group, len(out)),
+                copies=copies,
+            )
+        )
+        at += rows
+    if at != len(designs["point"]):
+        raise ValueError(f"its batches have {at} designs, but it lists {len(designs['point'])}")
+    return out
+
+
+def _read_slopes(group: h5py.Group, batch: int) -> Slopes | None:
+    found = group.get(f"slopes/{batch}")
+    return None if found is None else Slopes(found["gradient"][...], found["curvature"][...])

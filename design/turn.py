@@ -1,0 +1,109 @@
+"""One turn of a search method: the batch that it proposes, of which a part is left where the budget
+ends within it, and what it learns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import torchfilm as tf
+from design.entries import Entry
+from design.known import KnownDesigns
+from design.methods import Batch, Method
+from design.objective import Objective
+from design.study import Study
+from design.task import Task
+
+
+@dataclass(eq=False)
+class Turn:
+    """batch: what a method proposes; entry: the first of its designs, which have been grown. known:
+    the batch is of designs that were known before, and no method's."""
+
+    batch: Batch
+    known: bool = False
+    entry: Entry | None = None
+
+    @classmethod
+    def next_of(cls, method: Method, task: Task, study: Study, known: KnownDesigns | None) -> Turn:
+        """The next batch of a method; first of all, the known designs that are to be grown."""
+        if known is not None and not study.entries:
+            return cls(Batch(known.points), known=True)
+        batch = method.ask()
+        if not isinstance(batch, Batch):
+            raise tf.InputError(
+                f"{type(method).__name__}.ask must return a design.Batch of points"
+                f" (n, {task.space.size}), not {type(batch).__name__}."
+            )
+        return cls(batch)
+
+    @property
+    def done(self) -> int:
+        """Designs that have been grown."""
+        return 0 if self.entry is None else len(self.entry.points)
+
+    @property
+    def complete(self) -> bool:
+        return self.done == len(self.batch.points)
+
+    def part(self, objective: Objective, colonies: float) -> Batch | None:
+        """As many of the designs that are left as `colonies` allow; None where that is none."""
+        most = objective.task.replicates
+        replicates = min(self.batch.replicates or most, most)
+        cost = replicates * self.batch.size * objective.copies(self.batch.slopes)
+        rows = min(int(colonies / cost + 1e-9), len(self.batch.points) - self.done)
+        if rows < 1:
+            return None
+        chosen = self.batch.points[self.done : self.done + rows]
+        return replace(self.batch, points=chosen, replicates=replicates)
+
+    def take(self, entry: Entry, study: Study) -> None:
+        """Keep further designs that have been grown, here and in the study."""
+        first = self.entry is None
+        self.entry = entry if self.entry is None else self.entry.followed_by(entry)
+        study.add(self.entry, replace=not first)
+
+    def tell(self, method: Method) -> None:
+        """Let a method learn the whole batch. Methods that never ask for slopes need not take
+        any."""
+        assert self.entry is not None
+        loss, slopes = self.entry.loss, self.entry.slopes
+        if self.known:
+            know = getattr(method, "know", None)
+            if know is not None:
+                know(self.entry.points, loss)
+            return
+        batch = replace(self.batch, points=self.entry.points)
+        if batch.slopes:
+            method.tell(batch, loss, slopes)  # type: ignore[call-arg]
+        else:
+            method.tell(batch, loss)
+
+
+def repeat_study(method: Method, study: Study, known: KnownDesigns | None) -> Turn | None:
+    """Bring a method to where the study ends: it proposes each batch again and learns its losses.
+    Returns the turn of which only a part was grown, if any. Raises InputError where the method
+    proposes other points."""
+    for k, entry in enumerate(study.entries):
+        if known is not None and k == 0:
+            turn = Turn(Batch(known.points), known=True)
+        else:
+            turn = Turn(method.ask())
+        turn.entry = entry
+        wanted = turn.batch.points[: turn.done]
+        whole = turn.complete or k == len(study.entries) - 1
+        # another machine may round in another way
+        if (
+            not whole
+            or wanted.shape != entry.points.shape
+            or not np.allclose(wanted, entry.points, rtol=0, atol=1e-6)
+        ):
+            raise tf.InputError(
+                f"{study.path}: the method proposes other points than its batch {k} holds; another"
+                " version of the method may have made the file. Start a new study."
+            )
+        if not turn.complete:
+            return turn
+        turn.tell(method)
+    return None
