@@ -7,7 +7,8 @@ It uses torchfilm's public names only, as any user can.
 
 from design.best import Best
 from design.finals import Finals
-from design.methods import CMAES, Batch, Bayesian, Local, Method, Racing, Sobol
+from design.front import Front
+from design.methods import CMAES, NSGA2, Batch, Bayesian, Local, Method, Racing, Sobol
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
 from design.robustness import Robustness
@@ -18,29 +19,39 @@ from design.slopes import Slopes
 from design.study import Study
 from design.targets import (
     Bands,
+    Burden,
+    Constrained,
     DomainSize,
+    Duration,
     Gradient,
     Image,
     OnFraction,
     Oscillation,
     ProfileTarget,
     Ring,
+    Spread,
     Stripe,
     Target,
+    Weighted,
 )
 from design.task import Task
 
 __all__ = [
     "CMAES",
+    "NSGA2",
     "Bands",
     "Batch",
     "Bayesian",
     "Best",
+    "Burden",
     "Choice",
+    "Constrained",
     "DomainSize",
+    "Duration",
     "Evaluation",
     "Finals",
     "FinishedColonies",
+    "Front",
     "Gradient",
     "Image",
     "Local",
@@ -57,9 +68,11 @@ __all__ = [
     "Slopes",
     "Sobol",
     "Space",
+    "Spread",
     "Stripe",
     "Study",
     "Target",
     "Task",
+    "Weighted",
     "check_robustness",
 ]

@@ -31,6 +31,9 @@ class SearchView(Protocol):
     @property
     def why_regrown(self) -> str: ...
 
+    @property
+    def why_chosen(self) -> str: ...
+
     def first(self) -> Best: ...
 
     def colonies(self, point: np.ndarray) -> list[FinishedColonies]: ...
@@ -120,5 +123,10 @@ class Best:
             for title, d in (("first guess", first), ("best", self))
         )
         return report.SearchReport(
-            self.objective.task, search.study, search.why_regrown, first_guess, best
+            self.objective.task,
+            search.study,
+            search.why_regrown,
+            first_guess,
+            best,
+            search.why_chosen,
         )

@@ -19,7 +19,7 @@ class Entry:
     size: share of the full size; seconds; values: the parameters of each point; streams (R,): of
     random numbers, one for each replicate. slopes: where the method asked for them; copies:
     colonies that were grown for each loss: more than 1 for its derivatives, 0 where it was known
-    before.
+    before; goals (n, G): the losses of several targets side by side, NaN for a design that failed.
     """
 
     points: np.ndarray
@@ -33,6 +33,7 @@ class Entry:
     streams: tuple[int, ...]
     slopes: Slopes | None = None
     copies: int = 1
+    goals: np.ndarray | None = None
 
     @property
     def replicates(self) -> int:
@@ -57,5 +58,6 @@ class Entry:
             reasons=self.reasons | {(r + rows, k): w for (r, k), w in other.reasons.items()},
             seconds=self.seconds + other.seconds,
             values=[*self.values, *other.values],
+            goals=None if self.goals is None else join("goals"),
             slopes=None if self.slopes is None else joined([self.slopes, other.slopes]),
         )

@@ -17,6 +17,7 @@ from scipy.stats import t as student
 
 from design.methods.base import whole
 from design.objective import Objective
+from design.pareto import nondominated, spread
 from design.study import Study
 from design.task import Task
 from torchfilm import checks
@@ -145,7 +146,10 @@ class FinalsRun:
     work_items: int = 1
 
     def run(self) -> None:
-        """Play all rounds that the budget allows."""
+        """Play all rounds that the budget allows. Several goals have one round, of a front."""
+        if self.task.goals:
+            self._front()
+            return
         chosen = self._finalists()
         for count, seeds in self.finals.rounds(self.budget):
             chosen = self._grow(chosen[:count], seeds)
@@ -165,6 +169,19 @@ class FinalsRun:
                 return False
         found = fresh_losses(self.task, self.study, self.finals.sizes, point)
         return found is not None and found.band[1] <= wanted
+
+    def _front(self) -> None:
+        """Grow designs from all parts of the front."""
+        full = [e for e in self.study.full() if e.goals is not None]
+        points = np.concatenate([e.points for e in full])
+        goals = np.concatenate([e.goals for e in full if e.goals is not None])
+        front = nondominated(goals)
+        most = 2 * self.finals.most
+        room = self.finals.colonies(self.budget) / sum(self.finals.sizes)
+        count = min(len(front), most, int(room / LEAST))
+        if count:
+            chosen = front[spread(goals[front], count)]
+            self._grow([points[k] for k in chosen], int(room / count))
 
     def _finalists(self) -> list[np.ndarray]:
         """The best designs of the search, no two of them alike."""

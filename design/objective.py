@@ -29,7 +29,7 @@ class Evaluation:
     cells (n, R), of each colony at its end; reasons, by (row, replicate), why a colony failed;
     size: share of the full size; why_regrown: the reason why colonies did not follow recorded
     growth, or ""; seconds; slopes: of the n designs, where they were asked for; copies: colonies
-    that were grown for each loss (n, R).
+    that were grown for each loss (n, R); goals (n, G): as `Entry` has them.
     """
 
     points: np.ndarray
@@ -43,6 +43,7 @@ class Evaluation:
     seconds: float
     slopes: Slopes | None = None
     copies: int = 1
+    goals: np.ndarray | None = None
 
     def entry(self, streams: tuple[int, ...], size: float | None = None) -> Entry:
         """For a study. streams: that were evaluated; size: share of the full size of the search,
@@ -59,6 +60,7 @@ class Evaluation:
             streams=streams,
             slopes=self.slopes,
             copies=self.copies,
+            goals=self.goals,
         )
 
 
@@ -150,8 +152,11 @@ class Objective:
         gathered = Slopes.none(len(points) * count, task.space.size)
         reasons: dict[tuple[int, int], str] = {}
         why_regrown = ""
+        goals = np.full((len(points), count, task.goals), np.nan)
         for item, found in results:
             rows = list(item.rows)
+            if found.goals is not None:
+                goals[rows] = found.goals
             losses[rows], cells[rows] = found.losses, found.cells
             reasons |= {(rows[row], k): words for (row, k), words in found.reasons.items()}
             why_regrown = why_regrown or found.why_regrown
@@ -161,7 +166,7 @@ class Objective:
         copies = 1 if turns is None else len(turns[0])
         return Evaluation(
             points, values, losses, task.reduced(losses), cells, reasons, size, why_regrown, 0.0,
-            slopes, copies,
+            slopes, copies, task.reduced_goals(goals),
         )  # fmt: skip
 
     def _differences(self, points: np.ndarray, streams: tuple[int, ...], *run: Any) -> Evaluation:
@@ -177,6 +182,7 @@ class Objective:
             found,
             points=points, values=found.values[first], losses=found.losses[first],
             loss=found.loss[first], cells=found.cells[first], slopes=slopes, copies=each,
+            goals=None if found.goals is None else found.goals[first],
             reasons={(r // each, k): w for (r, k), w in found.reasons.items() if not r % each},
         )  # fmt: skip
 

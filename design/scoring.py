@@ -18,6 +18,7 @@ from design.parameters import Value
 from design.rollout import FinishedColonies, grow
 from design.slopes import Slopes, joined
 from design.targets.base import Target
+from design.targets.goals import Goals
 from design.task import Task
 
 
@@ -41,13 +42,15 @@ class WorkItem:
 class WorkResult:
     """The result of a work item: losses and cells (n, R), and the reasons of failures by (row of
     the item, replicate). why_regrown: the reason why no recorded growth was used, or "". slopes: of
-    the n · R colonies, where they were asked for."""
+    the n · R colonies, where they were asked for. goals: of each colony (n, R, G), NaN where it
+    failed; None where all did."""
 
     losses: np.ndarray
     cells: np.ndarray
     reasons: dict[tuple[int, int], str]
     why_regrown: str
     slopes: Slopes | None = None
+    goals: np.ndarray | None = None
 
 
 def cut_work_items(
@@ -121,7 +124,14 @@ def run_work_item(task: Task, item: WorkItem, streams: tuple[int, ...], size: fl
         first.reasons | moved,
         first.why_regrown or second.why_regrown,
         None if first.slopes is None else joined([first.slopes, second.slopes]),
+        np.concatenate([_goals(task, part, replicates) for part in (first, second)]),
     )
+
+
+def _goals(task: Task, part: WorkResult, replicates: int) -> np.ndarray:
+    """The losses of each goal (n, R, G); NaN where all colonies failed."""
+    none = np.full((len(part.losses), replicates, task.goals), np.nan)
+    return none if part.goals is None else part.goals
 
 
 @torch.no_grad()
@@ -138,6 +148,7 @@ def _grow_and_score(
             task.settings,
         )
         losses = np.full(count * replicates, task.target.failed, np.float64)
+        goals = np.full((count * replicates, task.goals), np.nan)
         cells = np.zeros(count * replicates, np.int64)
         gathered = Gathered(task.space, count * replicates) if item.turns else None
         reasons: dict[tuple[int, int], str] = {}
@@ -155,14 +166,18 @@ def _grow_and_score(
             reasons |= {divmod(k, replicates): w for k, w in zip(ids, unfit, strict=True) if w}
             good = np.isfinite(score) & np.array([not why for why in unfit])
             losses[ids] = np.where(good, score, task.target.failed)
+            if isinstance(task.target, Goals):
+                each = task.target.losses(event.state, event.history)[::copies].cpu().numpy()
+                goals[ids] = np.where(good[:, None], each, np.nan)
             cells[ids] = event.state.counts.cpu().numpy()[::copies]
             if gathered is not None:
                 gathered.add(task.target, event, ids)
                 gathered.forget([k for k, well in zip(ids, good, strict=True) if not well])
     shape, slopes = (count, replicates), None if gathered is None else gathered.slopes
     return WorkResult(
-        losses.reshape(shape), cells.reshape(shape), reasons, prepared.why_regrown, slopes
-    )
+        losses.reshape(shape), cells.reshape(shape), reasons, prepared.why_regrown, slopes,
+        goals.reshape(*shape, task.goals),
+    )  # fmt: skip
 
 
 def _unfit(task: Task, state: tf.State, size: float) -> list[str]:

@@ -14,8 +14,9 @@ import numpy as np
 import torchfilm as tf
 from design.best import Best
 from design.finals import Finals, FinalsRun, fresh_losses, winner
+from design.front import Front, front_of
 from design.known import KnownDesigns, Start, known_designs
-from design.methods import Method, method_of
+from design.methods import METHODS, Chosen, Method, choose, method_of
 from design.objective import Objective
 from design.progress import advance, open_bar
 from design.rollout import FinishedColonies
@@ -30,11 +31,12 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False)
 class SearchProgress:
-    """What a search has found so far. grown: the colonies of designs that were drawn or measured,
-    by their points."""
+    """What a search has found so far. chosen: its method; grown: the colonies of designs that were
+    drawn or measured, by their points."""
 
     study: Study
     why_regrown: str
+    chosen: Chosen | None = None
     grown: dict[bytes, list[FinishedColonies]] = field(default_factory=dict)
 
 
@@ -50,8 +52,9 @@ class Search(TaskOptions):
         )
         best = search.run(colonies=2000, study="stripe.h5")
 
-    method: "cmaes", "sobol", "racing", "bayesian", "local", one of their objects with settings of
-    its own, or any object with start, ask and tell (`Method`). finals: how the best designs are
+    method: "cmaes", "sobol", "racing", "bayesian", "local", for several goals "nsga2", one of their
+    objects with settings of its own, or any object with start, ask and tell (`Method`); "auto"
+    chooses, and `best.table()` says why. finals: how the best designs are
     tested on fresh seeds; None leaves this out. start: designs from which the search starts: their
     values by name, a `Best`, the file of a saved design, or a `Study` or its file. A study of the
     same task with other bounds, or without some of the parameters, keeps its losses; of any other
@@ -60,7 +63,7 @@ class Search(TaskOptions):
     method, finals or a start that are not allowed.
     """
 
-    method: str | Method = field(default="cmaes", kw_only=True)
+    method: str | Method = field(default="auto", kw_only=True)
     finals: Finals | None = field(default_factory=Finals, kw_only=True)
     start: Start | None = field(default=None, kw_only=True, repr=False)
     objective: Objective = field(init=False, repr=False)
@@ -72,11 +75,12 @@ class Search(TaskOptions):
         if not isinstance(self.finals, Finals | None):
             raise checks.input_error("finals", self.finals, "Finals(…) or None")
         known = None if self.start is None else known_designs(self.start, task)
+        chosen = _check_method(self.method, task)
         for name, value in (
-            ("method", method_of(self.method)), ("objective", Objective(task)), ("_known", known)
+            ("method", chosen), ("objective", Objective(task)), ("_known", known)
         ):  # fmt: skip
             object.__setattr__(self, name, value)
-        started = SearchProgress(self._open_study(None), task.tried.why_regrown)
+        started = SearchProgress(self._open_study(None, "auto"), task.tried.why_regrown)
         object.__setattr__(self, "_progress", started)
 
     @property
@@ -89,6 +93,12 @@ class Search(TaskOptions):
         """The reason why colonies do not follow recorded growth, or ""."""
         return self._progress.why_regrown
 
+    @property
+    def why_chosen(self) -> str:
+        """The method that "auto" has chosen and why, or ""."""
+        chosen = self._progress.chosen
+        return f"{chosen.describe()} ({chosen.why})" if chosen and chosen.why else ""
+
     def run(
         self,
         colonies: int,
@@ -98,8 +108,9 @@ class Search(TaskOptions):
         executor: Executor | None = None,
         work_items: int = 1,
         progress: bool = True,
-    ) -> Best:
-        """Search until `colonies` have been simulated, and return the best design.
+    ) -> Best | Front:
+        """Search until `colonies` have been simulated, and return the best design; with several
+        goals, the front of those that none exceeds in all.
 
         colonies: each replicate of each design counts as one, a smaller colony as its share of the
         full size; no more are grown. The last of them go to the finals: the best designs on fresh
@@ -112,7 +123,9 @@ class Search(TaskOptions):
         study of another search, and where no design was grown to full size.
         """
         self._check_run(colonies, stop_at)
-        self._progress.study = self._open_study(study)
+        chosen = self._choose(colonies, study)
+        self._progress.chosen = chosen
+        self._progress.study = self._open_study(study, chosen.describe())
         try:
             with open_bar(colonies, progress) as bar:
                 _show(bar, self.study)
@@ -130,7 +143,7 @@ class Search(TaskOptions):
         if self.study.entries and all(len(e.reasons) == e.losses.size for e in self.study.entries):
             reason = self.study.failures()[0][0]
             print(f"every colony failed; the most frequent reason: {reason}", file=sys.stderr)
-        return self.best()
+        return self.front() if self.objective.task.goals else self.best()
 
     def _check_run(self, colonies: int, stop_at: float | None) -> None:
         least = self.objective.task.replicates
@@ -139,6 +152,10 @@ class Search(TaskOptions):
             raise checks.input_error("colonies", colonies, f"a whole number from {least}", hint)
         if stop_at is not None:
             checks.number("stop_at", stop_at)
+            if self.objective.task.goals:
+                raise checks.input_error(
+                    "stop_at", stop_at, "None with several goals", "A front has no one loss."
+                )
 
     def _search(
         self,
@@ -151,7 +168,8 @@ class Search(TaskOptions):
     ) -> bool:
         """Search with the part of the budget that the finals leave. Returns whether a design holds
         the wanted loss."""
-        task, method = self.objective.task, method_of(self.method)
+        assert self._progress.chosen is not None
+        task, method = self.objective.task, self._progress.chosen.method
         limit = colonies - (self.finals.colonies(colonies) if self.finals else 0.0)
         method.start(task.space, task.seed, task.replicates)
         turn = repeat_study(method, self.study, self._known)
@@ -171,6 +189,8 @@ class Search(TaskOptions):
                 slopes=part.slopes,
             )
             turn.take(found.entry(streams), self.study)
+            if len(self.study.entries) == 1 and (remark := task.target.remark(found.loss)):
+                print(remark, file=sys.stderr)
             self._progress.why_regrown = found.why_regrown
             if turn.complete:
                 turn.tell(method)
@@ -196,14 +216,23 @@ class Search(TaskOptions):
         chosen = None
         if self.finals is not None:
             chosen = winner(self.objective.task, self.study, self.finals.sizes)
-        return self._design(found[0] if chosen is None else chosen)
+        return self.design(found[0] if chosen is None else chosen)
+
+    def front(self) -> Front:
+        """The designs that no other exceeds in all goals: on fresh seeds, where designs were tested
+        on these. Raises InputError for a search with one target, and before a design was grown to
+        full size."""
+        if not self.objective.task.goals:
+            raise checks.input_error("front", "one target", "of several: give targets=[…]")
+        sizes = () if self.finals is None else self.finals.sizes
+        return front_of(self, self.study, sizes)
 
     def first(self) -> Best:
         """The first design that was grown to full size. Raises InputError before there is one."""
         found = self.study.first()
         if found is None:
             raise _none_yet()
-        return self._design(found[0])
+        return self.design(found[0])
 
     def colonies(self, point: np.ndarray) -> list[FinishedColonies]:
         """The replicates of a design (D,) at their ends, grown again once: the same colonies as
@@ -213,17 +242,27 @@ class Search(TaskOptions):
             grown[key] = self.objective.colonies(point)
         return grown[key]
 
-    def _design(self, point: np.ndarray) -> Best:
+    def design(self, point: np.ndarray) -> Best:
+        """A design (D,) that was grown to full size."""
         task = self.objective.task
         fresh = None
         if self.finals is not None:
             fresh = fresh_losses(task, self.study, self.finals.sizes, point)
         return Best(self, task.space.values(point), point, self.study.scored(point)[1], fresh)
 
-    def _open_study(self, path: str | Path | None) -> Study:
+    def _choose(self, colonies: int, path: str | Path | None) -> Chosen:
+        """The method of a run."""
+        task = self.objective.task
+        if self.method != "auto":
+            return Chosen(method_of(self.method))
+        resumed = path is not None and Path(path).is_file()
+        before = Study.read(path).about.get("method", "") if path is not None and resumed else ""
+        return choose(task.space.size, colonies / task.replicates, task.goals, before)
+
+    def _open_study(self, path: str | Path | None, method: str) -> Study:
         task = self.objective.task
         names = task.space.names
-        about = task.describe() | {"names": list(names), "method": _describe(self.method)}
+        about = task.describe() | {"names": list(names), "method": method}
         if self._known is not None:
             about["start"] = self._known.describe()
         streams = task.streams(None)
@@ -262,6 +301,19 @@ def _none_yet() -> tf.InputError:
     )
 
 
-def _describe(method: str | Method) -> str:
-    describe = getattr(method, "describe", None)
-    return describe() if callable(describe) else type(method).__name__
+def _check_method(method: str | Method, task: Task) -> str | Method:
+    """The method of a search; "auto" stays. Raises InputError for one that is not allowed."""
+    if isinstance(method, str):
+        checks.choice("method", method, ("auto", *METHODS))
+        if method == "auto":
+            return method
+    found = method_of(method)
+    several = bool(getattr(found, "several", False))
+    if several != bool(task.goals):
+        raise checks.input_error(
+            "method",
+            type(found).__name__,
+            'one for several goals, such as "nsga2"' if task.goals else "one for one target",
+            "" if task.goals else "NSGA2 needs targets=[…].",
+        )
+    return found

@@ -5,7 +5,7 @@
     /streams      (R,) streams of random numbers, one for each replicate
     /batches/     rows, size, replicates, first_stream, seconds, copies: a row for each batch
     /designs/     point (N, D), loss (N,), losses (N, R), cells (N, R); NaN and 0 where a replicate
-                  was not grown; reasons, JSON by replicate
+                  was not grown; reasons, JSON by replicate; goals (N, G), where there are several
     /slopes/K/    gradient (n, D) and curvature (n, D, D) of batch K, where they were wanted
     /values/NAME  (N,) the values of each parameter
     /finals/      the same of the finals, the designs on fresh seeds
@@ -88,6 +88,9 @@ def _write_entries(
     group["designs/loss"] = np.concatenate([e.loss for e in entries])
     group["designs/losses"] = np.concatenate([wide(e.losses, np.nan) for e in entries])
     group["designs/cells"] = np.concatenate([wide(e.cells, 0) for e in entries])
+    goals = [e.goals for e in entries if e.goals is not None]
+    if goals:
+        group["designs/goals"] = np.concatenate(goals)
     for number, slopes in enumerate(e.slopes for e in entries):
         if slopes is not None:
             group[f"slopes/{number}/gradient"] = slopes.gradient
@@ -174,6 +177,7 @@ def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> 
                 streams=(streams or tuple(range(first, first + replicates)))[:replicates],
                 slopes=_read_slopes(group, len(out)),
                 copies=copies,
+                goals=designs["goals"][mine] if "goals" in designs else None,
             )
         )
         at += rows

@@ -18,8 +18,10 @@ from design.colonies import RunSettings
 from design.parameters import Choice, Parameter, Space
 from design.scene_family import SceneFamily, TriedScenes, scene_function, try_scenes
 from design.targets.base import Target
+from design.targets.goals import Goals
 from torchfilm import checks
 
+NONE = cast(Target, None)  # the target where `targets` are given
 REDUCE = ("mean", "worst")
 
 
@@ -28,20 +30,21 @@ class TaskOptions:
     """The arguments that describe a task; `Task` and `Search` take the same ones.
 
     scene: a function from parameters to a `tf.Scene`, or the name of a ready scene. parameters:
-    those that are searched. target: the pattern that is scored. fixed: further arguments of the
-    scene function. cells, until: a colony ends at `cells` cells or at `until` h, whichever comes
-    first. replicates: colonies of each design. Replicate k of every design follows stream k of
-    random numbers, so that designs are compared on equal terms. reduce: how the losses of the
-    replicates become one loss: "mean", "worst", or a quantile such as 0.75. seed, dt (h, by default
-    the scene's), dtype, device: as for `tf.simulate`. replay: run circuits on recorded growth where
-    the scene allows it. most: the greatest number of colonies in one batch; by default as many as
-    fit into memory.
+    those that are searched. target: the pattern that is scored. targets: several goals instead, for
+    a front of designs. fixed: further arguments of the scene function. cells, until: a colony ends
+    at `cells` cells or at `until` h, whichever comes first. replicates: colonies of each design.
+    Replicate k of every design follows stream k of random numbers, so that designs are compared on
+    equal terms. reduce: how the losses of the replicates become one loss: "mean", "worst", or a
+    quantile such as 0.75. seed, dt (h, by default the scene's), dtype, device: as for
+    `tf.simulate`. replay: run circuits on recorded growth where the scene allows it. most: the
+    greatest number of colonies in one batch; by default as many as fit into memory.
     """
 
     scene: Callable[..., tf.Scene] | str
     parameters: Sequence[Parameter | Choice]
-    target: Target
+    target: Target = NONE
     _: KW_ONLY
+    targets: Sequence[Target] | None = None
     cells: int | None = None
     until: float | None = None
     replicates: int = 4
@@ -75,6 +78,7 @@ class Task(TaskOptions):
         return cls(**{name: getattr(options, name) for name in names})
 
     def __post_init__(self) -> None:
+        self._set(target=_one_target(self.target, self.targets), targets=None)
         function, fixed = scene_function(self.scene), dict(self.fixed or {})
         family = SceneFamily(function, Space(self.parameters), fixed, self.device)
         until = _check_options(self)
@@ -140,13 +144,30 @@ class Task(TaskOptions):
             )
         return found
 
-    def reduced(self, losses: np.ndarray) -> np.ndarray:
-        """One loss for each design, (n,), from the losses of its replicates (n, R)."""
+    def reduced(self, losses: np.ndarray, target: Target | None = None) -> np.ndarray:
+        """One loss for each design, (n,), from the losses of its replicates (n, R). target: of
+        which they are; by default that of the task."""
+        own = (target or self.target).reduced(losses)
+        if own is not None:
+            return own
         if self.reduce == "mean":
             return losses.mean(1)
         if self.reduce == "worst":
             return losses.max(1)
         return np.quantile(losses, float(self.reduce), axis=1)
+
+    @property
+    def goals(self) -> int:
+        """How many goals stand side by side; 0 where there is one target."""
+        return len(self.target.parts) if isinstance(self.target, Goals) else 0
+
+    def reduced_goals(self, losses: np.ndarray) -> np.ndarray | None:
+        """The losses of each goal, (n, G), from those of the replicates (n, R, G); None where there
+        is one target. NaN where a replicate failed."""
+        if not isinstance(self.target, Goals):
+            return None
+        each = [self.reduced(losses[:, :, k], part) for k, part in enumerate(self.target.parts)]
+        return np.where(np.isnan(losses).any(1), np.nan, np.stack(each, 1))
 
     def shares(self, losses: np.ndarray) -> np.ndarray:
         """The derivative of `reduced` by the losses, (n, R)."""
@@ -195,10 +216,21 @@ def _without_addresses(value: Any) -> str:
     return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
 
+def _one_target(target: Any, targets: Any) -> Target:
+    """The target of a task: the one that is given, or several side by side."""
+    if (target is None) == (targets is None):
+        raise checks.input_error(
+            "target", target, "a Target, such as Stripe(…), or targets=[…], and one of the two"
+        )
+    if targets is not None:
+        return Goals(targets)
+    if not isinstance(target, Target):
+        raise checks.input_error("target", target, "a Target, such as Stripe(…)")
+    return target
+
+
 def _check_options(options: TaskOptions) -> float | None:
     """Check what needs no scene; returns `until` as a float."""
-    if not isinstance(options.target, Target):
-        raise checks.input_error("target", options.target, "a Target, such as Stripe(…)")
     if options.cells is None and options.until is None:
         raise checks.InputError("a colony needs an end: give cells=… or until=… (hours).")
     for name, least in (("cells", 2), ("replicates", 1), ("most", 1), ("seed", 0)):

@@ -75,7 +75,9 @@ class Turn:
                 know(self.entry.points, loss)
             return
         batch = replace(self.batch, points=self.entry.points)
-        if batch.slopes:
+        if self.entry.goals is not None:
+            method.tell(batch, self.entry.goals)
+        elif batch.slopes:
             method.tell(batch, loss, slopes)  # type: ignore[call-arg]
         else:
             method.tell(batch, loss)

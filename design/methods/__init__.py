@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from design.methods.auto import Chosen, choose
 from design.methods.base import Batch, Method
 from design.methods.bayesian import Bayesian
 from design.methods.cmaes import CMAES
 from design.methods.local import Local
+from design.methods.nsga2 import NSGA2
 from design.methods.racing import Racing
 from design.methods.sobol import Sobol
 from torchfilm import checks
@@ -18,17 +20,21 @@ METHODS: dict[str, type[Any]] = {
     "bayesian": Bayesian,
     "racing": Racing,
     "local": Local,
+    "nsga2": NSGA2,
 }
 
 __all__ = [
     "CMAES",
     "METHODS",
+    "NSGA2",
     "Batch",
     "Bayesian",
+    "Chosen",
     "Local",
     "Method",
     "Racing",
     "Sobol",
+    "choose",
     "method_of",
 ]
 

@@ -1,6 +1,7 @@
 """Targets: patterns of a colony. The loss of each is 0 where the colony has the pattern."""
 
 from design.targets.base import Target
+from design.targets.goals import Burden, Constrained, Duration, Goals, Spread, Weighted
 from design.targets.image import Image
 from design.targets.oscillation import Oscillation
 from design.targets.patterns import DomainSize, OnFraction
@@ -9,13 +10,19 @@ from design.targets.stripe import Stripe
 
 __all__ = [
     "Bands",
+    "Burden",
+    "Constrained",
     "DomainSize",
+    "Duration",
+    "Goals",
     "Gradient",
     "Image",
     "OnFraction",
     "Oscillation",
     "ProfileTarget",
     "Ring",
+    "Spread",
     "Stripe",
     "Target",
+    "Weighted",
 ]

@@ -6,6 +6,7 @@ import difflib
 import math
 from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -62,6 +63,15 @@ class Target:
         with gradients as the loss has; None where a target has no such form. Least squares use
         them."""
         return None
+
+    def reduced(self, losses: np.ndarray) -> np.ndarray | None:
+        """One loss for each design, (n,), from those of its replicates (n, R); None: as the task
+        says."""
+        return None
+
+    def remark(self, loss: np.ndarray) -> str:
+        """What the losses of a first batch (n,) should make a user reconsider; "" mostly."""
+        return ""
 
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """Measures of the pattern that a colony has, (B,) by name; NaN where one is not

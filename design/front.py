@@ -1,0 +1,152 @@
+"""The front of a search with several goals: the designs that none exceeds in all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+import torchfilm as tf
+from design.best import Best
+from design.entries import Entry
+from design.front_plot import draw_front
+from design.objective import Objective
+from design.parameters import Value, show_value
+from design.pareto import nondominated, spread
+from design.study import Study
+from design.targets.goals import Goals
+
+
+class FrontSearch(Protocol):
+    """What a front asks of the search that found it."""
+
+    @property
+    def objective(self) -> Objective: ...
+
+    @property
+    def study(self) -> Study: ...
+
+    def design(self, point: np.ndarray) -> Best: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """Designs that no other exceeds in all goals, in order of the first goal.
+
+    search: that found them; titles: of the goals; points (F, D); goals (F, G): their losses; seeds:
+    fresh seeds on which these were measured, 0 where they are those of the search. `front[k]` is a
+    design as `Best`, with `save`, `colonies`, `table`.
+    """
+
+    search: FrontSearch = field(repr=False)
+    titles: tuple[str, ...]
+    points: np.ndarray = field(repr=False)
+    goals: np.ndarray
+    seeds: int
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, row: int) -> Best:
+        return self.search.design(self.points[row])
+
+    def __iter__(self) -> Iterator[Best]:
+        return (self[row] for row in range(len(self)))
+
+    @property
+    def values(self) -> list[dict[str, Value]]:
+        """The parameters of each design by name."""
+        return [self.search.objective.task.space.values(point) for point in self.points]
+
+    def convergence(self) -> tuple[np.ndarray, np.ndarray]:
+        """After each batch of the search: the colonies simulated, and the hypervolume, (K,) each.
+
+        That is the part of a box that the front so far exceeds; the box reaches from the best to
+        the worst value of each goal on the front of the whole search (Zitzler and Thiele, 1999).
+        Needs pymoo (the `pareto` extra).
+        """
+        from pymoo.indicators.hv import HV
+
+        full, study = full_goals(self.search.study), self.search.study
+        every = np.concatenate([goals for _, goals in full])
+        good = every[nondominated(every)]
+        low, high = good.min(0), good.max(0)
+        measure = HV(ref_point=np.ones(every.shape[1]))
+        spent = np.cumsum([e.colonies for e in study.entries])
+        found, known = [], np.empty((0, every.shape[1]))
+        of = {id(entry): goals for entry, goals in full}
+        for entry in study.entries:
+            if id(entry) in of:
+                known = np.concatenate([known, of[id(entry)]])
+                known = known[nondominated(known)]
+            scaled = (known - low) / np.where(high > low, high - low, 1.0)
+            found.append(float(measure(scaled)) if len(known) else 0.0)
+        return spent, np.array(found)
+
+    def table(self) -> str:
+        """The goals and the parameters of each design."""
+        names = self.search.objective.task.space.names
+        text = [["", *self.titles, *names]]
+        for k, (goals, values) in enumerate(zip(self.goals, self.values, strict=True)):
+            shown = [show_value(values[name]) for name in names]
+            text.append([str(k), *(f"{x:.4g}" for x in goals), *shown])
+        wide = [max(map(len, column)) for column in zip(*text, strict=True)]
+        lines = ["  ".join(x.rjust(w) for x, w in zip(r, wide, strict=True)) for r in text]
+        where = f"on {self.seeds} fresh seeds" if self.seeds else "on the seeds of the search"
+        return "\n".join([*lines, f"{len(self)} designs, {where}"])
+
+    def plot(self, path: str | Path) -> Path:
+        """Draw the front among all designs, colonies along it, and the hypervolume. Needs
+        matplotlib and pymoo (the `app` and `pareto` extras)."""
+        every = np.concatenate([goals for _, goals in full_goals(self.search.study)])
+        colonies = {int(k): self[int(k)].colonies() for k in spread(self.goals, 5)}
+        return draw_front(
+            Path(path),
+            self.search.objective.task.target,
+            self.titles,
+            every,
+            self.goals,
+            colonies,
+            self.convergence(),
+        )
+
+
+def full_goals(study: Study) -> list[tuple[Entry, np.ndarray]]:
+    """The batches at full size with all replicates, and the losses of their goals (n, G)."""
+    return [(e, e.goals) for e in study.full() if e.goals is not None]
+
+
+def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front:
+    """The front of a study: on fresh seeds where its designs were grown at all these sizes. Raises
+    InputError before a design was grown to full size, and where all failed."""
+    target = search.objective.task.target
+    assert isinstance(target, Goals)
+    full = full_goals(study)
+    if not full:
+        raise tf.InputError(
+            "no design has been grown to full size yet: run the search for more colonies."
+        )
+    fresh = _fresh(study, sizes) if sizes else None
+    seeds = 0
+    if fresh is None:
+        points = np.concatenate([e.points for e, _ in full])
+        goals = np.concatenate([g for _, g in full])
+    else:
+        points, goals, seeds = fresh
+    rows = nondominated(goals)
+    if not len(rows):
+        raise tf.InputError(f"every design failed: {study.failures()[0][0]}")
+    return Front(search, target.titles, points[rows], goals[rows], seeds)
+
+
+def _fresh(study: Study, sizes: Sequence[float]) -> tuple[np.ndarray, np.ndarray, int] | None:
+    """Points, goals and seeds of the last finals: of each goal the worst of all sizes."""
+    last = [next((e for e in reversed(study.finals) if e.size == s), None) for s in sizes]
+    found = [e for e in last if e is not None and e.goals is not None]
+    if len(found) < len(sizes) or len({e.points.tobytes() for e in found}) > 1:
+        return None
+    goals = np.max([e.goals for e in found if e.goals is not None], axis=0)
+    return found[0].points, goals, found[0].replicates

@@ -1,0 +1,62 @@
+"""The picture of a front."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import torchfilm as tf
+from design import report
+from design.rollout import FinishedColonies
+from design.targets.base import Target
+
+
+def draw_front(
+    path: Path,
+    target: Target,
+    titles: tuple[str, ...],
+    every: np.ndarray,
+    front: np.ndarray,
+    colonies: dict[int, list[FinishedColonies]],
+    course: tuple[np.ndarray, np.ndarray],
+) -> Path:
+    """Draw the first two goals of all designs (n, G) and of the front (F, G), a colony of some of
+    its designs, by row, and the hypervolume against colonies simulated."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise tf.InputError('pictures need matplotlib: pip install "torchfilm[app]".') from error
+    columns = max(2, len(colonies))
+    figure = Figure(figsize=(2.6 * columns, 6.4), layout="constrained")
+    grid = figure.add_gridspec(2, columns, height_ratios=[1.0, 0.8])
+    ax = figure.add_subplot(grid[0, : max(1, (2 * columns) // 3)])
+    ax.plot(every[:, 0], every[:, 1], ".", color="0.75", ms=3, label="every design")
+    ax.plot(front[:, 0], front[:, 1], "D-", color="C3", ms=4, lw=0.8, label="front")
+    for row in colonies:
+        ax.annotate(
+            str(row),
+            (front[row, 0], front[row, 1]),
+            xytext=(4, 4),
+            textcoords="offset points",
+            fontsize=9,
+        )
+    # designs that are far worse than the front would press it into a corner
+    for axis, set_limits in ((0, ax.set_xlim), (1, ax.set_ylim)):
+        low, high = front[:, axis].min(), front[:, axis].max()
+        room = 0.6 * (high - low) or 0.1 * abs(high) or 0.1
+        set_limits(low - 0.15 * room, high + room)
+    ax.set(xlabel=titles[0], ylabel=titles[1])
+    ax.set_title("goals: lower is better", fontsize=9)
+    ax.legend(fontsize=7)
+    right = figure.add_subplot(grid[0, max(1, (2 * columns) // 3) :])
+    right.plot(*course, color="C3")
+    right.set(xlabel="colonies simulated", ylabel="hypervolume", ylim=(0, None))
+    report.draw_colonies(
+        [figure.add_subplot(grid[1, k]) for k in range(len(colonies))],
+        target,
+        list(colonies.values()),
+        [f"design {row}" for row in colonies],
+    )
+    figure.savefig(path, dpi=160)
+    return path

@@ -1,0 +1,50 @@
+"""The choice of a method from what is known of a search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from design.methods.cmaes import CMAES
+from design.methods.nsga2 import NSGA2
+from design.methods.racing import Racing
+from design.methods.sobol import Sobol
+
+# designs of a batch, and the width of its first cloud: the settings that were measured
+BATCH, WIDTH = 24, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """A method and why it was chosen, "" where the user named it."""
+
+    method: Any
+    why: str = ""
+
+    def describe(self) -> str:
+        """What a study says of it."""
+        describe = getattr(self.method, "describe", None)
+        text = describe() if callable(describe) else type(self.method).__name__
+        return f"auto: {text}" if self.why else text
+
+
+def choose(dimensions: int, designs: float, goals: int, before: str = "") -> Chosen:
+    """The method of a search that leaves the choice. dimensions: parameters; designs: that the
+    budget can grow with all replicates; goals: 0 for one target; before: what the study of a
+    search that is resumed says of its method, which goes on."""
+    few = Chosen(
+        Sobol(batch=BATCH),
+        f"{designs:.0f} designs are fewer than two batches of {BATCH}, and no method learns from so"
+        " few",
+    )
+    race = Chosen(
+        Racing(inner=CMAES(population=BATCH, sigma=WIDTH)),
+        f"{designs:.0f} designs for {dimensions} parameters: small colonies first, and CMA-ES"
+        " learns from the best",
+    )
+    for known in (few, race) if before else ():
+        if known.describe() == before:
+            return Chosen(known.method, "the study began with it")
+    if goals:
+        return Chosen(NSGA2(), f"{goals} goals side by side")
+    return few if designs < 2 * BATCH else race

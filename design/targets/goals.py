@@ -1,0 +1,317 @@
+"""Several goals at once: sums of targets with weights, targets under constraints, goals side by
+side for a front, and goals that are no patterns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.base import Target, ratio, require, species_names, total, valid_levels, weights
+from torchfilm import checks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+CONCENTRATION = "conc"  # the unit of species
+WORST = 1e4  # the loss of a failed colony where a loss has no upper limit
+
+
+@dataclass(frozen=True)
+class Burden(Target):
+    """What a design costs its cells: the total concentration of some species, a mean over the
+    volume of the colony. It has no upper limit.
+
+    species: by default all species of all circuits.
+    """
+
+    failed = WORST
+    species: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.species is not None:
+            species_names("Burden.species", self.species)
+
+    def _of(self, state: tf.State) -> tuple[str, ...]:
+        if self.species is not None:
+            return self.species
+        return tuple(n for n, f in state.declared.items() if f.unit == CONCENTRATION)
+
+    def check(self, state: tf.State) -> None:
+        require(state, self._of(state))
+        if not self._of(state):
+            raise checks.input_error("Burden", "a scene without species", "a scene with a Circuit")
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        found, sound = valid_levels(state, self._of(state))
+        amount = total(state, weights(state) * found.sum(1))
+        return torch.where(sound, ratio(amount, total(state, weights(state)), 0.0), torch.nan)
+
+    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
+        return {"burden": self.loss(state)}
+
+    def describe(self) -> str:
+        return "little of " + (", ".join(self.species) if self.species else "all species")
+
+
+@dataclass(frozen=True)
+class Duration(Target):
+    """The hours that a colony takes to its end: for scenes in which the design sets the pace."""
+
+    failed = WORST
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        return torch.full((state.colonies,), float(state.time), dtype=torch.float64)
+
+    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
+        return {"hours": self.loss(state)}
+
+    def describe(self) -> str:
+        return "soon"
+
+
+class Several(Target):
+    """The base class of targets that are made of others, `parts`: a colony must suit all."""
+
+    parts: tuple[Target, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for part in self.parts for name in part.names))
+
+    @property
+    def fewest(self) -> int:  # type: ignore[override]
+        return max(part.fewest for part in self.parts)
+
+    @property
+    def failed(self) -> float:  # type: ignore[override]
+        return sum(part.failed for part in self.parts)
+
+    def check(self, state: tf.State) -> None:
+        for part in self.parts:
+            part.check(state)
+
+    def unfit(self, state: tf.State) -> list[str]:
+        return [
+            next(filter(None, why), "")
+            for why in zip(*(part.unfit(state) for part in self.parts), strict=True)
+        ]
+
+    def note(self, state: tf.State) -> Tensor | None:
+        found = [note for note in (part.note(state) for part in self.parts) if note is not None]
+        return torch.cat(found, 1) if found else None
+
+    def _each(
+        self, of: Callable[[Target, Tensor | None], Any], state: tf.State, history: Tensor | None
+    ) -> list[Any]:
+        """Something of every part, with its own columns of the history."""
+        out, at = [], 0
+        for part in self.parts:
+            note = part.note(state)
+            size = 0 if note is None else note.shape[1]
+            own = None if history is None or not size else history[..., at : at + size]
+            out.append(of(part, own))
+            at += size
+        return out
+
+    def losses(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        """The loss of every part, (B, parts)."""
+        each = self._each(lambda part, own: part.loss(state, own).double(), state, history)
+        return torch.stack(each, 1)
+
+    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
+        each = self._each(lambda part, own: part.measures(state, own), state, history)
+        return {name: value for part in each for name, value in part.items()}
+
+    def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
+        self._each(lambda part, own: part.draw(ax, state, place, own), state, history)
+
+
+@dataclass(frozen=True)
+class Weighted(Several):
+    """The sum of the losses of several targets: `Weighted([(Stripe(…), 1.0), (Burden(), 0.1)])`.
+    Weights are above 0."""
+
+    terms: Sequence[tuple[Target, float]]
+    parts: tuple[Target, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        terms = list(self.terms) if isinstance(self.terms, Sequence) else []
+        if not terms or not all(
+            isinstance(t, tuple) and len(t) == 2 and isinstance(t[0], Target) for t in terms
+        ):
+            raise checks.input_error(
+                "Weighted.terms", self.terms, "pairs of a target and its weight, at least one"
+            )
+        for part, weight in terms:
+            checks.number(f"Weighted: the weight of {type(part).__name__}", weight, above=0.0)
+        object.__setattr__(self, "terms", tuple(terms))
+        object.__setattr__(self, "parts", tuple(part for part, _ in terms))
+
+    @property
+    def failed(self) -> float:  # type: ignore[override]
+        return sum(weight * part.failed for part, weight in self.terms)
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        found = self.losses(state, history)
+        return found @ found.new_tensor([weight for _, weight in self.terms])
+
+    def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor | None:
+        each = self._each(lambda part, own: part.residuals(state, own), state, history)
+        if any(found is None for found in each):
+            return None
+        return torch.cat(
+            [found * weight**0.5 for found, (_, weight) in zip(each, self.terms, strict=True)], 1
+        )
+
+    def describe(self) -> str:
+        return " + ".join(f"{weight:g} × {part.describe()}" for part, weight in self.terms)
+
+
+@dataclass(frozen=True)
+class Constrained(Several):
+    """A target under constraints on the measures of targets:
+    `Constrained(Burden(), [Stripe(…)], at_least={"contrast": 10.0})`.
+
+    Where they hold, the loss is that of the target. Where they do not, it is `BROKEN` and more, by
+    how much a measure is missed: half of the way to `BROKEN` + 1 where it is missed by its whole
+    bound. So every design that meets the constraints is better than every one that does not, as
+    long as the loss of the target stays below `BROKEN`. more: targets that are only measured.
+    """
+
+    BROKEN = WORST
+
+    target: Target
+    more: Sequence[Target] = ()
+    at_least: Mapping[str, float] = field(default_factory=dict)
+    at_most: Mapping[str, float] = field(default_factory=dict)
+    parts: tuple[Target, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        parts = (self.target, *self.more)
+        if not all(isinstance(part, Target) for part in parts):
+            raise checks.input_error("Constrained", parts, "targets, such as Stripe(…)")
+        if not self.at_least and not self.at_most:
+            raise checks.input_error(
+                "Constrained",
+                "no constraint",
+                'at_least={…} or at_most={…}, such as at_least={"contrast": 10.0}',
+            )
+        for bounds in (self.at_least, self.at_most):
+            for name, bound in bounds.items():
+                checks.number(f"Constrained: the bound of {name!r}", bound)
+        object.__setattr__(self, "parts", parts)
+
+    @property
+    def failed(self) -> float:  # type: ignore[override]
+        return max(self.BROKEN + 1.0, self.target.failed)
+
+    def check(self, state: tf.State) -> None:
+        super().check(state)
+        there = self._measured(state)
+        for name in (*self.at_least, *self.at_most):
+            if name not in there:
+                raise checks.input_error(
+                    "Constrained: measure", name, "one of " + ", ".join(map(repr, there))
+                )
+
+    def _measured(self, state: tf.State) -> dict[str, Tensor]:
+        """Of a first state: the names of all measures."""
+        note = self.note(state)
+        return self.measures(state, None if note is None else note.unsqueeze(0))
+
+    def missed(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        """By how much the constraints are missed, (B,): the sum over all of the distance to the
+        bound, as a share of it; 0 where they hold. An undefined measure misses by infinity."""
+        found = self.measures(state, history)
+        out = torch.zeros(state.colonies, dtype=torch.float64, device=state.device)
+        for bounds, side in ((self.at_least, 1.0), (self.at_most, -1.0)):
+            for name, bound in bounds.items():
+                short = side * (bound - found[name].double()) / (abs(bound) or 1.0)
+                out = out + torch.nan_to_num(short, nan=torch.inf).clamp(min=0.0)
+        return out
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        own = self._each(lambda part, own: part.loss(state, own).double(), state, history)[0]
+        missed = self.missed(state, history)
+        share = torch.where(missed.isinf(), 1.0, missed / (1.0 + missed))
+        return torch.where(missed > 0, self.BROKEN + share, own)
+
+    def remark(self, loss: np.ndarray) -> str:
+        share = float(np.min(loss)) - self.BROKEN
+        if share < 0:
+            return ""
+        miss = f"{100 * share / (1 - share):.3g} %" if share < 1 else "infinity"
+        return (
+            f"no design of the first batch meets the constraints ({self._bounds()}); the nearest"
+            f" misses them by {miss}"
+        )
+
+    def _bounds(self) -> str:
+        bounds = [f"{n} ≥ {x:g}" for n, x in self.at_least.items()]
+        bounds += [f"{n} ≤ {x:g}" for n, x in self.at_most.items()]
+        return ", ".join(bounds)
+
+    def describe(self) -> str:
+        return f"{self.target.describe()}, with {self._bounds()}"
+
+
+@dataclass(frozen=True)
+class Spread(Several):
+    """How much the loss of a target differs between the seeds of a design: their standard
+    deviation. A goal for robust designs."""
+
+    target: Target
+    parts: tuple[Target, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.target, Target):
+            raise checks.input_error("Spread", self.target, "a Target, such as Stripe(…)")
+        object.__setattr__(self, "parts", (self.target,))
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        return self.losses(state, history)[:, 0]
+
+    def reduced(self, losses: np.ndarray) -> np.ndarray | None:
+        return losses.std(1, ddof=1) if losses.shape[1] > 1 else np.zeros(len(losses))
+
+    def describe(self) -> str:
+        return f"the same on all seeds: {self.target.describe()}"
+
+
+@dataclass(frozen=True)
+class Goals(Several):
+    """Targets side by side, for a front of designs that none exceeds in all. The loss is the sum
+    of theirs."""
+
+    parts: tuple[Target, ...]
+
+    def __post_init__(self) -> None:
+        parts = tuple(self.parts) if isinstance(self.parts, Sequence) else ()
+        if not parts or not all(isinstance(part, Target) for part in parts):
+            raise checks.input_error("targets", self.parts, "a list of targets")
+        if len(parts) < 2:
+            raise checks.input_error(
+                "targets", self.parts, "two targets or more", "One goal has no front: give target=."
+            )
+        object.__setattr__(self, "parts", parts)
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """A short name of each goal, all different."""
+        kinds = [type(part).__name__.lower() for part in self.parts]
+        return tuple(
+            kind if kinds.count(kind) == 1 else f"{kind} {1 + kinds[:k].count(kind)}"
+            for k, kind in enumerate(kinds)
+        )
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        return self.losses(state, history).sum(1)
+
+    def describe(self) -> str:
+        return "; ".join(part.describe() for part in self.parts)

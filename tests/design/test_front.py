@@ -1,0 +1,204 @@
+"""Several goals: the front of a search, targets under constraints, and goals that are no
+patterns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from searching import Level, Spread, built, fragile, grown, lit, mean, objective_of, paced
+
+import torchfilm as tf
+from design import NSGA2, Burden, Constrained, Duration, Parameter, Search, Sobol, Study, Weighted
+from design import Spread as SpreadOfLosses
+from design.pareto import nondominated, spread
+
+LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
+GOALS = [Level(wanted=1.0), Burden()]
+
+
+def search(parameters=LIT, scene=lit, targets=GOALS, **options):
+    options = {"method": NSGA2(population=8), "cells": 3, "replicates": 2, **options}
+    return Search(scene, parameters, targets=targets, **options)
+
+
+# --- the front ------------------------------------------------------------------------------------
+
+
+def test_the_front_is_what_no_other_row_exceeds():
+    goals = np.random.default_rng(0).random((200, 3)).round(1)
+    goals[5] = np.nan
+    rows = nondominated(goals)
+    for k, mine in enumerate(goals):
+        better = [(g <= mine).all() and (g < mine).any() for g in goals]
+        alike = any(np.array_equal(goals[r], mine) for r in rows)
+        assert alike == (not np.isnan(mine).any() and not any(better)), k
+    assert (np.diff(goals[rows, 0]) >= 0).all()
+    few = spread(goals[rows], 4)
+    assert len(few) == 4 and {few[0], few[-1]} == {0, len(rows) - 1}
+    assert spread(goals[rows[:2]], 4).tolist() == [0, 1]
+
+
+def test_a_search_with_two_goals_returns_their_front():
+    """Designs brighter than wanted are worse in both goals."""
+    made = search()
+    front = made.run(400, progress=False)
+    assert front.titles == ("level", "burden") and len(front) >= 5
+    assert (np.diff(front.goals[:, 0]) > 0).all() and (np.diff(front.goals[:, 1]) < 0).all()
+    assert front.goals[:, 0].min() < 0.25 and front.goals[:, 1].max() < 1.3
+    # one cell of a design: its level, and the distance from it, add up to 1
+    assert front.goals.sum(1) == pytest.approx(1.0, abs=0.35)
+    assert front.seeds >= 4 and made.study.colonies <= 400
+    streams = made.study.finals[-1].streams
+    found = made.objective.evaluate(front.points, streams=streams)
+    assert np.array_equal(found.goals, front.goals)
+    assert found.loss == pytest.approx(found.goals.sum(1))
+    colonies, volume = front.convergence()
+    assert (np.diff(volume) >= 0).all() and 0 < volume[-1] <= 1 and len(colonies) == len(volume)
+    assert "on" in front.table() and "fresh seeds" in front.table()
+
+
+def test_any_design_of_a_front_is_saved_and_drawn(tmp_path):
+    front = search(cells=6).run(120, progress=False)
+    best = front[1]
+    assert best.values == front.values[1] and len(list(front)) == len(front)
+    assert best.save(tmp_path / "one.json").exists()
+    assert "level" not in best.table() or "burden" in best.table()
+    assert front.plot(tmp_path / "front.png").stat().st_size > 10_000
+
+
+def test_a_front_resumes(tmp_path):
+    whole = search()
+    expected = whole.run(160, progress=False)
+    search(finals=None).run(60, study=tmp_path / "s.h5", progress=False)
+    again = search()
+    front = again.run(160, study=tmp_path / "s.h5", progress=False)
+    assert np.array_equal(front.points, expected.points)
+    assert np.array_equal(front.goals, expected.goals)
+    kept = Study.read(tmp_path / "s.h5")
+    assert np.array_equal(kept.entries[0].goals, whole.study.entries[0].goals)
+    assert len(search(start=kept).study.entries[0].points) == sum(
+        len(e.points) for e in kept.entries
+    )
+
+
+def test_designs_that_fail_are_not_on_the_front():
+    made = search([Parameter("make", 1, 10)], fragile, [Level(), Burden()], finals=None)
+    front = made.run(64, progress=False)
+    goals = np.concatenate([e.goals for e in made.study.entries])
+    assert np.isnan(goals).any() and not np.isnan(front.goals).any()
+
+
+def test_auto_takes_a_method_for_several_goals():
+    made = search(method="auto", finals=None)
+    made.run(70, progress=False)
+    assert made.why_chosen.startswith("auto: nsga2") and "2 goals" in made.why_chosen
+
+
+# --- goals ----------------------------------------------------------------------------------------
+
+
+def last_state(scene, colonies=3, **end):
+    *_, state = tf.simulate(scene, scene.bind(colonies, seed=1).start(), **end)
+    return state
+
+
+def test_burden_is_the_mean_over_the_volume_of_all_species():
+    state = last_state(built(genes=3), until=1.0)
+    volume = state.volume.double()
+    total = sum(state.fields[f"g{k}"].double() for k in range(3))
+    wanted = [
+        float((volume * total)[state.colony == k].sum() / volume[state.colony == k].sum())
+        for k in range(3)
+    ]
+    assert Burden().loss(state).tolist() == pytest.approx(wanted)
+    one = Burden(("g1",)).loss(state) + Burden(("g0", "g2")).loss(state)
+    assert one.tolist() == pytest.approx(wanted)
+
+
+def test_duration_is_the_time_of_the_end():
+    objective = objective_of(
+        paced, [Parameter("rate", 1.0, 2.0)], Duration(), cells=4, replicates=1
+    )
+    slow, fast = objective.evaluate(np.array([[0.0], [1.0]])).loss
+    assert slow > 1.5 * fast > 0
+
+
+def test_a_weighted_sum_is_one():
+    state = last_state(lit(), until=1.0)
+    parts = [(Level(wanted=1.0), 2.0), (Burden(), 0.5)]
+    wanted = 2.0 * Level(wanted=1.0).loss(state) + 0.5 * Burden().loss(state)
+    target = Weighted(parts)
+    assert torch.allclose(target.loss(state), wanted)
+    assert set(target.measures(state)) == {"mean_level", "burden"} and target.names == ("gfp",)
+    assert target.failed == 2.0 * 1.5 + 0.5 * Burden.failed
+
+
+def test_constraints_come_before_the_loss():
+    state = last_state(grown(2.0, make=torch.tensor([0.5, 2.0, 8.0])), until=1.0)
+    level = mean(state, "gfp")
+    bound = float(level[1])
+    target = Constrained(Burden(), [Level()], at_least={"mean_level": bound})
+    loss = target.loss(state)
+    assert torch.equal(loss[1:], Burden().loss(state)[1:])
+    missed = float((bound - level[0]) / bound)
+    assert float(loss[0]) == pytest.approx(target.BROKEN + missed / (1 + missed))
+    above = Constrained(Burden(), [Level()], at_most={"mean_level": bound}).loss(state)
+    assert float(above[2]) > target.BROKEN > float(above[1])
+    assert "mean_level ≥" in target.describe()
+
+
+def test_spread_is_that_between_seeds():
+    objective = objective_of(lit, LIT, SpreadOfLosses(Level()), cells=6, replicates=4)
+    found = objective.evaluate(np.full((2, 2), 0.5))
+    assert found.loss == pytest.approx(found.losses.std(1, ddof=1)) and (found.loss > 0).all()
+
+
+def test_a_search_says_by_how_much_its_first_batch_misses_the_constraints(capsys):
+    target = Constrained(Burden(), [Level()], at_least={"mean_level": 1e3})
+    made = Search(lit, LIT, target, cells=3, replicates=2, method=Sobol(batch=4), finals=None)
+    made.run(16, progress=False)
+    words = capsys.readouterr().err
+    assert words.count("no design of the first batch meets") == 1 and "mean_level ≥ 1000" in words
+    found = float(words.rsplit("misses them by ")[1].split(" %")[0])
+    nearest = made.study.entries[0].loss.min() - target.BROKEN
+    assert found == pytest.approx(100 * nearest / (1 - nearest), abs=0.5)
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: search(targets=[Level()]), "two targets or more.*One goal has no front"),
+        (lambda: search(targets=[]), "a list of targets"),
+        (lambda: search(targets=[Level(), 3]), "a list of targets"),
+        (lambda: search(method="cmaes"), 'one for several goals, such as "nsga2"'),
+        (lambda: Search(lit, LIT, Level(), cells=3, method="nsga2"), r"NSGA2 needs targets=\[…\]"),
+        (lambda: Search(lit, LIT, cells=3), r"target = None.*or targets=\[…\]"),
+        (lambda: Search(lit, LIT, Level(), targets=GOALS, cells=3), "one of the two"),
+        (lambda: search().run(20, stop_at=0.1, progress=False), "A front has no one loss"),
+        (lambda: Search(lit, LIT, Level(), cells=3, method=Sobol()).front(), r"targets=\[…\]"),
+        (lambda: Weighted([]), "pairs of a target and its weight"),
+        (lambda: Weighted([(Level(), -1.0)]), "weight of Level.*-1.0"),
+        (lambda: Constrained(Level()), "no constraint"),
+        (lambda: Burden(()), "Burden.species"),
+        (lambda: search(targets=[Level(), Burden(("rfp",))]), "'rfp'"),
+        (
+            lambda: search(targets=[Level(), Constrained(Level(), at_least={"contrast": 1.0})]),
+            "measure = 'contrast'.*'mean_level'",
+        ),
+        (
+            lambda: Search("microcolony", [Parameter("rate", 0.5, 1.0)], Burden(), cells=3),
+            "without species",
+        ),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused(make, words):
+    with pytest.raises(tf.InputError, match=words):
+        make()
+
+
+def test_spread_of_places_needs_no_species():
+    assert Weighted([(Spread(), 1.0)]).names == ()
