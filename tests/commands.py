@@ -32,7 +32,7 @@ def shell(*arguments: object, folder: Path, **options) -> subprocess.CompletedPr
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         env=ENVIRONMENT,
         check=False,
         **options,

@@ -287,7 +287,7 @@ def test_a_reader_that_has_read_enough_is_no_error(tmp_path, arguments):
     ) as child:
         child.stdout.close()  # long before the command has something to say
         said = child.stderr.read()
-        assert child.wait(timeout=60) == 1 and said == ""
+        assert child.wait(timeout=600) == 1 and said == ""
 
 
 # --- pictures that are there already --------------------------------------------------------------

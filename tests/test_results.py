@@ -219,7 +219,7 @@ def python(code: str, *arguments: object, **options) -> subprocess.CompletedProc
         command,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         env=environment,
         check=False,
         **options,

@@ -304,7 +304,7 @@ def test_a_file_that_can_really_grow_no_further(tmp_path, every_step):
         [sys.executable, "-c", LIMITED, str(path)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=False,
         env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.path.dirname(__file__)},
     )
@@ -373,7 +373,7 @@ def test_a_disk_that_is_really_full(tmp_path, every_step):
         ],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=False,
         env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.path.dirname(__file__)},
     )
