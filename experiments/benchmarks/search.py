@@ -1,184 +1,113 @@
-"""Compares search methods by the colonies that they need, and measures designs per hour.
+"""Compares search methods on eight tasks by the colonies that they need, and measures designs per
+hour.
 
-    python experiments/benchmarks/search.py methods    # about an hour on two cores
-    python experiments/benchmarks/search.py methods --targets stripe --methods sobol cmaes --seeds 3
+    python experiments/benchmarks/search.py tasks      # an hour or two on two cores
+    python experiments/benchmarks/search.py tasks --tasks stripe ring --methods auto --seeds 3
     python experiments/benchmarks/search.py rate
-    python experiments/benchmarks/search.py unseen
 
-`methods` runs every method on every target with equal numbers of colonies. `rate` measures designs
-per hour: one design at a time, in batches, and on recorded growth. `unseen` scores the designs that
-`methods` found on 32 seeds that no search has used.
-
-The searches of one method differ by the seed of the method and share four seeds of the colonies.
-One batch evaluates all of them together, so their seconds are shares of a common batch. A search
-succeeds when the mean loss of a design over its four replicates is at most the threshold of the
-target. A colony grown to a fraction of the full size counts as that fraction. The script appends
-each run to a JSON file with its machine, versions and commit.
+`tasks` runs searches that differ by their seed: random starts and random colonies. Each has 2,000
+colonies, finals included. The best design so far, at every batch that improved it, is grown on 16
+seeds that no search uses. Colonies to success are those simulated when it first held the threshold
+there; a search succeeds where the design that it returns holds it. `tasks.py` has the tasks and
+says how the thresholds were set. `rate` measures designs per hour: one design at a time, in
+batches, and on recorded growth. The script appends each run to a JSON file with its machine,
+versions and commit.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
+import torch
 from record import machine
+from tasks import CELLS, REPLICATES, SHARE, TASKS, UNSEEN, SearchTask
 
 import torchfilm as tf
-from design import CMAES, Bayesian, DomainSize, Objective, Racing, Sobol, Task
+from design import CMAES, Local, Objective, Racing, Search, Sobol, Task
+from design.trivial import trivial_losses
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import bands
-import boundary_stripe
-import domain_size
-import ring
-
-# scene, parameters, target, colony, threshold of the loss, searches, colonies of each
-TARGETS = {
-    "stripe": (
-        "boundary_detector",
-        boundary_stripe.PARAMETERS,
-        boundary_stripe.TARGET,
-        {"cells": 100, "dt": 0.05, "fixed": {"width": 16.0, "rtol": 1e-2}},
-        0.07,
-        10,
-        2000,
-    ),
-    "bands": (bands.flag, bands.PARAMETERS, bands.TARGET, bands.COLONY, 0.15, 5, 600),
-    "ring": (ring.band_detector, ring.PARAMETERS, ring.TARGET, ring.COLONY, 0.1, 5, 600),
-    "domains": (
-        "toggle_switch",
-        domain_size.PARAMETERS,
-        DomainSize(("red", "green"), 12.0),
-        domain_size.COLONY,
-        0.02,
-        5,
-        100,
-    ),
-}
 # Batches of 24, because a large batch costs less per colony; a wide initial distribution, because
 # the losses have several minima.
 CLOUD = {"population": 24, "sigma": 0.5}
 METHODS = {
-    "sobol": Sobol,
+    "auto": lambda: "auto",
+    "sobol": lambda: Sobol(batch=24),
     "cmaes": lambda: CMAES(**CLOUD),
-    "cmaes by default": CMAES,
     "racing": lambda: Racing(inner=CMAES(**CLOUD)),
-    "bayesian": Bayesian,
+    "local": Local,
 }
-REPLICATES = 4
 
 
-class Run:
-    """One search of those that share batches."""
-
-    def __init__(self, objective: Objective, name: str, seed: int):
-        self.method, self.objective = METHODS[name](), objective
-        self.method.start(objective.task.space, seed, objective.task.replicates)
-        self.colonies, self.seconds, self.loss, self.point = 0.0, 0.0, float("inf"), None
-        self.history: list[tuple[float, float, float]] = []
-
-    def tell(self, batch, loss: np.ndarray, seconds: float) -> None:
-        """Passes the losses of a batch to the method and notes the best design."""
-        self.method.tell(batch, loss)
-        count = batch.replicates or self.objective.task.replicates
-        self.colonies += len(loss) * count * batch.size
-        self.seconds += seconds
-        if batch.size == 1.0 and count == self.objective.task.replicates and loss.min() < self.loss:
-            self.loss, self.point = float(loss.min()), batch.points[loss.argmin()]
-        self.history.append((self.colonies, self.seconds, self.loss))
+def threshold(task: SearchTask) -> float:
+    """The loss of a success: a share of the best trivial answer in the middle of the space."""
+    checked = task.task()
+    objective = Objective(checked)
+    middle = np.full(checked.space.size, 0.5)
+    found = objective.colonies(middle, streams=UNSEEN)
+    return SHARE * min(trivial_losses(checked.target, found).values())
 
 
-def together(objective: Objective, runs: list[Run], colonies: int) -> None:
-    """Runs all searches until each has used its colonies, with joint batches."""
-    while open_runs := [r for r in runs if r.colonies < colonies]:
-        groups: dict[tuple[float, int], list] = {}
-        for run in open_runs:
-            batch = run.method.ask()
-            groups.setdefault(
-                (batch.size, batch.replicates or objective.task.replicates), []
-            ).append((run, batch))
-        for (size, count), members in groups.items():
-            found = objective.evaluate(
-                np.concatenate([b.points for _, b in members]), streams=range(count), size=size
-            )
-            parts = np.split(found.loss, np.cumsum([len(b.points) for _, b in members])[:-1])
-            for (run, batch), loss in zip(members, parts, strict=True):
-                run.tell(batch, loss, found.seconds * len(loss) / len(found.loss))
-        print(
-            f"\r{min(r.colonies for r in open_runs):6.0f} of {colonies} colonies, best"
-            f" {min(r.loss for r in runs):.4f}",
-            end="",
-            file=sys.stderr,
-            flush=True,
-        )
-    print("\r" + " " * 60 + "\r", end="", file=sys.stderr)
-
-
-def objective_of(name: str) -> Objective:
-    """Returns the objective of a target."""
-    scene, parameters, target, colony, *_ = TARGETS[name]
-    return Objective(Task(scene, parameters, target, **colony, replicates=REPLICATES))
-
-
-def methods(options: argparse.Namespace) -> dict:
-    """Returns success, loss and colonies of every method on every target."""
-    out: dict = {}
-    print(
-        f"{'target':<9}{'method':<19}{'found':>7}{'colonies':>17}{'median loss':>14}"
-        f"{'worst':>8}{'s per search':>18}"
-    )
-    for target in options.targets:
-        *_, threshold, seeds, colonies = TARGETS[target]
-        seeds, colonies = options.seeds or seeds, options.colonies or colonies
-        objective = objective_of(target)
-        for name in options.methods:
-            runs = [Run(objective, name, seed) for seed in range(seeds)]
-            together(objective, runs, colonies)
-            needed = [
-                next((c for c, _, loss in r.history if loss <= threshold), None) for r in runs
-            ]
-            reached = sorted(n for n in needed if n is not None)
-            out.setdefault(target, {})[name] = {
-                "threshold": threshold,
-                "colonies": colonies,
-                "needed": needed,
-                "loss": [r.loss for r in runs],
-                "seconds": [r.seconds for r in runs],
-                "best": [objective.task.space.values(r.point) for r in runs],
-                "course": [r.history for r in runs],
-            }
-            middle = f"{np.median([n if n is not None else np.inf for n in needed]):.0f}"
-            losses = [r.loss for r in runs]
-            print(
-                f"{target:<9}{name:<19}{len(reached):>4} of"
-                f" {seeds:<2}{middle:>14}{np.median(losses):>14.4f}{max(losses):>8.4f}"
-                f"{np.mean([r.seconds for r in runs]):>18.1f}",
-                flush=True,
-            )
+def improvements(search: Search) -> list[tuple[float, np.ndarray]]:
+    """The best design after each batch that improved it: colonies simulated, and its point."""
+    out, best, spent = [], np.inf, 0.0
+    for entry in search.study.entries:
+        spent += entry.colonies
+        if search.study.is_full(entry) and entry.loss.min() < best:
+            best = float(entry.loss.min())
+            out.append((spent, entry.points[entry.loss.argmin()]))
     return out
 
 
-def unseen(options: argparse.Namespace) -> dict:
-    """Scores the best design of each recorded search on 32 seeds that the search did not use."""
-    known: dict = {}
-    for record in json.loads(options.out.read_text()):
-        for target, found in record.get("methods", {}).items():
-            known.setdefault(target, {}).update(found)
+def one_search(task: SearchTask, method: str, seed: int, colonies: int, wanted: float) -> dict:
+    """Returns the outcome of one search, on seeds that it never saw."""
+    begin = time.perf_counter()
+    search = Search(**task.options(), method=METHODS[method](), seed=seed)
+    best = search.run(colonies, progress=False)
+    seconds = time.perf_counter() - begin
+    course = improvements(search)
+    points = np.array([*(point for _, point in course), best.point])
+    losses = search.objective.evaluate(points, streams=UNSEEN).loss
+    held = [spent for (spent, _), loss in zip(course, losses[:-1], strict=True) if loss <= wanted]
+    return {
+        "seed": seed,
+        "needed": min(held, default=None),
+        "success": bool(losses[-1] <= wanted),
+        "unseen": float(losses[-1]),
+        "searched": best.searched_loss,
+        "band": best.band,
+        "seconds": seconds,
+        "values": best.values,
+        "course": [[spent, float(x)] for (spent, _), x in zip(course, losses, strict=False)],
+    }
+
+
+def tasks(options: argparse.Namespace) -> dict:
+    """Returns the outcomes of every method on every task."""
     out: dict = {}
-    for target, found in known.items():
-        objective = objective_of(target)
-        for name, record in found.items():
-            points = np.array([objective.task.space.point(values) for values in record["best"]])
-            losses = objective.evaluate(points, streams=range(100, 132)).losses
-            out.setdefault(target, {})[name] = losses.mean(1).tolist()
-            held = int((losses.mean(1) <= record["threshold"]).sum())
+    print(
+        f"{'task':<20}{'threshold':>10}  {'method':<8}{'held':>8}{'colonies':>10}{'unseen':>9}"
+        f"{'s a search':>12}"
+    )
+    for name in options.tasks:
+        task = TASKS[name]
+        wanted = threshold(task)
+        out[name] = {"threshold": wanted, "cells": CELLS, "colonies": options.colonies}
+        for method in options.methods:
+            runs = [
+                one_search(task, method, seed, options.colonies, wanted)
+                for seed in range(1, 1 + options.seeds)
+            ]
+            out[name][method] = runs
+            needed = [np.inf if r["needed"] is None else r["needed"] for r in runs]
             print(
-                f"{target:<9}{name:<19}search seeds {np.median(record['loss']):.4f}, new seeds"
-                f" {np.median(losses.mean(1)):.4f}, {held} of {len(points)} hold",
+                f"{name:<20}{wanted:>10.4f}  {method:<8}{sum(r['success'] for r in runs):>3} of"
+                f" {len(runs):<2}{np.median(needed):>9.0f}"
+                f"{np.median([r['unseen'] for r in runs]):>9.4f}"
+                f"{np.mean([r['seconds'] for r in runs]):>12.1f}",
                 flush=True,
             )
     return out
@@ -193,16 +122,8 @@ def rate(options: argparse.Namespace) -> dict:
             ("batch", options.designs, False),
             ("batch on recorded growth", options.designs, True),
         ):
-            scene, parameters, target, colony, *_ = TARGETS["stripe"]
-            task = Task(
-                scene,
-                parameters,
-                target,
-                **{**colony, "cells": cells},
-                replicates=REPLICATES,
-                replay=replay,
-            )
-            objective = Objective(task)
+            stripe = TASKS["stripe"].options() | {"fixed": {"width": 16.0, "rtol": 1e-2}}
+            objective = Objective(Task(**stripe | {"cells": cells, "replay": replay}))
             points = np.random.default_rng(0).random((count, objective.task.space.size))
             if replay:
                 objective.evaluate(points[:1])  # records the growth, once for a whole search
@@ -226,20 +147,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("part", choices=("methods", "unseen", "rate"))
-    parser.add_argument("--targets", nargs="*", choices=list(TARGETS), default=list(TARGETS))
+    parser.add_argument("part", choices=("tasks", "rate"))
+    parser.add_argument("--tasks", nargs="*", choices=list(TASKS), default=list(TASKS))
     parser.add_argument(
-        "--methods", nargs="*", choices=list(METHODS), default=["sobol", "cmaes", "racing"]
+        "--methods", nargs="*", choices=list(METHODS), default=["auto", "sobol", "cmaes"]
     )
-    parser.add_argument("--seeds", type=int)
-    parser.add_argument("--colonies", type=int)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--colonies", type=int, default=2000)
     parser.add_argument("--cells", type=int, nargs="*", default=[100, 500])
     parser.add_argument("--designs", type=int, default=64)
+    parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
     options = parser.parse_args()
     options.out.parent.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(options.threads)
     tf.keep_memory()
-    found = {"methods": methods, "unseen": unseen, "rate": rate}[options.part](options)
+    found = {"tasks": tasks, "rate": rate}[options.part](options)
     kept = json.loads(options.out.read_text()) if options.out.exists() else []
     options.out.write_text(json.dumps([*kept, {**machine(), options.part: found}], indent=1) + "\n")
 
