@@ -252,6 +252,7 @@ def deterministic_functions() -> TorchFunctionMode:
 
     It covers pow and **, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp, hypot,
     linear layers and products with a matrix (K, M), in the forward and reverse modes of autograd.
-    It does not cover gelu, mish, logit, atan2, gammainc and products with batches of matrices. The cost is about a microsecond per torch call.
+    It does not cover gelu, mish, logit, atan2, gammainc and products with batches of matrices.
+    The cost is about a microsecond per torch call.
     """
     return _DeterministicMode()
