@@ -11,7 +11,7 @@ import torchfilm as tf
 from design import Bands
 
 F64 = torch.float64
-TARGET = Bands(("gfp",), (2.0, math.inf), along="edge", floor=0.1)
+TARGET = Bands(("gfp",), (1.0, math.inf), along="edge", floor=0.1)
 
 
 class Controller(torch.nn.Module):

@@ -11,7 +11,7 @@ from patterned import SHARP, crowded, graded, placed
 
 import torchfilm as tf
 from design import Bands, Gradient, Lasting, Oscillation, Parameter, Ring, Search
-from design.targets.outline import below_edge, ellipse
+from design.targets.outline import Ellipses, below_edge, ellipses
 
 
 def filled(a: float, b: float, angle: float = 0.0, at=(0.0, 0.0), dim=2) -> tf.State:
@@ -28,10 +28,28 @@ def filled(a: float, b: float, angle: float = 0.0, at=(0.0, 0.0), dim=2) -> tf.S
 def test_the_outline_of_a_filled_ellipse_is_its_edge(a, b, dim):
     """To 2 %: the grid has steps of 0.4 µm, and balls of 0.5 µm add r²/4 to a²/4."""
     state = filled(a, b, 0.7, at=(5.0, -3.0), dim=dim)
-    centre, matrix = ellipse(state)
-    axes = torch.linalg.eigvalsh(matrix[0]).rsqrt().tolist()
-    assert axes == pytest.approx([a, b], rel=0.02)
-    assert centre[0].tolist() == pytest.approx([5.0, -3.0], abs=0.2)
+    found = ellipses(state)
+    assert found.half_axes[0].tolist() == pytest.approx([a, b], rel=0.02)
+    assert found.centre[0].tolist() == pytest.approx([5.0, -3.0], abs=0.2)
+    if a > b:
+        turned = abs(
+            float(found.direction[0] @ torch.tensor([math.cos(0.7), math.sin(0.7)]).double())
+        )
+        assert turned == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("a, b", [(10.0, 10.0), (15.0, 9.0), (12.0, 4.0)])
+def test_the_distance_from_an_ellipse_is_that_of_its_nearest_point(a, b):
+    """Against the nearest of 20,000 points of the edge, which lie 0.004 µm apart at most."""
+    ellipse = Ellipses(*(torch.tensor([v]).double() for v in ((1.0, 2.0), (a, b), (0.6, 0.8))))
+    place = torch.rand(300, 2, generator=torch.Generator().manual_seed(0)).double() * 30 - 14
+    angle = torch.linspace(0, 2 * math.pi, 20_000, dtype=torch.float64)
+    edge = torch.stack([a * angle.cos(), b * angle.sin()], 1) @ torch.tensor(
+        [[0.6, 0.8], [-0.8, 0.6]], dtype=torch.float64
+    ) + torch.tensor([1.0, 2.0])
+    found = ellipse.below_edge(place, torch.zeros(300, dtype=torch.int64))
+    assert torch.allclose(found.abs(), torch.cdist(place, edge).amin(1), atol=5e-3)
+    assert bool((found > 0).any()) and bool((found < 0).any())
 
 
 def test_the_distance_below_the_edge_of_a_disc_is_radius_minus_distance():
@@ -154,6 +172,7 @@ def test_the_drawn_edges_lie_below_the_edge_of_their_colony():
     ax.set(xlim=(-9, 9), ylim=(-8, 8))
     target = Lasting(Bands(("yfp",), (2.0, math.inf), along="edge"), since=1.0)
     target.draw(ax, filled(12.0, 12.0), 0)
-    (line,) = ax.lines
-    assert np.hypot(*line.get_data()) == pytest.approx(np.full(181, 10.0), abs=0.2)
+    (contour,) = ax.collections
+    (path,) = contour.get_paths()
+    assert np.hypot(*path.vertices.T) == pytest.approx(np.full(len(path), 10.0), abs=0.2)
     assert (ax.get_xlim(), ax.get_ylim()) == ((-9, 9), (-8, 8))
