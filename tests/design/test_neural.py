@@ -85,7 +85,7 @@ def test_the_gradient_of_a_replay_equals_differences(circuit):
 
 
 def test_training_lowers_the_loss_on_colonies_never_seen():
-    """Twelve steps of Adam on two colonies, looked at on two others. They take off half of the
+    """Twelve steps of Adam on two colonies, looked at on two others. They take off over half of the
     loss; a fifth is asked for."""
     controller = Controller(seed=1)
     replay, fresh = (replay_of(controller, s, method="heun2") for s in ((0, 1), (7, 8)))
