@@ -25,6 +25,7 @@ from design.targets import (
     Duration,
     Gradient,
     Image,
+    Lasting,
     OnFraction,
     Oscillation,
     ProfileTarget,
@@ -35,6 +36,7 @@ from design.targets import (
     Weighted,
 )
 from design.task import Task
+from design.weights import load_weights, save_weights
 
 __all__ = [
     "CMAES",
@@ -54,6 +56,7 @@ __all__ = [
     "Front",
     "Gradient",
     "Image",
+    "Lasting",
     "Local",
     "Method",
     "Objective",
@@ -75,4 +78,6 @@ __all__ = [
     "Task",
     "Weighted",
     "check_robustness",
+    "load_weights",
+    "save_weights",
 ]

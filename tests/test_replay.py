@@ -344,3 +344,23 @@ def test_more_that_cannot_be_kept(scene, why):
     assert why in scene().bind().why_not_replayable
     with pytest.raises(tf.InputError, match=why):
         tf.GrowthRecording(scene(), streams=(0,))
+
+
+@pytest.mark.parametrize("segment", [1, 3, None])
+def test_rollout_follows_a_replay_with_its_gradient(segment):
+    """The same bits and the same gradient as step by step, from the first state and from a later
+    one."""
+    make = torch.tensor([1.0, 2.0], requires_grad=True)
+    recording = tf.GrowthRecording(lit(), streams=[4, 1], dt=0.1)
+    designs = Designs(lit(make=make), recording)
+    start = designs.start(2, [1, 4])
+    plain = stepped(designs, start, 20)
+    half = tf.rollout(designs.replay, until=0.7, segment=segment)
+    end = tf.rollout(designs.replay, half, until=2.0, segment=segment)
+    assert (end.step, end.cells) == (20, plain.cells) and end.cells > 2
+    assert torch.equal(end.gfp, plain.gfp)
+    slopes = [torch.autograd.grad(s.gfp.sum(), make)[0] for s in (end, plain)]
+    torch.testing.assert_close(slopes[0], slopes[1])
+    assert bool((slopes[0] > 0).all())
+    with pytest.raises(tf.InputError, match=r"dt = 0.05 .* 0.1 h, as in the recording"):
+        tf.rollout(designs.replay, until=1.0, dt=0.05)

@@ -16,6 +16,7 @@ from torch.utils.checkpoint import checkpoint
 
 from torchfilm.loop import EndlessRunWarning, LastingConcerns, Monitor, advance, handle_failures
 from torchfilm.model import Model
+from torchfilm.replay import Replay
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools import checks
@@ -179,24 +180,31 @@ def _run(step, state, stop, first, monitors, recorder, bar) -> Iterator[State]:
 
 @checks.known_keywords
 def rollout(
-    scene: Scene | Model,
+    scene: Scene | Model | Replay,
     state: State | None = None,
     *,
     until: float,
     dt: float | None = None,
-    segment: int = 10,
+    segment: int | None = 10,
 ) -> State:
     """The state at `until` (h), for gradients through a long run: only every `segment`-th state is
     kept, and the steps between are computed again on the way back (torch.utils.checkpoint), so that
-    memory grows with the number of segments and not of steps. state: from which to start; by
-    default the scene's first. Failures are raised as in `simulate`.
+    memory grows with the number of segments and not of steps; None keeps all, and saves the time.
+    scene: or a model, or a `Replay`, whose steps are as long as its recording's. state: from which
+    to start; by default the first. Failures are raised as in `simulate`.
     """
-    _check_kinds("rollout", scene, state)
+    _check_kinds("rollout", scene, state, Replay)
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
-    if isinstance(segment, bool) or not isinstance(segment, int) or segment < 1:
-        raise checks.input_error("segment", segment, "an integer number of steps from 1")
-    model = _bound(scene, state, {})
-    state = model.start() if state is None else state
+    if segment is not None and (type(segment) is not int or segment < 1):
+        raise checks.input_error("segment", segment, "an integer number of steps from 1, or None")
+    if isinstance(scene, Replay):
+        if dt != scene.dt:
+            raise checks.input_error("dt", dt, f"{scene.dt:g} h, as in the recording")
+        model, step = scene.model, scene.step
+        state = scene.start() if state is None else state
+    else:
+        model = _bound(scene, state, {})
+        state, step = model.start() if state is None else state, partial(model.step, dt=dt)
     last = _last_step(state, checks.number("until", until), dt)
     model.check(state)
     model.check_step(dt)
@@ -205,10 +213,12 @@ def rollout(
     def segment_of(begin: State, steps: int) -> State:
         last_step, end = begin.step + steps, begin
         stop = lambda s: s.step >= last_step
-        for later in advance(partial(model.step, dt=dt), begin, stop=stop, monitors=monitors):
+        for later in advance(step, begin, stop=stop, monitors=monitors):
             end = later
         return end
 
+    if segment is None or not torch.is_grad_enabled():
+        return segment_of(state, last - state.step)
     while state.step < last:
         state = checkpoint(segment_of, state, min(segment, last - state.step), use_reentrant=False)
     return state
@@ -220,8 +230,10 @@ def _bound(scene: Scene | Model, state: State | None, batch: dict[str, Any]) -> 
     return scene.bind(**batch) if state is None else scene.bind(state=state)
 
 
-def _check_kinds(name: str, scene: object, state: object) -> None:
-    if not isinstance(scene, (Scene, Model)) or not (state is None or isinstance(state, State)):
+def _check_kinds(name: str, scene: object, state: object, *more: type) -> None:
+    if not isinstance(scene, (Scene, Model, *more)) or not (
+        state is None or isinstance(state, State)
+    ):
         given = f"{name}({type(scene).__name__}, {type(state).__name__}, …)"
         raise checks.InputError(
             f"{given} is not allowed: first comes a Scene or a Model, then, if any, a State, such"

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
+from design.targets.outline import below_edge, draw_below_edge
 from torchfilm import checks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Centre = Literal["colony"] | tuple[float, float]
-ALONG = ("x", "y", "radius")
+ALONG = ("x", "y", "radius", "edge")
 COLOURS = ("#c2185b", "#1976d2", "#388e3c", "#f57c00", "#7b1fa2", "#5d4037")  # of the species
 
 
@@ -58,7 +59,10 @@ def offset(state: tf.State, centre: Centre) -> Tensor:
 
 
 def coordinate(state: tf.State, along: str, centre: Centre) -> Tensor:
-    """The coordinate of each cell along "x", "y" or "radius", from the centre, (N,) float64 µm."""
+    """The coordinate of each cell along "x", "y" or "radius", from the centre, or below the
+    "edge" of its colony, (N,) float64 µm."""
+    if along == "edge":
+        return below_edge(state)
     x, y = offset(state, centre).unbind(1)
     return x if along == "x" else y if along == "y" else (x * x + y * y).sqrt()
 
@@ -95,3 +99,20 @@ def lines(
         else:
             ax.axhline(centre[1] + edge, color=colour, linestyle=style, linewidth=1.0, zorder=3)
     ax.set(xlim=window[0], ylim=window[1])
+
+
+def draw_edges(
+    ax: Axes,
+    state: tf.State,
+    place: int,
+    along: str,
+    centre: Centre,
+    edges: Sequence[float],
+    colour: str,
+    style: str = "--",
+) -> None:
+    """Draw edges along a coordinate in the picture of the colony at `place` of the batch."""
+    if along == "edge":
+        draw_below_edge(ax, state, place, tuple(edges), colour, style)
+    else:
+        lines(ax, along, centre_at(state, centre, place), edges, colour, style)

@@ -34,6 +34,7 @@ from design.targets.geometry import (
     check_profile,
     checked_centre,
     coordinate,
+    draw_edges,
     half,
     lines,
 )
@@ -152,7 +153,8 @@ class Bands(ProfileTarget):
     edges[k] and edges[k + 1].
 
     edges: ascending, µm from `centre`, one more than species; the first may be −inf and the last
-    inf. along: "x", "y" or "radius". centre: (x, y) µm, or "colony" for the centre of the colony.
+    inf. along: "x", "y", "radius", or "edge", the distance below the colony's own edge, an ellipse
+    that moves outwards as it grows. centre: (x, y) µm, or "colony" for the centre of the colony.
     floor: the level from which a cell counts as lit. edge_width: µm; an edge is a logistic that
     rises from 0.27 to 0.73 between one width before it and one width behind it.
     """
@@ -207,9 +209,9 @@ class Bands(ProfileTarget):
         )
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        middle = centre_at(state, self.centre, place)
         for k in range(len(self.species)):
-            lines(ax, self.along, middle, self.edges[k : k + 2], COLOURS[k % len(COLOURS)])
+            edges, colour = self.edges[k : k + 2], COLOURS[k % len(COLOURS)]
+            draw_edges(ax, state, place, self.along, self.centre, edges, colour)
 
     def describe(self) -> str:
         parts = [
@@ -299,7 +301,7 @@ class Ring(ProfileTarget):
 @dataclass(frozen=True)
 class Gradient(ProfileTarget):
     """A gradient: the target level falls linearly from 1 at `low` to 0 at `high`, µm from `centre`
-    along "x", "y" or "radius". It is constant beyond them.
+    along "x", "y", "radius" or "edge", as for `Bands`. It is constant beyond them.
 
     With low > high it rises. centre, floor: as for `Bands`.
     """
@@ -352,9 +354,8 @@ class Gradient(ProfileTarget):
         }
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
-        middle = centre_at(state, self.centre, place)
-        lines(ax, self.along, middle, (self.low,), COLOURS[0], "-")
-        lines(ax, self.along, middle, (self.high,), COLOURS[0], ":")
+        for edge, style in ((self.low, "-"), (self.high, ":")):
+            draw_edges(ax, state, place, self.along, self.centre, (edge,), COLOURS[0], style)
 
     def describe(self) -> str:
         return (

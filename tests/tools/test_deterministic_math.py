@@ -16,6 +16,14 @@ from torchfilm.tools.deterministic_math import deterministic_functions, power
 
 EXPONENTS = [0, 1, 2, 3, 4, 7, 8, 13, -1, -2, -3, 0.5, 1.5, 2.7, 0.3, -0.5, -1.5]
 
+
+def layer(x):
+    """Columns (M, 5) made of x, weights (2, 5) and a bias (2,)."""
+    columns = torch.stack([x, 2 - x, x * x, x - 3, 1 / (1 + x)], 1)
+    weight = torch.linspace(-1.3, 1.7, 10, dtype=x.dtype).reshape(2, 5)
+    return columns, weight, weight[:, 0]
+
+
 # functions that users may write, each found to vary on some build of torch; powers of 0, 1, 2, 3
 # belong to the same family
 WRITTEN = {
@@ -37,6 +45,8 @@ WRITTEN = {
     "elu": lambda x: torch.nn.functional.elu(x - 2),
     "logaddexp": lambda x: torch.logaddexp(x, 2 - x),
     "hypot": lambda x: torch.hypot(x, 2 - x),
+    "linear": lambda x: torch.nn.functional.linear(*layer(x))[:, 1],
+    "matrix product": lambda x: (layer(x)[0] @ layer(x)[1].t())[:, 0],
     # not replaced: found deterministic, and must stay so
     "exp": torch.exp,
     "expm1": torch.expm1,
@@ -194,6 +204,21 @@ def test_derivatives_by_finite_differences():
             ),
             check_forward_ad=True,
         )
+
+
+def test_linear_layers_promote_precisions_and_agree_with_torch():
+    """Within the mode a float32 module takes float64 columns, as the stiff solver gives them."""
+    x, (_, weight, bias) = torch.rand(7, 5), layer(torch.ones(1))
+    plain = torch.nn.functional.linear(x, weight, bias)
+    with deterministic_functions():
+        found = torch.nn.functional.linear(x.double(), weight, bias)
+        assert found.dtype == torch.float64
+        torch.testing.assert_close(found.float(), plain)
+        torch.testing.assert_close(x @ weight.t() + bias, plain)
+        torch.testing.assert_close(x[0] @ weight.t(), (x @ weight.t())[0])
+        assert torch.equal(x @ weight[0], torch.mv(x, weight[0]))  # left to torch
+    inputs = [t.double().requires_grad_() for t in (x, weight, bias)]
+    assert torch.autograd.gradcheck(deterministic_math.linear, inputs, check_forward_ad=True)
 
 
 OTHERS = {

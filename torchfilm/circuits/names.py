@@ -67,6 +67,12 @@ class Names:
         return f"Names({', '.join(self.__dict__) or 'none'})"
 
 
+def label_of(part: object) -> str:
+    """What messages call the rates of a circuit: a function by its name, a module by its class."""
+    kind = type(part).__name__ if callable(part) else "the list of reactions"
+    return getattr(part, "__name__", kind)
+
+
 def unknown(what: str, name: str, known: Sequence[str]) -> str:
     """The message for an unknown name: the known names, and the closest one."""
     near = difflib.get_close_matches(name, known, 1, cutoff=0.6)

@@ -20,7 +20,7 @@ from torchfilm.circuits.compiled_explicit import compiled_explicit
 from torchfilm.circuits.compiled_molecules import compiled_molecules
 from torchfilm.circuits.compiled_stiff import compiled_circuit
 from torchfilm.circuits.draws import KeyedDraws
-from torchfilm.circuits.names import unknown
+from torchfilm.circuits.names import label_of, unknown
 from torchfilm.circuits.network import build_network
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
@@ -339,7 +339,7 @@ class BoundCircuit(BoundEffect):
     ) -> run.CircuitCells:
         """The circuit in the cells of one type as they are in this state."""
         part = self.networks.get(kind, self.rates[kind])
-        label = getattr(part, "__name__", "the list of reactions")
+        label = label_of(part)
         label += "" if isinstance(kind, str) else f" (cell type {kind})"
         pool, in_reservoir = (None, None) if medium is None else (medium.pool, medium.in_reservoir)
         if isinstance(part, run.Network):

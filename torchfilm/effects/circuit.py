@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchfilm.circuits import integrators, run
 from torchfilm.circuits.graph import CircuitGraph, graph_of
-from torchfilm.circuits.names import unknown
+from torchfilm.circuits.names import label_of, unknown
 from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.tracing import Untraceable
@@ -188,7 +188,7 @@ class Circuit(Effect):
         """Its equations by cell type."""
         found = {}
         for kind, part in self.rates.items():
-            label = getattr(part, "__name__", "the list of reactions")
+            label = label_of(part)
             try:
                 found[kind] = graph_of(part, tuple(self.variables), tuple(self.parameters), label)
             except Untraceable as why:

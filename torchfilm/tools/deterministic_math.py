@@ -161,6 +161,26 @@ def hypot(x: Tensor, y: Tensor) -> Tensor:
     return torch.sqrt(x * x + y * y)
 
 
+def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """x Wᵀ + b with x (…, K), W (M, K), b (M,), one column of x after the other.
+
+    A matrix product adds in an order that depends on the number of rows. Precisions may differ,
+    as in the four operations: a stiff solver calls in float64 what a module holds in float32.
+    """
+    terms = zip(x.unsqueeze(-1).unbind(-2), weight.unbind(-1), strict=True)
+    out = sum((column * row for column, row in terms), x.new_zeros(()))
+    return out if bias is None else out + bias
+
+
+def _linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor | None:
+    fits = x.dim() > 0 and weight.dim() == 2 and x.shape[-1] == weight.shape[1]
+    return linear(x, weight, bias) if fits and x.is_floating_point() else None
+
+
+def _matmul(x: Tensor, y: Tensor) -> Tensor | None:
+    return _linear(x, y.t()) if isinstance(x, Tensor) and y.dim() == 2 else None
+
+
 def _pow(x: Tensor | float, n: float | Tensor) -> Tensor | None:
     if isinstance(x, Tensor):
         if (
@@ -212,6 +232,8 @@ REPLACEMENTS: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
     torch.nn.functional.softplus: _floating(softplus),
     torch.nn.functional.silu: _floating(silu),
     torch.nn.functional.elu: _floating(elu),
+    torch.nn.functional.linear: _linear,
+    **dict.fromkeys((torch.matmul, torch.mm, Tensor.matmul, Tensor.mm, Tensor.__matmul__), _matmul),
 }
 
 
@@ -228,8 +250,9 @@ class _DeterministicMode(TorchFunctionMode):
 def deterministic_functions() -> TorchFunctionMode:
     """Within `with deterministic_functions():` this module's functions replace torch's.
 
-    It covers pow and **, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp and
-    hypot, in the forward and reverse modes of autograd. It does not cover gelu, mish, logit, atan2,
-    gammainc and matrix products. The cost is about a microsecond per torch call.
+    It covers pow and **, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp, hypot,
+    linear layers and products with a matrix (K, M), in the forward and reverse modes of autograd.
+    It does not cover gelu, mish, logit, atan2, gammainc and products with batches of matrices.
+    The cost is about a microsecond per torch call.
     """
     return _DeterministicMode()

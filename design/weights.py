@@ -1,0 +1,58 @@
+"""The weights of a `torch.nn.Module` as JSON: data only, so reading a file cannot run code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchfilm import checks
+
+FORMAT = "torchfilm weights 1"
+
+
+def save_weights(module: torch.nn.Module, path: str | Path) -> Path:
+    """Write the parameters and buffers of a module, each with name, dtype and shape. Replaces an
+    older file. Raises InputError where a number is not finite, or a tensor holds no reals."""
+    stored = {}
+    for name, value in module.state_dict().items():
+        if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
+            raise checks.input_error(f"weights[{name!r}]", value.dtype, "finite floating numbers")
+        flat = value.detach().cpu().double().flatten().tolist()
+        kind = str(value.dtype).removeprefix("torch.")
+        stored[name] = {"dtype": kind, "shape": list(value.shape), "values": flat}
+    Path(path).write_text(json.dumps({"format": FORMAT, "weights": stored}, indent=1) + "\n")
+    return Path(path)
+
+
+def load_weights(module: torch.nn.Module, path: str | Path) -> None:
+    """Give a module the weights of a file, which it keeps in its own dtype and on its own device.
+
+    Raises InputError for a file that holds no weights, or those of another module, and changes
+    nothing then.
+    """
+    stored, own = _read(Path(path)), module.state_dict()
+    for name in sorted({*stored, *own}):
+        shapes = [tuple(w[name].shape) if name in w else "none" for w in (stored, own)]
+        if shapes[0] != shapes[1]:
+            what = f"{name!r} of shape {shapes[0]}"
+            rule = f"of shape {shapes[1]}, as in {type(module).__name__}"
+            raise checks.input_error(f"weights in {path}", what, rule)
+    module.load_state_dict(stored)
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    try:
+        found = json.loads(path.read_text())
+        if found["format"] != FORMAT:
+            raise ValueError(f"its format is {found['format']!r}")
+        return {
+            name: torch.tensor(w["values"], dtype=torch.float64).reshape(w["shape"])
+            for name, w in found["weights"].items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as why:
+        raise checks.InputError(
+            f"{path} holds no weights that save_weights wrote: {type(why).__name__}: {why}."
+        ) from why
