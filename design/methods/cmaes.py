@@ -17,6 +17,8 @@ from torchfilm import checks
 
 # A restart doubles the population, up to this many times the first: the batch must fit the machine.
 MOST = 16
+# The greatest width of a cloud around a design that is known before the search.
+NEAR = 0.1
 # Learning rate of the mean and damping of the step size, for losses with noise; cma's own are 1 and
 # 1 (docs/methods.md gives the measurements).
 SLOW = {"CMA_cmean": 0.4, "CSA_dampfac": 3.0}
@@ -88,10 +90,11 @@ class CMAES(Turns):
         return self._cloud is None
 
     def know(self, points: np.ndarray, loss: np.ndarray) -> None:
-        """The first cloud begins at the best of them, half as wide as others."""
+        """The first cloud begins at the best of them, and is narrow: a wide one leaves what is
+        known."""
         best = int(loss.argmin())
         self._start = float(loss[best])
-        self._cloud = self._new(points[best], self.sigma / 2)
+        self._cloud = self._new(points[best], min(self.sigma, NEAR))
 
     def draw(self, count: int) -> np.ndarray:
         space = self._started()
