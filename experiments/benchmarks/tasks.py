@@ -1,9 +1,9 @@
 """The eight tasks of the benchmark of searches: scenes, parameters, targets and thresholds.
 
 A search has succeeded where the mean loss of its design, on 16 seeds that it never saw, is at most
-the threshold. Thresholds were written down before the searches were run, by one rule: a quarter of the
-loss of the best answer that knows nothing of the target (all cells dark, all lit, every second one
-lit, all at the best even level), in colonies of the middle of the space.
+the threshold. Thresholds were written down before the searches were run, by one rule: a quarter of
+the loss of the best answer that knows nothing of the target (all cells dark, all lit, every second
+one lit, all at the best even level), in colonies of the middle of the space.
 """
 
 from __future__ import annotations
