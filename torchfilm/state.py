@@ -227,9 +227,7 @@ class State:
         if self.layout is None:
             return None
         values = self.signals if names is None else {n: self.fields[OUTSIDE + n] for n in names}
-        return self.layout.contact(
-            self.places, self.colony, self.own_colony_id, values, self.dtype
-        )
+        return self.layout.contact(self.places, self.colony, self.own_colony_id, values, self.dtype)
 
     @property
     def own_colony_id(self) -> Tensor:
@@ -303,9 +301,8 @@ class State:
             name: value.index_select(0, index) if self.declared[name].scope == CELL else value
             for name, value in self.fields.items()
         }
-        part = {
-            name: getattr(self, name).index_select(0, index) for name in PER_CELL if name not in known
-        }
+        left = [name for name in PER_CELL if name not in known]
+        part = {name: getattr(self, name).index_select(0, index) for name in left}
         return self.replace(**part, **known, fields=fields)
 
     def reset_at_division(self, daughters: Tensor, names: Iterable[str]) -> State:
