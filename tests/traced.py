@@ -164,7 +164,7 @@ NAMES = tuple("abcdefgh")
 
 
 @st.composite
-def circuits(draw) -> dict:
+def circuits(draw, signal: str = "x0") -> dict:
     """A circuit of up to eight species as reactions, and the same as a function."""
     names = NAMES[: draw(st.integers(1, 8))]
     number = st.floats(0.05, 3.0).map(lambda x: float(f"{x:.3g}"))
@@ -195,11 +195,11 @@ def circuits(draw) -> dict:
                 ({a: 1}, lambda u, s, c, r=rate, b=b, h=half, n=power, f=use: r * f(u[b], h, n))
             )
         elif kind == "out":
-            gone, back = parts.exchange(a, rate, "x0")
+            gone, back = parts.exchange(a, rate, signal)
             listed += [tf.Reaction(r.consumes, r.produces, r.rate, f"{k} {n}")
                        for n, r in enumerate((gone, back))]  # fmt: skip
-            net = lambda u, s, c, r=rate, a=a: r * c.area / c.volume * (u[a] - s.x0)
-            terms.append(({a: -1, "out.x0": 1}, net))
+            net = lambda u, s, c, r=rate, a=a: r * c.area / c.volume * (u[a] - s[signal])
+            terms.append(({a: -1, f"out.{signal}": 1}, net))
     if not listed:
         listed.append(tf.Reaction({}, {names[0]: 1}, 1.0))
         terms.append(({names[0]: 1}, lambda u, s, c: 1.0))

@@ -290,25 +290,31 @@ class Replay:
 
     def _apply(self, state: State, change: RecordedChange, place: Tensor) -> State:
         """The state after a recorded change, whose colonies at `place` (B,) ours follow."""
-        counts = change.counts.index_select(0, place)
-        owner, rows = expand_ranges(offsets(change.counts)[:-1].index_select(0, place), counts)
+        unit, times = _repeated(place)
+        begin, mine = offsets(change.counts)[:-1].index_select(0, unit), change.counts[unit]
+        owner, rows = expand_ranges(begin, mine)
         taken = {
-            n: value.index_select(0, rows)
+            n: _tiled(value.index_select(0, rows), times)
             for n, value in change.values.items()
             if n not in self.own
         }
+        shape = {n: taken.pop(n) for n in PER_CELL if n in taken}
         old = state
-        if change.source is not None:
-            start = offsets(state.counts)[:-1].index_select(0, owner)
-            source = change.source.index_select(0, rows) + start
-            state = state.take(source).replace(next_uid=change.next_uid.index_select(0, place))
-        state = state.replace(**{n: taken.pop(n) for n in PER_CELL if n in taken})
+        if change.source is None:
+            state = state.replace(**shape)
+        else:
+            before = offsets(state.counts[: len(unit)])
+            within = change.source.index_select(0, rows) + before.index_select(0, owner)
+            first_cell = torch.arange(times, device=place.device).unsqueeze(1) * before[-1]
+            source = (first_cell + within).reshape(-1)
+            state = state.take(source, **shape)
+            state = state.replace(next_uid=change.next_uid.index_select(0, place))
         if change.births is None:
             return state.with_fields(**taken)
         number, firsts, seconds = change.births
         begin = offsets(number)[:-1].index_select(0, place)
         mine, at = expand_ranges(begin, number.index_select(0, place))
-        start = offsets(counts)[:-1].index_select(0, mine)
+        start = offsets(state.counts)[:-1].index_select(0, mine)
         first, second = firsts.index_select(0, at) + start, seconds.index_select(0, at) + start
         daughters = torch.cat([first, second])
         parents = old.take(source.index_select(0, first))
@@ -328,3 +334,18 @@ class Replay:
         status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
         status[list(words)] = 1
         return state.replace(reports={**state.reports, "recording": RecordingReport(status, words)})
+
+
+def _repeated(place: Tensor) -> tuple[Tensor, int]:
+    """The numbers whose repetition `place` (B,) is, and how often they stand in it. The designs of
+    a search follow the same streams, whose cells then need to be looked up once."""
+    again = torch.nonzero(place[1:] == place[0])
+    period = int(again[0]) + 1 if len(again) else len(place)
+    if len(place) % period or not torch.equal(place[period:], place[:-period]):
+        period = len(place)
+    return place[:period], len(place) // period
+
+
+def _tiled(value: Tensor, times: int) -> Tensor:
+    """(N, …) that many times, one after the other."""
+    return value if times == 1 else value.repeat(times, *[1] * (value.dim() - 1))

@@ -211,15 +211,23 @@ class State:
             }
         )
 
+    @property
+    def places(self) -> Tensor:
+        """Positions in the three dimensions of the medium, (N, 3) float64, µm."""
+        assert self.layout is not None
+        if self.position.requires_grad:
+            return self.layout.places(self.position)
+        if "places" not in self.__dict__:
+            self.__dict__["places"] = self.layout.places(self.position)
+        return self.__dict__["places"]
+
     def contact(self, names: Iterable[str] | None = None) -> Contact | None:
         """Where cells meet the medium and what they find there of each signal, or of these; None in
         a scene without a medium."""
         if self.layout is None:
             return None
         values = self.signals if names is None else {n: self.fields[OUTSIDE + n] for n in names}
-        return self.layout.contact(
-            self.position, self.colony, self.own_colony_id, values, self.dtype
-        )
+        return self.layout.contact(self.places, self.colony, self.own_colony_id, values, self.dtype)
 
     @property
     def own_colony_id(self) -> Tensor:
@@ -286,15 +294,16 @@ class State:
             )
         return declared.with_fields(**{field.name: start})
 
-    def take(self, index: Tensor) -> State:
+    def take(self, index: Tensor, **known: Tensor) -> State:
         """The cells at `index` (M,), which keeps colonies side by side; colonies stay, if need be
-        empty."""
+        empty. known: parts that these cells have already, such as `length`."""
         fields = {
             name: value.index_select(0, index) if self.declared[name].scope == CELL else value
             for name, value in self.fields.items()
         }
-        part = {name: getattr(self, name).index_select(0, index) for name in PER_CELL}
-        return self.replace(**part, fields=fields)
+        left = [name for name in PER_CELL if name not in known]
+        part = {name: getattr(self, name).index_select(0, index) for name in left}
+        return self.replace(**part, **known, fields=fields)
 
     def reset_at_division(self, daughters: Tensor, names: Iterable[str]) -> State:
         """The state right after divisions (`births[-1]` tells of them) in which those of the named
@@ -402,6 +411,7 @@ DERIVED = {
     "counts": ("colony", "colony_id"),
     "volume": ("length", "radius"),
     "area": ("length", "radius"),
+    "places": ("position", "layout"),
 }
 PARTS = frozenset(part.name for part in dataclasses.fields(State))
 RESERVED = PARTS | {n for n in vars(State) if not n.startswith("__")}

@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ import torch
 from mock_cuda import pretended_cuda  # noqa: F401
 
 import torchfilm as tf
+from torchfilm.kernels import compiling
 from torchfilm.physics import compiled
 from torchfilm.tools import numba_calls
 
@@ -160,6 +162,39 @@ def test_two_processes_compile_at_once_and_a_third_finds_what_they_kept(tmp_path
     assert any(name.endswith(".nbc") for name in kept)
     assert compile_in(tmp_path, 1) == [one]
     assert kept == {file.name: file.stat().st_mtime_ns for file in folder.rglob("*.nb?")}
+
+
+def test_kernels_that_nobody_uses_are_removed(tmp_path, monkeypatch):
+    """By a new version, and only those of this package; two processes at once, or a home where
+    nothing can be removed, do no harm."""
+    home, old = tmp_path / "torchfilm", time.time() - 31 * 86400
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for name in ("kernels-unused", "kernels-used", "mine"):
+        (home / name / "__pycache__").mkdir(parents=True)
+    for name in ("kernels-unused", "mine"):
+        os.utime(home / name, (old, old))
+    found = compiling.cache_folder()
+    assert {f.name for f in home.iterdir()} == {"kernels-used", "mine", found.name}
+    os.utime(found, (old, old))
+    assert compiling.cache_folder() == found and found.stat().st_mtime > old + 86400
+    # it was there: another look removes nothing
+    os.utime(home / "kernels-used", (old, old))
+    compiling.cache_folder()
+    assert (home / "kernels-used").exists()
+
+
+def test_kernels_that_cannot_be_removed_stay(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    unused = tmp_path / "torchfilm" / "kernels-unused"
+    unused.mkdir(parents=True)
+    os.utime(unused, (0, 0))
+
+    def refuse(self, target):
+        raise PermissionError  # as a file system does that is read-only, and a second process finds
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    assert compiling.cache_folder() is not None
+    assert unused.exists()
 
 
 def two_cells(apart: float, backend: str, **extra) -> tuple[tf.Scene, tf.State]:

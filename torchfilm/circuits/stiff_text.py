@@ -108,6 +108,8 @@ def controlled(error, broken, left, h, dt):
     ends = good and h >= left
     if good:
         left -= h
+    if ends:  # a logarithm and an exponential less for every cell
+        return good, ends, False, left, h
     factor = 0.25
     if abs(error) < np.inf:
         factor = GROW

@@ -169,8 +169,8 @@ class GridCoverage(_MediumPart):
         layout = state.layout
         if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
-        left, first = layout.outside_medium(state.position, state.groups)
-        place = torch.nn.functional.pad(layout.places(state.position), (0, 0, 0, 1))  # none: 0
+        left, first = layout.outside_medium(state.places, state.groups)
+        place = torch.nn.functional.pad(state.places, (0, 0, 0, 1))  # none: 0
         return MediumReport((left > 0).long(), left, place.index_select(0, first))
 
     @torch.no_grad()
@@ -178,7 +178,7 @@ class GridCoverage(_MediumPart):
         """The lower and upper corner of the box that the cells need, (B, 3) µm each."""
         layout = state.layout
         assert layout is not None
-        low, high = spans(layout.places(state.position), state.groups)
+        low, high = spans(state.places, state.groups)
         corner, end, size = self.effect.corners
         # a box of one layer stays one layer
         flat = torch.tensor(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,19 +26,44 @@ def _digest() -> str:
     return found.hexdigest()[:16]
 
 
+# After so many days without use compiled kernels of another version are removed.
+KEPT_DAYS = 30
+
+
 def cache_folder() -> Path | None:
     """Where compiled kernels are kept, or None where nothing can be written: the user's own cache,
-    since compiled code that others could write must never be loaded."""
+    since compiled code that others could write must never be loaded. A new version removes what
+    older ones left and nobody uses."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     folder = Path(home) / "torchfilm" / f"kernels-{_digest()}"
     try:
+        new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f"writable-{os.getpid()}"
         probe.touch()
         probe.unlink()
+        os.utime(folder)  # in use
     except OSError:
         return None
+    if new:
+        _remove_unused(folder)
     return folder
+
+
+def _remove_unused(mine: Path) -> None:
+    """Remove the folders beside `mine` that no process has used for KEPT_DAYS. Another process may
+    do the same at once, and what cannot be removed stays. A folder is renamed first: nobody finds
+    one that is partly empty."""
+    oldest = time.time() - KEPT_DAYS * 86400
+    for folder in mine.parent.glob("*kernels-*"):  # also one whose removal was interrupted
+        try:
+            if folder == mine or folder.is_symlink() or folder.stat().st_mtime >= oldest:
+                continue
+            gone = folder.with_name(f"removed-{os.getpid()}-{folder.name[-24:]}")
+            folder.rename(gone)
+        except OSError:
+            continue
+        shutil.rmtree(gone, ignore_errors=True)
 
 
 FOLDER = cache_folder()

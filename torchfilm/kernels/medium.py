@@ -24,30 +24,29 @@ def _two_voxels(at, size, periodic):
 def put_stencil(position, colony, origin, step, shape, first, used, periodic, slack, mask, node,
                 weight, outside, blocked):  # fmt: skip
     """Puts the voxels of each cell, the nearest first, and their weights into node and weight,
-    (N, K). used: the axes with more than one voxel. mask: (nodes,), or empty."""
+    (N, K). used: (3,) bool, the axes with more than one voxel. mask: (nodes,), or empty."""
     corners, zero, one = node.shape[1], weight.dtype.type(0), weight.dtype.type(1)
-    pairs, far = np.zeros((3, 2), np.int64), np.zeros((3, 2), weight.dtype)
     for i in range(position.shape[0]):
-        b = colony[i]
+        b, made, away = colony[i], 1, False
+        node[i, 0], weight[i, 0] = first[b], one
         for k in range(3):
             at, size = (position[i, k] - origin[b, k]) / step[k], shape[b, k]
             if periodic[k]:
-                outside[i] |= not abs(at) < np.inf
+                away |= not abs(at) < np.inf
             else:
-                outside[i] |= not (at >= -slack and at <= size + slack)
+                away |= not (at >= -slack and at <= size + slack)
+            if not used[k]:
+                continue
             nearest, other, share = _two_voxels(at - 0.5, size, periodic[k])
             stride = shape[b, 1] * shape[b, 2] if k == 0 else shape[b, 2] if k == 1 else 1
-            pairs[k, 0], pairs[k, 1] = nearest * stride, other * stride
-            far[k, 1] = share
-            far[k, 0] = one - far[k, 1]
-        for c in range(corners):
-            n, w, left = first[b], one, corners
-            for k in used:
-                left //= 2
-                side = (c // left) % 2
-                n += pairs[k, side]
-                w *= far[k, side]
-            node[i, c], weight[i, c] = n, w
+            far = weight.dtype.type(share)
+            near = one - far
+            for c in range(made - 1, -1, -1):  # each corner so far has two along this axis
+                n, w = node[i, c], weight[i, c]
+                node[i, 2 * c], weight[i, 2 * c] = n + nearest * stride, w * near
+                node[i, 2 * c + 1], weight[i, 2 * c + 1] = n + other * stride, w * far
+            made *= 2
+        outside[i] = away
         if mask.shape[0]:
             _mask(i, node, weight, mask, outside, blocked)
         if corners > 1:

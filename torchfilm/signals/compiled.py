@@ -31,10 +31,8 @@ def stencil(
     from torchfilm.kernels.medium import put_stencil
 
     count = position.shape[0]
-    used = torch.tensor(
-        [k for k in range(3) if any(s[k] > 1 for s in grid.shapes)], dtype=torch.int64
-    )
-    node = torch.empty(count, 2 ** used.numel(), dtype=torch.int64)
+    used = (grid.shape > 1).any(0)
+    node = torch.empty(count, 2 ** int(used.sum()), dtype=torch.int64)
     weight = torch.empty(node.shape, dtype=dtype)
     outside, blocked = torch.zeros(2, count, dtype=torch.bool)
     put_stencil(
