@@ -14,6 +14,7 @@ from design.parameters import Choice, Parameter, Space
 from design.robustness import Robustness
 from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
+from design.scene_family import UnfitDesign
 from design.search import Search
 from design.slopes import Slopes
 from design.study import Study
@@ -76,6 +77,7 @@ __all__ = [
     "Study",
     "Target",
     "Task",
+    "UnfitDesign",
     "Weighted",
     "check_robustness",
     "load_weights",
