@@ -8,6 +8,7 @@ It uses torchfilm's public names only, as any user can.
 from design.best import Best
 from design.finals import Finals
 from design.front import Front
+from design.library import Library, Sensor, SensorDevice, Wiring
 from design.methods import CMAES, NSGA2, Batch, Bayesian, Local, Method, Racing, Sobol
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
@@ -58,6 +59,7 @@ __all__ = [
     "Gradient",
     "Image",
     "Lasting",
+    "Library",
     "Local",
     "Method",
     "Objective",
@@ -69,6 +71,8 @@ __all__ = [
     "Ring",
     "Robustness",
     "Search",
+    "Sensor",
+    "SensorDevice",
     "Slopes",
     "Sobol",
     "Space",
@@ -79,6 +83,7 @@ __all__ = [
     "Task",
     "UnfitDesign",
     "Weighted",
+    "Wiring",
     "check_robustness",
     "load_weights",
     "save_weights",
