@@ -8,12 +8,14 @@ It uses torchfilm's public names only, as any user can.
 from design.best import Best
 from design.finals import Finals
 from design.front import Front
+from design.library import Library, Sensor, SensorDevice, Wiring
 from design.methods import CMAES, NSGA2, Batch, Bayesian, Local, Method, Racing, Sobol
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
 from design.robustness import Robustness
 from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
+from design.scene_family import UnfitDesign
 from design.search import Search
 from design.slopes import Slopes
 from design.study import Study
@@ -57,6 +59,7 @@ __all__ = [
     "Gradient",
     "Image",
     "Lasting",
+    "Library",
     "Local",
     "Method",
     "Objective",
@@ -68,6 +71,8 @@ __all__ = [
     "Ring",
     "Robustness",
     "Search",
+    "Sensor",
+    "SensorDevice",
     "Slopes",
     "Sobol",
     "Space",
@@ -76,7 +81,9 @@ __all__ = [
     "Study",
     "Target",
     "Task",
+    "UnfitDesign",
     "Weighted",
+    "Wiring",
     "check_robustness",
     "load_weights",
     "save_weights",

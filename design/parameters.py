@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from torchfilm import checks
 
 # The value of a parameter: a number, or one of the options of a choice.
 Value = Any
+Resolve = Callable[[Mapping[str, Value]], Mapping[str, Value]]
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,11 @@ class Parameter:
             )
 
     @property
+    def structural(self) -> bool:
+        """Whether each of its values makes a scene of its own."""
+        return self.whole
+
+    @property
     def levels(self) -> int | None:
         """The number of its values; None: continuous."""
         return int(self.high - self.low) + 1 if self.whole else None
@@ -108,17 +114,29 @@ class Parameter:
 
 @dataclass(frozen=True, init=False)
 class Choice:
-    """One of several options, such as promoters: `Choice("promoter", ("weak", "strong"))`. Each
-    option makes its own scene.
+    """One of several options, such as promoters: `Choice("promoter", ("weak", "strong"))`.
 
     name: of an argument of the scene function. options: at least two, all different, each a text, a
-    number, True or False, so that a file can store it. Raises InputError for other options.
+    number, True or False, so that a file can store it. per_colony: the scene function takes a list
+    with one option for each colony, as it takes numbers, so that all designs share a batch. By
+    default each option makes its own scene. resolve: where choices exclude each other, a function
+    from the values of a design to those of these choices that stand; all of them share it. Raises
+    InputError for other options.
     """
 
     name: str
     options: tuple[Value, ...]
+    per_colony: bool
+    resolve: Resolve | None = field(compare=False, repr=False)
 
-    def __init__(self, name: str, options: Sequence[Value]):
+    def __init__(
+        self,
+        name: str,
+        options: Sequence[Value],
+        *,
+        per_colony: bool = False,
+        resolve: Resolve | None = None,
+    ):
         _check_name("Choice", name)
         listed = isinstance(options, Sequence) and not isinstance(options, str)
         odd = [o for o in options if not isinstance(o, (str, bool, int, float))] if listed else []
@@ -138,6 +156,13 @@ class Choice:
             )
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "options", tuple(options))
+        object.__setattr__(self, "per_colony", per_colony)
+        object.__setattr__(self, "resolve", resolve)
+
+    @property
+    def structural(self) -> bool:
+        """Whether each of its options makes a scene of its own."""
+        return not self.per_colony
 
     @property
     def levels(self) -> int:
@@ -181,6 +206,9 @@ class Space:
             raise checks.input_error("parameters", twice[0], "named once")
         self.size = len(self.parameters)
         self.levels = tuple(p.levels for p in self.parameters)
+        self._resolving = dict.fromkeys(
+            p.resolve for p in self.parameters if isinstance(p, Choice) and p.resolve is not None
+        )
 
     @property
     def moving(self) -> list[int]:
@@ -189,7 +217,10 @@ class Space:
 
     def values(self, point: np.ndarray) -> dict[str, Value]:
         """The values of one design by name, from its coordinates (D,)."""
-        return {p.name: p.value(float(u)) for p, u in zip(self.parameters, point, strict=True)}
+        found = {p.name: p.value(float(u)) for p, u in zip(self.parameters, point, strict=True)}
+        for resolve in self._resolving:
+            found |= resolve(found)
+        return found
 
     def point(self, values: Mapping[str, Value]) -> np.ndarray:
         """The coordinates (D,) of one design, from its values by name."""

@@ -12,9 +12,15 @@ import torch
 
 import torchfilm as tf
 from design import colonies
-from design.parameters import Parameter, Space, Value
+from design.parameters import Choice, Parameter, Space, Value
 from design.targets.base import Target
 from torchfilm import checks
+
+
+class UnfitDesign(tf.InputError):
+    """A scene function raises it for a design that cannot work, with the reason. The design is
+    scored as failed and not grown. The trial before a search passes over it, as long as other
+    designs can be built."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +46,18 @@ class SceneFamily:
         repeat: int = 1,
         turns: Sequence[Mapping[str, float]] | None = None,
     ) -> tf.Scene:
-        """One scene for several designs whose structure is the same. A number becomes one value per
-        colony; each design has `repeat` colonies. turns: for each design, the derivatives that
-        its values carry as tangents, by name; those that are not named carry 0."""
+        """One scene for several designs whose structure is the same. A number, or a choice that is
+        made per colony, becomes one value per colony; each design has `repeat` colonies. turns: for
+        each design, the derivatives that its values carry as tangents, by name; those that are not
+        named carry 0."""
         arguments = dict(self.fixed)
         for parameter in self.space.parameters:
             name = parameter.name
-            if parameter.levels is not None:
+            if parameter.structural:
                 arguments[name] = values[0][name]
+                continue
+            if isinstance(parameter, Choice):
+                arguments[name] = [design[name] for design in values for _ in range(repeat)]
                 continue
             arguments[name] = self._column([design[name] for design in values], repeat)
             if turns is not None:
@@ -133,10 +143,12 @@ def try_scenes(
     option; check the target on each first state.
 
     cells: the number that must be reachable, or None. Raises InputError where a scene cannot be
-    built, where the target does not suit it, and where no scene can reach `cells` cells.
+    built, where the target does not suit it, where no scene can reach `cells` cells, and where all
+    these designs are unfit.
     """
     middle = {p.name: p.value(0.5) for p in family.space.parameters}
-    made_of, endless = [], []
+    made_of, endless, unfit = [], [], []
+    example: tf.Scene | None = None
     for values in _trial_values(family.space, middle):
         try:
             # two colonies: a tensor with one number would pass for a plain number
@@ -144,6 +156,9 @@ def try_scenes(
             tried = colonies.try_scene(
                 scene, 2, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=cells
             )
+        except UnfitDesign as error:
+            unfit.append(str(error))
+            continue
         except Exception as error:
             changed = {n: v for n, v in values.items() if v != middle[n]} or values
             raise tf.InputError(
@@ -153,12 +168,13 @@ def try_scenes(
                 " per colony."
             ) from error
         target.check(tried.first)
+        example = example or family.scene([values])
         made_of.append((scene.effects, scene.founders))
         endless.append(tried.why_endless)
     # one design that does not grow is scored as such; a search in which none grows is a mistake
-    if all(endless):
-        raise tf.InputError(endless[0])
-    scene = family.scene([middle])
+    if example is None or all(endless):
+        raise tf.InputError(unfit[0] if example is None else endless[0])
+    scene = example
     why_regrown = colonies.try_scene(
         scene, 1, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=None
     ).why_regrown

@@ -16,6 +16,7 @@ from design import colonies, memory
 from design.derivatives import Gathered
 from design.parameters import Value
 from design.rollout import FinishedColonies, grow
+from design.scene_family import UnfitDesign
 from design.slopes import Slopes, joined
 from design.targets.base import Target
 from design.targets.goals import Goals
@@ -67,12 +68,13 @@ def cut_work_items(
         tuple(range(len(values))), tuple(values), None if turns is None else tuple(turns)
     )
     colonies_each = replicates * (1 if turns is None else len(turns[0]))
-    structural = [p.name for p in task.space.parameters if p.levels is not None]
+    structural = [p.name for p in task.space.parameters if p.structural]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row, design in enumerate(values):
         groups.setdefault(tuple(repr(design[n]) for n in structural), []).append(row)
     out = []
-    for rows in groups.values():
+    apart = (_unfit_apart(task, values, rows) for rows in groups.values())
+    for rows in itertools.chain.from_iterable(apart):
         most = task.most or _max_colonies(task, [values[r] for r in rows], size)
         wanted = max(
             math.ceil(len(rows) / max(1, most // colonies_each)),
@@ -82,6 +84,28 @@ def cut_work_items(
         cuts = [len(rows) * k // count for k in range(count + 1)]  # as even as possible
         out += [whole.take(rows[a:b]) for a, b in itertools.pairwise(cuts)]
     return out
+
+
+def _unfit_apart(
+    task: Task, values: Sequence[dict[str, Value]], rows: list[int]
+) -> list[list[int]]:
+    """The rows of designs with the same structure, each unfit one by itself: it must not cut the
+    batch of the others in halves."""
+
+    def is_unfit(among: list[int]) -> bool:
+        try:
+            task.family.scene([values[row] for row in among])
+        except UnfitDesign:
+            return True
+        except tf.InputError:  # `run_work_item` finds the design that the scene refuses
+            return False
+        return False
+
+    if not is_unfit(rows):
+        return [rows]
+    unfit = [row for row in rows if is_unfit([row])]
+    fit = [row for row in rows if row not in unfit]
+    return [*([fit] if fit else []), *([row] for row in unfit)]
 
 
 def _max_colonies(task: Task, values: Sequence[dict[str, Value]], size: float) -> int:
