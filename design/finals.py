@@ -187,10 +187,15 @@ class FinalsRun:
         """The best designs of the search, no two of them alike."""
         full = self.study.full()
         rows = [(float(e.loss[k]), e.points[k]) for e in full for k in range(len(e.loss))]
+        space = self.task.space
         out: list[np.ndarray] = []
+        places: list[np.ndarray] = []
         for _, point in sorted(rows, key=lambda row: row[0]):
-            if all(np.abs(point - other).max() >= ALIKE for other in out):
+            # several points may stand for one design: that of its values
+            place = space.point(space.values(point))
+            if all(np.abs(place - other).max() >= ALIKE for other in places):
                 out.append(point)
+                places.append(place)
                 if len(out) == self.finals.most:
                     break
         return out
