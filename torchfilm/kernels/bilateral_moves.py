@@ -36,10 +36,11 @@ def _depth_after(kind, place, size, x, axis, length, radius, move, share, turn, 
     """The gap of a capsule's deepest point to a wall after a share of its move (D,), in which it
     would turn by the angle `turn`."""
     D, d = degrees(dof), x.shape[0]
-    at, way = x.copy(), axis.copy()
+    at, way, turns = x.copy(), axis.copy(), share * move[d : D - 1]
     for k in range(d):
         at[k] += share * move[k]
-    rotate(way, share * move[d : D - 1], share * turn)
+    ty, tz = (turns[1], turns[2]) if d == 3 else (0.0, 0.0)
+    rotate(way.reshape(1, d), 0, turns[0], ty, tz, share * turn, dof)
     return _depth(kind, place, size, at, way, 0.5 * (length + share * move[D - 1]), radius)
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from torchfilm.kernels.compiling import kernel
 
 
-@kernel
+@kernel(inline=True)
 def clamp(x, half):
     """x, limited to −half … half."""
     return min(max(x, -half), half)
 
 
-@kernel
+@kernel(inline=True)
 def squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s, t):
     """Of the points s and t of two centrelines. b: from centre to centre; a, c: the axes."""
     dx = bx + t * cx - s * ax
@@ -20,7 +20,7 @@ def squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s, t):
     return dx * dx + dy * dy + dz * dz
 
 
-@kernel
+@kernel(inline=True)
 def closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b):
     """Arc lengths s and t of the closest points, and their squared distance.
 
@@ -51,14 +51,14 @@ def closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b):
     return s, t, best
 
 
-@kernel
+@kernel(inline=True)
 def end_of(s, half):
     """+1 or −1 at an end of the centreline, else 0."""
     slack = 1e-6 * half + 1e-9
     return (1.0 if s >= half - slack else 0.0) - (1.0 if s <= slack - half else 0.0)
 
 
-@kernel
+@kernel(inline=True)
 def end_while_sliding(s, free, half, radius, slide):
     """`end_of` for a contact that may be a line, as in `physics.contacts`."""
     if slide <= 0:

@@ -101,21 +101,23 @@ def announce(name: str, what: str) -> bool:
     return True
 
 
-def kernel(function=None, *, any_order: bool = False):
+def kernel(function=None, *, any_order: bool = False, inline: bool = False):
     """Compile a function at its first call with new types, without the interpreter's lock.
 
     Sums keep their order, unless any_order: then the compiler may choose one, the same for all
     calls with as many terms. Such a function must not write to arrays: the order would depend on
-    how near to each other they lie in memory.
+    how near to each other they lie in memory. inline: compile it into its callers; a call with
+    many arrays costs more than the work of a short function.
     """
     if function is None:
-        return partial(kernel, any_order=any_order)
+        return partial(kernel, any_order=any_order, inline=inline)
     before = config.CACHE_DIR
     config.CACHE_DIR = "" if FOLDER is None else str(FOLDER)
     fast = {"reassoc", "contract", "nsz"} if any_order else False
     try:
-        return numba.njit(nogil=True, cache=FOLDER is not None, error_model="numpy", fastmath=fast)(
-            function
-        )
+        return numba.njit(
+            nogil=True, cache=FOLDER is not None, error_model="numpy", fastmath=fast,
+            forceinline=inline,
+        )(function)  # fmt: skip
     finally:
         config.CACHE_DIR = before

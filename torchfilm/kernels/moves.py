@@ -25,32 +25,28 @@ def drags(length, radius, viscosity, length_drag, growth, scale, dof):
         scale[i, D - 1] = 1.0 / math.sqrt(length_drag[i]) if growth[i] > 0 else 0.0
 
 
-@kernel
-def rotate(axis, turn, angle):
-    """Rotate a unit axis (d,) in place by a rotation vector, (3,), or (1,) in the plane, of this
-    size."""
+@kernel(inline=True)
+def rotate(axis, i, tx, ty, tz, angle, dof):
+    """Rotate the unit axis of cell i, in place, by a rotation vector of this size; in the plane by
+    the angle tx."""
     sinc, versine = 1.0, 0.5
     if angle > 1e-4:
         sinc, versine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
-    ax, ay = axis[0], axis[1]
-    if axis.shape[0] == 2:
-        t = turn[0]
-        bx, by = (
-            ax - sinc * t * ay - versine * t * t * ax,
-            ay + sinc * t * ax - versine * t * t * ay,
-        )
+    ax, ay = axis[i, 0], axis[i, 1]
+    if len(dof) == 4:
+        bx = ax - sinc * tx * ay - versine * tx * tx * ax
+        by = ay + sinc * tx * ax - versine * tx * tx * ay
         size = math.sqrt(bx * bx + by * by)
-        axis[0], axis[1] = bx / size, by / size
+        axis[i, 0], axis[i, 1] = bx / size, by / size
     else:
-        az = axis[2]
-        tx, ty, tz = turn[0], turn[1], turn[2]
+        az = axis[i, 2]
         ux, uy, uz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
         wx, wy, wz = ty * uz - tz * uy, tz * ux - tx * uz, tx * uy - ty * ux
         bx = ax + sinc * ux + versine * wx
         by = ay + sinc * uy + versine * wy
         bz = az + sinc * uz + versine * wz
         size = math.sqrt(bx * bx + by * by + bz * bz)
-        axis[0], axis[1], axis[2] = bx / size, by / size, bz / size
+        axis[i, 0], axis[i, 1], axis[i, 2] = bx / size, by / size, bz / size
 
 
 @kernel
@@ -80,7 +76,8 @@ def move_cells(x, axis, length, y, scale, about, bound, least, dof):
         for k in range(d, D - 1):
             y[i, k] *= turn * scale[i, k]
         y[i, D - 1] *= scale[i, D - 1]
-        rotate(axis[i], y[i, d : D - 1], angle * turn)
+        ty, tz = (y[i, d + 1], y[i, d + 2]) if d == 3 else (0.0, 0.0)
+        rotate(axis, i, y[i, d], ty, tz, angle * turn, dof)
         length[i] = max(length[i] + y[i, D - 1], least[i])
     return clipped
 

@@ -87,7 +87,7 @@ def _apart(ax, ay, az, cx, cy, cz, d):
     return nx, ny, nz
 
 
-@kernel
+@kernel(inline=True)
 def _put_half(H, h, i, weight, s, end, nx, ny, nz, axis, scale, dof):
     """One half of a row: weight · (n, q × n, ∂) · M^(−½) for a point at arc length s."""
     D = degrees(dof)
@@ -107,7 +107,7 @@ def _put_half(H, h, i, weight, s, end, nx, ny, nz, axis, scale, dof):
     H[h, D - 1] = weight * 0.5 * end * along * scale[i, D - 1]
 
 
-@kernel
+@kernel(inline=True)
 def _put_pair(H, gaps, r, i, j, x, axis, half, radius, scale, s, t, end_a, end_b, weight, dof):
     """The row of two cells at the points s and t of their centrelines."""
     d = 2 if len(dof) == 4 else 3
@@ -201,7 +201,7 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
     return r
 
 
-@kernel
+@kernel(inline=True)
 def wall_gap(kind, place, size, px, py, pz):
     """Distance of a point to a wall, µm, and the direction to the wall.
 

@@ -51,13 +51,15 @@ def add_product(H, one, two, on, p, out, dof):
         add_scaled(out, j, t, H, h + 1, dof)
 
 
-@kernel
+@kernel(inline=True)
 def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, floor, dof):
     """The inverse of cell i's own block of JᵀAJ + α, worked out in B in float64; 0 in its last row
     and column where the length is held. The diagonal is raised by its share `floor`: rounding must
     leave it positive definite. Returns the entry of the length."""
     end = degrees(dof) - 1
-    B[:] = 0.0
+    for k in range(len(dof)):
+        for m in range(len(dof)):
+            B[k, m] = 0.0
     for q in range(begin[i], begin[i + 1]):
         h = halves[q]
         if act[h >> 1]:
@@ -66,14 +68,15 @@ def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, floor, dof):
         B[k, k] = B[k, k] * (1 + floor) + alpha
     own = B[end, end]
     if held:
-        B[end], B[:, end] = 0.0, 0.0
+        for k in range(end):
+            B[end, k] = B[k, end] = 0.0
         B[end, end] = 1.0
     invert(B, dof)
     if held:
         B[end, end] = 0.0
-    block, found = inverse[i].reshape(-1), B.reshape(-1)
-    for k in range(block.shape[0]):
-        block[k] = found[k]
+    for k in range(len(dof)):
+        for m in range(len(dof)):
+            inverse[i, k, m] = B[k, m]
     return own
 
 
