@@ -123,7 +123,7 @@ def test_no_cells_come_nearer_than_told(dim, spread, own):
     y[:, turns.stop] = 0.1 * own * rng.uniform(-1, 1, 60)
     margin, every = 100.0, np.array(list(itertools.combinations(range(60), 2)), np.int32)
     first, second = every.T.copy()
-    gaps = lambda: rows.near_contacts(x, axis, half, radius, first, second, margin)[2]
+    gaps = lambda: rows.near_contacts(x, axis, half, radius, first, second, margin, dof)[2]
     before, length = gaps(), 2 * half
     scale, least = np.ones_like(y), np.zeros(60)
     moves.move_cells(x, axis, length, y, scale, np.zeros_like(y), 1e9, least, dof)

@@ -84,7 +84,7 @@ def _contacts(x, axis, half, radius, hold, dof):
     `near_contacts`."""
     margin = 2.0 * max(CANDIDATE, 0.5 * NEAR * hold) * radius.max()
     first, second = near_pairs(x, axis, half, radius, margin, dof)
-    keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin)
+    keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin, dof)
     return first, second, keep, points, gap
 
 

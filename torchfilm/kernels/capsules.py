@@ -12,32 +12,49 @@ def clamp(x, half):
 
 
 @kernel(inline=True)
-def squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s, t):
+def dot_of(ax, ay, az, bx, by, bz, dof):
+    """a · b; in the plane without the third components."""
+    if len(dof) == 4:
+        return ax * bx + ay * by
+    return ax * bx + ay * by + az * bz
+
+
+@kernel(inline=True)
+def squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s, t, dof):
     """Of the points s and t of two centrelines. b: from centre to centre; a, c: the axes."""
     dx = bx + t * cx - s * ax
     dy = by + t * cy - s * ay
     dz = bz + t * cz - s * az
-    return dx * dx + dy * dy + dz * dz
+    return dot_of(dx, dy, dz, dx, dy, dz, dof)
 
 
 @kernel(inline=True)
-def closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b):
+def squared_sine(ax, ay, az, cx, cy, cz, dof):
+    """Of the angle between two axes."""
+    nz = ax * cy - ay * cx
+    if len(dof) == 4:
+        return nz * nz
+    nx, ny = ay * cz - az * cy, az * cx - ax * cz
+    return nx * nx + ny * ny + nz * nz
+
+
+@kernel(inline=True)
+def closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b, dof):
     """Arc lengths s and t of the closest points, and their squared distance.
 
     The nearest of five candidates, as in `physics.contacts.closest_points`.
     """
-    cosine = ax * cx + ay * cy + az * cz
-    on_a = bx * ax + by * ay + bz * az
-    on_b = bx * cx + by * cy + bz * cz
-    nx, ny, nz = ay * cz - az * cy, az * cx - ax * cz, ax * cy - ay * cx
-    sine2 = nx * nx + ny * ny + nz * nz
+    cosine = dot_of(ax, ay, az, cx, cy, cz, dof)
+    on_a = dot_of(bx, by, bz, ax, ay, az, dof)
+    on_b = dot_of(bx, by, bz, cx, cy, cz, dof)
+    sine2 = squared_sine(ax, ay, az, cx, cy, cz, dof)
     s = 0.0
     if sine2 >= 1e-12:
         s = (on_a - cosine * on_b) / sine2
     s = clamp(s, half_a)
     t = clamp(cosine * s - on_b, half_b)
     s = clamp(cosine * t + on_a, half_a)
-    best = squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s, t)
+    best = squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s, t, dof)
     for k in range(4):
         if k < 2:
             s1 = half_a if k == 0 else -half_a
@@ -45,7 +62,7 @@ def closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b):
         else:
             t1 = half_b if k == 2 else -half_b
             s1 = clamp(cosine * t1 + on_a, half_a)
-        d2 = squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s1, t1)
+        d2 = squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s1, t1, dof)
         if d2 < best:
             best, s, t = d2, s1, t1
     return s, t, best

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from torchfilm.kernels.capsules import closest_points
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import MAX_TURN
@@ -112,3 +113,41 @@ def approach(x, length, radius, y, dof):
         half = 0.5 * (length[i] + abs(y[i, end]))
         own = max(own, math.sqrt(rest) + half * math.sqrt(turn) + 0.5 * abs(y[i, end]))
     return abs(stretch) * (longest + 2 * own) + 2 * own
+
+
+@kernel(inline=True)
+def _own_way(i, half, before, y, d, end):
+    """How far, at most, points of cell i have come by turning and by its change of length, µm."""
+    turn = 0.0
+    for k in range(d, end):
+        turn += y[i, k] ** 2
+    return half[i] * math.sqrt(turn) + abs(half[i] - before[i])
+
+
+@kernel
+def any_deeper(x, axis, half, radius, y, before, found, deep, dof):
+    """Whether a contact is deeper than `deep` after the move y of `move_cells`. found: the contacts
+    before it, of `near_contacts`; before: half lengths then. Only pairs that may have come so near
+    are looked at closely."""
+    first, second, keep, _, gap = found
+    d, end = 2 if len(dof) == 4 else 3, degrees(dof) - 1
+    for k in range(keep.shape[0]):
+        i, j = first[keep[k]], second[keep[k]]
+        way, far = 0.0, 0.0
+        for c in range(d):
+            way += (y[i, c] - y[j, c]) ** 2
+            far += abs(y[i, c])
+        way = math.sqrt(way) + _own_way(i, half, before, y, d, end)
+        way += _own_way(j, half, before, y, d, end)
+        if gap[k] - way > -deep + 1e-5 * (1.0 + far):  # more than y is rounded by
+            continue
+        bz = x[j, 2] - x[i, 2] if d == 3 else 0.0
+        az = axis[i, 2] if d == 3 else 0.0
+        cz = axis[j, 2] if d == 3 else 0.0
+        _, _, d2 = closest_points(
+            x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], bz,
+            axis[i, 0], axis[i, 1], az, axis[j, 0], axis[j, 1], cz, half[i], half[j], dof,
+        )  # fmt: skip
+        if math.sqrt(d2) - (radius[i] + radius[j]) < -deep:
+            return True
+    return False

@@ -16,6 +16,7 @@ from torchfilm.kernels.capsules import (
     end_of,
     end_while_sliding,
     squared_distance,
+    squared_sine,
 )
 from torchfilm.kernels.compiling import kernel
 
@@ -32,9 +33,9 @@ def degrees(dof):
 
 
 @kernel
-def near_contacts(x, axis, half, radius, first, second, margin):
+def near_contacts(x, axis, half, radius, first, second, margin, dof):
     """The pairs nearer than margin: their number, closest points and gap, µm."""
-    m, d = first.shape[0], x.shape[1]
+    m, d = first.shape[0], 2 if len(dof) == 4 else 3
     keep, points, gap = np.empty(m, np.int32), np.empty((m, 2)), np.empty(m)
     found = 0
     for k in range(m):
@@ -44,7 +45,7 @@ def near_contacts(x, axis, half, radius, first, second, margin):
         cz = axis[j, 2] if d == 3 else 0.0
         s, t, d2 = closest_points(
             x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], bz,
-            axis[i, 0], axis[i, 1], az, axis[j, 0], axis[j, 1], cz, half[i], half[j],
+            axis[i, 0], axis[i, 1], az, axis[j, 0], axis[j, 1], cz, half[i], half[j], dof,
         )  # fmt: skip
         touching = radius[i] + radius[j]
         if d2 < (touching + margin) * (touching + margin):
@@ -154,8 +155,7 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
         az = cz = bz = 0.0
         if d == 3:
             az, cz, bz = axis[i, 2], axis[j, 2], x[j, 2] - x[i, 2]
-        ux, uy, uz = ay * cz - az * cy, az * cx - ax * cz, ax * cy - ay * cx
-        sine2 = ux * ux + uy * uy + uz * uz
+        sine2 = squared_sine(ax, ay, az, cx, cy, cz, dof)
         slide = 1.0 - sine2 / (LINE_CONTACT_SINE * LINE_CONTACT_SINE)
         ha, hb, ra, rb = half[i], half[j], radius[i], radius[j]
         low = high = project = offset = sign = cosine = 0.0
@@ -179,7 +179,7 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
         share = min((high - low) / (0.5 * (ra + rb)), 1.0)
         swing = 0.5 * (high - low) * math.sqrt(sine2)
         if swing > 1e-6 * ra:
-            apart = math.sqrt(squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s0, t0))
+            apart = math.sqrt(squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s0, t0, dof))
             share *= min(apart / swing, 1.0)
         slide = slide * slide * share
         end_a0 = end_while_sliding(s0, cosine * t0 + bx * ax + by * ay + bz * az, ha, ra, slide)

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchfilm.kernels.batch import cells_of, put_back
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.moves import approach, drags, move_cells
+from torchfilm.kernels.moves import any_deeper, approach, drags, move_cells
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
 from torchfilm.kernels.rows import (
     HARD,
@@ -78,24 +78,24 @@ def _deep_cells(found, rows, walls, deep, n):
 
 
 @kernel
-def _contacts(x, axis, half, radius, margin, deep, found, listed, dof):
-    """Near pairs (first, second), and the contacts among them: see `near_contacts`.
-
-    found: those before the last move. listed: whether only its pairs can lie deeper than `deep`;
-    where they do not, they are all that is looked at.
-    """
-    first, second = found[0], found[1]
-    keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin)
-    if not (listed and _deepest(gap) >= -deep):
-        first, second = near_pairs(x, axis, half, radius, margin, dof)
-        keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin)
+def _contacts(x, axis, half, radius, margin, dof):
+    """Near pairs (first, second), and the contacts among them: see `near_contacts`."""
+    first, second = near_pairs(x, axis, half, radius, margin, dof)
+    keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin, dof)
     return first, second, keep, points, gap
 
 
 @kernel
-def _no_contacts():
-    none = np.empty(0, np.int32)
-    return none, none, none, np.empty((0, 2)), np.empty(0)
+def _contacts_after(x, axis, length, radius, y, before, margin, deep, found, dof):
+    """The contacts after the move y, and whether one of them is deeper than `deep`. Where none is,
+    they may be those before it, `found`: most need no closer look. before: half lengths then."""
+    half = 0.5 * length
+    if approach(x, length, radius, y, dof) > margin + deep:  # other pairs may have met
+        found = _contacts(x, axis, half, radius, margin, dof)
+        return found, _deepest(found[4]) < -deep
+    if any_deeper(x, axis, half, radius, y, before, found, deep, dof):
+        return _contacts(x, axis, half, radius, margin, dof), True
+    return found, False
 
 
 @kernel
@@ -123,13 +123,12 @@ def _wall_contacts(x, axis, half, radius, scale, kinds, places, sizes, root, rea
 
 @kernel
 def _numbers(x, length, scale, growth, least, last, first_pass, hardness, softer, roots, is_soft,
-             alphas, margin, alpha, low, half, reach, root, dof):  # fmt: skip
-    """α, the least scaled Δl, half length, reach of walls and weight of walls of each cell."""
+             alphas, margin, alpha, low, reach, root, dof):  # fmt: skip
+    """α, the least scaled Δl, reach of walls and weight of walls of each cell."""
     end = degrees(dof) - 1
     for i in range(x.shape[0]):
         alpha[i] = softer * (alphas[i] if alphas.shape[0] > 0 else hardness)
         low[i] = min((least[i] - length[i]) / scale[i, end], 0.0) if growth[i] > 0 else 0.0
-        half[i] = 0.5 * length[i]
         way = 0.0
         for k in range(x.shape[1]):
             way += last[i, k] * last[i, k]
@@ -181,30 +180,32 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
     hardness[0] = hardness[0] if hardness[0] > 0 else softest
     length, scale = base + growth, np.zeros(last.shape)
     least = np.maximum(base - SHRINK * np.maximum(growth, 0.0), shortest)
-    half, reach, root = np.empty_like(base), np.empty_like(base), np.empty(roots.shape)
+    half, reach, root = 0.5 * length, np.empty_like(base), np.empty(roots.shape)
     alpha, low, y = np.empty_like(last[:, 0]), np.empty_like(last[:, 0]), np.empty_like(last)
-    number, softer, rising, kept, held, kept_alpha = 0, 1.0, True, y, 0.0, 0.0
-    found, moved, listed = _no_contacts(), True, False
+    number, deeply, softer, rising, kept, held, kept_alpha = 0, False, 1.0, True, y, 0.0, 0.0
+    found = _contacts(x, axis, half, radius, margin, dof)
     while True:
         drags(length, radius, viscosity, length_drag, growth, scale, dof)
         _numbers(
             x, length, scale, growth, least, last, number == 0, hardness[0], softer, roots,
-            is_soft, alphas, margin, alpha, low, half, reach, root, dof,
+            is_soft, alphas, margin, alpha, low, reach, root, dof,
         )  # fmt: skip
         if rising:
             y[:] = np.where(scale > 0, last / np.maximum(scale, 1e-300), 0.0) * (number == 0)
-        if moved:
-            found = _contacts(x, axis, half, radius, margin, deep, found, listed, dof)
         rows, walls, deepest = _wall_contacts(
             x, axis, half, radius, scale, kinds, places, sizes, root, reach, is_soft, found, last,
             dof,
         )  # fmt: skip
         if number == 0:
             report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(found, radius)
-        elif min(deepest, _deepest(found[4])) >= -deep or number == passes or settings[SOFT] > 0:
-            break
+        elif not deeply:
+            if deepest >= -deep:
+                break
+            keep = near_contacts(x, axis, half, radius, found[0], found[1], margin, dof)
+            found, deeply = (found[0], found[1], *keep), True
+            continue
         numbers, count = _deep_cells(found, rows, walls, deep, 0 if number == 0 else y.shape[0])
-        moved, m = False, pair_rows(x, axis, half, radius, scale, found, walls, rows, dof)
+        m = pair_rows(x, axis, half, radius, scale, found, walls, rows, dof)
         iterations, error, e = _minimise_some(
             rows, m, numbers, count, alpha, low, y, tolerance, 2 * target, settings[LIMIT], dof
         )
@@ -231,8 +232,13 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
         about = last * (number == 0 and np.any(rows[1][:m] < 0))  # without a push nothing moves
         report[CLIPPED] = move_cells(x, axis, length, y, scale, about, margin, least, dof)
         last[:] = y if number == 0 else last
-        listed = approach(x, length, radius, y, dof) <= margin + deep
-        moved, number, softer, rising = True, number + 1, 1.0, True
+        number, softer, rising = number + 1, 1.0, True
+        if number == passes or settings[SOFT] > 0:
+            break
+        found, deeply = _contacts_after(x, axis, length, radius, y, half, margin, deep, found, dof)
+        if not deeply and kinds.shape[0] == 0:
+            break
+        half = 0.5 * length
     return length
 
 
