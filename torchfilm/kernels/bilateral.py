@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.batch import cells_of, put_back
+from torchfilm.kernels.batch import cells_of, doubles_of, put_back
 from torchfilm.kernels.bilateral_moves import make_moves
 from torchfilm.kernels.bilateral_scheme import CANDIDATE, CLOSE, DEEP, NEAR, PENALTY
 from torchfilm.kernels.bilateral_scheme import TOLERANCE as USUAL_TOLERANCE
@@ -226,11 +226,9 @@ def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosit
             continue
         of = spatial_order(x[begin[b] : begin[b + 1]], 6.0 * radius[begin[b]]) + begin[b]
         own_x, own_axis, own_start, own_roots = cells_of(of, x, axis, last, roots, dof)
-        own_length = length[of].astype(np.float64)
-        share = growth[of].astype(np.float64) / steps[b]
-        own_radius = radius[of].astype(np.float64)
-        own_viscosity = viscosity[of].astype(np.float64)
-        own_drag = length_drag[of].astype(np.float64)
+        own_length, share = doubles_of(of, length), doubles_of(of, growth) / steps[b]
+        own_radius, own_viscosity = doubles_of(of, radius), doubles_of(of, viscosity)
+        own_drag = doubles_of(of, length_drag)
         own_alpha, own_last = alphas[of], own_start.copy()
         coarse = steps[b] > 1
         penalty = np.minimum(own_alpha * own_drag / PENALTY, 1.0)

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.batch import cells_of, put_back
+from torchfilm.kernels.batch import cells_of, doubles_of, put_back
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.moves import any_deeper, approach, drags, move_cells
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
@@ -138,6 +138,15 @@ def _numbers(x, length, scale, growth, least, last, first_pass, hardness, softer
 
 
 @kernel
+def _put_start(y, last, scale, first_pass):
+    """Puts the scaled move from which a pass starts into y: the last one, or that of a repeated
+    pass, 0."""
+    for i in range(y.shape[0]):
+        for k in range(y.shape[1]):
+            y[i, k] = last[i, k] / scale[i, k] if first_pass and scale[i, k] > 0 else 0.0
+
+
+@kernel
 def _minimise_some(rows, m, numbers, count, alpha, low, y, tolerance, cap, limit, dof):
     """Minimise from y with the first m of the rows: for all cells, where no numbers are given; or,
     in a later pass, in which soft walls have already pushed, for the numbered cells among the
@@ -191,7 +200,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
             is_soft, alphas, margin, alpha, low, reach, root, dof,
         )  # fmt: skip
         if rising:
-            y[:] = np.where(scale > 0, last / np.maximum(scale, 1e-300), 0.0) * (number == 0)
+            _put_start(y, last, scale, number == 0)
         rows, walls, deepest = _wall_contacts(
             x, axis, half, radius, scale, kinds, places, sizes, root, reach, is_soft, found, last,
             dof,
@@ -298,16 +307,13 @@ def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosit
             continue
         of = spatial_order(x[begin[b] : begin[b + 1]], 6.0 * radius[begin[b]]) + begin[b]
         own_x, own_axis, own_last, own_roots = cells_of(of, x, axis, last, roots, dof)
-        own_length = length[of].astype(np.float64)
-        share = growth[of].astype(np.float64) / steps[b]
+        own_length, share = doubles_of(of, length), doubles_of(of, growth) / steps[b]
         own_settings = settings.copy()
         if steps[b] > 1 and settings[DEEP] <= 0:
             own_settings[DEEP] = DEEP_IN_SUBSTEPS * radius[begin[b] : begin[b + 1]].mean()
-        own_radius = radius[of].astype(np.float64)
-        own_viscosity = viscosity[of].astype(np.float64)
-        own_drag = length_drag[of].astype(np.float64)
+        own_radius, own_viscosity = doubles_of(of, radius), doubles_of(of, viscosity)
+        own_drag, own_shortest = doubles_of(of, length_drag), doubles_of(of, shortest)
         own_alphas = alphas[of] if alphas.shape[0] else alphas
-        own_shortest = shortest[of].astype(np.float64)
         for _ in range(steps[b]):
             own_length = step_colony(
                 own_x, own_axis, own_length, share, own_radius, own_viscosity, own_drag,
