@@ -13,7 +13,7 @@ from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.ragged import offsets
+from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, places
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
@@ -256,7 +256,7 @@ def divide(state: State, due: Tensor, fraction: Resolved, axis_noise: Resolved) 
     (parent_rows,) = places(due)
     whole = state.cells + parent_rows.numel()
     every = torch.arange(state.cells, device=state.device)
-    source = torch.repeat_interleave(every, copies, output_size=whole)
+    source = repeated(every, copies, whole)
     first = torch.cumsum(copies, 0).index_select(0, parent_rows) - 2
     second = first + 1
     parents = state.take(parent_rows)
@@ -304,7 +304,8 @@ def _with_noise(new: State, daughters: Tensor, axis_noise: Resolved) -> Tensor:
     sd = axis_noise.of_rows(new, daughters, "axis_noise").unsqueeze(1)
     noise = sd * new.normal(daughters, "Division.axis_noise")[:, : new.dim]
     axis = new.axis.index_select(0, daughters) + noise
-    axis = torch.where(sd > 0, axis / (axis * axis).sum(1, keepdim=True).sqrt(), axis)
+    # not sqrt, for which torch wakes all threads on the CPU
+    axis = torch.where(sd > 0, axis * (axis * axis).sum(1, keepdim=True).rsqrt(), axis)
     return new.axis.index_copy(0, daughters, axis)
 
 

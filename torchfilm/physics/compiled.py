@@ -59,16 +59,16 @@ def contact_steps(given: StepInput) -> StepResult:
         *([] if isinstance(given.settings, ContactSettings) else [as_array(given.shortest, dtype)]),
         numbers, reports, (0,) * (4 if given.settings.dim == 2 else 8),
     )  # fmt: skip
-    for done in _started(step_colonies, begin, counts.numpy(), arguments):
-        done()
+    _call(step_colonies, begin, counts.numpy(), arguments)
     if new:
         keep(name)
     _called.add(name)
-    column = lambda k: torch.from_numpy(reports[:, k].astype(np.int64))
+    error = torch.from_numpy(reports[:, kernels.ERROR].copy())
+    reports[:, kernels.ERROR] = 0  # may be no number; the others are integers
+    whole = torch.from_numpy(reports.T.astype(np.int64)).unbind()
     return StepResult(
-        position, axis, length, move, hardness, column(kernels.STATUS),
-        column(kernels.ITERATIONS), torch.from_numpy(reports[:, kernels.ERROR].copy()),
-        column(kernels.PASSES), column(kernels.CLIPPED), column(kernels.DEEPLY),
+        position, axis, length, move, hardness, whole[kernels.STATUS], whole[kernels.ITERATIONS],
+        error, whole[kernels.PASSES], whole[kernels.CLIPPED], whole[kernels.DEEPLY],
     )  # fmt: skip
 
 
@@ -91,23 +91,25 @@ def _kernel_of(settings: OneSidedSettings | ContactSettings):
     return step_colonies, np.array(numbers, dtype=np.float64)
 
 
-def _started(kernel, begin: np.ndarray, counts: np.ndarray, arguments: tuple):
-    """Calls that return when a share of the colonies is done. Colonies never meet, so the result
-    does not depend on the number of threads."""
+def _call(kernel, begin: np.ndarray, counts: np.ndarray, arguments: tuple) -> None:
+    """Call the kernel for all colonies, shared among threads, of which this is one. Colonies never
+    meet, so the result does not depend on the number of threads."""
     threads = min(torch.get_num_threads(), counts.size)
     if threads < 2 or begin[-1] < WORTH_THREADS:
         kernel(np.arange(counts.size), *arguments)
-        return []
+        return
     # the largest first, each to the thread with the least work
     work = [0] * threads
     shares: list[list[int]] = [[] for _ in range(threads)]
-    for colony in np.argsort(-counts, kind="stable"):
+    for colony in np.argsort(-counts, kind="stable").tolist():
         least = work.index(min(work))
         work[least] += int(counts[colony])
         shares[least].append(colony)
-    return [
-        pool(threads).submit(kernel, np.array(s, np.int64), *arguments).result for s in shares if s
-    ]
+    own, *others = [np.array(share, np.int64) for share in shares]
+    calls = [pool(threads).submit(kernel, share, *arguments) for share in others]
+    kernel(own, *arguments)
+    for call in calls:
+        call.result()
 
 
 def _walls(given: StepInput) -> tuple[np.ndarray, ...]:
@@ -116,12 +118,12 @@ def _walls(given: StepInput) -> tuple[np.ndarray, ...]:
     from torchfilm.kernels import rows
 
     surfaces, colonies = given.surfaces, given.groups.size
-    ids = given.ids
     kinds = np.zeros(len(surfaces), np.int64)
     places = np.zeros((len(surfaces), colonies, 3))
     sizes = np.zeros((len(surfaces), colonies))
     roots = np.ones((len(surfaces), given.radius.shape[0]))
     soft = np.zeros(len(surfaces), np.uint8)
+    ids = given.ids if surfaces else None
     for k, (surface, (kind, value)) in enumerate(zip(surfaces, given.walls, strict=True)):
         if isinstance(surface, FlatSurface):
             place, size, kinds[k] = surface.normal, surface.offset, rows.FLAT
@@ -137,7 +139,7 @@ def _walls(given: StepInput) -> tuple[np.ndarray, ...]:
     return kinds, places, sizes, roots, soft
 
 
-def _of_colonies(given: float | Tensor, ids: Tensor):
+def _of_colonies(given: float | Tensor, ids: Tensor | None):
     """A wall's number for each colony of the batch."""
     if not isinstance(given, Tensor):
         return given

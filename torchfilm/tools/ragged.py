@@ -45,6 +45,15 @@ def offsets(counts: Tensor) -> Tensor:
     return out
 
 
+def repeated(value: Tensor, count: Tensor, total: int | None = None) -> Tensor:
+    """Each integer (K,) as often as `count` (K,) says; total: how many that are, where the host
+    knows it."""
+    if value.device.type != "cpu":
+        return torch.repeat_interleave(value, count, output_size=total)
+    # torch's own wakes all threads, even for a few numbers; on a busy machine it waits for them
+    return torch.from_numpy(np.repeat(value.numpy(), count.numpy()))
+
+
 def expand_ranges(start: Tensor, count: Tensor, total: int | None = None) -> tuple[Tensor, Tensor]:
     """Write out ranges: for each i the numbers start[i] … start[i] + count[i] − 1.
 
@@ -52,7 +61,7 @@ def expand_ranges(start: Tensor, count: Tensor, total: int | None = None) -> tup
     owner is the i of each value.
     """
     number = torch.arange(count.numel(), device=count.device)
-    owner = torch.repeat_interleave(number, count, output_size=total)
+    owner = repeated(number, count, total)
     shift = start - (torch.cumsum(count, 0) - count)
     value = torch.arange(owner.numel(), device=count.device) + shift.index_select(0, owner)
     return owner, value
