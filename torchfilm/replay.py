@@ -317,8 +317,8 @@ class Replay:
         start = offsets(state.counts)[:-1].index_select(0, mine)
         first, second = firsts.index_select(0, at) + start, seconds.index_select(0, at) + start
         daughters = torch.cat([first, second])
-        parents = old.take(source.index_select(0, first))
-        births = Births(first, second, state.uid.index_select(0, daughters), parents)
+        parents = source.index_select(0, first)
+        births = Births(first, second, state.uid.index_select(0, daughters), old, parents)
         state = state.replace(births=(*state.births, births))
         # as where cells divide: what starts again does so from the parents' values of all that does
         return state.reset_at_division(daughters, self.own).with_fields(**taken)

@@ -67,12 +67,18 @@ class Field:
 @dataclass(frozen=True)
 class Births:
     """Divisions of one step: rows (M,) of both daughters in the state right after, their uids
-    (2M,), first daughters first, and the parents, M cells, as they were."""
+    (2M,), first daughters first, and the state before, with the rows (M,) of the parents in it."""
 
     first: Tensor
     second: Tensor
     uid: Tensor
-    parents: State
+    before: State
+    rows: Tensor
+
+    @cached_property
+    def parents(self) -> State:
+        """The parents, M cells, as they were."""
+        return self.before.take(self.rows)
 
 
 @dataclass(frozen=True)
@@ -377,7 +383,7 @@ class State:
         by seed, stream, uid, step, purpose."""
         return random.uniform(
             self.seed,
-            self.own_stream.index_select(0, rows),
+            self.stream.index_select(0, self.colony.index_select(0, rows)),
             self.uid.index_select(0, rows),
             self.step,
             purpose,
@@ -388,7 +394,7 @@ class State:
         """Four standard normal draws for each of the given cells, (M, 4), keyed as `uniform`."""
         return random.normal(
             self.seed,
-            self.own_stream.index_select(0, rows),
+            self.stream.index_select(0, self.colony.index_select(0, rows)),
             self.uid.index_select(0, rows),
             self.step,
             purpose,

@@ -282,7 +282,7 @@ class DivisionRule(_BoundRule):
             return state
         one = torch.zeros(1, dtype=torch.int64, device=state.device)
         twice = state.take(torch.cat([one, one]))
-        births = Births(one, one + 1, torch.cat([one, one]), state.take(one))
+        births = Births(one, one + 1, torch.cat([one, one]), state, one)
         views = _after_divide(divide, twice, births)
         self.traced_reads = tuple(sorted(_read(views)))
         self.traced_writes = tuple(sorted(views[1]._set | views[2]._set))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -14,7 +15,7 @@ from torchfilm.resolver import Resolved, Values
 from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets, repeated
-from torchfilm.tools.reads import numbers, places
+from torchfilm.tools.reads import numbers, places, reads_are_free
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 CRITERIA = ("length", "volume", "added")
@@ -207,6 +208,8 @@ class Division(Effect):
     def step(self, state: State, dt: float, values: Values) -> State:
         with torch.no_grad():
             due = self.due(state)
+            if reads_are_free(state.device) and not bool(due.any()):
+                return state
             short = due & (state.length < 2 * state.radius)
             some_due, some_short = numbers(due.any(), short.any())
             if not some_due:
@@ -252,39 +255,60 @@ def divide(state: State, due: Tensor, fraction: Resolved, axis_noise: Resolved) 
     Their lengths are (l − 2r)f and (l − 2r)(1 − f). Their outer ends are those of the parent.
     Gradients pass through.
     """
-    copies = due.long() + 1
-    (parent_rows,) = places(due)
-    whole = state.cells + parent_rows.numel()
-    every = torch.arange(state.cells, device=state.device)
-    source = repeated(every, copies, whole)
-    first = torch.cumsum(copies, 0).index_select(0, parent_rows) - 2
-    second = first + 1
-    parents = state.take(parent_rows)
+    rows, daughters, source, ids = _split(state, due)
+    length, radius, axis = (
+        x.index_select(0, rows) for x in (state.length, state.radius, state.axis)
+    )
+    share = fraction.of_rows(state, rows, "Division.fraction")
+    rest = length - 2 * radius
+    lengths = torch.cat([rest * share, rest * (1 - share)])
+    shift = 0.5 * (lengths - torch.cat([length, length]))
+    shift = torch.cat([shift[: rows.numel()], -shift[rows.numel() :]]).unsqueeze(1)
+    shift = shift * torch.cat([axis, axis])
+
     new = state.take(source)
-
-    everyone = torch.arange(parents.cells, device=state.device)
-    share = fraction.of_rows(parents, everyone, "Division.fraction")
-    rest = parents.length - 2 * parents.radius
-    length_1, length_2 = rest * share, rest * (1 - share)
-    shift_1, shift_2 = 0.5 * (length_1 - parents.length), 0.5 * (parents.length - length_2)
-    daughters = torch.cat([first, second])
-    length = new.length.index_copy(0, daughters, torch.cat([length_1, length_2]))
-    shift = torch.cat([shift_1.unsqueeze(1) * parents.axis, shift_2.unsqueeze(1) * parents.axis])
-    position = new.position.index_add(0, daughters, shift.to(new.position.dtype))
-
-    uid, parent, next_uid = _new_ids(new, daughters, parents)
-    new = new.replace(length=length, position=position, uid=uid, parent=parent, next_uid=next_uid)
-    new = new.replace(axis=_with_noise(new, daughters, axis_noise))
-    note = Ended(parents.own_colony_id, parents.uid, "divided")
     new = new.replace(
-        births=(*new.births, Births(first, second, new.uid.index_select(0, daughters), parents)),
+        length=new.length.index_copy(0, daughters, lengths),
+        position=new.position.index_add(0, daughters, shift.to(new.position.dtype)),
+        **ids,
+    )
+    first, second = daughters.chunk(2)
+    births = Births(first, second, new.uid.index_select(0, daughters), state, rows)
+    colony_id = state.colony_id.index_select(0, state.colony.index_select(0, rows))
+    note = Ended(colony_id, state.uid.index_select(0, rows), "divided")
+    new = new.replace(
+        axis=_with_noise(new, daughters, axis_noise),
+        births=(*new.births, births),
         ended=(*new.ended, note),
     )
     return new.reset_at_division(daughters, new.declared)
 
 
-def _new_ids(new: State, daughters: Tensor, parents: State) -> tuple[Tensor, Tensor, Tensor]:
-    """New uids, numbered on within each colony; the parents' uids; and each colony's next uid."""
+def _split(state: State, due: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
+    """The rows of the parents (M,), of their daughters in the new batch (2M,), from which row each
+    new cell comes (N + M,), and the new uid, parent and next_uid: see `kernels.divisions.split`."""
+    given = due, state.colony, state.uid, state.parent, state.next_uid
+    if due.device.type == "cpu" and "numba" in sys.modules:  # to load it here would cost more
+        from torchfilm.kernels.divisions import split
+
+        parts = [torch.from_numpy(x) for x in split(*(x.contiguous().numpy() for x in given))]
+        return *parts[:3], dict(zip(("uid", "parent", "next_uid"), parts[3:], strict=True))
+    copies = due.long() + 1
+    (rows,) = places(due)
+    whole = state.cells + rows.numel()
+    every = torch.arange(state.cells, device=state.device)
+    source = repeated(every, copies, whole)
+    first = torch.cumsum(copies, 0).index_select(0, rows) - 2
+    daughters = torch.cat([first, first + 1])
+    new = state.take(source)
+    parents = state.uid.index_select(0, rows)
+    ids = dict(zip(("uid", "parent", "next_uid"), _new_ids(new, daughters, parents), strict=True))
+    return rows, daughters, source, ids
+
+
+def _new_ids(new: State, daughters: Tensor, parents: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """New uids, numbered on within each colony; the parents' uids (M,); and each colony's next
+    uid."""
     is_new = torch.zeros(new.cells, dtype=torch.int64, device=new.device)
     is_new[daughters] = 1
     before = torch.cumsum(is_new, 0) - is_new
@@ -294,7 +318,7 @@ def _new_ids(new: State, daughters: Tensor, parents: State) -> tuple[Tensor, Ten
     base = new.next_uid - offsets(per_colony)[:-1]
     uid = torch.where(is_new > 0, base.index_select(0, new.colony) + before, new.uid)
     parent = new.parent.clone()
-    parent[daughters] = torch.cat([parents.uid, parents.uid])
+    parent[daughters] = torch.cat([parents, parents])
     return uid, parent, new.next_uid + per_colony
 
 

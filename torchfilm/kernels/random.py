@@ -19,12 +19,14 @@ def philox_block(a, b, c, d, p, q):
 
 
 @kernel
-def philox_words(c0, c1, c2, c3, k0, k1):
-    """c0, c1, c2: (M,) int64 words in [0, 2³²); c3, k0, k1: uint64. Returns (4, M) int64."""
-    out = np.empty((4, c0.shape[0]), np.int64)
-    for i in range(c0.shape[0]):
-        a, b, c = np.uint64(c0[i]), np.uint64(c1[i]), np.uint64(c2[i])
-        out[0, i], out[1, i], out[2, i], out[3, i] = philox_block(a, b, c, c3, k0, k1)
+def philox_words(uid, stream, step, k0, k1):
+    """uid, stream: (M,) int64; step and the key k0, k1: uint64 words in [0, 2³²). Returns (4, M)
+    int64."""
+    out, mask = np.empty((4, uid.shape[0]), np.int64), np.uint64(0xFFFFFFFF)
+    for i in range(uid.shape[0]):
+        own, of_colony = np.uint64(uid[i]), np.uint64(stream[i]) & mask
+        a, b = own & mask, own >> np.uint64(32)
+        out[0, i], out[1, i], out[2, i], out[3, i] = philox_block(a, b, of_colony, step, k0, k1)
     return out
 
 

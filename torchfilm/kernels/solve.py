@@ -269,10 +269,7 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
     iterations, that relative error, and each row's gap after the move.
     """
     n, D = y.shape[0], degrees(dof)
-    deepest = 0.0
-    for r in range(rows):
-        deepest = min(deepest, gaps[r])
-    if not deepest < 0:  # nothing pushes: such a colony does not move at all
+    if not np.any(gaps[:rows] < 0):  # nothing pushes: such a colony does not move at all
         y[:] = 0
         return 0, 0.0, gaps[:rows].copy()
     v, q = np.empty(rows, y.dtype), np.empty(rows, y.dtype)

@@ -45,15 +45,15 @@ def purpose_code(purpose: str) -> int:
 
 def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> Tensor:
     """Four independent 32-bit words for each cell: stream, uid (M,) int64 -> (4, M) int64."""
-    of_cells = (uid & MASK, (uid >> 32) & MASK, stream & MASK)
     mixed = (seed ^ (purpose_code(purpose) << 32)) & (2**64 - 1)
     key = (mixed & MASK, (mixed >> 32) & MASK)
     if uid.device.type == "cpu" and "numba" in sys.modules:  # to load it here would cost more
         from torchfilm.kernels.random import philox_words
 
         constant = [np.uint64(x) for x in (step & MASK, *key)]
-        given = [x.expand(uid.shape).contiguous().numpy() for x in of_cells]
+        given = [x.expand(uid.shape).contiguous().numpy() for x in (uid, stream)]
         return torch.from_numpy(philox_words(*given, *constant))
+    of_cells = (uid & MASK, (uid >> 32) & MASK, stream & MASK)
     return torch.stack(philox((*of_cells, torch.full_like(uid, step & MASK)), key))
 
 
