@@ -4,6 +4,7 @@ copying."""
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 
 import pytest
@@ -12,6 +13,7 @@ from helpers import ends, seeded, step
 
 import torchfilm as tf
 from torchfilm.effect import Effect
+from torchfilm.effects import division
 from torchfilm.physics import capsule
 
 
@@ -511,3 +513,22 @@ def test_exactly_two_radii_may_divide():
     """l = 2r leaves two spheres: the limit, and allowed."""
     scene = tf.Scene(tf.Division(), founders=row_of_cells(1, 1.0))
     assert step(scene, flagged(scene), 0.1).length.tolist() == [0.0, 0.0]
+
+
+def test_cells_are_split_alike_by_a_kernel_and_by_torch(monkeypatch):
+    """Colonies in which none, some and all cells are due, and one without cells."""
+    pytest.importorskip("numba")
+    counts = torch.tensor([3, 5, 0, 4])
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2))
+    one = scene.bind(4, seed=0).start()
+    rows = torch.repeat_interleave(torch.arange(4), counts)
+    state = one.take(rows).replace(
+        uid=torch.arange(12) + 7, parent=torch.arange(12) - 1, next_uid=torch.arange(4) * 100 + 20
+    )
+    due = torch.tensor([0, 0, 0, 1, 0, 1, 1, 0, 1, 1, 1, 1], dtype=torch.bool)
+    *by_kernel, ids = division._split(state, due)
+    monkeypatch.delitem(sys.modules, "numba", raising=False)
+    *by_torch, others = division._split(state, due)
+    assert by_kernel[0].tolist() == [3, 5, 6, 8, 9, 10, 11]
+    for a, b in zip([*by_kernel, *ids.values()], [*by_torch, *others.values()], strict=True):
+        assert torch.equal(a, b)

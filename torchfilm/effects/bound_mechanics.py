@@ -64,13 +64,14 @@ class BoundMechanics(BoundEffect):
             torch.maximum(status, found.status), found.iterations, found.error, found.passes,
             found.clipped, found.deeply_overlapping,
         )  # fmt: skip
-        at = (found.position, found.axis, found.length, found.move)
-        state = self._placed(state, at, base, report, steps)
-        if not self.effect.one_sided:
-            return state
-        alpha = state.groups.spread(found.hardness.to(state.dtype))
-        lost = (state.fields["compression"] + base - found.length).clamp(min=0.0)
-        return state.with_fields(contact_alpha=alpha, compression=lost)
+        fields = {"displacement": found.move}
+        if "elongation" in state.fields:
+            fields["elongation"] = found.length - base
+        if self.effect.one_sided:
+            fields["contact_alpha"] = state.groups.spread(found.hardness.to(state.dtype))
+            lost = state.fields["compression"] + base - found.length
+            fields["compression"] = lost.clamp(min=0.0)
+        return self._placed(state, found, fields, report, steps)
 
     @staticmethod
     def _own_dt(state: State, dt: float, steps: Tensor) -> Tensor:
@@ -118,22 +119,23 @@ class BoundMechanics(BoundEffect):
     def _placed(
         self,
         state: State,
-        at: tuple[Tensor, Tensor, Tensor, Tensor],
-        base: Tensor,
+        found: StepResult,
+        fields: dict[str, Tensor],
         report: ContactReport,
         steps: Tensor,
     ) -> State:
-        """The state with cells at their new position, axis and length, and their last move."""
-        position, axis, length, move = at
+        """The state with cells at their new position, axis and length, and these fields."""
         collapsed = self._collapsed_steps(state, report)
         lasting = (collapsed >= LONG) & (report.status == CONVERGED)
-        status = torch.where(lasting, COLLAPSED, report.status)
-        fields = {"displacement": move, "collapsed_steps": collapsed.index_select(0, state.colony)}
-        if "elongation" in state.fields:
-            fields["elongation"] = length - base
-        made = MechanicsReport(**{**vars(report), "status": status}, substeps=steps)
-        state = state.replace(position=position, axis=axis, length=length)
-        return state.with_fields(**fields).replace(reports={**state.reports, "mechanics": made})
+        made = MechanicsReport(
+            torch.where(lasting, COLLAPSED, report.status), report.iterations, report.residual,
+            report.passes, report.clipped, report.deeply_overlapping, steps,
+        )  # fmt: skip
+        fields["collapsed_steps"] = state.groups.spread(collapsed)
+        return state.replace(
+            position=found.position, axis=found.axis, length=found.length,
+            fields={**state.fields, **fields}, reports={**state.reports, "mechanics": made},
+        )  # fmt: skip
 
     @staticmethod
     def _collapsed_steps(state: State, report: ContactReport) -> Tensor:

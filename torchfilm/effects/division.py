@@ -19,6 +19,7 @@ from torchfilm.tools.reads import numbers, places, reads_are_free
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 CRITERIA = ("length", "volume", "added")
+NAMES = ("uid", "parent", "next_uid")  # what a division numbers anew
 
 TOO_SHORT = 1
 PIXELS = 10.0  # µm; for a longer first cell, messages say that lengths may be in pixels
@@ -291,8 +292,9 @@ def _split(state: State, due: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str,
     if due.device.type == "cpu" and "numba" in sys.modules:  # to load it here would cost more
         from torchfilm.kernels.divisions import split
 
-        parts = [torch.from_numpy(x) for x in split(*(x.contiguous().numpy() for x in given))]
-        return *parts[:3], dict(zip(("uid", "parent", "next_uid"), parts[3:], strict=True))
+        found = split(*(x.contiguous().numpy() for x in given))
+        rows, daughters, source, *ids = (torch.from_numpy(x) for x in found)
+        return rows, daughters, source, dict(zip(NAMES, ids, strict=True))
     copies = due.long() + 1
     (rows,) = places(due)
     whole = state.cells + rows.numel()
@@ -302,8 +304,8 @@ def _split(state: State, due: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str,
     daughters = torch.cat([first, first + 1])
     new = state.take(source)
     parents = state.uid.index_select(0, rows)
-    ids = dict(zip(("uid", "parent", "next_uid"), _new_ids(new, daughters, parents), strict=True))
-    return rows, daughters, source, ids
+    new_ids = _new_ids(new, daughters, parents)
+    return rows, daughters, source, dict(zip(NAMES, new_ids, strict=True))
 
 
 def _new_ids(new: State, daughters: Tensor, parents: Tensor) -> tuple[Tensor, Tensor, Tensor]:

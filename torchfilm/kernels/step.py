@@ -80,13 +80,20 @@ def _deep_cells(found, rows, walls, deep, n):
 @kernel
 def _contacts(x, axis, half, radius, margin, dof):
     """Near pairs (first, second), and the contacts among them: see `near_contacts`."""
-    first, second = near_pairs(x, axis, half, radius, margin, dof)
+    pairs = near_pairs(x, axis, half, radius, margin, dof)
+    return _contacts_of(x, axis, half, radius, margin, pairs, dof)
+
+
+@kernel
+def _contacts_of(x, axis, half, radius, margin, pairs, dof):
+    """The contacts among pairs, which are the first two of `pairs`."""
+    first, second = pairs[0], pairs[1]
     keep, points, gap = near_contacts(x, axis, half, radius, first, second, margin, dof)
     return first, second, keep, points, gap
 
 
 @kernel
-def _contacts_after(x, axis, length, radius, y, before, margin, deep, found, dof):
+def _after(x, axis, length, radius, y, before, margin, deep, found, dof):
     """The contacts after the move y, and whether one of them is deeper than `deep`. Where none is,
     they may be those before it, `found`: most need no closer look. before: half lengths then."""
     half = 0.5 * length
@@ -107,10 +114,11 @@ def _deepest(gap):
 
 
 @kernel
-def _wall_contacts(x, axis, half, radius, scale, kinds, places, sizes, root, reach, is_soft, found,
-                   like, dof):  # fmt: skip
+def _wall_contacts(x, axis, half, radius, scale, at, found, like, dof):
     """Rows (H, gaps, one, two, soft) of cells at walls, with room for those of the contacts
-    `found`; how many there are, and the deepest gap."""
+    `found`; how many there are, and the deepest gap. at: kinds, places and sizes of walls, weight
+    and reach by cell, and which walls are soft."""
+    kinds, places, sizes, root, reach, is_soft = at
     room = 2 * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
     H, gaps = np.empty((2 * room, len(dof)), like.dtype), np.empty(room, like.dtype)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
@@ -138,24 +146,29 @@ def _numbers(x, length, scale, growth, least, last, first_pass, hardness, softer
 
 
 @kernel
-def _put_start(y, last, scale, first_pass):
+def _put_start(y, last, scale, first_pass, rising):
     """Puts the scaled move from which a pass starts into y: the last one, or that of a repeated
-    pass, 0."""
-    for i in range(y.shape[0]):
+    pass, 0. A solve with harder contacts than the one before starts from that: not `rising`."""
+    for i in range(y.shape[0] if rising else 0):
         for k in range(y.shape[1]):
             y[i, k] = last[i, k] / scale[i, k] if first_pass and scale[i, k] > 0 else 0.0
 
 
 @kernel
-def _minimise_some(rows, m, numbers, count, alpha, low, y, tolerance, cap, limit, dof):
+def _minimise_some(rows, m, numbers, count, alpha, low, y, cap, settings, report, dof):
     """Minimise from y with the first m of the rows: for all cells, where no numbers are given; or,
     in a later pass, in which soft walls have already pushed, for the numbered cells among the
-    others at rest. Puts the move into y, 0 for cells at rest."""
+    others at rest. Puts the move into y, 0 for cells at rest. Returns
+    the error, and each row's gap after the move."""
     H, gaps, one, two, soft = rows
-    D, limit = degrees(dof), int(limit)
+    tolerance, limit = settings[TOLERANCE], int(settings[LIMIT])
     if numbers.shape[0] == 0:
         none = np.zeros(m, y.dtype)
-        return minimise(H, one, two, m, gaps, none, alpha, low, y, tolerance, cap, limit, dof)
+        iterations, error, e = minimise(
+            H, one, two, m, gaps, none, alpha, low, y, tolerance, cap, limit, dof
+        )
+        report[ITERATIONS] += iterations
+        return error, e
     m = rows_among(H, gaps, one, two, soft, m, numbers)
     pushed, part = np.zeros(m, y.dtype), np.zeros((count, len(dof)), y.dtype)
     for r in range(m):
@@ -170,9 +183,10 @@ def _minimise_some(rows, m, numbers, count, alpha, low, y, tolerance, cap, limit
         H, one, two, m, gaps, pushed, some_alpha, some_low, part, tolerance, cap, limit, dof
     )
     for i in range(y.shape[0]):
-        for k in range(D):
+        for k in range(degrees(dof)):
             y[i, k] = part[numbers[i], k] if numbers[i] >= 0 else 0.0
-    return iterations, error, e
+    report[ITERATIONS] += iterations
+    return error, e
 
 
 @kernel
@@ -184,41 +198,35 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
     (n,). last: (n, D) the first move before, from which this one starts. hardness: (1,) α. roots:
     (S, n) D of each wall, or stiffness · Δt. alphas: (n,) given, or (0,). Returns lengths.
     """
-    margin, target, deep, softest = _of_colony(base, growth, radius, viscosity, settings)
-    tolerance, passes, given = settings[TOLERANCE], settings[MOST_PASSES], alphas.shape[0] > 0
+    margin, target, deep, softest, passes = _of_colony(base, growth, radius, viscosity, settings)
+    tolerance, given = settings[TOLERANCE], alphas.shape[0] > 0
     hardness[0] = hardness[0] if hardness[0] > 0 else softest
     length, scale = base + growth, np.zeros(last.shape)
     least = np.maximum(base - SHRINK * np.maximum(growth, 0.0), shortest)
     half, reach, root = 0.5 * length, np.empty_like(base), np.empty(roots.shape)
     alpha, low, y = np.empty_like(last[:, 0]), np.empty_like(last[:, 0]), np.empty_like(last)
+    at = kinds, places, sizes, root, reach, is_soft
     number, deeply, softer, rising, kept, held, kept_alpha = 0, False, 1.0, True, y, 0.0, 0.0
     found = _contacts(x, axis, half, radius, margin, dof)
-    while True:
+    report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(found, radius)
+    while number < passes:
         drags(length, radius, viscosity, length_drag, growth, scale, dof)
+        _put_start(y, last, scale, number == 0, rising)
         _numbers(
             x, length, scale, growth, least, last, number == 0, hardness[0], softer, roots,
             is_soft, alphas, margin, alpha, low, reach, root, dof,
         )  # fmt: skip
-        if rising:
-            _put_start(y, last, scale, number == 0)
-        rows, walls, deepest = _wall_contacts(
-            x, axis, half, radius, scale, kinds, places, sizes, root, reach, is_soft, found, last,
-            dof,
-        )  # fmt: skip
-        if number == 0:
-            report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(found, radius)
-        elif not deeply:
+        rows, walls, deepest = _wall_contacts(x, axis, half, radius, scale, at, found, last, dof)
+        if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
                 break
-            keep = near_contacts(x, axis, half, radius, found[0], found[1], margin, dof)
-            found, deeply = (found[0], found[1], *keep), True
+            found, deeply = _contacts_of(x, axis, half, radius, margin, found, dof), True
             continue
         numbers, count = _deep_cells(found, rows, walls, deep, 0 if number == 0 else y.shape[0])
         m = pair_rows(x, axis, half, radius, scale, found, walls, rows, dof)
-        iterations, error, e = _minimise_some(
-            rows, m, numbers, count, alpha, low, y, tolerance, 2 * target, settings[LIMIT], dof
+        error, e = _minimise_some(
+            rows, m, numbers, count, alpha, low, y, 2 * target, settings, report, dof
         )
-        report[ITERATIONS] += iterations
         failed = error > tolerance and error < np.inf
         if failed and rising and softer < MOST_SOFTER:
             softer *= SOFTER
@@ -242,9 +250,8 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
         report[CLIPPED] = move_cells(x, axis, length, y, scale, about, margin, least, dof)
         last[:] = y if number == 0 else last
         number, softer, rising = number + 1, 1.0, True
-        if number == passes or settings[SOFT] > 0:
-            break
-        found, deeply = _contacts_after(x, axis, length, radius, y, half, margin, deep, found, dof)
+        if number < passes:
+            found, deeply = _after(x, axis, length, radius, y, half, margin, deep, found, dof)
         if not deeply and kinds.shape[0] == 0:
             break
         half = 0.5 * length
@@ -265,15 +272,16 @@ def _noted(report, error, tolerance):
 
 @kernel
 def _of_colony(base, growth, radius, viscosity, settings):
-    """The margin, the overlap that is wanted, how deep is too deep, all µm, and the α of the
-    softest contacts."""
+    """The margin, the overlap that is wanted, how deep is too deep, all µm, the α of the softest
+    contacts, and the most passes."""
     wide, drag, n = 0.0, 0.0, base.shape[0]
     for i in range(n):
         wide += radius[i] / n
         drag += viscosity[i] * (base[i] + growth[i] + 2 * radius[i]) / n
     deep = settings[DEEP] if settings[DEEP] > 0 else TOO_DEEP * wide
     softest = SOFTEST * settings[YIELD] / OVERLAP / drag
-    return MARGIN * wide, settings[YIELD] * wide, deep, softest
+    passes = 1.0 if settings[SOFT] > 0 else settings[MOST_PASSES]
+    return MARGIN * wide, settings[YIELD] * wide, deep, softest, passes
 
 
 @kernel
