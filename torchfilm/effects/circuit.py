@@ -5,15 +5,17 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchfilm.circuits import run
+from torchfilm.circuits import run, sbml
 from torchfilm.circuits.graph import CircuitGraph, graph_of
 from torchfilm.circuits.names import label_of
 from torchfilm.circuits.partition import binomial
@@ -31,8 +33,10 @@ from torchfilm.effects.circuit_checks import (
     check_rates,
     check_species,
     diluted_names,
+    model_choices,
     names_of,
     shared_fields,
+    written_numbers,
 )
 from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, Field, State
@@ -148,6 +152,107 @@ class Circuit(Effect):
         }
         for key, value in given.items():
             object.__setattr__(self, key, value)
+
+    @classmethod
+    def from_sbml(
+        cls,
+        path: str | Path,
+        *,
+        signals: Sequence[str] | Mapping[str, str] = (),
+        properties: Mapping[str, str] | None = None,
+        without: Sequence[str] = (),
+        time_unit: str | None = None,
+        initial: Mapping[str, Value] | None = None,
+        dilution: bool | Sequence[str] = True,
+        **options: Any,
+    ) -> Circuit:
+        """The circuit of an SBML model (Levels 1 to 3): its species and all else that has a rate
+        are species of the circuit, its constants are parameters.
+
+        signals: ids of species that are signals outside, or {id: name of the signal}. properties:
+        ids of the model that are properties of the cell, {"cytosol": "volume"}. without: reactions
+        to leave out. time_unit: "s", "min", "h" or "day", in place of what the model declares;
+        rates become per hour. initial: first values in place of the model's. dilution: as for a
+        circuit; True is all species, and not parameters or compartments. Further keywords are
+        values for constants by id, of the forms that a circuit takes, and its options. Raises
+        InputError, with the line or the id, for what cannot be read or simulated.
+        """
+        text = sbml.decoded(sbml.read_bytes(path), str(path))
+        given = model_choices(
+            signals, properties, without, time_unit, initial, options, OPTION_NAMES
+        )
+        return cls._described(sbml.describe(text, str(path), given), dilution, options)
+
+    @classmethod
+    def from_antimony(
+        cls,
+        text: str,
+        *,
+        signals: Sequence[str] | Mapping[str, str] = (),
+        properties: Mapping[str, str] | None = None,
+        without: Sequence[str] = (),
+        time_unit: str | None = None,
+        initial: Mapping[str, Value] | None = None,
+        dilution: bool | Sequence[str] = True,
+        **options: Any,
+    ) -> Circuit:
+        """The circuit of a model as Antimony text. Keywords and errors as of `from_sbml`."""
+        where = "the Antimony text"
+        given = model_choices(
+            signals, properties, without, time_unit, initial, options, OPTION_NAMES
+        )
+        description = sbml.describe(sbml.antimony_to_sbml(text, where), where, given)
+        return cls._described(description, dilution, options)
+
+    @classmethod
+    def _described(
+        cls, found: sbml.Description, dilution: bool | Sequence[str], options: Mapping[str, Any]
+    ) -> Circuit:
+        """The circuit of a model that was read. options: those of a circuit, among others."""
+        return cls(
+            found.rates,
+            species=found.species,
+            initial=found.initial,
+            dilution=found.diluted if dilution is True else dilution,
+            **{n: x for n, x in options.items() if n in OPTION_NAMES},
+            **found.parameters,
+        )
+
+    def to_sbml(
+        self,
+        path: str | Path,
+        *,
+        cell_type: int | None = None,
+        initial: Mapping[str, float] | None = None,
+        **values: float,
+    ) -> None:
+        """Write the equations as an SBML model (Level 3 Version 2), in hours. `from_sbml` reads
+        the same circuit again: the same equations and numbers.
+
+        cell_type: whose rates, where they differ. initial, and further keywords: numbers by name in
+        place of first values and constants that are not one number. Raises InputError where a
+        number is missing, and where the rates cannot be written as equations.
+        """
+        if cell_type is None:
+            graph = self.graph
+        else:
+            checks.choice("cell_type", cell_type, tuple(self.rates))
+            graph = self.graphs[cell_type]
+        if self.shared:
+            raise checks.InputError(
+                f"{self.value_owner()} shares species of another circuit, so it is no whole model:"
+                " write a circuit that has them all."
+            )
+        part = self.rates[EVERY if cell_type is None else cell_type]
+        undiluted = [n for n in self.species if self.variables[n] not in self.diluted_fields]
+        text = sbml.sbml_text(
+            graph,
+            self.name or getattr(part, "__name__", "circuit"),
+            written_numbers("initial", self.initial, initial or {}, self.species),
+            written_numbers("constant", self.parameters, values, tuple(self.parameters)),
+            undiluted,
+        )
+        sbml.write(path, text)
 
     @property
     def title(self) -> str:  # type: ignore[override]
@@ -290,6 +395,12 @@ class Circuit(Effect):
         for name, value in changes.items():
             object.__setattr__(changed, name, value)
         return changed
+
+
+OPTION_NAMES = tuple(
+    n for n in inspect.signature(Circuit.__init__).parameters
+    if n not in ("self", "rates", "species", "initial", "dilution", "parameters")
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
