@@ -139,7 +139,8 @@ def _raise_first_error(document: Any, where: str, libsbml: Any) -> None:
     for k in range(document.getNumErrors()):
         error = document.getError(k)
         if error.getSeverity() >= libsbml.LIBSBML_SEV_ERROR:
-            said = " ".join(error.getMessage().split())
+            lines = [x for x in error.getMessage().splitlines() if x and x[:9] != "Reference"]
+            said = " ".join(lines[-1].split())  # what is wrong here, after the rule
             raise InputError(f"{where}, line {error.getLine()}: this is no valid SBML. {said}")
 
 
@@ -151,7 +152,8 @@ def name_of(thing: Any, place: int = 0) -> str:
 
 def _unsupported(document: Any, model: Any) -> Iterator[str]:
     """What the model has that torchfilm does not simulate, each named with its id."""
-    for k in range(document.getNumPlugins()):
+    packages = document.getNumPlugins() if document.getLevel() > 2 else 0
+    for k in range(packages):
         plugin = document.getPlugin(k)
         name = plugin.getPackageName()
         if name not in OWN_PACKAGES and document.getPackageRequired(name):

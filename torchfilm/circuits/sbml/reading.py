@@ -303,12 +303,11 @@ def _check_given(quantities: Quantities, given: Given, by_id: Any) -> None:
     constants = [quantities.column(n) for n in quantities.constants]
     for name in given.values:
         own = names.get(name, name)
+        if own in quantities.things and quantities.is_variable(own):
+            first = f"initial={{{name!r}: …}}"
+            raise InputError(f"{name!r} is a variable: give its first value, {first}")
         if name in constants or own in quantities.used:
             continue
-        if own in quantities.things and quantities.is_variable(own):
-            raise InputError(
-                f"{name!r} is a variable: give its first value, initial={{{name!r}: …}}"
-            )
         if own in quantities.things:
             raise InputError(f"{name!r} is no constant that an equation reads: leave it out")
         raise InputError(unknown(f"the model has no constant {name!r}", name, constants))
