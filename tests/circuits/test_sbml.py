@@ -239,6 +239,7 @@ FORMULAS = {
     "piecewise(1, x > 0.5 && x < 0.7, 2, x == 0.25, 3)": lambda x: {0.25: 2, 0.6: 1}.get(x, 3),
     "piecewise(1, xor(x > 0.5, x > 0.2), 0)": lambda x: float(0.2 < x <= 0.5),
     "piecewise(1, !(x > 0.5) || x > 0.7, 0)": lambda x: float(x <= 0.5 or x > 0.7),
+    "piecewise(x, 2 > 1, 3)": lambda x: x,
     "(x > 0.5) + 1": lambda x: (x > 0.5) + 1.0, "exp(x)^-x": lambda x: np.exp(x) ** -x,
     "abs(-x)*pi": lambda x: np.pi * x, "avogadro*1e-23*x": lambda x: 6.02214179 * x,
 }  # fmt: skip
@@ -259,6 +260,46 @@ def test_rates_of_other_quantities_can_be_read():
     )
     found = course(circuit, HOURS)
     close(found["B"], 9 - 3 * (1 - np.exp(-2 * np.array(HOURS))))
+
+
+def test_a_parameter_of_a_law_has_no_rate():
+    """Although another of its name has one."""
+    body = (
+        '<listOfCompartments><compartment id="c" size="1" constant="true"/></listOfCompartments>'
+        '<listOfSpecies><species id="A" compartment="c" initialAmount="4" constant="false"'
+        ' hasOnlySubstanceUnits="true" boundaryCondition="false"/></listOfSpecies>'
+        '<listOfParameters><parameter id="k" value="1" constant="false"/></listOfParameters>'
+        '<listOfRules><rateRule variable="k"><math><cn>2</cn></math></rateRule></listOfRules>'
+        '<listOfReactions><reaction id="J" reversible="false"><listOfReactants>'
+        '<speciesReference species="A" stoichiometry="1" constant="true"/></listOfReactants>'
+        '<kineticLaw><math><apply><csymbol encoding="text" definitionURL='
+        '"http://www.sbml.org/sbml/symbols/rateOf">rateOf</csymbol><ci>k</ci></apply></math>{}'
+        "</kineticLaw></reaction></listOfReactions>"
+    )
+    own = '<listOfLocalParameters><localParameter id="k" value="3"/></listOfLocalParameters>'
+    assert str(read(sbml(body.format(own))).graph) == "d k/dt = 2\nd A/dt = 0"
+    assert str(read(sbml(body.format(""))).graph) == "d A/dt = −2\nd k/dt = 2"
+
+
+def test_a_point_has_the_size_that_it_is_given():
+    for size, rate in ((' size="2"', -0.3), ("", -0.6)):
+        body = (
+            f'<listOfCompartments><compartment id="c" spatialDimensions="0"{size} constant="true"/>'
+            '</listOfCompartments><listOfSpecies><species id="A" compartment="c" initialAmount="4"'
+            ' hasOnlySubstanceUnits="false" boundaryCondition="false" constant="false"/>'
+            '</listOfSpecies><listOfReactions><reaction id="J" reversible="false"><listOfReactants>'
+            '<speciesReference species="A" stoichiometry="1" constant="true"/></listOfReactants>'
+            "<kineticLaw><math><cn>0.6</cn></math></kineticLaw></reaction></listOfReactions>"
+        )
+        found = read(sbml(body)).graph.evaluate({"A": 1.0, "c": 2.0})
+        assert float(found["A"]) == rate
+
+
+def test_a_drawing_of_the_model_is_left_aside():
+    drawn = TOGGLE.replace(
+        "<sbml", '<sbml xmlns:render="http://www.sbml.org/sbml/level3/version1/render/version1"', 1
+    )
+    assert str(read(drawn).graph) == str(read(TOGGLE).graph)
 
 
 def test_a_compartment_that_grows_dilutes_what_is_in_it():

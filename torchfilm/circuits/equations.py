@@ -73,10 +73,10 @@ COLUMNS_ONLY = ("logaddexp", "hypot")  # torch takes no plain numbers here
 
 def operate(builder: Builder, op: str, *args: Term) -> Term:
     """The operation on expressions; of numbers only, its value, in float64."""
+    if op == "where" and not isinstance(args[0], Expression):
+        return args[1] if args[0] else args[2]
     if any(isinstance(a, Expression) for a in args):
         return builder.make(op, *(a if isinstance(a, Expression) else float(a) for a in args))
-    if op == "where":
-        return args[1] if args[0] else args[2]
     logical = op in ("and", "or", "not")
     dtype = torch.bool if logical else torch.float64
     found = OPERATIONS[op](*(torch.tensor(a, dtype=dtype) for a in args))

@@ -15,7 +15,10 @@ EXTRA = 'pip install "torchfilm[sbml]"'
 # Deeper than any model, and less deep than what would overflow the stack of a parser.
 MAX_DEPTH = 250
 OWN_PACKAGES = ("l3v2extendedmath",)  # functions of Level 3 Version 2, which libsbml calls one
+DRAWINGS = ("layout", "render")  # packages that change no number
 ENCODINGS = ("utf-8", "ascii", "us-ascii")  # SBML is UTF-8, of which ASCII is a part
+# Errors of libsbml in names of units, which convert nothing; those of time are read by `units`.
+UNITS = (10313, *range(20217, 20222))
 
 
 def needed(module: str, package: str) -> Any:
@@ -138,7 +141,8 @@ def open_model(text: str, where: str) -> Any:
 def _raise_first_error(document: Any, where: str, libsbml: Any) -> None:
     for k in range(document.getNumErrors()):
         error = document.getError(k)
-        if error.getSeverity() >= libsbml.LIBSBML_SEV_ERROR:
+        harmless = error.getErrorId() in UNITS or error.getPackage() in DRAWINGS
+        if error.getSeverity() >= libsbml.LIBSBML_SEV_ERROR and not harmless:
             lines = [x for x in error.getMessage().splitlines() if x and x[:9] != "Reference"]
             said = " ".join(lines[-1].split())  # what is wrong here, after the rule
             raise InputError(f"{where}, line {error.getLine()}: this is no valid SBML. {said}")
@@ -156,7 +160,7 @@ def _unsupported(document: Any, model: Any) -> Iterator[str]:
     for k in range(packages):
         plugin = document.getPlugin(k)
         name = plugin.getPackageName()
-        if name not in OWN_PACKAGES and document.getPackageRequired(name):
+        if name not in (*OWN_PACKAGES, *DRAWINGS) and document.getPackageRequired(name):
             yield f"it needs the package {name}, which torchfilm does not read"
     for k in range(document.getNumUnknownPackages()):
         prefix = document.getUnknownPackagePrefix(k)

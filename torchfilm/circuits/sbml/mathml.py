@@ -58,7 +58,8 @@ class Formulas:
         if kind == "name_time":
             return symbols.time()
         if kind == "function_rate_of":
-            return symbols.slope(node.getChild(0).getName())
+            own = node.getChild(0).getName()
+            return 0.0 if own in names else symbols.slope(own)
         if kind in CONSTANTS:
             return CONSTANTS[kind]
         given = [self._of(node.getChild(k), symbols, names) for k in range(node.getNumChildren())]

@@ -15,6 +15,7 @@ from torchfilm.tools.checks import InputError
 
 COMPARTMENT, SPECIES, PARAMETER, STOICHIOMETRY = "compartment", "species", "parameter", "reference"
 CLOCK = "u.model_time"
+IMPLIED = "default_compartment"  # of Antimony, where a model has none
 
 
 class NotConstant(Exception):
@@ -165,6 +166,8 @@ class Quantities:
                 return self.formulas.of(self.initial[name], _Constants(self))
             except NotConstant:
                 pass
+        if name == IMPLIED and name not in self.choices.values and self.first(name) == 1:
+            return 1.0
         one = plain(self.choices.values.get(name, 0.0))
         self.constants[name] = self.first(name) if one else 0.0
         return b.name(f"p.{self.column(name)}")
@@ -176,9 +179,15 @@ class Quantities:
         return self.builder.name(CLOCK)
 
     def size(self, species: Any) -> Term:
-        """The size of the compartment of a species; 1 where it has no dimensions."""
+        """The size of the compartment of a species; 1 where it has neither dimensions nor size."""
+        home = self.home(species)
+        return 1.0 if home is None else self.value(home)
+
+    def home(self, species: Any) -> str | None:
+        """The compartment of a species, if it has a size."""
         home = self.model.getCompartment(species.getCompartment())
-        return 1.0 if home.getSpatialDimensionsAsDouble() == 0 else self.value(home.getId())
+        point = home.getSpatialDimensionsAsDouble() == 0 and not home.isSetSize()
+        return None if point else home.getId()
 
     def stoichiometry(self, reference: Any) -> Term:
         """The number of molecules that an event makes or takes."""
@@ -362,9 +371,8 @@ class _Start:
         return quantities.first(name)
 
     def size(self, species: Any) -> float:
-        home = self.quantities.model.getCompartment(species.getCompartment())
-        flat = home.getSpatialDimensionsAsDouble() == 0
-        return 1.0 if flat else float(self.value(home.getId()))  # type: ignore[arg-type]
+        home = self.quantities.home(species)
+        return 1.0 if home is None else float(self.value(home))  # type: ignore[arg-type]
 
     def time(self) -> Term:
         return 0.0
