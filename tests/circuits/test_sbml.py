@@ -307,3 +307,8 @@ def test_a_compartment_that_grows_dilutes_what_is_in_it():
         "compartment c; c = 1; c' = 0.5*c; species A in c; A = 2; A -> ; c*0.25*A", **TIGHT
     )
     close(course(circuit, HOURS)["A"], 2 * np.exp(-0.75 * np.array(HOURS)))
+
+
+def test_long_sums_are_read():
+    text = f"species A; A = 1; A' = {' + '.join(['A'] * 1000)}"
+    assert float(tf.Circuit.from_antimony(text).graph.evaluate({"A": 1.0})["A"]) == 1000

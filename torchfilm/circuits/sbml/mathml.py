@@ -62,7 +62,7 @@ class Formulas:
             return 0.0 if own in names else symbols.slope(own)
         if kind in CONSTANTS:
             return CONSTANTS[kind]
-        given = [self._of(node.getChild(k), symbols, names) for k in range(node.getNumChildren())]
+        given = [self._of(child, symbols, names) for child in _operands(node)]
         if kind == "function":
             return self._called(node.getName(), given, symbols)
         if kind not in RULES:
@@ -86,6 +86,18 @@ class Formulas:
         if function.own:
             return operate(self.builder, function.own, *(numeric(self.builder, x) for x in given))
         return self._of(function.body, symbols, dict(zip(function.arguments, given, strict=True)))
+
+
+def _operands(node: Any) -> list[Any]:
+    """The operands of a formula. libsbml nests long sums and products to the left: all of them."""
+    kind, found = node.getType(), []
+    while True:
+        children = [node.getChild(k) for k in range(node.getNumChildren())]
+        found = [*children[1:], *found]
+        nested = _kinds().get(kind) in ("plus", "times") and len(children) > 1
+        if not (nested and children[0].getType() == kind):
+            return [*children[:1], *found]
+        node = children[0]
 
 
 @functools.cache
