@@ -90,7 +90,8 @@ class Formulas:
 
 def _operands(node: Any) -> list[Any]:
     """The operands of a formula. libsbml nests long sums and products to the left: all of them."""
-    kind, found = node.getType(), []
+    kind = node.getType()
+    found: list[Any] = []
     while True:
         children = [node.getChild(k) for k in range(node.getNumChildren())]
         found = [*children[1:], *found]
