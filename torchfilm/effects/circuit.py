@@ -247,7 +247,7 @@ class Circuit(Effect):
         undiluted = [n for n in self.species if self.variables[n] not in self.diluted_fields]
         text = sbml.sbml_text(
             graph,
-            self.name or getattr(part, "__name__", "circuit"),
+            self.name or label_of(part),
             written_numbers("initial", self.initial, initial or {}, self.species),
             written_numbers("constant", self.parameters, values, tuple(self.parameters)),
             undiluted,
