@@ -67,6 +67,7 @@ ROOMS = {
 # Modules of one effect, which may import each other: the description and what binding makes of it.
 ONE_EFFECT = {
     frozenset({"torchfilm.effects.circuit", "torchfilm.effects.bound_circuit"}),
+    frozenset({"torchfilm.effects.circuit", "torchfilm.effects.circuit_checks"}),
     frozenset({"torchfilm.effects.medium", "torchfilm.effects.bound_medium"}),
     frozenset({"torchfilm.effects.medium", "torchfilm.effects.medium_transport"}),
     frozenset({"torchfilm.effects.bound_medium", "torchfilm.effects.medium_transport"}),

@@ -42,6 +42,7 @@ def spoilt(tmp_path_factory) -> Path:
         " tf.Scene(tf.Rules(update), tf.Growth())\n"
     )
     (folder / "toggle.xml").write_text("<sbml/>\n")
+    (folder / "toggle.cellml").write_text("<model/>\n")
     (folder / "imports.py").write_text("import no_such_module\n")
     scene = tf.scenes.microcolony()
     for _ in tf.simulate(scene, scene.bind().start(), until=0.5, record=folder / "good.h5"):
@@ -55,7 +56,8 @@ def spoilt(tmp_path_factory) -> Path:
 ERRORS = {
     "run unknown": ("nothing_like_it", "microcolony, programmed_growth, channel"),
     "run no_such_file.py": (r"no_such_file\.py", "No such file"),
-    "run toggle.xml --until 1": (r"toggle\.xml", r"reads no \.xml files", "Circuit"),
+    "run toggle.xml --until 1": (r"toggle\.xml", r"line \d: this is no valid SBML"),
+    "run toggle.cellml --until 1": (r"toggle\.cellml", r"reads no \.cellml files", "Circuit"),
     "run good.h5 --until 1": (r"good\.h5", "results file", "torchfilm resume"),
     "run empty.py": (r"empty\.py", "scene"),
     "run number.py": (r"number\.py", "Scene"),

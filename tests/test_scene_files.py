@@ -150,15 +150,18 @@ def test_a_bad_design_is_refused_in_words(folder, told, words):
         ("mine.txt", "No such file"),
         (".", "scene = '.'.*folder"),
         (
-            "toggle.xml",
-            r"scene = 'toggle.xml'.*\.py.*\.json.*reads no \.xml files.*Scene.*reactions.*Circuit",
+            "toggle.cellml",
+            r"scene = 'toggle.cellml'.*\.py.*\.xml.*reads no \.cellml files.*Scene.*Circuit",
         ),
+        ("toggle.xml", r"toggle\.xml, line \d: this is no valid SBML"),
+        ("none.xml", "No such file.$"),
         ("run.h5", "No such file.*results file.*torchfilm resume"),
         ("cells.csv", "No such file.*table of cells.*--start"),
     ],
 )
 def test_what_is_no_scene_is_refused_in_words(folder, what, words):
     (folder / "toggle.xml").write_text("<sbml/>")
+    (folder / "toggle.cellml").write_text("<model/>")
     with pytest.raises(tf.InputError, match=words):
         load_scene(what, {})
 
@@ -272,3 +275,47 @@ def test_scene_files_do_not_come_upon_one_another(tmp_path):
     with pytest.raises(tf.InputError, match=r"ZeroDivisionError: division by zero \(line 1\)"):
         load_scene(str(tmp_path / "bad_one.py"), {})
     assert "bad_one" not in sys.modules
+
+
+TOGGLE = """
+model toggle
+  species red, green
+  red' = strength/(1 + green^2) - red
+  green' = strength/(1 + red^2) - green
+  red = 2; green = 1; strength = 4; unread = 1
+end
+"""
+
+
+@pytest.mark.parametrize("suffix", [".xml", ".sbml", ".ant"])
+def test_a_model_is_a_colony_with_its_circuit(folder, suffix):
+    path = folder / f"toggle{suffix}"
+    if suffix == ".ant":
+        path.write_text(TOGGLE)
+    else:
+        tf.Circuit.from_antimony(TOGGLE).to_sbml(path)
+    made = load_scene(str(path), {"strength": 8.0, "red": 0.5, "rtol": 1e-3})
+    circuit = next(e for e in made.effects if isinstance(e, tf.Circuit))
+    assert made.name == "toggle"
+    assert [type(e).__name__ for e in made.effects] == [
+        "Growth",
+        "Division",
+        "Mechanics",
+        "Circuit",
+    ]
+    assert circuit.parameters == {"strength": 8.0} and circuit.rtol == 1e-3
+    assert circuit.initial == {"red": 0.5, "green": 1.0}
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"strengt": 1.0}, "no constant 'strengt'.*'strength'"),
+        ({"unread": 1.0}, "'unread' is no constant that an equation reads"),
+        ({"signals": "red"}, "signals.*needs a medium"),
+    ],
+)
+def test_parameters_that_a_model_does_not_have_are_refused(folder, given, words):
+    (folder / "toggle.ant").write_text(TOGGLE)
+    with pytest.raises(tf.InputError, match=words):
+        load_scene("toggle.ant", given)

@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 from study import Point, Study, timed
 
 import torchfilm as tf
-from torchfilm.effects.circuit import EXPLICIT
+from torchfilm.effects.circuit_checks import EXPLICIT
 
 Columns = dict[str, Any]
 ERROR, WORK = "relative error", "rate evaluations per cell"

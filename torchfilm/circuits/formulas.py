@@ -11,12 +11,12 @@ TEX_SIGNS = SIGNS | {"ge": r"\ge", "le": r"\le", "ne": r"\ne", "and": r"\wedge",
 QUIET = ("cast32", "cast64", "full32", "full64", "detach")  # operations on the type of a number
 
 
-def _bare(node: Expression) -> Expression:
+def bare(node: Expression) -> Expression:
     """The expression without what does not show: types of numbers, and zeros that are added."""
     while node.op in QUIET:
         node = node.args[0]
-    if node.op == "add" and any(_bare(a).is_number(0) for a in node.args):
-        return _bare(node.args[1] if _bare(node.args[0]).is_number(0) else node.args[0])
+    if node.op == "add" and any(bare(a).is_number(0) for a in node.args):
+        return bare(node.args[1] if bare(node.args[0]).is_number(0) else node.args[0])
     return node
 
 
@@ -63,14 +63,14 @@ class _Plain:
         return found if binds >= at_least else self.brackets(found)
 
     def _of(self, node: Expression) -> tuple[str, int]:
-        op, args = node.op, tuple(map(_bare, node.args))
+        op, args = node.op, tuple(map(bare, node.args))
         if op == NUMBER:
             found, binds = self.number(abs(node.value))
             return (found, binds) if node.value >= 0 else (self.minus + found, SIGN)
         if op == NAME:
             return self.name(node.name), ATOM
-        if _bare(node) is not node:
-            return self.made[_bare(node)]
+        if bare(node) is not node:
+            return self.made[bare(node)]
         if op == "sub" and args[1].is_number(0):
             return self.made[args[0]]
         if op == "mul" and (args[0].is_number(1) or args[1].is_number(1)):
@@ -86,7 +86,7 @@ class _Plain:
                 sign, right = f" {self.minus} ", right[1:]
             return self._in(args[0], SUM) + sign + right, SUM
         if op == "mul" and args[0].op == "div" and args[0].args[0].is_number(1):
-            return self.fraction(args[1], _bare(args[0].args[1]))  # as torch divides a number
+            return self.fraction(args[1], bare(args[0].args[1]))  # as torch divides a number
         if op == "mul" and args[1].op == NUMBER and args[0].op != NUMBER:
             args = args[::-1]  # 2·a, also where torch was given (a, 2)
         if op == "mul":

@@ -1,4 +1,5 @@
-"""Scenes as a user names them: a ready-made scene by name, a Python file, or a saved design."""
+"""Scenes as a user names them: a ready-made scene by name, a Python file, a model, or a saved
+design."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from torchfilm import scenes
+from torchfilm.cli.model_files import is_model, scene_of_model
 from torchfilm.scene import Scene
 from torchfilm.scenes.recipes import parse_value, to_plain
 from torchfilm.tools import checks
@@ -30,20 +32,22 @@ OTHER_SUFFIX = (
 
 
 def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -> Scene:
-    """A ready-made scene by name; or the `function` or Scene of that name in a Python file; or the
-    scene of a saved design (.json). `parameters` replace those of the design. Raises InputError for
-    anything else."""
+    """A ready-made scene by name; or the `function` or Scene of that name in a Python file; or a
+    colony with a model in SBML or Antimony; or the scene of a saved design (.json). `parameters`
+    replace those of the design. Raises InputError for anything else."""
     path = Path(what)
     if path.suffix == ".json":
         return _scene_of_design(what, parameters)
     if not path.suffix and path.name == what:
         return scenes.build(what, parameters)
+    if path.is_file() and is_model(path):
+        return scene_of_model(path, parameters)
     if not path.is_file() or path.suffix != ".py":
         raise checks.input_error(
             "scene",
             what,
-            "the name of a ready scene, or the path of a Python file (.py) or of a saved design"
-            " (.json)",
+            "the name of a ready scene, or the path of a Python file (.py), of a model in SBML"
+            " (.xml) or Antimony (.ant), or of a saved design (.json)",
             _hint(path),
         )
     names = _run_scene_file(path, what)
@@ -74,7 +78,7 @@ def _hint(path: Path) -> str:
     if path.is_dir():
         return "This is a folder."
     hints = [] if path.exists() else ["No such file."]
-    if path.suffix not in ("", ".py"):
+    if path.suffix not in ("", ".py") and not is_model(path):
         hints.append(KNOWN_SUFFIXES.get(path.suffix, OTHER_SUFFIX.format(path.suffix)))
     return " ".join(hints)
 

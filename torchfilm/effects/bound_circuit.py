@@ -44,17 +44,9 @@ GEOMETRY = {
     "z": ("position",),
 }
 OPTIONS = (
-    "initial",
-    "daughters",
-    "method",
-    "steps",
-    "rtol",
-    "atol",
-    "molecules_per_unit",
-    "name",
-    "shared",
-    "backend",
-)
+    "initial", "daughters", "method", "steps", "rtol", "atol", "molecules_per_unit", "name",
+    "shared", "backend", "dilution",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -81,8 +73,9 @@ class BoundCircuit(BoundEffect):
 
     def __init__(self, effect: Circuit, binding: Binding):
         super().__init__(effect, binding)
-        kinds = [k for k in effect.rates if isinstance(k, int)]
-        if kinds:  # cells of other types need no constants
+        if kinds := [
+            k for k in effect.rates if isinstance(k, int)
+        ]:  # cells of other types need no constants
             self.values = Values({n: self.values[n].needed_by(kinds) for n in self.values})
         self.rates = snapshot(effect.rates, "Circuit.rates", binding.batch)
         self.networks: dict[int | str, run.Network] = {}
@@ -130,9 +123,8 @@ class BoundCircuit(BoundEffect):
         if state.cells == 0:
             return state
         circuit, signals = self.effect, tuple(state.signals)
-        names = tuple(circuit.variables)
         self.networks = {
-            k: build_network(part, names, signals)
+            k: build_network(part, tuple(circuit.variables), signals)
             for k, part in self.rates.items()
             if not callable(part)
         }
@@ -279,7 +271,8 @@ class BoundCircuit(BoundEffect):
         # amounts
         middle, end = _half_way(state, volume), state.volume
         diluted = {
-            n: state.fields[n] * (state.fields[volume] / middle.volume) for n in circuit.own_fields
+            n: state.fields[n] * (state.fields[volume] / middle.volume)
+            for n in circuit.diluted_fields
         }
         state = state.with_fields(**{volume: end}, **diluted)
         medium = MediumExchange.of(state, self.signals)
@@ -319,7 +312,7 @@ class BoundCircuit(BoundEffect):
         if medium is not None:
             state = medium.settle()
         thinner = middle.volume / end
-        own = set(circuit.own_fields)
+        own = set(circuit.diluted_fields)
         state = state.with_fields(**{n: v * thinner if n in own else v for n, v in changed.items()})
         return state.replace(reports={**state.reports, self.title: report.report()})
 

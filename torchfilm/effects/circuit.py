@@ -5,35 +5,47 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from numbers import Integral
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchfilm.circuits import integrators, run
+from torchfilm.circuits import run, sbml
 from torchfilm.circuits.graph import CircuitGraph, graph_of
-from torchfilm.circuits.names import label_of, unknown
+from torchfilm.circuits.names import label_of
 from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.effect import CIRCUIT, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_circuit import BoundCircuit
+from torchfilm.effects.circuit_checks import (
+    DIRECT,
+    LEAP,
+    STIFF,
+    check_constants,
+    check_initial,
+    check_method,
+    check_rates,
+    check_species,
+    diluted_names,
+    model_choices,
+    names_of,
+    shared_fields,
+    written_numbers,
+)
 from torchfilm.resolver import Values
-from torchfilm.state import CELL_TYPE, RESERVED, Field, State
+from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.numba_calls import unavailable
-from torchfilm.values import COLONY, FORMS, Rule, Value, checked
+from torchfilm.values import COLONY, Rule, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
-STIFF, LEAP, DIRECT = "rosenbrock", "tau_leap", "direct"
-EXPLICIT = ("euler", *integrators.METHODS)
-METHODS = (STIFF, *EXPLICIT, LEAP, DIRECT)
-GEOMETRY = ("volume", "area", "x", "y", "z")
 BACKENDS = ("compiled", "torch")
 EVERY = "every cell"  # where a circuit runs that is not given by type
 EACH_CELL = "initial[{!r}]"  # by which name the first value of a species is resolved
@@ -60,8 +72,9 @@ class Circuit(Effect):
     fields NAME_SPECIES. shared: species of another circuit that this one reads and changes too, as
     field names, or {name here: field}. backend: "compiled" functions of its equations (on
     the CPU) or "torch"; by default compiled where the rates can be written as equations: see
-    `graph`. Circuits act one after the other. Growth dilutes: amounts
-    stay, concentrations are multiplied by V_old/V_new. Further keywords are constants of the rates:
+    `graph`. dilution: True, growth dilutes: amounts stay, concentrations are multiplied by
+    V_old/V_new; False, concentrations stay; or names, the species that growth dilutes. Circuits act
+    one after the other. Further keywords are constants of the rates:
     each a number, one per colony, one per cell type, or a distribution drawn for each cell at birth
     (extrinsic noise). Where rates are given by cell type, cells of other types need no constants.
     """
@@ -78,6 +91,7 @@ class Circuit(Effect):
     name: str = ""
     shared: Mapping[str, str] = field(default_factory=dict)
     backend: str | None = None
+    dilution: bool | tuple[str, ...] = True
     parameters: Mapping[str, Value] = field(default_factory=dict)
 
     stage = CIRCUIT
@@ -97,18 +111,19 @@ class Circuit(Effect):
         name: str = "",
         shared: Sequence[str] | Mapping[str, str] = (),
         backend: str | None = None,
+        dilution: bool | Sequence[str] = True,
         **parameters: Value,
     ):
         by_type: dict[int | str, Part] = (
             dict(rates.items()) if isinstance(rates, Mapping) else {EVERY: rates}
         )
-        names = _names(species)
-        others = _shared(shared)
-        _check_species(names, others)
-        _check_rates(by_type, isinstance(rates, Mapping))
-        _check_initial(initial, names)
-        _check_constants(parameters, [f.name for f in dataclasses.fields(self)])
-        _check_method(method, steps, by_type)
+        names = names_of(species)
+        others = shared_fields(shared)
+        check_species(names, others)
+        check_rates(by_type, isinstance(rates, Mapping))
+        check_initial(initial, names)
+        check_constants(parameters, [f.name for f in dataclasses.fields(self)])
+        check_method(method, steps, by_type)
         if backend is not None:
             checks.choice("Circuit.backend", backend, BACKENDS)
         checks.choice("Circuit.daughters", daughters, ("concentration", "amount"))
@@ -121,6 +136,7 @@ class Circuit(Effect):
             "name": name,
             "shared": others,
             "backend": backend,
+            "dilution": diluted_names(dilution, names, method),
             "daughters": daughters,
             "method": method,
             "steps": steps,
@@ -136,6 +152,107 @@ class Circuit(Effect):
         }
         for key, value in given.items():
             object.__setattr__(self, key, value)
+
+    @classmethod
+    def from_sbml(
+        cls,
+        path: str | Path,
+        *,
+        signals: Sequence[str] | Mapping[str, str] = (),
+        properties: Mapping[str, str] | None = None,
+        without: Sequence[str] = (),
+        time_unit: str | None = None,
+        initial: Mapping[str, Value] | None = None,
+        dilution: bool | Sequence[str] = True,
+        **options: Any,
+    ) -> Circuit:
+        """The circuit of an SBML model (Levels 1 to 3): its species and all else that has a rate
+        are species of the circuit, its constants are parameters.
+
+        signals: ids of species that are signals outside, or {id: name of the signal}. properties:
+        ids of the model that are properties of the cell, {"cytosol": "volume"}. without: reactions
+        to leave out. time_unit: "s", "min", "h" or "day", in place of what the model declares;
+        rates become per hour. initial: first values in place of the model's. dilution: as for a
+        circuit; True is all species, and not parameters or compartments. Further keywords are
+        values for constants by id, of the forms that a circuit takes, and its options. Raises
+        InputError, with the line or the id, for what cannot be read or simulated.
+        """
+        text = sbml.decoded(sbml.read_bytes(path), str(path))
+        given = model_choices(
+            signals, properties, without, time_unit, initial, options, OPTION_NAMES
+        )
+        return cls._described(sbml.describe(text, str(path), given), dilution, options)
+
+    @classmethod
+    def from_antimony(
+        cls,
+        text: str,
+        *,
+        signals: Sequence[str] | Mapping[str, str] = (),
+        properties: Mapping[str, str] | None = None,
+        without: Sequence[str] = (),
+        time_unit: str | None = None,
+        initial: Mapping[str, Value] | None = None,
+        dilution: bool | Sequence[str] = True,
+        **options: Any,
+    ) -> Circuit:
+        """The circuit of a model as Antimony text. Keywords and errors as of `from_sbml`."""
+        where = "the Antimony text"
+        given = model_choices(
+            signals, properties, without, time_unit, initial, options, OPTION_NAMES
+        )
+        description = sbml.describe(sbml.antimony_to_sbml(text, where), where, given)
+        return cls._described(description, dilution, options)
+
+    @classmethod
+    def _described(
+        cls, found: sbml.Description, dilution: bool | Sequence[str], options: Mapping[str, Any]
+    ) -> Circuit:
+        """The circuit of a model that was read. options: those of a circuit, among others."""
+        return cls(
+            found.rates,
+            species=found.species,
+            initial=found.initial,
+            dilution=found.diluted if dilution is True else dilution,
+            **{n: x for n, x in options.items() if n in OPTION_NAMES},
+            **found.parameters,
+        )
+
+    def to_sbml(
+        self,
+        path: str | Path,
+        *,
+        cell_type: int | None = None,
+        initial: Mapping[str, float] | None = None,
+        **values: float,
+    ) -> None:
+        """Write the equations as an SBML model (Level 3 Version 2), in hours. `from_sbml` reads
+        the same circuit again: the same equations and numbers.
+
+        cell_type: whose rates, where they differ. initial, and further keywords: numbers by name in
+        place of first values and constants that are not one number. Raises InputError where a
+        number is missing, and where the rates cannot be written as equations.
+        """
+        if cell_type is None:
+            graph = self.graph
+        else:
+            checks.choice("cell_type", cell_type, tuple(self.rates))
+            graph = self.graphs[cell_type]
+        if self.shared:
+            raise checks.InputError(
+                f"{self.value_owner()} shares species of another circuit, so it is no whole model:"
+                " write a circuit that has them all."
+            )
+        part = self.rates[EVERY if cell_type is None else cell_type]
+        undiluted = [n for n in self.species if self.variables[n] not in self.diluted_fields]
+        text = sbml.sbml_text(
+            graph,
+            self.name or label_of(part),
+            written_numbers("initial", self.initial, initial or {}, self.species),
+            written_numbers("constant", self.parameters, values, tuple(self.parameters)),
+            undiluted,
+        )
+        sbml.write(path, text)
 
     @property
     def title(self) -> str:  # type: ignore[override]
@@ -161,6 +278,12 @@ class Circuit(Effect):
     def own_fields(self) -> tuple[str, ...]:
         """The fields of its own species."""
         return tuple(self.variables[n] for n in self.species)
+
+    @cached_property
+    def diluted_fields(self) -> tuple[str, ...]:
+        """The fields of those that growth dilutes."""
+        chosen = self.species if self.dilution is True else self.dilution or ()
+        return tuple(self.variables[n] for n in chosen)
 
     @property
     def volume_field(self) -> str:
@@ -216,14 +339,14 @@ class Circuit(Effect):
         return found | {n: (v, Rule()) for n, v in self.parameters.items()}
 
     def declares(self, dim: int) -> tuple[Field, ...]:
-        rule = "reset" if self.resets else "copy"
+        again = self.diluted_fields if self.resets else ()
         fields = [
             Field(
                 self.variables[n],
                 "concentration in the cell",
                 "conc",
                 initial=_First(self, n),
-                at_division=rule,
+                at_division="reset" if self.variables[n] in again else "copy",
             )
             for n in self.species
         ]
@@ -274,6 +397,12 @@ class Circuit(Effect):
         return changed
 
 
+OPTION_NAMES = tuple(
+    n for n in inspect.signature(Circuit.__init__).parameters
+    if n not in ("self", "rates", "species", "initial", "dilution", "parameters")
+)  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class _First:
     """Concentrations (M,) of new cells: at the start as `initial` says, of daughters as `daughters`
@@ -304,89 +433,3 @@ class _First:
 
 def _volume_of(state: State, rows: Tensor, values: Values) -> Tensor:
     return state.volume.index_select(0, rows)
-
-
-def _names(species: Sequence[str], what: str = "species") -> tuple[str, ...]:
-    """Names of species, checked."""
-    names = (species,) if isinstance(species, str) else tuple(species)
-    if not _fit(names):
-        apart = tuple(species.replace(",", " ").split()) if isinstance(species, str) else ()
-        hint = f"Pass a tuple of names: {what}={apart}." if _fit(apart) else ""
-        raise checks.input_error(f"Circuit.{what}", species, "different names, at least one", hint)
-    return names
-
-
-def _fit(names: Sequence[Any]) -> bool:
-    distinct = bool(names) and len(set(names)) == len(names)
-    return distinct and all(isinstance(n, str) and n.isidentifier() for n in names)
-
-
-def _check_species(names: tuple[str, ...], shared: Mapping[str, str]) -> None:
-    taken = [n for n in (*names, *shared) if n in RESERVED or n in GEOMETRY]
-    if taken:
-        listed = ", ".join(sorted(n for n in {*RESERVED, *GEOMETRY} if not n.startswith("_")))
-        raise checks.input_error(
-            "Circuit.species",
-            taken[0],
-            "a name that cells do not have already",
-            f"Names in use: {listed}.",
-        )
-    both = [n for n in names if n in shared]
-    if both:
-        raise checks.input_error("Circuit.shared", both[0], "no species of the circuit's own")
-
-
-def _check_rates(by_type: Mapping[int | str, Any], typed: bool) -> None:
-    for kind, part in by_type.items():
-        if typed and (isinstance(kind, bool) or not isinstance(kind, Integral)):
-            raise checks.input_error("Circuit.rates", kind, "by cell types that are integers")
-        if not callable(part) and not (isinstance(part, (list, tuple)) and part):
-            raise checks.input_error(
-                "Circuit.rates",
-                part,
-                "a function (u, s, p, cell), a list of reactions, or a dict of either by cell type",
-            )
-
-
-def _check_initial(initial: object, names: tuple[str, ...]) -> None:
-    if initial is not None and not isinstance(initial, Mapping):
-        raise checks.input_error(
-            "Circuit.initial", initial, f"a dict by species, such as {{{names[0]!r}: 1.0}}"
-        )
-    for name in initial or {}:
-        if name not in names:
-            raise checks.InputError(
-                unknown(f"Circuit.initial names {name!r}, which is no species", name, names)
-            )
-
-
-def _shared(given: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
-    """Species of another circuit, by the name here, with their fields."""
-    if isinstance(given, Mapping):
-        return dict(given)
-    return {n: n for n in _names(given, "shared")} if given else {}
-
-
-def _check_constants(given: Mapping[str, Any], options: Sequence[str]) -> None:
-    for name, value in given.items():
-        near = checks.nearest(name, options)
-        # a dict by names is meant for an option such as `initial`; a constant goes by cell types
-        by_names = isinstance(value, Mapping) and any(isinstance(key, str) for key in value)
-        if isinstance(value, str) or callable(value) or (near and by_names):
-            hint = f"Did you mean {near}?" if near else FORMS
-            allowed = "a constant of the rates, as further keywords are"
-            raise checks.input_error(f"Circuit.{name}", value, allowed, hint)
-
-
-def _check_method(method: str, steps: int, by_type: Mapping[int | str, Any]) -> None:
-    checks.choice("Circuit.method", method, METHODS)
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise checks.input_error("Circuit.steps", steps, "an integer from 1")
-    functions = [part for part in by_type.values() if callable(part)]
-    if method in (LEAP, DIRECT) and functions:
-        raise checks.input_error(
-            "Circuit.method",
-            method,
-            f"for reactions; {getattr(functions[0], '__name__', 'a function')} gives rates",
-            "Write the circuit as a list of reactions.",
-        )

@@ -1,0 +1,236 @@
+"""Files that are no SBML, and models that torchfilm does not simulate: refused with line or id."""
+
+from __future__ import annotations
+
+import re
+import sys
+
+import pytest
+from modelled import QUORUM, REPRESSILATOR, TOGGLE, apply, law, read, sbml
+
+import torchfilm as tf
+
+HEAD = (
+    '<listOfCompartments><compartment id="c" size="1" constant="true"/></listOfCompartments>'
+    '<listOfSpecies><species id="A" compartment="c" initialConcentration="1" constant="false"'
+    ' boundaryCondition="false" hasOnlySubstanceUnits="false"/></listOfSpecies>'
+    '<listOfParameters><parameter id="k" value="1" constant="false"/></listOfParameters>'
+)
+RATE = "<listOfRules><rateRule variable='A'><math>{}</math></rateRule></listOfRules>"
+TRIGGER = (
+    f"<trigger initialValue='true' persistent='true'><math>{apply('gt', 'A', 1)}</math></trigger>"
+)
+
+FILES = {
+    "empty": (b"", r"is empty"),
+    "blank": (b"\n \n", r"is empty"),
+    "truncated": (TOGGLE[: len(TOGGLE) // 2].encode(), r"line \d+: this is no XML: .*complete"),
+    "no XML": (b"name,value\nk,1\n", r"line 1: this is no XML"),
+    "Latin-1": (TOGGLE.replace("tested", "régulé").encode("latin-1"), r"not UTF-8 \(line 3, byte"),
+    "another encoding": (TOGGLE.replace("UTF-8", "ISO-8859-1").encode(),
+                         r"line 1: the encoding is ISO-8859-1; SBML is UTF-8"),
+    "UTF-16": (TOGGLE.encode("utf-16"), r"not UTF-8"),
+    "another format": (b"<cellml><model/></cellml>", r"line 1: this is no SBML: .*cellml"),
+    "a zero byte": (b"\0" * 40, "this is no XML"),
+    "no model": (re.sub(r"<model.*</model>", "", TOGGLE, flags=re.DOTALL).encode(),
+                 "has no model"),
+    "no number": (REPRESSILATOR.replace("<cn>1</cn>", "<cn>one</cn>", 1).encode(),
+                  r"line \d+: 'one' is no number"),
+    "a number too large": (REPRESSILATOR.replace("<cn>1</cn>", "<cn>1e999</cn>", 1).encode(),
+                           r"line \d+: this is no valid SBML"),
+    "an attribute that is no number": (TOGGLE.replace('size="2"', 'size="two"').encode(),
+                                       r"line \d+: this is no valid SBML"),
+    "deep": (TOGGLE.replace("</math>", "</math>" + "<a>" * 10_000, 1).encode(), "nested more than"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_that_is_no_sbml_is_refused(name, tmp_path):
+    content, words = FILES[name]
+    path = tmp_path / "model.xml"
+    path.write_bytes(content)
+    with pytest.raises(tf.InputError, match=r"model\.xml") as error:
+        tf.Circuit.from_sbml(path)
+    assert re.search(words, str(error.value))
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(tf.InputError, match=r"none\.xml cannot be read: No such file"):
+        tf.Circuit.from_sbml(tmp_path / "none.xml")
+
+
+def test_entities_are_refused_before_they_grow():
+    laughs = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 30))
+    bomb = TOGGLE.replace("<sbml", f'<!DOCTYPE sbml [<!ENTITY a0 "ha">{laughs}]><sbml', 1).replace(
+        'id="tested"', 'id="&a29;"'
+    )
+    with pytest.raises(tf.InputError, match="line 2: a document type or entity is declared"):
+        read(bomb)
+
+
+def test_files_outside_are_not_read():
+    outside = TOGGLE.replace(
+        "<sbml", '<!DOCTYPE sbml [<!ENTITY x SYSTEM "file:///etc/hostname">]><sbml', 1
+    )
+    with pytest.raises(tf.InputError, match="document type or entity"):
+        read(outside)
+
+
+MODELS = {
+    "the event 'late' with a delay": sbml(
+        HEAD + f"<listOfEvents><event id='late' useValuesFromTriggerTime='true'>{TRIGGER}"
+        "<delay><math><cn>1</cn></math></delay></event></listOfEvents>"
+    ),
+    "the event 'divide' is": sbml(
+        HEAD + f"<listOfEvents><event id='divide' useValuesFromTriggerTime='true'>{TRIGGER}"
+        "</event></listOfEvents>"
+    ),
+    "the algebraic rule 'sum' is": sbml(
+        HEAD + "<listOfRules><algebraicRule id='sum'><math><ci>A</ci></math></algebraicRule>"
+        "</listOfRules>"
+    ),
+    "the constraint number 1": sbml(
+        HEAD + f"<listOfConstraints><constraint><math>{apply('gt', 'A', 1)}</math></constraint>"
+        "</listOfConstraints>"
+    ),
+    "the fast reaction 'J'": sbml(
+        HEAD.replace(' constant="false"/>', "/>")
+        .replace(' constant="false" boundaryCondition="false" hasOnlySubstanceUnits="false"', "")
+        .replace(' constant="true"', "")
+        + "<listOfReactions>"
+        + law("J", "A", "", "<ci>A</ci>").replace("<reaction", "<reaction fast='true'")
+        + "</listOfReactions>",
+        2, 4,
+    ),
+    "in 'rate of A': the formula uses 'delay'": sbml(
+        HEAD + RATE.format(
+            '<apply><csymbol encoding="text"'
+            ' definitionURL="http://www.sbml.org/sbml/symbols/delay">delay</csymbol>'
+            "<ci>A</ci><cn>1</cn></apply>"
+        )
+    ),
+    "the reaction 'J' has no kinetic law": sbml(
+        HEAD + '<listOfReactions><reaction id="J" reversible="false"><listOfReactants>'
+        '<speciesReference species="A" stoichiometry="1" constant="true"/></listOfReactants>'
+        "</reaction></listOfReactions>"
+    ),
+    "the parameter 'k' has no value: give k=…": sbml(
+        HEAD.replace(' value="1"', "") + RATE.format("<ci>k</ci>")
+    ),
+    "the species 'A' has no first value": sbml(
+        HEAD.replace(' initialConcentration="1"', "") + RATE.format("<ci>k</ci>")
+    ),
+    "'A' is -1 at the start": sbml(
+        HEAD.replace('initialConcentration="1"', 'initialConcentration="-1"')
+        + RATE.format("<ci>k</ci>")
+    ),
+    "nothing in the model changes": sbml(""),
+    "the unit of time 'dimensionless' is no multiple of a second": sbml(
+        HEAD + RATE.format("<ci>k</ci>"), attributes='timeUnits="dimensionless"'
+    ),
+    "the factorial of a variable": sbml(HEAD + RATE.format(apply("factorial", "A"))),
+    "no valid SBML": sbml(HEAD + RATE.format("<ci>nowhere</ci>")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", MODELS)
+def test_what_is_not_simulated_is_refused_by_name(words):
+    with pytest.raises(tf.InputError, match=r"^model\.xml") as error:
+        read(MODELS[words])
+    assert words in str(error.value)
+
+
+def test_a_package_that_a_model_needs_is_refused():
+    text = TOGGLE.replace(
+        "<sbml",
+        '<sbml xmlns:comp="http://www.sbml.org/sbml/level3/version1/comp/version1"'
+        ' comp:required="true"',
+        1,
+    )
+    with pytest.raises(tf.InputError, match="needs the package comp"):
+        read(text)
+
+
+def test_a_value_that_is_missing_can_be_given():
+    text = MODELS["the parameter 'k' has no value: give k=…"]
+    assert read(text, k=2.0).parameters == {"k": 2.0}
+    text = MODELS["the species 'A' has no first value"]
+    assert read(text, initial={"A": 2.0}).initial["A"] == 2.0
+
+
+def test_rules_that_depend_on_each_other_are_refused():
+    with pytest.raises(tf.InputError, match="line 1: Loop detected: b's definition"):
+        tf.Circuit.from_antimony("a := b + 1; b := a + 1; species S; S' = a; S = 1")
+
+
+OPTIONS = [
+    ({"signals": ("ahl_oot",)}, "signals names 'ahl_oot', which is no species.*'ahl_out'"),
+    ({"signals": {"ahl_out": "a b"}}, r"signals\['ahl_out'\] = 'a b'.*name of a signal"),
+    ({"without": ("lost",)}, "without names 'lost', which is no reaction.*'lose'"),
+    ({"time_unit": "year"}, "time_unit = 'year'.*one of 's', 'min', 'h'"),
+    ({"properties": {"cytosol": "size"}}, r"properties\['cytosol'\] = 'size'.*one of volume"),
+    ({"properties": {"there": "volume"}}, r"properties\['there'\].*compartment or parameter"),
+    ({"properties": ("cytosol",)}, "properties = .*a dict"),
+    ({"kk": 3.0}, "the model has no constant 'kk'"),
+    ({"luxi": 3.0}, "'luxi' is a variable: give its first value, initial="),
+    ({"initial": {"lux": 1.0}}, "initial names 'lux', which is no variable.*'luxi'"),
+    ({"species": ("luxi",)}, "species = .*left to the model"),
+    ({"methodd": "euler"}, "no constant 'methodd'"),
+    ({"method": "tau_leap", "dilution": True}, "for reactions"),
+]
+
+
+@pytest.mark.parametrize("given, words", OPTIONS, ids=[str(list(o)) for o, _ in OPTIONS])
+def test_options_that_do_not_fit_are_refused(given, words):
+    with pytest.raises(tf.InputError, match=words):
+        tf.Circuit.from_antimony(QUORUM, **given)
+
+
+def test_reactions_in_the_medium_are_refused():
+    text = QUORUM.replace("make:", "decay: ahl_out -> ; outside*loss*ahl_out; make:")
+    with pytest.raises(tf.InputError, match=r"'decay' happens outside.*without=\('decay',\)"):
+        tf.Circuit.from_antimony(text, signals={"ahl_out": "ahl"})
+    tf.Circuit.from_antimony(text, signals={"ahl_out": "ahl"}, without=("decay",))
+
+
+def test_a_signal_with_a_rule_is_refused():
+    with pytest.raises(tf.InputError, match="the signal 'S' has a rule"):
+        tf.Circuit.from_antimony("species S, A; A' = S; S' = 1; S = 1; A = 1", signals="S")
+
+
+def test_several_compartments_need_one_that_is_the_cell():
+    text = QUORUM.replace("luxi in cytosol,", "luxi in nucleus,").replace(
+        "compartment ", "compartment nucleus = 1, "
+    )
+    with pytest.raises(tf.InputError, match=r"nucleus, cytosol: say which is the cell"):
+        tf.Circuit.from_antimony(text, signals={"ahl_out": "ahl"})
+
+
+ANTIMONY = {
+    "species A\nA' = -k*A\nk = = 2": "the Antimony text, line 3: syntax error",
+    "": "the Antimony text is empty",
+    " \n": "the Antimony text is empty",
+    "toggle.ant": "looks like the name of a file",
+    'model m\nimport "other.ant"\nend': "line 2: import reads another file",
+    "species A\0; A' = 1": "zero byte",
+    "species A; A = 1": None,
+    "species A; A = 1; at (A > 2): A = 1; A' = 1": "the event '.+' is not supported",
+}
+
+
+@pytest.mark.parametrize("text", ANTIMONY)
+def test_antimony_that_cannot_be_read_is_refused_with_its_line(text):
+    if ANTIMONY[text] is None:
+        assert tf.Circuit.from_antimony(text).species == ("A",)
+        return
+    with pytest.raises(tf.InputError, match=ANTIMONY[text]):
+        tf.Circuit.from_antimony(text)
+
+
+@pytest.mark.parametrize(
+    "module, package", [("libsbml", "python-libsbml"), ("antimony", "antimony")]
+)
+def test_a_missing_extra_is_named(module, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(tf.InputError, match=rf'{package}: pip install "torchfilm\[sbml\]"'):
+        tf.Circuit.from_antimony(QUORUM)

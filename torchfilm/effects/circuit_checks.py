@@ -1,0 +1,175 @@
+"""Checks of what a circuit is given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from numbers import Integral
+from typing import Any
+
+from torch import Tensor
+
+from torchfilm.circuits import integrators, sbml
+from torchfilm.circuits.names import unknown
+from torchfilm.state import RESERVED
+from torchfilm.tools import checks
+from torchfilm.values import FORMS
+
+STIFF, LEAP, DIRECT = "rosenbrock", "tau_leap", "direct"
+EXPLICIT = ("euler", *integrators.METHODS)
+METHODS = (STIFF, *EXPLICIT, LEAP, DIRECT)
+GEOMETRY = ("volume", "area", "x", "y", "z")
+
+
+def names_of(species: Sequence[str], what: str = "species") -> tuple[str, ...]:
+    """Names of species, checked."""
+    names = (species,) if isinstance(species, str) else tuple(species)
+    if not _fit(names):
+        apart = tuple(species.replace(",", " ").split()) if isinstance(species, str) else ()
+        hint = f"Pass a tuple of names: {what}={apart}." if _fit(apart) else ""
+        raise checks.input_error(f"Circuit.{what}", species, "different names, at least one", hint)
+    return names
+
+
+def _fit(names: Sequence[Any]) -> bool:
+    distinct = bool(names) and len(set(names)) == len(names)
+    return distinct and all(isinstance(n, str) and n.isidentifier() for n in names)
+
+
+def check_species(names: tuple[str, ...], shared: Mapping[str, str]) -> None:
+    taken = [n for n in (*names, *shared) if n in RESERVED or n in GEOMETRY]
+    if taken:
+        listed = ", ".join(sorted(n for n in {*RESERVED, *GEOMETRY} if not n.startswith("_")))
+        raise checks.input_error(
+            "Circuit.species",
+            taken[0],
+            "a name that cells do not have already",
+            f"Names in use: {listed}.",
+        )
+    both = [n for n in names if n in shared]
+    if both:
+        raise checks.input_error("Circuit.shared", both[0], "no species of the circuit's own")
+
+
+def check_rates(by_type: Mapping[int | str, Any], typed: bool) -> None:
+    for kind, part in by_type.items():
+        if typed and (isinstance(kind, bool) or not isinstance(kind, Integral)):
+            raise checks.input_error("Circuit.rates", kind, "by cell types that are integers")
+        if not callable(part) and not (isinstance(part, (list, tuple)) and part):
+            raise checks.input_error(
+                "Circuit.rates",
+                part,
+                "a function (u, s, p, cell), a list of reactions, or a dict of either by cell type",
+            )
+
+
+def check_initial(initial: object, names: tuple[str, ...]) -> None:
+    if initial is not None and not isinstance(initial, Mapping):
+        raise checks.input_error(
+            "Circuit.initial", initial, f"a dict by species, such as {{{names[0]!r}: 1.0}}"
+        )
+    for name in initial or {}:
+        if name not in names:
+            raise checks.InputError(
+                unknown(f"Circuit.initial names {name!r}, which is no species", name, names)
+            )
+
+
+def shared_fields(given: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
+    """Species of another circuit, by the name here, with their fields."""
+    if isinstance(given, Mapping):
+        return dict(given)
+    return {n: n for n in names_of(given, "shared")} if given else {}
+
+
+def check_constants(given: Mapping[str, Any], options: Sequence[str]) -> None:
+    for name, value in given.items():
+        near = checks.nearest(name, options)
+        # a dict by names is meant for an option such as `initial`; a constant goes by cell types
+        by_names = isinstance(value, Mapping) and any(isinstance(key, str) for key in value)
+        if isinstance(value, str) or callable(value) or (near and by_names):
+            hint = f"Did you mean {near}?" if near else FORMS
+            allowed = "a constant of the rates, as further keywords are"
+            raise checks.input_error(f"Circuit.{name}", value, allowed, hint)
+
+
+def check_method(method: str, steps: int, by_type: Mapping[int | str, Any]) -> None:
+    checks.choice("Circuit.method", method, METHODS)
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        raise checks.input_error("Circuit.steps", steps, "an integer from 1")
+    functions = [part for part in by_type.values() if callable(part)]
+    if method in (LEAP, DIRECT) and functions:
+        raise checks.input_error(
+            "Circuit.method",
+            method,
+            f"for reactions; {getattr(functions[0], '__name__', 'a function')} gives rates",
+            "Write the circuit as a list of reactions.",
+        )
+
+
+def diluted_names(
+    given: bool | Sequence[str], species: Sequence[str], method: str
+) -> bool | tuple[str, ...]:
+    """The option `dilution`: True, False, or the names of the species that growth dilutes."""
+    if not isinstance(given, bool):
+        given = tuple(dict.fromkeys((given,) if isinstance(given, str) else given))
+        for name in given:
+            if name not in species:
+                what = f"Circuit.dilution names {name!r}, which is no species"
+                raise checks.InputError(unknown(what, name, species))
+        given = True if len(given) == len(species) else given or False
+    if given is not True and method in (LEAP, DIRECT):
+        raise checks.input_error(
+            "Circuit.dilution", given, "True where molecules are counted", "Their number is kept."
+        )
+    return given
+
+
+def model_choices(
+    signals: Sequence[str] | Mapping[str, str],
+    properties: Mapping[str, str] | None,
+    without: Sequence[str],
+    time_unit: str | None,
+    initial: Mapping[str, Any] | None,
+    keywords: Mapping[str, Any],
+    options: Sequence[str],
+) -> sbml.Given:
+    """What a user says of a model to read; `options` are keywords of a circuit."""
+    if not isinstance(signals, Mapping):
+        signals = {n: n for n in ((signals,) if isinstance(signals, str) else signals)}
+    for name in ("species", "rates"):
+        if name in keywords:
+            raise checks.input_error(f"Circuit.{name}", keywords[name], "left to the model")
+    for name, given in (("properties", properties), ("initial", initial)):
+        if given is not None and not isinstance(given, Mapping):
+            raise checks.input_error(name, given, "a dict by ids of the model")
+    return sbml.Given(
+        signals=signals,
+        properties=properties or {},
+        without=(without,) if isinstance(without, str) else tuple(without),
+        time_unit=time_unit,
+        values={n: x for n, x in keywords.items() if n not in options},
+        initial=initial or {},
+        options=options,
+        fields=(*RESERVED, *GEOMETRY),
+    )
+
+
+def written_numbers(
+    what: str, values: Mapping[str, Any], given: Mapping[str, float], names: Sequence[str]
+) -> dict[str, float]:
+    """Numbers by name for a model to write: those given in place of the circuit's own."""
+    for name in given:
+        if name not in names:
+            raise checks.InputError(unknown(f"{what} {name!r} is not in the circuit", name, names))
+    found = {}
+    for name in names:
+        value = given.get(name, values.get(name, 0.0))
+        if isinstance(value, Tensor) and value.numel() == 1:
+            value = value.item()
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            hint = f"initial={{{name!r}: …}}" if what == "initial" else f"{name}=…"
+            raise checks.input_error(
+                f"{what} {name!r}", value, "one number to be written", f"Give it: {hint}."
+            )
+        found[name] = float(value)
+    return found
