@@ -65,7 +65,8 @@ def crossing(u, s, p, cell):
     within = lambda m, above, below: (
         (m**p.n / (above**p.n + m**p.n)) * (1.0 - m**p.n / (below**p.n + m**p.n))
     )
-    lit = within(s.right, p.x_above, p.x_below) + within(s.up, p.y_above, p.y_below)
+    x, y = within(s.right, p.x_above, p.x_below), within(s.up, p.y_above, p.y_below)
+    lit = x + y - x * y
     return {"gfp": p.make * lit - p.decay * u.gfp}
 
 
@@ -171,6 +172,7 @@ TASKS = {
             Parameter("diffusion", 10.0, 1000.0, **LOG),
         ],
         Ring("gfp", radius=3.0, width=6.0, floor=0.2),
+        {"cells": 200},  # grown anew for each design
     ),
     "domain size": SearchTask(
         "toggle_switch", domain_size.PARAMETERS, DomainSize(("red", "green"), 12.0)
