@@ -32,7 +32,9 @@ def draw_front(
     grid = figure.add_gridspec(2, columns, height_ratios=[1.0, 0.8])
     ax = figure.add_subplot(grid[0, : max(1, (2 * columns) // 3)])
     ax.plot(every[:, 0], every[:, 1], ".", color="0.75", ms=3, label="every design")
-    ax.plot(front[:, 0], front[:, 1], "D-", color="C3", ms=4, lw=0.8, label="front")
+    # no design lies between two neighbours: a step, not a slope
+    ax.step(front[:, 0], front[:, 1], where="post", color="C3", lw=0.8, zorder=1)
+    ax.plot(front[:, 0], front[:, 1], "D", color="C3", ms=4, label="front")
     for row in colonies:
         ax.annotate(
             str(row),

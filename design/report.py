@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 import torchfilm as tf
 from design.finals import FreshLosses
@@ -16,6 +17,7 @@ from design.parameters import Choice, Parameter, Value, show_value
 from design.rollout import FinishedColonies
 from design.study import Study
 from design.targets.base import Target
+from design.targets.goals import Goals
 from design.task import Task
 from design.trivial import trivial_losses
 
@@ -59,11 +61,14 @@ def table(report: SearchReport) -> str:
     for p in report.task.space.parameters:
         values = (show_value(design.values[p.name]) for design in (first, best))
         rows.append((p.name, _bounds(p), *values, _at_bound(p, best.values[p.name])))
-    rows.append(("loss", "", f"{first.loss:.4f}", f"{best.loss:.4f}", ""))
+    rows.append((_loss_title(report), "", f"{first.loss:.4f}", f"{best.loss:.4f}", ""))
+    rows += _goals(report)
     if best.fresh is not None:
         low, high = best.fresh.band
         seeds = f"{low:.4f} … {high:.4f}, {len(best.fresh.losses)} seeds"
-        rows.append(("loss on fresh seeds", "", "", f"{best.fresh.loss:.4f}", seeds))
+        rows.append(
+            (f"{_loss_title(report)} on fresh seeds", "", "", f"{best.fresh.loss:.4f}", seeds)
+        )
     rows.append(("cells", "", *(_cells(design.colonies) for design in (first, best)), ""))
     target = report.task.target
     old, new = (each_measured(target, design.colonies) for design in (first, best))
@@ -94,6 +99,27 @@ def table(report: SearchReport) -> str:
     spent = f"{study.colonies:.0f} colonies in {study.seconds:.0f} s"
     lines.append(spent + (f", {failed} failed" if failed else "") + f"; {how}")
     return "\n".join(lines)
+
+
+def _loss_title(report: SearchReport) -> str:
+    return "sum of goals" if report.task.goals else "loss"
+
+
+def _goals(report: SearchReport) -> list[tuple[str, ...]]:
+    """A row for each of several goals: its mean over the replicates."""
+    target = report.task.target
+    if not isinstance(target, Goals):
+        return []
+    each = [
+        torch.cat([target.losses(part.state, part.history) for part in design.colonies]).mean(0)
+        for design in (report.first, report.best)
+        if design.colonies
+    ]
+    return [
+        (title, "", *(f"{float(found[k]):.4f}" for found in each), "")
+        for k, title in enumerate(target.titles)
+        if len(each) == 2
+    ]
 
 
 def _warnings(report: SearchReport) -> list[str]:
@@ -190,6 +216,8 @@ def draw(report: SearchReport, path: Path) -> Path:
     for row, one in enumerate(designs):
         axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
         title = f"{one.title}, loss {one.loss:.3f}"
+        if one.fresh is not None:
+            title += f" ({one.fresh.loss:.3f} on fresh seeds)"
         scales = _draw_row(axes, grown[row], frames[row], target, size, limits, title) or scales
     bars = [figure.add_subplot(grid[2, k]) for k in range(columns)]
     for bar, scale in zip(bars, scales, strict=False):
@@ -291,20 +319,16 @@ def _draw_row(
 
 
 def _draw_convergence(ax: Axes, study: Study) -> None:
-    """The loss of every full-size design, and the lowest loss so far."""
-    colonies, _, best = study.convergence()
-    spent = np.concatenate([[0.0], colonies])
+    """The loss of every full-size design, and the lowest so far."""
+    spent = np.concatenate([[0.0], study.convergence()[0]])
+    places, losses = [np.empty(0)], [np.empty(0)]
     for entry, begin, end in zip(study.entries, spent[:-1], spent[1:], strict=True):
         if study.is_full(entry):
-            ax.plot(
-                np.linspace(begin, end, len(entry.loss) + 1)[1:],
-                entry.loss,
-                ".",
-                color="0.75",
-                ms=2,
-                zorder=0,
-            )
-    ax.step(colonies, best, where="post", color="C3")
+            places.append(np.linspace(begin, end, len(entry.loss) + 1)[1:])
+            losses.append(entry.loss)
+    x, y = np.concatenate(places), np.concatenate(losses)
+    ax.plot(x, y, ".", color="0.75", ms=2, zorder=0)
+    ax.step(x, np.minimum.accumulate(y), where="post", color="C3")
     ax.set(xlabel="colonies simulated", ylabel="loss", ylim=(0, None))
     ax.set_title("every design (grey), the best so far (red)", fontsize=9)
 

@@ -160,13 +160,7 @@ def try_scenes(
             unfit.append(str(error))
             continue
         except Exception as error:
-            changed = {n: v for n, v in values.items() if v != middle[n]} or values
-            raise tf.InputError(
-                f"{type(error).__name__}: {str(error).rstrip('.')}. So the scene cannot be built"
-                f" with {changed}. Narrow the bounds. If the scene takes a plain number or a name"
-                " there, use whole=True or a Choice: a Parameter arrives as a tensor with one value"
-                " per colony."
-            ) from error
+            raise _cannot_be_built(error, values, middle) from error
         target.check(tried.first)
         example = example or family.scene([values])
         made_of.append((scene.effects, scene.founders))
@@ -189,6 +183,25 @@ def try_scenes(
         digest=tf.digest(made_of),
         why_regrown=why_regrown,
         why_rough=_why_rough(scene),
+    )
+
+
+def _cannot_be_built(
+    error: Exception, values: dict[str, Value], middle: dict[str, Value]
+) -> tf.InputError:
+    """What to do depends on whether the scene fails in the middle of the space too, and on whether
+    torchfilm has refused a value, or Python or torch a tensor."""
+    changed = {n: v for n, v in values.items() if v != middle[n]}
+    kind = "" if isinstance(error, tf.InputError) else f"{type(error).__name__}: "
+    hints = " Narrow the bounds." if changed else ""
+    if kind:
+        hints += (
+            " If the scene takes a plain number or a name there, use whole=True or a Choice: a"
+            " Parameter arrives as a tensor with one value per colony."
+        )
+    return tf.InputError(
+        f"{kind}{str(error).rstrip('.')}. So the scene cannot be built with {changed or values}."
+        + hints
     )
 
 

@@ -16,7 +16,7 @@ def refusal(path: Path, names: list[str], there: Mapping[str, Any], here: Mappin
     # the listed effects are those in the middle of the bounds, so bounds change them too
     names = sorted(names, key=lambda name: (name in DIGESTS, name == "effects"))
     out = f"{path.name} is the study of another search. Different: {', '.join(names)}."
-    close = " Give another path, or restore the search."
+    close = " Give another path (start= takes what this study knows), or restore the search."
     for name in names:
         if name in DIGESTS:  # their values say nothing to a reader
             continue

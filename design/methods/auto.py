@@ -8,7 +8,6 @@ from typing import Any
 from design.methods.cmaes import CMAES
 from design.methods.nsga2 import NSGA2
 from design.methods.racing import Racing
-from design.methods.sobol import Sobol
 
 # designs of a batch, and the width of its first cloud: the settings that were measured
 BATCH, WIDTH = 24, 0.5
@@ -33,9 +32,9 @@ def choose(dimensions: int, designs: float, goals: int, before: str = "") -> Cho
     budget can grow with all replicates; goals: 0 for one target; before: what the study of a
     search that is resumed says of its method, which goes on."""
     few = Chosen(
-        Sobol(batch=BATCH),
-        f"{designs:.0f} designs are fewer than two batches of {BATCH}, and no method learns from so"
-        " few",
+        CMAES(population=BATCH, sigma=WIDTH),
+        f"{designs:.0f} designs are fewer than two batches of {BATCH}, so there is nothing to spare"
+        " for small colonies; its first batch is of Sobol points",
     )
     race = Chosen(
         Racing(inner=CMAES(population=BATCH, sigma=WIDTH)),

@@ -252,3 +252,9 @@ def test_a_flat_box_in_space_is_refused_unless_it_is_meant():
         scene().bind().start()
     for given in ({"depth": 2.0}, {"outside": "grow"}, {"outside": "reservoir"}):
         scene(**given).bind().start()
+
+
+@pytest.mark.parametrize("boundary", [tf.Dirichlet(0.0), "noflux", tf.NoFlux], ids=str)
+def test_faces_of_a_signal_are_boundary_conditions(boundary):
+    with pytest.raises(tf.InputError, match=r"Signal.boundary = .*BoundaryConditions\(x="):
+        tf.Signal(diffusion=1.0, boundary=boundary)

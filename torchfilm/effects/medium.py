@@ -52,6 +52,7 @@ class Signal:
     reservoir: float | Tensor = 0.0
 
     def __post_init__(self) -> None:
+        _check_boundary("Signal.boundary", self.boundary)
         rule = Rule(scope="colony", least=0.0)
         for name in ("diffusion", "reservoir", "decay", "initial", "source"):
             given = getattr(self, name)
@@ -306,6 +307,16 @@ def _check_signals(signals: Mapping[str, Any]) -> None:
             )
 
 
+def _check_boundary(name: str, given: object) -> None:
+    if given is not None and not isinstance(given, BoundaryConditions):
+        raise checks.input_error(
+            name,
+            given,
+            "BoundaryConditions",
+            "Write boundary=tf.BoundaryConditions(x=tf.Open(), y=tf.NoFlux()).",
+        )
+
+
 def _check_medium(
     boundary: object,
     outside: str,
@@ -315,13 +326,7 @@ def _check_medium(
     splitting: str,
     obstacles: object,
 ) -> None:
-    if boundary is not None and not isinstance(boundary, BoundaryConditions):
-        raise checks.input_error(
-            "Medium.boundary",
-            boundary,
-            "BoundaryConditions",
-            "Write boundary=tf.BoundaryConditions(x=tf.Open(), y=tf.NoFlux()).",
-        )
+    _check_boundary("Medium.boundary", boundary)
     checks.choice("Medium.outside", outside, OUTSIDE_CELLS)
     if not isinstance(grows, str) or not grows or set(grows) - set("xyz"):
         raise checks.input_error(
