@@ -19,7 +19,8 @@ class Entry:
     size: share of the full size; seconds; values: the parameters of each point; streams (R,): of
     random numbers, one for each replicate. slopes: where the method asked for them; copies:
     colonies that were grown for each loss: more than 1 for its derivatives, 0 where it was known
-    before; goals (n, G): the losses of several targets side by side, NaN for a design that failed.
+    before; goals (n, G): the losses of several targets side by side, NaN for a design that failed;
+    each_goals (n, R, G): those of each replicate.
     """
 
     points: np.ndarray
@@ -34,6 +35,7 @@ class Entry:
     slopes: Slopes | None = None
     copies: int = 1
     goals: np.ndarray | None = None
+    each_goals: np.ndarray | None = None
 
     @property
     def replicates(self) -> int:
@@ -59,5 +61,6 @@ class Entry:
             seconds=self.seconds + other.seconds,
             values=[*self.values, *other.values],
             goals=None if self.goals is None else join("goals"),
+            each_goals=None if self.each_goals is None else join("each_goals"),
             slopes=None if self.slopes is None else joined([self.slopes, other.slopes]),
         )

@@ -133,6 +133,7 @@ def _of_study(study: Study, task: Task) -> KnownDesigns:
         best = np.argsort([e.loss[k] for e, k in rows], kind="stable")[:MOST]
         return KnownDesigns(np.array(points)[best], why=why)
     join = lambda name: np.array([getattr(e, name)[k] for e, k in rows])
+    kept = lambda name: join(name) if all(getattr(e, name) is not None for e, _ in rows) else None
     values_of = [task.space.values(point) for point in points]
     entry = Entry(
         points=np.array(points),
@@ -150,6 +151,8 @@ def _of_study(study: Study, task: Task) -> KnownDesigns:
         values=values_of,
         streams=study.streams,
         copies=0,
+        goals=kept("goals"),
+        each_goals=kept("each_goals"),
     )
     return KnownDesigns(entry.points, entry)
 
@@ -164,13 +167,25 @@ def _why_other(
     options = {f.name: getattr(task, f.name) for f in dataclasses.fields(TaskOptions)}
     stated = {n: v for n, v in added.items() if n in fixed}
     try:
-        options["parameters"] = [read_parameter(text) for text in study.about["parameters"]]
+        options["parameters"] = [
+            _as_here(read_parameter(text), task) for text in study.about["parameters"]
+        ]
         options["fixed"] = {**task.family.fixed, **stated}
         then = Task(**options).describe()
     except (tf.InputError, ValueError, KeyError) as error:
         return str(error)
     differ = [name for name, value in then.items() if study.about.get(name) != value]
     return f"another {', '.join(differ)}" if differ else ""
+
+
+def _as_here(parameter: Parameter | Choice, task: Task) -> Parameter | Choice:
+    """A parameter of a study; a choice reaches the scene as that of the same name in a task."""
+    here = next((p for p in task.space.parameters if p.name == parameter.name), None)
+    if not isinstance(parameter, Choice) or not isinstance(here, Choice):
+        return parameter
+    return Choice(
+        parameter.name, parameter.options, per_colony=here.per_colony, resolve=here.resolve
+    )
 
 
 def _literals(texts: Mapping[str, str]) -> dict[str, Value]:

@@ -29,7 +29,7 @@ class Evaluation:
     cells (n, R), of each colony at its end; reasons, by (row, replicate), why a colony failed;
     size: share of the full size; why_regrown: the reason why colonies did not follow recorded
     growth, or ""; seconds; slopes: of the n designs, where they were asked for; copies: colonies
-    that were grown for each loss (n, R); goals (n, G): as `Entry` has them.
+    that were grown for each loss (n, R); goals (n, G), each_goals (n, R, G): as `Entry` has them.
     """
 
     points: np.ndarray
@@ -44,6 +44,7 @@ class Evaluation:
     slopes: Slopes | None = None
     copies: int = 1
     goals: np.ndarray | None = None
+    each_goals: np.ndarray | None = None
 
     def entry(self, streams: tuple[int, ...], size: float | None = None) -> Entry:
         """For a study. streams: that were evaluated; size: share of the full size of the search,
@@ -61,6 +62,7 @@ class Evaluation:
             slopes=self.slopes,
             copies=self.copies,
             goals=self.goals,
+            each_goals=self.each_goals,
         )
 
 
@@ -123,6 +125,8 @@ class Objective:
             )
         if task.tried.why_regrown:
             return f"growth depends on the design ({task.tried.why_regrown})"
+        if task.target.reduced(np.zeros((1, task.replicates))) is not None:
+            return "the loss is a statistic of several seeds"
         return task.tried.why_rough
 
     def copies(self, slopes: bool) -> int:
@@ -166,7 +170,7 @@ class Objective:
         copies = 1 if turns is None else len(turns[0])
         return Evaluation(
             points, values, losses, task.reduced(losses), cells, reasons, size, why_regrown, 0.0,
-            slopes, copies, task.reduced_goals(goals),
+            slopes, copies, task.reduced_goals(goals), goals if task.goals else None,
         )  # fmt: skip
 
     def _differences(self, points: np.ndarray, streams: tuple[int, ...], *run: Any) -> Evaluation:
@@ -183,6 +187,7 @@ class Objective:
             points=points, values=found.values[first], losses=found.losses[first],
             loss=found.loss[first], cells=found.cells[first], slopes=slopes, copies=each,
             goals=None if found.goals is None else found.goals[first],
+            each_goals=None if found.each_goals is None else found.each_goals[first],
             reasons={(r // each, k): w for (r, k), w in found.reasons.items() if not r % each},
         )  # fmt: skip
 

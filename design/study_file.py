@@ -5,7 +5,8 @@
     /streams      (R,) streams of random numbers, one for each replicate
     /batches/     rows, size, replicates, first_stream, seconds, copies: a row for each batch
     /designs/     point (N, D), loss (N,), losses (N, R), cells (N, R); NaN and 0 where a replicate
-                  was not grown; reasons, JSON by replicate; goals (N, G), where there are several
+                  was not grown; reasons, JSON by replicate; goals (N, G) and each_goals (N, R, G),
+                  where there are several
     /slopes/K/    gradient (n, D) and curvature (n, D, D) of batch K, where they were wanted
     /values/NAME  (N,) the values of each parameter
     /finals/      the same of the finals, the designs on fresh seeds
@@ -82,15 +83,20 @@ def _write_entries(
     for name in ("size", "replicates", "seconds", "copies"):
         group[f"batches/{name}"] = [getattr(e, name) for e in entries]
     wide = lambda x, fill: np.concatenate(
-        [x, np.full((len(x), most - x.shape[1]), fill, x.dtype)], 1
+        [x, np.full((len(x), most - x.shape[1], *x.shape[2:]), fill, x.dtype)], 1
     )
     group["designs/point"] = np.concatenate([e.points for e in entries])
     group["designs/loss"] = np.concatenate([e.loss for e in entries])
     group["designs/losses"] = np.concatenate([wide(e.losses, np.nan) for e in entries])
     group["designs/cells"] = np.concatenate([wide(e.cells, 0) for e in entries])
-    goals = [e.goals for e in entries if e.goals is not None]
-    if goals:
-        group["designs/goals"] = np.concatenate(goals)
+    count = next((e.goals.shape[1] for e in entries if e.goals is not None), 0)
+    if count:
+        none = lambda e, *shape: np.full((len(e.points), *shape, count), np.nan)
+        group["designs/goals"] = np.concatenate(
+            [none(e) if e.goals is None else e.goals for e in entries]
+        )
+        each = [none(e, most) if e.each_goals is None else e.each_goals for e in entries]
+        group["designs/each_goals"] = np.concatenate([wide(x, np.nan) for x in each])
     for number, slopes in enumerate(e.slopes for e in entries):
         if slopes is not None:
             group[f"slopes/{number}/gradient"] = slopes.gradient
@@ -178,6 +184,9 @@ def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> 
                 slopes=_read_slopes(group, len(out)),
                 copies=copies,
                 goals=designs["goals"][mine] if "goals" in designs else None,
+                each_goals=(
+                    designs["each_goals"][mine, :replicates] if "each_goals" in designs else None
+                ),
             )
         )
         at += rows

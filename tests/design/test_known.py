@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from searching import Level, built, lit, paced
 
 import torchfilm as tf
@@ -183,3 +184,17 @@ def test_choices_and_paces_are_compared():
     paced_search.run(6, progress=False)
     wider = search([Parameter("rate", 1.0, 2.4)], paced, start=paced_search.study)
     assert wider.study.entries[0].copies == 0
+
+
+def lit_together(kind=("a",), decay=1.0):
+    """The choice is a list, with one option for each colony."""
+    assert isinstance(kind, list)
+    return lit(torch.tensor([{"a": 1.0, "b": 3.0}[k] for k in kind]), decay)
+
+
+def test_choices_per_colony_keep_the_losses():
+    kinds = Choice("kind", ("a", "b"), per_colony=True)
+    old = search([kinds, Parameter("decay", 0.8, 1.2)], lit_together)
+    old.run(12, progress=False)
+    made = search([kinds, Parameter("decay", 0.5, 2.0)], lit_together, start=old.study)
+    assert made.study.entries[0].copies == 0 and made._known.why == ""
