@@ -75,12 +75,11 @@ class Turn:
                 know(self.entry.points, loss)
             return
         batch = replace(self.batch, points=self.entry.points)
-        if self.entry.goals is not None:
-            method.tell(batch, self.entry.goals)
-        elif batch.slopes:
-            method.tell(batch, loss, slopes)  # type: ignore[call-arg]
+        found = loss if self.entry.goals is None else self.entry.goals
+        if batch.slopes:
+            method.tell(batch, found, slopes)  # type: ignore[call-arg]
         else:
-            method.tell(batch, loss)
+            method.tell(batch, found)
 
 
 def repeat_study(method: Method, study: Study, known: KnownDesigns | None) -> Turn | None:

@@ -18,7 +18,8 @@ class NSGA2(Turns):
     """NSGA-II (Deb et al., IEEE Trans. Evol. Comput. 6, 182, 2002), by the package pymoo, for the
     front of several goals.
 
-    population: designs in a batch, kept from one to the next. The first batch is of Sobol points.
+    population: designs in a batch, kept from one to the next. The first batch is of Sobol points,
+    of which those with the same levels count once.
     Designs that failed come after all others. `tell` takes the losses of all goals, (n, G), NaN for
     a design that failed.
     """
@@ -35,13 +36,13 @@ class NSGA2(Turns):
             )
 
     def _begin(self) -> None:
-        self._points = sobol_points(self._started(), self._seed, 0, self.population)
+        self._points = _different(sobol_points(self._started(), self._seed, 0, self.population))
         self._search: Any = None
 
     def know(self, points: np.ndarray, loss: np.ndarray) -> None:
         """The first batch begins with the best of them."""
-        best = np.argsort(loss, kind="stable")[: self.population]
-        self._points[: len(best)] = points[best]
+        best = points[np.argsort(loss, kind="stable")]
+        self._points = _different(np.concatenate([best, self._points]))[: self.population]
 
     def _next(self) -> Batch:
         if self._search is None:
@@ -78,3 +79,8 @@ class NSGA2(Turns):
         algorithm = Algorithm(pop_size=self.population, sampling=self._points)
         algorithm.setup(problem, termination=NoTermination(), seed=self._seed)
         return algorithm
+
+
+def _different(points: np.ndarray) -> np.ndarray:
+    """Each of some points once, in their order: pymoo drops those that it has."""
+    return points[np.sort(np.unique(points, axis=0, return_index=True)[1])]
