@@ -18,7 +18,7 @@ from design.colonies import RunSettings
 from design.parameters import Choice, Parameter, Space
 from design.scene_family import SceneFamily, TriedScenes, scene_function, try_scenes
 from design.targets.base import Target
-from design.targets.goals import Goals
+from design.targets.goals import Goals, of_seeds
 from torchfilm import checks
 
 NONE = cast(Target, None)  # the target where `targets` are given
@@ -82,6 +82,10 @@ class Task(TaskOptions):
         function, fixed = scene_function(self.scene), dict(self.fixed or {})
         family = SceneFamily(function, Space(self.parameters), fixed, self.device)
         until = _check_options(self)
+        if of_seeds(self.target) and self.replicates < 2:
+            raise checks.input_error(
+                "replicates", self.replicates, "2 or more with Spread", "It compares seeds."
+            )
         family.check_names()
         tried = try_scenes(
             family,

@@ -66,7 +66,8 @@ class Duration(Target):
     failed = WORST
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        return torch.full((state.colonies,), float(state.time), dtype=torch.float64)
+        hours = float(state.time)
+        return torch.full((state.colonies,), hours, dtype=torch.float64, device=state.device)
 
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         return {"hours": self.loss(state)}
@@ -150,6 +151,7 @@ class Weighted(Several):
             )
         for part, weight in terms:
             checks.number(f"Weighted: the weight of {type(part).__name__}", weight, above=0.0)
+            of_colonies("Weighted", part)
         object.__setattr__(self, "terms", tuple(terms))
         object.__setattr__(self, "parts", tuple(part for part, _ in terms))
 
@@ -158,8 +160,10 @@ class Weighted(Several):
         return sum(weight * part.failed for part, weight in self.terms)
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
-        found = self.losses(state, history)
-        return found @ found.new_tensor([weight for _, weight in self.terms])
+        found = self.losses(state, history).unbind(1)
+        # one after the other: the bits of a product with a matrix may depend on the batch
+        each = [loss * weight for loss, (_, weight) in zip(found, self.terms, strict=True)]
+        return sum(each[1:], each[0])
 
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor | None:
         each = self._each(lambda part, own: part.residuals(state, own), state, history)
@@ -196,6 +200,8 @@ class Constrained(Several):
         parts = (self.target, *self.more)
         if not all(isinstance(part, Target) for part in parts):
             raise checks.input_error("Constrained", parts, "targets, such as Stripe(…)")
+        for part in parts:
+            of_colonies("Constrained", part)
         if not self.at_least and not self.at_most:
             raise checks.input_error(
                 "Constrained",
@@ -213,17 +219,27 @@ class Constrained(Several):
 
     def check(self, state: tf.State) -> None:
         super().check(state)
-        there = self._measured(state)
+        each = self._measured(state)
+        there = [name for found in each for name in found]
         for name in (*self.at_least, *self.at_most):
             if name not in there:
                 raise checks.input_error(
                     "Constrained: measure", name, "one of " + ", ".join(map(repr, there))
                 )
+            owners = [p for p, found in zip(self.parts, each, strict=True) if name in found]
+            if any(part != owners[0] for part in owners):
+                raise checks.input_error(
+                    "Constrained: measure",
+                    name,
+                    "a measure of one target",
+                    "Several have it: " + "; ".join(part.describe() for part in owners) + ".",
+                )
 
-    def _measured(self, state: tf.State) -> dict[str, Tensor]:
-        """Of a first state: the names of all measures."""
+    def _measured(self, state: tf.State) -> list[dict[str, Tensor]]:
+        """Of a first state: the measures of each part."""
         note = self.note(state)
-        return self.measures(state, None if note is None else note.unsqueeze(0))
+        history = None if note is None else note.unsqueeze(0)
+        return self._each(lambda part, own: part.measures(state, own), state, history)
 
     def missed(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """By how much the constraints are missed, (B,): the sum over all of the distance to the
@@ -240,7 +256,8 @@ class Constrained(Several):
         own = self._each(lambda part, own: part.loss(state, own).double(), state, history)[0]
         missed = self.missed(state, history)
         share = torch.where(missed.isinf(), 1.0, missed / (1.0 + missed))
-        return torch.where(missed > 0, self.BROKEN + share, own)
+        # a colony without a loss has failed, whatever it misses
+        return torch.where((missed > 0) & ~own.isnan(), self.BROKEN + share, own)
 
     def remark(self, loss: np.ndarray) -> str:
         share = float(np.min(loss)) - self.BROKEN
@@ -272,16 +289,35 @@ class Spread(Several):
     def __post_init__(self) -> None:
         if not isinstance(self.target, Target):
             raise checks.input_error("Spread", self.target, "a Target, such as Stripe(…)")
+        of_colonies("Spread", self.target)
         object.__setattr__(self, "parts", (self.target,))
 
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         return self.losses(state, history)[:, 0]
 
     def reduced(self, losses: np.ndarray) -> np.ndarray | None:
-        return losses.std(1, ddof=1) if losses.shape[1] > 1 else np.zeros(len(losses))
+        """Seeds that all fail are alike, and no goal: the design has failed."""
+        wide = losses.std(1, ddof=1) if losses.shape[1] > 1 else np.zeros(len(losses))
+        return np.where((losses == self.failed).any(1), self.failed, wide)
 
     def describe(self) -> str:
         return f"the same on all seeds: {self.target.describe()}"
+
+
+def of_seeds(target: Target) -> bool:
+    """Whether a target is a statistic of several seeds, or has one among its parts."""
+    return isinstance(target, Spread) or any(map(of_seeds, getattr(target, "parts", ())))
+
+
+def of_colonies(name: str, part: Target) -> None:
+    """Raises `tf.InputError` for a part whose loss is none of single colonies."""
+    if of_seeds(part):
+        raise checks.input_error(
+            f"{name}: a target",
+            part.describe(),
+            "a loss of single colonies",
+            "Spread compares the seeds of a design: give it in targets=[…].",
+        )
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import Target
+from design.targets.goals import of_colonies
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ class Lasting(Target):
     def __post_init__(self) -> None:
         if not isinstance(self.target, Target) or isinstance(self.target, Lasting):
             raise checks.input_error("Lasting.target", self.target, "a target of one state")
+        of_colonies("Lasting", self.target)
         checks.number("Lasting.since", self.since, least=0.0)
 
     @property

@@ -52,9 +52,11 @@ def _nearest(x: Tensor, y: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor
         middle = (a * a - b * b) * s**3 / a, (b * b - a * a) * t**3 / b
         radius = _length(a * s - middle[0], b * t - middle[1])
         away = x - middle[0], y - middle[1]
-        scale = radius / _length(*away).clamp(min=1e-12)
-        s = ((away[0] * scale + middle[0]) / a).clamp(0.0, 1.0)
-        t = ((away[1] * scale + middle[1]) / b).clamp(0.0, 1.0)
+        far = _length(*away)
+        scale = radius / far.clamp(min=1e-12)
+        # at the centre of curvature, as in the middle of a circle, no direction is better
+        s = torch.where(far > 0, (away[0] * scale + middle[0]) / a, s).clamp(0.0, 1.0)
+        t = torch.where(far > 0, (away[1] * scale + middle[1]) / b, t).clamp(0.0, 1.0)
         unit = _length(s, t).clamp(min=1e-12)
         s, t = s / unit, t / unit
     return a * s, b * t

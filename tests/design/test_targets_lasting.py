@@ -176,3 +176,10 @@ def test_the_drawn_edges_lie_below_the_edge_of_their_colony():
     (path,) = contour.get_paths()
     assert np.hypot(*path.vertices.T) == pytest.approx(np.full(len(path), 10.0), abs=0.2)
     assert (ax.get_xlim(), ax.get_ylim()) == ((-9, 9), (-8, 8))
+
+
+def test_the_middle_of_a_circle_lies_a_radius_below_its_edge():
+    circle = Ellipses(*torch.tensor([[[0.0, 0.0]], [[5.0, 5.0]], [[1.0, 0.0]]]).double())
+    places = torch.tensor([[0.0, 0.0], [0.0, 3.0], [6.0, 0.0]]).double()
+    found = circle.below_edge(places, torch.zeros(3, dtype=torch.int64))
+    assert found.tolist() == pytest.approx([5.0, 2.0, -1.0])
