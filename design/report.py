@@ -84,7 +84,7 @@ def table(report: SearchReport) -> str:
         for r in rows
     ]
     lines += _warnings(report)
-    failed = sum(len(e.reasons) for e in study.entries)
+    failed = study.failed
     lines += [
         f"most frequent failure: {reason} ({times} colonies)"
         for reason, times in study.failures()[:1]
@@ -126,8 +126,10 @@ def _warnings(report: SearchReport) -> list[str]:
     """The losses of trivial answers, and what they and the bounds say of the best design."""
     best, space = report.best, report.task.space
     answers, lines = {}, []
-    if not report.task.goals:  # a sum of goals compares nothing
-        answers = trivial_losses(report.task.target, best.colonies)
+    target = report.task.target
+    # a sum of goals compares nothing; a target that names no species has no trivial answers
+    if target.names and not report.task.goals and best.colonies:
+        answers = trivial_losses(target, best.colonies)
         lines = ["without a pattern: " + ", ".join(f"{n} {x:.3f}" for n, x in answers.items())]
     least = min(answers, key=lambda n: answers[n], default="")
     if least and best.loss >= answers[least]:

@@ -49,6 +49,11 @@ class Study:
     def seconds(self) -> float:
         return sum(e.seconds for e in (*self.entries, *self.finals))
 
+    @property
+    def failed(self) -> int:
+        """Colonies that failed, with those of the finals."""
+        return sum(len(e.reasons) for e in (*self.entries, *self.finals))
+
     def full(self) -> list[Entry]:
         """The batches at full size with all replicates. Only their losses are comparable."""
         return [e for e in self.entries if self.is_full(e)]
@@ -104,7 +109,7 @@ class Study:
         """What was searched, how far it has come, and what it found: a line for each."""
         about, found = self.about, self.best()
         end = [f"{about[n]} {unit}" for n, unit in (("cells", "cells"), ("until", "h")) if about[n]]
-        failed = sum(len(e.reasons) for e in self.entries)
+        failed = self.failed
         designs = sum(len(e.points) for e in self.entries)
         fresh = sum(e.colonies for e in self.finals)
         lines = [
@@ -128,7 +133,7 @@ class Study:
         Reasons that differ in their numbers only count as one; the first of them is given.
         """
         kinds: dict[str, list[str]] = {}
-        for entry in self.entries:
+        for entry in (*self.entries, *self.finals):
             for reason in entry.reasons.values():
                 kind = re.sub(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", "#", reason)
                 kinds.setdefault(kind, []).append(reason)
