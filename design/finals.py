@@ -90,28 +90,58 @@ def fresh_losses(
     task: Task, study: Study, sizes: Sequence[float], point: np.ndarray
 ) -> FreshLosses | None:
     """Of a design (D,); None before it was grown on LEAST seeds at all sizes."""
-    each = [_tested(study, point, size) for size in sizes]
-    seeds = min(len(x) for x in each)
-    if seeds < LEAST:
+    losses = worst_of_sizes([_tested(study, point, size) for size in sizes])
+    if len(losses) < LEAST:
         return None
-    losses = np.max([x[:seeds] for x in each], axis=0)
     return FreshLosses(losses, float(task.reduced(losses[None])[0]), _band(task, losses))
 
 
-def _tested(study: Study, point: np.ndarray, size: float) -> np.ndarray:
-    """The losses of a design (D,) on the first fresh seeds at a size, (S,)."""
+def fresh_goals(
+    task: Task, study: Study, sizes: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray, int] | None:
+    """Points (F, D) of the designs on which the last finals ended, their goals (F, G), of each seed
+    the worst of its sizes, and the seeds of each. None before there are any."""
+    last = [e for e in study.finals if e.size in sizes and e.each_goals is not None][-1:]
+    seeds = max((e.streams[-1] + 1 - FIRST_STREAM for e in last), default=0)
+    points = {p.tobytes(): p for e in study.finals for p in e.points}.values()
     found = [
-        e.losses[k]
+        (p, worst_of_sizes([_tested(study, p, size, "each_goals") for size in sizes]))
+        for p in points
+    ]
+    whole = [(p, goals[:seeds]) for p, goals in found if len(goals) >= seeds]
+    if seeds < LEAST or not whole:
+        return None
+    goals = task.reduced_goals(np.array([goals for _, goals in whole]))
+    assert goals is not None
+    return np.array([p for p, _ in whole]), goals, seeds
+
+
+def worst_of_sizes(each: Sequence[np.ndarray]) -> np.ndarray:
+    """Of each seed that all sizes have, (S,) or (S, G)."""
+    seeds = min(len(x) for x in each)
+    return np.asarray(np.max([x[:seeds] for x in each], axis=0))
+
+
+def _tested(study: Study, point: np.ndarray, size: float, name: str = "losses") -> np.ndarray:
+    """The losses of a design (D,) on the first fresh seeds at a size, (S,); or its "each_goals",
+    (S, G)."""
+    found = [
+        getattr(e, name)[k]
         for e in study.finals
-        if e.size == size
+        if e.size == size and getattr(e, name) is not None
         for k in np.flatnonzero((e.points == point).all(1))
     ]
     return np.concatenate(found) if found else np.empty(0)
 
 
+def _is_mean(task: Task) -> bool:
+    """Whether the loss of a design is the mean of those of its colonies."""
+    return task.reduce == "mean" and task.target.reduced(np.zeros((1, LEAST))) is None
+
+
 def _band(task: Task, losses: np.ndarray) -> tuple[float, float]:
     """Student's interval of a mean; for a quantile, that of resampled losses."""
-    if task.reduce == "mean":
+    if _is_mean(task):
         error = losses.std(ddof=1) / np.sqrt(len(losses))
         wide = float(student.ppf(0.5 + BAND / 2, len(losses) - 1) * error)
         return float(losses.mean()) - wide, float(losses.mean()) + wide
@@ -121,12 +151,24 @@ def _band(task: Task, losses: np.ndarray) -> tuple[float, float]:
 
 
 def winner(task: Task, study: Study, sizes: Sequence[float]) -> np.ndarray | None:
-    """The point (D,) of the design whose band ends lowest: few seeds make a wide band. None before
-    a design was grown on fresh seeds."""
+    """The point (D,) of the design whose band ends lowest: few seeds make a wide band of a mean.
+    But few seeds make a low quantile. So elsewhere a design must also be as good as those with
+    fewer seeds on the seeds of these. None before a design was grown on fresh seeds."""
     points = {p.tobytes(): p for e in study.finals for p in e.points}
     found = ((fresh_losses(task, study, sizes, p), p) for p in points.values())
-    known = [(fresh.band[1], p) for fresh, p in found if fresh is not None]
-    return min(known, key=lambda x: x[0])[1] if known else None
+    known = [(fresh, p) for fresh, p in found if fresh is not None]
+    # where every colony fails, a narrow band says nothing
+    ends = lambda x: (bool((x[0].losses == task.target.failed).all()), x[0].band[1])
+    if not known or _is_mean(task):
+        return min(known, key=ends)[1] if known else None
+    out: tuple[FreshLosses, np.ndarray] | None = None
+    for seeds in sorted({len(fresh.losses) for fresh, _ in known}):
+        group = [x for x in known if len(x[0].losses) == seeds]
+        if out is not None:
+            first, most = len(out[0].losses), out[0].loss
+            group = [x for x in group if task.reduced(x[0].losses[None, :first])[0] <= most]
+        out = min(group, key=ends) if group else out
+    return None if out is None else out[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,12 +198,15 @@ class FinalsRun:
             chosen = sorted(chosen, key=partial(self._loss, seeds))
 
     def holds(self, wanted: float) -> bool:
-        """Whether one of the best designs of the last batch holds a loss on fresh seeds: its band
-        ends there. A few seeds decide whether it is tested on more."""
-        entry = self.study.entries[-1]
-        best = np.argsort(entry.loss, kind="stable")[:TESTED]
-        rows = [k for k in best if entry.loss[k] <= wanted] if self.study.is_full(entry) else []
-        return any(self._holds(entry.points[k], wanted) for k in rows)
+        """Whether one of the best designs, of all and of the last batch, holds a loss on fresh
+        seeds: its band ends there. A few seeds decide whether it is tested on more."""
+        full, last = self.study.full(), self.study.entries[-1:]
+        points: dict[bytes, np.ndarray] = {}
+        for entries in (full, [e for e in full if e is last[0]]):
+            rows = [(float(e.loss[k]), e.points[k]) for e in entries for k in range(len(e.loss))]
+            best = sorted(rows, key=lambda row: row[0])[:TESTED]
+            points |= {p.tobytes(): p for loss, p in best if loss <= wanted}
+        return any(self._holds(point, wanted) for point in points.values())
 
     def _holds(self, point: np.ndarray, wanted: float) -> bool:
         for seeds in HOLDS:
@@ -171,17 +216,23 @@ class FinalsRun:
         return found is not None and found.band[1] <= wanted
 
     def _front(self) -> None:
-        """Grow designs from all parts of the front."""
+        """Grow designs from all parts of the front, as many as LEAST seeds of each allow."""
         full = [e for e in self.study.full() if e.goals is not None]
+        if not full:
+            return
         points = np.concatenate([e.points for e in full])
         goals = np.concatenate([e.goals for e in full if e.goals is not None])
         front = nondominated(goals)
-        most = 2 * self.finals.most
         room = self.finals.colonies(self.budget) / sum(self.finals.sizes)
-        count = min(len(front), most, int(room / LEAST))
-        if count:
-            chosen = front[spread(goals[front], count)]
-            self._grow([points[k] for k in chosen], int(room / count))
+        for count in range(min(len(front), 2 * self.finals.most), 0, -1):
+            chosen = [points[k] for k in front[spread(goals[front], count)]]
+            seeds = int(room / count + 1e-9)
+            # an earlier run with a smaller budget has spent a part on other designs
+            while seeds >= LEAST and not self._affords(sum(self._cost(p, seeds) for p in chosen)):
+                seeds -= 1
+            if seeds >= LEAST:
+                self._grow(chosen, seeds)
+                return
 
     def _finalists(self) -> list[np.ndarray]:
         """The best designs of the search, no two of them alike."""
@@ -204,20 +255,28 @@ class FinalsRun:
         """Grow designs on as many of the first fresh seeds as they lack, the best first, while the
         budget lasts. Returns those that have been grown on all."""
         lacking: dict[tuple[float, int], list[np.ndarray]] = {}
-        done, spent = [], self.study.colonies
+        done, spent = [], 0.0
         for point in points:
-            known = {size: len(_tested(self.study, point, size)) for size in self.finals.sizes}
-            cost = sum(size * max(0, seeds - n) for size, n in known.items())
-            if spent + cost > self.budget + 1e-9:
+            cost = self._cost(point, seeds)
+            if not self._affords(spent + cost):
                 break
             spent += cost
             done.append(point)
-            for size, n in known.items():
+            for size in self.finals.sizes:
+                n = len(_tested(self.study, point, size))
                 if n < seeds:
                     lacking.setdefault((size, n), []).append(point)
         for (size, known_seeds), group in lacking.items():
             self._add(np.array(group), size, range(known_seeds, seeds))
         return done
+
+    def _cost(self, point: np.ndarray, seeds: int) -> float:
+        """Colonies of a design that are lacking to as many fresh seeds."""
+        known = {size: len(_tested(self.study, point, size)) for size in self.finals.sizes}
+        return sum(size * max(0, seeds - n) for size, n in known.items())
+
+    def _affords(self, cost: float) -> bool:
+        return self.study.colonies + cost <= self.budget + 1e-9
 
     def _add(self, points: np.ndarray, size: float, seeds: range) -> None:
         objective = Objective(self.task if size == 1.0 else self.task.resized(size))
@@ -229,5 +288,5 @@ class FinalsRun:
 
     def _loss(self, seeds: int, point: np.ndarray) -> float:
         """On the first fresh seeds, the worst of all sizes."""
-        each = [_tested(self.study, point, size)[:seeds] for size in self.finals.sizes]
-        return float(self.task.reduced(np.max(each, axis=0)[None])[0])
+        each = worst_of_sizes([_tested(self.study, point, size) for size in self.finals.sizes])
+        return float(self.task.reduced(each[None, :seeds])[0])

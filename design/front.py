@@ -12,6 +12,7 @@ import numpy as np
 import torchfilm as tf
 from design.best import Best
 from design.entries import Entry
+from design.finals import fresh_goals
 from design.front_plot import draw_front
 from design.objective import Objective
 from design.parameters import Value, show_value
@@ -129,7 +130,7 @@ def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front
         raise tf.InputError(
             "no design has been grown to full size yet: run the search for more colonies."
         )
-    fresh = _fresh(study, sizes) if sizes else None
+    fresh = fresh_goals(search.objective.task, study, sizes) if sizes else None
     seeds = 0
     if fresh is None:
         points = np.concatenate([e.points for e, _ in full])
@@ -140,13 +141,3 @@ def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front
     if not len(rows):
         raise tf.InputError(f"every design failed: {study.failures()[0][0]}")
     return Front(search, target.titles, points[rows], goals[rows], seeds)
-
-
-def _fresh(study: Study, sizes: Sequence[float]) -> tuple[np.ndarray, np.ndarray, int] | None:
-    """Points, goals and seeds of the last finals: of each goal the worst of all sizes."""
-    last = [next((e for e in reversed(study.finals) if e.size == s), None) for s in sizes]
-    found = [e for e in last if e is not None and e.goals is not None]
-    if len(found) < len(sizes) or len({e.points.tobytes() for e in found}) > 1:
-        return None
-    goals = np.max([e.goals for e in found if e.goals is not None], axis=0)
-    return found[0].points, goals, found[0].replicates

@@ -170,7 +170,8 @@ class Search(TaskOptions):
         the wanted loss."""
         assert self._progress.chosen is not None
         task, method = self.objective.task, self._progress.chosen.method
-        limit = colonies - (self.finals.colonies(colonies) if self.finals else 0.0)
+        reserved = self.finals.colonies(colonies) if self.finals else 0.0
+        limit = max(colonies - reserved, task.replicates)  # one design at least
         method.start(task.space, task.seed, task.replicates)
         turn = repeat_study(method, self.study, self._known)
         while not self._reached(stop_at, finals):
@@ -290,7 +291,7 @@ def _show(bar: tqdm | None, study: Study) -> None:
         return
     found = study.best()
     advance(bar, min(study.colonies, bar.total) - bar.n)
-    failed = sum(len(e.reasons) for e in study.entries)
+    failed = study.failed
     best = "no full-size colony yet" if found is None else f"best loss {found[1]:.4f}"
     bar.set_postfix_str(best + (f", {failed} colonies failed" if failed else ""))
 

@@ -11,7 +11,8 @@ from searching import lit, mean
 
 import torchfilm as tf
 from design import Finals, Parameter, Search, Sobol, Study, Target
-from design.finals import FIRST_STREAM, HOLDS, LEAST
+from design.entries import Entry
+from design.finals import FIRST_STREAM, HOLDS, LEAST, winner
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 
@@ -147,6 +148,50 @@ def test_bands_of_quantiles(reduce):
     best = search(reduce=reduce).run(400, progress=False)
     low, high = best.band
     assert low <= best.loss <= high <= best.losses.max()
+
+
+def study_of(task, losses):
+    """A study whose design k has these losses on the first fresh seeds."""
+    points = np.linspace(0.1, 0.9, len(losses))
+    entries = [
+        Entry(
+            points=np.full((1, 2), point), loss=own[None].mean(1), losses=own[None],
+            cells=np.ones((1, len(own)), int), reasons={}, size=1.0, seconds=0.0, values=[{}],
+            streams=tuple(range(FIRST_STREAM, FIRST_STREAM + len(own))),
+        )
+        for point, own in zip(points, losses, strict=True)
+    ]  # fmt: skip
+    return Study({}, task.space.names, (0, 1), finals=entries), points
+
+
+@pytest.mark.parametrize("reduce", ["worst", 0.75])
+def test_the_worst_of_few_seeds_does_not_win(reduce):
+    """All designs are alike; those that drop out have the greater loss on the seeds of all."""
+    task, random = search(reduce=reduce).objective.task, np.random.default_rng(0)
+    for _ in range(20):
+        long = random.random((8, 28))
+        best = sorted(long, key=lambda x: task.reduced(x[None, :4])[0])
+        study, points = study_of(task, [x[: 28 if k < 2 else 4] for k, x in enumerate(best)])
+        assert winner(task, study, (1.0,))[0] in points[:2]
+
+
+def test_a_design_that_always_fails_does_not_win():
+    """The band of the other ends above the loss of a failure."""
+    task = search().objective.task
+    study, points = study_of(task, [np.full(4, 1.5), np.array([0.1, 1.5, 1.5, 1.5])])
+    assert winner(task, study, (1.0,))[0] == points[1]
+
+
+def test_a_search_that_goes_on_tests_what_it_had_found(tmp_path):
+    search(Lucky(most=0.0)).run(300, study=tmp_path / "s.h5", progress=False)
+    made = search(Lucky(most=0.0))
+    best = made.run(3000, study=tmp_path / "s.h5", stop_at=0.15, progress=False)
+    assert made.study.searched < 300 < made.study.colonies + HOLDS[-1] and best.band[1] <= 0.15
+
+
+def test_one_design_comes_before_the_finals():
+    made = search(replicates=20)
+    assert made.run(20, progress=False).band is None and made.study.colonies == 20
 
 
 @pytest.mark.parametrize(

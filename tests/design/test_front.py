@@ -9,8 +9,22 @@ import torch
 from searching import Level, Spread, built, fragile, grown, lit, mean, objective_of, paced
 
 import torchfilm as tf
-from design import NSGA2, Burden, Constrained, Duration, Parameter, Search, Sobol, Study, Weighted
+from design import (
+    NSGA2,
+    Burden,
+    Choice,
+    Constrained,
+    Duration,
+    Finals,
+    Lasting,
+    Parameter,
+    Search,
+    Sobol,
+    Study,
+    Weighted,
+)
 from design import Spread as SpreadOfLosses
+from design.finals import FIRST_STREAM
 from design.pareto import nondominated, spread
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
@@ -95,6 +109,63 @@ def test_auto_takes_a_method_for_several_goals():
     assert made.why_chosen.startswith("auto: nsga2") and "2 goals" in made.why_chosen
 
 
+def test_a_study_of_goals_is_a_start_with_its_goals(tmp_path):
+    search([Parameter("make", 0.5, 5, log=True), LIT[1]], finals=None).run(
+        32, study=tmp_path / "old.h5", progress=False
+    )
+    made = search(start=tmp_path / "old.h5", finals=None)
+    made.run(32, study=tmp_path / "new.h5", progress=False)
+    old, kept = Study.read(tmp_path / "old.h5"), Study.read(tmp_path / "new.h5")
+    assert np.array_equal(kept.entries[0].goals, np.concatenate([e.goals for e in old.entries]))
+    for one, other in zip(kept.entries, made.study.entries, strict=True):
+        assert one.copies == other.copies and np.array_equal(one.goals, other.goals)
+        assert np.array_equal(one.each_goals, other.each_goals)
+    again = search(start=tmp_path / "old.h5", finals=None)
+    front = again.run(64, study=tmp_path / "new.h5", progress=False)
+    assert len(again.study.entries) == 5 and len(front) >= 5
+
+
+@pytest.mark.parametrize("sizes", [(1.0,), (0.5, 1.0)])
+def test_a_front_of_a_longer_search_keeps_all_its_designs(tmp_path, sizes):
+    """The second finals grow again only the seeds that designs of the first finals lack."""
+    make = lambda: search(finals=Finals(sizes=sizes), reduce="worst")
+    make().run(160, study=tmp_path / "s.h5", progress=False)
+    made = make()
+    front = made.run(500, study=tmp_path / "s.h5", progress=False)
+    assert made.study.colonies <= 500 and len(made.study.finals) > len(sizes)
+    streams = range(FIRST_STREAM, FIRST_STREAM + front.seeds)
+    task = made.objective.task
+    each = [
+        type(made.objective)(task.resized(s)).evaluate(front.points, streams=streams).each_goals
+        for s in sizes
+    ]
+    assert np.array_equal(task.reduced_goals(np.max(each, axis=0)), front.goals)
+    # both ends of the front of the search have been grown
+    last = make()
+    last.run(500, study=tmp_path / "s.h5", progress=False)
+    every = np.concatenate([e.points for e in made.study.full()])
+    goals = np.concatenate([e.goals for e in made.study.full()])
+    rows = nondominated(goals)
+    tested = {p.tobytes() for e in made.study.finals for p in e.points}
+    assert {every[rows[0]].tobytes(), every[rows[-1]].tobytes()} <= tested
+    assert last.study.colonies == made.study.colonies
+
+
+@pytest.mark.parametrize("start", [None, [{"genes": 2, "promoter": "weak"}] * 2])
+def test_designs_with_few_levels_are_grown_once_in_the_first_batch(start):
+    few = [Parameter("genes", 1, 2, whole=True), Choice("promoter", ("weak", "strong"))]
+    made = search(few, built, [Level("g0"), Burden()], finals=None, start=start)
+    made.run(40, progress=False)
+    first = made.study.entries[0 if start is None else 1].points
+    assert len(first) == len(np.unique(first, axis=0)) == 4
+
+
+def test_a_front_needs_no_more_than_the_replicates_of_one_design():
+    made = search(replicates=20)
+    front = made.run(20, progress=False)
+    assert len(front) == 1 and front.seeds == 0 and made.study.colonies == 20
+
+
 # --- goals ----------------------------------------------------------------------------------------
 
 
@@ -154,6 +225,38 @@ def test_spread_is_that_between_seeds():
     assert found.loss == pytest.approx(found.losses.std(1, ddof=1)) and (found.loss > 0).all()
 
 
+def test_a_design_whose_seeds_all_fail_is_not_alike_on_all():
+    made = Search(
+        fragile, [Parameter("make", 1, 10)], SpreadOfLosses(Level()), cells=6, replicates=2,
+        method=Sobol(batch=8), finals=None,
+    )  # fmt: skip
+    best = made.run(16, progress=False)
+    entry = made.study.entries[0]
+    failed = {row for row, _ in entry.reasons}
+    assert 0 < len(failed) < 8 and best.loss < 0.5
+    assert all((entry.loss[k] == 1.5) == (k in failed) for k in range(8))
+
+
+def test_the_band_and_the_slopes_of_a_spread_are_its_own():
+    made = Search(lit, LIT, SpreadOfLosses(Level()), cells=6, replicates=3, method=Sobol(batch=8))
+    best = made.run(100, progress=False)
+    assert best.band[0] <= best.loss <= best.band[1]
+    point, step = np.full((1, 2), 0.5), 0.01 * np.eye(2)
+    objective = made.objective
+    assert "several seeds" in objective.why_differences
+    found = objective.evaluate(point, slopes=True).slopes.gradient[0]
+    for k in range(2):
+        up, down = (objective.evaluate(point + side * step[k]).loss[0] for side in (1, -1))
+        assert found[k] == pytest.approx((up - down) / 0.02)
+
+
+def test_a_weighted_sum_does_not_depend_on_the_batch():
+    target = Weighted([(Level(wanted=1.0 / (k + 3)), 0.1 + 0.3 * k) for k in range(5)])
+    state = last_state(grown(2.0, make=torch.linspace(0.5, 3.0, 24)), colonies=24, until=1.0)
+    each = [target.loss(state.select(torch.tensor([k])))[0] for k in range(24)]
+    assert torch.equal(target.loss(state), torch.stack(each))
+
+
 def test_a_search_says_by_how_much_its_first_batch_misses_the_constraints(capsys):
     target = Constrained(Burden(), [Level()], at_least={"mean_level": 1e3})
     made = Search(lit, LIT, target, cells=3, replicates=2, method=Sobol(batch=4), finals=None)
@@ -185,6 +288,19 @@ def test_a_search_says_by_how_much_its_first_batch_misses_the_constraints(capsys
         (lambda: Constrained(Level()), "no constraint"),
         (lambda: Burden(()), "Burden.species"),
         (lambda: search(targets=[Level(), Burden(("rfp",))]), "'rfp'"),
+        (lambda: search(targets=[Level(), SpreadOfLosses(Level())], replicates=1), "2 or more"),
+        (lambda: Weighted([(SpreadOfLosses(Level()), 1.0)]), "Weighted.*loss of single colonies"),
+        (lambda: Lasting(SpreadOfLosses(Level()), since=1.0), "Lasting.*single colonies"),
+        (lambda: SpreadOfLosses(SpreadOfLosses(Level())), "Spread.*single colonies"),
+        (
+            lambda: search(
+                targets=[
+                    Level(),
+                    Constrained(Level(), [Level(wanted=2.0)], at_least={"mean_level": 1.0}),
+                ]
+            ),
+            "'mean_level'.*a measure of one target",
+        ),
         (
             lambda: search(targets=[Level(), Constrained(Level(), at_least={"contrast": 1.0})]),
             "measure = 'contrast'.*'mean_level'",
