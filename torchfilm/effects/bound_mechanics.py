@@ -132,9 +132,9 @@ class BoundMechanics(BoundEffect):
             report.passes, report.clipped, report.deeply_overlapping, steps,
         )  # fmt: skip
         fields["collapsed_steps"] = state.groups.spread(collapsed)
-        return state.replace(
+        return state.with_fields(**fields).replace(
             position=found.position, axis=found.axis, length=found.length,
-            fields={**state.fields, **fields}, reports={**state.reports, "mechanics": made},
+            reports={**state.reports, "mechanics": made},
         )  # fmt: skip
 
     @staticmethod
