@@ -6,12 +6,15 @@ It uses torchfilm's public names only, as any user can.
 """
 
 from design.best import Best
+from design.calibration import Calibration
 from design.finals import Finals
 from design.front import Front
+from design.inference import infer
 from design.library import Library, Sensor, SensorDevice, Wiring
 from design.methods import CMAES, NSGA2, Batch, Bayesian, Local, Method, Racing, Sobol
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
+from design.posterior import Posterior
 from design.robustness import Robustness
 from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
@@ -28,6 +31,7 @@ from design.targets import (
     Gradient,
     Image,
     Lasting,
+    Observed,
     OnFraction,
     Oscillation,
     ProfileTarget,
@@ -48,6 +52,7 @@ __all__ = [
     "Bayesian",
     "Best",
     "Burden",
+    "Calibration",
     "Choice",
     "Constrained",
     "DomainSize",
@@ -63,9 +68,11 @@ __all__ = [
     "Local",
     "Method",
     "Objective",
+    "Observed",
     "OnFraction",
     "Oscillation",
     "Parameter",
+    "Posterior",
     "ProfileTarget",
     "Racing",
     "Ring",
@@ -85,6 +92,7 @@ __all__ = [
     "Weighted",
     "Wiring",
     "check_robustness",
+    "infer",
     "load_weights",
     "save_weights",
 ]

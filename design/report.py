@@ -127,8 +127,8 @@ def _warnings(report: SearchReport) -> list[str]:
     best, space = report.best, report.task.space
     answers, lines = {}, []
     target = report.task.target
-    # a sum of goals compares nothing; a target that names no species has no trivial answers
-    if target.names and not report.task.goals and best.colonies:
+    # a sum of goals compares nothing; data, and a target without species, have no trivial answers
+    if target.names and target.pattern and not report.task.goals and best.colonies:
         answers = trivial_losses(target, best.colonies)
         lines = ["without a pattern: " + ", ".join(f"{n} {x:.3f}" for n, x in answers.items())]
     least = min(answers, key=lambda n: answers[n], default="")

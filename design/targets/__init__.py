@@ -4,6 +4,7 @@ from design.targets.base import Target
 from design.targets.goals import Burden, Constrained, Duration, Goals, Spread, Weighted
 from design.targets.image import Image
 from design.targets.lasting import Lasting
+from design.targets.observed import Observed
 from design.targets.oscillation import Oscillation
 from design.targets.patterns import DomainSize, OnFraction
 from design.targets.profiles import Bands, Gradient, ProfileTarget, Ring
@@ -19,6 +20,7 @@ __all__ = [
     "Gradient",
     "Image",
     "Lasting",
+    "Observed",
     "OnFraction",
     "Oscillation",
     "ProfileTarget",

@@ -35,6 +35,8 @@ class Target:
 
     failed: ClassVar[float] = 1.5
     fewest: ClassVar[int] = 1  # cells: a smaller colony is not scored
+    # whether answers without a pattern, such as evenly lit cells, say what a loss is worth
+    pattern: ClassVar[bool] = True
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,0 +1,58 @@
+"""Whether posteriors cover the truth as often as they claim."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from design.posterior_plot import draw_ranks
+
+ALL = "all together"  # the region of highest density of all parameters
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The places of hidden truths among samples of their posteriors.
+
+    names: of the D parameters; ranks: the number of samples below the truth, (T, D), from 0 to
+    `samples`; density_ranks: the number of samples with a higher density than the truth, (T,).
+    Where the posteriors are right, all ranks are equally frequent. failed: simulations of truths
+    that failed, and are not among the T.
+    """
+
+    names: tuple[str, ...]
+    ranks: np.ndarray
+    density_ranks: np.ndarray
+    samples: int
+    failed: int = 0
+
+    def coverage(self, level: float = 0.9) -> dict[str, float]:
+        """The share of truths in the central interval of each parameter, and in the joint region
+        of highest density ("all together"); `level` where the posteriors are right."""
+        # the middle of the share of samples that a rank stands for
+        place = (self.ranks + 0.5) / (self.samples + 1)
+        inside = np.abs(place - 0.5) <= 0.5 * level
+        joint = (self.density_ranks + 0.5) / (self.samples + 1) <= level
+        return {n: float(v) for n, v in zip(self.names, inside.mean(0), strict=True)} | {
+            ALL: float(joint.mean())
+        }
+
+    def table(self, level: float = 0.9) -> str:
+        """The coverage in per cent, with its standard error where the posteriors are right."""
+        count = len(self.ranks)
+        error = 100 * np.sqrt(level * (1 - level) / count)
+        lines = [
+            f"{100 * level:g} % regions cover of {count} truths ({error:.1f} % standard error)"
+        ]
+        lines += [f"  {n:<16} {100 * v:.1f} %" for n, v in self.coverage(level).items()]
+        if self.failed:
+            lines.append(f"{self.failed} truths failed and are left out")
+        return "\n".join(lines)
+
+    def plot(self, path: str | Path) -> Path:
+        """Draw the histograms of ranks. Needs matplotlib (the `app` extra)."""
+        return draw_ranks(
+            Path(path), (*self.names, ALL), np.c_[self.ranks, self.density_ranks], self.samples
+        )

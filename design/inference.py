@@ -1,0 +1,104 @@
+"""Inference: from observed colonies to the parameters that grow such colonies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import torchfilm as tf
+from design.neural_posterior import NeuralPosterior, require_sbi
+from design.parameters import Choice, Parameter
+from design.posterior import Posterior
+from design.progress import advance, open_bar
+from design.simulations import Simulations, check_count, simulate_designs
+from design.targets.observed import Observed
+from design.task import Task
+from torchfilm import checks
+
+LEAST = 50  # simulations that succeeded
+
+
+def infer(
+    scene: Callable[..., tf.Scene] | str,
+    parameters: Sequence[Parameter | Choice],
+    observed: Observed,
+    *,
+    simulations: int = 5000,
+    cells: int | None = None,
+    until: float | None = None,
+    replicates: int | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    dt: float | None = None,
+    dtype: torch.dtype = torch.float32,
+    device: str = "cpu",
+    path: str | Path | None = None,
+    samples: int = 4000,
+    flows: int = 2,
+    epochs: int = 400,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> Posterior:
+    """The parameters of a scene that could have grown the observed colonies, as a posterior.
+
+        posterior = infer(my_scene, [Parameter("rate", 0.5, 2, log=True)], observed, until=5.0)
+
+    Before the data, every value within the bounds is as likely as any other, on the logarithmic
+    scale where log=True. `simulations` designs are drawn so and grown, each with random numbers of
+    its own and `replicates` colonies, by default as many as were observed, whose statistics are
+    averaged. From these, neural posterior estimation (`NeuralPosterior`
+    names the sources) learns the density of the parameters, given statistics. Simulations that fail
+    are left out, so the posterior is that of colonies that do not.
+
+    scene, parameters, cells, fixed, seed, dt, dtype, device: as for `Search`. until: h, by default
+    when the data were observed. replicates: with fewer than were observed, the posterior is wider
+    than the data allow. path: a file that keeps the simulations; running the same again
+    takes them from it, also for other data of the same statistics. samples: of the posterior.
+    flows, epochs: of the estimator. executor: of the `concurrent.futures` kind, for other
+    processes. progress: show a bar. Raises the errors of `Task`, and InputError where sbi is
+    missing (the `infer` extra), for the file of other simulations, and where fewer than 50
+    simulations succeed.
+    """
+    require_sbi()
+    if not isinstance(observed, Observed):
+        raise checks.input_error(
+            "observed", observed, "an Observed, such as Observed.from_table(…)"
+        )
+    for name, value, least in (
+        ("simulations", simulations, LEAST), ("samples", samples, 10), ("flows", flows, 1),
+        ("epochs", epochs, 1),
+    ):  # fmt: skip
+        check_count(name, value, least)
+    task = Task(
+        scene, parameters, observed, cells=cells,
+        until=observed.time if until is None and cells is None else until,
+        replicates=observed.colonies if replicates is None else replicates,
+        fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
+    )  # fmt: skip
+    found = _simulate(task, simulations, None if path is None else Path(path), executor, progress)
+    rows = found.sound
+    estimator = NeuralPosterior.learn(
+        found.points[rows], found.statistics[rows], seed=seed, flows=flows, epochs=epochs
+    )
+    return Posterior.of(task, found, estimator, observed, samples)
+
+
+def _simulate(
+    task: Task, count: int, path: Path | None, executor: Executor | None, progress: bool
+) -> Simulations:
+    """The simulations of a task. Raises InputError where too few succeed."""
+    each = task.replicates
+    with open_bar(count * each, progress, "infer") as bar:
+        seen = lambda known: advance(bar, known * each - (bar.n if bar else 0))
+        found = simulate_designs(task, count, path=path, executor=executor, seen=seen)
+    sound = int(found.sound.sum())
+    if sound < LEAST:
+        raise tf.InputError(
+            f"{sound} of {count} simulations succeeded, and {LEAST} are needed; the most frequent"
+            f" reason of failure: {found.failures()[0][0]}"
+        )
+    return found

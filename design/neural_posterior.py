@@ -1,0 +1,141 @@
+"""Neural posterior estimation: a density of parameters for any statistics, learnt from
+simulations."""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+
+EDGE = 1e-6  # coordinates this close to a bound count as so close
+FARTHEST = 10.0  # standard deviations: statistics farther off count as so far
+CONSTANT = 1e-9  # a standard deviation, relative to the mean, from which a statistic varies
+SAMPLES_AT_ONCE = 2**16
+
+
+@dataclass(frozen=True, eq=False)
+class NeuralPosterior:
+    """The density of parameters, given statistics, as the mean of some normalising flows.
+
+    flows: conditional densities of ln(u/(1 − u)), where u in [0, 1] are the coordinates of
+    parameters. centre, scale: (K',) of the statistics in use; used: which they are, (K,) bool.
+    """
+
+    flows: tuple[Any, ...]
+    centre: Tensor
+    scale: Tensor
+    used: np.ndarray
+
+    @staticmethod
+    def learn(
+        points: np.ndarray, statistics: np.ndarray, *, seed: int, flows: int, epochs: int
+    ) -> NeuralPosterior:
+        """Learn from simulations: points (n, D) in [0, 1], statistics (n, K), all finite.
+
+        The method is that of Papamakarios and Murray (NeurIPS 2016) with masked autoregressive
+        flows, by the package sbi; the mean of several flows is less sure of itself than each
+        (Hermans et al., TMLR 2022). epochs: passes through the data at most; learning ends before,
+        20 passes after the loss on a tenth of the data has ceased to fall. Needs sbi (the `infer`
+        extra). The state of torch's random numbers is kept.
+        """
+        require_sbi()
+        spread, level = statistics.std(0), np.abs(statistics).max(0)
+        used = spread > CONSTANT * np.maximum(level, CONSTANT)
+        if not used.any():
+            raise tf.InputError(
+                "all simulations have the same statistics: the parameters do not change what was"
+                " observed. Widen their bounds, or observe something else."
+            )
+        centre, scale = (torch.tensor(v[used]) for v in (statistics.mean(0), spread))
+        learner = NeuralPosterior((), centre, scale, used)
+        theta, x = _logit(torch.as_tensor(points)).float(), learner._inputs(statistics)
+        with torch.random.fork_rng(devices=[]):
+            found = tuple(_learn_flow(theta, x, seed + k, epochs) for k in range(flows))
+        return NeuralPosterior(found, centre, scale, used)
+
+    def _inputs(self, statistics: np.ndarray) -> Tensor:
+        found = (torch.as_tensor(statistics[:, self.used]) - self.centre) / self.scale
+        return found.clamp(-FARTHEST, FARTHEST).float()
+
+    @torch.no_grad()
+    def sample(self, statistics: np.ndarray, count: int, *, seed: int) -> np.ndarray:
+        """Samples of the parameters for each row of statistics (m, K): (m, count, D) coordinates
+        in [0, 1]. Every flow gives an equal share of them."""
+        x = self._inputs(statistics)
+        rows = max(1, SAMPLES_AT_ONCE // count)
+        shares = [count * (k + 1) // len(self.flows) - count * k // len(self.flows)
+                  for k in range(len(self.flows))]  # fmt: skip
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            parts = [
+                torch.cat([flow.sample((share,), condition=some)
+                           for flow, share in zip(self.flows, shares, strict=True) if share])
+                for some in x.split(rows)
+            ]  # fmt: skip
+        return torch.sigmoid(torch.cat(parts, 1).double()).transpose(0, 1).contiguous().numpy()
+
+    @torch.no_grad()
+    def log_density(self, points: np.ndarray, statistics: np.ndarray) -> np.ndarray:
+        """The logarithm of the density of coordinates, (m, n), for points (m, n, D) and one row of
+        statistics each, (m, K)."""
+        x = self._inputs(statistics)
+        u = torch.as_tensor(points).transpose(0, 1).clamp(EDGE, 1.0 - EDGE)
+        z = _logit(u).float()
+        each = [flow.log_prob(z, condition=x).double() for flow in self.flows]
+        mixed = torch.logsumexp(torch.stack(each), 0) - math.log(len(each))
+        # from ln(u/(1 − u)) to u
+        return (mixed - (u * (1.0 - u)).log().sum(-1)).transpose(0, 1).numpy()
+
+
+def require_sbi() -> None:
+    """Raises InputError where the package sbi is missing."""
+    if find_spec("sbi") is None:
+        raise tf.InputError(
+            "inference needs the package sbi, which is not installed: pip install"
+            ' "torchfilm[infer]"'
+        )
+
+
+class _NoTracker:
+    """sbi reports its progress to this instead of writing files."""
+
+    log_dir = None
+
+    def log_metric(self, name: str, value: float, step: int | None = None) -> None: ...
+
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None: ...
+
+    def log_params(self, params: dict[str, Any]) -> None: ...
+
+    def add_figure(self, name: str, figure: Any, step: int | None = None) -> None: ...
+
+    def flush(self) -> None: ...
+
+
+def _learn_flow(theta: Tensor, x: Tensor, seed: int, epochs: int) -> Any:
+    """One flow, from its own start and division of the data."""
+    # sbi warns of its own imports, and prints when it has converged
+    with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        from sbi.inference import NPE
+
+        torch.manual_seed(seed)
+        learner = NPE(density_estimator="maf", show_progress_bars=False, tracker=_NoTracker())
+        learner.append_simulations(theta, x)
+        batch = min(200, max(2, len(theta) // 10))
+        return learner.train(training_batch_size=batch, max_num_epochs=epochs).eval()
+
+
+def _logit(u: Tensor) -> Tensor:
+    u = u.double().clamp(EDGE, 1.0 - EDGE)
+    return torch.log(u) - torch.log1p(-u)

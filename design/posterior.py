@@ -1,0 +1,179 @@
+"""The posterior of parameters, as samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from design.calibration import Calibration
+from design.neural_posterior import NeuralPosterior
+from design.parameters import Parameter, Value, show_value
+from design.posterior_plot import draw_corner
+from design.simulations import (
+    Simulations,
+    check_count,
+    random_points,
+    shown_values,
+    simulate_points,
+)
+from design.targets.observed import Observed
+from design.task import Task
+from torchfilm import checks
+
+LEVEL = 0.9  # of intervals, unless a caller gives one
+BEYOND = 0.002  # share of simulations beyond a statistic for which the model is questioned
+STREAM = 1  # of the truths of a calibration
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Posterior:
+    """Parameters that could have grown the observed colonies.
+
+    task: scene, parameters and end of the colonies; simulations: what the posterior was learnt
+    from; estimator: the density of parameters for any statistics; observed: the data. points: the
+    samples, (S, D) coordinates in [0, 1].
+    """
+
+    task: Task
+    simulations: Simulations
+    estimator: NeuralPosterior
+    observed: Observed
+    points: np.ndarray
+
+    @staticmethod
+    def of(
+        task: Task,
+        simulations: Simulations,
+        estimator: NeuralPosterior,
+        observed: Observed,
+        samples: int,
+    ) -> Posterior:
+        """Draw the samples for some data."""
+        row = np.array([observed.values])
+        points = estimator.sample(row, samples, seed=task.seed)[0]
+        return Posterior(task, simulations, estimator, observed, points)
+
+    def given(self, observed: Observed) -> Posterior:
+        """The posterior for other data of the same statistics (`Observed.from_table(…, like=…)`)
+        and as many colonies, without further simulations."""
+        if observed.plan != self.observed.plan or observed.colonies != self.observed.colonies:
+            raise checks.input_error(
+                "observed",
+                observed.describe(),
+                f"data of the same statistics from {self.observed.colonies} colonies",
+                "Make it with like=….",
+            )
+        return self.of(self.task, self.simulations, self.estimator, observed, len(self.points))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+        return self.task.space.names
+
+    @property
+    def samples(self) -> dict[str, np.ndarray]:
+        """Samples of each parameter by name, (S,) each; sample k of all of them belongs
+        together."""
+        return {n: np.array(v) for n, v in shown_values(self.task, self.points).items()}
+
+    @property
+    def mean(self) -> dict[str, Value]:
+        """The mean of each parameter, with log=True the geometric one; of a choice or a whole
+        number the most frequent value."""
+        return {
+            p.name: p.value(float(self.points[:, k].mean()))
+            if isinstance(p, Parameter) and p.levels is None
+            else _most_frequent(self.samples[p.name])
+            for k, p in enumerate(self.task.space.parameters)
+        }
+
+    def interval(self, level: float = LEVEL) -> dict[str, tuple[float, float]]:
+        """The central interval of each number, which holds it with a probability of `level`.
+        Choices have none."""
+        checks.number("level", level, above=0.0, most=1.0)
+        ends = [0.5 - 0.5 * level, 0.5 + 0.5 * level]
+        found = {}
+        for k, p in enumerate(self.task.space.parameters):
+            if isinstance(p, Parameter):
+                low, high = np.quantile(self.points[:, k], ends)
+                found[p.name] = (float(p.value(float(low))), float(p.value(float(high))))
+        return found
+
+    @property
+    def surprises(self) -> list[str]:
+        """Statistics of the data that hardly any simulation reaches. Where there are some, no
+        parameters within the bounds grow such colonies, and the samples mean little."""
+        statistics = self.simulations.statistics[self.simulations.sound]
+        out = []
+        for k, name in enumerate(self.observed.plan.names):
+            value, column = self.observed.values[k], statistics[:, k]
+            # as far as a spread counts as reached
+            slack = 0.5 * self.observed.spread[k]
+            share = min((column <= value + slack).mean(), (column >= value - slack).mean())
+            if share < BEYOND:
+                out.append(
+                    f"{name} is {value:.4g}; of the simulations {column.min():.4g} to"
+                    f" {column.max():.4g}"
+                )
+        return out
+
+    def table(self, level: float = LEVEL) -> str:
+        """The parameters with their means and intervals, failures, and what no simulation
+        reaches."""
+        intervals, means = self.interval(level), self.mean
+        width = max(len(name) for name in (*self.names, "parameter"))
+        lines = [f"{'parameter':<{width}} {'mean':>10}  {100 * level:g} % interval, bounds"]
+        for p in self.task.space.parameters:
+            line = f"{p.name:<{width}} {show_value(means[p.name]):>10}"
+            if isinstance(p, Parameter):
+                low, high = (f"{v:.4g}" for v in intervals[p.name])
+                line += f"  {low} to {high}, of {p.low:g} to {p.high:g}"
+                line += " log" if p.log else ""
+            else:
+                share = np.mean(self.samples[p.name] == means[p.name])
+                line += f"  {100 * share:.0f} % of the samples"
+            lines.append(line)
+        lines.append(f"from {len(self.simulations)} simulations; {self.observed.describe()}")
+        lines += [f"{n} simulations failed: {why}" for why, n in self.simulations.failures()[:3]]
+        if self.surprises:
+            lines.append("The model does not reach the data within these bounds:")
+            lines += [f"  {words}" for words in self.surprises]
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"Posterior(mean={self.mean}, {len(self.points)} samples)"
+
+    def plot(self, path: str | Path, truth: dict[str, Value] | None = None) -> Path:
+        """Draw the samples: of each parameter, and of each two of them. truth: values to mark.
+        Needs matplotlib (the `app` extra)."""
+        marked = None if truth is None else self.task.space.point(truth)
+        return draw_corner(Path(path), self.task.space, self.points, marked)
+
+    def check(self, truths: int = 200, *, samples: int = 999) -> Calibration:
+        """Simulation-based calibration (Talts et al., arXiv 1804.06788): grow colonies of hidden,
+        random parameters, and see how often the posteriors of their statistics cover these. It
+        costs `truths` simulations and no learning."""
+        check_count("truths", truths, 2)
+        check_count("samples", samples, 9)
+        points = random_points(self.task, truths, stream=STREAM)
+        # random numbers that no simulation has used
+        first = 2**24 + STREAM * 2**20
+        found = simulate_points(self.task, points, first)
+        kept = Simulations(points[found.sound], found.statistics[found.sound])
+        drawn = self.estimator.sample(kept.statistics, samples, seed=self.task.seed + 1)
+        here = self.estimator.log_density(kept.points[:, None], kept.statistics)
+        there = self.estimator.log_density(drawn, kept.statistics)
+        return Calibration(
+            names=self.names,
+            ranks=(drawn < kept.points[:, None]).sum(1),
+            density_ranks=(there > here).sum(1),
+            samples=samples,
+            failed=truths - len(kept),
+        )
+
+
+def _most_frequent(values: np.ndarray) -> Value:
+    found, counts = np.unique(values, return_counts=True)
+    return found[counts.argmax()].item()

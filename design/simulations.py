@@ -1,0 +1,250 @@
+"""Simulations for inference: colonies of random parameters, and their statistics."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+import torchfilm as tf
+from design import colonies
+from design.parameters import Value
+from design.rollout import FailedColony, grow
+from design.scoring import WorkItem, cut_work_items
+from design.targets.observed import Observed
+from design.task import Task
+from torchfilm import checks
+
+FORMAT, VERSION = "torchfilm simulations", 1
+BATCH = 256  # designs that are grown at once, and after which the file is written
+
+
+@dataclass(frozen=True, eq=False)
+class Simulations:
+    """Statistics of colonies of random parameters.
+
+    points: coordinates of the parameters, (n, D) in [0, 1], drawn evenly; statistics: (n, K), means
+    over the colonies of each, NaN where one of them failed. reasons: of failures, by row.
+    """
+
+    points: np.ndarray
+    statistics: np.ndarray
+    reasons: dict[int, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def sound(self) -> np.ndarray:
+        """The simulations that did not fail, (n,) bool."""
+        return np.isfinite(self.statistics).all(1)
+
+    def take(self, rows: slice) -> Simulations:
+        """Some of them, from the first on."""
+        start, stop, _ = rows.indices(len(self))
+        reasons = {k - start: words for k, words in self.reasons.items() if start <= k < stop}
+        return Simulations(self.points[rows], self.statistics[rows], reasons)
+
+    def followed_by(self, other: Simulations) -> Simulations:
+        moved = {k + len(self): words for k, words in other.reasons.items()}
+        return Simulations(
+            np.concatenate([self.points, other.points]),
+            np.concatenate([self.statistics, other.statistics]),
+            self.reasons | moved,
+        )
+
+    def failures(self) -> list[tuple[str, int]]:
+        """The reasons of failures, without their times, and how often each came, most first."""
+        alike = (re.sub(r"^at \S+ h: ", "", words) for words in self.reasons.values())
+        return Counter(alike).most_common()
+
+
+def observed_of(task: Task) -> Observed:
+    """The data of a task of inference."""
+    assert isinstance(task.target, Observed)
+    return task.target
+
+
+def about(task: Task) -> dict[str, Any]:
+    """What simulations depend on, as plain data: all of the task but the observed numbers."""
+    found = task.describe() | {"target": repr(observed_of(task).plan)}
+    del found["code of the target"], found["reduce"]
+    return found
+
+
+def simulate_designs(
+    task: Task,
+    count: int,
+    *,
+    path: Path | None = None,
+    executor: Executor | None = None,
+    seen: Callable[[int], None] = lambda count: None,
+) -> Simulations:
+    """Simulate `count` designs with parameters drawn evenly from the space, each with
+    `task.replicates` colonies and random numbers of its own.
+
+    path: of the file that keeps them; those that it holds are not simulated again. executor: of the
+    `concurrent.futures` kind. seen: called with the number of designs that are known. Simulation
+    k is the same in any batch and on any machine of the same kind.
+    """
+    known = _read(path, task)
+    seen(min(count, len(known)))
+    points = np.random.default_rng(task.seed).random((max(count, len(known)), task.space.size))
+    starts = range(len(known), count, BATCH)
+    parts = [(first, points[first : min(first + BATCH, count)]) for first in starts]
+    run = partial(_simulate_part, task)
+    for found in map(run, parts) if executor is None else executor.map(run, parts):
+        known = known.followed_by(found)
+        _write(path, task, known)
+        seen(len(known))
+    return known.take(slice(0, count))
+
+
+def simulate_points(task: Task, points: np.ndarray, first: int) -> Simulations:
+    """Simulate given designs, (n, D). first: the number of the first of them, which says which
+    random numbers it follows."""
+    values = [task.space.values(point) for point in points]
+    statistics = np.full((len(points), len(observed_of(task).values)), np.nan)
+    reasons: dict[int, str] = {}
+    for item in cut_work_items(task, values, task.replicates, 1.0, 1):
+        for row, found, why in _run_item(task, item, first):
+            statistics[row] = found
+            if why:
+                reasons[row] = why
+    return Simulations(points, statistics, reasons)
+
+
+def _simulate_part(task: Task, part: tuple[int, np.ndarray]) -> Simulations:
+    return simulate_points(task, part[1], part[0])
+
+
+def _run_item(task: Task, item: WorkItem, first: int) -> Iterator[tuple[int, np.ndarray, str]]:
+    """Row, statistics (K,) and reason of failure of each design of a work item. A scene that is
+    refused is tried in halves, so that only the designs at fault fail."""
+    try:
+        yield from _grow_item(task, item, first)
+        return
+    except (tf.InputError, tf.SimulationError) as error:
+        if len(item.rows) == 1:
+            yield item.rows[0], np.full(len(observed_of(task).values), np.nan), str(error)
+            return
+    half = len(item.rows) // 2
+    for part in (range(half), range(half, len(item.rows))):
+        yield from _run_item(task, item.take(part), first)
+
+
+@torch.no_grad()
+def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.ndarray, str]]:
+    observed, each = observed_of(task), task.replicates
+    streams = [(first + row) * each + k for row in item.rows for k in range(each)]
+    scene = task.family.scene(item.values, repeat=each)
+    prepared = colonies.prepare(scene, streams, task.settings)
+    found = np.full((len(streams), len(observed.values)), np.nan)
+    reasons: dict[int, str] = {}
+    cells, until = task.end(1.0)
+    for event in grow(prepared, cells=cells, until=until, note=observed.note):
+        if isinstance(event, FailedColony):
+            reasons[event.colony_id // each] = event.reason
+            continue
+        values = observed.statistics(event.state, event.history)
+        found[event.state.colony_id.cpu().numpy()] = values.cpu().numpy()
+    means = found.reshape(len(item.rows), each, -1).mean(1)
+    for k in np.flatnonzero(~np.isfinite(means).all(1)).tolist():
+        reasons.setdefault(k, "a statistic is not finite")
+    return [(row, means[k], reasons.get(k, "")) for k, row in enumerate(item.rows)]
+
+
+def random_points(task: Task, count: int, *, stream: int) -> np.ndarray:
+    """Further random designs, (n, D), none of those that `simulate_designs` draws."""
+    return np.random.default_rng([task.seed, stream]).random((count, task.space.size))
+
+
+def shown_values(task: Task, points: np.ndarray) -> dict[str, list[Value]]:
+    """The values of designs (n, D) by the names of parameters."""
+    found = [task.space.values(point) for point in points]
+    return {name: [values[name] for values in found] for name in task.space.names}
+
+
+def _write(path: Path | None, task: Task, known: Simulations) -> None:
+    """In place of the older file, so that a kill at any moment costs at most one batch."""
+    if path is None:
+        return
+    beside = path.with_name(path.name + ".new")
+    try:
+        with h5py.File(beside, "w") as file:
+            file.attrs.update({
+                "format": FORMAT,
+                "version": VERSION,
+                "about": json.dumps(about(task)),
+                "torchfilm": tf.__version__,
+                "torch": str(torch.__version__),
+            })  # fmt: skip
+            file["points"], file["statistics"] = known.points, known.statistics
+            names = list(observed_of(task).plan.names)
+            file.create_dataset("names", data=names, dtype=h5py.string_dtype())
+            for name, column in shown_values(task, known.points).items():
+                text = any(isinstance(v, str) for v in column)
+                file.create_dataset(
+                    f"values/{name}",
+                    data=[str(v) for v in column] if text else column,
+                    dtype=h5py.string_dtype() if text else None,
+                )
+            file.attrs["reasons"] = json.dumps(known.reasons)
+        os.replace(beside, path)
+    except OSError as error:
+        raise tf.SimulationError(
+            f"could not write {path}: {error}. Is the disk full? The file keeps the earlier"
+            " simulations."
+        ) from error
+
+
+def _read(path: Path | None, task: Task) -> Simulations:
+    """What a file holds; nothing where there is none. Raises InputError for the file of another
+    task and for one that cannot be read."""
+    names = observed_of(task).plan.names
+    if path is None or not path.exists():
+        return Simulations(np.empty((0, task.space.size)), np.empty((0, len(names))))
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT or int(file.attrs["version"]) > VERSION:
+                raise tf.InputError(
+                    f"{path} is no file of simulations that this torchfilm reads (format"
+                    f" {file.attrs.get('format')!r}, version {file.attrs.get('version')})."
+                )
+            kept, mine = json.loads(file.attrs["about"]), about(task)
+            reasons = {int(k): words for k, words in json.loads(file.attrs["reasons"]).items()}
+            found = Simulations(file["points"][...], file["statistics"][...], reasons)
+    except tf.InputError:
+        raise
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise tf.InputError(
+            f"{path} cannot be read: it is truncated or no file of simulations ({error})."
+        ) from error
+    plain = json.loads(json.dumps(mine))
+    differing = [name for name in plain | kept if kept.get(name) != plain.get(name)]
+    if differing:
+        raise checks.input_error(
+            "path",
+            str(path),
+            f"a file of the same simulations; this one differs in {', '.join(differing)}",
+            "Give another path.",
+        )
+    return found
+
+
+def check_count(name: str, value: Any, least: int) -> int:
+    """A whole number from `least`, or InputError."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise checks.input_error(name, value, f"a whole number from {least}")
+    return value

@@ -1,0 +1,342 @@
+"""A target that is made from data: statistics of observed colonies, each with its spread."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.base import Target, require, species_names
+from design.targets.observed_table import Units, read_table
+from design.targets.statistics import (
+    LOG_CELLS,
+    ColonyStatistics,
+    SeenCells,
+    birth_note,
+    from_centre,
+    seen_cells,
+)
+from torchfilm import checks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FARTHEST = 100.0  # spreads: a statistic that is farther off counts as so far
+ENOUGH = 3  # colonies from which on the spread between them is measured
+RESAMPLED = 200  # bootstrapped colonies
+FINEST = 0.01  # the least spread, relative to the greatest statistic of its group
+COUNT = 0.02  # the least spread of the logarithm of a number of cells
+INNER = 0.95  # share of the cells within the outermost ring
+
+
+@dataclass(frozen=True)
+class Observed(Target):
+    """A colony like those that were observed: `Observed.from_table("cells.csv", pixel_size=0.065)`.
+
+    values: the statistics (K,), means over the observed colonies; spread: of each, above 0; plan:
+    which they are. colonies: how many were observed; cells: how many in all. time: h, when they
+    were observed, or None. Make one by `from_table`, `from_state` or `from_results`.
+
+    The statistics are ln of the number of cells; the quantiles 10, 25, 50, 75 and 90 % of lengths
+    and ages; the radius of gyration; cells per µm² in rings around the centre; the alignment of
+    neighbours, mean cos 2φ; and for each reporter its mean, its means in the rings, and Moran's I,
+    the correlation between neighbours. Neighbours are cells with centres closer than `reach`. All
+    are seen from above, in the x–y plane.
+
+    Loss: the mean over the statistics of ((statistic − value)/spread)². It is about 1 for a colony
+    that grew as the observed ones did. It has no upper limit but 100², a statistic 100 spreads off.
+
+    spread is bootstrapped: the cells of each colony are drawn 200 times with replacement; the
+    number of cells has 1/√N, as if divisions were independent. This leaves out what all cells of a
+    colony share. With 3 colonies or more, it is the standard deviation between them where that is
+    greater, and for the number of cells in any case. Spreads are at least 1 % of the greatest
+    statistic of their kind.
+    """
+
+    failed = FARTHEST**2
+    pattern = False
+    values: tuple[float, ...]
+    spread: tuple[float, ...]
+    plan: ColonyStatistics
+    _: KW_ONLY
+    colonies: int = 1
+    cells: int = 0
+    time: float | None = None
+
+    def __post_init__(self) -> None:
+        names = self.plan.names
+        for name in ("values", "spread"):
+            given = getattr(self, name)
+            if len(given) != len(names):
+                raise checks.input_error(f"Observed.{name}", given, f"{len(names)} numbers")
+            above = 0.0 if name == "spread" else -math.inf
+            found = [
+                checks.number(f"Observed.{name}[{n!r}]", float(v), above=above)
+                for n, v in zip(names, given, strict=True)
+            ]
+            object.__setattr__(self, name, tuple(found))
+        if self.time is not None:
+            checks.number("Observed.time", self.time, above=0.0)
+
+    @staticmethod
+    def from_table(
+        table: str | Path | Mapping[str, Any],
+        *,
+        species: Sequence[str] = (),
+        pixel_size: float | None = None,
+        length_unit: str | None = None,
+        angle_unit: str | None = None,
+        time_unit: str | None = None,
+        columns: Mapping[str, str] | None = None,
+        tip_to_tip: bool = False,
+        relative: bool = False,
+        rings: int = 4,
+        reach: float = 3.0,
+        time: float | None = None,
+        like: Observed | None = None,
+    ) -> Observed:
+        """The target of a table with one row for each cell: a CSV file with a header, or columns
+        by name (a dictionary, or a pandas.DataFrame).
+
+        Columns, of which any may be missing: x and y, the centre; length; angle; age; colony, which
+        tells replicates apart; and the species. columns: their names in the table where they
+        differ, such as {"x": "centroid_x"}. Units stand in the names of columns (x_um or x_px,
+        angle_deg or angle_rad, age_h or age_min) or in arguments: pixel_size, µm a pixel;
+        length_unit "um"; angle_unit "degrees" or "radians"; time_unit "h" or "min".
+
+        tip_to_tip: lengths include the caps, as masks measure them. relative: levels count relative
+        to their mean in the colony, for a reporter in arbitrary units. rings: how many, out to
+        where 95 % of the cells are. reach: µm; cells with closer centres are neighbours. time: h,
+        when the colonies were observed. like: another `Observed`, whose rings and options are
+        taken, so that both compare the same statistics.
+
+        Raises InputError for a table without units, a column that is missing or not numbers, and
+        arguments that nothing uses.
+        """
+        names = species_names("Observed.species", tuple(species)) if species else ()
+        units = Units(pixel_size, length_unit, angle_unit, time_unit)
+        cells = read_table(table, names, units, columns or {})
+        plan = _plan(cells, names, rings, reach, tip_to_tip, relative)
+        return _observed(cells, plan if like is None else like.plan, time)
+
+    @staticmethod
+    def from_state(
+        state: tf.State,
+        *,
+        species: Sequence[str] = (),
+        history: Tensor | None = None,
+        tip_to_tip: bool = False,
+        relative: bool = False,
+        rings: int = 4,
+        reach: float = 3.0,
+        like: Observed | None = None,
+    ) -> Observed:
+        """The target of the colonies of a state, each a replicate. history: the notes of
+        `Observed.note` after every step, for ages. Else as `from_table`."""
+        names = species_names("Observed.species", tuple(species)) if species else ()
+        require(state, names)
+        whole = ColonyStatistics(
+            True, history is not None, True, True, names, (0.0, 1.0), 1.0, tip_to_tip, relative
+        )
+        cells = seen_cells(state, whole, history)
+        plan = _plan(cells, names, rings, reach, tip_to_tip, relative)
+        return _observed(cells, plan if like is None else like.plan, state.time or None)
+
+    @staticmethod
+    def from_results(
+        path: str | Path,
+        frame: int = -1,
+        *,
+        species: Sequence[str] = (),
+        tip_to_tip: bool = False,
+        relative: bool = False,
+        rings: int = 4,
+        reach: float = 3.0,
+        like: Observed | None = None,
+    ) -> Observed:
+        """The target of a frame of a results file, with the ages of its cells. Else as
+        `from_table`."""
+        with tf.Results(path) as results:
+            table, lineage = results.table(frame), results.lineage()
+            born = dict(zip(zip(lineage["colony"], lineage["uid"], strict=True),
+                            np.interp(lineage["born"], results.steps, results.times),
+                            strict=True))  # fmt: skip
+            now = float(results.times[frame])
+        columns = {
+            "colony": table["colony"],
+            "x_um": table["x"],
+            "y_um": table["y"],
+            "length_um": table["length"] + (2.0 * table["radius"] if tip_to_tip else 0.0),
+            "angle_rad": np.arctan2(table["axis_y"], table["axis_x"]),
+            "age_h": [now - born[key] for key in zip(table["colony"], table["uid"], strict=True)],
+            **{name: table[name] for name in species if name in table},
+        }
+        return Observed.from_table(
+            columns, species=species, tip_to_tip=tip_to_tip, relative=relative, rings=rings,
+            reach=reach, time=now or None, like=like,
+        )  # fmt: skip
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.plan.species
+
+    def without(self, *groups: str) -> Observed:
+        """The same data without some groups of statistics, such as "age" or "gfp neighbours"; those
+        that no model of yours could show. `table()` lists them."""
+        for group in groups:
+            checks.choice("Observed.without", group, tuple(self.plan.groups))
+        plan = replace(self.plan, omitted=(*self.plan.omitted, *groups))
+        if not plan.names:
+            raise checks.input_error("Observed.without", groups, "not all of the groups")
+        kept = [self.plan.names.index(name) for name in plan.names]
+        of = lambda values: tuple(values[k] for k in kept)
+        return replace(self, values=of(self.values), spread=of(self.spread), plan=plan)
+
+    def check(self, state: tf.State) -> None:
+        require(state, self.plan.species)
+
+    def unfit(self, state: tf.State) -> list[str]:
+        if self.time is None or abs(state.time - self.time) <= 1e-6 * self.time:
+            return [""] * state.colonies
+        why = f"it ended at {state.time:g} h, and was observed at {self.time:g} h: set until"
+        return [why] * state.colonies
+
+    def note(self, state: tf.State) -> Tensor | None:
+        """Time and next uid of each colony, (B, 2), which tell when cells were born; None where
+        ages are not compared."""
+        return birth_note(state) if self.plan.ages else None
+
+    def statistics(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        """The statistics of each colony, (B, K) float64, with gradients by the levels."""
+        return self.plan.of(seen_cells(state, self.plan, history))
+
+    def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        found = self.statistics(state, history)
+        apart = (found - found.new_tensor(self.values)) / found.new_tensor(self.spread)
+        return apart.clamp(-FARTHEST, FARTHEST) / math.sqrt(len(self.values))
+
+    def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
+        apart = self.residuals(state, history)
+        # column by column: a sum over many columns may depend on the number of rows
+        return sum((a * a for a in apart.unbind(1)), apart.new_zeros(len(apart)))
+
+    @torch.no_grad()
+    def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
+        """The number of cells, and the other statistics by name, (B,) each."""
+        found = dict(zip(self.plan.names, self.statistics(state, history).unbind(1), strict=True))
+        found.pop(LOG_CELLS, None)
+        return {"cells": state.counts.double(), **found}
+
+    def table(self) -> str:
+        """The statistics with their spreads, a line each."""
+        lines = [f"{self.describe()}:"]
+        for group, names in self.plan.groups.items():
+            lines.append(group)
+            for name in names:
+                k = self.plan.names.index(name)
+                lines.append(f"  {name:<24} {self.values[k]:>10.4g} ± {self.spread[k]:.2g}")
+        return "\n".join(lines)
+
+    def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
+        """Draw the rings around the colony's centre."""
+        if not self.plan.positions:
+            return
+        mine = state.position[state.colony == place][:, :2]
+        x, y = mine.mean(0).tolist()
+        turn = np.linspace(0.0, 2.0 * np.pi, 100)
+        window = ax.get_xlim(), ax.get_ylim()
+        for edge in self.plan.edges[1:]:
+            ax.plot(x + edge * np.cos(turn), y + edge * np.sin(turn), color="#c2185b", lw=0.6)
+        ax.set(xlim=window[0], ylim=window[1])
+
+    def describe(self) -> str:
+        many = f"{self.colonies} observed colon" + ("ies" if self.colonies > 1 else "y")
+        when = "" if self.time is None else f" at {self.time:g} h"
+        return f"like {many}{when}, {self.cells} cells: {', '.join(self.plan.groups)}"
+
+
+def _plan(
+    cells: SeenCells,
+    species: tuple[str, ...],
+    rings: int,
+    reach: float,
+    tip_to_tip: bool,
+    relative: bool,
+) -> ColonyStatistics:
+    """The statistics of all that is known of some cells."""
+    if isinstance(rings, bool) or not isinstance(rings, int) or not 1 <= rings <= 50:
+        raise checks.input_error("Observed(rings)", rings, "a whole number from 1 to 50")
+    checks.number("Observed(reach)", reach, above=0.0)
+    checks.choice("Observed(tip_to_tip)", tip_to_tip, (True, False))
+    checks.choice("Observed(relative)", relative, (True, False))
+    edges: tuple[float, ...] = ()
+    if cells.position is not None:
+        outer = float(np.quantile(from_centre(cells.position, cells).cpu().numpy(), INNER))
+        # a colony of one cell has no extent; its ring is a cell long
+        edges = tuple(np.linspace(0.0, outer or reach, rings + 1).tolist())
+    return ColonyStatistics(
+        lengths=cells.length is not None,
+        ages=cells.age is not None,
+        positions=cells.position is not None,
+        alignment=cells.position is not None and cells.axis is not None,
+        species=species,
+        edges=edges,
+        reach=reach,
+        tip_to_tip=tip_to_tip,
+        relative=relative,
+    )
+
+
+def _observed(cells: SeenCells, plan: ColonyStatistics, time: float | None) -> Observed:
+    """The target of some cells."""
+    with torch.no_grad():
+        each = plan.of(cells)
+        count = len(cells.counts)
+        resampled = [_bootstrap(cells, plan, k) for k in range(count)]
+        spread = torch.stack(resampled).square().mean(0).sqrt()
+        if count >= ENOUGH:
+            between = each.std(0)
+            # of few colonies it is small by chance, and it contains that of drawing cells; but
+            # divisions in step make numbers of cells more alike than independent ones would
+            at = plan.names.index(LOG_CELLS) if LOG_CELLS in plan.names else None
+            spread = torch.maximum(spread, between)
+            if at is not None:
+                spread[at] = between[at]
+    least = torch.cat([
+        each[:, [plan.names.index(n) for n in names]].abs().max().mul(FINEST).expand(len(names))
+        for names in plan.groups.values()
+    ])  # fmt: skip
+    if plan.names[0] == LOG_CELLS:
+        least[0] = COUNT
+    spread = torch.maximum(spread, least)
+    spread = torch.where(spread > 0, spread, 1.0)  # a reporter that is dark in all cells
+    total = int(cells.counts.sum())
+    mean = tuple(each.mean(0).tolist())
+    return Observed(mean, tuple(spread.tolist()), plan, colonies=count, cells=total, time=time)
+
+
+def _bootstrap(cells: SeenCells, plan: ColonyStatistics, colony: int) -> Tensor:
+    """The standard deviation of each statistic (K,) when the cells of one colony are drawn again
+    with replacement; of the logarithm of their number, 1/√N."""
+    rows = torch.nonzero(cells.colony == colony).squeeze(1).cpu()
+    count = len(rows)
+    drawn = np.random.default_rng(0).integers(count, size=(RESAMPLED, count))
+    drawn_rows = rows[torch.from_numpy(drawn.ravel())].to(cells.colony.device)
+    take = lambda value: None if value is None else value.index_select(0, drawn_rows)
+    again = SeenCells(
+        torch.arange(RESAMPLED, device=cells.colony.device).repeat_interleave(count),
+        torch.full((RESAMPLED,), count, device=cells.colony.device),
+        take(cells.position), take(cells.axis), take(cells.length), take(cells.age),
+        take(cells.levels),
+    )  # fmt: skip
+    found = plan.of(again).std(0)
+    if plan.names[0] == LOG_CELLS:
+        found[0] = 1.0 / math.sqrt(count)
+    return found

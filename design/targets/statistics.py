@@ -1,0 +1,261 @@
+"""Statistics of colonies that can be seen under a microscope, of simulated and of observed cells
+alike."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+import torchfilm as tf
+from design.targets.base import levels, ratio
+
+LOG_CELLS = "log_cells"
+QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+STEADY = 1e-12  # variance, in squares of the mean, that rounding can cause
+
+
+@dataclass(frozen=True)
+class SeenCells:
+    """The cells of B colonies, those of one colony side by side, as statistics need them.
+
+    colony (N,) int64; counts (B,); position (N, 2) µm, axis (N, 2) unit vectors, length (N,) µm,
+    age (N,) h, levels (N, S) of S species; None where it is not known.
+    """
+
+    colony: Tensor
+    counts: Tensor
+    position: Tensor | None = None
+    axis: Tensor | None = None
+    length: Tensor | None = None
+    age: Tensor | None = None
+    levels: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class ColonyStatistics:
+    """Which statistics of a colony are compared.
+
+    lengths, ages, positions, alignment: whether the lengths, ages, places and directions of cells
+    are known. species: reporters. edges: of the rings around the centre of the colony, µm, the
+    first 0. reach: cells whose centres are closer are neighbours, µm. tip_to_tip: lengths include
+    the caps. relative: levels count relative to the mean of their colony. omitted: groups that are
+    left out.
+    """
+
+    lengths: bool
+    ages: bool
+    positions: bool
+    alignment: bool
+    species: tuple[str, ...]
+    edges: tuple[float, ...]
+    reach: float
+    tip_to_tip: bool
+    relative: bool
+    omitted: tuple[str, ...] = ()
+
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """The names of the statistics, (K,) in all, by what they are about."""
+        return {g: names for g, names in self._known_groups().items() if g not in self.omitted}
+
+    def _known_groups(self) -> dict[str, tuple[str, ...]]:
+        percent = [f"{100 * q:.0f}" for q in QUANTILES]
+        rings = range(1, len(self.edges))
+        found: dict[str, tuple[str, ...]] = {"cells": (LOG_CELLS,)}
+        if self.lengths:
+            found["length"] = tuple(f"length_{p}_um" for p in percent)
+        if self.ages:
+            found["age"] = tuple(f"age_{p}_h" for p in percent)
+        if self.positions:
+            found["extent"] = ("gyration_um",)
+            found["density"] = tuple(f"density_{k}" for k in rings)
+        if self.alignment:
+            found["alignment"] = ("alignment",)
+        for name in self.species:
+            if not self.relative:
+                found[name] = (f"{name}_mean",)
+            if self.positions:
+                found[f"{name} profile"] = tuple(f"{name}_ring_{k}" for k in rings)
+                found[f"{name} neighbours"] = (f"{name}_neighbours",)
+        return found
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all statistics, (K,)."""
+        return tuple(name for names in self.groups.values() for name in names)
+
+    def of(self, cells: SeenCells) -> Tensor:
+        """The statistics of each colony, (B, K) float64, with gradients by the levels. A colony
+        without cells has NaN."""
+        parts = [cells.counts.double().log().unsqueeze(1)]
+        if self.lengths:
+            parts.append(_quantiles(_known(cells.length), cells))
+        if self.ages:
+            parts.append(_quantiles(_known(cells.age), cells))
+        radius, pairs = None, None
+        if self.positions:
+            radius = from_centre(_known(cells.position), cells)
+            pairs = _neighbours(_known(cells.position), cells.colony, self.reach)
+            parts += [_means(radius * radius, cells).sqrt(), self._density(radius, cells)]
+        if self.alignment:
+            assert pairs is not None
+            parts.append(_alignment(_known(cells.axis), cells, pairs))
+        for k in range(len(self.species)):
+            parts.append(self._reporter(_known(cells.levels)[:, k], cells, radius, pairs))
+        found = torch.cat(parts, 1)
+        if self.omitted:
+            every = [n for names in self._known_groups().values() for n in names]
+            found = found[:, [every.index(name) for name in self.names]]
+        return torch.where((cells.counts > 0).unsqueeze(1), found, math.nan)
+
+    def _ring(self, radius: Tensor) -> Tensor:
+        """The ring of each cell, from 0, (N,); beyond the last edge as many as there are rings."""
+        outer = radius.new_tensor(self.edges[1:])
+        return torch.bucketize(radius.squeeze(1), outer, right=True)
+
+    def _density(self, radius: Tensor, cells: SeenCells) -> Tensor:
+        """Cells per µm² in each ring, (B, rings)."""
+        rings = len(self.edges) - 1
+        ring = self._ring(radius)
+        count = _sums(torch.nn.functional.one_hot(ring, rings + 1).double(), cells)[:, :rings]
+        square = radius.new_tensor(self.edges).square()
+        return count / (math.pi * square.diff())
+
+    def _reporter(
+        self, level: Tensor, cells: SeenCells, radius: Tensor | None, pairs: Tensor | None
+    ) -> Tensor:
+        """Mean, means in rings and correlation between neighbours of one reporter, (B, …). An
+        empty ring counts as one with the mean of the colony."""
+        mean = _means(level.unsqueeze(1), cells)
+        scale = torch.where(mean != 0, mean, 1.0) if self.relative else torch.ones_like(mean)
+        parts = [] if self.relative else [mean]
+        if radius is not None and pairs is not None:
+            rings = len(self.edges) - 1
+            # cells beyond the last edge belong to the last ring
+            inside = torch.nn.functional.one_hot(self._ring(radius).clamp(max=rings - 1), rings)
+            count = _sums(inside.double(), cells)
+            amount = _sums(inside * level.unsqueeze(1), cells)
+            filled = count > 0
+            profile = torch.where(filled, amount / torch.where(filled, count, 1.0), mean)
+            parts += [profile / scale, _correlation(level, mean, cells, pairs)]
+        return torch.cat(parts, 1)
+
+
+def seen_cells(state: tf.State, plan: ColonyStatistics, history: Tensor | None) -> SeenCells:
+    """The cells of a state as a microscope sees them from above. history: the notes of
+    `birth_note`, which ages need."""
+    flat = state.axis[:, :2].double()
+    size = flat.square().sum(1, keepdim=True).sqrt()
+    upright = torch.tensor([1.0, 0.0], dtype=torch.float64, device=flat.device)
+    length = state.length.double() + (2.0 * state.radius.double() if plan.tip_to_tip else 0.0)
+    found = [levels(state, name).double() for name in plan.species]
+    return SeenCells(
+        colony=state.colony,
+        counts=state.counts,
+        position=state.position[:, :2].detach(),
+        axis=torch.where(size > 0, flat / torch.where(size > 0, size, 1.0), upright).detach(),
+        length=length.detach(),
+        age=_ages(state, history) if plan.ages else None,
+        levels=torch.stack(found, 1) if found else None,
+    )
+
+
+def birth_note(state: tf.State) -> Tensor:
+    """The time and the next uid of each colony, (B, 2) float64: uids grow with time, so that
+    the notes of all steps tell when each cell was born."""
+    return torch.stack([torch.full_like(state.next_uid, state.time, dtype=torch.float64),
+                        state.next_uid.double()], 1)  # fmt: skip
+
+
+def _ages(state: tf.State, history: Tensor | None) -> Tensor:
+    """The age of each cell, (N,) h; that of founders is the time since the start."""
+    if history is None:
+        raise tf.InputError(
+            "ages need the notes of all steps: stack target.note(state) after each of them, or"
+            " leave ages out."
+        )
+    times, uids = history[:, :, 0], history[:, :, 1]
+    step = (uids.index_select(1, state.colony) <= state.uid).sum(0)
+    born = times[step.clamp(max=len(times) - 1), state.colony]
+    return state.time - torch.where(state.parent < 0, 0.0, born)
+
+
+def _known(value: Tensor | None) -> Tensor:
+    assert value is not None  # a plan speaks only of what its cells have
+    return value
+
+
+def _sums(value: Tensor, cells: SeenCells) -> Tensor:
+    """The sums over colonies of (N, k): (B, k); cell by cell, whatever else is in the batch."""
+    out = value.new_zeros(len(cells.counts), value.shape[1], dtype=torch.float64)
+    return out.index_add(0, cells.colony, value.double())
+
+
+def _means(value: Tensor, cells: SeenCells) -> Tensor:
+    return _sums(value, cells) / cells.counts.clamp(min=1).unsqueeze(1)
+
+
+def _quantiles(value: Tensor, cells: SeenCells) -> Tensor:
+    """Of each colony, (B, 5), linear between two cells."""
+    order = torch.argsort(value, stable=True)
+    order = order[torch.argsort(cells.colony[order], stable=True)]
+    sorted_values = torch.cat([value[order].double(), value.new_zeros(1, dtype=torch.float64)])
+    first = torch.cumsum(cells.counts, 0) - cells.counts
+    share = torch.tensor(QUANTILES, dtype=torch.float64, device=value.device)
+    place = share * (cells.counts - 1).clamp(min=0).unsqueeze(1)
+    below = place.floor()
+    low = first.unsqueeze(1) + below.long()
+    high = first.unsqueeze(1) + place.ceil().long()
+    last = len(value)  # a colony without cells may stand at the end
+    one, other = sorted_values[low.clamp(max=last)], sorted_values[high.clamp(max=last)]
+    return one + (place - below) * (other - one)
+
+
+def from_centre(position: Tensor, cells: SeenCells) -> Tensor:
+    """The distance of each cell from the centre of its colony, (N, 1) µm."""
+    apart = position - _means(position, cells).index_select(0, cells.colony)
+    return apart.square().sum(1, keepdim=True).sqrt()
+
+
+def _neighbours(position: Tensor, colony: Tensor, reach: float) -> Tensor:
+    """Pairs of cells of one colony with centres closer than `reach`, (2, P), each pair once. A cell
+    is no neighbour of a copy of itself (at the same place)."""
+    # colonies are apart along an axis of their own
+    places = torch.cat([position, 2.0 * reach * colony.double().unsqueeze(1)], 1).cpu().numpy()
+    pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
+    apart = np.square(places[pairs[:, 0]] - places[pairs[:, 1]]).sum(1)
+    pairs = pairs[apart > 0]
+    # in an order that does not depend on the batch
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+    return torch.from_numpy(np.ascontiguousarray(pairs.T).astype(np.int64)).to(position.device)
+
+
+def _over_pairs(value: Tensor, cells: SeenCells, pairs: Tensor) -> Tensor:
+    """The mean over the pairs of each colony, (B, 1); 0 without pairs."""
+    colony = cells.colony.index_select(0, pairs[0])
+    both = torch.stack([value, torch.ones_like(value)], 1)
+    out = value.new_zeros(len(cells.counts), 2).index_add(0, colony, both)
+    return ratio(out[:, :1], out[:, 1:], 0.0)
+
+
+def _correlation(level: Tensor, mean: Tensor, cells: SeenCells, pairs: Tensor) -> Tensor:
+    """Moran's I (Biometrika 37, 17, 1950): the mean over pairs of neighbours of the product of
+    their deviations from the mean, over the variance, (B, 1); 0 where all cells are alike."""
+    apart = level - mean.squeeze(1).index_select(0, cells.colony)
+    variance = _means(apart.square().unsqueeze(1), cells)
+    together = apart.index_select(0, pairs[0]) * apart.index_select(0, pairs[1])
+    varied = variance > STEADY * mean.square()
+    return torch.where(
+        varied, _over_pairs(together, cells, pairs) / torch.where(varied, variance, 1.0), 0.0
+    )
+
+
+def _alignment(axis: Tensor, cells: SeenCells, pairs: Tensor) -> Tensor:
+    """The mean of cos 2φ over pairs of neighbours, φ the angle between them, (B, 1)."""
+    cosine = (axis.index_select(0, pairs[0]) * axis.index_select(0, pairs[1])).sum(1)
+    return _over_pairs(2.0 * cosine.square() - 1.0, cells, pairs)

@@ -1,0 +1,221 @@
+"""Inference: simulations and their file, posteriors, and their calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.util import find_spec
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from searching import grown
+
+import torchfilm as tf
+from design import Calibration, Choice, Observed, Parameter, Task, infer
+from design.simulations import simulate_designs, simulate_points
+
+RATE = [Parameter("rate", 0.8, 2.0, log=True)]
+needs_sbi = pytest.mark.skipif(find_spec("sbi") is None, reason="needs sbi")
+
+
+def colony(rate=1.5, make=1.0):
+    """Without mechanics, so that it is fast."""
+    return grown(tf.LogNormal(rate, 0.2), make)
+
+
+@pytest.fixture(scope="module")
+def data():
+    *_, state = tf.simulate(colony(rate=1.4), until=2.0, colonies=2, seed=8)
+    return Observed.from_state(state).without("extent", "density", "alignment")
+
+
+def task_of(data, parameters=RATE, **options):
+    options = {"until": 2.0, "dt": 0.1, "replicates": 2, "replay": False, **options}
+    return Task(colony, parameters, data, **options)
+
+
+def alike(one, other):
+    return np.array_equal(one.points, other.points) and np.array_equal(
+        one.statistics, other.statistics, equal_nan=True
+    )
+
+
+# --- simulations ----------------------------------------------------------------------------------
+
+
+def test_a_simulation_does_not_depend_on_its_batch(data):
+    task = task_of(data)
+    every = simulate_designs(task, 12)
+    assert every.points.shape == (12, 1) and every.sound.all()
+    later = simulate_points(task, every.points[7:10], 7)
+    assert np.array_equal(later.statistics, every.statistics[7:10])
+    assert len(np.unique(simulate_points(task, np.full((6, 1), 0.5), 0).statistics, axis=0)) == 6
+
+
+def test_simulations_resume(data, tmp_path, monkeypatch):
+    monkeypatch.setattr("design.simulations.BATCH", 4)
+    task, path = task_of(data), tmp_path / "simulations.h5"
+    whole, counts = simulate_designs(task, 10), []
+    simulate_designs(task, 6, path=path)
+    found = simulate_designs(task, 10, path=path, seen=counts.append)
+    assert alike(found, whole) and counts == [6, 10]
+    assert alike(simulate_designs(task, 5, path=path), whole.take(slice(0, 5)))
+    with h5py.File(path) as file:
+        assert set(file) == {"points", "statistics", "names", "values"}
+        assert file["values/rate"][0] == pytest.approx(task.space.values(whole.points[0])["rate"])
+
+
+def test_the_file_serves_other_data_but_no_other_simulations(data, tmp_path):
+    path = tmp_path / "simulations.h5"
+    one = simulate_designs(task_of(data), 4, path=path)
+    *_, state = tf.simulate(colony(rate=1.0), until=2.0, colonies=2, seed=9)
+    other = Observed.from_state(state, like=data)
+    assert other.values != data.values
+    assert alike(simulate_designs(task_of(other), 4, path=path), one)
+    for options, word in (
+        ({"until": 1.0}, "until"),
+        ({"seed": 1}, "seed"),
+        ({"replicates": 1}, "replicates"),
+        ({"parameters": [Parameter("rate", 0.5, 2.0, log=True)]}, "parameters"),
+    ):
+        with pytest.raises(tf.InputError, match=f"differs in .*{word}"):
+            simulate_designs(task_of(data, **options), 4, path=path)
+    with pytest.raises(tf.InputError, match="differs in target"):
+        simulate_designs(task_of(data.without("cells")), 4, path=path)
+    path.write_text("no HDF5")
+    with pytest.raises(tf.InputError, match="cannot be read"):
+        simulate_designs(task_of(data), 4, path=path)
+
+
+def fragile(rate=1.5, make=1.0):
+    """The scene refuses some rates."""
+    bad = (torch.as_tensor(rate) > 1.5) & (torch.as_tensor(rate) < 1.6)
+    return grown(torch.where(bad, -1.0, torch.as_tensor(rate)), make)
+
+
+def test_designs_that_fail_are_left_out(data):
+    task = Task(fragile, [Parameter("rate", 1.0, 2.0)], data, until=2.0, replicates=2, replay=False)
+    points = np.array([[0.2], [0.55], [0.8]])
+    found = simulate_points(task, points, 0)
+    assert found.sound.tolist() == [True, False, True] and list(found.reasons) == [1]
+    assert "rate" in found.failures()[0][0] and found.failures()[0][1] == 1
+    both = found.followed_by(found)
+    assert list(both.reasons) == [1, 4] and both.take(slice(2, 5)).reasons.keys() == {2}
+
+
+# --- posteriors -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def posterior(data):
+    if find_spec("sbi") is None:
+        pytest.skip("needs sbi")
+    state = torch.random.get_rng_state()
+    found = infer(
+        colony, RATE, data, simulations=300, dt=0.1, flows=2, epochs=60, samples=500,
+        progress=False,
+    )  # fmt: skip
+    assert torch.equal(torch.random.get_rng_state(), state)
+    return found
+
+
+def test_the_posterior_finds_the_hidden_rate(posterior):
+    low, high = posterior.interval(0.95)["rate"]
+    assert low < 1.4 < high and high / low < 1.6
+    assert low < posterior.mean["rate"] < high
+    sample = posterior.samples["rate"]
+    assert sample.shape == (500,) and sample.min() >= 0.8 and sample.max() <= 2.0
+    # log scale: the mean is the geometric one
+    assert posterior.mean["rate"] == pytest.approx(np.exp(np.log(sample).mean()))
+    assert posterior.surprises == [] and "90 % interval" in posterior.table()
+    assert "Posterior(mean=" in repr(posterior)
+
+
+def test_one_estimator_serves_other_data(posterior, data):
+    *_, state = tf.simulate(colony(rate=1.0), until=2.0, colonies=2, seed=11)
+    slow = posterior.given(Observed.from_state(state, like=data))
+    assert slow.mean["rate"] < 1.2 < posterior.mean["rate"]
+    with pytest.raises(tf.InputError, match="of the same statistics"):
+        posterior.given(Observed.from_state(state))
+
+
+def test_data_that_no_simulation_reaches_are_named(posterior, data):
+    far = replace(data, values=(20.0, *data.values[1:]))
+    found = posterior.given(far)
+    assert len(found.surprises) == 1 and found.surprises[0].startswith("log_cells is 20")
+    assert "does not reach the data" in found.table()
+
+
+def test_calibration_counts_covered_truths(posterior, tmp_path):
+    found = posterior.check(40, samples=99)
+    assert found.ranks.shape == (40, 1) and found.density_ranks.shape == (40,)
+    assert (found.ranks >= 0).all() and (found.ranks <= 99).all()
+    assert all(share > 0.7 for share in found.coverage().values())
+    assert "40 truths" in found.table()
+    assert found.plot(tmp_path / "ranks.png").stat().st_size > 1000
+    assert posterior.plot(tmp_path / "corner.png", truth={"rate": 1.4}).stat().st_size > 1000
+
+
+def test_coverage_of_even_ranks_is_the_level():
+    ranks = np.arange(100)
+    made = Calibration(("a",), ranks[:, None], ranks, 99, failed=2)
+    assert made.coverage(0.9) == pytest.approx({"a": 0.9, "all together": 0.9})
+    assert made.coverage(0.5) == pytest.approx({"a": 0.5, "all together": 0.5})
+    assert "2 truths failed" in made.table()
+
+
+def kinds(kind="fast", copies=1, make=1.0):
+    return grown(tf.LogNormal({"slow": 0.8, "fast": 1.8}[kind], 0.2), make * copies)
+
+
+@needs_sbi
+def test_choices_and_whole_numbers_are_inferred(tmp_path):
+    *_, state = tf.simulate(kinds("slow", 3), until=2.0, colonies=2, seed=8)
+    data = Observed.from_state(state, species=["gfp"]).without("extent", "density", "alignment")
+    found = infer(
+        kinds, [Choice("kind", ("slow", "fast")), Parameter("copies", 1, 4, whole=True)], data,
+        simulations=200, flows=1, epochs=40, samples=200, progress=False,
+    )  # fmt: skip
+    assert found.mean == {"kind": "slow", "copies": 3}
+    assert set(found.samples["kind"]) <= {"slow", "fast"} and "of the samples" in found.table()
+    assert set(found.interval()) == {"copies"}
+    found.plot(tmp_path / "corner.png", truth={"kind": "slow", "copies": 3})
+
+
+@needs_sbi
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"simulations": 20}, "simulations"),
+        ({"samples": 0}, "samples"),
+        ({"flows": 0}, "flows"),
+        ({"epochs": 0}, "epochs"),
+        ({"observed": 3}, "observed"),
+        ({"replicates": 0}, "replicates"),
+    ],
+)
+def test_bad_arguments_are_refused(data, options, message):
+    observed = options.pop("observed", data)
+    with pytest.raises(tf.InputError, match=message):
+        infer(colony, RATE, observed, **{"progress": False, **options})
+
+
+def hopeless(rate=1.5):
+    """The scene refuses all rates but the bounds and the middle, which a task tries."""
+    rate = torch.as_tensor(rate)
+    tried = ((rate - 1.5).abs() < 1e-4) | (rate < 1.0001) | (rate > 1.9999)
+    return grown(torch.where(tried, rate, -1.0), 1.0)
+
+
+@needs_sbi
+def test_too_many_failures_are_refused(data, monkeypatch):
+    monkeypatch.setattr("design.inference.LEAST", 5)
+    with pytest.raises(tf.InputError, match=r"0 of 5 simulations succeeded.*rate"):
+        infer(hopeless, [Parameter("rate", 1.0, 2.0)], data, simulations=5, progress=False)
+
+
+def test_without_sbi_the_error_names_the_extra(monkeypatch, data):
+    monkeypatch.setattr("design.neural_posterior.find_spec", lambda name: None)
+    with pytest.raises(tf.InputError, match=r"torchfilm\[infer\]"):
+        infer(colony, RATE, data)
