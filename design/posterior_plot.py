@@ -36,7 +36,7 @@ def draw_corner(path: Path, space: Space, points: np.ndarray, truth: np.ndarray 
     count = space.size
     figure = _figure((1.0 + 1.8 * count, 0.6 + 1.8 * count))
     edges = [_edges(p, points[:, k], truth, k) for k, p in enumerate(space.parameters)]
-    grid = figure.subplots(count, count, squeeze=False)
+    grid: Any = figure.subplots(count, count, squeeze=False)
     for row, column in np.ndindex(count, count):
         ax = grid[row, column]
         if column > row:

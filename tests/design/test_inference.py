@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from importlib.util import find_spec
+from multiprocessing import get_context
 
 import h5py
 import numpy as np
@@ -61,6 +63,8 @@ def test_simulations_resume(data, tmp_path, monkeypatch):
     found = simulate_designs(task, 10, path=path, seen=counts.append)
     assert alike(found, whole) and counts == [6, 10]
     assert alike(simulate_designs(task, 5, path=path), whole.take(slice(0, 5)))
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        assert alike(simulate_designs(task, 10, executor=pool), whole)
     with h5py.File(path) as file:
         assert set(file) == {"points", "statistics", "names", "values"}
         assert file["values/rate"][0] == pytest.approx(task.space.values(whole.points[0])["rate"])
