@@ -38,7 +38,7 @@ def infer(
     device: str = "cpu",
     path: str | Path | None = None,
     samples: int = 4000,
-    flows: int = 2,
+    flows: int = 3,
     epochs: int = 400,
     executor: Executor | None = None,
     progress: bool = True,

@@ -24,7 +24,7 @@ from torchfilm import checks
 
 LEVEL = 0.9  # of intervals, unless a caller gives one
 BEYOND = 0.002  # share of simulations beyond a statistic for which the model is questioned
-STREAM = 1  # of the truths of a calibration
+STREAM = 2  # of the truths of a calibration
 
 
 @dataclass(frozen=True, eq=False, repr=False)

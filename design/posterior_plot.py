@@ -49,7 +49,7 @@ def draw_corner(path: Path, space: Space, points: np.ndarray, truth: np.ndarray 
         else:
             ax.hist2d(x, y, (edges[column], edges[row]), cmap="Blues")
         if truth is not None:
-            _mark(ax, truth[column], None if row == column else truth[row])
+            _mark(ax, float(truth[column]), None if row == column else float(truth[row]))
         ax.set_xlim(edges[column][0], edges[column][-1])
         at, labels = _ticks(space.parameters[column], edges[column])
         ax.set_xticks(at, labels if row == count - 1 else [""] * len(at), fontsize=7)
