@@ -38,7 +38,7 @@ def infer(
     device: str = "cpu",
     path: str | Path | None = None,
     samples: int = 4000,
-    flows: int = 3,
+    flows: int = 2,
     epochs: int = 400,
     executor: Executor | None = None,
     progress: bool = True,
@@ -58,10 +58,10 @@ def infer(
     when the data were observed. replicates: with fewer than were observed, the posterior is wider
     than the data allow. path: a file that keeps the simulations; running the same again
     takes them from it, also for other data of the same statistics. samples: of the posterior.
-    flows, epochs: of the estimator. executor: of the `concurrent.futures` kind, for other
-    processes. progress: show a bar. Raises the errors of `Task`, and InputError where sbi is
-    missing (the `infer` extra), for the file of other simulations, and where fewer than 50
-    simulations succeed.
+    flows, epochs: of the estimator; more flows are less sure. executor: of the
+    `concurrent.futures` kind, for other processes. progress: show a bar. Raises the errors of
+    `Task`, and InputError where sbi is missing (the `infer` extra), for the file of other
+    simulations, and where fewer than 50 simulations succeed.
     """
     require_sbi()
     if not isinstance(observed, Observed):

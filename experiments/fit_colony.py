@@ -30,7 +30,7 @@ from record import machine
 HERE = Path(__file__).parent
 HOURS, COLONIES, SEED = 4.0, 4, 2026
 PIXEL = 0.065  # µm
-SIMULATIONS = 2000
+SIMULATIONS, FLOWS = 2000, 3  # few simulations need more flows, to be no surer than right
 TRUTH = {"rate": 1.15, "division": 3.4, "variation": 0.12, "make": 3.0}
 PARAMETERS = [
     Parameter("rate", 0.7, 1.5, log=True),
@@ -95,7 +95,7 @@ def main() -> None:
     print(observed.table())
     posterior = infer(
         colony, PARAMETERS, observed, simulations=options.simulations,
-        path=options.out / "simulations.h5",
+        path=options.out / "simulations.h5", flows=FLOWS,
     )  # fmt: skip
     seconds = time.perf_counter() - begin
     print(posterior.table())
