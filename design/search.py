@@ -258,7 +258,9 @@ class Search(TaskOptions):
             return Chosen(method_of(self.method))
         resumed = path is not None and Path(path).is_file()
         before = Study.read(path).about.get("method", "") if path is not None and resumed else ""
-        return choose(task.space.size, colonies / task.replicates, task.goals, before)
+        return choose(
+            task.space.size, colonies / task.replicates, task.goals, task.target.pattern, before
+        )
 
     def _open_study(self, path: str | Path | None, method: str) -> Study:
         task = self.objective.task

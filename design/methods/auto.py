@@ -27,12 +27,16 @@ class Chosen:
         return f"auto: {text}" if self.why else text
 
 
-def choose(dimensions: int, designs: float, goals: int, before: str = "") -> Chosen:
+def choose(
+    dimensions: int, designs: float, goals: int, pattern: bool = True, before: str = ""
+) -> Chosen:
     """The method of a search that leaves the choice. dimensions: parameters; designs: that the
-    budget can grow with all replicates; goals: 0 for one target; before: what the study of a
-    search that is resumed says of its method, which goes on."""
+    budget can grow with all replicates; goals: 0 for one target; pattern: whether the target is a
+    pattern, of which small colonies show something; before: what the study of a search that is
+    resumed says of its method, which goes on."""
+    cloud = CMAES(population=BATCH, sigma=WIDTH)
     few = Chosen(
-        CMAES(population=BATCH, sigma=WIDTH),
+        cloud,
         f"{designs:.0f} designs are fewer than two batches of {BATCH}, so there is nothing to spare"
         " for small colonies; its first batch is of Sobol points",
     )
@@ -46,4 +50,6 @@ def choose(dimensions: int, designs: float, goals: int, before: str = "") -> Cho
             return Chosen(known.method, "the study began with it")
     if goals:
         return Chosen(NSGA2(), f"{goals} goals side by side")
+    if not pattern:
+        return Chosen(cloud, "data of a colony of one size: a smaller one does not compare")
     return few if designs < 2 * BATCH else race
