@@ -217,11 +217,11 @@ class FinalsRun:
 
     def _front(self) -> None:
         """Grow designs from all parts of the front, as many as LEAST seeds of each allow."""
-        full = [e for e in self.study.full() if e.goals is not None]
+        full = self.study.full_goals()
         if not full:
             return
-        points = np.concatenate([e.points for e in full])
-        goals = np.concatenate([e.goals for e in full if e.goals is not None])
+        points = np.concatenate([e.points for e, _ in full])
+        goals = np.concatenate([found for _, found in full])
         front = nondominated(goals)
         room = self.finals.colonies(self.budget) / sum(self.finals.sizes)
         for count in range(min(len(front), 2 * self.finals.most), 0, -1):

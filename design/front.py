@@ -11,11 +11,10 @@ import numpy as np
 
 import torchfilm as tf
 from design.best import Best
-from design.entries import Entry
 from design.finals import fresh_goals
 from design.front_plot import draw_front
 from design.objective import Objective
-from design.parameters import Value, show_value
+from design.parameters import Value, right_aligned, show_value
 from design.pareto import nondominated, spread
 from design.study import Study
 from design.targets.goals import Goals
@@ -71,7 +70,8 @@ class Front:
         """
         from pymoo.indicators.hv import HV
 
-        full, study = full_goals(self.search.study), self.search.study
+        study = self.search.study
+        full = study.full_goals()
         every = np.concatenate([goals for _, goals in full])
         good = every[nondominated(every)]
         low, high = good.min(0), good.max(0)
@@ -94,15 +94,13 @@ class Front:
         for k, (goals, values) in enumerate(zip(self.goals, self.values, strict=True)):
             shown = [show_value(values[name]) for name in names]
             text.append([str(k), *(f"{x:.4g}" for x in goals), *shown])
-        wide = [max(map(len, column)) for column in zip(*text, strict=True)]
-        lines = ["  ".join(x.rjust(w) for x, w in zip(r, wide, strict=True)) for r in text]
         where = f"on {self.seeds} fresh seeds" if self.seeds else "on the seeds of the search"
-        return "\n".join([*lines, f"{len(self)} designs, {where}"])
+        return "\n".join([*right_aligned(text), f"{len(self)} designs, {where}"])
 
     def plot(self, path: str | Path) -> Path:
         """Draw the front among all designs, colonies along it, and the hypervolume. Needs
         matplotlib and pymoo (the `app` and `pareto` extras)."""
-        every = np.concatenate([goals for _, goals in full_goals(self.search.study)])
+        every = np.concatenate([goals for _, goals in self.search.study.full_goals()])
         colonies = {int(k): self[int(k)].colonies() for k in spread(self.goals, 5)}
         return draw_front(
             Path(path),
@@ -115,17 +113,12 @@ class Front:
         )
 
 
-def full_goals(study: Study) -> list[tuple[Entry, np.ndarray]]:
-    """The batches at full size with all replicates, and the losses of their goals (n, G)."""
-    return [(e, e.goals) for e in study.full() if e.goals is not None]
-
-
 def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front:
     """The front of a study: on fresh seeds where its designs were grown at all these sizes. Raises
     InputError before a design was grown to full size, and where all failed."""
     target = search.objective.task.target
     assert isinstance(target, Goals)
-    full = full_goals(study)
+    full = study.full_goals()
     if not full:
         raise tf.InputError(
             "no design has been grown to full size yet: run the search for more colonies."

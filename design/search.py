@@ -54,13 +54,13 @@ class Search(TaskOptions):
 
     method: "cmaes", "sobol", "racing", "bayesian", "local", for several goals "nsga2", one of their
     objects with settings of its own, or any object with start, ask and tell (`Method`); "auto"
-    chooses, and `best.table()` says why. finals: how the best designs are
-    tested on fresh seeds; None leaves this out. start: designs from which the search starts: their
-    values by name, a `Best`, the file of a saved design, or a `Study` or its file. A study of the
-    same task with other bounds, or without some of the parameters, keeps its losses; of any other
-    designs the best are grown again. `TaskOptions` documents the other arguments;
-    `search.objective.task` holds them checked. Raises the errors of `Task`, and InputError for a
-    method, finals or a start that are not allowed.
+    chooses, and `best.table()` says why. finals: how the best designs are tested on fresh seeds;
+    None leaves this out. start: designs from which the search starts: their values by name, a
+    `Best`, the file of a saved design, or a `Study` or its file. A study of the same task with
+    other bounds, or without some of the parameters, keeps its losses; of any other designs the best
+    are grown again. `TaskOptions` documents the other arguments; `search.objective.task` holds them
+    checked. Raises the errors of `Task`, and InputError for a method, finals or a start that are
+    not allowed.
     """
 
     method: str | Method = field(default="auto", kw_only=True)
@@ -173,9 +173,9 @@ class Search(TaskOptions):
         reserved = self.finals.colonies(colonies) if self.finals else 0.0
         limit = max(colonies - reserved, task.replicates)  # one design at least
         method.start(task.space, task.seed, task.replicates)
-        turn = repeat_study(method, self.study, self._known)
+        turn = repeat_study(method, task, self.study, self._known)
         while not self._reached(stop_at, finals):
-            turn = turn or Turn.next_of(method, task, self.study, self._known)
+            turn = turn or Turn.of_number(len(self.study.entries), method, task, self._known)
             room = min(limit - self.study.searched, colonies - self.study.colonies)
             part = turn.part(self.objective, room)
             if part is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ import torch
 
 import torchfilm as tf
 from design import colonies
+from design.data_file import replacing, write_values
 from design.parameters import Value
 from design.rollout import FailedColony, grow
 from design.scoring import WorkItem, cut_work_items
@@ -177,36 +177,16 @@ def shown_values(task: Task, points: np.ndarray) -> dict[str, list[Value]]:
 
 
 def _write(path: Path | None, task: Task, known: Simulations) -> None:
-    """In place of the older file, so that a kill at any moment costs at most one batch."""
+    """In place of the older file, where there is one."""
     if path is None:
         return
-    beside = path.with_name(path.name + ".new")
-    try:
-        with h5py.File(beside, "w") as file:
-            file.attrs.update({
-                "format": FORMAT,
-                "version": VERSION,
-                "about": json.dumps(about(task)),
-                "torchfilm": tf.__version__,
-                "torch": str(torch.__version__),
-            })  # fmt: skip
-            file["points"], file["statistics"] = known.points, known.statistics
-            names = list(observed_of(task).plan.names)
-            file.create_dataset("names", data=names, dtype=h5py.string_dtype())
-            for name, column in shown_values(task, known.points).items():
-                text = any(isinstance(v, str) for v in column)
-                file.create_dataset(
-                    f"values/{name}",
-                    data=[str(v) for v in column] if text else column,
-                    dtype=h5py.string_dtype() if text else None,
-                )
-            file.attrs["reasons"] = json.dumps(known.reasons)
-        os.replace(beside, path)
-    except OSError as error:
-        raise tf.SimulationError(
-            f"could not write {path}: {error}. Is the disk full? The file keeps the earlier"
-            " simulations."
-        ) from error
+    with replacing(path, FORMAT, VERSION, about(task), "earlier simulations") as file:
+        file["points"], file["statistics"] = known.points, known.statistics
+        names = list(observed_of(task).plan.names)
+        file.create_dataset("names", data=names, dtype=h5py.string_dtype())
+        for name, column in shown_values(task, known.points).items():
+            write_values(file, name, column)
+        file.attrs["reasons"] = json.dumps(known.reasons)
 
 
 def _read(path: Path | None, task: Task) -> Simulations:

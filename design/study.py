@@ -13,7 +13,7 @@ import numpy as np
 
 import torchfilm as tf
 from design.entries import Entry
-from design.parameters import show_value
+from design.parameters import right_aligned, show_value
 from design.study_file import StudyData, read_study, write_study
 from design.study_refusal import refusal
 from torchfilm import checks
@@ -58,6 +58,10 @@ class Study:
         """The batches at full size with all replicates. Only their losses are comparable."""
         return [e for e in self.entries if self.is_full(e)]
 
+    def full_goals(self) -> list[tuple[Entry, np.ndarray]]:
+        """The batches at full size with all replicates, and the losses of their goals (n, G)."""
+        return [(e, e.goals) for e in self.full() if e.goals is not None]
+
     def is_full(self, entry: Entry) -> bool:
         """Whether a batch was grown to full size with all replicates."""
         return entry.size == 1.0 and entry.replicates == len(self.streams)
@@ -99,10 +103,8 @@ class Study:
             spread = f"{losses.std(ddof=1):.2g}" if len(losses) > 1 else ""
             shown = [show_value(values[name]) for name in self.names]
             text.append([f"{loss:.4f}", spread, f"{cells.mean():.0f}", *shown])
-        wide = [max(map(len, column)) for column in zip(*text, strict=True)]
-        lines = ["  ".join(x.rjust(w) for x, w in zip(r, wide, strict=True)) for r in text]
         hidden = len(rows) - (len(text) - 1)
-        return "\n".join(lines + ([f"and {hidden} more"] if hidden else []))
+        return "\n".join(right_aligned(text) + ([f"and {hidden} more"] if hidden else []))
 
     @property
     def info(self) -> str:

@@ -18,7 +18,6 @@ any moment costs at most one batch. The file holds data only; nothing in it is e
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,9 +25,9 @@ from typing import Any
 
 import h5py
 import numpy as np
-import torch
 
 import torchfilm as tf
+from design.data_file import replacing, write_values
 from design.entries import Entry
 from design.slopes import Slopes
 from torchfilm import checks
@@ -48,30 +47,14 @@ class StudyData:
 
 def write_study(path: Path, data: StudyData) -> None:
     """Write a study, in place of an older file. Raises SimulationError where that fails."""
-    beside = path.with_name(path.name + ".new")
-    try:
-        with h5py.File(beside, "w") as file:
-            file.attrs.update(
-                {
-                    "format": FORMAT,
-                    "version": VERSION,
-                    "about": json.dumps(data.about),
-                    "torchfilm": tf.__version__,
-                    "torch": str(torch.__version__),
-                }
-            )
-            file["streams"] = np.asarray(data.streams, np.int64)
-            names = data.about["names"]
-            _write_entries(file, data.entries, names, len(data.streams))
-            if data.finals:
-                most = max(e.replicates for e in data.finals)
-                _write_entries(file.create_group("finals"), data.finals, names, most)
-        os.replace(beside, path)
-    except OSError as error:
-        raise tf.SimulationError(
-            f"could not write {path}: {error}. Is the disk full? The file keeps the earlier"
-            " batches. Run the search again to resume it."
-        ) from error
+    kept = "earlier batches. Run the search again to resume it"
+    with replacing(path, FORMAT, VERSION, data.about, kept) as file:
+        file["streams"] = np.asarray(data.streams, np.int64)
+        names = data.about["names"]
+        _write_entries(file, data.entries, names, len(data.streams))
+        if data.finals:
+            most = max(e.replicates for e in data.finals)
+            _write_entries(file.create_group("finals"), data.finals, names, most)
 
 
 def _write_entries(
@@ -108,12 +91,7 @@ def _write_entries(
     ]
     group.create_dataset("designs/reasons", data=words, dtype=h5py.string_dtype())
     for name in names:
-        column = [v[name] for e in entries for v in e.values]
-        if any(isinstance(v, str) for v in column):
-            text = [str(v) for v in column]
-            group.create_dataset(f"values/{name}", data=text, dtype=h5py.string_dtype())
-        else:
-            group[f"values/{name}"] = column
+        write_values(group, name, [v[name] for e in entries for v in e.values])
 
 
 def read_study(path: Path) -> StudyData:

@@ -26,9 +26,10 @@ class Turn:
     entry: Entry | None = None
 
     @classmethod
-    def next_of(cls, method: Method, task: Task, study: Study, known: KnownDesigns | None) -> Turn:
-        """The next batch of a method; first of all, the known designs that are to be grown."""
-        if known is not None and not study.entries:
+    def of_number(cls, number: int, method: Method, task: Task, known: KnownDesigns | None) -> Turn:
+        """The batch of a number, from 0: the known designs first of all, then what a method
+        proposes."""
+        if known is not None and number == 0:
             return cls(Batch(known.points), known=True)
         batch = method.ask()
         if not isinstance(batch, Batch):
@@ -82,15 +83,14 @@ class Turn:
             method.tell(batch, found)
 
 
-def repeat_study(method: Method, study: Study, known: KnownDesigns | None) -> Turn | None:
+def repeat_study(
+    method: Method, task: Task, study: Study, known: KnownDesigns | None
+) -> Turn | None:
     """Bring a method to where the study ends: it proposes each batch again and learns its losses.
     Returns the turn of which only a part was grown, if any. Raises InputError where the method
     proposes other points."""
     for k, entry in enumerate(study.entries):
-        if known is not None and k == 0:
-            turn = Turn(Batch(known.points), known=True)
-        else:
-            turn = Turn(method.ask())
+        turn = Turn.of_number(k, method, task, known)
         turn.entry = entry
         wanted = turn.batch.points[: turn.done]
         whole = turn.complete or k == len(study.entries) - 1

@@ -41,7 +41,7 @@ def choose(
         " for small colonies; its first batch is of Sobol points",
     )
     race = Chosen(
-        Racing(inner=CMAES(population=BATCH, sigma=WIDTH)),
+        Racing(inner=cloud),
         f"{designs:.0f} designs for {dimensions} parameters: small colonies first, and CMA-ES"
         " learns from the best",
     )
