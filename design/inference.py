@@ -14,9 +14,9 @@ from design.neural_posterior import NeuralPosterior, require_sbi
 from design.parameters import Choice, Parameter
 from design.posterior import Posterior
 from design.progress import advance, open_bar
-from design.simulations import Simulations, check_count, simulate_designs
+from design.simulations import Simulations, simulate_designs
 from design.targets.observed import Observed
-from design.task import Task
+from design.task import Task, check_whole
 from torchfilm import checks
 
 LEAST = 50  # simulations that succeeded
@@ -72,7 +72,7 @@ def infer(
         ("simulations", simulations, LEAST), ("samples", samples, 10), ("flows", flows, 1),
         ("epochs", epochs, 1),
     ):  # fmt: skip
-        check_count(name, value, least)
+        check_whole(name, value, least)
     task = Task(
         scene, parameters, observed, cells=cells,
         until=observed.time if until is None and cells is None else until,

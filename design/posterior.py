@@ -11,15 +11,9 @@ from design.calibration import Calibration
 from design.neural_posterior import NeuralPosterior
 from design.parameters import Parameter, Value, show_value
 from design.posterior_plot import draw_corner
-from design.simulations import (
-    Simulations,
-    check_count,
-    random_points,
-    shown_values,
-    simulate_points,
-)
+from design.simulations import Simulations, random_points, shown_values, simulate_points
 from design.targets.observed import Observed
-from design.task import Task
+from design.task import Task, check_whole
 from torchfilm import checks
 
 LEVEL = 0.9  # of intervals, unless a caller gives one
@@ -155,8 +149,8 @@ class Posterior:
         """Simulation-based calibration (Talts et al., arXiv 1804.06788): grow colonies of hidden,
         random parameters, and see how often the posteriors of their statistics cover these. It
         costs `truths` simulations and no learning."""
-        check_count("truths", truths, 2)
-        check_count("samples", samples, 9)
+        check_whole("truths", truths, 2)
+        check_whole("samples", samples, 9)
         points = random_points(self.task, truths, stream=STREAM)
         # random numbers that no simulation has used
         first = 2**24 + STREAM * 2**20

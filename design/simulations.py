@@ -221,10 +221,3 @@ def _read(path: Path | None, task: Task) -> Simulations:
             "Give another path.",
         )
     return found
-
-
-def check_count(name: str, value: Any, least: int) -> int:
-    """A whole number from `least`, or InputError."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise checks.input_error(name, value, f"a whole number from {least}")
-    return value

@@ -240,7 +240,7 @@ def _check_options(options: TaskOptions) -> float | None:
     for name, least in (("cells", 2), ("replicates", 1), ("most", 1), ("seed", 0)):
         value = getattr(options, name)
         if value is not None or name in ("replicates", "seed"):
-            _check_whole(name, value, least)
+            check_whole(name, value, least)
     reduce = options.reduce
     if reduce not in REDUCE and (
         isinstance(reduce, bool) or not isinstance(reduce, (int, float)) or not 0 < reduce <= 1
@@ -251,6 +251,7 @@ def _check_options(options: TaskOptions) -> float | None:
     return None if options.until is None else checks.number("until", options.until, above=0.0)
 
 
-def _check_whole(name: str, value: Any, least: int) -> None:
+def check_whole(name: str, value: Any, least: int) -> None:
+    """Raises InputError unless a value is a whole number from `least`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise checks.input_error(name, value, f"a whole number from {least}")
