@@ -11,7 +11,7 @@ from design.finals import Finals
 from design.front import Front
 from design.inference import infer
 from design.library import Library, Sensor, SensorDevice, Wiring
-from design.methods import CMAES, NSGA2, Batch, Bayesian, Local, Method, Racing, Sobol
+from design.methods import CMAES, NSGA2, Batch, Bayesian, Local, Method, Polish, Racing, Sobol
 from design.objective import Evaluation, Objective
 from design.parameters import Choice, Parameter, Space
 from design.posterior import Posterior
@@ -72,6 +72,7 @@ __all__ = [
     "OnFraction",
     "Oscillation",
     "Parameter",
+    "Polish",
     "Posterior",
     "ProfileTarget",
     "Racing",

@@ -129,6 +129,13 @@ class Objective:
             return "the loss is a statistic of several seeds"
         return task.tried.why_rough
 
+    @property
+    def least_squares(self) -> bool:
+        """Whether the loss is a sum of squares with exact derivatives."""
+        return (
+            self.task.target.squares and bool(self.task.space.moving) and not self.why_differences
+        )
+
     def copies(self, slopes: bool) -> int:
         """Colonies that are grown for each loss."""
         moving = len(self.task.space.moving)

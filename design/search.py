@@ -259,7 +259,12 @@ class Search(TaskOptions):
         resumed = path is not None and Path(path).is_file()
         before = Study.read(path).about.get("method", "") if path is not None and resumed else ""
         return choose(
-            task.space.size, colonies / task.replicates, task.goals, task.target.pattern, before
+            task.space.size,
+            colonies / task.replicates,
+            task.goals,
+            task.target.pattern,
+            self.objective.least_squares,
+            before,
         )
 
     def _open_study(self, path: str | Path | None, method: str) -> Study:

@@ -10,6 +10,7 @@ from design.methods.bayesian import Bayesian
 from design.methods.cmaes import CMAES
 from design.methods.local import Local
 from design.methods.nsga2 import NSGA2
+from design.methods.polish import Polish
 from design.methods.racing import Racing
 from design.methods.sobol import Sobol
 from torchfilm import checks
@@ -20,6 +21,7 @@ METHODS: dict[str, type[Any]] = {
     "bayesian": Bayesian,
     "racing": Racing,
     "local": Local,
+    "polish": Polish,
     "nsga2": NSGA2,
 }
 
@@ -32,6 +34,7 @@ __all__ = [
     "Chosen",
     "Local",
     "Method",
+    "Polish",
     "Racing",
     "Sobol",
     "choose",

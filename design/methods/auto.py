@@ -7,10 +7,13 @@ from typing import Any
 
 from design.methods.cmaes import CMAES
 from design.methods.nsga2 import NSGA2
+from design.methods.polish import Polish
 from design.methods.racing import Racing
 
 # designs of a batch, and the width of its first cloud: the settings that were measured
 BATCH, WIDTH = 24, 0.5
+# designs before the first descents (one race), and for each parameter, so that descents end
+BEFORE, EACH = BATCH, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +31,18 @@ class Chosen:
 
 
 def choose(
-    dimensions: int, designs: float, goals: int, pattern: bool = True, before: str = ""
+    dimensions: int,
+    designs: float,
+    goals: int,
+    pattern: bool = True,
+    squares: bool = False,
+    before: str = "",
 ) -> Chosen:
     """The method of a search that leaves the choice. dimensions: parameters; designs: that the
     budget can grow with all replicates; goals: 0 for one target; pattern: whether the target is a
-    pattern, of which small colonies show something; before: what the study of a search that is
-    resumed says of its method, which goes on."""
+    pattern, of which small colonies show something; squares: whether its loss is a sum of squares
+    with exact derivatives; before: what the study of a search that is resumed says of its method,
+    which goes on."""
     cloud = CMAES(population=BATCH, sigma=WIDTH)
     few = Chosen(
         cloud,
@@ -45,11 +54,18 @@ def choose(
         f"{designs:.0f} designs for {dimensions} parameters: small colonies first, and CMA-ES"
         " learns from the best",
     )
-    for known in (few, race) if before else ():
+    race_and_descend = Chosen(
+        Polish(inner=Racing(inner=cloud), after=BEFORE),
+        f"{designs:.0f} designs for {dimensions} parameters: one race of small colonies, then down"
+        " the slope from the best, since the loss is a sum of squares with exact derivatives",
+    )
+    for known in (few, race, race_and_descend) if before else ():
         if known.describe() == before:
             return Chosen(known.method, "the study began with it")
     if goals:
         return Chosen(NSGA2(), f"{goals} goals side by side")
     if not pattern:
         return Chosen(cloud, "data of a colony of one size: a smaller one does not compare")
-    return few if designs < 2 * BATCH else race
+    if designs < 2 * BATCH:
+        return few
+    return race_and_descend if squares and designs >= BEFORE + EACH * dimensions else race

@@ -17,6 +17,7 @@ LEAST_STEP, LEAST_GAIN = 1e-4, 1e-4  # coordinates; share of the loss
 # Steps in a row whose decrease is not what the derivatives promised, after which they mislead.
 MISSES = 4
 FAIR = 0.1  # share of the promised decrease that a step should bring at least
+APART = 0.05  # starts that are nearer than this in every coordinate lead to the same end
 
 
 @dataclass(eq=False)
@@ -115,6 +116,15 @@ class Descent:
         )
 
 
+def unlike(points: np.ndarray, loss: np.ndarray, most: int) -> list[int]:
+    """The rows of the best designs that are not alike, the best first."""
+    chosen: list[int] = []
+    for k in np.argsort(loss, kind="stable"):
+        if len(chosen) < most and all(np.abs(points[k] - points[c]).max() >= APART for c in chosen):
+            chosen.append(int(k))
+    return chosen
+
+
 @dataclass(kw_only=True, eq=False)
 class Local(Turns):
     """Least squares by Levenberg and Marquardt (Moré 1978) from several starts side by side.
@@ -143,8 +153,13 @@ class Local(Turns):
         self._descents: list[Descent] = []
 
     def know(self, points: np.ndarray, loss: np.ndarray) -> None:
-        """The first descents begin at the best of them."""
-        self._keep_best(points, loss)
+        """The first descents begin at these, the best first."""
+        self._waiting = [points[k] for k in unlike(points, loss, len(points))]
+
+    @property
+    def idle(self) -> bool:
+        """Whether all descents have ended, and no start waits."""
+        return not self._waiting and all(d.over for d in self._descents)
 
     def _next(self) -> Batch:
         self._descents = [d for d in self._descents if not d.over]
@@ -162,7 +177,7 @@ class Local(Turns):
 
     def _keep_best(self, points: np.ndarray, loss: np.ndarray) -> None:
         """A quarter of the designs: the others are worse than where a descent would end."""
-        best = np.argsort(loss, kind="stable")[: max(self.starts, len(loss) // 4)]
+        best = unlike(points, loss, max(self.starts, len(loss) // 4))
         self._waiting = [points[k] for k in best]
 
     def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:

@@ -66,6 +66,11 @@ class Target:
         them."""
         return None
 
+    @property
+    def squares(self) -> bool:
+        """Whether the loss is a sum of squares, so that there are `residuals`."""
+        return type(self).residuals is not Target.residuals
+
     def reduced(self, losses: np.ndarray) -> np.ndarray | None:
         """One loss for each design, (n,), from those of its replicates (n, R); None: as the task
         says."""

@@ -173,6 +173,10 @@ class Weighted(Several):
             [found * weight**0.5 for found, (_, weight) in zip(each, self.terms, strict=True)], 1
         )
 
+    @property
+    def squares(self) -> bool:
+        return all(part.squares for part in self.parts)
+
     def describe(self) -> str:
         return " + ".join(f"{weight:g} × {part.describe()}" for part, weight in self.terms)
 

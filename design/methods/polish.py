@@ -1,0 +1,79 @@
+"""Polishing: another method first, then the way down from its best designs, by derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from design.methods.base import Batch, Method, Turns, whole
+from design.methods.local import Local, unlike
+from design.methods.racing import Racing
+from design.slopes import Slopes
+from torchfilm import checks
+
+
+@dataclass(kw_only=True, eq=False)
+class Polish(Turns):
+    """Searches with another method, and then goes down the slope from its best designs.
+
+    inner: the method that searches first; None is Racing(). after: designs that it grows before, in
+    units of full colonies with all replicates. starts: the best of them, no two alike, from which
+    `Local` descends side by side. Where all descents have ended, `inner` goes on.
+
+    CMA-ES and racing find the valley; its floor is a matter of the last digits of several
+    parameters at once, and a slope knows all of these. Derivatives cost colonies (see `Local`), so
+    this is worth while where they are exact.
+    """
+
+    inner: Method | None = None
+    after: int = 24
+    starts: int = 3
+
+    def __post_init__(self) -> None:
+        self.inner = self._inner = Racing() if self.inner is None else self.inner
+        if isinstance(self.inner, type) or not all(
+            callable(getattr(self.inner, name, None)) for name in ("start", "ask", "tell")
+        ):
+            raise checks.input_error("Polish.inner", self.inner, "a method, such as Racing()")
+        whole("Polish.after", self.after, least=1)
+        whole("Polish.starts", self.starts, least=1)
+
+    def _begin(self) -> None:
+        self._inner.start(self._started(), self._seed, self._replicates)
+        self._local = Local(starts=self.starts)
+        self._local.start(self._started(), self._seed, self._replicates)
+        self._spent, self._descending, self._over = 0.0, False, False
+        self._points = np.empty((0, self._started().size))
+        self._loss = np.empty(0)
+
+    def know(self, points: np.ndarray, loss: np.ndarray) -> None:
+        """The method inside learns them, and descents may begin there."""
+        know = getattr(self._inner, "know", None)
+        if know is not None:
+            know(points, loss)
+        self._keep(points, loss)
+
+    def _keep(self, points: np.ndarray, loss: np.ndarray) -> None:
+        self._points = np.concatenate([self._points, points])
+        self._loss = np.concatenate([self._loss, loss])
+
+    def _next(self) -> Batch:
+        if not self._descending and not self._over and self._spent >= self.after:
+            best = unlike(self._points, self._loss, self.starts)
+            self._local.know(self._points[best], self._loss[best])
+            self._descending = True
+        if self._descending and self._local.idle:
+            self._descending, self._over = False, True
+        return self._local.ask() if self._descending else self._inner.ask()
+
+    def _take(self, batch: Batch, loss: np.ndarray) -> None:
+        replicates = min(batch.replicates or self._replicates, self._replicates)
+        self._spent += len(batch.points) * batch.size * replicates / self._replicates
+        if batch.size == 1 and replicates == self._replicates:
+            self._keep(batch.points, loss)
+        self._inner.tell(batch, loss)
+
+    def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:
+        batch = self.ask()
+        self._local.tell(batch, loss, slopes)

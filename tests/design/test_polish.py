@@ -1,0 +1,143 @@
+"""Another method first, then descents by derivatives from its best designs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from asking import Room, begun
+from searching import Level, lit, paced
+
+from design import CMAES, Parameter, Polish, Racing, Search, Sobol, Study
+from design.methods import choose
+from design.methods.local import unlike
+from design.slopes import Slopes
+from design.targets import Bands
+from torchfilm.tools.checks import InputError
+
+EDGES = Bands(("gfp",), (-3.0, 3.0), floor=0.5)
+TWO = [Parameter("make", 0.1, 10.0, log=True), Parameter("decay", 0.1, 5.0)]
+ROOM = Room((None, None, None))
+
+
+def bowls(point):
+    """Residuals and their Jacobian: two bowls, of which the one at 0.2 is the deeper."""
+    centre, floor = (0.2, 0.0) if point.mean() < 0.5 else (0.8, 0.3)
+    return np.append(point - centre, floor), np.vstack([np.eye(3), np.zeros((1, 3))])
+
+
+def answer(method, batch, function=bowls):
+    """Tell a method the losses of its batch, and slopes where it asks for them."""
+    found = [function(p) for p in batch.points]
+    loss = np.array([float(r @ r) for r, _ in found])
+    if batch.slopes:
+        slopes = [
+            np.array(x) for x in zip(*[(2 * j.T @ r, 2 * j.T @ j) for r, j in found], strict=True)
+        ]
+        method.tell(batch, loss, Slopes(*slopes))
+    else:
+        method.tell(batch, loss)
+    return loss
+
+
+def run(method, batches):
+    out = []
+    for _ in range(batches):
+        batch = method.ask()
+        out.append((batch, answer(method, batch)))
+    return out
+
+
+def test_designs_come_first_then_descents_then_the_method_goes_on():
+    history = run(begun(Polish(inner=Sobol(batch=8), after=20, starts=2), ROOM), 20)
+    kinds = [batch.slopes for batch, _ in history]
+    first, last = kinds.index(True), len(kinds) - 1 - kinds[::-1].index(True)
+    assert first == 3 and all(kinds[first : last + 1]) and last < len(kinds) - 1
+    points = np.concatenate([b.points for b, _ in history[:3]])
+    losses = np.concatenate([x for _, x in history[:3]])
+    assert (history[3][0].points == points[unlike(points, losses, 2)]).all()
+    # the method inside sees nothing of the descents: it goes on with its own sequence
+    plain = begun(Sobol(batch=8), ROOM)
+    own = run(plain, len(kinds) - (last + 1 - first))
+    mine = [batch for batch, _ in history if not batch.slopes]
+    assert all((a.points == b.points).all() for a, (b, _) in zip(mine, own, strict=True))
+
+
+def test_a_descent_ends_on_the_floor():
+    history = run(begun(Polish(inner=Sobol(batch=8), after=8, starts=1), ROOM), 6)
+    assert min(loss.min() for _, loss in history) < 1e-12
+
+
+def test_small_colonies_count_by_their_size():
+    """A race of 24 designs in full grows 73 at a quarter of the size, in one replicate of 4."""
+    inner = Racing(inner=CMAES(population=24, sigma=0.5))
+    history = run(begun(Polish(inner=inner, after=28), ROOM, replicates=4), 3)
+    assert [(len(b.points), b.size, b.slopes) for b, _ in history] == [
+        (73, 0.25, False),
+        (24, 1.0, False),
+        (3, 1.0, True),
+    ]
+
+
+def test_starts_are_not_alike():
+    points = np.array([[0.1, 0.1], [0.11, 0.1], [0.9, 0.1], [0.1, 0.2]])
+    assert unlike(points, np.array([0.0, 0.1, 0.3, 0.2]), 3) == [0, 3, 2]
+    assert unlike(points, np.array([0.0, 0.1, 0.3, 0.2]), 2) == [0, 3]
+
+
+def test_known_designs_are_starts():
+    given = begun(Polish(inner=Sobol(batch=4), after=4, starts=1), ROOM)
+    given.know(np.full((1, 3), 0.21), np.array([3e-4]))
+    assert (run(given, 2)[1][0].points == 0.21).all()
+
+
+@pytest.mark.parametrize("stop", [1, 3, 4, 7])
+def test_after_a_stop_the_next_batches_have_the_same_bits(stop):
+    make = lambda: Polish(inner=CMAES(population=6), after=12, starts=2)
+    whole = run(begun(make(), ROOM, seed=5), 10)
+    again = begun(make(), ROOM, seed=5)
+    for batch, _ in whole[:stop]:
+        answer(again, batch)
+    for batch, _ in whole[stop:]:
+        asked = again.ask()
+        assert asked.slopes == batch.slopes and (asked.points == batch.points).all()
+        answer(again, asked)
+
+
+@pytest.mark.parametrize("wrong", [{"inner": CMAES}, {"inner": 3}, {"after": 0}, {"starts": 0}])
+def test_what_is_not_allowed(wrong):
+    with pytest.raises(InputError, match=f"Polish.{next(iter(wrong))}"):
+        Polish(**wrong)
+
+
+def test_auto_descends_where_the_loss_is_a_sum_of_squares():
+    chosen = choose(5, 500, 0, squares=True)
+    assert isinstance(chosen.method, Polish) and "slope" in chosen.why
+    assert isinstance(choose(5, 500, 0).method, Racing)
+    # too few designs for descents that come to an end
+    assert isinstance(choose(30, 400, 0, squares=True).method, Racing)
+    # a study that began by racing goes on so
+    before = choose(5, 500, 0).describe()
+    assert isinstance(choose(5, 500, 0, squares=True, before=before).method, Racing)
+    assert isinstance(choose(5, 900, 0, before=chosen.describe()).method, Polish)
+
+
+def test_what_a_search_says_of_its_loss():
+    squares = lambda *given, **more: Search(*given, replicates=1, **more).objective.least_squares
+    assert squares(lit, TWO, EDGES, cells=4)
+    assert not squares(lit, TWO, Level(), cells=4)  # no residuals
+    assert not squares(paced, [Parameter("rate", 0.5, 2.0)], EDGES, until=1.0)  # differences
+    assert not squares(lit, [Parameter("decay", 1, 4, whole=True)], EDGES, cells=4)
+
+
+def test_a_search_polishes_and_resumes(tmp_path):
+    make = lambda: Search(lit, TWO, EDGES, cells=8, replicates=2, finals=None)
+    whole = make()
+    best = whole.run(colonies=160, progress=False)
+    assert whole.why_chosen.startswith("auto: polish") and "slope" in best.table()
+    assert any(e.slopes is not None for e in whole.study.entries)
+    first = make()
+    first.run(colonies=112, study=tmp_path / "a.h5", progress=False)
+    again = make().run(colonies=160, study=tmp_path / "a.h5", progress=False)
+    assert again.loss == best.loss
+    kept = Study.read(tmp_path / "a.h5")
+    assert [e.copies for e in kept.entries] == [e.copies for e in whole.study.entries]
