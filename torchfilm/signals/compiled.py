@@ -9,7 +9,7 @@ from torchfilm.signals.grid import Grid
 from torchfilm.signals.stencil import SLACK, Stencil
 from torchfilm.tools.numba_calls import as_array, unavailable
 from torchfilm.tools.ragged import Groups
-from torchfilm.tools.tangents import tracked
+from torchfilm.tools.tangents import both, only_forward, tracked, with_tangent
 
 
 def may_run(*given: Tensor) -> bool:
@@ -17,6 +17,11 @@ def may_run(*given: Tensor) -> bool:
     if given[0].device.type != "cpu" or unavailable():
         return False
     return not tracked(*given)
+
+
+def may_run_forward(*given: Tensor) -> bool:
+    """Whether kernels may take these tensors without their tangents, which some of them carry."""
+    return given[0].device.type == "cpu" and only_forward(*given) and not unavailable()
 
 
 def stencil(
@@ -58,6 +63,14 @@ def read(values: Tensor, stencil: Stencil) -> Tensor:
     return out
 
 
+def read_with_tangent(values: Tensor, stencil: Stencil) -> Tensor:
+    """As `read`, of values with a tangent: what is read is linear in them."""
+    value, moved = both(values)
+    return with_tangent(
+        read(value, stencil), None if moved is None else read(moved.contiguous(), stencil)
+    )
+
+
 def pool_volume(stencil: Stencil) -> Tensor:
     """As `exchange.pool_volume`."""
     from torchfilm.kernels.medium import pools
@@ -84,6 +97,32 @@ def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps:
         out.numpy(),
     )  # fmt: skip
     return out
+
+
+def write_with_tangent(
+    values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps: int
+) -> Tensor:
+    """As `write`, with the tangent of `exchange.write`, term by term."""
+    plain = [both(x) for x in (values, amount, there)]
+    (value, dv), (change, da), (found, dr) = (
+        (x, torch.zeros_like(x) if t is None else t) for x, t in plain
+    )
+    weight, volume = stencil.weight.to(value.dtype), stencil.voxel_volume
+    spread = lambda x: stencil.sum(weight * x.unsqueeze(1))
+    is_there = found > 0
+    content = torch.where(is_there, found, 1.0) * volume
+    wanted = 0.5 * (change.abs() - change)
+    turned = 0.5 * (change.sign() * da - da)
+    part = torch.where((wanted > 0) & ~is_there, torch.inf, wanted / content)
+    d_part = (turned - torch.where(is_there, part * volume * dr, 0.0)) / content
+    taken = spread(part)
+    emptied = (taken > 1) & (taken < 1 + ulps * torch.finfo(value.dtype).eps)
+    taken, d_taken = (
+        torch.where(emptied, end, x) for end, x in ((1.0, taken), (0.0, spread(d_part)))
+    )
+    d_given = spread(0.5 * (change.sign() * da + da) / volume)
+    moved = dv * (1.0 - taken) - value * d_taken + d_given
+    return with_tangent(write(value, change, found, stencil, ulps), moved)
 
 
 def spans(position: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:

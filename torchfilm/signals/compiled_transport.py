@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -29,6 +29,10 @@ class CompiledExponential:
     firsts: tuple[np.ndarray, ...]
     lasts: tuple[np.ndarray, ...]
     gained: np.ndarray
+
+    def linear(self) -> CompiledExponential:
+        """The step without what sources and boundaries add."""
+        return replace(self, gained=np.empty((0, 0), self.gained.dtype))
 
     def step(self, values: Tensor, starts: np.ndarray, out: Tensor) -> None:
         """Put the grids that begin at `starts` of values (voxels,) into out, one step later."""
@@ -81,6 +85,14 @@ class CompiledSeries:
     stepper: Series
     shape: Shape
     arrays: tuple[np.ndarray, ...]
+
+    def linear(self) -> CompiledSeries | None:
+        """The step without what sources and boundaries add; None where another method takes the
+        long steps."""
+        if self.stepper.far is not None:
+            return None
+        *mixing, gained = self.arrays
+        return replace(self, arrays=(*mixing, np.empty((0, gained.shape[1]), gained.dtype)))
 
     def step(self, values: Tensor, starts: np.ndarray, out: Tensor) -> None:
         """Put the grids that begin at `starts` of values (voxels,) into out, one step later."""

@@ -224,6 +224,8 @@ def read(values: Tensor, stencil: Stencil) -> Tensor:
     """
     if compiled.may_run(values, stencil.weight):
         return compiled.read(values, stencil)
+    if compiled.may_run_forward(values) and compiled.may_run(stencil.weight):
+        return compiled.read_with_tangent(values, stencil)
     found, weight = stencil.gather(values).unbind(1), stencil.weight.to(values.dtype).unbind(1)
     nearest = torch.where(weight[0] > 0, found[0], 0.0)
     out = nearest
@@ -259,6 +261,8 @@ def write(values: Tensor, amount: Tensor, stencil: Stencil) -> Tensor:
     there = read(values, stencil)
     if compiled.may_run(values, amount, there):
         return compiled.write(values, amount, there, stencil, ULPS)
+    if compiled.may_run_forward(values, amount, there) and compiled.may_run(stencil.weight):
+        return compiled.write_with_tangent(values, amount, there, stencil, ULPS)
     weight = stencil.weight.to(values.dtype)
     volume = stencil.voxel_volume
     # halves of amount ± |amount|: at 0 the derivatives of both then add up to 1

@@ -22,7 +22,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchfilm.signals.compiled import may_run
+from torchfilm.signals.compiled import may_run, may_run_forward
 from torchfilm.signals.compiled_transport import (
     CompiledExponential,
     CompiledSeries,
@@ -36,6 +36,7 @@ from torchfilm.signals.transport_iterative import prepare_crank_nicolson, prepar
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_series import Series, prepare_series
 from torchfilm.tools import checks
+from torchfilm.tools.tangents import both, with_tangent
 
 
 class Stepper(Protocol):
@@ -54,6 +55,7 @@ METHODS: dict[str, Callable[[Operator, float], Stepper]] = {
     "euler": prepare_euler,
 }
 
+Kernel = CompiledExponential | CompiledSeries
 # those that kernels compute, too
 COMPILED = {"exponential", "series"}
 
@@ -80,7 +82,12 @@ class Carrier:
     may_compile: bool = True
 
     @cached_property
-    def compiled(self) -> CompiledExponential | CompiledSeries | None:
+    def linear(self) -> Kernel | None:
+        """The step by kernels without what sources and boundaries add, or None."""
+        return None if self.compiled is None else self.compiled.linear()
+
+    @cached_property
+    def compiled(self) -> Kernel | None:
         """The step by kernels, or None where there is none."""
         if self.may_compile and isinstance(self.stepper, Exponential):
             return compiled_exponential(self.stepper, self.shape)
@@ -92,9 +99,20 @@ class Carrier:
 def carry(grid: Grid, carriers: Sequence[Carrier], values: Tensor) -> Tensor:
     """Values (voxels,) of all colonies one step later. carriers: one for each of `grid.batches`."""
     kernels = [carrier.compiled for carrier in carriers]
+    if None not in kernels and may_run_forward(values):
+        value, moved = both(values)
+        # the tangent of an affine step is its linear part
+        linear = [carrier.linear for carrier in carriers]
+        if moved is not None and None not in linear:
+            return with_tangent(_run(grid, kernels, value), _run(grid, linear, moved))
     if None in kernels or not may_run(values):
         pairs = zip(carriers, grid.batches, strict=True)
         return grid.join([carrier.stepper.step(batch.of(values)) for carrier, batch in pairs])
+    return _run(grid, kernels, values)
+
+
+def _run(grid: Grid, kernels: Sequence[Kernel | None], values: Tensor) -> Tensor:
+    """Values (voxels,) of all colonies after the kernel of each of `grid.batches`."""
     out = torch.empty_like(values)
     for kernel, batch in zip(kernels, grid.batches, strict=True):
         assert kernel is not None

@@ -59,6 +59,14 @@ def tracked(*values: Tensor | None) -> bool:
     return has_tangent(*values)
 
 
+def only_forward(*values: Tensor | None) -> bool:
+    """Whether a tangent of one of them is wanted, and no gradient by the backward pass."""
+    given = [x for x in values if x is not None]
+    return has_tangent(*given) and not (
+        torch.is_grad_enabled() and any(x.requires_grad for x in given)
+    )
+
+
 def both(value: Tensor) -> tuple[Tensor, Tensor | None]:
     """The tensor without its tangent, and the tangent or None."""
     found = forward_ad.unpack_dual(value)
