@@ -55,6 +55,7 @@ ROOMS = {
             "torchfilm.model",
             "torchfilm.binding_checks",
             "torchfilm.initial_cells",
+            "torchfilm.micrographs",
         ),
     ),
     "loop": Room(6, ("torchfilm.loop", "torchfilm.replay")),

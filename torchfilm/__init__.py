@@ -31,7 +31,7 @@ from torchfilm.signals.boundary_conditions import (
 )
 from torchfilm.simulation import rollout, simulate
 from torchfilm.state import Field, State
-from torchfilm.tools import checks, tangents
+from torchfilm.tools import checks, tables, tangents
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.memory import keep_memory
@@ -119,6 +119,7 @@ __all__ = [
     "scenes",
     "show",
     "simulate",
+    "tables",
     "tangents",
     "tune",
 ]

@@ -1,9 +1,7 @@
-"""Initial cells: given directly, from arrays, or from files of segmented images (CSV, HDF5)."""
+"""Initial cells: given directly, from arrays, from tables or from label images."""
 
 from __future__ import annotations
 
-import csv
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,14 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.micrographs.cell_tables import Reading, table_cells
+from torchfilm.micrographs.masks import mask_cells
+from torchfilm.micrographs.record import Micrograph, summarise
 from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks
-
-# The names of columns for position and axis.
-POSITION, AXIS = ("x", "y", "z"), ("axis_x", "axis_y", "axis_z")
-# Columns by which segmentation programs number cells and frames; any other column becomes a field.
-BOOKKEEPING = ("label", "frame", "id", "cell_id", "track", "track_id", "index")
+from torchfilm.tools.tables import Table
 
 
 @dataclass(frozen=True)
@@ -30,8 +27,9 @@ class Cells:
     position: (N, d) µm. axis: (N, d), of any length above 0. length: (N,) µm of the centreline.
     radius: (N,) µm. cell_type: (N,) integers or None. colony: (N,) or None. extra: further fields
     by name, (N,) each. With a colony for each cell, a batch has as many colonies as the greatest
-    number requires. Without it, every colony starts from a copy of all cells. Raises InputError for
-    invalid values.
+    number requires. Without it, every colony starts from a copy of all cells. micrograph: where the
+    cells lie in the image that they were read from, if they were. Raises InputError for invalid
+    values.
     """
 
     position: Any
@@ -41,6 +39,8 @@ class Cells:
     cell_type: Any = None
     colony: Any = None
     extra: Mapping[str, Any] = field(default_factory=dict)
+    # not in the repr: it has no effect on a simulation, so it does not count for a scene's digest
+    micrograph: Micrograph | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         position = _array("position", self.position, np.float64)
@@ -191,199 +191,117 @@ class Cells:
 
     @staticmethod
     def from_table(
-        columns: Mapping[str, Sequence[float] | np.ndarray], source: str = "table"
+        table: Any,
+        *,
+        pixel_size: float | None = None,
+        columns: str | Mapping[str, str] | None = None,
+        angle_unit: str | None = None,
+        angle_turns: str | None = None,
+        y: str | None = None,
+        length_with_caps: bool = False,
+        radius: float | None = None,
+        frame: int | float | str | None = None,
+        fields: Sequence[str] | Mapping[str, str] | None = None,
+        centre: bool = False,
     ) -> Cells:
-        """Cells from columns of equal length, one row per cell.
+        """Cells from a table with one row for each: a CSV file with a header, or columns by name (a
+        dictionary, or a pandas.DataFrame).
 
-        Columns: x, y and, in space, z (µm); length (µm, of the centreline, without caps); angle
-        (rad, in the plane), or axis_x, axis_y and, in space, axis_z; optional radius (µm),
-        cell_type, colony. Any other column becomes a field of the cells. Raises InputError if a
-        column is missing or has bad values, or if two cells of a colony have one position. Warns
-        of angles that look like degrees, and of columns that number cells or frames, such as label
-        and frame.
+        Columns: x, y and, in space, z; length, of the centreline; angle, from +x, or axis_x, axis_y
+        and, in space, axis_z; optional radius or width, cell_type, colony, label, frame. columns:
+        their names in the table where they differ, such as {"x": "cx"}; or the set of a program,
+        "skimage" (regionprops_table, of which it takes the capsule with the same second moments) or
+        "matlab" (regionprops).
+
+        Lengths are in µm, or in pixels of pixel_size µm; angles in angle_unit, "radians" (the
+        default) or "degrees". A column may name its unit: x_um, x_px, angle_deg, angle_rad. y: "up"
+        (the default) or "down", as in images; then y changes its sign, so that the centre of the
+        first pixel is the origin. angle_turns: "clockwise" or "counterclockwise" as seen; default
+        from +x towards the table's +y. length_with_caps: lengths include both caps, as masks
+        measure them. radius: µm, of all cells, where no column gives it; default 0.5. centre: move
+        the mean of the centres of each colony to the origin.
+
+        frame: the cells to take, of a table with several frames. Labels name cells in messages.
+        fields: further columns that become fields of the cells, by name or {"field": "column"};
+        without `columns`, by default all others, but never those that number cells or frames.
+
+        Raises InputError for a column that is missing, is not numbers or is used twice, for rows
+        with one label or one place, for several frames, and for arguments that nothing uses. Warns
+        of angles that cannot be in their unit.
         """
-        left = dict(columns)
-        dim = 3 if "z" in left else 2
-        missing = [n for n in POSITION[:dim] if n not in left] + [
-            n for n in ("length",) if n not in left
-        ]
-        if missing:
-            raise checks.InputError(
-                f"{source} lacks the column {missing[0]!r}; it has {', '.join(columns)}."
-            )
-        sizes = {n: len(v) for n, v in left.items()}
-        if len(set(sizes.values())) > 1:
-            raise checks.InputError(
-                f"{source}: all columns must have the same length; they have"
-                f" {', '.join(f'{n} {k}' for n, k in sizes.items())}."
-            )
-        if sizes["x"] == 0:
-            raise checks.InputError(
-                f"{source} has no cell, only a header. Give one line per cell, at least one."
-            )
-        given = [n for n in AXIS if n in left]
-        if "angle" in left and given:
-            raise checks.InputError(
-                f"{source} has the columns 'angle' and {', '.join(map(repr, given))}, which both"
-                " give the direction. Give only one of the two."
-            )
-        position = np.stack([np.asarray(left.pop(n), dtype=np.float64) for n in POSITION[:dim]], 1)
-        if "angle" in left:
-            angle = np.asarray(left.pop("angle"), dtype=np.float64)
-            _warn_of_degrees(angle, source)
-            axis = np.stack([np.cos(angle), np.sin(angle)] + [np.zeros_like(angle)] * (dim - 2), 1)
-        elif all(n in left for n in AXIS[:dim]):
-            axis = np.stack([np.asarray(left.pop(n), dtype=np.float64) for n in AXIS[:dim]], 1)
-        else:
-            raise checks.InputError(
-                f"{source} lacks the cells' direction: give the column 'angle' (rad), or"
-                f" {', '.join(AXIS[:dim])}."
-            )
-        _check_places(position, left.get("colony"), source)
-        known = {n: left.pop(n) for n in ("length", "radius", "cell_type", "colony") if n in left}
-        _warn_of_bookkeeping(left, source)
-        return Cells(position, axis, **known, extra=left)
+        reading = Reading(
+            pixel_size, columns, angle_unit, angle_turns, y, length_with_caps, radius, frame,
+            fields, centre,
+        )  # fmt: skip
+        return Cells(**table_cells(Table.read(table), reading))
 
     @staticmethod
-    def from_csv(path: str | Path) -> Cells:
-        """Cells from a CSV file with a header line; columns as in `from_table`, separated by
-        commas.
+    def from_masks(
+        image: Any,
+        *,
+        pixel_size: float,
+        frame: int | None = None,
+        drop: str | Sequence[str] = (),
+        least_area: int = 30,
+        centre: bool = False,
+    ) -> Cells:
+        """Cells from a label image: 0 between the cells, and a number for each cell. A cell gets
+        the centre, axis and second moments of its region. Requires the extra `images`.
+
+        image: an array (rows, columns) of whole numbers; a file .tif, .png or .npy (of Omnipose or
+        Cellpose: NAME_cp_masks.tif); or a results file .nc of DeLTA. pixel_size: µm a pixel. frame:
+        of a stack. The centre of the first pixel is the origin, x goes to the right and y up, so
+        that cells have y ≤ 0. centre: move the mean of the centres to the origin.
+
+        Regions smaller than least_area pixels ("tiny") or in several "pieces" raise InputError.
+        Regions at the "border" of the image, or of which over 15 % of the area is outside of the
+        capsule or missing in it ("misfit": curved, or several cells in one), give a warning with
+        their labels. drop: the kinds to leave out instead, such as "border" or ("border", "tiny").
         """
-        names, rows = _read_csv(path)
-        columns: dict[str, list[float]] = {name: [] for name in names}
-        for number, row in rows:
-            line = f"{path}, line {number}"
-            if len(row) > len(names):
-                raise checks.InputError(
-                    f"{line}: more values than the {len(names)} columns of the header. Decimal"
-                    " commas? Write decimal points."
-                )
-            if len(row) < len(names):
-                values = f"{len(row)} value{'s' if len(row) > 1 else ''}"
-                raise checks.InputError(
-                    f"{line}, column {names[len(row)]!r}: no value; the line has {values} for"
-                    f" {len(names)} columns."
-                )
-            for name, text in zip(names, row, strict=True):
-                try:
-                    columns[name].append(float(text))
-                except ValueError as error:
-                    raise checks.InputError(
-                        f"{line}, column {name!r}: {text!r} is not a number."
-                    ) from error
-        return Cells.from_table(columns, str(path))
+        given = mask_cells(
+            image,
+            pixel_size=pixel_size,
+            frame=frame,
+            drop=drop,
+            least_area=least_area,
+            centre=centre,
+        )
+        return Cells(**given)
 
     @staticmethod
     def from_hdf5(path: str | Path, group: str = "/") -> Cells:
-        """Cells from an HDF5 file with one data set per column (as in `from_table`) in `group`."""
+        """Cells from an HDF5 file with one data set per column in `group`, in µm and radians as
+        `from_table` takes them by default."""
         import h5py
 
-        with _readable(path, "rb"):
-            pass
         try:
             opened = h5py.File(path, "r")
         except OSError as error:
-            raise checks.InputError(f"{path} cannot be read as HDF5 ({error}).") from error
+            reason = "no such file" if not Path(path).exists() else error
+            raise checks.InputError(f"{path} cannot be read as HDF5 ({reason}).") from error
         with opened as file:
             if group not in file:
                 raise checks.input_error("group", group, f"a group of {path}")
             columns = {
                 n: np.asarray(d) for n, d in file[group].items() if isinstance(d, h5py.Dataset)
             }
-        return Cells.from_table(columns, str(path))
+        return Cells(**table_cells(Table.read(columns, str(path)), Reading()))
 
+    def relaxed(self, depth: float = 0.01) -> Cells:
+        """The same cells, pushed apart until none overlap by more than `depth` µm. Lengths and
+        radii do not change; one-sided contacts move and turn the cells. `summary` says how far
+        cells of a micrograph moved.
 
-def _check_places(
-    position: np.ndarray, colony: Sequence[float] | np.ndarray | None, source: str
-) -> None:
-    """Raise InputError if two rows of a table have the same centre in one colony."""
-    of = np.zeros(len(position)) if colony is None else np.asarray(colony, dtype=np.float64)
-    places, first, counts = np.unique(
-        np.column_stack([of, position]), axis=0, return_index=True, return_counts=True
-    )
-    again = np.flatnonzero(counts > 1)
-    if again.size:
-        at = again[np.argmin(first[again])]
-        raise checks.InputError(
-            f"{source}: {counts[at]} cells have the same position, {places[at, 1:].tolist()}, the"
-            f" first of them cell {first[at]} (counted from 0; such positions: {again.size}). Is a"
-            " cell listed twice, or are there several frames in one table? Keep one cell of each."
-        )
+        Raises SimulationError if they still overlap after 200 steps.
+        """
+        from torchfilm.micrographs.relaxing import relax
 
+        return relax(self, depth)
 
-def _warn_of_degrees(angle: np.ndarray, source: str) -> None:
-    """Warn of angles beyond a full turn: in radians they would be strange, in degrees usual."""
-    beyond = np.abs(angle) > 2 * np.pi
-    if beyond.any():
-        warnings.warn(
-            f"{source}: the column 'angle' reaches {float(np.abs(angle[beyond]).max()):g}, and"
-            f" torchfilm reads it in radians ({int(beyond.sum())} of {angle.size} values are over a"
-            " full turn, 2π). If they are degrees, convert them: angle = numpy.deg2rad(angle).",
-            RuntimeWarning,
-            stacklevel=3,
-        )
-
-
-def _warn_of_bookkeeping(extra: Mapping[str, Any], source: str) -> None:
-    """Warn of columns that number cells or frames: they become fields of the cells."""
-    found = [name for name in extra if name.lower() in BOOKKEEPING]
-    if not found:
-        return
-    frames = {len(np.unique(np.asarray(extra[n]))) for n in found if n.lower() == "frame"}
-    several = (
-        f" The table has {max(frames)} frames, and the cells of all frames start together: keep the"
-        " rows of one frame."
-        if max(frames, default=1) > 1
-        else ""
-    )
-    warnings.warn(
-        f"{source}: these columns number cells or frames, and become fields that daughters inherit:"
-        f" {', '.join(map(repr, found))}. Delete them from the table.{several}",
-        RuntimeWarning,
-        stacklevel=3,
-    )
-
-
-def _read_csv(path: str | Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The names in a CSV file's header, and its other lines with their line numbers.
-
-    Blank lines are skipped.
-    """
-    with _readable(path, "r", encoding="utf-8-sig", newline="") as file:
-        reader = csv.reader(file, skipinitialspace=True)
-        try:
-            rows = [(reader.line_num, row) for row in reader if row]
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise checks.InputError(
-                f"{path} cannot be read as CSV: it must be text in UTF-8 ({error})."
-            ) from error
-    if not rows:
-        raise checks.InputError(
-            f"{path} is empty: it requires a header, such as x,y,angle,length, and one line per"
-            " cell."
-        )
-    line, names = rows[0][0], [name.strip() for name in rows[0][1]]
-    for mark, word in ((";", "semicolons"), ("\t", "tabs")):
-        if len(names) == 1 and mark in names[0]:
-            raise checks.InputError(
-                f"{path}, line {line}: columns are separated by {word}. Write commas between them,"
-                " and decimal points."
-            )
-    for name in names:
-        # a line of numbers is not a header; another check reports that more clearly
-        if names.count(name) > 1 and "x" in names:
-            raise checks.InputError(
-                f"{path}, line {line}: the header has the column {name!r} twice. Remove one."
-            )
-    return names, rows[1:]
-
-
-def _readable(path: str | Path, mode: str, **options: Any) -> Any:
-    """An open file. Raises InputError if the file cannot be read."""
-    try:
-        return open(path, mode, **options)
-    except OSError as error:
-        raise checks.InputError(f"{path} cannot be read: {error.strerror or error}.") from error
+    def summary(self) -> str:
+        """What was read, for checking: counts, sizes and extent in µm, what was left out, overlaps,
+        and how far `relaxed` moved the cells."""
+        return summarise(self)
 
 
 def _array(name: str, given: Any, dtype: type) -> np.ndarray:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import Target, require, species_names
-from design.targets.observed_table import Units, read_table
+from design.targets.observed_table import read_table
 from design.targets.statistics import (
     LOG_CELLS,
     ColonyStatistics,
@@ -121,7 +121,7 @@ class Observed(Target):
         arguments that nothing uses.
         """
         names = species_names("Observed.species", tuple(species)) if species else ()
-        units = Units(pixel_size, length_unit, angle_unit, time_unit)
+        units = tf.tables.Units(pixel_size, length_unit, angle_unit, time_unit)
         cells = read_table(table, names, units, columns or {})
         plan = _plan(cells, names, rings, reach, tip_to_tip, relative)
         return _observed(cells, plan if like is None else like.plan, time)

@@ -277,9 +277,9 @@ PLACES = {"x": [0.0, 1.0], "y": [0.0, 2.0], "length": [2.0, 3.0]}
         (PLACES, {"pixel_size": 0.0}, "pixel_size"),
         ({"x_um": [0.0]}, {}, "lacks the column 'y'"),
         ({"length_um": [2.0]}, {"species": ["gfp"]}, "lacks the column 'gfp'"),
-        ({"length_um": [2.0, math.nan]}, {}, "in cell 2, column 'length_um', is not a number"),
+        ({"length_um": [2.0, math.nan]}, {}, "row 2, column 'length_um': 'nan' is not a number"),
         ({"length_um": [2.0], "length_px": [3.0]}, {}, "keep one of them"),
-        ({"length_um": [2.0], "x_um": [1.0, 2.0]}, {}, "columns of one length"),
+        ({"length_um": [2.0], "x_um": [1.0, 2.0]}, {}, "the same length"),
         ({"length_um": []}, {}, "at least one"),
         ({"weight": [1.0]}, {}, "none of the columns x, y, length"),
         ({"length_um": [2.0]}, {"columns": {"age": "alter_h"}}, "lacks the column 'alter_h'"),
@@ -302,8 +302,11 @@ def test_a_csv_file_is_read_and_its_faults_are_named(tmp_path):
     target = Observed.from_table(path, pixel_size=0.1, columns=columns)
     found = dict(zip(target.plan.names, target.values, strict=True))
     assert found["length_50_um"] == pytest.approx(2.5) and found["age_50_h"] == pytest.approx(0.75)
-    for text, message in (("x_um,y_um\n1,2\n1", "row 3"), ("x_um,y_um\n1,a\n", "'a' in cell 1"),
-                          ("x_um,y_um\n", "has no cells")):  # fmt: skip
+    for text, message in (
+        ("x_um,y_um\n1,2\n1", "line 3"),
+        ("x_um,y_um\n1,a\n", "line 2.*'a' is not"),
+        ("x_um,y_um\n", "has no cell"),
+    ):
         path.write_text(text)
         with pytest.raises(tf.InputError, match=message):
             Observed.from_table(path)

@@ -212,7 +212,7 @@ class Resume:
 
 def read_cells(path: Path) -> Cells:
     """The cells of a CSV file, or of an HDF5 file (any other suffix)."""
-    return Cells.from_csv(path) if path.suffix == ".csv" else Cells.from_hdf5(path)
+    return Cells.from_table(path) if path.suffix == ".csv" else Cells.from_hdf5(path)
 
 
 def print_notes(path: str, cells: Cells, model: Model, state: State) -> None:

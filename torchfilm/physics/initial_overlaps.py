@@ -57,7 +57,7 @@ def check_apart(
         found = (
             f"{name(worst)} start {-float(gap[worst]):.3g} µm deep in one another (pairs that"
             f" overlap by over a radius: {deep.numel()}). The first steps may push them through one"
-            " another. Move the cells apart; or check the unit of the table (µm) and its lengths"
-            " (of the centreline, without caps)."
+            " another. Push the cells apart by Cells.relaxed(); or check the unit of the table"
+            " (µm) and its lengths (of the centreline, without caps)."
         )
     warnings.warn(found, RuntimeWarning, stacklevel=2)

@@ -1,0 +1,170 @@
+"""Images from files and arrays: label images, and micrographs to draw over."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchfilm.tools import checks
+
+EXTRA = 'Images require scikit-image and tifffile: pip install "torchfilm[images]".'
+# files of programs that hold more than an image, and how to get at the image
+NOT_IMAGES = {
+    ".mat": "Read it by scipy.io.loadmat, and give the array of labels (SuperSegger:"
+    ' loadmat(file, simplify_cells=True)["regs"]["regs_label"]).',
+    ".pkl": "Give a label image.",
+    ".csv": "For a table, use Cells.from_table.",
+}
+
+
+def read_image(image: Any, frame: int | None, what: str) -> tuple[np.ndarray, str]:
+    """An image (rows, columns) or (rows, columns, 3 or 4), and a name for messages.
+
+    image: an array, or the path of a file: .tif, .tiff, .png, .jpg, .npy, or DeLTA's .nc, whose
+    label images are placed where their regions of interest were. frame: of a stack; required if it
+    has several. what: "mask" or "micrograph". Nothing in a file can execute.
+    """
+    if isinstance(image, (str, Path)):
+        path = Path(image)
+        values, source = _file(path, frame, what), str(path)
+        if path.suffix.lower() == ".nc":
+            return values, source
+    else:
+        values, source = _array(image, what), f"the {what}"
+    if values.ndim == 3 and values.shape[-1] in (3, 4) and min(values.shape[:2]) > 4:
+        return _one_frame(values[None], frame, source)
+    while values.ndim > 3 and 1 in values.shape[:-2]:
+        values = values.squeeze(values.shape.index(1))
+    if values.ndim == 2:
+        values = values[None]
+    if values.ndim != 3 and not (values.ndim == 4 and values.shape[-1] in (3, 4)):
+        raise checks.InputError(
+            f"{source} has the shape {values.shape}: it must be an image (rows, columns), or a"
+            " stack of them (frames, rows, columns)."
+        )
+    return _one_frame(values, frame, source)
+
+
+def _one_frame(stack: np.ndarray, frame: int | None, source: str) -> tuple[np.ndarray, str]:
+    count = len(stack)
+    if frame is None:
+        if count != 1:
+            raise checks.InputError(
+                f"{source} has {count} frames: say which one by frame=…, from 0 to {count - 1}."
+            )
+        frame = 0
+    elif isinstance(frame, bool) or not isinstance(frame, (int, np.integer)):
+        raise checks.input_error("frame", frame, "a whole number")
+    if not 0 <= frame < count:
+        raise checks.input_error("frame", frame, f"from 0 to {count - 1}, the frames of {source}")
+    return stack[frame], source if count == 1 else f"{source}, frame {frame}"
+
+
+def _array(image: Any, what: str) -> np.ndarray:
+    try:
+        values = np.asarray(image.detach().cpu() if hasattr(image, "detach") else image)
+    except (TypeError, ValueError) as error:
+        raise checks.input_error(what, image, "an array or the path of an image") from error
+    if values.dtype.kind not in "biuf" or not values.size:
+        raise checks.input_error(
+            what, f"an array of {values.dtype}, {values.shape}", "an array of numbers, not empty"
+        )
+    return values
+
+
+def _file(path: Path, frame: int | None, what: str) -> np.ndarray:
+    """The values of a file. Raises InputError if it cannot be read, whatever the library says."""
+    kind = path.suffix.lower()
+    if kind in NOT_IMAGES:
+        raise checks.InputError(f"{path} is not an image. {NOT_IMAGES[kind]}")
+    if kind not in (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".npy", ".nc"):
+        raise checks.input_error(what, str(path), "a file .tif, .png, .npy or .nc, or an array")
+    try:
+        if path.stat().st_size == 0:
+            raise checks.InputError(f"{path} is empty: it has no bytes.")
+    except OSError as error:
+        raise checks.InputError(f"{path} cannot be read: {error.strerror or error}.") from error
+    if kind == ".nc":
+        return _delta_labels(path, frame)
+    try:
+        return _array(_read(path, kind), what)
+    except checks.InputError:
+        raise
+    except Exception as error:  # the libraries raise errors of many kinds for a broken file
+        hint = (
+            " It may hold Python objects, which are not loaded since they can execute code; save"
+            " the masks alone, as .tif."
+            if kind == ".npy" and "pickle" in str(error)
+            else " Is it truncated, or a file of another kind?"
+        )
+        raise checks.InputError(
+            f"{path} cannot be read as {kind[1:].upper()} ({error}).{hint}"
+        ) from error
+
+
+def _read(path: Path, kind: str) -> np.ndarray:
+    if kind == ".npy":
+        return np.load(path, allow_pickle=False)
+    try:
+        import tifffile
+        from PIL import Image
+    except ImportError as error:
+        raise checks.InputError(EXTRA) from error
+    if kind in (".tif", ".tiff"):
+        return tifffile.imread(path)
+    with Image.open(path) as image:
+        # the numbers of a palette are the labels
+        return np.asarray(image)
+
+
+def _delta_labels(path: Path, frame: int | None) -> np.ndarray:
+    """The label image of a frame of DeLTA's results (netCDF, which is HDF5): a group roi00, roi01,
+    … for each region of interest, with label_stack (frame, rows, columns), the numbers of the
+    frames, and its box in the image. Cells of several regions are numbered on."""
+    import h5py
+
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise checks.InputError(f"{path} cannot be read as netCDF ({error}).") from error
+    with file:
+        groups = [file[name] for name in sorted(file) if name.startswith("roi")]
+        if not groups or any("label_stack" not in g or "frame" not in g for g in groups):
+            raise checks.InputError(
+                f"{path} is not a results file of DeLTA: it requires groups roi00, roi01, … with"
+                " label_stack and frame."
+            )
+        parts, count = [], 0
+        for group in groups:
+            try:
+                box = ast.literal_eval(_text(group.attrs["box"]))
+                top, left = int(box["ytl"]), int(box["xtl"])
+            except (KeyError, ValueError, SyntaxError, TypeError) as error:
+                raise checks.InputError(
+                    f"{path}, group {group.name}: the attribute box is missing or not readable."
+                ) from error
+            numbers = [int(n) for n in group["frame"][()]]
+            if frame is None and len(numbers) == 1:
+                frame = numbers[0]
+            if frame not in numbers:
+                raise checks.input_error(
+                    "frame", frame, f"one of {numbers[0]} to {numbers[-1]}, the frames of {path}"
+                )
+            labels = np.asarray(group["label_stack"][numbers.index(frame)], dtype=np.int64)
+            parts.append((top, left, np.where(labels > 0, labels + count, 0)))
+            count += int(labels.max())
+    whole = np.zeros(
+        (max(t + x.shape[0] for t, _, x in parts), max(c + x.shape[1] for _, c, x in parts)),
+        dtype=np.int64,
+    )
+    for top, left, labels in parts:
+        part = whole[top : top + labels.shape[0], left : left + labels.shape[1]]
+        part[labels > 0] = labels[labels > 0]
+    return whole
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)

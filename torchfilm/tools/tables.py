@@ -1,0 +1,267 @@
+"""Tables with a row for each cell: CSV files and columns by name, their numbers and units."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchfilm.tools import checks
+
+# by which units the names of columns may end; each in µm, rad or h, None: in pixels
+UNITS: dict[str, dict[str, float | None]] = {
+    "length": {"um": 1.0, "px": None},
+    "angle": {"rad": 1.0, "deg": math.pi / 180.0},
+    "time": {"h": 1.0, "min": 1.0 / 60.0},
+}
+
+
+@dataclass(frozen=True)
+class Units:
+    """The units that arguments state. pixel_size: µm a pixel. length_unit: "um" or "px".
+    angle_unit: "degrees" or "radians". time_unit: "h" or "min"."""
+
+    pixel_size: float | None = None
+    length_unit: str | None = None
+    angle_unit: str | None = None
+    time_unit: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.pixel_size is not None:
+            checks.number("pixel_size", self.pixel_size, above=0.0, hint="µm a pixel.")
+        for name, allowed in (
+            ("length_unit", ("um", "px")),
+            ("angle_unit", ("degrees", "radians")),
+            ("time_unit", ("h", "min")),
+        ):
+            if getattr(self, name) is not None:
+                checks.choice(name, getattr(self, name), allowed)
+        if self.length_unit == "um" and self.pixel_size is not None:
+            raise checks.input_error(
+                "pixel_size",
+                self.pixel_size,
+                'left out with length_unit="um"',
+                "Lengths are in µm.",
+            )
+
+    def stated(self, kind: str) -> str:
+        """The unit of a kind of column, as a name ends; "" where none is stated."""
+        if kind == "length":
+            return self.length_unit or ("" if self.pixel_size is None else "px")
+        if kind == "angle":
+            return {"degrees": "deg", "radians": "rad", None: ""}[self.angle_unit]
+        return self.time_unit or ""
+
+    def factor(self, kind: str, unit: str, column: str) -> float:
+        """What turns numbers of a unit into µm, rad or h."""
+        found = UNITS[kind][unit]
+        if found is not None:
+            return found
+        if self.pixel_size is None:
+            raise checks.input_error(
+                "pixel_size", None, f"given: the column {column!r} is in pixels", "In µm a pixel."
+            )
+        return self.pixel_size
+
+    def check_used(self, used: set[tuple[str, str]]) -> None:
+        """Raises InputError for a unit that no column has. used: kind and unit of each that went by
+        an argument, and ("pixels", "") where there are any."""
+        for name, kind in (
+            ("angle_unit", "angle"),
+            ("time_unit", "time"),
+            ("length_unit", "length"),
+        ):
+            if getattr(self, name) is not None and (kind, self.stated(kind)) not in used:
+                raise checks.input_error(
+                    name, getattr(self, name), "left out: the unit of no column depends on it"
+                )
+        if self.pixel_size is not None and ("pixels", "") not in used:
+            raise checks.input_error(
+                "pixel_size", self.pixel_size, "left out: no column is in pixels"
+            )
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of equal length by name, as they were given (texts, from a CSV file).
+
+    source: for messages. lines: the line of the file for each row, counted from 1; None for columns
+    that are not from a file.
+    """
+
+    source: str
+    columns: Mapping[str, np.ndarray]
+    lines: np.ndarray | None = None
+
+    @staticmethod
+    def read(table: Any, source: str = "the table") -> Table:
+        """The table of a CSV file (its path) or of columns by name (a dictionary or DataFrame).
+
+        A CSV file is UTF-8, with a header, commas between columns and decimal points. Raises
+        InputError for a file that is not, and for columns of unequal length or without rows.
+        """
+        if isinstance(table, (str, Path)):
+            return _read_csv(Path(table))
+        if not hasattr(table, "keys") or not hasattr(table, "__getitem__"):
+            raise checks.input_error(
+                "table", type(table).__name__, "the path of a CSV file, or columns by name"
+            )
+        found: dict[str, np.ndarray] = {}
+        for name in table.keys():  # noqa: SIM118
+            column = table[name]
+            values = np.asarray(column.detach().cpu() if hasattr(column, "detach") else column)
+            if values.ndim != 1 or str(name) in found:
+                raise checks.InputError(
+                    f"{source}: the column {str(name)!r} is there twice, or is not a list of"
+                    " numbers."
+                )
+            found[str(name)] = values
+        sizes = {name: len(column) for name, column in found.items()}
+        if len(set(sizes.values())) > 1:
+            raise checks.InputError(
+                f"{source}: all columns must have the same length; they have"
+                f" {', '.join(f'{n} {k}' for n, k in sizes.items())}."
+            )
+        if not found or not max(sizes.values()):
+            raise checks.InputError(f"{source} has no cell: give a row for each, at least one.")
+        return Table(source, found)
+
+    @property
+    def rows(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def take(self, rows: np.ndarray) -> Table:
+        """Some of the rows, by index or mask."""
+        return Table(
+            self.source,
+            {name: column[rows] for name, column in self.columns.items()},
+            (np.arange(1, self.rows + 1) if self.lines is None else self.lines)[rows],
+        )
+
+    def place(self, row: int) -> str:
+        """Where a row is, for messages."""
+        if self.lines is None:
+            return f"{self.source}, row {row + 1}"
+        word = "row" if self.source == "the table" else "line"
+        return f"{self.source}, {word} {self.lines[row]}"
+
+    def numbers(self, column: str) -> np.ndarray:
+        """A column of finite numbers, (N,) float64. Raises InputError with the first row that has
+        none."""
+        values = self.columns[column]
+        try:
+            found = np.asarray(values, dtype=np.float64)
+            bad = np.flatnonzero(~np.isfinite(found))
+        except (TypeError, ValueError):
+            found, bad = np.zeros(0), np.flatnonzero([not _is_number(v) for v in values])
+        if len(bad):
+            more = f" (in {len(bad)} of {self.rows} rows)" if len(bad) > 1 else ""
+            raise checks.InputError(
+                f"{self.place(int(bad[0]))}, column {column!r}: {str(values[bad[0]])!r} is not a"
+                f" number{more}. Leave such cells out."
+            )
+        return found
+
+    def column(self, name: str, kind: str, columns: Mapping[str, str]) -> tuple[str, str] | None:
+        """The column that holds a quantity, and the unit at the end of its name, "" where there is
+        none; None where the table lacks it.
+
+        name: such as "x", which may be the column x, x_um or x_px. kind: of `UNITS`. columns: the
+        names of columns by quantity, where they differ.
+        """
+        if name in columns and columns[name] not in self.columns:
+            raise self.missing(columns[name])
+        allowed = (name, *(f"{name}_{unit}" for unit in UNITS[kind]))
+        given = [columns[name]] if name in columns else [n for n in allowed if n in self.columns]
+        if len(given) > 1:
+            raise checks.InputError(
+                f"{self.source} has {' and '.join(map(repr, given))}: keep one of them."
+            )
+        if not given:
+            return None
+        end = given[0].rpartition("_")[2]
+        return given[0], end if end in UNITS[kind] and "_" in given[0] else ""
+
+    def missing(self, column: str, hint: str = "") -> checks.InputError:
+        """The error for a column that the table lacks; raise what this returns."""
+        near = checks.nearest(column, self.columns)
+        hint = hint or (f"Did you mean {near!r}?" if near else "")
+        return checks.InputError(
+            f"{self.source} lacks the column {column!r}; it has {', '.join(self.columns)}."
+            + (f" {hint}" if hint else "")
+        )
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return math.isfinite(float(value))
+    except (TypeError, ValueError):
+        return False
+
+
+def _read_csv(path: Path) -> Table:
+    """Blank lines are skipped."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, skipinitialspace=True)
+            rows = [(reader.line_num, row) for row in reader if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise checks.InputError(
+            f"{path} cannot be read as CSV: it must be text in UTF-8 ({error})."
+        ) from error
+    except OSError as error:
+        raise checks.InputError(f"{path} cannot be read: {error.strerror or error}.") from error
+    if not rows:
+        raise checks.InputError(
+            f"{path} is empty: it requires a header, such as x,y,angle,length, and one line per"
+            " cell."
+        )
+    (line, header), rows = rows[0], rows[1:]
+    names = [name.strip() for name in header]
+    _check_header(path, line, names)
+    if not rows:
+        raise checks.InputError(
+            f"{path} has no cell, only a header. Give one line per cell, at least one."
+        )
+    for number, row in rows:
+        _check_row(f"{path}, line {number}", row, names)
+    columns = {name: np.array([row[k] for _, row in rows]) for k, name in enumerate(names)}
+    return Table(str(path), columns, np.array([number for number, _ in rows]))
+
+
+def _check_header(path: Path, line: int, names: Sequence[str]) -> None:
+    for mark, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(names) == 1 and mark in names[0]:
+            raise checks.InputError(
+                f"{path}, line {line}: columns are separated by {word}. Write commas between them,"
+                " and decimal points."
+            )
+    if all(map(_is_number, names)):
+        raise checks.InputError(
+            f"{path}, line {line}: numbers instead of a header. Begin with the names of the"
+            " columns, such as x,y,angle,length."
+        )
+    for name in names:
+        if names.count(name) > 1:
+            raise checks.InputError(
+                f"{path}, line {line}: the header has the column {name!r} twice. Remove one."
+            )
+
+
+def _check_row(line: str, row: Sequence[str], names: Sequence[str]) -> None:
+    if len(row) > len(names):
+        raise checks.InputError(
+            f"{line}: more values than the {len(names)} columns of the header. Decimal commas?"
+            " Write decimal points."
+        )
+    if len(row) < len(names):
+        values = f"{len(row)} value{'s' if len(row) > 1 else ''}"
+        raise checks.InputError(
+            f"{line}, column {names[len(row)]!r}: no value; the line has {values} for"
+            f" {len(names)} columns."
+        )
