@@ -190,6 +190,7 @@ class Cells:
         return [(int(i[k]), int(j[k]), -float(gap[k])) for k in order.tolist() if gap[k] < -depth]
 
     @staticmethod
+    @checks.known_keywords
     def from_table(
         table: Any,
         *,
@@ -236,6 +237,7 @@ class Cells:
         return Cells(**table_cells(Table.read(table), reading))
 
     @staticmethod
+    @checks.known_keywords
     def from_masks(
         image: Any,
         *,
@@ -269,6 +271,7 @@ class Cells:
         return Cells(**given)
 
     @staticmethod
+    @checks.known_keywords
     def from_hdf5(path: str | Path, group: str = "/") -> Cells:
         """Cells from an HDF5 file with one data set per column in `group`, in µm and radians as
         `from_table` takes them by default."""

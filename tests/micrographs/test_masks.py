@@ -124,6 +124,11 @@ def test_a_frame_of_a_stack(tmp_path):
         read(stack, frame="a")
 
 
+def test_labels_may_be_great():
+    cells = read(np.where(masked() == 2, 2**40, masked().astype(np.int64)))
+    assert cells.micrograph.label.tolist() == ["1", str(2**40)]
+
+
 def test_centre_moves_the_mean_to_the_origin():
     assert np.allclose(read(masked(), centre=True).position.mean(0), 0.0)
 
@@ -184,8 +189,9 @@ def test_a_curved_cell_is_reported():
 
 def test_two_cells_in_one_region_are_reported():
     mask = masked(x=[25.0, 27.0], y=[20.0, 30.0])
-    with pytest.warns(RuntimeWarning, match=r"several cells in one"):
-        read((mask > 0).astype(int))
+    with pytest.warns(RuntimeWarning, match=r"several cells in one") as found:
+        tf.Cells.from_masks((mask > 0).astype(int), pixel_size=0.1)
+    assert found[0].filename == __file__
 
 
 # --- bad images -----------------------------------------------------------------------------------
@@ -218,6 +224,9 @@ BAD = {
     "pixel size": (masked, {"pixel_size": 0.0}, r"pixel_size = 0\.0"),
     "pixel size text": (masked, {"pixel_size": "65 nm"}, r"pixel_size = '65 nm'"),
     "drop": (masked, {"drop": "edge"}, r"drop = 'edge'.*'border'"),
+    "no drop": (masked, {"drop": None}, r"drop = None"),
+    "centre": (masked, {"centre": 1.5}, r"centre = 1\.5"),
+    "an argument that is none": (masked, {"pixel": 1}, r"no parameter 'pixel'.*pixel_size"),
     "least area": (masked, {"least_area": 0}, r"least_area = 0"),
 }
 

@@ -89,6 +89,8 @@ def test_y_up_counts_rows_from_the_bottom(tmp_path):
         (lambda: tf.Cells.single(2), np.zeros(SHAPE), {}, r"no pixel size.*Cells\.from_masks"),
         (lambda: 7, np.zeros(SHAPE), {}, r"overlay\(cells\) = 'int'"),
         (cells, np.zeros((30, 50)), {}, r"2 of 3|1 of 3 cells lie outside.*label 13 at row 40"),
+        (cells, np.full(SHAPE, np.nan), {}, r"no finite number"),
+        (lambda: tf.Cells.single(3), np.zeros(SHAPE), {}, r"cells in the plane"),
         (cells, np.zeros(9), {}, r"shape \(9,\)"),
         (cells, "none.tif", {}, r"none\.tif cannot be read"),
         (cells, np.zeros(SHAPE), {"depth": -1.0}, r"depth = -1"),

@@ -98,7 +98,8 @@ def test_a_data_frame_and_a_csv_file_give_the_same_cells(tmp_path):
 @pytest.mark.parametrize("kind", ["table", "csv", "hdf5"])
 def test_degrees_are_noticed(tmp_path, kind):
     columns = table(angle=[0.5, -87.5])
-    with pytest.warns(RuntimeWarning, match=r"'angle' reaches 87\.5.*radians.*1 of 2.*degrees"):
+    said = r"'angle' reaches 87\.5.*radians.*1 of 2.*degrees"
+    with pytest.warns(RuntimeWarning, match=said) as found:
         if kind == "table":
             tf.Cells.from_table(columns)
         elif kind == "csv":
@@ -111,6 +112,7 @@ def test_degrees_are_noticed(tmp_path, kind):
                 for name, values in columns.items():
                     file[name] = values
             tf.Cells.from_hdf5(tmp_path / "cells.h5")
+    assert found[0].filename == __file__
 
 
 def test_a_full_turn_in_radians_is_no_degrees():
@@ -308,6 +310,18 @@ BAD = {
         SET,
         r"row 1, column 'orientation': 'nan' is not a number \(in 2 of 2 rows\)",
     ),
+    "complex numbers": (table(x=[1.0, 2.0j]), {}, r"column 'x': '\(1\+0j\)' is not a number"),
+    "one column for two": (
+        ONE,
+        {"columns": {"x": "length", "length": "length"}},
+        r"columns\['x'\] = 'length'.*used once",
+    ),
+    "a column that is no name": (ONE, {"columns": {"x": 3}}, r"columns\['x'\] = 3"),
+    "fields": (ONE, {"fields": 3}, r"fields = 3.*names of columns"),
+    "a field of text": (table(strain=["a", "b"]), {}, r"'strain'.*Leave the column out"),
+    "caps": (ONE, {"length_with_caps": "yes"}, r"length_with_caps = 'yes'.*True, False"),
+    "centre": (ONE, {"centre": "x"}, r"centre = 'x'"),
+    "an argument that is none": (ONE, {"pixelsize": 0.1}, r"'pixelsize'.*Did you mean pixel_size"),
     "no table": (7, {}, r"table = 'int'.*the path of a CSV file"),
     "a nested column": ({**ONE, "x": [[0.0, 1.0]]}, {}, r"column 'x'.*not a list of numbers"),
 }

@@ -62,14 +62,23 @@ class Reading:
                     self.columns,
                     f"names of columns by quantity, or one of {', '.join(map(repr, COLUMN_SETS))}",
                 )
-            for name in self.columns:
+            for name, column in self.columns.items():
                 checks.choice("columns", name, (*KINDS, *PLAIN, "label", "frame"))
+                if not isinstance(column, str) or list(self.columns.values()).count(column) > 1:
+                    raise checks.input_error(
+                        f"columns[{name!r}]", column, "the name of a column, used once"
+                    )
         for name, value, allowed in (
             ("y", self.y, ("up", "down")),
             ("angle_turns", self.angle_turns, ("clockwise", "counterclockwise")),
         ):
             if value is not None:
                 checks.choice(name, value, allowed)
+        for name, flag in (("length_with_caps", self.length_with_caps), ("centre", self.centre)):
+            checks.choice(name, flag, (True, False))
+        given = [self.fields] if isinstance(self.fields, str) else self.fields
+        if given is not None and not isinstance(given, (Sequence, Mapping)):
+            raise checks.input_error("fields", given, "names of columns, or columns by field")
         if self.radius is not None:
             checks.number("radius", self.radius, above=0.0, hint="µm.")
 
@@ -337,7 +346,7 @@ def _warn_of_units(angle: np.ndarray, unit: str, widest: float, column: str, sou
             f" ({beyond} of {angle.size} values are over {widest:.4g}). If they are degrees, give"
             ' angle_unit="degrees".',
             RuntimeWarning,
-            stacklevel=5,
+            stacklevel=6,
         )
     if unit == "deg" and angle.size >= ENOUGH and 0 < most <= math.pi:
         warnings.warn(
@@ -345,7 +354,7 @@ def _warn_of_units(angle: np.ndarray, unit: str, widest: float, column: str, sou
             " and torchfilm reads them in degrees. If they are radians, give"
             ' angle_unit="radians".',
             RuntimeWarning,
-            stacklevel=5,
+            stacklevel=6,
         )
 
 

@@ -21,7 +21,7 @@ PROBLEMS = {
     "misfit": ("not shaped like a straight capsule (curved, or several cells in one)", True),
 }
 MISFIT = 0.15  # share of the area that the capsule and the region do not share
-MOST = 2**31  # labels above this are not labels
+MOST = 2**53  # whole numbers above this are not exact as floats
 
 
 def mask_cells(
@@ -41,20 +41,25 @@ def mask_cells(
     """
     checks.number("pixel_size", pixel_size, above=0.0, hint="µm a pixel.")
     checks.number("least_area", least_area, least=4, hint="Pixels.")
-    drop = (drop,) if isinstance(drop, str) else tuple(drop)
+    checks.choice("centre", centre, (True, False))
+    drop = (drop,) if isinstance(drop, str) else drop
+    if not isinstance(drop, Sequence):
+        raise checks.input_error("drop", drop, "kinds of regions, such as ('border', 'tiny')")
     for name in drop:
         checks.choice("drop", name, tuple(PROBLEMS))
     values, source = read_image(image, frame, "mask")
-    mask = _labels(values, source)
+    # numbered on, since the measures take memory by the greatest label
+    labels, flat = np.unique(_labels(values, source), return_inverse=True)
+    mask: np.ndarray = flat.reshape(values.shape)
     regions = _regions(mask)
     problems, left_out = _problems(mask, regions, least_area), {}
     kept = np.ones(len(regions["label"]), dtype=bool)
     for name in drop:
         if problems[name].any():
-            left_out[name] = [str(k) for k in regions["label"][problems[name]]]
+            left_out[name] = [str(labels[k]) for k in regions["label"][problems[name]]]
         kept &= ~problems[name]
     regions = {name: column[kept] for name, column in regions.items()}
-    _report({n: p[kept] for n, p in problems.items()}, regions["label"], source, least_area)
+    _report({n: p[kept] for n, p in problems.items()}, labels[regions["label"]], source, least_area)
     if not kept.any():
         raise checks.InputError(
             f"{source}: no cell is left: drop={list(drop)} leaves out all {len(kept)} regions."
@@ -71,8 +76,8 @@ def mask_cells(
             source,
             pixel_size,
             np.array(shift),
-            label=np.array([str(k) for k in regions["label"]]),
-            image=mask.shape,
+            label=np.array([str(labels[k]) for k in regions["label"]]),
+            image=(mask.shape[0], mask.shape[1]),
             left_out=left_out,
         ),
     }
@@ -182,7 +187,7 @@ def _report(
                 f'{said} Look at tf.pictures.overlay(cells, image, "check.png"), or leave them out'
                 f" by drop={name!r}.",
                 RuntimeWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
             continue
         if name == "pieces":

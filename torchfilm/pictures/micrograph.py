@@ -47,6 +47,8 @@ def overlay(
     figure_class()
     if not isinstance(cells, Cells):
         raise checks.input_error("overlay(cells)", type(cells).__name__, "Cells")
+    if cells.dim != 2:
+        raise checks.input_error("overlay(cells)", "cells in space", "cells in the plane")
     if cells.micrograph is None:
         raise checks.InputError(
             "these cells have no pixel size, so their places in an image are unknown. Read them by"
@@ -117,10 +119,14 @@ def _grey(image: np.ndarray) -> np.ndarray:
     """An image from 0, black, to 1, white. Colours keep their range."""
     values = image.astype(np.float64)
     if image.ndim == 3:
-        return np.clip(values[..., :3] / (255.0 if image.dtype.kind in "iu" else 1.0), 0.0, 1.0)
-    low, high = np.percentile(values[np.isfinite(values)], SHADES)
+        most = np.iinfo(image.dtype).max if image.dtype.kind in "iu" else 1.0
+        return np.asarray(np.clip(values[..., :3] / most, 0.0, 1.0))
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        raise checks.InputError("the micrograph has no finite number.")
+    low, high = np.percentile(finite, SHADES)
     if high <= low:  # few pixels differ, as in a label image of few cells
-        low, high = np.nanmin(values), np.nanmax(values)
+        low, high = finite.min(), finite.max()
     return np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0)
 
 

@@ -155,15 +155,18 @@ class Table:
         none."""
         values = self.columns[column]
         try:
+            if values.dtype.kind == "c":  # numpy would drop the imaginary part
+                raise TypeError
             found = np.asarray(values, dtype=np.float64)
             bad = np.flatnonzero(~np.isfinite(found))
         except (TypeError, ValueError):
             found, bad = np.zeros(0), np.flatnonzero([not _is_number(v) for v in values])
         if len(bad):
             more = f" (in {len(bad)} of {self.rows} rows)" if len(bad) > 1 else ""
+            out = "the column" if len(bad) == self.rows else "such cells"
             raise checks.InputError(
                 f"{self.place(int(bad[0]))}, column {column!r}: {str(values[bad[0]])!r} is not a"
-                f" number{more}. Leave such cells out."
+                f" number{more}. Leave {out} out."
             )
         return found
 
@@ -198,6 +201,8 @@ class Table:
 
 
 def _is_number(value: Any) -> bool:
+    if isinstance(value, complex):
+        return False
     try:
         return math.isfinite(float(value))
     except (TypeError, ValueError):
