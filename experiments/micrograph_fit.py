@@ -104,7 +104,7 @@ def picture() -> None:
         "label": np.arange(1, len(x) + 1),
     }
     cells = tf.Cells.from_table(columns, pixel_size=PIXEL, y="down", radius=0.5)
-    tf.pictures.overlay(cells, phase, PICTURE, dpi=130)
+    tf.pictures.overlay(cells, phase, PICTURE, depth=0.05, dpi=130)
     print(cells.relaxed().summary())
 
 

@@ -211,8 +211,8 @@ class Cells:
         Columns: x, y and, in space, z; length, of the centreline; angle, from +x, or axis_x, axis_y
         and, in space, axis_z; optional radius or width, cell_type, colony, label, frame. columns:
         their names in the table where they differ, such as {"x": "cx"}; or the set of a program,
-        "skimage" (regionprops_table, of which it takes the capsule with the same second moments) or
-        "matlab" (regionprops).
+        "skimage" (regionprops_table; the cell is the capsule with the same second moments, and with
+        the same area where the table has it) or "matlab" (regionprops).
 
         Lengths are in µm, or in pixels of pixel_size µm; angles in angle_unit, "radians" (the
         default) or "degrees". A column may name its unit: x_um, x_px, angle_deg, angle_rad. y: "up"
@@ -247,8 +247,9 @@ class Cells:
         least_area: int = 30,
         centre: bool = False,
     ) -> Cells:
-        """Cells from a label image: 0 between the cells, and a number for each cell. A cell gets
-        the centre, axis and second moments of its region. Requires the extra `images`.
+        """Cells from a label image: 0 between the cells, and a number for each cell. A cell is the
+        capsule with the centre and area of its region, its axis and its second moment along that.
+        Requires the extra `images`.
 
         image: an array (rows, columns) of whole numbers; a file .tif, .png or .npy (of Omnipose or
         Cellpose: NAME_cp_masks.tif); or a results file .nc of DeLTA. pixel_size: µm a pixel. frame:

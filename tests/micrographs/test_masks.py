@@ -10,7 +10,11 @@ import pytest
 from rasterised import bent, rasterised
 
 import torchfilm as tf
-from torchfilm.micrographs.capsule_fit import capsule_of_moments, moments_of_capsule
+from torchfilm.micrographs.capsule_fit import (
+    capsule_of_area,
+    capsule_of_moments,
+    moments_of_capsule,
+)
 
 tifffile = pytest.importorskip("tifffile")
 pytest.importorskip("skimage")
@@ -39,7 +43,8 @@ def test_moments_of_a_capsule_are_those_of_its_area():
     h = 0.005
     x, y = np.meshgrid(np.arange(-3 + h / 2, 3, h), np.arange(-1.5 + h / 2, 1.5, h))
     inside = np.hypot(np.maximum(np.abs(x) - 1.25, 0), y) <= 0.75
-    along, across = moments_of_capsule(np.array([2.5]), np.array([0.75]))
+    area, along, across = moments_of_capsule(np.array([2.5]), np.array([0.75]))
+    assert inside.sum() * h**2 == pytest.approx(area[0], rel=1e-4)
     assert x[inside].var() == pytest.approx(along[0], rel=1e-4)
     assert y[inside].var() == pytest.approx(across[0], rel=1e-4)
 
@@ -47,10 +52,24 @@ def test_moments_of_a_capsule_are_those_of_its_area():
 def test_a_capsule_is_found_from_its_moments():
     length = np.array([0.0, 1e-6, 0.01, 0.5, 2.0, 7.0, 60.0, 1e3])
     radius = np.array([0.5, 0.5, 3.0, 0.2, 0.5, 0.4, 0.5, 1.0])
-    found = capsule_of_moments(*moments_of_capsule(length, radius))
-    # 1e-6 of a radius changes the ratio of the moments by 1e-6: ten digits of it are left
-    assert np.allclose(found[0], length, rtol=1e-12, atol=1e-9)
-    assert np.allclose(found[1], radius, rtol=1e-9)
+    area, along, across = moments_of_capsule(length, radius)
+    for found in (capsule_of_moments(along, across), capsule_of_area(area, along)):
+        # 1e-6 of a radius changes the ratio by 1e-6: ten digits of it are left
+        assert np.allclose(found[0], length, rtol=1e-12, atol=1e-9)
+        assert np.allclose(found[1], radius, rtol=1e-9)
+
+
+def test_a_region_rounder_than_a_disc_has_no_length():
+    """Pixels may have a moment a little below that of a disc of their area."""
+    length, radius = capsule_of_area(np.array([math.pi]), np.array([0.24]))
+    assert length[0] < 1e-12 and radius[0] == pytest.approx(1.0)
+
+
+def test_a_curved_cell_keeps_its_width():
+    """Bent by 0.8 radians: within 5 % of the radius, where the moment across adds 8 %."""
+    mask = bent((80, 80), (40, 30), 0.8, 30.0, 6.0)
+    with pytest.warns(RuntimeWarning, match="not shaped like"):
+        assert read(mask, pixel_size=1.0).radius[0] == pytest.approx(6.0, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -105,11 +124,15 @@ def test_kinds_of_images(tmp_path, name):
 def test_a_table_of_the_mask_gives_the_same_cells():
     from skimage.measure import regionprops_table
 
-    names = ("label", "centroid", "orientation", "axis_major_length", "axis_minor_length")
+    names = ("label", "centroid", "orientation", "axis_major_length", "axis_minor_length", "area")
     table = regionprops_table(masked(), properties=names)
     one, other = read(masked()), tf.Cells.from_table(table, pixel_size=0.1, columns="skimage")
     for name in ("position", "axis", "length", "radius"):
         assert np.allclose(getattr(one, name), getattr(other, name), rtol=1e-9)
+    del table["area"]  # then by the moment across
+    other = tf.Cells.from_table(table, pixel_size=0.1, columns="skimage")
+    assert np.allclose(one.length, other.length, atol=0.03)
+    assert np.allclose(one.radius, other.radius, atol=0.01)
 
 
 def test_a_frame_of_a_stack(tmp_path):
@@ -269,7 +292,7 @@ def test_files_with_objects_are_not_loaded(tmp_path):
 
 @pytest.mark.parametrize(
     "name, message",
-    [("a.csv", "Cells.from_table"), ("a.mat", "regs_label"), ("a.xyz", r"\.tif, \.png"),
+    [("a.csv", "Cells.from_table"), ("a.jpg", "JPEG changes numbers"), ("a.mat", "regs_label"), ("a.xyz", r"\.tif, \.png"),
      ("other.nc", "not a results file of DeLTA")],
 )  # fmt: skip
 def test_files_of_other_kinds_are_reported(tmp_path, name, message):

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchfilm.micrographs.capsule_fit import capsule_of_moments
+from torchfilm.micrographs.capsule_fit import capsule_of_area, capsule_of_moments
 from torchfilm.micrographs.column_sets import COLUMN_SETS, ColumnSet, matching
 from torchfilm.micrographs.record import Micrograph, listed
 from torchfilm.tools import checks
@@ -327,7 +327,15 @@ def _set_columns(
             f" {minor[bad[0]]:.4g} pixels: a cell has a width, and its major axis is the longer one"
             f" (such cells: {bad.size}). Leave out regions of a few pixels."
         )
-    length, radius = capsule_of_moments(along, across)
+    area = next((table.numbers(name) for name in known.area if name in table.columns), None)
+    if area is not None and (area <= 0).any():
+        at = int(np.argmin(area))
+        raise checks.InputError(
+            f"{_cell(table, at, label)} has an area of {area[at]:g} pixels: it must be above 0."
+        )
+    length, radius = (
+        capsule_of_moments(along, across) if area is None else capsule_of_area(area, along)
+    )
     return {
         "position": size * np.stack([x - known.first, known.first - y], 1),
         "axis": known.axis(np.deg2rad(angle) if unit == "deg" else angle),

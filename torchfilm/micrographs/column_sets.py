@@ -13,7 +13,8 @@ import numpy as np
 class ColumnSet:
     """The table of a program that gives the ellipse with the second moments of each region.
 
-    Each entry has the names of a column, of which a table has one. angle_unit: "rad" or "deg".
+    Each entry has the names of a column, of which a table has one; it may lack area, label and
+    frame. angle_unit: "rad" or "deg".
     widest: the greatest angle that there is, rad. first: the number of the first row and column of
     the image. pixel: the second moment of a pixel, which the program adds; 0, or 1/12. axis: the
     direction of the major axis, x to the right and y up, by the angle, rad. Lengths are in pixels,
@@ -26,6 +27,7 @@ class ColumnSet:
     major: tuple[str, ...]
     minor: tuple[str, ...]
     angle: tuple[str, ...]
+    area: tuple[str, ...]
     label: tuple[str, ...]
     frame: tuple[str, ...]
     angle_unit: str
@@ -49,6 +51,7 @@ COLUMN_SETS = {
         major=("axis_major_length", "major_axis_length"),
         minor=("axis_minor_length", "minor_axis_length"),
         angle=("orientation",),
+        area=("area",),
         label=("label",),
         frame=("frame",),
         angle_unit="rad",
@@ -65,6 +68,7 @@ COLUMN_SETS = {
         major=("MajorAxisLength",),
         minor=("MinorAxisLength",),
         angle=("Orientation",),
+        area=("Area",),
         label=("Label", "label"),
         frame=("Frame", "frame"),
         angle_unit="deg",

@@ -80,6 +80,8 @@ def _file(path: Path, frame: int | None, what: str) -> np.ndarray:
     kind = path.suffix.lower()
     if kind in NOT_IMAGES:
         raise checks.InputError(f"{path} is not an image. {NOT_IMAGES[kind]}")
+    if kind in (".jpg", ".jpeg") and what == "mask":
+        raise checks.InputError(f"{path}: JPEG changes numbers. Save masks as .tif or .png.")
     if kind not in (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".npy", ".nc"):
         raise checks.input_error(what, str(path), "a file .tif, .png, .npy or .nc, or an array")
     try:
@@ -98,6 +100,8 @@ def _file(path: Path, frame: int | None, what: str) -> np.ndarray:
             " It may hold Python objects, which are not loaded since they can execute code; save"
             " the masks alone, as .tif."
             if kind == ".npy" and "pickle" in str(error)
+            else " Install imagecodecs, or save the image without compression."
+            if "imagecodecs" in str(error)
             else " Is it truncated, or a file of another kind?"
         )
         raise checks.InputError(

@@ -1,4 +1,4 @@
-"""Cells from label images: the capsule with the second moments of each region."""
+"""Cells from label images: the capsule with the area and the second moment of each region."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchfilm.micrographs.capsule_fit import capsule_of_moments
+from torchfilm.micrographs.capsule_fit import capsule_of_area
 from torchfilm.micrographs.mask_files import EXTRA, read_image
 from torchfilm.micrographs.record import Micrograph, listed
 from torchfilm.tools import checks
@@ -35,9 +35,9 @@ def mask_cells(
 ) -> dict[str, Any]:
     """The arguments of `Cells` for the regions of a label image; `Cells.from_masks` documents it.
 
-    A region's capsule has its centre, its axis and its second central moments. The pixels are taken
-    as points, which leaves no bias: the sum over pixel centres in a shape is, on average over its
-    place, the integral over the shape.
+    A region's capsule has its centre, its axis, its area and its second central moment along the
+    axis. The pixels are taken as points, which leaves no bias: the sum over pixel centres in a
+    shape is, on average over its place, the integral over the shape.
     """
     checks.number("pixel_size", pixel_size, above=0.0, hint="µm a pixel.")
     checks.number("least_area", least_area, least=4, hint="Pixels.")
@@ -64,7 +64,7 @@ def mask_cells(
         raise checks.InputError(
             f"{source}: no cell is left: drop={list(drop)} leaves out all {len(kept)} regions."
         )
-    length, radius = capsule_of_moments(regions["along"], regions["across"])
+    length, radius = capsule_of_area(regions["area"], regions["along"])
     place = pixel_size * np.stack([regions["column"], -regions["row"]], 1)
     shift = np.broadcast_to(-place.mean(0) if centre else np.zeros(2), place.shape)
     return {
@@ -159,8 +159,7 @@ def _problems(
 
 def _misfit(mask: np.ndarray, regions: Mapping[str, np.ndarray]) -> np.ndarray:
     """(N,) whether a region and its capsule differ by over a share `MISFIT` of the area."""
-    across = np.maximum(regions["across"], 1.0 / 12.0)
-    length, radius = capsule_of_moments(np.maximum(regions["along"], across), across)
+    length, radius = capsule_of_area(regions["area"], np.maximum(regions["along"], 1.0 / 12.0))
     rows, columns = np.nonzero(mask)
     at = np.searchsorted(regions["label"], mask[rows, columns])
     away = np.stack([columns - regions["column"][at], rows - regions["row"][at]], 1)
@@ -168,8 +167,8 @@ def _misfit(mask: np.ndarray, regions: Mapping[str, np.ndarray]) -> np.ndarray:
     along = np.clip((away * axis).sum(1), -half, half)
     outside = np.hypot(*(away - along[:, None] * axis).T) > radius[at]
     share = np.bincount(at, outside, len(length)) / regions["area"]
-    area = 2.0 * length * radius + np.pi * radius**2
-    return np.asarray(2.0 * share + area / regions["area"] - 1.0 > MISFIT)
+    # both have one area, so as much of the capsule is outside of the region
+    return np.asarray(2.0 * share > MISFIT)
 
 
 def _report(

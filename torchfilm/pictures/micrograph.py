@@ -22,6 +22,7 @@ WIDTH, HEIGHT, NARROWEST = 7.2, 8.4, 3.2  # inches
 BELOW, BARE = 0.25, 0.65  # inches, for the scale bar; for it and the title, of two lines at most
 PLAIN, OVERLAP = "#19d3f3", "#ff3b30"  # outlines
 SHADES = (0.5, 99.5)  # percentiles of the image that are drawn black and white
+SHALLOW = 0.1  # of a width; masks that touch give capsules that overlap by some less than that
 NAMED = 40  # how many overlapping cells are named
 
 
@@ -31,7 +32,7 @@ def overlay(
     out: str | Path,
     *,
     frame: int | None = None,
-    depth: float = 0.05,
+    depth: float | None = None,
     labels: bool = False,
     dpi: float = 200,
 ) -> Path:
@@ -39,10 +40,10 @@ def overlay(
     path.
 
     cells: of `Cells.from_masks`, or of `Cells.from_table` with a pixel size. over: the micrograph
-    or the label image, an array (rows, columns) or (rows, columns, 3), or a .tif or .png file.
-    out: the picture (.png, .pdf, .svg). frame: of a stack. Cells that overlap by more than `depth`
-    µm are red and carry their labels. labels: name all cells. Raises InputError if the cells are
-    not from an image, or lie outside of this one.
+    or the label image, an array (rows, columns) or (rows, columns, 3), or a .tif or .png file. out:
+    the picture (.png, .pdf, .svg). frame: of a stack. Cells that overlap by more than `depth` µm,
+    by default a tenth of their median width, are red and carry their labels. labels: name all
+    cells. Raises InputError if the cells are not from an image, or lie outside of this one.
     """
     figure_class()
     if not isinstance(cells, Cells):
@@ -54,6 +55,8 @@ def overlay(
             "these cells have no pixel size, so their places in an image are unknown. Read them by"
             " Cells.from_masks, or by Cells.from_table with pixel_size=…."
         )
+    if depth is None:
+        depth = SHALLOW * 2.0 * float(np.median(cells.radius)) if cells.count else 0.0
     checks.number("depth", depth, least=0.0, hint="µm.")
     image, source = read_image(over, frame, "micrograph")
     seen = cells.micrograph
@@ -67,10 +70,10 @@ def overlay(
     touching = list(dict.fromkeys(k for i, j, _ in found for k in (i, j)))  # the deepest first
     _draw(ax, cells, seen, image, touching, range(cells.count) if labels else touching[:NAMED])
     scale_bar(ax)
-    words = f"none overlap by over {depth:g} µm"
+    words = f"none overlap by over {depth:.2g} µm"
     if found:
         pairs = "1 pair overlaps" if len(found) == 1 else f"{len(found)} pairs overlap"
-        words = f"{pairs} by over {depth:g} µm (red), the deepest by {found[0][2]:.2g} µm"
+        words = f"{pairs} by over {depth:.2g} µm (red), the deepest by {found[0][2]:.2g} µm"
     set_page_title(figure, f"{cells.count} cells over {Path(source).name}; {words}")
     return save(figure, out)
 
@@ -116,11 +119,8 @@ def _draw(
 
 
 def _grey(image: np.ndarray) -> np.ndarray:
-    """An image from 0, black, to 1, white. Colours keep their range."""
-    values = image.astype(np.float64)
-    if image.ndim == 3:
-        most = np.iinfo(image.dtype).max if image.dtype.kind in "iu" else 1.0
-        return np.asarray(np.clip(values[..., :3] / most, 0.0, 1.0))
+    """An image from 0, black, to 1, white; its colours without their opacity."""
+    values = image[..., :3].astype(np.float64) if image.ndim == 3 else image.astype(np.float64)
     finite = values[np.isfinite(values)]
     if not finite.size:
         raise checks.InputError("the micrograph has no finite number.")
