@@ -90,7 +90,7 @@ def main() -> None:
     cells = write_table(table)
     begin = time.perf_counter()
     observed = Observed.from_table(
-        table, species=["gfp"], pixel_size=PIXEL, tip_to_tip=True, time=HOURS
+        table, species=["gfp"], pixel_size=PIXEL, length_with_caps=True, time=HOURS
     )
     print(observed.table())
     posterior = infer(

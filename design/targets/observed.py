@@ -95,7 +95,7 @@ class Observed(Target):
         angle_unit: str | None = None,
         time_unit: str | None = None,
         columns: Mapping[str, str] | None = None,
-        tip_to_tip: bool = False,
+        length_with_caps: bool = False,
         relative: bool = False,
         rings: int = 4,
         reach: float = 3.0,
@@ -111,9 +111,9 @@ class Observed(Target):
         angle_deg or angle_rad, age_h or age_min) or in arguments: pixel_size, µm a pixel;
         length_unit "um"; angle_unit "degrees" or "radians"; time_unit "h" or "min".
 
-        tip_to_tip: lengths include the caps, as masks measure them. relative: levels count relative
-        to their mean in the colony, for a reporter in arbitrary units. rings: how many, out to
-        where 95 % of the cells are. reach: µm; cells with closer centres are neighbours. time: h,
+        length_with_caps: lengths include the caps, as masks measure them. relative: levels count
+        relative to their mean in the colony, for a reporter in arbitrary units. rings: how many,
+        out to where 95 % of the cells are. reach: µm; cells with closer centres are neighbours. time: h,
         when the colonies were observed. like: another `Observed`, whose rings and options are
         taken, so that both compare the same statistics.
 
@@ -123,7 +123,7 @@ class Observed(Target):
         names = species_names("Observed.species", tuple(species)) if species else ()
         units = tf.tables.Units(pixel_size, length_unit, angle_unit, time_unit)
         cells = read_table(table, names, units, columns or {})
-        plan = _plan(cells, names, rings, reach, tip_to_tip, relative)
+        plan = _plan(cells, names, rings, reach, length_with_caps, relative)
         return _observed(cells, plan if like is None else like.plan, time)
 
     @staticmethod
@@ -132,7 +132,7 @@ class Observed(Target):
         *,
         species: Sequence[str] = (),
         history: Tensor | None = None,
-        tip_to_tip: bool = False,
+        length_with_caps: bool = False,
         relative: bool = False,
         rings: int = 4,
         reach: float = 3.0,
@@ -143,10 +143,18 @@ class Observed(Target):
         names = species_names("Observed.species", tuple(species)) if species else ()
         require(state, names)
         whole = ColonyStatistics(
-            True, history is not None, True, True, names, (0.0, 1.0), 1.0, tip_to_tip, relative
+            True,
+            history is not None,
+            True,
+            True,
+            names,
+            (0.0, 1.0),
+            1.0,
+            length_with_caps,
+            relative,
         )
         cells = seen_cells(state, whole, history)
-        plan = _plan(cells, names, rings, reach, tip_to_tip, relative)
+        plan = _plan(cells, names, rings, reach, length_with_caps, relative)
         return _observed(cells, plan if like is None else like.plan, state.time or None)
 
     @staticmethod
@@ -155,7 +163,7 @@ class Observed(Target):
         frame: int = -1,
         *,
         species: Sequence[str] = (),
-        tip_to_tip: bool = False,
+        length_with_caps: bool = False,
         relative: bool = False,
         rings: int = 4,
         reach: float = 3.0,
@@ -173,14 +181,14 @@ class Observed(Target):
             "colony": table["colony"],
             "x_um": table["x"],
             "y_um": table["y"],
-            "length_um": table["length"] + (2.0 * table["radius"] if tip_to_tip else 0.0),
+            "length_um": table["length"] + (2.0 * table["radius"] if length_with_caps else 0.0),
             "angle_rad": np.arctan2(table["axis_y"], table["axis_x"]),
             "age_h": [now - born[key] for key in zip(table["colony"], table["uid"], strict=True)],
             **{name: table[name] for name in species if name in table},
         }
         return Observed.from_table(
-            columns, species=species, tip_to_tip=tip_to_tip, relative=relative, rings=rings,
-            reach=reach, time=now or None, like=like,
+            columns, species=species, length_with_caps=length_with_caps, relative=relative,
+            rings=rings, reach=reach, time=now or None, like=like,
         )  # fmt: skip
 
     @property
@@ -267,14 +275,14 @@ def _plan(
     species: tuple[str, ...],
     rings: int,
     reach: float,
-    tip_to_tip: bool,
+    length_with_caps: bool,
     relative: bool,
 ) -> ColonyStatistics:
     """The statistics of all that is known of some cells."""
     if isinstance(rings, bool) or not isinstance(rings, int) or not 1 <= rings <= 50:
         raise checks.input_error("Observed(rings)", rings, "a whole number from 1 to 50")
     checks.number("Observed(reach)", reach, above=0.0)
-    checks.choice("Observed(tip_to_tip)", tip_to_tip, (True, False))
+    checks.choice("Observed(length_with_caps)", length_with_caps, (True, False))
     checks.choice("Observed(relative)", relative, (True, False))
     edges: tuple[float, ...] = ()
     if cells.position is not None:
@@ -289,7 +297,7 @@ def _plan(
         species=species,
         edges=edges,
         reach=reach,
-        tip_to_tip=tip_to_tip,
+        length_with_caps=length_with_caps,
         relative=relative,
     )
 

@@ -42,9 +42,9 @@ class ColonyStatistics:
 
     lengths, ages, positions, alignment: whether the lengths, ages, places and directions of cells
     are known. species: reporters. edges: of the rings around the centre of the colony, µm, the
-    first 0. reach: cells whose centres are closer are neighbours, µm. tip_to_tip: lengths include
-    the caps. relative: levels count relative to the mean of their colony. omitted: groups that are
-    left out.
+    first 0. reach: cells whose centres are closer are neighbours, µm. length_with_caps: lengths
+    include the caps. relative: levels count relative to the mean of their colony. omitted: groups
+    that are left out.
     """
 
     lengths: bool
@@ -54,7 +54,7 @@ class ColonyStatistics:
     species: tuple[str, ...]
     edges: tuple[float, ...]
     reach: float
-    tip_to_tip: bool
+    length_with_caps: bool
     relative: bool
     omitted: tuple[str, ...] = ()
 
@@ -152,7 +152,7 @@ def seen_cells(state: tf.State, plan: ColonyStatistics, history: Tensor | None) 
     flat = state.axis[:, :2].double()
     size = flat.square().sum(1, keepdim=True).sqrt()
     upright = torch.tensor([1.0, 0.0], dtype=torch.float64, device=flat.device)
-    length = state.length.double() + (2.0 * state.radius.double() if plan.tip_to_tip else 0.0)
+    length = state.length.double() + (2.0 * state.radius.double() if plan.length_with_caps else 0.0)
     found = [levels(state, name).double() for name in plan.species]
     return SeenCells(
         colony=state.colony,

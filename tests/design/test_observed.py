@@ -127,9 +127,9 @@ def test_rows_of_a_table_may_come_in_any_order(seen):
     assert other.values == pytest.approx(one.values) and other.cells == one.cells
 
 
-def test_lengths_from_tip_to_tip_include_the_caps(seen):
+def test_lengths_from_length_with_caps_include_the_caps(seen):
     state, _ = seen
-    one, whole = (Observed.from_state(state, tip_to_tip=w) for w in (False, True))
+    one, whole = (Observed.from_state(state, length_with_caps=w) for w in (False, True))
     k = one.plan.names.index("length_50_um")
     assert whole.values[k] == pytest.approx(one.values[k] + 1.0)
 

@@ -292,9 +292,14 @@ def test_files_with_objects_are_not_loaded(tmp_path):
 
 @pytest.mark.parametrize(
     "name, message",
-    [("a.csv", "Cells.from_table"), ("a.jpg", "JPEG changes numbers"), ("a.mat", "regs_label"), ("a.xyz", r"\.tif, \.png"),
-     ("other.nc", "not a results file of DeLTA")],
-)  # fmt: skip
+    [
+        ("a.csv", "Cells.from_table"),
+        ("a.jpg", "JPEG changes numbers"),
+        ("a.mat", "regs_label"),
+        ("a.xyz", r"\.tif, \.png"),
+        ("other.nc", "not a results file of DeLTA"),
+    ],
+)
 def test_files_of_other_kinds_are_reported(tmp_path, name, message):
     with h5py.File(tmp_path / "other.nc", "w") as file:
         file["x"] = [0.0]

@@ -73,7 +73,7 @@ def overlay(
     words = f"none overlap by over {depth:.2g} µm"
     if found:
         pairs = "1 pair overlaps" if len(found) == 1 else f"{len(found)} pairs overlap"
-        words = f"{pairs} by over {depth:.2g} µm (red), the deepest by {found[0][2]:.2g} µm"
+        words = f"{pairs} by over {depth:.2g} µm (red), by up to {found[0][2]:.2g} µm"
     set_page_title(figure, f"{cells.count} cells over {Path(source).name}; {words}")
     return save(figure, out)
 
@@ -99,7 +99,7 @@ def _draw(
             list(shapes),
             facecolors="none",
             edgecolors=list(colours),
-            linewidths=min(1.0, max(0.3, 0.5 * pixel)),
+            linewidths=min(1.0, max(0.5, 0.5 * pixel)),
         )
     )
     for k in named:
