@@ -302,6 +302,22 @@ class Cells:
 
         return relax(self, depth)
 
+    def table(self) -> dict[str, np.ndarray]:
+        """The cells as columns (N,) with their units in the names, for `from_table`, for
+        `design.Observed.from_table` or for a DataFrame: x_um, y_um, z_um in space, length_um (of
+        the centreline), radius_um, the axis (in the plane angle_rad), cell_type and colony where
+        given, and the further fields."""
+        columns = {f"{n}_um": self.position[:, k] for k, n in enumerate("xyz"[: self.dim])}
+        columns |= {"length_um": self.length, "radius_um": self.radius}
+        if self.dim == 2:
+            columns["angle_rad"] = np.arctan2(self.axis[:, 1], self.axis[:, 0])
+        else:
+            columns |= {f"axis_{n}": self.axis[:, k] for k, n in enumerate("xyz")}
+        for name in ("cell_type", "colony"):
+            if getattr(self, name) is not None:
+                columns[name] = getattr(self, name)
+        return columns | dict(self.extra)
+
     def summary(self) -> str:
         """What was read, for checking: counts, sizes and extent in µm, what was left out, overlaps,
         and how far `relaxed` moved the cells."""

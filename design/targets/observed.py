@@ -113,9 +113,9 @@ class Observed(Target):
 
         length_with_caps: lengths include the caps, as masks measure them. relative: levels count
         relative to their mean in the colony, for a reporter in arbitrary units. rings: how many,
-        out to where 95 % of the cells are. reach: µm; cells with closer centres are neighbours. time: h,
-        when the colonies were observed. like: another `Observed`, whose rings and options are
-        taken, so that both compare the same statistics.
+        out to where 95 % of the cells are. reach: µm; cells with closer centres are neighbours.
+        time: h, when the colonies were observed. like: another `Observed`, whose rings and options
+        are taken, so that both compare the same statistics.
 
         Raises InputError for a table without units, a column that is missing or not numbers, and
         arguments that nothing uses.

@@ -314,6 +314,13 @@ def test_a_csv_file_is_read_and_its_faults_are_named(tmp_path):
         Observed.from_table(tmp_path / "none.csv")
 
 
+def test_cells_of_a_micrograph_are_observed():
+    cells = tf.Cells([[0.0, 0.0], [0.0, 3.0]], [[1.0, 0.0], [1.0, 0.0]], [2.0, 4.0])
+    target = Observed.from_table(cells.table())
+    found = dict(zip(target.plan.names, target.values, strict=True))
+    assert found["length_50_um"] == pytest.approx(3.0)
+
+
 def test_a_species_that_the_scene_lacks_is_refused():
     target = Observed.from_table({"length_um": [2.0, 3.0], "rfp": [1.0, 2.0]}, species=["rfp"])
     with pytest.raises(tf.InputError, match="rfp"):

@@ -92,6 +92,19 @@ def test_a_data_frame_and_a_csv_file_give_the_same_cells(tmp_path):
     assert set(tf.Cells.from_table(tmp_path / "own.csv", angle_unit="degrees").extra) == {"t"}
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cells_are_the_same_after_a_table(dim):
+    rng = np.random.default_rng(0)
+    cells = tf.Cells(
+        rng.normal(size=(5, dim)), rng.normal(size=(5, dim)), rng.uniform(1, 2, 5), 0.4,
+        cell_type=[0, 1, 0, 1, 2], colony=[0, 0, 1, 1, 1], extra={"gfp": rng.uniform(size=5)},
+    )  # fmt: skip
+    again = tf.Cells.from_table(cells.table())
+    for name in ("position", "axis", "length", "radius", "cell_type", "colony"):
+        assert np.allclose(getattr(again, name), getattr(cells, name), rtol=0, atol=1e-15)
+    assert np.array_equal(again.extra["gfp"], cells.extra["gfp"])
+
+
 # --- degrees and radians --------------------------------------------------------------------------
 
 
