@@ -101,7 +101,7 @@ def test_cells_are_the_same_after_a_table(dim):
     )  # fmt: skip
     again = tf.Cells.from_table(cells.table())
     for name in ("position", "axis", "length", "radius", "cell_type", "colony"):
-        assert np.allclose(getattr(again, name), getattr(cells, name), rtol=0, atol=1e-15)
+        assert np.allclose(getattr(again, name), getattr(cells, name), rtol=0, atol=1e-12)
     assert np.array_equal(again.extra["gfp"], cells.extra["gfp"])
 
 
