@@ -41,6 +41,7 @@ from torchfilm.version import __version__
 
 if TYPE_CHECKING:
     from torchfilm import measure, pictures, scenes
+    from torchfilm.cellmodeller import from_cellmodeller
     from torchfilm.explanation import explain
     from torchfilm.io.recorder import Recorder
     from torchfilm.io.results import Results
@@ -55,6 +56,7 @@ _LAZY = {
     "Recorder": "torchfilm.io.recorder",
     "Results": "torchfilm.io.results",
     "explain": "torchfilm.explanation",
+    "from_cellmodeller": "torchfilm.cellmodeller",
     "show": "torchfilm.pictures",
     "Settings": "torchfilm.tuning.settings",
     "preset": "torchfilm.tuning.settings",
@@ -108,6 +110,7 @@ __all__ = [
     "effect",
     "explain",
     "failures",
+    "from_cellmodeller",
     "keep_memory",
     "kinetics",
     "measure",

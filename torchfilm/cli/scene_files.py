@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from torchfilm import scenes
+from torchfilm.cellmodeller import from_cellmodeller, is_script
 from torchfilm.cli.model_files import is_model, scene_of_model
 from torchfilm.scene import Scene
 from torchfilm.scenes.recipes import parse_value, to_plain
@@ -50,6 +51,9 @@ def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -
             " (.xml) or Antimony (.ant), or of a saved design (.json)",
             _hint(path),
         )
+    if is_script(path):
+        made = _call(from_cellmodeller, f"CellModeller script {what}", {"path": path, **parameters})
+        return made.replace(settings=to_plain(parameters))
     names = _run_scene_file(path, what)
     if function not in names:
         raise InputError(

@@ -1,0 +1,6 @@
+"""CellModeller 4 scripts as scenes: a script runs with stand-ins that record what it asks for."""
+
+from torchfilm.cellmodeller.build import from_cellmodeller
+from torchfilm.cellmodeller.loading import is_script
+
+__all__ = ["from_cellmodeller", "is_script"]

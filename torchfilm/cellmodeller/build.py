@@ -1,0 +1,236 @@
+"""Builds a scene from what a script has asked for."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchfilm.cellmodeller import draws
+from torchfilm.cellmodeller.columns import ColumnRule, Uneven
+from torchfilm.cellmodeller.loading import Script, importing, load
+from torchfilm.cellmodeller.rates import SIGNAL, SPECIES, TextRates
+from torchfilm.cellmodeller.rehearsal import rehearse
+from torchfilm.cellmodeller.script_rules import ScriptRules
+from torchfilm.cellmodeller.sheets import Layout
+from torchfilm.cellmodeller.stand_ins import RADIUS
+from torchfilm.effect import Effect
+from torchfilm.effects.circuit import Circuit
+from torchfilm.effects.division import Division
+from torchfilm.effects.growth import Growth
+from torchfilm.effects.mechanics import Mechanics
+from torchfilm.effects.medium import Medium, Signal
+from torchfilm.initial_cells import Cells
+from torchfilm.physics.walls import Plane, Sphere, Wall
+from torchfilm.scene import Scene
+from torchfilm.signals.boundary_conditions import BoundaryConditions, Dirichlet, NoFlux, Periodic
+from torchfilm.state import State
+from torchfilm.tools import checks
+from torchfilm.tools.checks import InputError
+from torchfilm.tools.hashing import digest
+from torchfilm.tools.warn_once import warn
+
+LOOPS = ("auto", "columns", "cells")
+GAMMA = 10.0  # CLBacterium's
+# CellModeller draws each component of a daughter's axis from ±0.001
+AXIS_NOISE = 0.001 / math.sqrt(3.0)
+# transportRates divides the diffusion constant by 6 as well as by h²; the Crank–Nicolson integrator
+# halves it again, and does not store what its implicit half gives
+SPREAD = {"CLEulerSigIntegrator": 1 / 6, "CLCrankNicIntegrator": 1 / 12}
+BOUNDARIES = ("constant", "reflect", "nearest", "wrap")
+
+
+def from_cellmodeller(
+    path: str | Path, *, loop: str = "auto", contacts: str = "one-sided", method: str = "rosenbrock"
+) -> Scene:
+    """The scene of a CellModeller 4 script, which runs as Python: its file, `setup(sim)`, and in
+    each step `update(cells)` and `divide(parent, d1, d2)`.
+
+    loop: "columns", `update` acts on all cells at once; "cells", one cell after the other, which is
+    slow; "auto", columns where the loop is plain. contacts: as for `Mechanics`. method: of
+    `Circuit`. Raises InputError, with the line of the script, for what is not supported.
+    """
+    checks.choice("loop", loop, LOOPS)
+    path = Path(path)
+    if not path.is_file():
+        raise checks.input_error("script", str(path), "the path of a Python file", "No such file.")
+    script = load(path)
+    for words in script.request.ignored:
+        warn(f"{path.name}: {words}, and so does torchfilm.")
+    dim = 2 if _is_flat(script) else 3
+    founders = _founders(script, dim)
+    rules = script_rules(script, loop, founders)
+    options = script.request.options or {}
+    effects: list[Effect] = [
+        rules,
+        Growth(law="length"),
+        Division(axis_noise=AXIS_NOISE),
+        Mechanics(
+            dim=dim,
+            walls=_walls(script, dim),
+            length_drag=float(options.get("gamma", GAMMA)),
+            viscosity=float(options.get("muA", 1.0)),
+            contacts=contacts,
+        ),
+        *_chemistry(script, method),
+    ]
+    return Scene(*effects, name=path.stem, dt=script.dt, founders=founders)
+
+
+def script_rules(script: Script, loop: str, founders: Cells | None = None) -> ScriptRules:
+    """The effect of a script, after a rehearsal of its functions."""
+    founders = founders or _founders(script, 2 if _is_flat(script) else 3)
+    integrator, grid = script.request.integrator, script.request.grid
+    options = script.request.options or {}
+    species = _count("nSpecies", integrator["species"]) if integrator else 0
+    signals = _count("nSignals", grid["signals"]) if grid else 0
+    bare = Layout({}, species, signals, bool(options.get("compNeighbours")))
+    layout, first = rehearse(script, bare, founders)
+    rule, reason = None, "--set loop=cells"
+    if loop != "cells":
+        try:
+            rule = _column_rule(script, layout, first)
+        except Uneven as error:
+            reason = str(error)
+            if loop == "columns":
+                raise InputError(
+                    f"{script.path.name}: update(cells) cannot act on whole columns: {reason}."
+                ) from error
+    if rule is None:
+        warn(
+            f"{script.path.name}: update(cells) runs cell by cell, which is slow ({reason})."
+            " A loop is fast where it only calculates with the cell's own numbers."
+        )
+    used = "cells" if rule is None else "columns"
+    return ScriptRules(str(script.path), digest(script.text), used, reason, script, layout, rule)
+
+
+def _column_rule(script: Script, layout: Layout, first: State) -> ColumnRule:
+    """The rule on whole columns, tried on first cells. Raises Uneven if there is none."""
+    rule = ColumnRule(script.text, script.module, layout)
+    if script.mentions("deathFlag"):
+        raise Uneven("it uses deathFlag")
+    rule.act(first)
+    return rule
+
+
+def _count(name: str, given: Any) -> int:
+    if isinstance(given, bool) or not isinstance(given, int) or given < 1:
+        raise checks.input_error(name, given, "a whole number from 1")
+    return given
+
+
+# --- geometry -----------------------------------------------------------------------------
+
+
+def _vector(name: str, value: Any) -> tuple[float, float, float]:
+    found = checks.vector(name, value, 3)
+    return (float(found[0]), float(found[1]), float(found[2]))
+
+
+def _is_flat(script: Script) -> bool:
+    """Whether no cell can leave the plane z = 0: CLBacterium(jitter_z=False), first cells in it,
+    and no wall that presses them out of it."""
+    request = script.request
+    if (request.options or {}).get("jitter_z", True):
+        return False
+    for cell in request.cells:
+        for name, default in (("pos", (0, 0, 0)), ("dir", (1, 0, 0))):
+            if _vector(f"addCell({name}=…)", cell.get(name, default))[2] != 0:
+                return False
+    radius = max([float(c.get("rad", RADIUS)) for c in request.cells], default=RADIUS)
+    for point, normal, _ in request.planes:
+        p, n = _vector("addPlane: point", point), _vector("addPlane: normal", normal)
+        if n[2] != 0 and ((n[0], n[1]) != (0, 0) or -p[2] * n[2] < radius * abs(n[2]) - 1e-6):
+            return False
+    return all(_vector("addSphere: centre", s[0])[2] == 0 for s in request.spheres)
+
+
+def _founders(script: Script, dim: int) -> Cells:
+    cells = script.request.cells
+    if not cells:
+        raise InputError(f"{script.path.name}: setup(sim) adds no cell (sim.addCell).")
+    pos = [_vector("addCell(pos=…)", c.get("pos", (0, 0, 0))) for c in cells]
+    axis = [_vector("addCell(dir=…)", c.get("dir", (1, 0, 0))) for c in cells]
+    return Cells(
+        np.array(pos)[:, :dim],
+        np.array(axis)[:, :dim],
+        [float(c["length"]) for c in cells],
+        [float(c.get("rad", RADIUS)) for c in cells],
+        cell_type=[c["cellType"] for c in cells],
+    )
+
+
+def _walls(script: Script, dim: int) -> list[Wall]:
+    walls: list[Wall] = []
+    for point, normal, coefficient in script.request.planes:
+        p, n = _vector("addPlane: point", point), _vector("addPlane: normal", normal)
+        if dim == 2 and (n[0], n[1]) == (0, 0):
+            continue  # it touches no cell in the plane
+        weight = checks.number("addPlane: coefficient", coefficient, above=0.0)
+        walls.append(Plane(point=p[:dim], normal=n[:dim], weight=weight))
+    for centre, radius, coefficient, sign in script.request.spheres:
+        checks.choice("addSphere: norm", sign, (-1, 1))
+        walls.append(
+            Sphere(
+                _vector("addSphere: centre", centre)[:dim],
+                radius,
+                inside=sign < 0,
+                weight=checks.number("addSphere: coefficient", coefficient, above=0.0),
+            )
+        )
+    return walls
+
+
+# --- species and signals ------------------------------------------------------------------
+
+
+def _chemistry(script: Script, method: str) -> list[Effect]:
+    integrator, grid = script.request.integrator, script.request.grid
+    if integrator is None:
+        return []
+    texts: list[str | None] = []
+    for name, wanted in (("specRateCL", True), ("sigRateCL", grid is not None)):
+        function = script.function(name)
+        if wanted and function is None:
+            raise InputError(
+                f"{script.path.name}: {integrator['kind']} needs the function {name}()."
+            )
+        with draws.kept(), importing(script.path, script.module), script.errors(f"{name}()"):
+            texts.append(function() if wanted and function is not None else None)
+    volume = None if grid is None else float(math.prod(_vector("gridSize", grid["size"])))
+    count = integrator["species"]
+    rates = TextRates(texts[0], texts[1], count, grid["signals"] if grid else 0, volume)
+    circuit = Circuit(rates, species=[SPECIES.format(k) for k in range(count)], method=method)
+    return [circuit] if grid is None else [circuit, _medium(integrator, grid)]
+
+
+def _medium(integrator: dict[str, Any], grid: dict[str, Any]) -> Medium:
+    """The grid of CellModeller: values at its nodes are here the centres of voxels."""
+    checks.choice("boundcond", integrator["boundary"], BOUNDARIES)
+    count = grid["signals"]
+    origin, size = np.array(grid["origin"], float), np.array(_vector("gridSize", grid["size"]))
+    low = origin - size / 2
+    high = low + np.array(grid["dim"]) * size
+    if len(grid["diffusion"]) != count:
+        raise InputError(
+            f"GridDiffusion has {count} signals and {len(grid['diffusion'])} values of D."
+        )
+    first = grid["initial"] or [0.0] * count
+    faces: dict[str, Any] = {"wrap": Periodic(), "reflect": NoFlux(), "nearest": NoFlux()}
+    signals: dict[str, Any] = {}
+    for k in range(count):
+        face = faces.get(integrator["boundary"], Dirichlet(float(first[k])))
+        signals[SIGNAL.format(k)] = Signal(
+            diffusion=float(grid["diffusion"][k]) * SPREAD[integrator["kind"]],
+            initial=float(first[k]),
+            boundary=BoundaryConditions(x=face, y=face, z=face),
+        )
+    return Medium(
+        **signals,
+        box=(tuple(low.tolist()), tuple(high.tolist())),
+        spacing=tuple(size.tolist()),
+        outside="reservoir",
+    )

@@ -1,0 +1,143 @@
+"""Loads a CellModeller script: runs the file and its `setup(sim)`, with stand-ins for CellModeller.
+
+This is Python that the user names. Nothing else that torchfilm reads can execute.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from torchfilm.cellmodeller import draws, stand_ins
+from torchfilm.cellmodeller.time_limit import TooLong, time_limit
+from torchfilm.tools import checks
+from torchfilm.tools.checks import InputError
+
+SETUP_SECONDS = 60.0  # that a script may take to be loaded and set up
+FUNCTIONS = ("setup", "init", "update")
+OLD = re.compile(r"^\s*print\s+[^(\s=]", re.MULTILINE)
+
+
+@dataclass
+class Script:
+    """A script that has been set up. text: its source. request: what it asked for. dt: h."""
+
+    path: Path
+    text: str
+    module: ModuleType
+    request: stand_ins.Request
+    dt: float
+
+    def function(self, name: str) -> Callable[..., Any] | None:
+        found = getattr(self.module, name, None)
+        return found if callable(found) else None
+
+    def mentions(self, name: str) -> bool:
+        """Whether a word stands in the source."""
+        return re.search(rf"\b{re.escape(name)}\b", self.text) is not None
+
+    @contextmanager
+    def errors(self, doing: str) -> Iterator[None]:
+        """Raise InputError, with the line of the script, for what fails within."""
+        try:
+            yield
+        except TooLong:
+            raise InputError(
+                f"{self.path.name} was stopped after {SETUP_SECONDS:g} s in {doing}: does it loop"
+                " for ever?"
+            ) from None
+        except SystemExit as error:
+            raise InputError(f"{self._at(error)}: {doing} ends the program.") from error
+        except ModuleNotFoundError as error:
+            raise InputError(f"{self._at(error)}: {_missing(str(error.name))}") from error
+        except InputError as error:
+            raise InputError(f"{self._at(error)}: {error}") from error
+        except Exception as error:
+            raise InputError(
+                f"{self._at(error)}: {doing} fails: {type(error).__name__}: {error}"
+            ) from error
+
+    def _at(self, error: BaseException) -> str:
+        """The file and the last of its lines that led to an error."""
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [f.lineno for f in frames if f.filename == str(self.path)]
+        return f"{self.path.name}, line {lines[-1]}" if lines else self.path.name
+
+
+def is_script(path: Path) -> bool:
+    """Whether a file is a CellModeller script: it defines `setup`, `init` and `update`."""
+    if path.suffix != ".py" or not path.is_file():
+        return False
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return all(re.search(rf"^def\s+{name}\s*\(", text, re.MULTILINE) for name in FUNCTIONS)
+
+
+def load(path: Path) -> Script:
+    """Run a script and its `setup(sim)`. Raises InputError, with the line, for what is refused."""
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise checks.input_error("script", str(path), "a readable Python file in UTF-8") from error
+    module = ModuleType(path.stem)
+    module.__file__ = str(path)
+    request = stand_ins.Request()
+    script = Script(path, text, module, request, stand_ins.DT)
+    code = _compiled(path, text)
+    sim = stand_ins.Simulator(request, module)
+    with draws.kept(), importing(path, module), script.errors("loading"):
+        draws.seed("load")
+        with time_limit(SETUP_SECONDS), redirect_stdout(sys.stderr):
+            exec(code, vars(module))
+            vars(module)["setup"](sim)
+    if not request.started:
+        raise InputError(f"{path.name}: setup(sim) does not call sim.init(…).")
+    script.dt = checks.number("sim.dt", sim.dt, above=0.0)
+    return script
+
+
+@contextmanager
+def importing(path: Path, module: ModuleType) -> Iterator[None]:
+    """Within, imports of CellModeller find the stand-ins, and those of the script's folder its
+    files."""
+    folder = str(path.parent.resolve())
+    others, place = sys.modules.get(module.__name__), list(sys.path)
+    sys.path.insert(0, folder)
+    sys.modules[module.__name__] = module
+    try:
+        with stand_ins.installed():
+            yield
+    finally:
+        sys.path[:] = place
+        del sys.modules[module.__name__]
+        if others is not None:
+            sys.modules[module.__name__] = others
+
+
+def _compiled(path: Path, text: str) -> Any:
+    try:
+        return compile(ast.parse(text, str(path)), str(path), "exec", dont_inherit=True)
+    except (SyntaxError, ValueError) as error:
+        line = getattr(error, "lineno", None)
+        at = f"{path.name}, line {line}" if line else path.name
+        if OLD.search(text):
+            raise InputError(
+                f"{at}: the script is written in Python 2 (print without brackets). Convert it"
+                " first."
+            ) from error
+        raise InputError(f"{at}: {getattr(error, 'msg', error)}") from error
+
+
+def _missing(name: str) -> str:
+    """What to do about a module that is not there."""
+    if name.split(".")[0] == stand_ins.ROOT:
+        known = ", ".join(f"{stand_ins.ROOT}.{n}" for n in stand_ins.CLASSES)
+        return f"{name} is not supported by torchfilm; known are {known}."
+    return f"the script imports {name}, which is not installed: install it, or delete the import."
