@@ -173,8 +173,8 @@ def _call_on(update: Callable[..., Any], cells: dict[int, Cell]) -> None:
     update(cells)
     if list(cells) != before:
         raise InputError(
-            "update(cells) adds or deletes entries of `cells`: set cell.deathFlag = True to remove a"
-            " cell."
+            "update(cells) adds or deletes entries of `cells`: set cell.deathFlag = True to remove"
+            " a cell."
         )
 
 

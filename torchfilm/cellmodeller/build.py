@@ -104,7 +104,7 @@ def script_rules(script: Script, loop: str, founders: Cells | None = None) -> Sc
             " A loop is fast where it only calculates with the cell's own numbers."
         )
     used = "cells" if rule is None else "columns"
-    return ScriptRules(str(script.path), digest(script.text), used, reason, script, layout, rule)
+    return ScriptRules(script.path.name, digest(script.text), used, reason, script, layout, rule)
 
 
 def _column_rule(script: Script, layout: Layout, first: State) -> ColumnRule:

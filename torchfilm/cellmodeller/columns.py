@@ -214,6 +214,12 @@ class _Turn:
 
     _tuple = _list
 
+    def _dict(self, node: ast.Dict) -> dict[Any, Any]:
+        keys = [self.value(k) for k in node.keys if k is not None]
+        if not all(isinstance(k, PLAIN) for k in keys):
+            raise Uneven("a dict that is not plain")
+        return dict(zip(keys, map(self.value, node.values), strict=True))
+
     def _name(self, node: ast.Name) -> Any:
         name = node.id
         if name == self.id and name:
@@ -233,7 +239,7 @@ class _Turn:
         home = self.value(node.value)
         if isinstance(home, ModuleType) and home in (math, np):
             return getattr(home, node.attr)
-        raise Uneven("it reads an attribute of something else than the cell")
+        raise Uneven(f"it uses {ast.unparse(node)}")
 
     def _subscript(self, node: ast.Subscript) -> Any:
         home, key = self.value(node.value), self.value(node.slice)
@@ -294,7 +300,14 @@ class _Turn:
 
     def _ifexp(self, node: ast.IfExp) -> Any:
         condition = self.truth(node, self.value(node.test))
-        return _where(condition, self.value(node.body), self.value(node.orelse))
+        if isinstance(condition, bool):
+            return self.value(node.body if condition else node.orelse)
+        mask, ways = self.mask, []
+        for way, part in ((condition, node.body), (~condition, node.orelse)):
+            self.mask = way if mask is None else mask & way
+            ways.append(self.value(part))
+        self.mask = mask
+        return _where(condition, *ways)
 
     def _call(self, node: ast.Call) -> Any:
         function = self.value(node.func)
@@ -332,6 +345,8 @@ class _Turn:
         if name in FIELDS and FIELDS[name] in s.fields:
             values = s.fields[FIELDS[name]]
             return values if values.dtype == torch.bool else values.double()
+        if name == "id":
+            return (s.uid + 1).double()
         if name in ("length", "volume", "radius"):
             return (s.radius if name == "radius" else s.length).double()
         if name in ("pos", "dir"):

@@ -13,6 +13,8 @@ from contextlib import contextmanager
 
 import numpy as np
 
+# ruff: noqa: NPY002 - scripts use numpy's global generator
+
 
 @contextmanager
 def kept() -> Iterator[None]:

@@ -10,7 +10,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -21,7 +21,7 @@ from torchfilm.cellmodeller.time_limit import TooLong, time_limit
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 
-SETUP_SECONDS = 60.0  # that a script may take to be loaded and set up
+SETUP_SECONDS = 60.0  # that a script may take to be set up, and each function in its rehearsal
 FUNCTIONS = ("setup", "init", "update")
 OLD = re.compile(r"^\s*print\s+[^(\s=]", re.MULTILINE)
 
@@ -40,9 +40,20 @@ class Script:
         found = getattr(self.module, name, None)
         return found if callable(found) else None
 
+    def place_of(self, attribute: str) -> str:
+        """The file, and the line where it first sets an attribute of a cell."""
+        found = re.search(rf"\.{re.escape(attribute)}\s*[-+*/]?=", self.text)
+        line = f", line {self.text[: found.start()].count(chr(10)) + 1}" if found else ""
+        return self.path.name + line
+
     def mentions(self, name: str) -> bool:
         """Whether a word stands in the source."""
         return re.search(rf"\b{re.escape(name)}\b", self.text) is not None
+
+    @staticmethod
+    def limited() -> AbstractContextManager[None]:
+        """Within, the script may take SETUP_SECONDS."""
+        return time_limit(SETUP_SECONDS)
 
     @contextmanager
     def errors(self, doing: str) -> Iterator[None]:
@@ -94,7 +105,7 @@ def load(path: Path) -> Script:
     sim = stand_ins.Simulator(request, module)
     with draws.kept(), importing(path, module), script.errors("loading"):
         draws.seed("load")
-        with time_limit(SETUP_SECONDS), redirect_stdout(sys.stderr):
+        with script.limited(), redirect_stdout(sys.stderr):
             exec(code, vars(module))
             vars(module)["setup"](sim)
     if not request.started:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchfilm.cellmodeller.rates_text import Node, parse, refusal
+from torchfilm.tools.hashing import digest
 
 SPECIES, SIGNAL = "species{}", "signal{}"  # names of the fields
 CONSTANTS = {
@@ -61,7 +61,6 @@ CALCULATE: Mapping[str, Callable[[Any, Any], Any]] = {
 }
 
 
-@dataclass(frozen=True)
 class TextRates:
     """Rates of species and signals as a script's OpenCL text gives them.
 
@@ -71,17 +70,23 @@ class TextRates:
     text does not set is 0.
     """
 
-    species_text: str | None
-    signals_text: str | None
-    species: int
-    signals: int
-    grid_volume: float | None
-    trees: tuple[Node | None, Node | None] = field(init=False, repr=False, compare=False)
+    __name__ = "specRateCL"  # by which the scene shows it
 
-    def __post_init__(self) -> None:
-        given = ((self.species_text, "specRateCL"), (self.signals_text, "sigRateCL"))
-        trees = tuple(None if text is None else parse(text, owner) for text, owner in given)
-        object.__setattr__(self, "trees", trees)
+    def __init__(
+        self,
+        species_text: str | None,
+        signals_text: str | None,
+        species: int,
+        signals: int,
+        grid_volume: float | None,
+    ):
+        given = ((species_text, "specRateCL"), (signals_text, "sigRateCL"))
+        self.trees = [None if text is None else parse(text, owner) for text, owner in given]
+        self.species, self.signals, self.grid_volume = species, signals, grid_volume
+        self._word = digest(species_text, signals_text, species, signals, grid_volume)
+
+    def __repr__(self) -> str:
+        return f"TextRates({self._word})"  # by which scenes are compared
 
     def __call__(self, u: Any, s: Any, p: Any, cell: Any) -> Any:
         inside, outside = self.trees

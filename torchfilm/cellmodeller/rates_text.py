@@ -153,16 +153,15 @@ class _Parser:
                 raise self.error("a plain variable is expected")
             name = self.now
             self.at += 1
-            if kind not in ("float", "double"):
+            whole = kind not in ("float", "double")
+            if whole:
                 self.whole.add(name.text)
             if self.now.text == "[":
                 raise self.error("arrays cannot be declared")
-            if self.take("="):
-                value = self.expression()
-                made.append(
-                    Node("set", "declare", (Node("name", name.text, (), name.line), value),
-                         name.line, kind not in ("float", "double"))
-                )  # fmt: skip
+            zero = Node("number", "0", (), name.line, whole)  # until it is set
+            value = self.expression() if self.take("=") else zero
+            target = Node("name", name.text, (), name.line)
+            made.append(Node("set", "declare", (target, value), name.line, whole))
             if not self.take(","):
                 self.need(";")
                 return made

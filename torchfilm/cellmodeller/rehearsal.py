@@ -48,7 +48,7 @@ def rehearse(script: Script, bare: Layout, founders: Cells) -> tuple[Layout, Sta
             found.setdefault(name, []).extend(given)
     if not script.mentions(COLOR):
         del found[COLOR]
-    variables = {**named, **_variables(found, named, bare)}
+    variables = {**named, **_variables(script, found, named, bare)}
     layout = Layout(variables, bare.species, bare.signals, bare.neighbours)
     return layout, _first_state(state, layout, first)
 
@@ -85,7 +85,7 @@ def _rehearsed(script: Script, name: str, calls: Sequence[list[Any]], cells: lis
     function = script.function(name)
     if function is None:
         raise InputError(f"{script.path.name} has no function {name}.")
-    with script.errors(f"{name}(…)"):
+    with script.errors(f"{name}(…)"), script.limited():
         for given in calls:
             draws.seed("rehearsal", name)
             function(*given)
@@ -93,7 +93,7 @@ def _rehearsed(script: Script, name: str, calls: Sequence[list[Any]], cells: lis
 
 
 def _variables(
-    found: dict[str, list[Any]], named: dict[str, Variable], bare: Layout
+    script: Script, found: dict[str, list[Any]], named: dict[str, Variable], bare: Layout
 ) -> dict[str, Variable]:
     """The variables among all that the script has set."""
     others = {*READ_ONLY, *FIELDS, *named, "deathFlag"}
@@ -101,4 +101,10 @@ def _variables(
         others.add("species")
     if not bare.signals:
         others.discard("signals")
-    return {n: variable(n, values) for n, values in found.items() if n not in others}
+    made = {}
+    for name in found.keys() - others:
+        try:
+            made[name] = variable(name, found[name])
+        except InputError as error:
+            raise InputError(f"{script.place_of(name)}: {error}") from error
+    return {name: made[name] for name in sorted(made)}

@@ -20,11 +20,11 @@ class ScriptRules(Effect):
     """A CellModeller script's own functions: `init(cell)` of the first cells, `update(cells)` at
     the start of each step, `divide(parent, d1, d2)` after each division.
 
-    path: the script. content: a digest of its source. loop: "columns", `update` acts on whole
-    columns, or "cells", on one cell after the other; reason: why.
+    name: of the script's file. content: a digest of its source. loop: "columns", `update` acts on
+    whole columns, or "cells", on one cell after the other; reason: why.
     """
 
-    path: str
+    name: str
     content: str
     loop: str
     reason: str = field(repr=False)
@@ -38,15 +38,15 @@ class ScriptRules(Effect):
     writes_anything = True
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_again, (self.path, self.loop))
+        return (_again, (str(self.script.path), self.loop))
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (CELL_TYPE, *(v.declared() for v in self.layout.variables.values()))
 
     def numerics(self, dt: float, state: State) -> list[str]:
         if self.rule is not None:
-            return [f"update(cells) of {Path(self.path).name}, on whole columns"]
-        return [f"update(cells) of {Path(self.path).name}, cell by cell (slow): {self.reason}"]
+            return [f"update(cells) of {self.name}, on whole columns"]
+        return [f"update(cells) of {self.name}, cell by cell (slow): {self.reason}"]
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (BoundScript(self, binding), ScriptDivision(self, binding))

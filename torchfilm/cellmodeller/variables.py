@@ -7,7 +7,7 @@ NaN marks a cell that does not have the variable.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,3 +109,9 @@ def variable(name: str, values: Sequence[Any]) -> Variable:
     made = Variable(name, arrays[0].shape, kind, container if arrays[0].ndim else "number")
     made.column(values)
     return made
+
+
+def own_colour(declared: Mapping[str, Field]) -> str | None:
+    """The field of the colour that a script gives its cells, or None."""
+    found = declared.get(COLOR)
+    return COLOR if found is not None and found.shape == (3,) else None

@@ -14,6 +14,7 @@ import tyro
 from tqdm import tqdm
 
 from torchfilm import pictures, scenes
+from torchfilm.cellmodeller import own_colour
 from torchfilm.cli.report import (
     empty_colonies_note,
     extra_columns_note,
@@ -270,6 +271,7 @@ def go(
     seconds = time.perf_counter() - begun
     print(f"results  {recorder.path}")
     if picture and state.cells:
+        colour = colour or own_colour(state.declared)
         print(f"picture  {pictures.show(recorder.path, colour=colour)}")
     print(summary_table(model.scene, state, timings, seconds))
 

@@ -15,6 +15,7 @@ from torchfilm.state import OUTSIDE
 from torchfilm.tools import checks
 
 ANGLE = "angle"
+VECTORS = ("position", "axis")  # three values of a cell that are no colour
 CELLS, MEAN = "cells", "mean"
 # The darkest cell colour is not black, so that cells are visible on black. Missing values are grey.
 FLOOR, NO_VALUE = 0.14, (0.55, 0.55, 0.55, 1.0)
@@ -129,6 +130,8 @@ class PlotStyle:
                 "a signal of the medium: " + (", ".join(frame.signals) or "there is none"),
             )
         known = [n for n, v in frame.cells.items() if v.ndim == 1]
+        if self.channels is None:
+            known += [n for n in frame.cells if is_rgb(frame.cells, n)]
         for name in self.quantities:
             if name not in known and not (name == ANGLE and self.channels is None):
                 what = "colour" if self.channels is None else "channels"
@@ -137,6 +140,12 @@ class PlotStyle:
                     name,
                     ("'angle' or " if self.channels is None else "") + "one of " + ", ".join(known),
                 )
+
+
+def is_rgb(cells: Mapping[str, np.ndarray], name: str) -> bool:
+    """Whether a quantity of the cells is a colour: three values, red, green and blue."""
+    found = cells.get(name)
+    return found is not None and found.shape[1:] == (3,) and name not in VECTORS
 
 
 def values_of(cells: Mapping[str, np.ndarray], name: str, view: str) -> np.ndarray:
@@ -296,8 +305,14 @@ def paint_cells(
 ) -> np.ndarray:
     """The colour of each cell, (N, 4).
 
-    It shows one quantity, or the sum of the light of its channels, as in fluorescence microscopy.
+    It shows one quantity, or the sum of the light of its channels, as in fluorescence microscopy. A
+    quantity that is a colour itself has no scale.
     """
+    name = style.quantities[0]
+    if style.channels is None and is_rgb(cells, name):
+        own = np.column_stack([np.clip(cells[name], 0.0, 1.0), np.ones(len(cells[name]))])
+        own[np.isnan(own).any(1)] = NO_VALUE
+        return own
     if style.channels is None:
         (scale,) = scales
         return scale.paint(values_of(cells, scale.name, style.view))

@@ -14,6 +14,7 @@ from torchfilm.pictures.colours import (
     PlotStyle,
     Scale,
     ValueRange,
+    is_rgb,
     paint_cells,
     scale_of,
     values_of,
@@ -50,6 +51,8 @@ def draw_cells(
     style = PlotStyle(colour=colour, channels=channels, limits=limits, view=view)
     scales = []
     for name in style.quantities:
+        if channels is None and is_rgb(cells, name):
+            continue
         if (name in cells and cells[name].ndim != 1) or name not in (*cells, "angle"):
             raise checks.input_error(
                 "colour",
@@ -182,7 +185,8 @@ def add_cells(
     # an outline helps where a cell is large on paper; where a cell is small it would hide the
     # colour
     width = min(0.4, 1.2 * inch)
-    edge = "black" if style.channels is None else "#d0d0d0"
+    own = style.channels is None and is_rgb(cells, style.quantities[0])  # which may be black
+    edge = "#808080" if own else "black" if style.channels is None else "#d0d0d0"
     made = PolyCollection(
         list(shapes),
         facecolors=paint_cells(cells, scales, style),

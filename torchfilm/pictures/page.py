@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchfilm.pictures.colours import CELLS, MEAN, PlotStyle, Scale, ValueRange, scale_of
+from torchfilm.pictures.colours import CELLS, MEAN, PlotStyle, Scale, ValueRange, is_rgb, scale_of
 from torchfilm.pictures.draw import (
     add_cells,
     add_signal,
@@ -77,6 +77,7 @@ def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle
         name: ValueRange()
         for name in (*style.quantities, *([style.signal] if style.signal else []))
     }
+    coloured: set[str] = set()  # quantities that are colours themselves
     covered: dict[int, np.ndarray] = {}
     boxes: dict[int, np.ndarray] = {}
     for frame in frames:
@@ -86,7 +87,9 @@ def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle
             if (new := span(cells, style.view)) is not None:
                 covered[place] = _union(covered.get(place), new)
             for name in style.quantities:
-                if name in cells:
+                if is_rgb(cells, name):
+                    coloured.add(name)
+                elif name in cells:
                     seen[name].add(cells[name])
             if (
                 (style.background or style.whole)
@@ -100,7 +103,8 @@ def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle
                 )
             if style.signal is not None:
                 seen[style.signal].add(signal_section(frame, place, style, cells))
-    scales = tuple(scale_of(name, seen[name], style, frame.units) for name in style.quantities)
+    scaled = [name for name in style.quantities if name not in coloured]
+    scales = tuple(scale_of(name, seen[name], style, frame.units) for name in scaled)
     behind = (
         None
         if style.signal is None
@@ -309,7 +313,7 @@ def _legend(
         for k in row:
             bars.append((x + 0.5 * ROOM, y, slots[k] - ROOM))
             x += slots[k]
-    deepest = max(y for _, y, _ in bars) + 0.22
+    deepest = max((y for _, y, _ in bars), default=0.0) + 0.22
     return bars, max(0.0, deepest - BELOW)
 
 

@@ -1,0 +1,220 @@
+"""What scripts may not do is refused by name and line."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+
+import pytest
+from cell_scripts import DIVIDE, GROWS, HEAD, INIT, SETUP, UPDATE, signalling, written
+
+import torchfilm as tf
+from torchfilm.cellmodeller import is_script, loading
+
+SLOW = "ignore:.*runs cell by cell:UserWarning"
+
+
+def refused(folder, text: str) -> str:
+    with pytest.raises(tf.InputError) as found:
+        tf.from_cellmodeller(written(folder, text))
+    return str(found.value)
+
+
+def line_of(text: str, part: str) -> int:
+    return text[: text.index(part)].count("\n") + 1
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("import math", "import nowhere", "imports nowhere, which is not installed"),
+        (
+            "from CellModeller.GUI import Renderers",
+            "from CellModeller.Signalling.NeighbourDiffusion import NeighbourDiffusion",
+            "CellModeller.Signalling.NeighbourDiffusion is not supported",
+        ),
+        ("gamma=50", "alternate_divisions=True", "alternate_divisions=True) is not supported"),
+        ("gamma=50", "speed=9", "CLBacterium(speed=…) is not supported; known are muA, gamma"),
+        ("sim.addRenderer(", "sim.loadFromPickle(", "a pickle can execute code"),
+        ("sim.addRenderer(", "sim.getOpenCL(", "sim.getOpenCL is not supported"),
+        ("sim.addRenderer(", "print('x', file=1/0) or (", "ZeroDivisionError"),
+        ("cell.growthRate = 1.0", "cell.name = 'x'", "cell.name = 'x' is not supported"),
+        ("cell.plasmids = 6", "exit()", "ends the program"),
+        ("d1.plasmids = sum(copies)", "d1.plasmids = d1.unknown", "has no 'unknown'"),
+    ],
+)  # fmt: skip
+def test_by_name_and_line(tmp_path, old, new, words):
+    text = GROWS.replace(old, new, 1)
+    assert text != GROWS
+    said = refused(tmp_path, text)
+    assert words in said and said.startswith("model.py")
+    assert f"line {line_of(text, new)}:" in said
+
+
+def test_python_2(tmp_path):
+    text = GROWS.replace("    random.shuffle(copies)", "    print 'shuffled'")
+    assert f"line {line_of(text, 'print ')}: the script is written in Python 2" in refused(
+        tmp_path, text
+    )
+
+
+def test_no_cell_and_no_init(tmp_path):
+    assert "adds no cell" in refused(tmp_path, GROWS.replace("sim.addCell", "dict"))
+    assert "does not call sim.init" in refused(
+        tmp_path, GROWS.replace("sim.init", "id(0); [].append").replace("(body, ", "((body, ")
+        .replace("None, None)", "None, None))").replace("sim.addCell", "dict")
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("where", ["body = CLB", "cell.plasmids = 6", "import math"])
+def test_a_loop_for_ever_is_stopped(tmp_path, monkeypatch, where):
+    monkeypatch.setattr(loading, "SETUP_SECONDS", 0.2)
+    at = "" if where == "import math" else "\n    "
+    text = GROWS.replace(where, f"while True:{at or chr(10)}    pass{at or chr(10)}{where}")
+    assert "was stopped after 0.2 s" in refused(tmp_path, text)
+
+
+def test_nothing_of_a_refused_script_stays(tmp_path):
+    path, modules = list(sys.path), set(sys.modules)
+    refused(tmp_path, GROWS.replace("gamma=50", "speed=9"))
+    assert sys.path == path
+    assert not {n for n in set(sys.modules) - modules if n.startswith(("CellModeller", "model"))}
+
+
+def test_what_is_a_script(tmp_path):
+    assert is_script(written(tmp_path, GROWS))
+    assert not is_script(written(tmp_path, GROWS.replace("def init", "def begin"), "b.py"))
+    assert not is_script(tmp_path / "none.py")
+
+
+# --- while it runs -------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings(SLOW)
+@pytest.mark.parametrize(
+    "line, words",
+    [
+        ("if cell.cellAge > 5: cell.late = 1", "cell.late is set for the first time"),
+        ("if cell.cellAge > 5: cell.plasmids = [1, 2]", "cell.plasmids was one number, and is"),
+        ("if cell.cellAge > 5: cell.plasmids = None", "cell.plasmids = None is not supported"),
+        ("if cell.cellAge > 5: 1 / 0", "ZeroDivisionError"),
+        ("if cell.cellAge > 5: exit()", "ends the program"),
+    ],
+)
+def test_faults_in_a_run_name_the_script(tmp_path, line, words):
+    text = GROWS.replace("if cell.volume", f"{line}\n        if cell.volume")
+    text = text.replace("targetVol = 3 +", "targetVol = 9 +")
+    scene = tf.from_cellmodeller(written(tmp_path, text))
+    with pytest.raises(tf.SimulationError) as found:
+        list(tf.simulate(scene, until=1.0))
+    assert words in str(found.value) and str(found.value).startswith("model.py")
+
+
+@pytest.mark.filterwarnings(SLOW)
+def test_global_variables_that_change(tmp_path):
+    update = "count = 0\ndef update(cells):\n    global count\n    count += 1\n"
+    scene = tf.from_cellmodeller(written(tmp_path, HEAD + SETUP + INIT + update + DIVIDE))
+    with pytest.warns(UserWarning, match="changes the global variable count") as said:
+        *_, state = tf.simulate(scene, until=0.2)
+    assert state.cells == 2 and len(said) == 1
+    with pytest.raises(tf.SimulationError, match="count, which all colonies share"):
+        list(tf.simulate(scene, until=0.2, colonies=2))
+
+
+def test_what_is_ignored_is_said(tmp_path):
+    with pytest.warns(UserWarning, match=r"addCell\(color=…\): CellModeller ignores"):
+        tf.from_cellmodeller(
+            written(tmp_path, GROWS.replace("cellType=0,", "cellType=0, color=(1, 0, 0),"))
+        )
+    update = UPDATE + "        cell.radius = 2\n"
+    with pytest.warns(UserWarning, match="cell by cell"):
+        scene = tf.from_cellmodeller(written(tmp_path, HEAD + SETUP + INIT + update + DIVIDE))
+    with pytest.warns(UserWarning, match=r"sets cell\.radius, which changes nothing"):
+        *_, state = tf.simulate(scene, until=0.1)
+    assert set(state.radius.tolist()) == {0.5}
+
+
+# --- columns -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "line, words",
+    [
+        ("cell.spare = random.random()", "uses random.random"),
+        ("for other in cells.values(): pass", "a statement that is not plain"),
+        ("total = total + 1", "total passes from cell to cell"),
+        ("cell.spare = len(cell.pos)", "calls len"),
+        ("if cell.length > 0: late = 1\n        cell.spare = late", "late has no value"),
+        ("cell.spare = math.exp(cell.length)", "calls math.exp"),
+        ("cell.spare = cell.length ** 2", "the operation Pow"),
+    ],
+)
+def test_loops_that_are_not_plain_run_cell_by_cell(tmp_path, line, words):
+    text = GROWS.replace("fastest = 1.2", "fastest = 1.2\n    total = 0")
+    text = text.replace("if cell.volume", f"{line}\n        if cell.volume")
+    path = written(tmp_path, text)
+    with pytest.raises(tf.InputError, match=f"line {line_of(text, line)}.*{words}|{words}"):
+        tf.from_cellmodeller(path, loop="columns")
+    with pytest.warns(UserWarning, match=words):
+        assert tf.from_cellmodeller(path).bind().start().cells == 2
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "cell.targetVol = {0: 3.2, 1: 3.4}[cell.cellType] if cell.pos[0] > 0 else 3.3",
+        "x = min(cell.length, 3.0); cell.growthRate = abs(x - 1.5) * math.sqrt(x)",
+        "cell.plasmids = -cell.plasmids + 2 * cell.plasmids",
+        "cell.divideFlag = not (cell.length < cell.targetVol or cell.id == 99) and True",
+        "cell.growthRate = 0.5 / cell.cellType if cell.cellType > 0 else 1.5",
+        "cell.growthRate = numpy.clip(cell.length / 3.0, 0.8, 1.1)",
+        "rich = cell.length > 2.8 < 99\n        if rich: cell.growthRate = 0.5\n"
+        "        elif cell.dir[1] > 0.5: cell.growthRate *= 0.99",
+    ],
+)
+def test_columns_are_the_loop(tmp_path, line):
+    text = GROWS.replace("if cell.volume", f"{line}\n        if cell.volume")
+    ends = []
+    for loop in ("columns", "cells"):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*cell by cell")
+            scene = tf.from_cellmodeller(written(tmp_path, text), loop=loop)
+        *_, end = tf.simulate(scene, until=2.0)
+        ends.append(end)
+    one, other = ends
+    assert one.cells > 3
+    for name in ("growth_rate", "targetVol", "color", "plasmids", "uid", "length"):
+        assert getattr(one, name).tolist() == getattr(other, name).tolist(), name
+
+
+# --- the text of rates ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "rates, words",
+    [
+        ("for (int i=0; i<2; i++) rates[i] = 0;", "line 3 of its text: 'for' is not supported"),
+        ("#define K 2", "line 3 of its text: '#define K 2' is not supported"),
+        ("rates[2] = 0;", "'rates[2]' is not supported: it has 2, counted from 0"),
+        ("rates[0] = k9;", "'k9' is not supported: this name is not declared"),
+        ("rates[0] = lgamma(2.0f);", "'lgamma(…)' is not supported: known are exp"),
+        ("rates[0] = pow(2.0f);", "it takes 2 values"),
+        ("rates[0] = 1.0f", "'rates' is not supported: ';' is expected"),
+        ("rates[0] = 1 @ 2;", "'@' is not supported"),
+        ("float x[3];", "arrays cannot be declared"),
+        ("species[0] = 1;", "'species[…] = …' is not supported"),
+        ("if (species[0] > 1) { rates[0] = 1;", "'}' is expected"),
+        ("rates[0] = cellType / 2;", "write floats"),
+        ("y = 2;", "a variable declared before"),
+    ],
+)
+def test_rates_by_line(tmp_path, rates, words):
+    text = signalling().replace("rates[0] = 0;", rates)
+    with pytest.raises(tf.InputError) as found:
+        tf.from_cellmodeller(written(tmp_path, text)).bind()
+    assert words in str(found.value) and "specRateCL()" in str(found.value)
+
+
+def test_two_numbers_of_signals(tmp_path):
+    said = refused(tmp_path, signalling().replace("sim, 1, 2, 1000", "sim, 3, 2, 1000"))
+    assert "has 3 signals and GridDiffusion 1" in said

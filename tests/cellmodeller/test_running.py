@@ -1,0 +1,229 @@
+"""Scripts in the style of CellModeller 4 run unchanged: on columns or cell by cell, alike in any
+batch, and after a restart."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from cell_scripts import DIVIDE, GROWS, HEAD, INIT, SETUP, UPDATE, signalling, written
+
+import torchfilm as tf
+from torchfilm.cli.scene_files import load_scene
+
+SLOW = "ignore:.*runs cell by cell:UserWarning"
+
+
+def grown(scene: tf.Scene, **options) -> tf.State:
+    *_, state = tf.simulate(scene, **{"until": 3.0, "seed": 3, **options})
+    return state
+
+
+def assert_alike(one: tf.State, other: tf.State) -> None:
+    assert one.cells == other.cells
+    assert torch.equal(one.position, other.position)
+    for name in ("color", "targetVol", "plasmids", "growth_rate", "cell_type"):
+        assert torch.equal(one.fields[name], other.fields[name]), name
+
+
+def test_a_script_is_what_it_asks_for(tmp_path):
+    scene = tf.from_cellmodeller(written(tmp_path, GROWS))
+    assert (scene.name, scene.dt, scene.dim) == ("model", 0.05, 2)
+    mechanics = next(e for e in scene.effects if isinstance(e, tf.Mechanics))
+    assert float(mechanics.length_drag) == 50
+    assert scene.founders.length.tolist() == [3.5, 2.5]
+    state = grown(scene)
+    assert state.cells > 8
+    assert int(state.plasmids.sum()) == 6 * state.cells  # each division shares 12 copies
+    assert bool(((state.targetVol >= 3) & (state.targetVol <= 3.5)).all())
+    assert torch.allclose(state.color[:, 2], torch.tensor(0.2, dtype=torch.float64))
+
+
+def test_columns_and_the_loop_give_the_same_bits(tmp_path):
+    path = written(tmp_path, GROWS)
+    columns = tf.from_cellmodeller(path, loop="columns")
+    with pytest.warns(UserWarning, match="cell by cell"):
+        cells = tf.from_cellmodeller(path, loop="cells")
+    assert_alike(grown(columns), grown(cells))
+
+
+@pytest.mark.parametrize("loop", ["columns", "cells"])
+@pytest.mark.filterwarnings(SLOW)
+def test_a_colony_is_the_same_in_any_batch(tmp_path, loop):
+    scene = tf.from_cellmodeller(written(tmp_path, GROWS), loop=loop)
+    many = grown(scene, colonies=3)
+    mine = many.select([2])
+    *_, alone = tf.simulate(scene, scene.bind(1, seed=3, streams=[2]).start(), until=3.0)
+    assert_alike(mine, alone)
+    assert not torch.equal(many.select([0]).targetVol[:1], mine.targetVol[:1])
+
+
+def test_a_run_leaves_the_random_numbers_of_others_alone(tmp_path):
+    scene = tf.from_cellmodeller(written(tmp_path, GROWS))
+    random.seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    wanted = random.random(), np.random.random()  # noqa: NPY002
+    random.seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    grown(scene, until=1.0)
+    assert (random.random(), np.random.random()) == wanted  # noqa: NPY002
+
+
+@pytest.mark.parametrize("loop", ["columns", "cells"])
+@pytest.mark.filterwarnings(SLOW)
+def test_a_run_resumes_bit_for_bit(tmp_path, loop):
+    text = GROWS.replace("cell.plasmids / 12.0", "cell.effGrowth")
+    scene = tf.from_cellmodeller(written(tmp_path, text), loop=loop)
+    whole = grown(scene)
+    for _ in tf.simulate(scene, until=1.5, seed=3, record=tf.Recorder(tmp_path / "a.h5", scene)):
+        pass
+    with tf.Results(tmp_path / "a.h5") as results:
+        half = results.state(tf.from_cellmodeller(tmp_path / "model.py", loop=loop))
+    *_, end = tf.simulate(scene, half, until=3.0)
+    assert_alike(whole, end)
+    assert torch.equal(whole.effGrowth, end.effGrowth)
+
+
+def test_the_command_knows_a_script(tmp_path):
+    written(tmp_path, GROWS)
+    made = subprocess.run(
+        [sys.executable, "-m", "torchfilm", "run", "model.py", "--cells", "8", "--out", "a.h5"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    assert (tmp_path / "a.png").stat().st_size > 5000
+    with tf.Results(tmp_path / "a.h5") as results:
+        assert results.frame(-1)["color"].shape[1] == 3
+    assert not [name for name in sys.modules if name.split(".")[0] == "CellModeller"]
+
+
+def test_settings_of_the_command(tmp_path):
+    written(tmp_path, GROWS)
+    scene = load_scene(str(tmp_path / "model.py"), {"contacts": "bilateral"})
+    assert any(getattr(e, "contacts", "") == "bilateral" for e in scene.effects)
+    with pytest.raises(tf.InputError, match="loop = 'fast' is not allowed"):
+        load_scene(str(tmp_path / "model.py"), {"loop": "fast"})
+
+
+# --- what CellModeller keeps of cells ------------------------------------------------------------
+
+
+def test_what_cells_have(tmp_path):
+    """Age in steps, growth of the last step, length at birth, and contacts."""
+    update = """
+def update(cells):
+    assert all(key == cell.id for key, cell in cells.items())
+    for cell in cells.values():
+        assert len(cell.pos) == 3 and cell.pos[2] == 0 and cell.volume == cell.length
+        far = numpy.linalg.norm(cell.ends[1] - cell.ends[0])
+        assert abs(far - cell.length) < 1e-5
+        cell.age = cell.cellAge
+        cell.grown = cell.strainRate
+        cell.first = cell.startVol
+        cell.touches = len(cell.neighbours)
+        assert all(other in cells for other in cell.neighbours)
+        cell.divideFlag = cell.length > cell.targetVol
+"""
+    setup = SETUP.replace("gamma=50", "gamma=1e6, compNeighbours=True")
+    path = written(tmp_path, HEAD + setup + INIT + update + DIVIDE)
+    with pytest.warns(UserWarning, match="cell by cell"):
+        scene = tf.from_cellmodeller(path)
+    states = list(tf.simulate(scene, until=2.0))
+    first, last = states[0], states[-1]
+    assert set(first.age.tolist()) == set(first.grown.tolist()) == {0}
+    assert last.cells > 4 and last.age.max() < 40 and last.age.min() >= 0
+    # 1/h, but for a little pressure: exp(0.05) - 1
+    assert last.grown[last.age > 0].median() == pytest.approx(np.expm1(0.05), rel=0.02)
+    assert bool((last.fields["first"] < 3.6).all())
+    assert last.touches.max() >= 1
+
+
+def test_init_sets_the_length(tmp_path):
+    init = INIT + "    cell.length = 2.0 + cell.cellType\n"
+    scene = tf.from_cellmodeller(written(tmp_path, HEAD + SETUP + init + UPDATE + DIVIDE))
+    assert scene.bind().start().length.tolist() == [2.0, 3.0]
+
+
+def test_cells_die(tmp_path):
+    update = UPDATE + "        if cell.id > 6: cell.deathFlag = True\n"
+    path = written(tmp_path, HEAD + SETUP + INIT + update + DIVIDE)
+    with pytest.warns(UserWarning, match="deathFlag"):
+        scene = tf.from_cellmodeller(path)
+    assert grown(scene, until=5.0).cells == 0  # all later cells have a higher id
+
+
+def test_planes_and_spheres(tmp_path):
+    walls = """
+    body.addPlane((0, -5, 0), (0, 1, 0), 1.0)
+    body.addPlane((0, 0, 1), (0, 0, -1), 1.0)
+    body.addSphere((0, 0, 0), 30, 1.0, -1)
+"""
+    scene = tf.from_cellmodeller(
+        written(tmp_path, HEAD + SETUP.rstrip() + walls + INIT + UPDATE + DIVIDE)
+    )
+    mechanics = next(e for e in scene.effects if isinstance(e, tf.Mechanics))
+    plane, sphere = mechanics.walls  # the plane above touches no cell in the plane z = 0
+    assert isinstance(plane, tf.Plane) and isinstance(sphere, tf.Sphere) and sphere.inside
+
+
+def test_jitter_in_z_is_space(tmp_path):
+    text = GROWS.replace("jitter_z=False, ", "")
+    assert tf.from_cellmodeller(written(tmp_path, text)).dim == 3
+
+
+# --- species and signals -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "integrator, share", [("CLEulerSigIntegrator", 6), ("CLCrankNicIntegrator", 12)]
+)
+def test_rates_are_those_of_the_text(tmp_path, integrator, share):
+    """A cell that does not grow: dx/dt = 2, and 0.5·4 of signal an hour in units of its voxels."""
+    scene = tf.from_cellmodeller(written(tmp_path, signalling(integrator)))
+    medium = next(e for e in scene.effects if isinstance(e, tf.Medium))
+    assert float(medium.signals["signal0"].diffusion) == 6.0 / share
+    assert medium.box == ((-24.0, -24.0, -8.0), (24.0, 24.0, 8.0))  # nodes are centres of voxels
+    state = grown(scene, until=1.0)
+    assert state.species1.item() == pytest.approx(2.0, rel=1e-5)
+    assert state.species0.item() == pytest.approx(4.0, rel=1e-5)
+    assert state.signals["signal0"].sum().item() == pytest.approx(2.0, rel=1e-4)
+    assert 0 < state.seen.item() < 2.0  # update sees the signal where the cell is
+
+
+def test_growth_dilutes_species(tmp_path):
+    scene = tf.from_cellmodeller(written(tmp_path, signalling(rate=1.0)))
+    first = scene.bind().start()
+    state = grown(scene, until=1.0)
+    assert state.species0.item() == pytest.approx(
+        4.0 * float(first.volume / state.volume), rel=1e-4
+    )
+
+
+def test_the_equations_can_be_printed(tmp_path):
+    scene = tf.from_cellmodeller(written(tmp_path, signalling()))
+    circuit = next(e for e in scene.effects if isinstance(e, tf.Circuit))
+    assert "to out.signal0 = 64·0.5·species0" in str(circuit.graph)
+
+
+def test_species_can_be_set_at_division(tmp_path):
+    text = signalling(rate=1.0) + (
+        "        if cell.length > 4: cell.divideFlag = True\n"
+        "def divide(parent, d1, d2):\n    d1.species[:] = 0\n    d2.species = [8, 8]\n"
+    )
+    scene = tf.from_cellmodeller(written(tmp_path, text))
+    for state in tf.simulate(scene, until=0.6):
+        if state.cells == 2:
+            break
+    # after the division they grow for one step
+    assert state.species0[0] == 0 and state.species0[1] == pytest.approx(8.0, rel=0.06)
+
+
+def test_no_warning_for_what_is_plain(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tf.from_cellmodeller(written(tmp_path, signalling()))
