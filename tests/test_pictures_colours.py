@@ -43,6 +43,17 @@ def test_one_range_for_all_colonies():
     ) == pytest.approx(viridis(1.0), abs=NEAR)
 
 
+def test_three_values_are_a_colour():
+    """Clipped to 0 … 1; without a legend; missing ones are grey."""
+    own = np.array([[1.0, 0.0, 0.0], [0.2, 2.0, -1.0], [np.nan, 0.0, 0.0]])
+    drawn = Drawn(frame([[0, 0], [4, 0], [8, 0]], tint=own), colour="tint")
+    assert drawn.layout.scales == ()
+    for x, rgb in ((0, (1, 0, 0)), (4, (0.2, 1, 0)), (8, NO_VALUE[:3])):
+        assert drawn.at(x, 0) == pytest.approx(rgb, abs=NEAR)
+    with pytest.raises(tf.InputError, match="channels"):
+        Drawn(frame([[0, 0]], tint=own[:1]), channels={"tint": "red"})
+
+
 def test_lights_of_channels_add_up():
     """Cyan + yellow is white; a cell without light is dark, but not as dark as the paper."""
     drawn = Drawn(

@@ -3,6 +3,7 @@ batch, and after a restart."""
 
 from __future__ import annotations
 
+import pickle
 import random
 import subprocess
 import sys
@@ -227,3 +228,47 @@ def test_no_warning_for_what_is_plain(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         tf.from_cellmodeller(written(tmp_path, signalling()))
+
+
+def test_rates_read_the_cell(tmp_path):
+    """effGrowth is the mean growth of a step, µm; pos and area are the cell's."""
+    text = signalling("CLEulerIntegrator", rate=1.0)
+    text = text.replace("sim, 1, 2, 1000, sig, boundcond='reflect'", "sim, 2, 1000")
+    text = text.replace("ModuleRegulator(sim), sig, integ", "ModuleRegulator(sim), None, integ")
+    text = text.replace("pos=(0, 0, 0), length", "pos=(7, 0, 0), length")
+    text = text.replace("rates[1] = k;", "rates[1] = effGrowth > 0.1 ? pos.x : 0.0f;")
+    text = text.replace("cell.signals[:] = [0]", "pass").replace(
+        "cell.signals[0]", "cell.effGrowth"
+    )
+    state = grown(tf.from_cellmodeller(written(tmp_path, text)), until=0.5)
+    assert state.effGrowth.item() == pytest.approx(3 * np.expm1(0.45) / 9, rel=1e-3)
+    assert 2.0 < state.species1.item() < 3.2  # 7 an hour, but for dilution and the first step
+
+
+def test_first_cells_from_a_table(tmp_path):
+    scene = tf.from_cellmodeller(written(tmp_path, GROWS))
+    table = {"x": [0.0], "y": [0.0], "length": [2.0], "angle": [0.0], "plasmids": [4.0]}
+    state = scene.bind(cells=tf.Cells.from_table(table), dtype=torch.float64).start()
+    assert state.plasmids.tolist() == [4] and 3 <= state.targetVol.item() <= 3.5
+
+
+def test_asymm_and_other_random_numbers(tmp_path):
+    update = UPDATE + "        cell.asymm = [2, 1]\n"
+    text = HEAD + "generator = numpy.random.default_rng()\n" + SETUP + INIT + update + DIVIDE
+    with pytest.warns(UserWarning, match="default_rng has random numbers of its own"):
+        scene = tf.from_cellmodeller(written(tmp_path, text))
+    with pytest.warns(UserWarning, match="cells divide in the middle"):
+        grown(scene, until=1.0)
+
+
+def test_a_scene_is_known_again(tmp_path):
+    """By what the script says, not by where it lies; and in another process."""
+    scene = tf.from_cellmodeller(written(tmp_path, GROWS))
+    again = pickle.loads(pickle.dumps(scene))
+    assert again.fingerprint == scene.fingerprint
+    (tmp_path / "other").mkdir()
+    moved = tf.from_cellmodeller(written(tmp_path / "other", GROWS))
+    assert moved.fingerprint == scene.fingerprint
+    changed = tf.from_cellmodeller(written(tmp_path, GROWS.replace("1.2", "1.3")))
+    assert changed.fingerprint != scene.fingerprint
+    assert "cell by cell" not in str(tf.explain(scene, seconds=0.0))

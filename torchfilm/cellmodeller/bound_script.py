@@ -203,10 +203,21 @@ class ScriptDivision(_Bound):
 
     def step(self, state: State, dt: float) -> State:
         for births in state.births:
+            self._warn_of_shares(births.parents)
             state = self._daughters(state, torch.cat([births.first, births.second]))
             if self.script.function("divide") is not None:
                 state = self._divide(state, births)
         return state
+
+    def _warn_of_shares(self, parents: State) -> None:
+        share = self.layout.variables.get("asymm")
+        if share is not None and share.shape == (2,):
+            one, other = parents.fields[share.field].unbind(1)
+            if bool((one - other).abs().gt(0).any()):
+                warn(
+                    "the script sets cell.asymm, which CellModeller's CLBacterium does not use:"
+                    " cells divide in the middle, here as well."
+                )
 
     def _daughters(self, state: State, rows: Tensor) -> State:
         """What CellModeller resets in daughters."""

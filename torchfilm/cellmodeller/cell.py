@@ -69,7 +69,9 @@ class Cell:
         # only for what the script has not set
         value = UNSET if name.startswith("_") else self._sheet.value(name, self._row)
         if value is UNSET:
-            raise AttributeError(f"this cell has no {name!r} (set it in init)")
+            raise AttributeError(
+                f"this cell has no {name!r}: neither torchfilm nor init(cell) gives it one"
+            )
         if isinstance(value, list) and name not in READ_ONLY:
             self.__dict__[name] = value  # which may be changed in place
         return value

@@ -20,9 +20,14 @@ from torchfilm.cellmodeller import draws, stand_ins
 from torchfilm.cellmodeller.time_limit import TooLong, time_limit
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
+from torchfilm.tools.warn_once import warn
 
 SETUP_SECONDS = 60.0  # that a script may take to be set up, and each function in its rehearsal
 FUNCTIONS = ("setup", "init", "update")
+# Random numbers that no call can seed anew.
+OTHER_RANDOM = re.compile(
+    r"\b(default_rng|RandomState|SystemRandom|random\.Random|urandom|secrets)\b"
+)
 OLD = re.compile(r"^\s*print\s+[^(\s=]", re.MULTILINE)
 
 
@@ -110,6 +115,12 @@ def load(path: Path) -> Script:
             vars(module)["setup"](sim)
     if not request.started:
         raise InputError(f"{path.name}: setup(sim) does not call sim.init(…).")
+    if own := OTHER_RANDOM.search(text):
+        line = text[: own.start()].count("\n") + 1
+        warn(
+            f"{path.name}, line {line}: {own.group()} has random numbers of its own. Runs repeat"
+            " only with the functions of random and numpy.random."
+        )
     script.dt = checks.number("sim.dt", sim.dt, above=0.0)
     return script
 

@@ -41,12 +41,14 @@ from torchfilm.tuning.settings import Settings, accurate
 @dataclass
 class Run:
     """Run a scene: a ready-made one by name, your own Python file that defines `scene` (a Scene, or
-    a function that returns one), a model in SBML or Antimony, or a saved design."""
+    a function that returns one), a CellModeller 4 script, a model in SBML or Antimony, or a saved
+    design."""
 
     scene: Annotated[str, tyro.conf.Positional]
-    """microcolony, programmed_growth, channel, …; or the path of a Python file; or the path of a
-    model (.xml, .sbml, .ant), whose circuit runs in a growing colony; or the path of a saved design
-    (.json), which also gives the step, the seed and the end of the run."""
+    """microcolony, programmed_growth, channel, …; or the path of a Python file; of a CellModeller
+    script (setup, init, update), which runs as it is; of a model (.xml, .sbml, .ant), whose circuit
+    runs in a growing colony; or of a saved design (.json), which also gives the step, the seed and
+    the end of the run."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE, such as --set dim=3 rate=0.8."""
     colonies: int = 1

@@ -33,9 +33,10 @@ OTHER_SUFFIX = (
 
 
 def load_scene(what: str, parameters: dict[str, Any], function: str = "scene") -> Scene:
-    """A ready-made scene by name; or the `function` or Scene of that name in a Python file; or a
-    colony with a model in SBML or Antimony; or the scene of a saved design (.json). `parameters`
-    replace those of the design. Raises InputError for anything else."""
+    """A ready-made scene by name; or the `function` or Scene of that name in a Python file; or what
+    a CellModeller script asks for; or a colony with a model in SBML or Antimony; or the scene of a
+    saved design (.json). `parameters` replace those of the design. Raises InputError for anything
+    else."""
     path = Path(what)
     if path.suffix == ".json":
         return _scene_of_design(what, parameters)
