@@ -51,6 +51,53 @@ def test_by_name_and_line(tmp_path, old, new, words):
     assert f"line {line_of(text, new)}:" in said
 
 
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("pos=(-4, 0, 0)", "pos=(-4, 0)", "addCell(pos=…) = (-4, 0) is not allowed"),
+        ("length=2.5", "length=None", "addCell(length=…) = None is not allowed"),
+        ("cellType=0", "cellType=0.5", "a whole number from 0"),
+        ("gamma=50", "gamma='a'", "CLBacterium(gamma=…) = 'a' is not allowed"),
+        ("sim.addRenderer", "sim.dt = 0; sim.addRenderer", "sim.dt = 0 is not allowed"),
+        (
+            "sim.addRenderer",
+            "body.addPlane((0, 0, 0), (0, 0, 0), 1.0); sim.addRenderer",
+            "addPlane: normal = (0, 0, 0) is not allowed",
+        ),
+        ("cell.growthRate = 1.0", "cell.growthRate = -1.0", "cell.growthRate = -1: it must be"),
+        ("cell.plasmids = 6", "cell.plasmids = 6; cell.x = [[1, 2], [3]]", "is not supported"),
+        ("cell.color = [cell", "cell.color = [0.1]; [cell", "cell.color has 1 numbers and 3"),
+    ],
+)
+def test_values_that_are_not_allowed(tmp_path, old, new, words):
+    said = refused(tmp_path, GROWS.replace(old, new, 1))
+    assert words in said and said.startswith("model.py")
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("gridSize=(4, 4, 4)", "gridSize=(4, 4)", "GridDiffusion: size = (4, 4) is not allowed"),
+        ("D=[6.0]", "D=[6.0, 1.0]", "has 1 signals and 2 values of D"),
+        ("'reflect'", "'odd'", "boundcond = 'odd' is not allowed"),
+        ("sim, 1, 2, 1000", "sim, 1, 0, 1000", "nSpecies = 0 is not allowed"),
+        ("return '''rates", "return 3; '''rates", "sigRateCL() returned int"),
+        ("[4.0, 0]", "[4.0, 0, 3]", "could not broadcast"),
+    ],
+)
+def test_chemistry_that_is_not_allowed(tmp_path, old, new, words):
+    assert words in refused(tmp_path, signalling().replace(old, new, 1))
+
+
+@pytest.mark.filterwarnings(SLOW)
+@pytest.mark.parametrize("loop", ["columns", "cells"])
+def test_a_growth_rate_below_0_ends_the_run(tmp_path, loop):
+    text = GROWS.replace("fastest / max(1.0, cell.length - 2)", "8 * (2.9 - cell.length)")
+    scene = tf.from_cellmodeller(written(tmp_path, text), loop=loop)
+    with pytest.raises(tf.SimulationError, match=r"model\.py.*cell\.growthRate = -.*at least 0"):
+        list(tf.simulate(scene, until=1.0))
+
+
 def test_python_2(tmp_path):
     text = GROWS.replace("    random.shuffle(copies)", "    print 'shuffled'")
     assert f"line {line_of(text, 'print ')}: the script is written in Python 2" in refused(

@@ -124,15 +124,16 @@ class BoundScript(_Bound):
         if state.cells == 0:
             return state
         state = self._after_step(state)
-        if self.effect.rule is not None:
+        if self.effect.rule is None:
+            return self._cell_by_cell(state)
+        with self.running("update(cells)", state):
             try:
                 return self.effect.rule.act(state)
             except Uneven as error:
-                raise SimulationError(
-                    f"{self.script.path.name}: update(cells) cannot act on whole columns any more"
-                    f" ({error}). Run it cell by cell: --set loop=cells."
+                raise InputError(
+                    f"update(cells) cannot act on whole columns any more ({error}). Run it cell by"
+                    " cell: --set loop=cells."
                 ) from error
-        return self._cell_by_cell(state)
 
     def _after_step(self, state: State) -> State:
         """What CellModeller notes of a cell after each step, from the length before it."""

@@ -15,7 +15,7 @@ from torchfilm.cellmodeller.rates import SIGNAL, SPECIES, TextRates
 from torchfilm.cellmodeller.rehearsal import rehearse
 from torchfilm.cellmodeller.script_rules import ScriptRules
 from torchfilm.cellmodeller.sheets import Layout
-from torchfilm.cellmodeller.stand_ins import RADIUS
+from torchfilm.cellmodeller.stand_ins import LENGTH, RADIUS
 from torchfilm.effect import Effect
 from torchfilm.effects.circuit import Circuit
 from torchfilm.effects.division import Division
@@ -56,27 +56,38 @@ def from_cellmodeller(
     path = Path(path)
     if not path.is_file():
         raise checks.input_error("script", str(path), "the path of a Python file", "No such file.")
-    script = load(path)
+    try:
+        return _scene(load(path), loop, contacts, method)
+    except InputError as error:
+        if str(error).startswith(path.name):
+            raise
+        raise InputError(f"{path.name}: {error}") from error
+
+
+def _scene(script: Script, loop: str, contacts: str, method: str) -> Scene:
     for words in script.request.ignored:
-        warn(f"{path.name}: {words}, and so does torchfilm.")
+        warn(f"{script.path.name}: {words}, and so does torchfilm.")
     dim = 2 if _is_flat(script) else 3
     founders = _founders(script, dim)
-    rules = script_rules(script, loop, founders)
     options = script.request.options or {}
+    given = {
+        name: checks.number(f"CLBacterium({name}=…)", options.get(name, usual), above=0.0)
+        for name, usual in (("gamma", GAMMA), ("muA", 1.0))
+    }
     effects: list[Effect] = [
-        rules,
+        script_rules(script, loop, founders),
         Growth(law="length"),
         Division(axis_noise=AXIS_NOISE),
         Mechanics(
             dim=dim,
             walls=_walls(script, dim),
-            length_drag=float(options.get("gamma", GAMMA)),
-            viscosity=float(options.get("muA", 1.0)),
+            length_drag=given["gamma"],
+            viscosity=given["muA"],
             contacts=contacts,
         ),
         *_chemistry(script, method),
     ]
-    return Scene(*effects, name=path.stem, dt=script.dt, founders=founders)
+    return Scene(*effects, name=script.path.stem, dt=script.dt, founders=founders)
 
 
 def script_rules(script: Script, loop: str, founders: Cells | None = None) -> ScriptRules:
@@ -130,6 +141,17 @@ def _vector(name: str, value: Any) -> tuple[float, float, float]:
     return (float(found[0]), float(found[1]), float(found[2]))
 
 
+def _normal(value: Any) -> tuple[float, float, float]:
+    found = _vector("addPlane: normal", value)
+    if not any(found):
+        raise checks.input_error("addPlane: normal", value, "a direction that is not zero")
+    return found
+
+
+def _size(cell: dict[str, Any], name: str, usual: float) -> float:
+    return checks.number(f"addCell({name}=…)", cell.get(name, usual), least=0.0)
+
+
 def _is_flat(script: Script) -> bool:
     """Whether no cell can leave the plane z = 0: CLBacterium(jitter_z=False), first cells in it,
     and no wall that presses them out of it."""
@@ -140,9 +162,9 @@ def _is_flat(script: Script) -> bool:
         for name, default in (("pos", (0, 0, 0)), ("dir", (1, 0, 0))):
             if _vector(f"addCell({name}=…)", cell.get(name, default))[2] != 0:
                 return False
-    radius = max([float(c.get("rad", RADIUS)) for c in request.cells], default=RADIUS)
+    radius = max([_size(c, "rad", RADIUS) for c in request.cells], default=RADIUS)
     for point, normal, _ in request.planes:
-        p, n = _vector("addPlane: point", point), _vector("addPlane: normal", normal)
+        p, n = _vector("addPlane: point", point), _normal(normal)
         if n[2] != 0 and ((n[0], n[1]) != (0, 0) or -p[2] * n[2] < radius * abs(n[2]) - 1e-6):
             return False
     return all(_vector("addSphere: centre", s[0])[2] == 0 for s in request.spheres)
@@ -157,8 +179,8 @@ def _founders(script: Script, dim: int) -> Cells:
     return Cells(
         np.array(pos)[:, :dim],
         np.array(axis)[:, :dim],
-        [float(c["length"]) for c in cells],
-        [float(c.get("rad", RADIUS)) for c in cells],
+        [_size(c, "length", LENGTH) for c in cells],
+        [_size(c, "rad", RADIUS) for c in cells],
         cell_type=[c["cellType"] for c in cells],
     )
 
@@ -166,7 +188,7 @@ def _founders(script: Script, dim: int) -> Cells:
 def _walls(script: Script, dim: int) -> list[Wall]:
     walls: list[Wall] = []
     for point, normal, coefficient in script.request.planes:
-        p, n = _vector("addPlane: point", point), _vector("addPlane: normal", normal)
+        p, n = _vector("addPlane: point", point), _normal(normal)
         if dim == 2 and (n[0], n[1]) == (0, 0):
             continue  # it touches no cell in the plane
         weight = checks.number("addPlane: coefficient", coefficient, above=0.0)
@@ -200,7 +222,9 @@ def _chemistry(script: Script, method: str) -> list[Effect]:
             )
         with draws.kept(), importing(script.path, script.module), script.errors(f"{name}()"):
             texts.append(function() if wanted and function is not None else None)
-    volume = None if grid is None else float(math.prod(_vector("gridSize", grid["size"])))
+    volume = (
+        None if grid is None else float(math.prod(_vector("GridDiffusion: size", grid["size"])))
+    )
     count = integrator["species"]
     rates = TextRates(texts[0], texts[1], count, grid["signals"] if grid else 0, volume)
     circuit = Circuit(rates, species=[SPECIES.format(k) for k in range(count)], method=method)
@@ -211,14 +235,18 @@ def _medium(integrator: dict[str, Any], grid: dict[str, Any]) -> Medium:
     """The grid of CellModeller: values at its nodes are here the centres of voxels."""
     checks.choice("boundcond", integrator["boundary"], BOUNDARIES)
     count = grid["signals"]
-    origin, size = np.array(grid["origin"], float), np.array(_vector("gridSize", grid["size"]))
+    origin, size, voxels = (
+        np.array(_vector(f"GridDiffusion: {name}", grid[name]))
+        for name in ("origin", "size", "dim")
+    )
     low = origin - size / 2
-    high = low + np.array(grid["dim"]) * size
-    if len(grid["diffusion"]) != count:
-        raise InputError(
-            f"GridDiffusion has {count} signals and {len(grid['diffusion'])} values of D."
-        )
-    first = grid["initial"] or [0.0] * count
+    high = low + voxels * size
+    first = [0.0] * count if grid["initial"] is None else list(grid["initial"])
+    for name, values in (("D", grid["diffusion"]), ("initLevels", first)):
+        if len(values) != count:
+            raise InputError(
+                f"GridDiffusion has {count} signals and {len(values)} values of {name}."
+            )
     faces: dict[str, Any] = {"wrap": Periodic(), "reflect": NoFlux(), "nearest": NoFlux()}
     signals: dict[str, Any] = {}
     for k in range(count):

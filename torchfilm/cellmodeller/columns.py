@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.cellmodeller.cell import READ_ONLY
-from torchfilm.cellmodeller.sheets import Layout, found_signals
+from torchfilm.cellmodeller.sheets import Layout, check_growth, found_signals
 from torchfilm.cellmodeller.variables import FIELDS
 from torchfilm.state import State
 
@@ -381,6 +381,8 @@ class _Turn:
             new = torch.stack(columns, 1) if width else columns[0]
             if name == "cellType" and bool((new != new.round()).any()):
                 raise Uneven("cell.cellType is set to other than whole numbers")
+            if name == "growthRate":
+                check_growth(new)
             made[field] = new.to(like.dtype)
         return s.with_fields(**made)
 

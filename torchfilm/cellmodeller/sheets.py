@@ -229,7 +229,16 @@ def _plain(name: str, given: Sequence[Any]) -> np.ndarray:
         raise InputError(f"cell.{name} = {given[0]!r} is not supported: it must be one number.")
     if name == "cellType" and (made != np.round(made)).any():
         raise InputError(f"cell.cellType = {given[0]!r}: it must be a whole number.")
+    if name == "growthRate":
+        check_growth(torch.as_tensor(made))
     return made
+
+
+def check_growth(rates: Tensor) -> None:
+    """Raise InputError for a growth rate that no cell can have."""
+    bad = ~(rates >= 0)
+    if bool(bad.any()):
+        raise InputError(f"cell.growthRate = {float(rates[bad][0]):g}: it must be at least 0, 1/h.")
 
 
 def _warn_ignored(name: str) -> None:

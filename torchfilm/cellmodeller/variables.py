@@ -7,6 +7,7 @@ NaN marks a cell that does not have the variable.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -55,7 +56,8 @@ class Variable:
     def shown(self, values: Tensor) -> list[Any]:
         """The values (M, …) as the script sees them, UNSET where a cell has none."""
         array = values.detach().cpu().numpy()
-        unset = np.isnan(array.reshape(len(array), -1)).all(1) if array.size else []
+        flat = array.reshape(len(array), math.prod(self.shape))
+        unset = np.isnan(flat).all(1) & bool(flat.size)
         made: list[Any]
         if self.container == "array":
             made = [row.copy() for row in array]
@@ -72,14 +74,18 @@ class Variable:
 
     def column(self, values: Sequence[Any]) -> np.ndarray:
         """Values as the script set them, (M, …). Raises InputError for others than numbers."""
-        made = np.stack([numbers(self.name, x) for x in values])
-        if made.shape[1:] != self.shape:
-            shape = lambda s: f"{' by '.join(map(str, s))} numbers" if s else "one number"
-            raise InputError(
-                f"cell.{self.name} was {shape(self.shape)}, and is set to"
-                f" {shape(made.shape[1:])}: a variable keeps its length."
-            )
-        return made
+        made = [numbers(self.name, x) for x in values]
+        for new in made:
+            if new.shape != self.shape:
+                raise InputError(
+                    f"cell.{self.name} was {_words(self.shape)}, and is set to"
+                    f" {_words(new.shape)}: a variable keeps its length."
+                )
+        return np.stack(made)
+
+
+def _words(shape: tuple[int, ...]) -> str:
+    return f"{' by '.join(map(str, shape))} numbers" if shape else "one number"
 
 
 def numbers(name: str, value: Any) -> np.ndarray:
@@ -101,14 +107,18 @@ def numbers(name: str, value: Any) -> np.ndarray:
 def variable(name: str, values: Sequence[Any]) -> Variable:
     """The variable that holds these values of a rehearsal."""
     arrays = [numbers(name, x) for x in values]
+    shapes = {x.shape for x in arrays}
+    if len(shapes) > 1:
+        raise InputError(
+            f"cell.{name} has {' and '.join(sorted(map(_words, shapes)))}: a variable keeps its"
+            " length."
+        )
     kinds = {np.asarray(x).dtype.kind for x in values}
     kind = "bool" if kinds == {"b"} else "int" if kinds <= {"b", "i", "u"} else "float"
     kind = "float" if name == COLOR else kind
     containers = {CONTAINERS.get(type(x), "number") for x in values}
     container = containers.pop() if len(containers) == 1 else "list"
-    made = Variable(name, arrays[0].shape, kind, container if arrays[0].ndim else "number")
-    made.column(values)
-    return made
+    return Variable(name, arrays[0].shape, kind, container if arrays[0].ndim else "number")
 
 
 def own_colour(declared: Mapping[str, Field]) -> str | None:
