@@ -62,5 +62,9 @@ def assert_same_file(path, other, frames: list[int] | None = None) -> None:
                         step,
                         name,
                     )
-        for name, x in a.lineage().items():
-            assert np.array_equal(x, b.lineage()[name]), name
+        one, two = a.lineage(), b.lineage()
+        for name in ("colony", "cell", "parent", "born", "ended", "fate"):
+            x, y = getattr(one, name), getattr(two, name)
+            # frames at other steps may give the hours of an event another last bit
+            near = np.allclose(x, y, rtol=1e-12, equal_nan=True) if x.dtype.kind == "f" else x == y
+            assert np.all(near), name

@@ -1,4 +1,4 @@
-"""Results files: round trip, tables, lineage, and reading while writing."""
+"""Results files: round trip, and reading while writing."""
 
 from __future__ import annotations
 
@@ -99,106 +99,15 @@ def test_a_file_holds_numbers_and_text_only(whole):
         )
 
 
-def test_the_table_has_a_row_for_each_cell(whole):
-    path, states = whole
-    with tf.Results(path) as results:
-        table = results.table()
-        last = results.table(-1)
-        total = int(results.counts.sum())
-    assert {len(v) for v in table.values()} == {total}
-    for name in (
-        "frame",
-        "time",
-        "colony",
-        "uid",
-        "parent",
-        "x",
-        "y",
-        "axis_x",
-        "axis_y",
-        "length",
-        "radius",
-        "growth_rate",
-        "mark",
-    ):
-        assert name in table, name
-    assert "z" not in table and all(v.ndim == 1 for v in table.values())
-    assert np.array_equal(np.unique(table["frame"]), np.arange(10))
-    assert np.array_equal(last["x"], states[-1].position[:, 0].numpy()) and np.array_equal(
-        last["colony"], states[-1].colony.numpy()
-    )
-    assert (last["time"] == states[-1].time).all()
-
-
 def test_colonies_of_a_selection_keep_their_ids(tmp_path):
     scene = make_scene()
     record(scene, scene.bind(4).start().select([3, 1]), tmp_path / "run.h5", until=1.0)
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.colony_id.tolist() == [3, 1]
         assert set(results.table()["colony"].tolist()) == {1, 3}
-        assert set(results.lineage()["colony"].tolist()) == {1, 3}
+        assert set(results.lineage().colony.tolist()) == {1, 3}
         state = results.state(make_scene())
     assert state.colony_id.tolist() == [3, 1]
-
-
-# --- lineage --------------------------------------------------------------------------------------
-
-
-def test_lineage_is_consistent(whole):
-    path, states = whole
-    with tf.Results(path) as results:
-        found = results.lineage()
-    keys = list(zip(found["colony"].tolist(), found["uid"].tolist(), strict=True))
-    assert len(set(keys)) == len(keys)
-    row = {key: k for k, key in enumerate(keys)}
-    for k, (colony, _) in enumerate(keys):
-        parent = int(found["parent"][k])
-        if parent == -1:
-            assert found["born"][k] == 0
-            continue
-        p = row[(colony, parent)]
-        assert found["fate"][p] == "divided" and found["ended"][p] == found["born"][k], (
-            "a daughter is born when its parent ends"
-        )
-        assert found["born"][p] < found["born"][k]
-    ended = found["ended"] >= 0
-    assert (found["ended"][ended] >= found["born"][ended]).all()
-    assert ((found["fate"] == "alive") == ~ended).all()
-    assert set(found["fate"]) == {"alive", "divided", "removed"}
-    daughters = np.bincount(
-        [row[(c, int(p))] for (c, _), p in zip(keys, found["parent"], strict=True) if p >= 0],
-        minlength=len(keys),
-    )
-    assert (daughters == np.where(found["fate"] == "divided", 2, 0)).all()
-    for state in states:  # who is alive at each step is who has been born and has not ended
-        alive = (found["born"] <= state.step) & (
-            (found["ended"] < 0) | (found["ended"] > state.step)
-        )
-        assert sorted(np.array(keys)[alive].tolist()) == sorted(
-            [list(k) for k in zip(state.colony.tolist(), state.uid.tolist(), strict=True)]
-        )
-
-
-def test_lineage_of_a_run_that_starts_in_the_middle_of_another(tmp_path):
-    """The state of a run's last step still carries that step's births; a new file must not count
-    them again."""
-    scene = make_scene()
-    state = scene.bind(2, seed=1).start()
-    while not state.births:
-        state = step(scene, state, DT)
-    record(scene, state, tmp_path / "run.h5", until=state.time + 1.0)
-    with tf.Results(tmp_path / "run.h5") as results:
-        found, first = results.lineage(), results.frame(0)
-    keys = list(zip(found["colony"].tolist(), found["uid"].tolist(), strict=True))
-    assert len(set(keys)) == len(keys), "a cell is listed twice"
-    assert (found["born"] >= state.step).all()
-    begun = set(zip(first["colony"].tolist(), first["uid"].tolist(), strict=True))
-    for key, parent in zip(keys, found["parent"].tolist(), strict=True):
-        assert key in begun or (key[0], parent) in keys
-    with tf.Results(tmp_path / "run.h5") as results:
-        last = results.frame()
-    alive = [k for k, fate in zip(keys, found["fate"], strict=True) if fate == "alive"]
-    assert sorted(alive) == sorted(zip(last["colony"].tolist(), last["uid"].tolist(), strict=True))
 
 
 # --- reading while it grows -----------------------------------------------------------------------
@@ -207,7 +116,7 @@ def test_lineage_of_a_run_that_starts_in_the_middle_of_another(tmp_path):
 READ = """
 import sys, torchfilm as tf
 with tf.Results(sys.argv[1]) as results:
-    sizes = len(results.frame()["uid"]), len(results.lineage()["uid"])
+    sizes = len(results.frame()["uid"]), len(results.lineage())
     print(len(results), int(results.counts[-1].sum()), *sizes)
 """
 
@@ -246,7 +155,7 @@ def test_reading_while_the_writer_is_open(tmp_path):
         assert results.steps.tolist() == [0, 5, 10, 15, 20, 25, 30]
         assert np.array_equal(results.frame()["position"], state.position.numpy())
         assert np.array_equal(results.frame(1)["position"], before)
-        assert len(results.lineage()["uid"]) >= state.cells
+        assert len(results.lineage()) >= state.cells
     other = python(READ, path)
     assert other.returncode == 0, other.stderr
     assert other.stdout.split()[:3] == ["7", str(state.cells), str(state.cells)]
@@ -332,8 +241,8 @@ def test_colonies_without_cells_are_recorded(tmp_path):
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.counts[0].tolist() == [0, 1, 0] and results.counts[-1].tolist() == [0, 0, 0]
         assert_same_state(results.state(scene), states[-1])
-        assert len(results.table()["uid"]) == int(results.counts.sum())
-        assert len(results.table(-1)["uid"]) == 0
+        assert len(results.table()["cell"]) == int(results.counts.sum())
+        assert len(results.table(-1)["cell"]) == 0
 
 
 def test_recipe_of_a_scene_of_ones_own_is_none(whole):

@@ -236,9 +236,10 @@ def test_what_a_file_tells_of_signals(tmp_path):
             np.concatenate([x.reshape(-1) for x in found]), last.signals["ahl"].numpy()
         )
         assert [x.shape for x in results.signal("ahl", 0)] == [(8, 8, 1)] * 3
-        assert {"luxi", "ahl", "circuit_volume"} <= set(
-            results.table(-1)
-        ) and "out.ahl" not in results.table(-1)
+        table = results.table(-1)
+        assert {"luxi", "ahl"} <= set(table) and "circuit_volume" not in table
+        assert "circuit_volume" in results.table(-1, internals=True)
+        assert np.array_equal(table["out.ahl"], last.contact().found["ahl"].numpy())
         with pytest.raises(InputError, match=r"signal = 'luxi'.*one of ahl"):
             results.signal("luxi")
 

@@ -200,7 +200,7 @@ def test_an_open_channel_keeps_its_sides_and_loses_cells_at_its_end(tmp_path):
         )
     assert float(last.position[:, 0].max()) <= 15.0
     with tf.Results(tmp_path / "run.h5") as results:
-        fate = results.lineage()["fate"]
+        fate = results.lineage().fate
     assert (fate == "left").sum() > 5
     # full: the cells' area cannot exceed the channel's by more than the overlaps
     assert float(last.counts.max()) < 60

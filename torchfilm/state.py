@@ -33,7 +33,8 @@ class Field:
     state's layout; the name begins with "out."). shape: of one row. unit and meaning: for people.
     initial: a number, or a function (state, rows) -> (M, *shape) tensor, called for new rows: at
     the start and, where at_division = "reset", for daughters, when `state.births[-1]` tells of
-    their parents. at_division: "copy" or "reset".
+    their parents. at_division: "copy" or "reset". internal: it serves the numerics; tables of
+    results show it only on request.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Field:
     dtype: torch.dtype | None = None  # None: the state's own
     initial: float | Callable[..., Tensor] = 0.0
     at_division: str = "copy"
+    internal: bool = False
 
     def __post_init__(self) -> None:
         checks.choice(f"Field({self.name!r}).scope", self.scope, (CELL, COLONY, GRID))

@@ -172,18 +172,14 @@ class Observed(Target):
         """The target of a frame of a results file, with the ages of its cells. Else as
         `from_table`."""
         with tf.Results(path) as results:
-            table, lineage = results.table(frame), results.lineage()
-            born = dict(zip(zip(lineage["colony"], lineage["uid"], strict=True),
-                            np.interp(lineage["born"], results.steps, results.times),
-                            strict=True))  # fmt: skip
-            now = float(results.times[frame])
+            table, now = results.table(frame), float(results.times[frame])
         columns = {
             "colony": table["colony"],
             "x_um": table["x"],
             "y_um": table["y"],
             "length_um": table["length"] + (2.0 * table["radius"] if length_with_caps else 0.0),
-            "angle_rad": np.arctan2(table["axis_y"], table["axis_x"]),
-            "age_h": [now - born[key] for key in zip(table["colony"], table["uid"], strict=True)],
+            "angle_rad": table["angle"],
+            "age_h": table["age"],
             **{name: table[name] for name in species if name in table},
         }
         return Observed.from_table(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch
 from helpers import step
@@ -107,11 +108,11 @@ def test_the_results_file_remembers_who_left_and_who_was_removed(tmp_path):
     with tf.Results(tmp_path / "run.h5") as results:
         found = results.lineage()
         assert results.counts[-1].tolist() == [1, 1]
-    assert found["colony"].tolist() == [0, 0, 0, 1, 1, 1]
-    assert found["uid"].tolist() == [0, 1, 2] * 2
-    assert found["fate"].tolist() == ["alive", "removed", "left"] * 2
+    assert found.colony.tolist() == [0, 0, 0, 1, 1, 1]
+    assert found.cell.tolist() == [0, 1, 2] * 2
+    assert found.fate.tolist() == ["alive", "removed", "left"] * 2
     # the rule sees t = 2 in the third step; 8.5 + 2 passes 10 in the second
-    assert found["ended"].tolist() == [-1, 3, 2] * 2
+    assert np.allclose(found.ended, [np.nan, 3, 2] * 2, equal_nan=True)
 
 
 def test_removed_and_divided_in_one_step_are_both_noted(tmp_path):

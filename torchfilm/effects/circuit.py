@@ -350,9 +350,9 @@ class Circuit(Effect):
             )
             for n in self.species
         ]
-        meaning = "volume that the concentrations refer to"
+        name, meaning = self.volume_field, "volume that the concentrations refer to"
         fields.append(
-            Field(self.volume_field, meaning, "µm³", initial=_volume_of, at_division="reset")
+            Field(name, meaning, "µm³", initial=_volume_of, at_division="reset", internal=True)
         )
         return (*fields, CELL_TYPE) if EVERY not in self.rates else tuple(fields)
 

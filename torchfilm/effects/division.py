@@ -97,6 +97,7 @@ class Division(Effect):
                 "divides at the next opportunity",
                 dtype=torch.bool,
                 at_division="reset",
+                internal=True,
             )
         ]
         name = self.criterion

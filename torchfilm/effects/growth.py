@@ -81,7 +81,9 @@ class Growth(Effect):
                 initial=0.0 if self.rate is None else _first_rate,
                 at_division="reset" if drawn and not is_inherited(self.rate) else "copy",
             ),
-            Field("elongation", "growth wanted in this step, contained in length", "µm"),
+            Field(
+                "elongation", "growth wanted in this step, contained in length", "µm", internal=True
+            ),
         )
 
     def reads(self) -> tuple[str, ...]:

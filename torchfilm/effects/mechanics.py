@@ -197,16 +197,17 @@ class Mechanics(Effect):
             "move of the last first solve of a step or sub-step (Δc, Δθ, Δl), from which the next"
             " starts"
         )
-        move = Field("displacement", meaning, "µm, rad, µm", shape=(self.settings.degrees,))
+        shape = (self.settings.degrees,)
+        move = Field("displacement", meaning, "µm, rad, µm", shape=shape, internal=True)
         # what a colony has, its cells have, so that growth can be recorded for other designs
         meaning = "steps in a row in which contacts have not held the colony's cells apart"
-        collapsed = Field("collapsed_steps", meaning, dtype=torch.int64)
+        collapsed = Field("collapsed_steps", meaning, dtype=torch.int64, internal=True)
         if not self.one_sided:
             return move, collapsed
         meaning = "α of the colony's contacts in the last step, 0 before the first"
-        alpha = Field("contact_alpha", meaning, "1/μ/µm")
+        alpha = Field("contact_alpha", meaning, "1/μ/µm", internal=True)
         meaning = "how much shorter pressure has made a cell than it once was"
-        compression = Field("compression", meaning, "µm", at_division="reset")
+        compression = Field("compression", meaning, "µm", at_division="reset", internal=True)
         return move, collapsed, alpha, compression
 
     @property

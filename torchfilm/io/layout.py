@@ -10,6 +10,9 @@
     /frames/grid/NAME     one row per frame: origin, shape (B, 3), first_voxel
     /signals/NAME         scenes with a medium only: one row per voxel, all colonies and frames in
                           sequence
+    /signals_at_cells/NAME  scenes with a medium only: one row per cell, as in /cells: the
+                          concentration that the cell finds
+    /parameters/PATH      (B,), parameters with one value per colony: see `torchfilm.io.parameters`
     /lineage/births       colony_id, uid, parent, step
     /lineage/ends         colony_id, uid, step, fate
 
@@ -30,6 +33,17 @@ from torch import Tensor
 from torchfilm.state import CELL, COLONY, PER_CELL, State
 
 FORMAT, VERSION = "torchfilm results", 2
+AT_CELLS = "signals_at_cells"
+# Internal fields of files that do not name theirs, as earlier versions wrote them.
+INTERNAL_BEFORE = (
+    "collapsed_steps",
+    "compression",
+    "contact_alpha",
+    "displacement",
+    "divide_flag",
+    "elongation",
+)
+INTERNAL_ENDING_BEFORE = "circuit_volume"
 FATES = ("divided", "removed", "left", "failed")
 CHUNK_ROWS, CHUNK_VOXELS, CHUNK_FRAMES = 8192, 32768, 64
 LINEAGE = {
@@ -61,6 +75,12 @@ def colony_columns(state: State) -> dict[str, np.ndarray]:
 def voxel_columns(state: State) -> dict[str, np.ndarray]:
     """The concentrations of the signals by name, each one value per voxel of all colonies."""
     return {n: numpy_of(v) for n, v in state.signals.items()}
+
+
+def found_columns(state: State) -> dict[str, np.ndarray]:
+    """The concentration of each signal at the cells by name, each (N,)."""
+    contact = state.contact()
+    return {} if contact is None else {n: numpy_of(v) for n, v in contact.found.items()}
 
 
 def grid_columns(state: State, first_voxel: int = 0) -> dict[str, np.ndarray]:
@@ -113,6 +133,7 @@ def create_tables(file: h5py.File, state: State) -> None:
         file.attrs["height"] = state.layout.height
         for name, value in voxel_columns(state).items():
             create_growing(file, f"signals/{name}", value.dtype, (), CHUNK_VOXELS)
+            create_growing(file, f"{AT_CELLS}/{name}", value.dtype, (), CHUNK_ROWS)
         for name, value in grid_columns(state).items():
             create_growing(file, f"frames/grid/{name}", value.dtype, value.shape, CHUNK_FRAMES)
     for table, columns in LINEAGE.items():

@@ -15,6 +15,8 @@ import torch
 from torchfilm.io import replacing
 from torchfilm.io.identity import scene_attributes
 from torchfilm.io.layout import (
+    AT_CELLS,
+    CHUNK_ROWS,
     FATES,
     FORMAT,
     FRAME_COLUMNS,
@@ -22,11 +24,14 @@ from torchfilm.io.layout import (
     VERSION,
     cell_columns,
     colony_columns,
+    create_growing,
     create_tables,
+    found_columns,
     grid_columns,
     numpy_of,
     voxel_columns,
 )
+from torchfilm.io.parameters import write_parameters
 from torchfilm.io.reading import committed, inode_of_open
 from torchfilm.io.results import Results
 from torchfilm.model import Model
@@ -171,6 +176,7 @@ class Recorder:
         for name, value in self._attributes(state).items():
             self.file.attrs[name] = value
         create_tables(self.file, state)
+        write_parameters(self.file, self.scene, state.colony_id, state.step)
         self.file.swmr_mode = True
         self._write(state)
 
@@ -192,6 +198,7 @@ class Recorder:
             "torchfilm": __version__,
             "torch": str(torch.__version__),
             "declared": json.dumps(declared),
+            "internal": json.dumps([f.name for f in state.declared.values() if f.internal]),
         }
 
     def _resume(self, state: State) -> None:
@@ -203,7 +210,19 @@ class Recorder:
         # with `changed`, the scene may be another one
         for name, value in {**scene_attributes(self.scene, self.model), "dt": self.dt}.items():
             self.file.attrs[name] = value
+        write_parameters(self.file, self.scene, state.colony_id, state.step)
+        self._add_found(self.file, state)
         self.file.swmr_mode = True
+
+    @staticmethod
+    def _add_found(file: h5py.File, state: State) -> None:
+        """Add the datasets of signals at the cells, NaN so far, to a file of an earlier version."""
+        rows = committed(file)["rows"]
+        for name, value in found_columns(state).items():
+            if f"{AT_CELLS}/{name}" not in file:
+                create_growing(file, f"{AT_CELLS}/{name}", value.dtype, (), CHUNK_ROWS)
+                file[f"{AT_CELLS}/{name}"].resize(rows, axis=0)
+                file[f"{AT_CELLS}/{name}"][:] = np.nan
 
     def _check_resumed(self, kept: Results, state: State) -> None:
         """Raise InputError unless the file ends with this state, of this scene."""
@@ -290,6 +309,7 @@ class Recorder:
         columns = (*cell_columns(state).values(), *voxel_columns(state).values())
         needed = (
             sum(v.nbytes for v in columns)
+            + state.cells * len(state.signals) * state.length.element_size()
             + sum(c.nbytes for e in (*self.births, *self.ends) for c in e)
             + SPARE_BYTES
         )
@@ -331,6 +351,8 @@ class Recorder:
         frame, first_voxel = sizes["frames"], sizes["voxels"]
         for name, value in columns.items():
             self._append(f"cells/{name}", value, sizes["rows"])
+        for name, value in found_columns(state).items():
+            self._append(f"{AT_CELLS}/{name}", value, sizes["rows"])
         for table, events in (("births", self.births), ("ends", self.ends)):
             names = LINEAGE[table]
             merged = (

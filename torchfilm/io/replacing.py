@@ -10,7 +10,7 @@ from typing import Any
 
 import h5py
 
-from torchfilm.io.layout import CHUNK_ROWS, FORMAT, create_growing
+from torchfilm.io.layout import AT_CELLS, CHUNK_ROWS, FORMAT, create_growing
 from torchfilm.io.reading import committed, open_results
 from torchfilm.tools import checks
 
@@ -100,6 +100,7 @@ def copy_committed(source: Path, target: Path) -> h5py.File:
             out.attrs[name] = value
         sizes = {
             "cells": keep["rows"],
+            AT_CELLS: keep["rows"],
             "signals": keep["voxels"],
             "frames": keep["frames"],
             "lineage/births": keep["births"],

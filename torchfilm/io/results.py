@@ -14,25 +14,28 @@ import h5py
 import numpy as np
 import torch
 
-from torchfilm.io.identity import check_same_scene
-from torchfilm.io.layout import FATES, LINEAGE
+from torchfilm.io.identity import check_same_scene, declared_fields
+from torchfilm.io.layout import AT_CELLS, INTERNAL_BEFORE, INTERNAL_ENDING_BEFORE
+from torchfilm.io.lineage import Lineage
+from torchfilm.io.parameters import parameters_at
 from torchfilm.io.reading import (
     blaming_file,
-    committed,
     frame_count,
     inode_of_open,
     open_results,
     read_dataset,
 )
 from torchfilm.io.restoring import restore_state
+from torchfilm.io.table import Tables, data_frame
 from torchfilm.scene import Scene
-from torchfilm.state import PER_CELL, State
+from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 
 # Groups whose datasets grow with the run, beside frames/step.
 GROWING = (
     "cells",
+    AT_CELLS,
     "signals",
     "lineage/births",
     "lineage/ends",
@@ -121,6 +124,15 @@ class Results:
         one per colony. "soft" says whether the surface yields."""
         return json.loads(self.file.attrs.get("walls", "[]"))
 
+    @property
+    def internal_fields(self) -> set[str]:
+        """The fields that serve the numerics: `table` shows them only with `internals`."""
+        given = self.file.attrs.get("internal")
+        if given is not None:
+            return set(json.loads(given))
+        names = declared_fields(self.file.attrs)
+        return {n for n in names if n in INTERNAL_BEFORE or n.endswith(INTERNAL_ENDING_BEFORE)}
+
     def refresh(self) -> None:
         """Read what a run has written since. If another file has replaced this one (a resumed run,
         or a new run with `overwrite`), open that one. Raises InputError if the path has no readable
@@ -154,17 +166,30 @@ class Results:
     def frame(self, frame: int = -1) -> dict[str, np.ndarray]:
         """Arrays of one frame by name: colony (place in the batch), uid, parent, position, axis,
         length, radius and the fields per cell."""
-        k = self._index(frame)
-        start = int(self._read("frames/first_row", k))
-        stop = start + int(self._read("frames/counts", k).sum())
-        return {
-            name: self._read(f"cells/{name}", slice(start, stop)) for name in self._names("cells")
-        }
+        rows = self._rows(self._index(frame))
+        return {name: self._read(f"cells/{name}", rows) for name in self._names("cells")}
 
     def colony_fields(self, frame: int = -1) -> dict[str, np.ndarray]:
         """The fields per colony of one frame by name, each (B, …)."""
         k = self._index(frame)
         return {n: self._read(f"frames/colony/{n}", k) for n in self._names("frames/colony")}
+
+    def parameters(self, frame: int = -1) -> dict[str, np.ndarray]:
+        """Every parameter with one value per colony, (B,), by its path in the scene, such as
+        "Circuit.parameters['k1']". A resume with `changed` may change them: NaN at frames where a
+        parameter had no value per colony. Empty for a file of an earlier version."""
+        return parameters_at(self.file, int(self._read("frames/step", self._index(frame))))
+
+    def signals_at_cells(self, frame: int = -1) -> dict[str, np.ndarray]:
+        """The concentration of each signal at the cells of one frame, (N,); NaN in frames of an
+        earlier version, which did not record it."""
+        rows = self._rows(self._index(frame))
+        return {n: self._read(f"{AT_CELLS}/{n}", rows) for n in self._names(AT_CELLS)}
+
+    def _rows(self, k: int) -> slice:
+        """The rows of a frame's cells."""
+        start = int(self._read("frames/first_row", k))
+        return slice(start, start + int(self._read("frames/counts", k).sum()))
 
     def next_uid(self, frame: int = -1) -> np.ndarray:
         """(B,) the uid that the next cell born in each colony gets."""
@@ -211,51 +236,27 @@ class Results:
         parameters, and functions with the same code."""
         check_same_scene(self.file.attrs, self.path, scene)
 
-    def table(self, frame: int | None = None) -> dict[str, np.ndarray]:
-        """One column per quantity, one row per cell, for `pandas.DataFrame(results.table())`: of
-        one frame, or of all frames, with columns for time and frame."""
-        frames = range(len(self)) if frame is None else [self._index(frame)]
-        parts = []
-        for k in frames:
-            columns: dict[str, np.ndarray] = {}
-            found = self.frame(k)
-            count = len(found["uid"])
-            columns["frame"] = np.full(count, k)
-            columns["time"] = np.full(count, self.times[k])
-            columns["colony"] = self.colony_id[found.pop("colony")]
-            for name in sorted(found, key=lambda n: (n not in PER_CELL, n)):
-                columns |= _columns_of(name, found[name])
-            parts.append(columns)
-        return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    def table(self, frame: int | None = None, *, internals: bool = False) -> dict[str, np.ndarray]:
+        """One row per cell, one column per quantity: of one frame, or of all.
 
-    def lineage(self) -> dict[str, np.ndarray]:
-        """Every cell of the recorded run: colony, uid, parent, born (step), ended (step, or −1),
-        fate ("alive", "divided", …)."""
-        size = committed(self.file)
-        births = {
-            n: self._read(f"lineage/births/{n}", slice(size["births"])) for n in LINEAGE["births"]
-        }
-        ends = {n: self._read(f"lineage/ends/{n}", slice(size["ends"])) for n in LINEAGE["ends"]}
-        first = self.frame(0)
-        colony = np.concatenate([self.colony_id[first["colony"]], births["colony_id"]])
-        uid = np.concatenate([first["uid"], births["uid"]])
-        parent = np.concatenate([first["parent"], births["parent"]])
-        born = np.concatenate([np.full(len(first["uid"]), self.steps[0]), births["step"]])
-        key, end_key = _pair(colony, uid), _pair(ends["colony_id"], ends["uid"])
-        order = np.argsort(key)
-        at = order[np.searchsorted(key, end_key, sorter=order)]
-        ended = np.full(len(uid), -1)
-        fate = np.full(len(uid), "alive", dtype="<U8")
-        ended[at] = ends["step"]
-        fate[at] = np.asarray(FATES)[ends["fate"]]
-        return {
-            "colony": colony,
-            "uid": uid,
-            "parent": parent,
-            "born": born,
-            "ended": ended,
-            "fate": fate,
-        }
+        frame · time, h · colony, its id · cell, unique within the colony · parent, −1 for founders
+        · x, y, z, µm · angle, rad, of the axis in the plane, and in space tilt, rad, above it ·
+        length, of the centreline, and radius, µm · volume, µm³ · age and born, h, as in `Lineage` ·
+        the fields of cells and colonies, such as species · out.NAME, each signal at the cell · the
+        parameters with one value per colony, by the shortest name that is free. A field whose name
+        is one of those above is called field.NAME. internals: with the axis, and with the fields
+        that serve the numerics.
+        """
+        frames = range(len(self)) if frame is None else [self._index(frame)]
+        return Tables(self, self.lineage(), internals)(frames)
+
+    def to_pandas(self, frame: int | None = None, *, internals: bool = False) -> Any:
+        """`table` as a pandas.DataFrame. Requires the extra `tables`."""
+        return data_frame(self.table(frame, internals=internals))
+
+    def lineage(self) -> Lineage:
+        """Every cell that ever lived, as arrays and as a tree."""
+        return Lineage(self)
 
     def state(
         self,
@@ -271,19 +272,3 @@ class Results:
         default. Raises InputError for another scene, and names what differs.
         """
         return restore_state(self, scene, self._index(frame), device, changed)
-
-
-def _columns_of(name: str, value: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of a table for one quantity: itself, or one per component."""
-    if value.ndim == 1:
-        return {name: value}
-    letters = "xyz" if name in ("position", "axis") else list(map(str, range(value.shape[1])))
-    return {
-        (letter if name == "position" else f"{name}_{letter}"): value[:, j]
-        for j, letter in zip(range(value.shape[1]), letters, strict=False)
-    }
-
-
-def _pair(colony: np.ndarray, uid: np.ndarray) -> np.ndarray:
-    """One integer key for each (colony, uid)."""
-    return colony.astype(np.int64) << 40 | uid.astype(np.int64)

@@ -1,0 +1,165 @@
+"""The lineage of results: births and ends in hours, the tree, and its exchange formats."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from helpers import step
+from recorded import DT, make_scene, record
+
+import torchfilm as tf
+
+
+def keys_of(tree) -> list[tuple[int, int]]:
+    return list(zip(tree.colony.tolist(), tree.cell.tolist(), strict=True))
+
+
+def test_lineage_is_consistent(whole):
+    path, states = whole
+    with tf.Results(path) as results:
+        found = results.lineage()
+    keys = keys_of(found)
+    assert len(set(keys)) == len(keys) == len(found)
+    row = {key: k for k, key in enumerate(keys)}
+    for k, (colony, _) in enumerate(keys):
+        parent = int(found.parent[k])
+        if parent == -1:
+            assert found.born[k] == 0
+            continue
+        p = row[(colony, parent)]
+        assert found.fate[p] == "divided" and found.ended[p] == found.born[k], (
+            "a daughter is born when its parent ends"
+        )
+        assert found.born[p] < found.born[k]
+    ended = ~np.isnan(found.ended)
+    assert (found.ended[ended] >= found.born[ended]).all()
+    assert ((found.fate == "alive") == ~ended).all()
+    assert set(found.fate) == {"alive", "divided", "removed"}
+    daughters = np.bincount(
+        [row[(c, int(p))] for (c, _), p in zip(keys, found.parent, strict=True) if p >= 0],
+        minlength=len(keys),
+    )
+    assert (daughters == np.where(found.fate == "divided", 2, 0)).all()
+    for state in states:  # who is alive at each step is who has been born and has not ended
+        now = state.time + DT / 2
+        alive = (found.born <= now) & ~(found.ended <= now)
+        assert sorted(np.array(keys)[alive].tolist()) == sorted(
+            [list(k) for k in zip(state.colony.tolist(), state.uid.tolist(), strict=True)]
+        )
+
+
+def test_ancestors_and_descendants(whole):
+    with tf.Results(whole[0]) as results:
+        tree = results.lineage()
+        last = results.frame()
+    cell = int(last["uid"][last["colony"] == 1].max())
+    line = tree.ancestors(cell, colony=1)
+    assert len(line) > 2 and line[-1] == 0 and tree.ancestors(0, colony=1) == []
+    mothers = {c: p for k, c, p in zip(tree.colony, tree.cell, tree.parent, strict=True) if k == 1}
+    assert [mothers[c] for c in [cell, *line]] == [*line, -1]
+    below = tree.descendants(0, colony=1)
+    assert sorted([0, *below]) == sorted(tree.cell[tree.colony == 1].tolist())
+    assert all(cell in tree.descendants(c, colony=1) for c in line)
+    assert tree.descendants(cell, colony=1) == []
+
+
+def test_the_course_of_a_cell_has_one_row_per_frame(whole):
+    path, _ = whole
+    with tf.Results(path) as results:
+        tree, table, times = results.lineage(), results.table(), results.times
+        mine = (table["colony"] == 2) & (table["frame"] == len(times) - 1)
+        cell = int(table["cell"][mine].max())
+        course = tree.course(cell, colony=2)
+    assert list(course) == list(table)
+    assert course["time"].tolist() == times.tolist() and course["cell"][-1] == cell
+    assert set(course["cell"]) <= {cell, *tree.ancestors(cell, colony=2)}
+    for k in range(len(times)):
+        row = (table["frame"] == k) & (table["colony"] == 2) & (table["cell"] == course["cell"][k])
+        assert table["x"][row].tolist() == [course["x"][k]]
+
+
+def test_newick_is_the_tree(whole):
+    with tf.Results(whole[0]) as results:
+        tree = results.lineage()
+    text = tree.to_newick(1)
+    assert text.count("\n") == 1 and text.endswith(";\n") and text.count("(") == text.count(")")
+    found = dict(re.findall(r"colony1\.cell(\d+):([-\d.e]+)", text))
+    own = tree.colony == 1
+    assert sorted(map(int, found)) == sorted(tree.cell[own].tolist())
+    for cell, born, ended in zip(tree.cell[own], tree.born[own], tree.ended[own], strict=True):
+        lived = (tree.now if np.isnan(ended) else ended) - born
+        assert float(found[str(cell)]) == pytest.approx(lived, abs=1e-5)
+    assert tree.to_newick().count(";") == 3, "a line for each founder"
+    # the length from root to tip is the time of the tip's end
+    alive = int(tree.cell[own & (tree.fate == "alive")][0])
+    line = [alive, *tree.ancestors(alive, colony=1)]
+    assert sum(float(found[str(c)]) for c in line) == pytest.approx(tree.now, abs=1e-4)
+
+
+def test_newick_of_a_lineage_that_is_very_deep(tmp_path):
+    """A mother that loses one daughter at each division: thousands of generations."""
+
+    def update(cells):
+        cells.divide_flag = cells.uid == cells.uid
+        cells.remove_flag = (cells.uid > 0) & (cells.uid % 2 == 0)
+
+    growth = tf.Growth(law="linear", rate=300.0)
+    scene = tf.Scene(tf.Rules(update), growth, tf.Division(), dim=3, dt=0.01)
+    recorder = tf.Recorder(tmp_path / "run.h5", scene, every=500)
+    for _ in tf.simulate(scene, until=15.0, record=recorder):
+        pass
+    with tf.Results(tmp_path / "run.h5") as results:
+        tree = results.lineage()
+        deepest = len(tree.ancestors(int(tree.cell.max())))
+        text = tree.to_newick()
+    assert deepest > 1400 and text.count("cell") == len(tree)
+
+
+def test_networkx(whole):
+    networkx = pytest.importorskip("networkx", reason="the extra tables")
+    with tf.Results(whole[0]) as results:
+        tree = results.lineage()
+    graph = tree.to_networkx()
+    assert set(graph) == set(keys_of(tree)) and networkx.is_branching(graph)
+    assert networkx.number_weakly_connected_components(graph) == 3
+    one = tree.to_networkx(colony=0)
+    assert set(networkx.descendants(one, (0, 1))) == {(0, c) for c in tree.descendants(1, colony=0)}
+    row = keys_of(tree).index((0, 0))
+    assert one.nodes[0, 0] == {"born": 0.0, "ended": tree.ended[row], "fate": "divided"}
+
+
+def test_a_cell_of_several_colonies_needs_its_colony(whole):
+    with tf.Results(whole[0]) as results:
+        tree = results.lineage()
+        with pytest.raises(tf.InputError, match=r"colony = None.*0, 1, 2.*its colony only"):
+            tree.ancestors(3)
+        with pytest.raises(tf.InputError, match=r"cell = 9999.*a cell of colony 1: 0 to"):
+            tree.course(9999, colony=1)
+        with pytest.raises(tf.InputError, match=r"colony = 7"):
+            tree.to_newick(7)
+        with pytest.raises(tf.InputError, match=r"cell = 1\.5"):
+            tree.descendants(1.5, colony=0)
+
+
+def test_lineage_of_a_run_that_starts_in_the_middle_of_another(tmp_path):
+    """The state of a run's last step still carries that step's births; a new file must not count
+    them again. When its first cells were born, the file does not know."""
+    scene = make_scene()
+    state = scene.bind(2, seed=1).start()
+    while not state.births:
+        state = step(scene, state, DT)
+    record(scene, state, tmp_path / "run.h5", until=state.time + 1.0)
+    with tf.Results(tmp_path / "run.h5") as results:
+        found, first, last = results.lineage(), results.frame(0), results.frame()
+        newick = found.to_newick()
+    keys = keys_of(found)
+    assert len(set(keys)) == len(keys), "a cell is listed twice"
+    begun = set(zip(first["colony"].tolist(), first["uid"].tolist(), strict=True))
+    for key, parent, born in zip(keys, found.parent.tolist(), found.born, strict=True):
+        assert key in begun or (key[0], parent) in keys
+        assert np.isnan(born) if key in begun else born > state.time
+    alive = [k for k, fate in zip(keys, found.fate, strict=True) if fate == "alive"]
+    assert sorted(alive) == sorted(zip(last["colony"].tolist(), last["uid"].tolist(), strict=True))
+    assert "nan" not in newick and newick.count(";") == len(begun)

@@ -1,0 +1,230 @@
+"""Tables of results: a row for each cell, values per colony as columns, internals on request."""
+
+from __future__ import annotations
+
+import builtins
+import math
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from recorded import DT, make_scene, record
+
+import torchfilm as tf
+from torchfilm.io.parameters import column_names
+from torchfilm.physics import capsule
+
+
+def designs(rates=(0.8, 1.2), k=(1.0, 2.0), **others) -> tf.Scene:
+    """Two colonies that differ by the growth rate, the length at division and a constant of the
+    circuit."""
+
+    def circuit(u, s, p, cell):
+        return {"gfp": p.k - p.g * u.gfp}, {"ahl": 1.0 + 0.0 * u.gfp}
+
+    return tf.Scene(
+        tf.Growth(rate=torch.tensor(rates)),
+        tf.Division(length=tf.PerColony([3.0, 3.5])),
+        tf.Circuit(circuit, species=("gfp",), k=torch.tensor(k), g=0.1),
+        tf.Medium(ahl=tf.Signal(diffusion=10.0), box=((-16.0, -16.0), (16.0, 16.0)), spacing=4.0),
+        tf.Mechanics(dim=2),
+        dt=DT,
+        **others,
+    )
+
+
+def test_the_table_has_a_row_for_each_cell(whole):
+    path, states = whole
+    with tf.Results(path) as results:
+        table, last = results.table(), results.table(-1)
+        total = int(results.counts.sum())
+    assert {len(v) for v in table.values()} == {total}
+    first = ["frame", "time", "colony", "cell", "parent", "x", "y", "angle", "length", "radius"]
+    assert list(table)[:13] == [*first, "volume", "age", "born"]
+    assert set(list(table)[13:]) == {"mark", "growth_rate", "division_threshold"}
+    assert all(v.ndim == 1 for v in table.values())
+    assert np.array_equal(np.unique(table["frame"]), np.arange(10))
+    state = states[-1]
+    assert np.array_equal(last["x"], state.position[:, 0].numpy())
+    assert np.array_equal(last["colony"], state.colony.numpy())
+    assert np.array_equal(last["cell"], state.uid.numpy())
+    assert (last["time"] == state.time).all()
+    assert np.allclose(np.cos(last["angle"]), state.axis[:, 0].numpy(), atol=1e-6)
+    assert np.allclose(last["volume"], state.volume.numpy(), rtol=1e-6)
+
+
+def test_ages_are_hours_since_birth(whole):
+    path, states = whole
+    seen: dict = {}
+    for state in states:
+        for key in zip(state.colony.tolist(), state.uid.tolist(), strict=True):
+            seen.setdefault(key, state.time)
+    with tf.Results(path) as results:
+        table = results.table()
+    keys = list(zip(table["colony"].tolist(), table["cell"].tolist(), strict=True))
+    assert np.allclose(table["born"], [seen[key] for key in keys], rtol=0, atol=1e-9)
+    assert np.allclose(table["age"], table["time"] - table["born"])
+    assert table["age"].max() > 0.3 and table["age"].min() >= 0
+
+
+def test_internals_are_shown_on_request(whole):
+    with tf.Results(whole[0]) as results:
+        table, every = results.table(-1), results.table(-1, internals=True)
+    more = {"axis_x", "axis_y", "displacement_0", "elongation", "divide_flag", "contact_alpha"}
+    assert more <= set(every) - set(table)
+    assert all(np.array_equal(table[name], every[name]) for name in table)
+
+
+def test_values_per_colony_come_back_as_columns(tmp_path):
+    path, scene = tmp_path / "run.h5", designs()
+    states = record(scene, scene.bind(2).start(), path, until=1.0)
+    with tf.Results(path) as results:
+        table = results.table()
+        assert set(results.parameters()) == {
+            "Growth.rate",
+            "Division.length",
+            "Circuit.parameters['k']",
+        }
+    for name, values in (("rate", [0.8, 1.2]), ("k", [1, 2]), ("Division.length", [3, 3.5])):
+        assert np.allclose(table[name], np.asarray(values)[table["colony"]]), name
+    last = states[-1]
+    mine = table["frame"] == table["frame"].max()
+    assert np.array_equal(table["out.ahl"][mine], last.contact().found["ahl"].numpy())
+    assert np.array_equal(table["gfp"][mine], last.gfp.numpy()) and table["out.ahl"].max() > 0
+
+
+def test_a_selection_of_colonies_keeps_its_values(tmp_path):
+    scene = designs()
+    record(scene, scene.bind(2).start().select([1]), tmp_path / "run.h5", until=0.5)
+    with tf.Results(tmp_path / "run.h5") as results:
+        assert results.parameters()["Growth.rate"].tolist() == [pytest.approx(1.2)]
+        assert set(results.table()["k"]) == {2.0}
+
+
+def test_values_that_a_resumed_run_changed_stay_those_of_the_earlier_frames(tmp_path):
+    path, scene = tmp_path / "run.h5", designs()
+    record(scene, scene.bind(2).start(), path, until=0.5, every=5)
+    with tf.Results(path) as results:
+        frames = len(results)
+        state = results.state(scene)
+    record(scene, state, path, until=1.0, append=True)
+    other = designs(k=(5.0, 6.0))
+    with tf.Results(path) as results:
+        same, state = len(results), results.state(other, changed=True)
+    record(other, state, path, until=1.5, append=True, changed=True)
+    with tf.Results(path) as results:
+        assert frames < same < len(results)
+        seen = [results.parameters(k)["Circuit.parameters['k']"][0] for k in range(len(results))]
+        table = results.table()
+    assert seen == [1.0] * same + [5.0] * (len(seen) - same)
+    assert np.array_equal(table["k"], np.where(table["frame"] < same, 1.0, 5.0) + table["colony"])
+
+
+def as_earlier(path, tmp_path):
+    """The file as an earlier version wrote it."""
+    old = tmp_path / "old.h5"
+    with h5py.File(path, "r") as source, h5py.File(old, "w", libver="latest") as file:
+        for name in source:
+            if name not in ("parameters", "signals_at_cells"):
+                source.copy(name, file)
+        for name, value in source.attrs.items():
+            if name != "internal":
+                file.attrs[name] = value
+    return old
+
+
+def test_files_of_earlier_versions_are_read_and_resumed(tmp_path):
+    path, scene = tmp_path / "run.h5", designs()
+    record(scene, scene.bind(2).start(), path, until=0.5, every=5)
+    with tf.Results(path) as results:
+        now = results.table()
+    old = as_earlier(path, tmp_path)
+    with tf.Results(old) as results:
+        assert results.parameters() == {} and results.signals_at_cells() == {}
+        table, state = results.table(), results.state(scene)
+        assert set(now) - set(table) == {"rate", "k", "Division.length", "out.ahl"}
+        assert set(table) < set(now)
+    record(scene, state, old, until=1.0, append=True)
+    with tf.Results(old) as results:
+        table = results.table()
+    before = table["frame"] < now["frame"].max() + 1
+    assert np.array_equal(np.isnan(table["out.ahl"]), before) and not before.all()
+    assert np.array_equal(table["k"], table["colony"] + 1.0)
+
+
+def test_a_field_named_as_a_column_is_kept_beside_it(tmp_path):
+    def update(cells):
+        cells.age = cells.age + 1.0
+
+    scene = tf.Scene(tf.Rules(update, variables={"age": 0.0}), tf.Growth(rate=1.0), dim=3, dt=0.1)
+    record(scene, scene.bind().start(), tmp_path / "run.h5", until=0.5)
+    with tf.Results(tmp_path / "run.h5") as results:
+        table = results.table(-1)
+    assert table["field.age"].tolist() == [5.0] and table["age"].tolist() == [pytest.approx(0.5)]
+
+
+def test_space_has_a_tilt(tmp_path):
+    axis = np.array([[1.0, 1.0, math.sqrt(2.0)]])
+    cells = tf.Cells([[0.0, 0.0, 0.0]], axis / np.linalg.norm(axis), 2.0)
+    scene = tf.Scene(tf.Growth(rate=1.0), founders=cells, dt=0.1)
+    record(scene, scene.bind().start(), tmp_path / "run.h5", until=0.2)
+    with tf.Results(tmp_path / "run.h5") as results:
+        table = results.table(-1)
+    assert table["angle"] == pytest.approx(math.pi / 4) == table["tilt"] and "z" in table
+    assert table["volume"] == pytest.approx(
+        float(capsule.volume(torch.tensor(table["length"][0]), torch.tensor(0.5)))
+    )
+
+
+def test_a_data_frame_has_the_columns_of_the_table(whole):
+    pandas = pytest.importorskip("pandas", reason="the extra tables")
+    with tf.Results(whole[0]) as results:
+        frame, table = results.to_pandas(), results.table()
+        assert list(frame.columns) == list(table) and isinstance(frame, pandas.DataFrame)
+        assert all(np.array_equal(frame[name], table[name]) for name in table)
+        assert len(results.to_pandas(frame=-1)) == int(results.counts[-1].sum())
+        assert "divide_flag" in results.to_pandas(-1, internals=True)
+
+
+def test_a_missing_extra_is_named(whole, monkeypatch):
+    def no_pandas(name, *args, **kwargs):
+        if name in ("pandas", "networkx"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    real = builtins.__import__
+    monkeypatch.setattr("torchfilm.io.table.import_module", no_pandas)
+    with tf.Results(whole[0]) as results:
+        with pytest.raises(tf.InputError, match=r'pandas: pip install "torchfilm\[tables\]"'):
+            results.to_pandas()
+        with pytest.raises(tf.InputError, match=r'networkx: pip install "torchfilm\[tables\]"'):
+            results.lineage().to_networkx()
+
+
+def test_names_of_parameters_are_as_short_as_they_can_be():
+    paths = [
+        "Circuit.parameters['k']",
+        "Growth.rate",
+        "Medium.signals['a'].diffusion",
+        "Medium.signals['b'].diffusion",
+        "Division.length.low",
+        "Division.length.high",
+        "Mechanics.walls[0].low[1]",
+    ]
+    assert list(column_names(paths, {"x", "length", "rate"}).values()) == [
+        "k",
+        "Growth.rate",
+        "a.diffusion",
+        "b.diffusion",
+        "low",
+        "high",
+        "low[1]",
+    ]
+
+
+def test_a_scene_without_values_per_colony_stores_none(tmp_path):
+    scene = make_scene()
+    record(scene, scene.bind(2).start(), tmp_path / "run.h5", until=0.3)
+    with tf.Results(tmp_path / "run.h5") as results:
+        assert results.parameters() == {}

@@ -1,0 +1,211 @@
+"""The lineage of a run as a tree: who descends from whom, when each cell was born and how it
+ended."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchfilm.io.layout import FATES, LINEAGE
+from torchfilm.io.reading import committed, read_dataset
+from torchfilm.io.table import Tables, data_frame, needed
+from torchfilm.tools import checks
+from torchfilm.tools.checks import InputError
+
+if TYPE_CHECKING:
+    from torchfilm.io.results import Results
+
+
+class Lineage:
+    """Every cell of a recorded run, as arrays (N,), and as a tree.
+
+    colony: id of its colony · cell: its uid, unique within the colony · parent: uid, −1 for
+    founders · born: h; the founders' is the start of the run, and that of cells which a run found
+    in the middle of another is not known, NaN · ended: h, NaN while it lives · fate: "alive",
+    "divided", "removed", "left" or "failed".
+
+    Cells are named by uid, and in a run of several colonies by `colony`, an id, too. `course` reads
+    the file, which must be open. Raises InputError for cells and colonies that the run does not
+    have.
+    """
+
+    def __init__(self, results: Results):
+        self._results = results
+        file, size, first = results.file, committed(results.file), results.frame(0)
+        births, ends = (
+            {n: read_dataset(file, f"lineage/{t}/{n}", slice(size[t])) for n in LINEAGE[t]}
+            for t in ("births", "ends")
+        )
+        steps, times = results.steps, results.times
+        self.frames = size["frames"]
+        self.begin, self.now = float(times[0]), float(times[self.frames - 1])
+        self._path, self._known = results.path, results.colony_id.tolist()
+        self.colony: np.ndarray = np.concatenate(
+            [results.colony_id[first["colony"]], births["colony_id"]]
+        )
+        self.cell: np.ndarray = np.concatenate([first["uid"], births["uid"]])
+        self.parent: np.ndarray = np.concatenate([first["parent"], births["parent"]])
+        founded = np.where((first["parent"] < 0) & (steps[0] == 0), times[0], np.nan)
+        self.born: np.ndarray = np.concatenate([founded, np.interp(births["step"], steps, times)])
+        self.ended = np.full(len(self.cell), np.nan)
+        self.fate = np.full(len(self.cell), "alive", dtype="<U8")
+        self._order = np.argsort(_pair(self.colony, self.cell))
+        self._keys = _pair(self.colony, self.cell)[self._order]
+        at = self._rows(ends["colony_id"], ends["uid"])
+        self.ended[at] = np.interp(ends["step"], steps, times)
+        self.fate[at] = np.asarray(FATES)[ends["fate"]]
+
+    def __len__(self) -> int:
+        return len(self.cell)
+
+    def __repr__(self) -> str:
+        colonies = len(np.unique(self.colony))
+        return f"Lineage({len(self)} cells in {colonies} colonies, {self.now:g} h)"
+
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame with one row per cell: colony, cell, parent, born, ended, fate."""
+        names = ("colony", "cell", "parent", "born", "ended", "fate")
+        return data_frame({name: getattr(self, name) for name in names})
+
+    def born_of(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
+        """When cells (M,) of colonies (M,) were born, h."""
+        return self.born[self._rows(colony, cell)]
+
+    def ancestors(self, cell: int, colony: int | None = None) -> list[int]:
+        """The cell's mother, her mother, and so on to the founder, or to the first cell that the
+        file has."""
+        row, found = self._row(cell, colony), []
+        while (mother := self._mothers[row]) >= 0:
+            row = int(mother)
+            found.append(int(self.cell[row]))
+        return found
+
+    def descendants(self, cell: int, colony: int | None = None) -> list[int]:
+        """The cell's daughters, then their daughters, and so on."""
+        generation, found = [self._row(cell, colony)], []
+        while generation:
+            generation = [d for row in generation for d in self._daughters.get(row, ())]
+            found += generation
+        return self.cell[found].tolist() if found else []
+
+    def course(self, cell: int, colony: int | None = None) -> dict[str, np.ndarray]:
+        """The values of the cell and of its ancestors over time: the columns of `Results.table`,
+        one row per frame since its founder."""
+        colony = self._colony(colony)
+        line = [int(cell), *self.ancestors(cell, colony)]
+        tables = Tables(self._results, self, internals=False)
+        keep = lambda ids, uid: (ids == colony) & np.isin(uid, line)
+        return tables(range(self.frames), keep)
+
+    def to_newick(self, colony: int | None = None) -> str:
+        """The trees of one colony, or of all, in Newick format: a line for each founder. Nodes are
+        named colony0.cell5; the length of a branch is how long the cell lived, h. A cell that was
+        there before the file counts from its first frame."""
+        return "".join(f"{self._newick(row)};\n" for row in self._roots(colony))
+
+    def to_networkx(self, colony: int | None = None) -> Any:
+        """The trees of one colony, or of all, as a networkx.DiGraph from mother to daughter. Nodes
+        are (colony, cell), with born, ended (h) and fate."""
+        graph = needed("networkx", "tables").DiGraph()
+        for row in self._of(colony):
+            about = {
+                "born": float(self.born[row]),
+                "ended": float(self.ended[row]),
+                "fate": str(self.fate[row]),
+            }
+            graph.add_node(self._node(row), **about)
+            if self._mothers[row] >= 0:
+                graph.add_edge(self._node(self._mothers[row]), self._node(row))
+        return graph
+
+    # --- rows ----------------------------------------------------------------------------
+
+    def _rows(self, colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
+        """The row of each cell; the file has it."""
+        wanted = _pair(colony, cell)
+        at = np.searchsorted(self._keys, wanted).clip(max=len(self._keys) - 1)
+        if len(wanted) and not (len(self._keys) and (self._keys[at] == wanted).all()):
+            raise InputError(
+                f"{self._path} is damaged: its frames have cells that its lineage lacks."
+                " Use another copy of it."
+            )
+        return self._order[at]
+
+    @cached_property
+    def _mothers(self) -> np.ndarray:
+        """(N,) the row of each cell's mother, −1 where the file does not have her."""
+        wanted = _pair(self.colony, self.parent)
+        at = np.searchsorted(self._keys, wanted).clip(max=len(self._keys) - 1)
+        known = (self.parent >= 0) & (self._keys[at] == wanted)
+        return np.where(known, self._order[at], -1)
+
+    @cached_property
+    def _daughters(self) -> dict[int, list[int]]:
+        found: dict[int, list[int]] = {}
+        for row, mother in enumerate(self._mothers.tolist()):
+            if mother >= 0:
+                found.setdefault(mother, []).append(row)
+        return found
+
+    def _colony(self, colony: int | None) -> int:
+        """The id of a colony of the run; without one, of its only colony."""
+        known = self._known
+        if colony is None and len(known) == 1:
+            return known[0]
+        if colony is None or colony not in known:
+            rule = "the id of one of the run's colonies: " + ", ".join(map(str, known))
+            hint = "A cell's number is unique within its colony only."
+            raise checks.input_error("colony", colony, rule, hint)
+        return int(colony)
+
+    def _row(self, cell: int, colony: int | None) -> int:
+        key = np.asarray([self._colony(colony)]), np.asarray([cell])
+        if isinstance(cell, bool) or not isinstance(cell, (int, np.integer)):
+            raise checks.input_error("cell", cell, "the number of a cell, as in the table")
+        at = int(np.searchsorted(self._keys, _pair(*key)[0]))
+        if at == len(self._keys) or self._keys[at] != _pair(*key)[0]:
+            own = self.cell[self.colony == key[0]]
+            rule = f"a cell of colony {int(key[0][0])}" + (
+                f": {own.min()} to {own.max()}" if len(own) else ", which has none"
+            )
+            raise checks.input_error("cell", int(cell), rule)
+        return int(self._order[at])
+
+    def _of(self, colony: int | None) -> list[int]:
+        """The rows of one colony, or of all."""
+        if colony is None:
+            return list(range(len(self)))
+        return np.flatnonzero(self.colony == self._colony(colony)).tolist()
+
+    def _roots(self, colony: int | None) -> list[int]:
+        return [row for row in self._of(colony) if self._mothers[row] < 0]
+
+    def _node(self, row: int) -> tuple[int, int]:
+        return int(self.colony[row]), int(self.cell[row])
+
+    def _newick(self, root: int) -> str:
+        """The tree below a row, without recursion: a lineage may be thousands of cells deep."""
+        born = np.where(np.isnan(self.born), self.begin, self.born)
+        lived = np.where(np.isnan(self.ended), self.now, self.ended) - born
+        text: list[str] = []
+        stack: list[int | str] = [root]
+        while stack:
+            item = stack.pop()
+            if isinstance(item, str):
+                text.append(item)
+                continue
+            colony, cell = self._node(item)
+            stack.append(f"colony{colony}.cell{cell}:{lived[item]:.6g}")
+            if daughters := self._daughters.get(item):
+                stack.append(")")
+                for daughter in reversed(daughters):
+                    stack += [daughter, ","]
+                stack[-1] = "("
+        return "".join(text)
+
+
+def _pair(colony: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """One integer key for each (colony, cell)."""
+    return np.asarray(colony).astype(np.int64) << 40 | np.asarray(cell).astype(np.int64)

@@ -1,0 +1,72 @@
+"""The parameters of a run that have one value per colony, kept in its results file.
+
+/parameters/PATH             (B,), by the colonies' places; PATH as `Scene.per_colony` names it
+/parameters_until/STEP/PATH  (B,), of frames up to STEP, where a resume changed the parameters
+"""
+
+from __future__ import annotations
+
+import re
+
+import h5py
+import numpy as np
+from torch import Tensor
+
+from torchfilm.io.layout import numpy_of
+from torchfilm.io.reading import blaming_file
+from torchfilm.scene import Scene
+
+NOW, UNTIL = "parameters", "parameters_until"
+SLASH = "\u2215"  # in a path, for the "/" that separates HDF5 groups
+
+
+def write_parameters(file: h5py.File, scene: Scene, colony_id: Tensor, step: int) -> None:
+    """Store the values of the colonies (B,) from `step` on. Those that the file holds, if they
+    differ, stay those of the frames up to that step."""
+    values = {path: numpy_of(x.double())[numpy_of(colony_id)] for path, x in scene.per_colony()}
+    if NOW in file:
+        before = _values(file[NOW])
+        alike = before.keys() == values.keys()
+        if alike and all(np.array_equal(before[n], values[n]) for n in values):
+            return
+        file.move(NOW, f"{UNTIL}/{step}")
+    group = file.create_group(NOW)
+    for path, value in values.items():
+        group.create_dataset(path.replace("/", SLASH), data=value)
+
+
+def parameters_at(file: h5py.File, step: int) -> dict[str, np.ndarray]:
+    """The values at a step by path, (B,) each; NaN where a parameter had then no value per colony.
+    Empty for files of earlier versions, which do not hold them."""
+    if NOW not in file:
+        return {}
+    with blaming_file(file, NOW):
+        found = _values(file[NOW])
+        names, size = set(found), len(file["colony_id"])
+        for until in sorted(map(int, file.get(UNTIL, {})), reverse=True):
+            earlier = _values(file[f"{UNTIL}/{until}"])
+            names |= set(earlier)
+            found = earlier if step <= until else found
+        return {name: found.get(name, np.full(size, np.nan)) for name in sorted(names)}
+
+
+def _values(group: h5py.Group) -> dict[str, np.ndarray]:
+    return {name.replace(SLASH, "/"): x[...] for name, x in group.items()}
+
+
+def column_names(paths: list[str], taken: set[str]) -> dict[str, str]:
+    """A column for each parameter: the shortest end of its path that no other column has, such as
+    "k1" for "Circuit.parameters['k1']", and "Division.length" beside the cells' length."""
+    ends = {path: _ends(path) for path in paths}
+    names = {}
+    for path in paths:
+        others = taken.union(*(ends[p] for p in paths if p != path))
+        names[path] = next((end for end in ends[path] if end not in others), path)
+    return names
+
+
+def _ends(path: str) -> list[str]:
+    """The ends of a path, the shortest first: "diffusion", "ahl.diffusion", … of
+    "Medium.signals['ahl'].diffusion"."""
+    words = re.sub(r"\['([^']*)'\]", r".\1", path).split(".")
+    return [".".join(words[k:]) for k in range(len(words) - 1, -1, -1)]
