@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from torchfilm.cli.scene_files import load_scene, parse_setting
@@ -55,8 +56,18 @@ class Info:
                 f"seed {a['seed']}, {a['dtype']}, dt {a['dt']:g} h, torchfilm {a['torchfilm']},"
                 f" torch {a['torch']}, {a['device']}"
             )
-            print("quantities per cell: " + ", ".join(results.file["cells"]))
+            print("columns of the table: " + ", ".join(results.table(0)))
+            values = results.parameters().items()
+            print(
+                "values per colony: " + ("; ".join(f"{n} = {_few(x)}" for n, x in values) or "none")
+            )
             print(a["scene"])
+
+
+def _few(values: np.ndarray, most: int = 8) -> str:
+    """The values of the first colonies."""
+    listed = ", ".join(f"{x:g}" for x in values[:most])
+    return f"{listed}, … ({len(values)} colonies)" if len(values) > most else listed
 
 
 @dataclass

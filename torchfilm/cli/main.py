@@ -1,5 +1,5 @@
 """The entry point of the command line: `torchfilm run SCENE`, `resume FILE`, `show FILE`,
-`info SCENE-or-FILE`, `explain SCENE`, `tune SCENE`."""
+`export FILE OUT`, `info SCENE-or-FILE`, `explain SCENE`, `tune SCENE`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from torchfilm.tools.warn_once import once
 try:
     import tyro
 
+    from torchfilm.cli.export import Export
     from torchfilm.cli.inspect import Explain, Info, Tune
     from torchfilm.cli.run import Resume, Run
     from torchfilm.cli.show import Show
@@ -28,6 +29,7 @@ COMMANDS: dict[str, type[Any]] = {
     "run": Run,
     "resume": Resume,
     "show": Show,
+    "export": Export,
     "info": Info,
     "explain": Explain,
     "tune": Tune,

@@ -93,7 +93,7 @@ class Lineage:
     def course(self, cell: int, colony: int | None = None) -> dict[str, np.ndarray]:
         """The values of the cell and of its ancestors over time: the columns of `Results.table`,
         one row per frame since its founder."""
-        colony = self._colony(colony)
+        colony = self.colony_of_run(colony)
         line = [int(cell), *self.ancestors(cell, colony)]
         tables = Tables(self._results, self, internals=False)
         keep = lambda ids, uid: (ids == colony) & np.isin(uid, line)
@@ -149,19 +149,24 @@ class Lineage:
                 found.setdefault(mother, []).append(row)
         return found
 
-    def _colony(self, colony: int | None) -> int:
-        """The id of a colony of the run; without one, of its only colony."""
+    def colony_of_run(self, colony: int | None) -> int:
+        """The id of a colony of the run; without one, of its only colony. Raises InputError where
+        there are several."""
         known = self._known
         if colony is None and len(known) == 1:
             return known[0]
-        if colony is None or colony not in known:
-            rule = "the id of one of the run's colonies: " + ", ".join(map(str, known))
-            hint = "A cell's number is unique within its colony only."
-            raise checks.input_error("colony", colony, rule, hint)
+        listed = ", ".join(map(str, known))
+        if colony is None:
+            raise InputError(
+                f"{self._path} has the colonies {listed}: say which, with colony=… (--colonies on"
+                " the command line). Cells are numbered within their colony."
+            )
+        if isinstance(colony, bool) or colony not in known:
+            raise checks.input_error("colony", colony, f"one of the run's colonies: {listed}")
         return int(colony)
 
     def _row(self, cell: int, colony: int | None) -> int:
-        key = np.asarray([self._colony(colony)]), np.asarray([cell])
+        key = np.asarray([self.colony_of_run(colony)]), np.asarray([cell])
         if isinstance(cell, bool) or not isinstance(cell, (int, np.integer)):
             raise checks.input_error("cell", cell, "the number of a cell, as in the table")
         at = int(np.searchsorted(self._keys, _pair(*key)[0]))
@@ -177,7 +182,7 @@ class Lineage:
         """The rows of one colony, or of all."""
         if colony is None:
             return list(range(len(self)))
-        return np.flatnonzero(self.colony == self._colony(colony)).tolist()
+        return np.flatnonzero(self.colony == self.colony_of_run(colony)).tolist()
 
     def _roots(self, colony: int | None) -> list[int]:
         return [row for row in self._of(colony) if self._mothers[row] < 0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import operator
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import EllipsisType
@@ -257,6 +258,89 @@ class Results:
     def lineage(self) -> Lineage:
         """Every cell that ever lived, as arrays and as a tree."""
         return Lineage(self)
+
+    def to_vtkhdf(
+        self,
+        path: str | Path,
+        *,
+        colonies: Sequence[int] | None = None,
+        frames: Sequence[int] | None = None,
+        rods: str = "capsules",
+        overwrite: bool = False,
+    ) -> list[Path]:
+        """Write the run for ParaView and pyvista: cells to `path`, NAME.vtkhdf, and signals, if
+        there are any, to NAME_signals.vtkhdf. Returns the paths.
+
+        Colonies, all or those with these ids, are laid side by side; the first keeps its
+        coordinates. frames: all, or these. rods: "capsules", surfaces of 60 polygons each, or
+        "lines", for a tube filter. Cells have the columns of `table`, signals one lattice that
+        covers the grids of all frames, NaN where there is none. Raises InputError for a path, a
+        colony or a frame that does not fit.
+        """
+        from torchfilm.io.vtkhdf import write_vtkhdf
+
+        return write_vtkhdf(self, path, colonies, frames, rods, overwrite)
+
+    def to_labels(
+        self,
+        path: str | Path,
+        *,
+        pixel_size: float,
+        colony: int | None = None,
+        frames: Sequence[int] | None = None,
+        window: tuple[tuple[float, float], tuple[float, float]] | None = None,
+        z: float | None = None,
+        overwrite: bool = False,
+    ) -> Path:
+        """Write label masks of one colony, a page per frame, as TIFF with OME-XML. Requires the
+        extra `images`.
+
+        A cell is its number plus 1 in all its frames, 0 is no cell: label − 1 is `cell` of the
+        table. 16 bits, or 32 where numbers need them. A pixel belongs to the cell that covers its
+        centre; where two overlap, to the one whose centreline is nearer. pixel_size: µm. colony:
+        its id; needed in a run of several. window: two corners, µm, by default the box around the
+        colony in all frames and 2 µm more. The first row lies at the greatest y. z: in space, the
+        height of the section, µm. Raises InputError for what does not fit.
+        """
+        from torchfilm.io.microscopy import view_of, write_labels
+
+        view = view_of(self, pixel_size, colony, frames, window, z, section=True)
+        return write_labels(view, path, overwrite)
+
+    def to_ome_tiff(
+        self,
+        path: str | Path,
+        *,
+        pixel_size: float,
+        channels: Mapping[str, float],
+        blur: float = 0.0,
+        noise: float | None = None,
+        background: float = 0.0,
+        offset: float = 100.0,
+        profile: str = "thickness",
+        colony: int | None = None,
+        frames: Sequence[int] | None = None,
+        window: tuple[tuple[float, float], tuple[float, float]] | None = None,
+        seed: int = 0,
+        overwrite: bool = False,
+    ) -> Path:
+        """Write synthetic fluorescence images of one colony, a page per frame and channel, as
+        OME-TIFF. Requires the extra `images`.
+
+        channels: columns of `table` with their gains, {"gfp": 100.0}: counts per µm of cell along
+        z and per unit of the quantity. profile: "flat" for counts that do not depend on how thick
+        the cell is there. blur: σ of a Gaussian, µm. background: light beside the cells, counts.
+        offset: counts that the camera adds. noise: σ of reading a pixel, counts; the photons'
+        Poisson noise comes with it. Without it there is no noise, and values are expected counts,
+        float32; with it they are uint16. seed: of the noise; a frame and a channel have the same
+        noise whatever else is written. Else as `to_labels`; in space the light of all heights adds
+        up. Raises InputError for what does not fit, and where 65535 counts do not suffice.
+        """
+        from torchfilm.io.microscopy import Camera, view_of, write_fluorescence
+
+        camera = Camera(blur, background, offset, noise, seed)
+        view = view_of(self, pixel_size, colony, frames, window, None, section=False)
+        return write_fluorescence(view, path, channels, profile, camera, overwrite)
 
     def state(
         self,

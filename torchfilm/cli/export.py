@@ -1,0 +1,204 @@
+"""The command that writes results for other programs: `torchfilm export FILE OUT`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from torchfilm.io.new_file import check_frames, check_new_file, written_whole
+from torchfilm.io.results import Results
+from torchfilm.io.table import Tables, data_frame, needed
+from torchfilm.tools import checks
+from torchfilm.tools.checks import InputError
+
+TABLE, NEWICK, GRAPH, VTK = ".csv", ".nwk", ".graphml", ".vtkhdf"
+IMAGES = (".tif", ".tiff")
+SUFFIXES = (TABLE, NEWICK, GRAPH, VTK, *IMAGES)
+# Options of each format, beside --overwrite.
+PAGES = ("frames", "colonies", "pixel_size", "window")
+LIGHT = ("channels", "blur", "noise", "background", "offset", "profile", "seed")
+OPTIONS: dict[str, tuple[str, ...]] = {
+    TABLE: ("frames", "internals"),
+    NEWICK: ("colonies",),
+    GRAPH: ("colonies",),
+    VTK: ("frames", "colonies", "rods"),
+    "label masks": (*PAGES, "z"),
+    "fluorescence": (*PAGES, *LIGHT),
+}
+
+
+@dataclass
+class Export:
+    """Write results for other programs. The suffix of the new file says the format: .csv, the
+    table of cells; .vtkhdf, for ParaView and pyvista; .tif or .ome.tif, label masks, or
+    fluorescence where --channels are given; .nwk, the lineage in Newick format; .graphml, the
+    lineage as a graph."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """Results file."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """The new file: NAME.csv, .vtkhdf, .tif, .ome.tif, .nwk or .graphml."""
+    frames: list[int] = field(default_factory=list)
+    """Which frames, such as --frames 0 10 -1; by default all. (Not .nwk, .graphml.)"""
+    colonies: list[int] = field(default_factory=list)
+    """Which colonies, by their ids; by default all. Images need one, if the run has several; .nwk
+    and .graphml take one or all. (Not .csv.)"""
+    pixel_size: float | None = None
+    """Images: width of a pixel, µm."""
+    window: list[float] = field(default_factory=list)
+    """Images: the part to show, as LEFT BOTTOM RIGHT TOP, µm; by default the colony."""
+    z: float | None = None
+    """Label masks in space: height of the section, µm."""
+    channels: list[str] = field(default_factory=list)
+    """Fluorescence: quantities and gains, as NAME=GAIN, such as --channels gfp=100 rfp=50: counts
+    per µm of cell and unit of the quantity."""
+    blur: float | None = None
+    """Fluorescence: σ of the optics, µm; by default 0."""
+    noise: float | None = None
+    """Fluorescence: σ of reading a pixel, counts; the photons' noise comes with it. By default
+    there is no noise."""
+    background: float | None = None
+    """Fluorescence: light beside the cells, counts; by default 0."""
+    offset: float | None = None
+    """Fluorescence: counts that the camera adds; by default 100."""
+    profile: str | None = None
+    """Fluorescence: thickness (the default), or flat, where the thickness of a cell does not
+    count."""
+    seed: int | None = None
+    """Fluorescence: seed of the noise; by default 0."""
+    rods: str | None = None
+    """.vtkhdf: capsules (the default), or lines, which take less space."""
+    internals: bool = False
+    """.csv: with the fields that serve the numerics."""
+    overwrite: bool = False
+    """Replace the file if it exists."""
+
+    def __call__(self) -> None:
+        suffix = self.out.suffix.lower()
+        if suffix not in SUFFIXES:
+            raise checks.input_error(
+                "OUT", str(self.out), f"a name that ends in {', '.join(SUFFIXES)}"
+            )
+        form = suffix
+        if suffix in IMAGES:
+            form = "fluorescence" if self.channels else "label masks"
+        self._check_options(form)
+        writers: dict[str, Callable[[Results], Any]] = {
+            TABLE: self._table,
+            NEWICK: self._newick,
+            GRAPH: self._graph,
+            VTK: self._vtk,
+            "label masks": self._labels,
+            "fluorescence": self._fluorescence,
+        }
+        with Results(self.file) as results:
+            for path in writers[form](results):
+                print(path)
+
+    def _check_options(self, form: str) -> None:
+        """Raise InputError for options that this format does not have."""
+        own = {"file", "out", "overwrite", *OPTIONS[form]}
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        unset = {n: v is None or v is False or v == [] for n, v in values.items()}
+        given = [n for n in values if n not in own and not unset[n]]
+        if given:
+            flags = ", ".join("--" + name.replace("_", "-") for name in given)
+            hint = (
+                " Light needs --channels."
+                if form == "label masks" and set(given) & {*LIGHT}
+                else ""
+            )
+            raise InputError(
+                f"{flags}: not for {self.out.name}, which holds {_content(form)}.{hint}"
+            )
+
+    @property
+    def _frames(self) -> list[int] | None:
+        return self.frames or None
+
+    def _one(self) -> int | None:
+        """The colony of an image or a lineage."""
+        if len(self.colonies) > 1:
+            raise checks.input_error("--colonies", self.colonies, "one colony, or left out")
+        return self.colonies[0] if self.colonies else None
+
+    def _table(self, results: Results) -> list[Path]:
+        path = self._new(results, TABLE)
+        frames = check_frames(len(results), self._frames, results.path)
+        tables = Tables(results, results.lineage(), self.internals)
+        with written_whole(path) as beside:
+            for number, k in enumerate(
+                frames
+            ):  # one at a time: a run may be larger than the memory
+                mode = "w" if number == 0 else "a"
+                table = data_frame(tables([k]))
+                table.to_csv(beside, mode=mode, header=number == 0, index=False)
+        return [path]
+
+    def _newick(self, results: Results) -> list[Path]:
+        path, text = self._new(results, NEWICK), results.lineage().to_newick(self._one())
+        with written_whole(path) as beside:
+            beside.write_text(text)
+        return [path]
+
+    def _graph(self, results: Results) -> list[Path]:
+        path, graph = self._new(results, GRAPH), results.lineage().to_networkx(self._one())
+        with written_whole(path) as beside:
+            needed("networkx", "tables").write_graphml(graph, beside)
+        return [path]
+
+    def _vtk(self, results: Results) -> list[Path]:
+        return results.to_vtkhdf(
+            self.out,
+            colonies=self.colonies or None,
+            frames=self._frames,
+            rods=self.rods or "capsules",
+            overwrite=self.overwrite,
+        )
+
+    def _labels(self, results: Results) -> list[Path]:
+        return [results.to_labels(self.out, z=self.z, **self._pages())]
+
+    def _fluorescence(self, results: Results) -> list[Path]:
+        names = ("blur", "noise", "background", "offset", "profile", "seed")
+        light = {n: getattr(self, n) for n in names if getattr(self, n) is not None}
+        gains = dict(map(_gain, self.channels))
+        return [results.to_ome_tiff(self.out, channels=gains, **self._pages(), **light)]
+
+    def _pages(self) -> dict[str, Any]:
+        if self.pixel_size is None:
+            raise InputError("an image needs --pixel-size, µm, such as --pixel-size 0.065.")
+        if len(self.window) not in (0, 4):
+            raise checks.input_error(
+                "--window", self.window, "four numbers: LEFT BOTTOM RIGHT TOP, µm"
+            )
+        return {
+            "pixel_size": self.pixel_size,
+            "colony": self._one(),
+            "frames": self._frames,
+            "window": (self.window[:2], self.window[2:]) if self.window else None,
+            "overwrite": self.overwrite,
+        }
+
+    def _new(self, results: Results, suffix: str) -> Path:
+        return check_new_file(self.out, (suffix,), self.overwrite, results.path)
+
+
+def _gain(text: str) -> tuple[str, float]:
+    name, _, number = text.partition("=")
+    try:
+        return name, float(number)
+    except ValueError:
+        rule = "a quantity and its gain, such as gfp=100"
+        raise checks.input_error("--channels", text, rule) from None
+
+
+def _content(form: str) -> str:
+    return {TABLE: "the table", NEWICK: "the lineage", GRAPH: "the lineage", VTK: "shapes"}.get(
+        form, form
+    )

@@ -1,0 +1,66 @@
+"""New files for other programs: where they may be written, and how they come to be there whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from torchfilm.tools import checks
+from torchfilm.tools.checks import SimulationError
+
+
+def check_new_file(
+    path: str | Path, suffixes: tuple[str, ...], overwrite: bool, source: Path
+) -> Path:
+    """The path of a file to be made from the results `source`. Raises InputError for another
+    suffix, for a folder that does not exist, for the results themselves, and for a file that exists
+    unless `overwrite`."""
+    found = Path(path)
+    if not found.name.lower().endswith(suffixes):
+        raise checks.input_error("path", str(path), f"a name that ends in {' or '.join(suffixes)}")
+    if not found.parent.is_dir():
+        hint = f"Make {found.parent} first."
+        raise checks.input_error("path", str(path), "in a folder that exists", hint)
+    if found.is_dir():
+        raise checks.input_error("path", str(path), "a file, not a folder")
+    if found.exists():
+        if source.exists() and found.samefile(source):
+            raise checks.input_error("path", str(path), "another file than the results")
+        if not overwrite:
+            rule = "a path where there is no file yet"
+            hint = "Choose another, or replace it: overwrite=True, or --overwrite."
+            raise checks.input_error("path", str(path), rule, hint)
+    return found
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Where to write a file, beside `path`, which it takes at the end. An error or a kill before
+    leaves what was at `path`. Raises SimulationError where the file cannot be written."""
+    beside = path.with_name(f".{path.name}.new")
+    try:
+        yield beside
+        os.replace(beside, path)
+    except OSError as error:
+        raise SimulationError(f"could not write {path}: {error}. Is the disk full?") from error
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def check_frames(count: int, frames: object, path: Path) -> list[int]:
+    """The numbers of the frames to be written, of a file with `count`: all of them without
+    `frames`. Raises InputError for frames that it does not have, and for none."""
+    if frames is None:
+        return list(range(count))
+    if not isinstance(frames, (list, tuple, range)) or not len(frames):
+        raise checks.input_error("frames", frames, "a list of at least one frame's number")
+    for k in frames:
+        if isinstance(k, bool) or not isinstance(k, int) or not -count <= k < count:
+            rule = f"each from {-count} to {count - 1}: {path} has {count} frames"
+            raise checks.input_error("frames", frames, rule)
+    chosen = [k % count for k in frames]
+    if sorted(set(chosen)) != chosen:
+        raise checks.input_error("frames", frames, "in the order of time, each once")
+    return chosen
