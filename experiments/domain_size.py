@@ -18,7 +18,7 @@ from design import CMAES, DomainSize, Parameter, Search
 
 PARAMETERS = [
     Parameter("strength", 3.0, 30.0, log=True),
-    Parameter("speed", 0.3, 3.0, log=True),
+    Parameter("speed", 0.3, 10.0, log=True),
     Parameter("molecules_per_unit", 1.0, 100.0, log=True),
 ]
 COLONY = {"cells": 100, "dt": 0.05}
