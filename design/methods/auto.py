@@ -12,8 +12,8 @@ from design.methods.racing import Racing
 
 # designs of a batch, and the width of its first cloud: the settings that were measured
 BATCH, WIDTH = 24, 0.5
-# designs before the first descents (one race), and for each parameter, so that descents end
-BEFORE, EACH = BATCH, 16
+# designs before the first descents (one race), and for each parameter of a descent, so that it ends
+BEFORE, EACH, MOST_STARTS = BATCH, 20, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +54,16 @@ def choose(
         f"{designs:.0f} designs for {dimensions} parameters: small colonies first, and CMA-ES"
         " learns from the best",
     )
-    race_and_descend = Chosen(
-        Polish(inner=Racing(inner=cloud), after=BEFORE),
-        f"{designs:.0f} designs for {dimensions} parameters: one race of small colonies, then down"
-        " the slope from the best, since the loss is a sum of squares with exact derivatives",
+    descents = tuple(
+        Chosen(
+            Polish(inner=Racing(inner=cloud), after=BEFORE, starts=starts),
+            f"{designs:.0f} designs for {dimensions} parameters: one race of small colonies, then"
+            " down the slope from the best, since the loss is a sum of squares with exact"
+            " derivatives",
+        )
+        for starts in range(1, MOST_STARTS + 1)
     )
-    for known in (few, race, race_and_descend) if before else ():
+    for known in (few, race, *descents) if before else ():
         if known.describe() == before:
             return Chosen(known.method, "the study began with it")
     if goals:
@@ -68,4 +72,5 @@ def choose(
         return Chosen(cloud, "data of a colony of one size: a smaller one does not compare")
     if designs < 2 * BATCH:
         return few
-    return race_and_descend if squares and designs >= BEFORE + EACH * dimensions else race
+    room = int((designs - BEFORE) / (EACH * dimensions))
+    return descents[min(room, MOST_STARTS) - 1] if squares and room else race

@@ -115,10 +115,13 @@ def test_auto_descends_where_the_loss_is_a_sum_of_squares():
     assert isinstance(choose(5, 500, 0).method, Racing)
     # too few designs for descents that come to an end
     assert isinstance(choose(30, 400, 0, squares=True).method, Racing)
+    # as many descents side by side as come to an end
+    assert [choose(5, n, 0, squares=True).method.starts for n in (125, 230, 400)] == [1, 2, 3]
     # a study that began by racing goes on so
     before = choose(5, 500, 0).describe()
     assert isinstance(choose(5, 500, 0, squares=True, before=before).method, Racing)
-    assert isinstance(choose(5, 900, 0, before=chosen.describe()).method, Polish)
+    again = choose(5, 9000, 0, squares=True, before=choose(5, 125, 0, squares=True).describe())
+    assert isinstance(again.method, Polish) and again.method.starts == 1
 
 
 def test_what_a_search_says_of_its_loss():
@@ -136,7 +139,7 @@ def test_a_search_polishes_and_resumes(tmp_path):
     assert whole.why_chosen.startswith("auto: polish") and "slope" in best.table()
     assert any(e.slopes is not None for e in whole.study.entries)
     first = make()
-    first.run(colonies=112, study=tmp_path / "a.h5", progress=False)
+    first.run(colonies=136, study=tmp_path / "a.h5", progress=False)
     again = make().run(colonies=160, study=tmp_path / "a.h5", progress=False)
     assert again.loss == best.loss
     kept = Study.read(tmp_path / "a.h5")
