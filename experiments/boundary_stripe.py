@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import torchfilm as tf
-from design import CMAES, Objective, Parameter, Racing, Search, Stripe
+from design import Objective, Parameter, Search, Stripe
 from design.report import measured
 
 PARAMETERS = [
@@ -75,14 +75,11 @@ def main() -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
 
-    # many small colonies, and only the best third in full, because the loss has several minima
-    method = Racing(inner=CMAES(population=24, sigma=0.5))
     search = Search(
         "boundary_detector",
         PARAMETERS,
         TARGET,
         **COLONY,
-        method=method,
         replicates=4,
         seed=options.seed,
     )

@@ -13,7 +13,7 @@ from design.methods.racing import Racing
 # designs of a batch, and the width of its first cloud: the settings that were measured
 BATCH, WIDTH = 24, 0.5
 # designs before the first descents (one race), and for each parameter of a descent, so that it ends
-BEFORE, EACH, MOST_STARTS = BATCH, 20, 3
+BEFORE, EACH, MOST_STARTS = BATCH, 10, 3
 
 
 @dataclass(frozen=True, eq=False)

@@ -114,13 +114,13 @@ def test_auto_descends_where_the_loss_is_a_sum_of_squares():
     assert isinstance(chosen.method, Polish) and "slope" in chosen.why
     assert isinstance(choose(5, 500, 0).method, Racing)
     # too few designs for descents that come to an end
-    assert isinstance(choose(30, 400, 0, squares=True).method, Racing)
+    assert isinstance(choose(30, 300, 0, squares=True).method, Racing)
     # as many descents side by side as come to an end
-    assert [choose(5, n, 0, squares=True).method.starts for n in (125, 230, 400)] == [1, 2, 3]
+    assert [choose(5, n, 0, squares=True).method.starts for n in (80, 130, 400)] == [1, 2, 3]
     # a study that began by racing goes on so
     before = choose(5, 500, 0).describe()
     assert isinstance(choose(5, 500, 0, squares=True, before=before).method, Racing)
-    again = choose(5, 9000, 0, squares=True, before=choose(5, 125, 0, squares=True).describe())
+    again = choose(5, 9000, 0, squares=True, before=choose(5, 80, 0, squares=True).describe())
     assert isinstance(again.method, Polish) and again.method.starts == 1
 
 

@@ -28,7 +28,7 @@ from torchfilm.circuits.names import Names, unknown
 from torchfilm.circuits.network import Network
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.deterministic_math import deterministic_functions
-from torchfilm.tools.tangents import has_tangent, in_forward_mode
+from torchfilm.tools.tangents import has_tangent, in_forward_mode, scaled
 
 # Returns the rates of species by name, conc/h, and the amounts per hour that the cell releases to
 # signals by name, conc·µm³/h.
@@ -242,9 +242,8 @@ def step(
     pools, reservoir = {}, {}
     for k, name in enumerate(circuit.given):
         assert circuit.pool is not None
-        pools[name] = (end[:, size + k] - start[:, size + k]) * circuit.pool.index_select(
-            0, circuit.rows
-        )
+        pool = circuit.pool.index_select(0, circuit.rows)
+        pools[name] = scaled(end[:, size + k] - start[:, size + k], pool)
         if circuit.in_reservoir is not None:
             reservoir[name] = end[:, size + more + k] - end[:, size + 2 * more + k]
     return CircuitOutcome(end[:, :size], pools, reservoir, code != 0, code, steps)

@@ -29,6 +29,7 @@ from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values, snapshot
 from torchfilm.state import CELL, OUTSIDE, State
 from torchfilm.tools import checks
+from torchfilm.tools.tangents import scaled
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import numbers
 
@@ -271,7 +272,7 @@ class BoundCircuit(BoundEffect):
         # amounts
         middle, end = _half_way(state, volume), state.volume
         diluted = {
-            n: state.fields[n] * (state.fields[volume] / middle.volume)
+            n: scaled(state.fields[n], state.fields[volume] / middle.volume)
             for n in circuit.diluted_fields
         }
         state = state.with_fields(**{volume: end}, **diluted)
@@ -313,7 +314,9 @@ class BoundCircuit(BoundEffect):
             state = medium.settle()
         thinner = middle.volume / end
         own = set(circuit.diluted_fields)
-        state = state.with_fields(**{n: v * thinner if n in own else v for n, v in changed.items()})
+        state = state.with_fields(
+            **{n: scaled(v, thinner) if n in own else v for n, v in changed.items()}
+        )
         return state.replace(reports={**state.reports, self.title: report.report()})
 
     def _concentrations(self, state: State, rows: Tensor) -> Tensor:

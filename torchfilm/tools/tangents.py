@@ -76,3 +76,13 @@ def both(value: Tensor) -> tuple[Tensor, Tensor | None]:
 def with_tangent(value: Tensor, moved: Tensor | None) -> Tensor:
     """The tensor with a tangent, where there is one."""
     return value if moved is None else forward_ad.make_dual(value, moved)
+
+
+def scaled(value: Tensor, factor: Tensor) -> Tensor:
+    """value · factor. Where only the value carries a tangent, torch would work out the other half
+    of the product rule, which is 0, in Python: half a millisecond a product."""
+    if not in_forward_mode() or has_tangent(factor) or not only_forward(value):
+        return value * factor
+    plain, moved = both(value)
+    assert moved is not None
+    return with_tangent(plain * factor, moved * factor)
