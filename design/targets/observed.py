@@ -117,8 +117,8 @@ class Observed(Target):
         time: h, when the colonies were observed. like: another `Observed`, whose rings and options
         are taken, so that both compare the same statistics.
 
-        Raises InputError for a table without units, a column that is missing or not numbers, and
-        arguments that nothing uses.
+        Raises InputError for a table without units or with several frames, a column that is
+        missing or not numbers, and arguments that nothing uses.
         """
         names = species_names("Observed.species", tuple(species)) if species else ()
         units = tf.tables.Units(pixel_size, length_unit, angle_unit, time_unit)

@@ -14,7 +14,7 @@ import torchfilm as tf
 from design.targets.statistics import SeenCells
 from torchfilm import checks, tables
 
-COLONY = "colony"
+COLONY, FRAME = "colony", "frame"
 KIND = {"x": "length", "y": "length", "length": "length", "angle": "angle", "age": "time"}
 HINTS = {
     "length": 'Give pixel_size=… (µm a pixel) or length_unit="um", or call the column "{0}_um".',
@@ -31,12 +31,14 @@ def read_table(
 ) -> SeenCells:
     """The cells of a table, sorted by colony. columns: names in the table where they differ.
 
-    Raises InputError for a column that is missing, is not numbers or has no unit.
+    Raises InputError for a column that is missing, is not numbers or has no unit, and for several
+    frames.
     """
     given = tables.Table.read(table)
     meant = (*KIND, COLONY, *species)
     for name in columns:
         checks.choice("Observed(columns)", name, meant)
+    _check_one_frame(given, columns)
     found: dict[str, Tensor] = {}
     used: set[tuple[str, str]] = set()
     for name, kind in KIND.items():
@@ -69,6 +71,21 @@ def read_table(
             f" {', '.join(given.columns)}. Name yours by columns={{…}}."
         )
     return _cells(found, species, _colonies(given, columns))
+
+
+def _check_one_frame(table: tables.Table, columns: Mapping[str, str]) -> None:
+    """Raise InputError for several frames of one movie: their cells are no colony of one time."""
+    column = next((c for c in table.columns if c.lower() == FRAME), None)
+    if column is None or columns.get(COLONY) == column:
+        return
+    frames = list(dict.fromkeys(table.columns[column].tolist()))
+    if len(frames) > 1:
+        raise tf.InputError(
+            f"{table.source} has {len(frames)} frames in the column {column!r}, from"
+            f" {frames[0]!r} to {frames[-1]!r}. Colonies are observed at one time: keep the rows of"
+            f' one frame. If each frame is a colony of its own, give columns={{"colony":'
+            f" {column!r}}}."
+        )
 
 
 def _cells(

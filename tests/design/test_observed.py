@@ -325,3 +325,15 @@ def test_a_species_that_the_scene_lacks_is_refused():
     target = Observed.from_table({"length_um": [2.0, 3.0], "rfp": [1.0, 2.0]}, species=["rfp"])
     with pytest.raises(tf.InputError, match="rfp"):
         Task(lit, [Parameter("make", 1, 2)], target, until=1.0)
+
+
+def test_several_frames_of_a_table_are_refused():
+    table = {"x_um": [0.0, 5.0, 9.0], "y_um": [0.0, 0.0, 3.0], "Frame": [1, 1, 2]}
+    wanted = r"2 frames in the column 'Frame', from 1 to 2.*one frame"
+    with pytest.raises(tf.InputError, match=wanted):
+        Observed.from_table(table)
+    table["Frame"] = [1, 1, 1]
+    one = Observed.from_table(table)
+    table["Frame"] = [1, 1, 2]
+    each = Observed.from_table(table, columns={"colony": "Frame"})
+    assert (one.colonies, one.cells) == (1, 3) and (each.colonies, each.cells) == (2, 3)
