@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchfilm.cellmodeller.rates import TextRates
+from torchfilm.tools.checks import InputError
 
 
 class Columns(dict):
@@ -53,6 +54,10 @@ def rates(text: str, species=((1.0, 4.0),), cell_type=(0, 1)) -> dict[str, list[
         ("volume", [2.5, 3.0]),
         ("pos.x", [1.0, 2.0]),
         ("M_PI", [math.pi, math.pi]),
+        ("10u / 4 + 7L / 2", [5.0, 5.0]),
+        ("abs(-3) / 2 + min(3, 2) / 4", [1.0, 1.0]),
+        ("(bool)0.5f + (bool)x", [2.0, 2.0]),
+        ("(x > 2 ? 3 : 1) * 0.5f", [0.5, 1.5]),
     ],
 )
 def test_expressions(expression, values):
@@ -79,6 +84,36 @@ def test_statements():
         """
     )
     assert found == {"species0": [10.0, 0.0], "species1": [0.0, 4.0], "species2": [-1.0, 3.0]}
+
+
+@pytest.mark.parametrize(
+    "text, value",
+    [
+        ("bool on = species[0] / 4; rates[0] = on;", [1.0, 1.0]),
+        ("{ int k = 1; } float k = 2.f; k = 2.5f; rates[0] = k;", [2.5, 2.5]),
+        ("float a = 1; { a = 2; float a = 3; a = 4; } rates[0] = a;", [2.0, 2.0]),
+        ("int n = 1; if (species[0] > 2) n = 3; rates[0] = n / 2.0f;", [0.5, 1.5]),
+        ("int n = 1; if (species[0] > 2) n = 3; float y = n; rates[0] = y / 2;", [0.5, 1.5]),
+    ],
+)
+def test_types_and_blocks(text, value):
+    assert rates(text)["species0"] == value
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("int n = species[0]; rates[0] = n;", "it would cut a value"),
+        ("int n = 1; if (species[0] > 2) n = 3; rates[0] = n / 2;", "write floats"),
+        ("rates[0] = (species[0] > 2 ? 3 : 1) / 2;", "write floats"),
+        ("rates[0] = pow(0.0f, -1);", "it is no number"),
+        ("rates[0] = pow(-2.0f, 0.5f);", "it is no number"),
+    ],
+)
+def test_values_that_are_not_c(text, words):
+    """C cuts whole numbers, which a solver cannot step; a float must be meant."""
+    with pytest.raises(InputError, match=words):
+        rates(text)
 
 
 def test_a_circuit_is_compiled():

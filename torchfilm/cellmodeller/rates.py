@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -45,6 +46,7 @@ FUNCTIONS: Mapping[str, tuple[int, Callable[..., Tensor]]] = {
     "fma": (3, lambda a, b, c: a * b + c),
     "step": (2, lambda edge, x: torch.where(x < edge, torch.zeros_like(x), torch.ones_like(x))),
 }  # fmt: skip
+WHOLE = ("abs", "min", "max", "clamp")  # which have whole values of whole numbers
 COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
     "<": lambda a, b: a < b,
     ">": lambda a, b: a > b,
@@ -59,6 +61,13 @@ CALCULATE: Mapping[str, Callable[[Any, Any], Any]] = {
     "*": lambda a, b: a * b,
     "/": lambda a, b: a / b,
 }
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A column of an integer type, kept as floats."""
+
+    column: Tensor
 
 
 class TextRates:
@@ -143,11 +152,7 @@ class _Run:
             raise refusal(
                 self.owner, node.line, f"{shown} = …", "set rates[…], or a variable declared before"
             )
-        if node.whole and isinstance(value, float):
-            value = int(value)
-        elif not node.whole:
-            value = self.number(value)
-        names[target.text] = value
+        names[target.text] = self.cast(node, value, node.type)
 
     def branch(self, node: Node, names: dict[str, Any]) -> None:
         test, then, other = node.parts
@@ -168,7 +173,7 @@ class _Run:
 
     def value(self, node: Node, names: dict[str, Any]) -> Any:
         if node.kind == "number":
-            return int(node.text) if node.whole else float(node.text)
+            return int(node.text) if node.type != "float" else float(node.text)
         if node.kind == "unary":
             return self.unary(node, names)
         if node.kind == "binary":
@@ -220,7 +225,7 @@ class _Run:
 
     def index(self, node: Node, names: dict[str, Any], count: int) -> int:
         found = self.value(node.parts[0], names)
-        if isinstance(found, Tensor) or found != int(found) or not 0 <= found < count:
+        if isinstance(found, (Tensor, Whole)) or found != int(found) or not 0 <= found < count:
             raise refusal(
                 self.owner, node.line, f"{node.text}[{found}]", f"it has {count}, counted from 0"
             )
@@ -231,16 +236,35 @@ class _Run:
         if node.text == "!":
             truth = self.truth(value)
             return ~truth if isinstance(truth, Tensor) else not truth
-        if node.text in ("(float)", "(double)"):
-            return self.number(value)
         if node.text.startswith("("):
-            if isinstance(value, float):
-                return int(value)
-            if isinstance(value, Tensor) and value.is_floating_point():
-                raise refusal(self.owner, node.line, node.text, "use floor()")
-            return value
-        value = self.number(value) if isinstance(value, Tensor) else value
-        return -value if node.text == "-" else value
+            kind = {"(float)": "float", "(double)": "float", "(bool)": "bool"}
+            return self.cast(node, value, kind.get(node.text, "int"))
+        whole, value = self.whole(value), self.plain(value)
+        return self.kept(-value if node.text == "-" else value, whole)
+
+    def cast(self, node: Node, value: Any, kind: str) -> Any:
+        """A value as one of a type: "float", "int" or "bool"."""
+        if kind == "bool":
+            return self.truth(value)
+        if kind == "float":
+            return self.number(value)
+        if isinstance(value, float):
+            return int(value)
+        if isinstance(value, Tensor) and value.is_floating_point():
+            raise refusal(
+                self.owner, node.line, "int", "it would cut a value: write floats, and floor()"
+            )
+        return self.kept(self.plain(value), True)
+
+    def kept(self, value: Any, whole: bool) -> Any:
+        """A value, marked if it is a column of an integer type."""
+        return Whole(value) if whole and isinstance(value, Tensor) else value
+
+    def whole(self, value: Any) -> bool:
+        """Whether a value is of an integer type."""
+        if isinstance(value, Tensor):
+            return not value.is_floating_point()
+        return isinstance(value, (int, Whole))
 
     def binary(self, node: Node, names: dict[str, Any]) -> Any:
         a, b = (self.value(p, names) for p in node.parts)
@@ -251,17 +275,17 @@ class _Run:
             one, other = (b, a) if isinstance(a, Tensor) else (a, b)  # `one` is plain
             return (other if one else False) if node.text == "&&" else (True if one else other)
         if node.text in COMPARE:
-            return COMPARE[node.text](a, b)
-        whole = all(_whole(x) for x in (a, b))
+            return COMPARE[node.text](self.plain(a), self.plain(b))
+        whole = self.whole(a) and self.whole(b)
         if whole and node.text in ("/", "%"):
-            if isinstance(a, Tensor) or isinstance(b, Tensor) or b == 0:
+            if not isinstance(a, int) or not isinstance(b, int) or b == 0:
                 raise refusal(self.owner, node.line, node.text, "write floats, such as 2.0f")
-            cut = int(a / b)
+            cut = abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)
             return cut if node.text == "/" else a - b * cut
         if node.text == "%":
             raise refusal(self.owner, node.line, "%", "it is for whole numbers")
         try:
-            return CALCULATE[node.text](self.plain(a), self.plain(b))
+            return self.kept(CALCULATE[node.text](self.plain(a), self.plain(b)), whole)
         except ZeroDivisionError:
             raise refusal(self.owner, node.line, "/", "it divides by 0") from None
 
@@ -274,21 +298,37 @@ class _Run:
         count, function = FUNCTIONS[name]
         if len(node.parts) != count:
             raise refusal(self.owner, node.line, f"{node.text}(…)", f"it takes {count} values")
-        given = [self.number(self.value(p, names)) for p in node.parts]
+        values = [self.value(p, names) for p in node.parts]
+        given = [self.number(x) for x in values]
+        if name in WHOLE and all(map(self.whole, values)):
+            if all(isinstance(x, int) for x in values):
+                return int(function(*(torch.tensor(x) for x in given)))
+            return Whole(function(*(x if isinstance(x, Tensor) else self.full(x) for x in given)))
         if name in ("pow", "pown", "powr") and not isinstance(given[1], Tensor):
             if not isinstance(given[0], Tensor):
-                return float(given[0]) ** given[1]
+                return self.power(node, float(given[0]), given[1])
             return function(given[0], int(given[1]) if given[1] == int(given[1]) else given[1])
         return function(*(x if isinstance(x, Tensor) else self.full(x) for x in given))
 
+    def power(self, node: Node, x: float, n: float) -> float:
+        try:
+            found = x**n
+        except (ZeroDivisionError, OverflowError):
+            found = math.nan
+        if isinstance(found, complex) or math.isnan(found):
+            raise refusal(self.owner, node.line, f"pow({x:g}, {n:g})", "it is no number")
+        return found
+
     def truth(self, value: Any) -> Any:
         """A condition: true where the value is not 0."""
+        value = value.column if isinstance(value, Whole) else value
         if isinstance(value, Tensor):
             return value if value.dtype == torch.bool else value != 0
         return bool(value)
 
     def number(self, value: Any) -> Any:
         """A value as a floating-point number or column."""
+        value = value.column if isinstance(value, Whole) else value
         if not isinstance(value, Tensor):
             return float(value)
         if value.dtype == torch.bool:
@@ -296,18 +336,13 @@ class _Run:
         return value if value.is_floating_point() else value.to(self.like.dtype)
 
     def plain(self, value: Any) -> Any:
-        return self.number(value) if isinstance(value, Tensor) else value
+        return self.number(value) if isinstance(value, (Tensor, Whole)) else value
 
     def full(self, value: float) -> Tensor:
         return torch.full_like(self.like, float(value))
 
-    def where(self, condition: Tensor, one: Any, two: Any) -> Tensor:
+    def where(self, condition: Tensor, one: Any, two: Any) -> Any:
         a, b = (self.number(x) for x in (one, two))
         a = a if isinstance(a, Tensor) else self.full(a)
-        return torch.where(condition, a, b if isinstance(b, Tensor) else self.full(b))
-
-
-def _whole(value: Any) -> bool:
-    if isinstance(value, Tensor):
-        return not value.is_floating_point() and value.dtype != torch.bool
-    return isinstance(value, int)
+        b = b if isinstance(b, Tensor) else self.full(b)
+        return self.kept(torch.where(condition, a, b), self.whole(one) and self.whole(two))

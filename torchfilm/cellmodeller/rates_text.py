@@ -28,13 +28,14 @@ TOKEN = re.compile(
 class Node:
     """A part of the text. kind: "number", "name", "item" (species[0]), "part" (pos.x), "call",
     "unary", "binary", "choice", "set", "if" or "block". text: the operation or the name; parts:
-    what it is made of; line: of the text, from 1."""
+    what it is made of; line: of the text, from 1. type: of a number or a variable, "float", "int"
+    or "bool"."""
 
     kind: str
     text: str
     parts: tuple[Node, ...] = ()
     line: int = 0
-    whole: bool = False  # a number or a variable of an integer type
+    type: str = "float"
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,9 @@ class _Parser:
             0,
             owner,
         )
-        self.whole: set[str] = set()  # variables of integer types
+        # variables that can be seen: their own name among all of the text, and their type
+        self.seen: dict[str, tuple[str, str]] = {}
+        self.variables = 0
 
     @property
     def now(self) -> Token:
@@ -121,11 +124,12 @@ class _Parser:
         if self.take(";"):
             return []
         if self.take("{"):
-            parts = []
+            parts, outer = [], dict(self.seen)
             while not self.take("}"):
                 if self.now.kind == "end":
                     raise self.error("'}' is expected before it")
                 parts += self.statement()
+            self.seen = outer
             return [Node("block", "", tuple(parts), line)]
         if self.now.text in REFUSED:
             raise self.error("known are declarations, assignments, and if … else")
@@ -153,15 +157,16 @@ class _Parser:
                 raise self.error("a plain variable is expected")
             name = self.now
             self.at += 1
-            whole = kind not in ("float", "double")
-            if whole:
-                self.whole.add(name.text)
+            type_ = {"float": "float", "double": "float", "bool": "bool"}.get(kind, "int")
             if self.now.text == "[":
                 raise self.error("arrays cannot be declared")
-            zero = Node("number", "0", (), name.line, whole)  # until it is set
+            zero = Node("number", "0", (), name.line, type_)  # until it is set
             value = self.expression() if self.take("=") else zero
-            target = Node("name", name.text, (), name.line)
-            made.append(Node("set", "declare", (target, value), name.line, whole))
+            self.variables += 1
+            own = f"{name.text}'{self.variables}" if name.text in self.seen else name.text
+            self.seen[name.text] = own, type_
+            target = Node("name", own, (), name.line)
+            made.append(Node("set", "declare", (target, value), name.line, type_))
             if not self.take(","):
                 self.need(";")
                 return made
@@ -173,7 +178,7 @@ class _Parser:
         value = self.expression()
         if operation.text != "=":
             value = Node("binary", operation.text[0], (target, value), operation.line)
-        return Node("set", "assign", (target, value), operation.line, target.text in self.whole)
+        return Node("set", "assign", (target, value), operation.line, target.type)
 
     # --- expressions ---------------------------------------------------------------------
 
@@ -216,10 +221,13 @@ class _Parser:
             raise self.error("a number, a name or a bracket is expected")
         self.at += 1
         if token.kind == "number":
-            return Node("number", token.text.rstrip("fFuUlL"), (), token.line, token.text.isdigit())
+            whole = token.text.rstrip("uUlL").isdigit()
+            digits = token.text.rstrip("fFuUlL")
+            return Node("number", digits, (), token.line, "int" if whole else "float")
         if self.take("("):
             return self.call(token)
-        made = Node("name", token.text, (), token.line, token.text in self.whole)
+        own, type_ = self.seen.get(token.text, (token.text, "float"))
+        made = Node("name", own, (), token.line, type_)
         while mark := self.take("[", "."):
             if mark.text == "[":
                 made = Node("item", token.text, (self.expression(),), token.line)
