@@ -196,6 +196,19 @@ def test_rates_are_those_of_the_text(tmp_path, integrator, share):
     assert 0 < state.seen.item() < 2.0  # update sees the signal where the cell is
 
 
+def test_the_options_of_integrators_go_by_their_own_order(tmp_path):
+    """CLEulerSigIntegrator has no greensThreshold, which CLCrankNicIntegrator has before regul."""
+    for kind, given in (
+        ("CLEulerSigIntegrator", "sig, None, 'wrap'"),
+        ("CLCrankNicIntegrator", "sig, 1e-9, None, 'wrap'"),
+    ):
+        text = signalling(kind).replace("sig, boundcond='reflect'", given)
+        scene = tf.from_cellmodeller(written(tmp_path, text))
+        medium = next(e for e in scene.effects if isinstance(e, tf.Medium))
+        faces = medium.signals["signal0"].boundary
+        assert {type(f) for f in (*faces.x, *faces.y, *faces.z)} == {tf.Periodic}
+
+
 def test_growth_dilutes_species(tmp_path):
     scene = tf.from_cellmodeller(written(tmp_path, signalling(rate=1.0)))
     first = scene.bind().start()

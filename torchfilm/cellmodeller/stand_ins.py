@@ -206,8 +206,7 @@ class CLEulerIntegrator(_Integrator):
 
 class _SignalIntegrator(_Integrator):
     def __init__(
-        self, sim: Simulator, nSignals: int, nSpecies: int, maxCells: int, sig: Any,
-        greensThreshold: float = 1e-12, regul: Any = None, boundcond: str = "constant",
+        self, nSignals: int, nSpecies: int, sig: Any, boundcond: str
     ):  # fmt: skip
         if not isinstance(sig, GridDiffusion):
             raise InputError(f"{self._title}: the signalling must be GridDiffusion.")
@@ -224,11 +223,23 @@ class CLCrankNicIntegrator(_SignalIntegrator):
 
     _title = "CLCrankNicIntegrator"
 
+    def __init__(
+        self, sim: Simulator, nSignals: int, nSpecies: int, maxCells: int, sig: Any,
+        greensThreshold: float = 1e-12, regul: Any = None, boundcond: str = "constant",
+    ):  # fmt: skip
+        super().__init__(nSignals, nSpecies, sig, boundcond)
+
 
 class CLEulerSigIntegrator(_SignalIntegrator):
     """Species and signals."""
 
     _title = "CLEulerSigIntegrator"
+
+    def __init__(
+        self, sim: Simulator, nSignals: int, nSpecies: int, maxCells: int, sig: Any,
+        regul: Any = None, boundcond: str = "constant",
+    ):  # fmt: skip
+        super().__init__(nSignals, nSpecies, sig, boundcond)
 
 
 class _Renderer:
