@@ -128,6 +128,42 @@ def test_nothing_of_a_refused_script_stays(tmp_path):
     assert not {n for n in set(sys.modules) - modules if n.startswith(("CellModeller", "model"))}
 
 
+def test_each_script_has_the_modules_of_its_folder(tmp_path):
+    """Two folders, each with a file helper.py; it is found inside of a function in a run, too."""
+    inner = "    from helper import FASTEST as fastest\n    fastest = float(fastest)"
+    text = GROWS.replace("import math", "import math, helper").replace("    fastest = 1.2", inner)
+    for name, rate in (("one", 1.5), ("other", 0.5)):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "helper.py").write_text(f"FASTEST = {rate}\n")
+        with pytest.warns(UserWarning, match="cell by cell"):
+            scene = tf.from_cellmodeller(written(folder, text))
+        assert "helper" not in sys.modules
+        *_, end = tf.simulate(scene, until=0.05)
+        assert set(end.growth_rate.tolist()) == {1.0, rate}
+
+
+@pytest.mark.filterwarnings(SLOW)
+def test_update_of_another_name(tmp_path):
+    """The function is what counts, not the first text of its name."""
+    text = GROWS + (
+        "\ndef other(cells):\n    for (id, cell) in cells.items():\n        cell.plasmids = 8\n"
+        "update = other\n"
+    )
+    *_, end = tf.simulate(tf.from_cellmodeller(written(tmp_path, text)), until=0.1)
+    assert end.plasmids.tolist() == [8, 8]
+
+
+@pytest.mark.filterwarnings(SLOW)
+def test_a_late_variable_is_refused_with_its_line(tmp_path):
+    text = GROWS.replace(
+        "if cell.volume", "if cell.cellAge > 2: cell.late = 1\n        if cell.volume"
+    )
+    scene = tf.from_cellmodeller(written(tmp_path, text))
+    with pytest.raises(tf.SimulationError, match=f"line {line_of(text, 'cell.late')}: cell.late"):
+        list(tf.simulate(scene, until=0.5))
+
+
 def test_what_is_a_script(tmp_path):
     assert is_script(written(tmp_path, GROWS))
     assert not is_script(written(tmp_path, GROWS.replace("def init", "def begin"), "b.py"))
@@ -194,6 +230,7 @@ def test_what_is_ignored_is_said(tmp_path):
         ("if cell.length > 0: late = 1\n        cell.spare = late", "late has no value"),
         ("cell.spare = math.exp(cell.length)", "calls math.exp"),
         ("cell.spare = cell.length ** 2", "the operation Pow"),
+        ("cell.spare = max([cell.length, 2.0])", "max of a list"),
     ],
 )
 def test_loops_that_are_not_plain_run_cell_by_cell(tmp_path, line, words):
@@ -217,6 +254,8 @@ def test_loops_that_are_not_plain_run_cell_by_cell(tmp_path, line, words):
         "cell.growthRate = numpy.clip(cell.length / 3.0, 0.8, 1.1)",
         "rich = cell.length > 2.8 < 99\n        if rich: cell.growthRate = 0.5\n"
         "        elif cell.dir[1] > 0.5: cell.growthRate *= 0.99",
+        "cell.targetVol = 11.3 / cell.length",
+        "if cell.cellAge == 0 or 1.0 / cell.cellAge < 0.3: cell.targetVol = 3.3",
     ],
 )
 def test_columns_are_the_loop(tmp_path, line):
@@ -232,6 +271,20 @@ def test_columns_are_the_loop(tmp_path, line):
     assert one.cells > 3
     for name in ("growth_rate", "targetVol", "color", "plasmids", "uid", "length"):
         assert getattr(one, name).tolist() == getattr(other, name).tolist(), name
+
+
+@pytest.mark.filterwarnings(SLOW)
+@pytest.mark.parametrize("loop", ["columns", "cells"])
+def test_a_truth_value_may_become_a_number(tmp_path, loop):
+    """It is one in the rehearsal, which takes one way through the branches."""
+    line = (
+        "if cell.cellAge == 0: cell.spare = False\n"
+        "        elif cell.cellAge == 3: cell.spare = 3\n"
+        "        elif cell.cellAge == 4: cell.plasmids = 10 * cell.spare"
+    )
+    text = GROWS.replace("if cell.volume", f"{line}\n        if cell.length < 0 and cell.volume")
+    *_, end = tf.simulate(tf.from_cellmodeller(written(tmp_path, text), loop=loop), until=0.4)
+    assert end.plasmids.tolist() == [30, 30]
 
 
 # --- the text of rates ---------------------------------------------------------------------------

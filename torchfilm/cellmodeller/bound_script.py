@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,6 +13,7 @@ from torchfilm.cellmodeller import draws
 from torchfilm.cellmodeller.cell import Cell
 from torchfilm.cellmodeller.columns import Uneven
 from torchfilm.cellmodeller.globals_watch import GlobalsWatch
+from torchfilm.cellmodeller.loading import INNER_IMPORT, importing
 from torchfilm.cellmodeller.sheets import first_fields, sheet_of, with_written
 from torchfilm.cellmodeller.variables import HISTORY
 from torchfilm.effect import DIVISION, Binding, BoundEffect
@@ -53,11 +54,15 @@ class _Bound(BoundEffect):
     def _signals(self) -> list[str]:
         return [f"out.signal{k}" for k in range(self.layout.signals)]
 
+    def _imports(self) -> AbstractContextManager[None]:
+        """Within, imports in the script's functions find what they found at the start."""
+        return importing(self.script) if INNER_IMPORT.search(self.script.text) else nullcontext()
+
     @contextmanager
     def running(self, doing: str, state: State, starting: bool = False) -> Iterator[None]:
         """Errors of the script with their line, and its global variables watched."""
         try:
-            with draws.kept(), self.script.errors(doing):
+            with draws.kept(), self._imports(), self.script.errors(doing):
                 yield
         except InputError as error:
             if starting:

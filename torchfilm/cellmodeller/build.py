@@ -220,7 +220,7 @@ def _chemistry(script: Script, method: str) -> list[Effect]:
             raise InputError(
                 f"{script.path.name}: {integrator['kind']} needs the function {name}()."
             )
-        with draws.kept(), importing(script.path, script.module), script.errors(f"{name}()"):
+        with draws.kept(), importing(script), script.errors(f"{name}()"):
             texts.append(function() if wanted and function is not None else None)
     volume = (
         None if grid is None else float(math.prod(_vector("GridDiffusion: size", grid["size"])))

@@ -83,8 +83,11 @@ class ColumnRule:
     def __init__(self, text: str, module: ModuleType, layout: Layout):
         found = [n for n in ast.parse(text).body if isinstance(n, ast.FunctionDef)]
         made = [n for n in found if n.name == "update"]
-        if len(made) != 1 or len(made[0].args.args) != 1 or made[0].decorator_list:
+        code = getattr(getattr(module, "update", None), "__code__", None)
+        if len(made) != 1 or made[0].decorator_list or _more_than_one(made[0].args):
             raise Uneven("update is not one plain function")
+        if code is None or code.co_firstlineno != made[0].lineno or code.co_name != "update":
+            raise Uneven("update is another function than the one in the text")
         self.body, self.cells = made[0].body, made[0].args.args[0].arg
         stored = [n for n in ast.walk(made[0]) if isinstance(n, ast.Name)]
         self.local = {n.id for n in stored if isinstance(n.ctx, ast.Store)}
@@ -139,6 +142,7 @@ class _Turn:
             raise _uneven(node, "else after a loop")
         self.statements(node.body)
         self.own = {n: v for n, v in self.own.items() if n.startswith(".")}
+        self.cell = self.id = ""
 
     # --- statements ----------------------------------------------------------------------
 
@@ -264,7 +268,10 @@ class _Turn:
         if type(node.op) not in OPERATORS:
             raise Uneven(f"the operation {type(node.op).__name__}")
         a, b = _number(self.value(node.left)), _number(self.value(node.right))
-        if isinstance(node.op, ast.Div) and isinstance(b, Tensor):
+        if isinstance(node.op, ast.Div) and (isinstance(a, Tensor) or isinstance(b, Tensor)):
+            # of two columns: with a number, torch multiplies by a rounded reciprocal
+            like = self.state.length
+            a, b = (x if isinstance(x, Tensor) else _column(float(x), like) for x in (a, b))
             self._all(b != 0, "it divides by 0")
         return OPERATORS[type(node.op)](a, b)
 
@@ -281,12 +288,20 @@ class _Turn:
         return made
 
     def _boolop(self, node: ast.BoolOp) -> Any:
-        each = [self.value(x) for x in node.values]
-        if not all(isinstance(x, bool) or _is_truth(x) for x in each):
-            raise Uneven("and/or of other than truth values")
-        made = each[0]
-        for x in each[1:]:
-            made = made & x if isinstance(node.op, ast.And) else made | x
+        both, mask = isinstance(node.op, ast.And), self.mask
+        made: Any = both
+        for part in node.values:
+            found = self.value(part)
+            if not (isinstance(found, bool) or _is_truth(found)):
+                raise Uneven("and/or of other than truth values")
+            made = made & found if both else made | found
+            if isinstance(made, bool):
+                if made != both:
+                    break
+            else:  # the rest counts in these cells
+                left = made if both else ~made
+                self.mask = left if mask is None else mask & left
+        self.mask = mask
         return made
 
     def _unaryop(self, node: ast.UnaryOp) -> Any:
@@ -314,6 +329,8 @@ class _Turn:
         if node.keywords or not _hashable(function) or function not in FUNCTIONS:
             raise Uneven(f"it calls {ast.unparse(node.func)}")
         given = [_number(self.value(x)) for x in node.args]
+        if any(isinstance(x, (list, dict)) for x in given):
+            raise Uneven(f"{ast.unparse(node.func)} of a list")
         if not any(isinstance(x, Tensor) for x in given):
             return function(*given)
         if function in (min, max) and len(given) != 2:
@@ -340,7 +357,7 @@ class _Turn:
                 self._all(there, f"cell.{name} is not set")
             if values.dim() > 2:
                 raise _uneven(node, f"cell.{name} is no plain list")
-            values = values.bool() if known.kind == "bool" else values
+            values = values.bool() if known.is_truth(values) else values
             return values if values.dim() == 1 else list(values.unbind(1))
         if name in FIELDS and FIELDS[name] in s.fields:
             values = s.fields[FIELDS[name]]
@@ -355,8 +372,7 @@ class _Turn:
         if name == "species" and self.layout.species:
             return [s.fields[n].double() for n in self.layout.species_fields()]
         if name == "signals" and self.layout.signals:
-            found_there = found_signals(s, self.layout)
-            return [x.double() for x in found_there]
+            return [x.double() for x in found_signals(s, self.layout)]
         raise _uneven(node, f"it reads cell.{name}")
 
     # --- result --------------------------------------------------------------------------
@@ -375,9 +391,7 @@ class _Turn:
                 raise Uneven(f"cell.{name} changes its length")
             if not all(isinstance(x, (Tensor, bool, int, float)) for x in each):
                 raise Uneven(f"cell.{name} is set to other than numbers")
-            columns = [
-                x if isinstance(x, Tensor) else _column(x, s.length) for x in each
-            ]  # fmt: skip
+            columns = [x if isinstance(x, Tensor) else _column(x, s.length) for x in each]
             new = torch.stack(columns, 1) if width else columns[0]
             if name == "cellType" and bool((new != new.round()).any()):
                 raise Uneven("cell.cellType is set to other than whole numbers")
@@ -393,6 +407,11 @@ def _uneven(node: ast.AST, what: str) -> Uneven:
 
 def _is_name(node: ast.AST, name: str) -> bool:
     return isinstance(node, ast.Name) and node.id == name
+
+
+def _more_than_one(given: ast.arguments) -> bool:
+    """Whether a function takes other than one argument."""
+    return len(given.args) != 1 or bool(given.vararg or given.kwonlyargs or given.kwarg)
 
 
 def _does_nothing(node: ast.stmt) -> bool:

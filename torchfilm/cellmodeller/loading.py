@@ -11,7 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,18 +28,21 @@ FUNCTIONS = ("setup", "init", "update")
 OTHER_RANDOM = re.compile(
     r"\b(default_rng|RandomState|SystemRandom|random\.Random|urandom|secrets)\b"
 )
+INNER_IMPORT = re.compile(r"^[ \t]+(import|from)[ \t]", re.MULTILINE)
 OLD = re.compile(r"^\s*print\s+[^(\s=]", re.MULTILINE)
 
 
 @dataclass
 class Script:
-    """A script that has been set up. text: its source. request: what it asked for. dt: h."""
+    """A script that has been set up. text: its source. request: what it asked for. dt: h. helpers:
+    modules that it imports from its folder, which no other script sees."""
 
     path: Path
     text: str
     module: ModuleType
     request: stand_ins.Request
     dt: float
+    helpers: dict[str, ModuleType] = field(default_factory=dict)
 
     def function(self, name: str) -> Callable[..., Any] | None:
         found = getattr(self.module, name, None)
@@ -75,7 +78,10 @@ class Script:
         except ModuleNotFoundError as error:
             raise InputError(f"{self._at(error)}: {_missing(str(error.name))}") from error
         except InputError as error:
-            raise InputError(f"{self._at(error)}: {error}") from error
+            at = self._at(error)
+            if at == self.path.name and (about := re.search(r"^cell\.(\w+)", str(error))):
+                at = self.place_of(about[1])
+            raise InputError(f"{at}: {error}") from error
         except Exception as error:
             raise InputError(
                 f"{self._at(error)}: {doing} fails: {type(error).__name__}: {error}"
@@ -108,7 +114,7 @@ def load(path: Path) -> Script:
     script = Script(path, text, module, request, stand_ins.DT)
     code = _compiled(path, text)
     sim = stand_ins.Simulator(request, module)
-    with draws.kept(), importing(path, module), script.errors("loading"):
+    with draws.kept(), importing(script), script.errors("loading"):
         draws.seed("load")
         with script.limited(), redirect_stdout(sys.stderr):
             exec(code, vars(module))
@@ -126,21 +132,34 @@ def load(path: Path) -> Script:
 
 
 @contextmanager
-def importing(path: Path, module: ModuleType) -> Iterator[None]:
+def importing(script: Script) -> Iterator[None]:
     """Within, imports of CellModeller find the stand-ins, and those of the script's folder its
     files."""
-    folder = str(path.parent.resolve())
-    others, place = sys.modules.get(module.__name__), list(sys.path)
-    sys.path.insert(0, folder)
-    sys.modules[module.__name__] = module
+    folder = script.path.parent.resolve()
+    ours = {script.module.__name__: script.module, **script.helpers}
+    others = {name: sys.modules[name] for name in ours if name in sys.modules}
+    place = list(sys.path)
+    sys.path.insert(0, str(folder))
+    sys.modules.update(ours)
+    before = {name.split(".")[0] for name in sys.modules}
     try:
         with stand_ins.installed():
             yield
     finally:
         sys.path[:] = place
-        del sys.modules[module.__name__]
-        if others is not None:
-            sys.modules[module.__name__] = others
+        for name, module in list(sys.modules.items()):
+            top = name.split(".")[0]
+            if top not in before and _lies_in(folder, sys.modules.get(top, module)):
+                script.helpers[name] = module
+        for name in [n for n in {**ours, **script.helpers} if n in sys.modules]:
+            del sys.modules[name]
+        sys.modules.update(others)
+
+
+def _lies_in(folder: Path, module: ModuleType) -> bool:
+    """Whether a module is a file of a folder, or a package in it."""
+    parts = [getattr(module, "__file__", None), *getattr(module, "__path__", [])]
+    return any(p is not None and Path(p).resolve().parent == folder for p in parts)
 
 
 def _compiled(path: Path, text: str) -> Any:

@@ -34,7 +34,7 @@ def rehearse(script: Script, bare: Layout, founders: Cells) -> tuple[Layout, Sta
     for cell in everyone:
         cell.__dict__[COLOR] = [GREY] * 3
     watch = GlobalsWatch(script.module)
-    with draws.kept(), importing(script.path, script.module):
+    with draws.kept(), importing(script):
         seen = [_rehearsed(script, "init", [[c] for c in everyone], everyone)]
         first = [copy.deepcopy(cell.__dict__) for cell in everyone]
         seen.append(_rehearsed(script, "update", [[cells]], everyone))

@@ -70,7 +70,12 @@ class Variable:
         """Numbers as Python's; those of a whole kind as int while they are whole."""
         if self.kind == "float" or not (array == np.round(array)).all():
             return array.tolist()
-        return array.astype(bool if self.kind == "bool" else np.int64).tolist()
+        return array.astype(bool if self.is_truth(array) else np.int64).tolist()
+
+    def is_truth(self, values: Any) -> bool:
+        """Whether values, an array or a tensor, are shown as truth values: a script may keep other
+        numbers in a variable that had a truth value in the rehearsal."""
+        return self.kind == "bool" and bool(((values == 0) | (values == 1)).all())
 
     def column(self, values: Sequence[Any]) -> np.ndarray:
         """Values as the script set them, (M, …). Raises InputError for others than numbers."""
