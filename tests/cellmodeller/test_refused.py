@@ -204,6 +204,27 @@ def test_global_variables_that_change(tmp_path):
         list(tf.simulate(scene, until=0.2, colonies=2))
 
 
+@pytest.mark.filterwarnings(SLOW)
+@pytest.mark.parametrize(
+    "made, change, name",
+    [
+        ("class Box: pass\nbox = Box()\nbox.n = 5", "box.n += 1; here = box.n", "box.n"),
+        ("class Box: n = 5", "Box.n += 1; here = Box.n", "Box.n"),
+        ("", "memory.append(0); here = 5 + len(memory)", "update.__defaults__"),
+    ],
+)
+def test_what_is_kept_in_objects_counts_as_global(tmp_path, made, change, name):
+    """And is as at the start after the rehearsal."""
+    update = f"{made}\ndef update(cells, memory=[]):\n    {change}\n"
+    update += "    for cell in cells.values(): cell.plasmids = here\n"
+    scene = tf.from_cellmodeller(written(tmp_path, HEAD + SETUP + INIT + update + DIVIDE))
+    with pytest.warns(UserWarning, match=f"changes the global variable {name}"):
+        *_, state = tf.simulate(scene, until=0.1)
+    assert state.plasmids.tolist() == [7, 7]  # two steps
+    with pytest.raises(tf.SimulationError, match=f"{name}, which all colonies share"):
+        list(tf.simulate(scene, until=0.2, colonies=2))
+
+
 def test_what_is_ignored_is_said(tmp_path):
     with pytest.warns(UserWarning, match=r"addCell\(color=…\): CellModeller ignores"):
         tf.from_cellmodeller(

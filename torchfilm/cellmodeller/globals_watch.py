@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -13,31 +13,44 @@ MOST = 10_000  # entries of a list that is compared
 
 
 class GlobalsWatch:
-    """The numbers, texts, lists and dicts among a module's global variables, as they were."""
+    """The numbers, texts, lists and dicts among a module's global variables, as they were, also
+    those in objects and classes of its own and in the defaults of its functions."""
 
     def __init__(self, module: ModuleType):
         self.module = module
-        self.before = {
-            name: copy.deepcopy(value)
-            for name, value in vars(module).items()
-            if not name.startswith("__") and _is_plain(value)
-        }
+        self.before = copy.deepcopy(self._now())
 
     def changed(self) -> list[str]:
         """The names of those that differ from before, and of new ones."""
-        now = {n: v for n, v in vars(self.module).items() if not n.startswith("__")}
-        new = [n for n, v in now.items() if n not in self.before and _is_plain(v)]
+        now = self._now()
         return sorted(
-            [*new, *(n for n, v in self.before.items() if n not in now or not _same(v, now[n]))]
+            n
+            for n in {**self.before, **now}
+            if n not in now or n not in self.before or not _same(self.before[n], now[n])
         )
 
     def restore(self) -> None:
         """Sets them back, and removes new ones."""
         for name in self.changed():
+            holder, _, last = name.rpartition(".")
+            owner = getattr(self.module, holder) if holder else self.module
             if name in self.before:
-                setattr(self.module, name, copy.deepcopy(self.before[name]))
+                setattr(owner, last, copy.deepcopy(self.before[name]))
             else:
-                delattr(self.module, name)
+                delattr(owner, last)
+
+    def _now(self) -> dict[str, Any]:
+        """The values by name; those in an object as "object.name"."""
+        found = {n: v for n, v in vars(self.module).items() if not n.startswith("__")}
+        for holder, owner in list(found.items()):
+            kind = owner if isinstance(owner, (type, FunctionType)) else type(owner)
+            if getattr(kind, "__module__", None) != self.module.__name__:
+                continue
+            inner = {n: v for n, v in getattr(owner, "__dict__", {}).items() if n[:2] != "__"}
+            if isinstance(owner, FunctionType) and owner.__defaults__ is not None:
+                inner["__defaults__"] = owner.__defaults__
+            found.update({f"{holder}.{n}": v for n, v in inner.items()})
+        return {n: v for n, v in found.items() if _is_plain(v)}
 
 
 def _is_plain(value: Any) -> bool:
