@@ -55,6 +55,18 @@ def test_the_sense_of_angles(options, sign):
     assert np.allclose(read(**options).axis[1], [math.sqrt(3) / 2, 0.5 * sign])
 
 
+def test_long_labels_have_all_their_digits():
+    long = [2**60, 2**60 + 1]  # which are one float
+    found = tf.Cells.from_table(table(label=long), pixel_size=0.1, fields=[])
+    assert found.micrograph.label.tolist() == [str(n) for n in long]
+
+
+def test_masked_values_are_missing():
+    masked = np.ma.array([0.0, 5.0], mask=[False, True])
+    with pytest.raises(tf.InputError, match="row 2, column 'x': 'nan' is not a number"):
+        tf.Cells.from_table(table(x=masked))
+
+
 def test_axes_are_mirrored_with_y():
     columns = {"x": [0.0], "y": [3.0], "axis_x": [0.6], "axis_y": [0.8], "length": [2.0]}
     cells = tf.Cells.from_table(columns, y="down")

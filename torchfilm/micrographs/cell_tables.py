@@ -183,6 +183,9 @@ def _tidy(values: np.ndarray) -> list[str]:
     """Values as texts, whole numbers without a point."""
     texts = []
     for value in values.tolist():
+        if isinstance(value, int) and not isinstance(value, bool):
+            texts.append(str(value))  # a float has not all digits of a long label
+            continue
         try:
             number = float(value)
             texts.append(str(int(number)) if number == int(number) else str(value))

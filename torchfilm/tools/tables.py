@@ -115,6 +115,8 @@ class Table:
         for name in table.keys():  # noqa: SIM118
             column = table[name]
             values = np.asarray(column.detach().cpu() if hasattr(column, "detach") else column)
+            if isinstance(column, np.ma.MaskedArray) and column.mask.any():
+                values = np.where(column.mask, np.nan, values)
             if values.ndim != 1 or str(name) in found:
                 raise checks.InputError(
                     f"{source}: the column {str(name)!r} is there twice, or is not a list of"
