@@ -89,7 +89,10 @@ def _point(design: Any, task: Task) -> np.ndarray:
         for name in values:
             if name not in allowed:
                 raise checks.input_error(
-                    "start", name, f"a parameter of {task.family.name}: {', '.join(allowed)}"
+                    "start",
+                    name,
+                    f"a parameter of {task.family.name}: {', '.join(allowed)}",
+                    checks.suggestion(name, allowed),
                 )
     space = task.space
     return space.point(

@@ -3,7 +3,6 @@ they span."""
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -238,10 +237,11 @@ class Space:
         """Raises InputError for a parameter that the scene does not have."""
         for name in self.names:
             if name not in allowed:
-                near = difflib.get_close_matches(name, allowed, 1)
-                hint = f"Did you mean {near[0]!r}?" if near else ""
                 raise checks.input_error(
-                    "Parameter", name, f"a parameter of {scene}: {', '.join(allowed)}", hint
+                    "Parameter",
+                    name,
+                    f"a parameter of {scene}: {', '.join(allowed)}",
+                    checks.suggestion(name, allowed),
                 )
 
     def describe(self) -> list[str]:

@@ -80,7 +80,10 @@ class SceneFamily:
             for given in self.fixed:
                 if given not in allowed:
                     raise checks.input_error(
-                        "fixed", given, f"a parameter of {self.name}: {', '.join(allowed)}"
+                        "fixed",
+                        given,
+                        f"a parameter of {self.name}: {', '.join(allowed)}",
+                        checks.suggestion(given, allowed),
                     )
         both = [name for name in self.fixed if name in self.space.names]
         if both:

@@ -76,12 +76,7 @@ def main() -> None:
     tf.keep_memory()
 
     search = Search(
-        "boundary_detector",
-        PARAMETERS,
-        TARGET,
-        **COLONY,
-        replicates=4,
-        seed=options.seed,
+        "boundary_detector", PARAMETERS, TARGET, **COLONY, replicates=4, seed=options.seed
     )
     best = search.run(options.colonies, study=options.out.with_suffix(".h5"))
     print(best.table())

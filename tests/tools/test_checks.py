@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+import torchfilm as tf
+from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError, unknown_keyword
 
 
@@ -27,3 +29,20 @@ from torchfilm.tools.checks import InputError, unknown_keyword
 def test_an_unknown_keyword_gets_the_nearest_known_one(given, allowed, message):
     error = unknown_keyword("Growth", given, allowed)
     assert isinstance(error, InputError) and str(error) == message
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: tf.scenes.build("microcoloni"), "Did you mean 'microcolony'?"),
+        (lambda: tf.scenes.build("microcolony", {"raet": 1.0}), "Did you mean 'rate'?"),
+        (lambda: tf.Mechanics(backend="compile"), "Did you mean 'compiled'?"),
+    ],
+)
+def test_names_that_are_nearly_right_get_the_right_one(call, message):
+    with pytest.raises(tf.InputError, match=message.replace("?", r"\?")):
+        call()
+
+
+def test_nothing_is_suggested_for_what_is_no_name():
+    assert checks.suggestion(3, ["a"]) == checks.suggestion("zebra", ["rate", 5]) == ""

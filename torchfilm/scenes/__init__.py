@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import inspect
 from collections.abc import Callable
@@ -83,13 +82,11 @@ def _accuracy_settings() -> set[str]:
 def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
     """The ready-made scene `name`. Raises InputError for an unknown name or parameter."""
     if name not in READY:
-        near = difflib.get_close_matches(name, READY, n=1)
-        hint = f"Did you mean {near[0]}?" if near else ""
         raise checks.input_error(
             "scene",
             name,
             "one of " + ", ".join(READY) + ", or the path of a Python file that defines `scene`",
-            hint,
+            checks.suggestion(name, READY),
         )
     allowed = inspect.signature(READY[name]).parameters
     for given in parameters or {}:
@@ -97,7 +94,7 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
             knob = (
                 "It is an accuracy setting: use --settings FILE or tf.Settings(…)."
                 if given in _accuracy_settings()
-                else ""
+                else checks.suggestion(given, allowed)
             )
             raise checks.input_error(
                 f"parameter of {name}", given, "one of " + ", ".join(allowed), knob

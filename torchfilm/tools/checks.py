@@ -49,6 +49,14 @@ def nearest(given: str, known: Iterable[str]) -> str | None:
     return next((n for n in begins if n.startswith(given) or given.startswith(n)), None)
 
 
+def suggestion(given: object, known: Iterable[object]) -> str:
+    """'Did you mean …?' for a name that is like a known one, else ""."""
+    if not isinstance(given, str):
+        return ""
+    near = nearest(given, [k for k in known if isinstance(k, str)])
+    return f"Did you mean {near!r}?" if near else ""
+
+
 def unknown_keyword(
     name: str, given: str, allowed: Sequence[str], former: Mapping[str, str] | None = None
 ) -> InputError:
@@ -243,7 +251,8 @@ def _rule(above: float, least: float, most: float) -> str:
 def choice(name: str, given: object, allowed: Sequence[object]) -> None:
     """Raises InputError if the value is not one of `allowed`."""
     if given not in allowed:
-        raise input_error(name, given, "one of " + ", ".join(repr(a) for a in allowed))
+        listed = ", ".join(repr(a) for a in allowed)
+        raise input_error(name, given, f"one of {listed}", suggestion(given, allowed))
 
 
 def vector(name: str, given: object, size: int | None = None) -> tuple[float, ...]:
