@@ -228,3 +228,76 @@ def test_a_scene_without_values_per_colony_stores_none(tmp_path):
     record(scene, scene.bind(2).start(), tmp_path / "run.h5", until=0.3)
     with tf.Results(tmp_path / "run.h5") as results:
         assert results.parameters() == {}
+
+
+def two_circuits(a=(1.0, 2.0), b=(3.0, 4.0)) -> tf.Scene:
+    """Two circuits with one set of names; a tuple is one value per colony."""
+
+    def circuit(u, s, p, cell):
+        return {"gfp": p.k - u.gfp}
+
+    value = lambda x: torch.tensor(x) if isinstance(x, tuple) else x
+    own = lambda name, k: tf.Circuit(circuit, species=("gfp",), name=name, k=value(k))
+    return tf.Scene(tf.Growth(rate=1.0), own("a", a), own("b", b), tf.Mechanics(dim=2), dt=DT)
+
+
+def resume_changed(scene, path, until):
+    with tf.Results(path) as results:
+        state = results.state(scene, changed=True)
+    return record(scene, state, path, until=until, append=True, changed=True)
+
+
+def test_two_circuits_keep_the_values_of_both(tmp_path):
+    scene = two_circuits()
+    record(scene, scene.bind(2).start(), tmp_path / "run.h5", until=0.2)
+    with tf.Results(tmp_path / "run.h5") as results:
+        values, table = results.parameters(), results.table(-1)
+    assert {name: x.tolist() for name, x in values.items()} == {
+        "Circuit['a'].parameters['k']": [1.0, 2.0],
+        "Circuit['b'].parameters['k']": [3.0, 4.0],
+    }
+    assert table["a.parameters.k"].tolist() == [1.0, 2.0]
+    assert table["b.parameters.k"].tolist() == [3.0, 4.0]
+
+
+def test_frames_without_values_per_colony_get_none_from_later_ones(tmp_path):
+    """None, then some, then none again, then others; each resume copies the file."""
+    path, first = tmp_path / "run.h5", two_circuits(1.0, 1.0)
+    record(first, first.bind(2).start(), path, until=0.2)
+    for k, (a, b) in enumerate([((5.0, 6.0), 1.0), (1.0, 1.0), (1.0, (7.0, 8.0))]):
+        resume_changed(two_circuits(a, b), path, 0.4 + 0.2 * k)
+    with tf.Results(path) as results:
+        seen = [results.parameters(k) for k in range(len(results))]
+        times = results.times
+    for name, since, values in (("a", 0.2, (5.0, 6.0)), ("b", 0.6, (7.0, 8.0))):
+        for time, found in zip(times, seen, strict=True):
+            there = since + 1e-9 < time < since + 0.2 + 1e-9
+            wanted = values if there else (math.nan, math.nan)
+            own = next(x for path, x in found.items() if f"'{name}'" in path)
+            assert np.array_equal(own, wanted, equal_nan=True), (name, time)
+
+
+def test_a_resume_that_is_killed_before_its_first_frame_may_be_changed_again(tmp_path):
+    path, first = tmp_path / "run.h5", two_circuits()
+    record(first, first.bind(2).start(), path, until=0.2)
+    killed = two_circuits(a=(5.0, 6.0))
+    with tf.Results(path) as results:
+        frames, state = len(results), results.state(killed, changed=True)
+    recorder = tf.Recorder(path, killed, append=True, changed=True)
+    recorder(state)
+    recorder.close()  # it has the last frame already, and writes none
+    resume_changed(two_circuits(a=(7.0, 8.0)), path, 0.4)
+    with tf.Results(path) as results:
+        assert len(results) > frames
+        seen = [results.parameters(k)["Circuit['a'].parameters['k']"] for k in (frames - 1, -1)]
+    assert [x.tolist() for x in seen] == [[1.0, 2.0], [7.0, 8.0]]
+
+
+def test_a_changed_resume_of_an_earlier_file_leaves_its_frames_unknown(tmp_path):
+    path, scene = tmp_path / "run.h5", designs()
+    record(scene, scene.bind(2).start(), path, until=0.2)
+    old = as_earlier(path, tmp_path)
+    resume_changed(designs(k=(5.0, 6.0)), old, 0.4)
+    with tf.Results(old) as results:
+        first, last = (results.parameters(k)["Circuit.parameters['k']"] for k in (0, -1))
+    assert np.isnan(first).all() and last.tolist() == [5.0, 6.0]

@@ -160,9 +160,11 @@ class Scene:
         return max([self.founders.colonies, *(tensor.numel() for _, tensor in self.per_colony())])
 
     def per_colony(self) -> list[tuple[str, Tensor]]:
-        """Every parameter with one value per colony, by name."""
+        """Every parameter with one value per colony, by name: "Growth.rate", and of several effects
+        of one kind "Circuit['lux'].parameters['k']"."""
+        owners = zip(self.effects, _owners(self.effects), strict=True)
         return [
-            (path, x) for effect in self.effects for path, x in parameters(effect) if x.dim() == 1
+            (path, x) for e, owner in owners for path, x in parameters(e, owner) if x.dim() == 1
         ]
 
     def listing(self) -> list[str]:
@@ -177,6 +179,20 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(summary(e) for e in self.effects)}, name={self.name!r})"
+
+
+def _owners(effects: Sequence[Effect]) -> list[str]:
+    """What parameters of each effect are named after: its class; of several of one class with its
+    name, or with its number among them where names do not tell them apart."""
+    kinds = [type(effect).__name__ for effect in effects]
+    out = []
+    for k, (effect, kind) in enumerate(zip(effects, kinds, strict=True)):
+        alike = [e for e, other in zip(effects, kinds, strict=True) if other == kind]
+        names = {name for e in alike if isinstance(name := getattr(e, "name", None), str) and name}
+        told_apart = len(names) == len(alike)
+        mark = effect.name if told_apart else kinds[:k].count(kind)  # type: ignore[attr-defined]
+        out.append(kind if len(alike) == 1 else f"{kind}[{mark!r}]")
+    return out
 
 
 def _check_effects(effects: Sequence[Any]) -> None:

@@ -20,16 +20,25 @@ NOW, UNTIL = "parameters", "parameters_until"
 SLASH = "\u2215"  # in a path, for the "/" that separates HDF5 groups
 
 
-def write_parameters(file: h5py.File, scene: Scene, colony_id: Tensor, step: int) -> None:
+def write_parameters(
+    file: h5py.File, scene: Scene, colony_id: Tensor, step: int, *, changed: bool = False
+) -> None:
     """Store the values of the colonies (B,) from `step` on. Those that the file holds, if they
-    differ, stay those of the frames up to that step."""
+    differ, stay those of the frames up to that step. changed: the frames so far are of another
+    scene, so that their values are not known where the file holds none."""
+    earlier = f"{UNTIL}/{step}"
     values = {path: numpy_of(x.double())[numpy_of(colony_id)] for path, x in scene.per_colony()}
     if NOW in file:
         before = _values(file[NOW])
         alike = before.keys() == values.keys()
-        if alike and all(np.array_equal(before[n], values[n]) for n in values):
+        if alike and all(np.array_equal(before[n], values[n], equal_nan=True) for n in values):
             return
-        file.move(NOW, f"{UNTIL}/{step}")
+        if earlier in file:
+            del file[NOW]  # of a resume that ended before its first frame
+        else:
+            file.move(NOW, earlier)
+    elif changed:
+        file.create_group(earlier)
     group = file.create_group(NOW)
     for path, value in values.items():
         group.create_dataset(path.replace("/", SLASH), data=value)

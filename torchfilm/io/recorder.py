@@ -210,7 +210,8 @@ class Recorder:
         # with `changed`, the scene may be another one
         for name, value in {**scene_attributes(self.scene, self.model), "dt": self.dt}.items():
             self.file.attrs[name] = value
-        write_parameters(self.file, self.scene, state.colony_id, state.step)
+        about = self.scene, state.colony_id, state.step
+        write_parameters(self.file, *about, changed=self.changed)
         self._add_found(self.file, state)
         self.file.swmr_mode = True
 

@@ -109,6 +109,7 @@ def copy_committed(source: Path, target: Path) -> h5py.File:
 
         def copy(name: str, item: Any) -> None:
             if not isinstance(item, h5py.Dataset):
+                out.require_group(name)  # also an empty one: it says that there was nothing
                 return
             size = next((n for group, n in sizes.items() if name.startswith(group + "/")), None)
             if size is None:
