@@ -9,6 +9,7 @@ import numpy as np
 
 from design.methods.base import Batch, Turns, sobol_points, whole
 from design.slopes import Slopes
+from torchfilm import checks
 
 # Damping, as a share of the curvature: at the start, and from which a descent is given up.
 FIRST, MOST = 1e-2, 1e6
@@ -148,6 +149,11 @@ class Local(Turns):
             whole("Local.first", self.first, least=self.starts)
 
     def _begin(self) -> None:
+        if None not in self._started().levels:
+            raise checks.InputError(
+                "there is no slope to descend: every parameter is whole or a choice. Use another"
+                ' method, such as "racing".'
+            )
         self._tried = 0
         self._waiting: list[np.ndarray] = []
         self._descents: list[Descent] = []

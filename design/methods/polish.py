@@ -18,8 +18,9 @@ class Polish(Turns):
     """Searches with another method, and then goes down the slope from its best designs.
 
     inner: the method that searches first; None is Racing(). after: designs that it grows before, in
-    units of full colonies with all replicates. starts: the best of them, no two alike, from which
-    `Local` descends side by side. Where all descents have ended, `inner` goes on.
+    units of full colonies with all replicates; one at least is grown to full size. starts: the best
+    of them, no two alike, from which `Local` descends side by side. Where all descents have ended,
+    `inner` goes on.
 
     CMA-ES and racing find the valley; its floor is a matter of the last digits of several
     parameters at once, and a slope knows all of these. Derivatives cost colonies (see `Local`), so
@@ -36,6 +37,8 @@ class Polish(Turns):
             callable(getattr(self.inner, name, None)) for name in ("start", "ask", "tell")
         ):
             raise checks.input_error("Polish.inner", self.inner, "a method, such as Racing()")
+        if getattr(self.inner, "several", False):
+            raise checks.input_error("Polish.inner", self.inner, "a method for one target")
         whole("Polish.after", self.after, least=1)
         whole("Polish.starts", self.starts, least=1)
 
@@ -59,7 +62,8 @@ class Polish(Turns):
         self._loss = np.concatenate([self._loss, loss])
 
     def _next(self) -> Batch:
-        if not self._descending and not self._over and self._spent >= self.after:
+        due = self._spent >= self.after and len(self._points) > 0
+        if due and not self._descending and not self._over:
             best = unlike(self._points, self._loss, self.starts)
             self._local.know(self._points[best], self._loss[best])
             self._descending = True
@@ -68,12 +72,20 @@ class Polish(Turns):
         return self._local.ask() if self._descending else self._inner.ask()
 
     def _take(self, batch: Batch, loss: np.ndarray) -> None:
+        self._count(batch, loss)
+        self._inner.tell(batch, loss)
+
+    def _count(self, batch: Batch, loss: np.ndarray) -> None:
+        """Count what `inner` grows, and keep its designs where they may be starts."""
         replicates = min(batch.replicates or self._replicates, self._replicates)
         self._spent += len(batch.points) * batch.size * replicates / self._replicates
         if batch.size == 1 and replicates == self._replicates:
             self._keep(batch.points, loss)
-        self._inner.tell(batch, loss)
 
     def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:
         batch = self.ask()
-        self._local.tell(batch, loss, slopes)
+        if self._descending:
+            self._local.tell(batch, loss, slopes)
+        else:  # a method inside that asks for slopes, too
+            self._count(batch, loss)
+            self._inner.tell(batch, loss, slopes)  # type: ignore[call-arg]

@@ -7,7 +7,7 @@ import pytest
 from asking import Room, begun
 from searching import Level, lit, paced
 
-from design import CMAES, Parameter, Polish, Racing, Search, Sobol, Study
+from design import CMAES, NSGA2, Local, Parameter, Polish, Racing, Search, Sobol, Study
 from design.methods import choose
 from design.methods.local import unlike
 from design.slopes import Slopes
@@ -78,6 +78,21 @@ def test_small_colonies_count_by_their_size():
     ]
 
 
+def test_descents_wait_for_a_design_of_full_size():
+    """The small colonies of the first race are more than `after` by themselves."""
+    inner = Racing(inner=CMAES(population=24, sigma=0.5))
+    history = run(begun(Polish(inner=inner, after=2), ROOM, replicates=1), 3)
+    assert [(b.size, b.slopes) for b, _ in history] == [(0.25, False), (1.0, False), (1.0, True)]
+
+
+def test_the_method_inside_may_descend_too():
+    history = run(begun(Polish(inner=Local(starts=2, first=4), after=5, starts=1), ROOM), 12)
+    sizes = [len(b.points) for b, _ in history if b.slopes]
+    # two side by side, then one from the best so far
+    assert sizes[0] == 2 and 1 in sizes
+    assert min(loss.min() for _, loss in history) < 1e-12
+
+
 def test_starts_are_not_alike():
     points = np.array([[0.1, 0.1], [0.11, 0.1], [0.9, 0.1], [0.1, 0.2]])
     assert unlike(points, np.array([0.0, 0.1, 0.3, 0.2]), 3) == [0, 3, 2]
@@ -103,10 +118,18 @@ def test_after_a_stop_the_next_batches_have_the_same_bits(stop):
         answer(again, asked)
 
 
-@pytest.mark.parametrize("wrong", [{"inner": CMAES}, {"inner": 3}, {"after": 0}, {"starts": 0}])
+@pytest.mark.parametrize(
+    "wrong", [{"inner": CMAES}, {"inner": 3}, {"inner": NSGA2()}, {"after": 0}, {"starts": 0}]
+)
 def test_what_is_not_allowed(wrong):
     with pytest.raises(InputError, match=f"Polish.{next(iter(wrong))}"):
         Polish(**wrong)
+
+
+@pytest.mark.parametrize("method", [Local(), Polish()])
+def test_there_is_no_slope_among_levels_alone(method):
+    with pytest.raises(InputError, match="every parameter is whole or a choice"):
+        method.start(Room((3, 2)), 0, 1)
 
 
 def test_auto_descends_where_the_loss_is_a_sum_of_squares():
