@@ -123,8 +123,6 @@ class Objective:
                 "there are no derivatives: every parameter is whole or a choice. Use another"
                 ' method, such as "racing".'
             )
-        if task.tried.why_regrown:
-            return f"growth depends on the design ({task.tried.why_regrown})"
         if task.target.reduced(np.zeros((1, task.replicates))) is not None:
             return "the loss is a statistic of several seeds"
         return task.tried.why_rough

@@ -120,7 +120,7 @@ class TriedScenes:
     dt (h): of the scene. recipe: name and arguments of a ready scene, or None. listing: its effects
     as text. digest: of what a listing does not show, the founders and the code of functions.
     why_regrown: the reason why colonies cannot follow recorded growth, or "". why_rough: the reason
-    why losses on recorded growth have no derivatives, or "".
+    why losses have no exact derivatives, with one option of a choice at least, or "".
     """
 
     founders: int
@@ -150,7 +150,7 @@ def try_scenes(
     these designs are unfit.
     """
     middle = {p.name: p.value(0.5) for p in family.space.parameters}
-    made_of, endless, unfit = [], [], []
+    made_of, endless, unfit, rough = [], [], [], []
     example: tf.Scene | None = None
     for values in _trial_values(family.space, middle):
         try:
@@ -168,6 +168,7 @@ def try_scenes(
         example = example or family.scene([values])
         made_of.append((scene.effects, scene.founders))
         endless.append(tried.why_endless)
+        rough.append(_why_rough(scene, tried.why_regrown))
     # one design that does not grow is scored as such; a search in which none grows is a mistake
     if example is None or all(endless):
         raise tf.InputError(unfit[0] if example is None else endless[0])
@@ -185,7 +186,7 @@ def try_scenes(
         listing=scene.listing(),
         digest=tf.digest(made_of),
         why_regrown=why_regrown,
-        why_rough=_why_rough(scene),
+        why_rough=next(filter(None, rough), ""),
     )
 
 
@@ -208,7 +209,10 @@ def _cannot_be_built(
     )
 
 
-def _why_rough(scene: tf.Scene) -> str:
+def _why_rough(scene: tf.Scene, why_regrown: str) -> str:
+    """Why the losses of a scene have no exact derivatives, or "". Options of a choice differ."""
+    if why_regrown:
+        return f"growth depends on the design ({why_regrown})"
     circuits = [e for e in scene.effects if isinstance(e, tf.Circuit) and e.is_stochastic]
     return "molecules are counted one by one" if circuits else ""
 

@@ -219,3 +219,26 @@ def test_a_search_by_derivatives_reaches_what_a_plain_one_reaches():
     plain = Search(lit, TWO, EDGES, cells=8, replicates=2, method="sobol")
     local = Search(lit, TWO, EDGES, cells=8, replicates=2, method=Local(starts=2, first=8))
     assert local.run(colonies=80, progress=False).loss <= plain.run(80, progress=False).loss
+
+
+def slowed(make=1.0, decay=1.0, load="slow"):
+    """With one option growth depends on the circuit, with the other it does not."""
+
+    def update(cells):
+        cells.growth_rate = 2.0 / (1.0 + 0.1 * cells.gfp)
+
+    scene = lit(make, decay)
+    if load == "none":
+        return scene
+    others = (tf.Division(length=tf.Uniform(3.0, 4.0)), *scene.effects[2:])
+    return tf.Scene(tf.Growth(), tf.Rules(update), *others, dt=scene.dt)
+
+
+@pytest.mark.parametrize("options", [("slow", "none"), ("none", "slow")])
+def test_one_option_without_exact_derivatives_is_enough(options):
+    parameters = [*TWO, Choice("load", options)]
+    objective = objective_of(slowed, parameters, EDGES, cells=8, replicates=1)
+    assert "growth depends on the design" in objective.why_differences
+    assert not objective.least_squares
+    found = objective.evaluate(np.array([[0.3, 0.6, 0.25], [0.3, 0.6, 0.75]]), slopes=True)
+    assert not found.reasons and (found.slopes.gradient[:, :2] != 0).all()
