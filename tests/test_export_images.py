@@ -201,6 +201,21 @@ def test_light_is_the_amount_in_the_cells(run, tmp_path):
         assert image.sum() * PIXEL**2 == pytest.approx(amount, rel=5e-3)
 
 
+def test_light_from_beyond_a_window_is_blurred_into_it(run, tmp_path):
+    """A window through the colony is the same part of a larger image."""
+    options = {"pixel_size": 0.1, "colony": 1, "channels": {"gfp": 100.0}, "blur": 0.3}
+    parts = []
+    for side in (8.0, 1.0):
+        path = tmp_path / f"{side}.ome.tif"
+        window = ((-side, -side), (side, side))
+        parts.append(
+            tifffile.imread(run.to_ome_tiff(path, frames=[-1], window=window, **options)).squeeze()
+        )
+    whole, part = parts
+    assert part.shape == (20, 20) and part[0].max() > 101.0, "cells should reach the edge"
+    assert np.allclose(part, whole[70:90, 70:90], rtol=1e-5)
+
+
 def test_noise_is_that_of_photons_and_camera(run, tmp_path):
     """Far from cells, mean background + offset and variance background + noise²."""
     options = {

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torchfilm.io.results import Results
 
 SUFFIXES = (".tif", ".tiff")
+CUT = 4.0  # σ of the optics, beyond which no light arrives
 MARGIN = 2.0  # µm around the cells, where no window is given
 MOST_PIXELS = 2**28  # of one page
 PROFILES = ("thickness", "flat")
@@ -176,11 +177,19 @@ class Camera:
     def dtype(self) -> np.dtype:
         return np.dtype(np.float32 if self.noise is None else np.uint16)
 
+    def margin(self, pixel: float) -> int:
+        """How many pixels beyond an image the optics blur into it."""
+        return math.ceil(CUT * self.blur / pixel)
+
     def image(self, light: np.ndarray, pixel: float, key: tuple[int, ...], name: str) -> np.ndarray:
-        """Counts of the light (rows, columns) that cells send out. key: of the noise."""
+        """Counts (rows, columns) of the light that cells send out, there and in the margin around
+        it. key: of the noise."""
         from scipy.ndimage import gaussian_filter
 
-        seen = gaussian_filter(light, self.blur / pixel, mode="constant") + self.background
+        margin = self.margin(pixel)
+        seen = gaussian_filter(light, self.blur / pixel, mode="constant", radius=margin)
+        inside = slice(margin, None if margin == 0 else -margin)
+        seen = seen[inside, inside] + self.background
         if self.noise is None:
             return (seen + self.offset).astype(np.float32)
         _check_counts(name, float(seen.max()) + self.offset)
@@ -213,6 +222,7 @@ def write_fluorescence(
     checks.choice("profile", profile, PROFILES)
     gains = _check_channels(view, channels)
     steps = view.results.steps
+    raster = view.raster.wider(camera.margin(view.raster.pixel))
 
     def pages() -> Iterator[np.ndarray]:
         for k in view.frames:
@@ -222,10 +232,10 @@ def write_fluorescence(
             if bad.any():
                 rule = "a quantity that is known and at least 0 in all cells"
                 raise checks.input_error("channels", list(gains)[int(bad.argmax())], rule)
-            light = thickness_image(rods, weights, view.raster, profile == "flat")
+            light = thickness_image(rods, weights, raster, profile == "flat")
             for name, image in zip(gains, light, strict=True):
                 key = (view.colony, int(steps[k]))
-                yield camera.image(image, view.raster.pixel, key, name)
+                yield camera.image(image, raster.pixel, key, name)
 
     return _write(view, target, pages(), camera.dtype, list(gains))
 

@@ -20,6 +20,12 @@ class Raster:
     top: float
     shape: tuple[int, int]
 
+    def wider(self, margin: int) -> Raster:
+        """With a margin of pixels on all sides."""
+        apart = margin * self.pixel
+        rows, columns = (n + 2 * margin for n in self.shape)
+        return Raster(self.pixel, self.left - apart, self.top + apart, (rows, columns))
+
 
 @dataclass(frozen=True, eq=False)
 class Rods:
