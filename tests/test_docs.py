@@ -40,3 +40,16 @@ def test_the_reference_lists_every_public_name():
     names = [f"tf.{n}" for n in torchfilm.__all__ if not n.startswith("_")]
     assert [n for n in names if f"`{n}`" not in text] == []
     assert [n for n in design.__all__ if f"`{n}`" not in text] == []
+
+
+def test_the_site_has_the_docstring_of_every_public_name():
+    text = (ROOT / "docs" / "docstrings.md").read_text()
+    listed = re.findall(r"^::: ([\w.]+)$", text, re.MULTILINE)
+    names = [f"torchfilm.{n}" for n in torchfilm.__all__ if not n.startswith("_")]
+    assert sorted(listed) == sorted([*names, *(f"design.{n}" for n in design.__all__)])
+
+
+def test_the_site_lists_every_page_once():
+    text = (ROOT / "mkdocs.yml").read_text()
+    listed = re.findall(r": (\S+\.md)$", text, re.MULTILINE)
+    assert sorted(listed) == sorted(p.name for p in PAGES if p.parent.name == "docs")

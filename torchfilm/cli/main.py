@@ -1,5 +1,5 @@
 """The entry point of the command line: `torchfilm run SCENE`, `resume FILE`, `show FILE`,
-`export FILE OUT`, `info SCENE-or-FILE`, `explain SCENE`, `tune SCENE`."""
+`export FILE OUT`, `info SCENE-or-FILE`, `explain SCENE`, `tune SCENE`, `help NAME`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ try:
     import tyro
 
     from torchfilm.cli.export import Export
+    from torchfilm.cli.help import Help
     from torchfilm.cli.inspect import Explain, Info, Tune
     from torchfilm.cli.run import Resume, Run
     from torchfilm.cli.show import Show
@@ -33,6 +34,7 @@ COMMANDS: dict[str, type[Any]] = {
     "info": Info,
     "explain": Explain,
     "tune": Tune,
+    "help": Help,
 }
 
 
