@@ -42,5 +42,5 @@ help:  ## this list
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -e ".[app,design,bayes,pareto,infer,cluster,images,tables,sbml,dev]"
+	$(BIN)/python -m pip install -q -c constraints.txt -e ".[app,design,bayes,pareto,infer,cluster,images,tables,notebook,sbml,dev]"
 	touch $@

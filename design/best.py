@@ -17,6 +17,7 @@ from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
 from design.saved_design import write_design
 from design.study import Study
+from torchfilm import displays
 
 
 class SearchView(Protocol):
@@ -87,6 +88,22 @@ class Best:
         tested = "" if self.fresh is None else f" on {len(self.losses)} fresh seeds"
         return f"Best(values={self.values}, loss={self.loss:.4g}{tested})"
 
+    def _repr_html_(self) -> str:
+        # what is known without growing the colonies again
+        found = self.search.study.first()
+        assert found is not None
+        first = self.objective.task.space.values(found[0])
+        rows = report.parameter_rows(self.objective.task.space, first, self.values)
+        losses: list[tuple[str, str]] = [
+            ("loss in the search", f"{self.searched_loss:.4f}, of the first guess {found[1]:.4f}")
+        ]
+        if self.fresh is not None:
+            losses.append(("loss on fresh seeds", report.fresh_words(self.fresh)))
+        study = self.search.study
+        losses.append(("grown", f"{study.colonies:.0f} colonies in {study.seconds:.0f} s"))
+        head = ("parameter", "bounds", "first guess", "best design", "")
+        return displays.card("Best design", displays.table(rows, head), displays.pairs(losses))
+
     def scene(self) -> tf.Scene:
         """The scene with these parameters, for one colony or any number of them."""
         family = self.objective.task.family
@@ -103,10 +120,11 @@ class Best:
             colonies=self.search.study.colonies,
         )
 
-    def plot(self, path: str | Path) -> Path:
-        """Draw the first guess, the best design, the target and the course of the search. Needs
+    def plot(self, out: str | Path | None = None) -> tf.pictures.Picture:
+        """Draw the first guess, the best design, the target and the course of the search. A
+        notebook displays the picture; with `out` it is saved there, in place of an older one. Needs
         matplotlib (the `app` extra)."""
-        return report.draw(self._report(), Path(path))
+        return tf.pictures.Picture(report.draw(self._report()), out)
 
     def table(self) -> str:
         """The parameters with their bounds and the first guess, the losses and the measures."""

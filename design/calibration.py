@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+import torchfilm as tf
 from design.posterior_plot import draw_ranks
 
 ALL = "all together"  # the region of highest density of all parameters
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """The places of hidden truths among samples of their posteriors.
 
@@ -51,8 +52,14 @@ class Calibration:
             lines.append(f"{self.failed} truths failed and are left out")
         return "\n".join(lines)
 
-    def plot(self, path: str | Path) -> Path:
-        """Draw the histograms of ranks. Needs matplotlib (the `app` extra)."""
-        return draw_ranks(
-            Path(path), (*self.names, ALL), np.c_[self.ranks, self.density_ranks], self.samples
-        )
+    def __repr__(self) -> str:
+        return f"Calibration({len(self.ranks)} truths of {', '.join(self.names)})"
+
+    def _repr_html_(self) -> str:
+        return tf.displays.card("Calibration", tf.displays.text(self.table()))
+
+    def plot(self, out: str | Path | None = None) -> tf.pictures.Picture:
+        """Draw the histograms of ranks; `out` as for `Best.plot`. Needs matplotlib (the `app`
+        extra)."""
+        ranks = np.c_[self.ranks, self.density_ranks]
+        return tf.pictures.Picture(draw_ranks((*self.names, ALL), ranks, self.samples), out)

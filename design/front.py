@@ -18,6 +18,7 @@ from design.parameters import Value, right_aligned, show_value
 from design.pareto import nondominated, spread
 from design.study import Study
 from design.targets.goals import Goals
+from torchfilm import displays
 
 
 class FrontSearch(Protocol):
@@ -32,7 +33,7 @@ class FrontSearch(Protocol):
     def design(self, point: np.ndarray) -> Best: ...
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Front:
     """Designs that no other exceeds in all goals, in order of the first goal.
 
@@ -89,21 +90,33 @@ class Front:
 
     def table(self) -> str:
         """The goals and the parameters of each design."""
+        return "\n".join([*right_aligned(self._rows()), self._where()])
+
+    def _repr_html_(self) -> str:
+        head, *rows = self._rows()
+        return displays.card(f"Front: {self._where()}", displays.table(rows, head))
+
+    def _rows(self) -> list[list[str]]:
         names = self.search.objective.task.space.names
         text = [["", *self.titles, *names]]
         for k, (goals, values) in enumerate(zip(self.goals, self.values, strict=True)):
             shown = [show_value(values[name]) for name in names]
             text.append([str(k), *(f"{x:.4g}" for x in goals), *shown])
-        where = f"on {self.seeds} fresh seeds" if self.seeds else "on the seeds of the search"
-        return "\n".join([*right_aligned(text), f"{len(self)} designs, {where}"])
+        return text
 
-    def plot(self, path: str | Path) -> Path:
-        """Draw the front among all designs, colonies along it, and the hypervolume. Needs
-        matplotlib and pymoo (the `app` and `pareto` extras)."""
+    def _where(self) -> str:
+        where = f"on {self.seeds} fresh seeds" if self.seeds else "on the seeds of the search"
+        return f"{len(self)} designs, {where}"
+
+    def __repr__(self) -> str:
+        return f"Front({', '.join(self.titles)}; {self._where()})"
+
+    def plot(self, out: str | Path | None = None) -> tf.pictures.Picture:
+        """Draw the front among all designs, colonies along it, and the hypervolume; `out` as for
+        `Best.plot`. Needs matplotlib and pymoo (the `app` and `pareto` extras)."""
         every = np.concatenate([goals for _, goals in self.search.study.full_goals()])
         colonies = {int(k): self[int(k)].colonies() for k in spread(self.goals, 5)}
-        return draw_front(
-            Path(path),
+        figure = draw_front(
             self.search.objective.task.target,
             self.titles,
             every,
@@ -111,6 +124,7 @@ class Front:
             colonies,
             self.convergence(),
         )
+        return tf.pictures.Picture(figure, out)
 
 
 def front_of(search: FrontSearch, study: Study, sizes: Sequence[float]) -> Front:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,24 +11,22 @@ from design import report
 from design.rollout import FinishedColonies
 from design.targets.base import Target
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 def draw_front(
-    path: Path,
     target: Target,
     titles: tuple[str, ...],
     every: np.ndarray,
     front: np.ndarray,
     colonies: dict[int, list[FinishedColonies]],
     course: tuple[np.ndarray, np.ndarray],
-) -> Path:
+) -> Figure:
     """Draw the first two goals of all designs (n, G) and of the front (F, G), a colony of some of
     its designs, by row, and the hypervolume against colonies simulated."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise tf.InputError('pictures need matplotlib: pip install "torchfilm[app]".') from error
     columns = max(2, len(colonies))
-    figure = Figure(figsize=(2.6 * columns, 6.4), layout="constrained")
+    figure = tf.pictures.new_figure(2.6 * columns, 6.4)
     grid = figure.add_gridspec(2, columns, height_ratios=[1.0, 0.8])
     ax = figure.add_subplot(grid[0, : max(1, (2 * columns) // 3)])
     ax.plot(every[:, 0], every[:, 1], ".", color="0.75", ms=3, label="every design")
@@ -60,5 +58,4 @@ def draw_front(
         list(colonies.values()),
         [f"design {row}" for row in colonies],
     )
-    figure.savefig(path, dpi=160)
-    return path
+    return figure

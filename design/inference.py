@@ -41,7 +41,7 @@ def infer(
     flows: int = 2,
     epochs: int = 400,
     executor: Executor | None = None,
-    progress: bool = True,
+    progress: bool | None = None,
 ) -> Posterior:
     """The parameters of a scene that could have grown the observed colonies, as a posterior.
 
@@ -59,8 +59,8 @@ def infer(
     than the data allow. path: a file that keeps the simulations; running the same again
     takes them from it, also for other data of the same statistics. samples: of the posterior.
     flows, epochs: of the estimator; more flows are less sure. executor: of the
-    `concurrent.futures` kind, for other processes. progress: show a bar. Raises the errors of
-    `Task`, and InputError where sbi is missing (the `infer` extra), for the file of other
+    `concurrent.futures` kind, for other processes. progress: as for `Search.run`. Raises the errors
+    of `Task`, and InputError where sbi is missing (the `infer` extra), for the file of other
     simulations, and where fewer than 50 simulations succeed.
     """
     require_sbi()
@@ -88,7 +88,7 @@ def infer(
 
 
 def _simulate(
-    task: Task, count: int, path: Path | None, executor: Executor | None, progress: bool
+    task: Task, count: int, path: Path | None, executor: Executor | None, progress: bool | None
 ) -> Simulations:
     """The simulations of a task. Raises InputError where too few succeed."""
     each = task.replicates

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+import torchfilm as tf
 from design.calibration import Calibration
 from design.neural_posterior import NeuralPosterior
 from design.parameters import Parameter, Value, show_value
@@ -139,11 +140,16 @@ class Posterior:
     def __repr__(self) -> str:
         return f"Posterior(mean={self.mean}, {len(self.points)} samples)"
 
-    def plot(self, path: str | Path, truth: dict[str, Value] | None = None) -> Path:
+    def _repr_html_(self) -> str:
+        return tf.displays.card("Posterior", tf.displays.text(self.table()))
+
+    def plot(
+        self, out: str | Path | None = None, truth: dict[str, Value] | None = None
+    ) -> tf.pictures.Picture:
         """Draw the samples: of each parameter, and of each two of them. truth: values to mark.
-        Needs matplotlib (the `app` extra)."""
+        out: as for `Best.plot`. Needs matplotlib (the `app` extra)."""
         marked = None if truth is None else self.task.space.point(truth)
-        return draw_corner(Path(path), self.task.space, self.points, marked)
+        return tf.pictures.Picture(draw_corner(self.task.space, self.points, marked), out)
 
     def check(self, truths: int = 200, *, samples: int = 999) -> Calibration:
         """Simulation-based calibration (Talts et al., arXiv 1804.06788): grow colonies of hidden,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,20 +20,12 @@ RANK_BINS = 10
 LIKELY = 0.99  # share of right posteriors whose bars lie within the band
 
 
-def _figure(size: tuple[float, float]) -> Figure:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise tf.InputError('pictures need matplotlib: pip install "torchfilm[app]".') from error
-    return Figure(figsize=size, layout="constrained")
-
-
-def draw_corner(path: Path, space: Space, points: np.ndarray, truth: np.ndarray | None) -> Path:
+def draw_corner(space: Space, points: np.ndarray, truth: np.ndarray | None) -> Figure:
     """Draw samples (S, D) in [0, 1]: histograms with the 90 % interval, and pairs, where the
     samples are. Axes are drawn in coordinates and labelled with values. truth: (D,) to mark, or
     None."""
     count = space.size
-    figure = _figure((1.0 + 1.8 * count, 0.6 + 1.8 * count))
+    figure = tf.pictures.new_figure(1.0 + 1.8 * count, 0.6 + 1.8 * count, dpi=130)
     edges = [_edges(p, points[:, k], truth, k) for k, p in enumerate(space.parameters)]
     grid: Any = figure.subplots(count, count, squeeze=False)
     for row, column in np.ndindex(count, count):
@@ -59,8 +50,7 @@ def draw_corner(path: Path, space: Space, points: np.ndarray, truth: np.ndarray 
             ax.set_xlabel(space.names[column], fontsize=9)
         if row and not column:
             ax.set_ylabel(space.names[row], fontsize=9)
-    figure.savefig(path, dpi=130)
-    return path
+    return figure
 
 
 def _edges(parameter: Any, unit: np.ndarray, truth: np.ndarray | None, k: int) -> np.ndarray:
@@ -99,13 +89,13 @@ def _mark(ax: Axes, x: float, y: float | None) -> None:
         ax.plot(x, y, "+", color="C3", ms=9)
 
 
-def draw_ranks(path: Path, names: Sequence[str], ranks: np.ndarray, samples: int) -> Path:
+def draw_ranks(names: Sequence[str], ranks: np.ndarray, samples: int) -> Figure:
     """Draw histograms of ranks (T, P) from 0 to `samples`, each with the band in which the bars
     of right posteriors lie with a probability of 99 %."""
     from scipy.stats import binom
 
     truths, count = ranks.shape
-    figure = _figure((2.4 * count, 2.4))
+    figure = tf.pictures.new_figure(2.4 * count, 2.4)
     edges = np.linspace(0, samples + 1, RANK_BINS + 1)
     low, high = binom.ppf([0.5 - 0.5 * LIKELY, 0.5 + 0.5 * LIKELY], truths, 1.0 / RANK_BINS)
     for k, ax in enumerate(figure.subplots(1, count, sharey=True, squeeze=False)[0]):
@@ -116,5 +106,4 @@ def draw_ranks(path: Path, names: Sequence[str], ranks: np.ndarray, samples: int
         ax.set_title(names[k], fontsize=9)
         ax.tick_params(labelsize=7)
     figure.axes[0].set_ylabel(f"truths of {truths}")
-    figure.savefig(path, dpi=160)
-    return path
+    return figure

@@ -10,21 +10,17 @@ import torchfilm as tf
 if TYPE_CHECKING:
     from tqdm import tqdm
 
+FORM = "{desc} |{bar}| {n:.0f}/{total:.0f} colonies {elapsed}<{remaining}{postfix}"
+
 
 def open_bar(
-    total: float, progress: bool, name: str = "search", note: str = ""
+    total: float, progress: bool | None, name: str = "search", note: str = ""
 ) -> AbstractContextManager[tqdm | None]:
-    """A bar of `total` colonies, or None without `progress`. Needs tqdm (the `app` extra)."""
-    if not progress:
+    """A bar of `total` colonies, or None where `progress` wants none; None as progress: a bar in a
+    notebook and on a terminal. Needs tqdm (the `app` extra)."""
+    if not tf.progress.wanted(progress):
         return nullcontext()
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise tf.InputError(
-            'a progress bar needs tqdm: pip install "torchfilm[app]", or give progress=False.'
-        ) from error
-    form = "{desc} |{bar}| {n:.0f}/{total:.0f} colonies {elapsed}<{remaining}{postfix}"
-    bar = tqdm(total=total, bar_format=form, desc=name, disable=None, mininterval=0.3)
+    bar = tf.progress.bar(total, name, FORM)
     bar.set_postfix_str(note)
     return bar
 

@@ -3,9 +3,8 @@ target."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import torch
 
 import torchfilm as tf
 from design.finals import FreshLosses
-from design.parameters import Choice, Parameter, Value, show_value
+from design.parameters import Choice, Parameter, Space, Value, show_value
 from design.rollout import FinishedColonies
 from design.study import Study
 from design.targets.base import Target
@@ -23,6 +22,7 @@ from design.trivial import trivial_losses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SHOWN = 3  # replicates side by side
 NEAR = 0.005  # of a bound, as a share of the range (of its logarithm)
@@ -58,17 +58,12 @@ def table(report: SearchReport) -> str:
     """Parameters with bounds, first guess and best value; then losses and measures."""
     first, best, study = report.first, report.best, report.study
     rows: list[tuple[str, ...]] = [("parameter", "bounds", first.title, best.title, "")]
-    for p in report.task.space.parameters:
-        values = (show_value(design.values[p.name]) for design in (first, best))
-        rows.append((p.name, _bounds(p), *values, _at_bound(p, best.values[p.name])))
+    rows += parameter_rows(report.task.space, first.values, best.values)
     rows.append((_loss_title(report), "", f"{first.loss:.4f}", f"{best.loss:.4f}", ""))
     rows += _goals(report)
     if best.fresh is not None:
-        low, high = best.fresh.band
-        seeds = f"{low:.4f} … {high:.4f}, {len(best.fresh.losses)} seeds"
-        rows.append(
-            (f"{_loss_title(report)} on fresh seeds", "", "", f"{best.fresh.loss:.4f}", seeds)
-        )
+        title, loss = f"{_loss_title(report)} on fresh seeds", f"{best.fresh.loss:.4f}"
+        rows.append((title, "", "", loss, _seeds(best.fresh)))
     rows.append(("cells", "", *(_cells(design.colonies) for design in (first, best)), ""))
     target = report.task.target
     old, new = (each_measured(target, design.colonies) for design in (first, best))
@@ -99,6 +94,33 @@ def table(report: SearchReport) -> str:
     spent = f"{study.colonies:.0f} colonies in {study.seconds:.0f} s"
     lines.append(spent + (f", {failed} failed" if failed else "") + f"; {how}")
     return "\n".join(lines)
+
+
+def parameter_rows(
+    space: Space, first: Mapping[str, Value], best: Mapping[str, Value]
+) -> list[tuple[str, ...]]:
+    """For each parameter its name, its bounds, its first and its best value, and whether that lies
+    at a bound."""
+    return [
+        (
+            p.name,
+            _bounds(p),
+            show_value(first[p.name]),
+            show_value(best[p.name]),
+            _at_bound(p, best[p.name]),
+        )
+        for p in space.parameters
+    ]
+
+
+def fresh_words(fresh: FreshLosses) -> str:
+    """The loss on fresh seeds, with its band."""
+    return f"{fresh.loss:.4f} ({_seeds(fresh)})"
+
+
+def _seeds(fresh: FreshLosses) -> str:
+    low, high = fresh.band
+    return f"{low:.4f} … {high:.4f}, {len(fresh.losses)} seeds"
 
 
 def _loss_title(report: SearchReport) -> str:
@@ -194,13 +216,9 @@ def measured(target: Target, finished: Iterable[FinishedColonies]) -> dict[str, 
     return {name: _mean(v) for name, v in each_measured(target, finished).items()}
 
 
-def draw(report: SearchReport, path: Path) -> Path:
+def draw(report: SearchReport) -> Figure:
     """Draw the first guess above and the best design below, with the target over each colony, and
     the course of the search beside them. Needs matplotlib (the `app` extra)."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise tf.InputError('pictures need matplotlib: pip install "torchfilm[app]".') from error
     designs = (report.first, report.best)
     grown = [_one_by_one(d.colonies)[:SHOWN] for d in designs]
     columns = max(1, *(len(g) for g in grown))
@@ -209,7 +227,7 @@ def draw(report: SearchReport, path: Path) -> Path:
     every = [cells for row in frames for cells in row]
     size = tuple(np.max([_extent(cells) for cells in every], axis=0)) if every else (1.0, 1.0)
     height = 6.2 if size[1] > 0.6 * size[0] else 4.6  # wide colonies leave room above
-    figure = Figure(figsize=(2.6 * columns + 4.2, height), layout="constrained")
+    figure = tf.pictures.new_figure(2.6 * columns + 4.2, height)
     grid = figure.add_gridspec(
         3, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 1.0, 0.05]
     )
@@ -219,7 +237,7 @@ def draw(report: SearchReport, path: Path) -> Path:
         axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
         title = f"{one.title}, loss {one.loss:.3f}"
         if one.fresh is not None:
-            title += f" ({one.fresh.loss:.3f} on fresh seeds)"
+            title += f"\n({one.fresh.loss:.3f} on fresh seeds)"  # no wider than a panel
         scales = _draw_row(axes, grown[row], frames[row], target, size, limits, title) or scales
     bars = [figure.add_subplot(grid[2, k]) for k in range(columns)]
     for bar, scale in zip(bars, scales, strict=False):
@@ -228,8 +246,7 @@ def draw(report: SearchReport, path: Path) -> Path:
         bar.set_visible(False)
     _draw_convergence(figure.add_subplot(grid[0, columns]), report.study)
     _draw_parameters(figure.add_subplot(grid[1:, columns]), report)
-    figure.savefig(path, dpi=160)
-    return path
+    return figure
 
 
 def draw_colonies(

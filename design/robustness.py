@@ -52,7 +52,7 @@ class ParameterChange:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Robustness:
     """How robust a design is.
 
@@ -89,6 +89,12 @@ class Robustness:
     def reached(self) -> float | None:
         """Share of the seeds whose loss is at most the threshold; None without one."""
         return None if self.threshold is None else float((self.losses <= self.threshold).mean())
+
+    def __repr__(self) -> str:
+        return f"Robustness({len(self.losses)} fresh seeds, mean loss {self.losses.mean():.4g})"
+
+    def _repr_html_(self) -> str:
+        return tf.displays.card("Robustness", tf.displays.text(self.table()))
 
     def table(self) -> str:
         """All results as text."""
@@ -151,17 +157,11 @@ class Robustness:
         path.write_text(json.dumps(saved, indent=1) + "\n")
         return path
 
-    def plot(self, path: str | Path) -> Path:
+    def plot(self, out: str | Path | None = None) -> tf.pictures.Picture:
         """Draw the losses on searched and fresh seeds, the changes of the loss, and which
-        parameters matter. Needs matplotlib (the `app` extra)."""
-        try:
-            from matplotlib.figure import Figure
-        except ImportError as error:
-            raise tf.InputError(
-                'pictures need matplotlib: pip install "torchfilm[app]".'
-            ) from error
-        path, panels = Path(path), 2 if self.indices is None else 3
-        figure = Figure(figsize=(3.6 * panels, 3.2), layout="constrained")
+        parameters matter; `out` as for `Best.plot`. Needs matplotlib (the `app` extra)."""
+        panels = 2 if self.indices is None else 3
+        figure = tf.pictures.new_figure(3.6 * panels, 3.2)
         axes = figure.subplots(1, panels)
         sizes = [(f"× {s.share:g}", s.losses) for s in self.sizes]
         columns = [("searched", self.searched), ("fresh", self.losses), *sizes]
@@ -177,8 +177,7 @@ class Robustness:
         if (found := self.indices) is not None:
             first, total = (found.first, found.first_error), (found.total, found.total_error)
             draw_indices(axes[2], list(self.values), first, total)
-        figure.savefig(path, dpi=160)
-        return path
+        return tf.pictures.Picture(figure, out)
 
 
 def _summary(losses: np.ndarray) -> tuple[str, ...]:

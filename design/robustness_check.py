@@ -45,7 +45,7 @@ def check_robustness(
     threshold: float | None = None,
     executor: Executor | None = None,
     work_items: int = 1,
-    progress: bool = True,
+    progress: bool | None = None,
 ) -> Robustness:
     """Check the best design of a search on colonies that the search did not see.
 

@@ -107,7 +107,7 @@ class Search(TaskOptions):
         stop_at: float | None = None,
         executor: Executor | None = None,
         work_items: int = 1,
-        progress: bool = True,
+        progress: bool | None = None,
     ) -> Best | Front:
         """Search until `colonies` have been simulated, and return the best design; with several
         goals, the front of those that none exceeds in all.
@@ -118,8 +118,9 @@ class Search(TaskOptions):
         design reaches it, and holds it on fresh seeds, the search ends. study: the file that keeps
         every evaluation. If it exists and belongs to this search, the search resumes from it, and
         its colonies count. executor: of the `concurrent.futures` kind (processes, Dask, …).
-        work_items: the least number of parts into which a batch is cut for it. progress: show a bar
-        with the lowest loss so far. Raises InputError for an argument that is not allowed, for the
+        work_items: the least number of parts into which a batch is cut for it. progress: a bar
+        with the lowest loss so far: True, always; False, never; None, in a notebook and on a
+        terminal. Raises InputError for an argument that is not allowed, for the
         study of another search, and where no design was grown to full size.
         """
         self._check_run(colonies, stop_at)

@@ -16,10 +16,10 @@ from design.entries import Entry
 from design.parameters import right_aligned, show_value
 from design.study_file import StudyData, read_study, write_study
 from design.study_refusal import refusal
-from torchfilm import checks
+from torchfilm import checks, displays
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Study:
     """The evaluations of a search, and the file that keeps them, if any.
 
@@ -92,6 +92,11 @@ class Study:
     def table(self, most: int = 20) -> str:
         """The best designs that were grown to full size, the first of equal ones first: loss, its
         spread between replicates, cells, and the values of the parameters. most: rows."""
+        text, more = self._rows(most)
+        return "\n".join(right_aligned(text) + ([more] if more else []))
+
+    def _rows(self, most: int) -> tuple[list[list[str]], str]:
+        """The rows of the table, its head first, and a line that says how many are left out."""
         rows = [
             (float(e.loss[k]), e.losses[k], e.cells[k], e.values[k])
             for e in self.full()
@@ -104,30 +109,47 @@ class Study:
             shown = [show_value(values[name]) for name in self.names]
             text.append([f"{loss:.4f}", spread, f"{cells.mean():.0f}", *shown])
         hidden = len(rows) - (len(text) - 1)
-        return "\n".join(right_aligned(text) + ([f"and {hidden} more"] if hidden else []))
+        return text, f"and {hidden} more" if hidden else ""
+
+    def __repr__(self) -> str:
+        found = self.best()
+        best = "no full-size colony yet" if found is None else f"best loss {found[1]:.4g}"
+        return f"Study({self.about['scene']}, {self.colonies:.0f} colonies, {best})"
+
+    def _repr_html_(self) -> str:
+        (head, *rows), more = self._rows(5)
+        return displays.card(
+            "Study",
+            displays.pairs(self._facts()),
+            displays.table(rows, head) if rows else "",
+            displays.lines(more),
+        )
 
     @property
     def info(self) -> str:
         """What was searched, how far it has come, and what it found: a line for each."""
+        return "\n".join(f"{name:<11} {words}" for name, words in self._facts())
+
+    def _facts(self) -> list[tuple[str, str]]:
         about, found = self.about, self.best()
         end = [f"{about[n]} {unit}" for n, unit in (("cells", "cells"), ("until", "h")) if about[n]]
         failed = self.failed
         designs = sum(len(e.points) for e in self.entries)
         fresh = sum(e.colonies for e in self.finals)
-        lines = [
-            f"scene       {about['scene']}, to {' or '.join(end)}, seed {about['seed']}",
-            f"target      {about['target']}",
-            f"method      {about['method']}",
-            *(f"parameter   {text}" for text in about["parameters"]),
-            f"grown       {self.colonies:.0f} colonies of {designs} designs in"
-            f" {self.seconds:.0f} s" + (f", {fresh:.0f} of them on fresh seeds" if fresh else ""),
+        grown = f"{self.colonies:.0f} colonies of {designs} designs in {self.seconds:.0f} s"
+        facts = [
+            ("scene", f"{about['scene']}, to {' or '.join(end)}, seed {about['seed']}"),
+            ("target", about["target"]),
+            ("method", about["method"]),
+            *(("parameter", text) for text in about["parameters"]),
+            ("grown", grown + (f", {fresh:.0f} of them on fresh seeds" if fresh else "")),
         ]
         if failed:
             reason, times = self.failures()[0]
-            lines.append(f"failed      {failed} colonies; {times} of them: {reason}")
+            facts.append(("failed", f"{failed} colonies; {times} of them: {reason}"))
         if found is not None:
-            lines.append(f"best loss   {found[1]:.4f} in the search")
-        return "\n".join(lines)
+            facts.append(("best loss", f"{found[1]:.4f} in the search"))
+        return facts
 
     def failures(self) -> list[tuple[str, int]]:
         """The reasons of failures and how many colonies each has, the most frequent first.

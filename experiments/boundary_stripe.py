@@ -88,7 +88,7 @@ def main() -> None:
         print(f"{name:<18}{published[name]:>12.4g}{found[name]:>12.4g}")
     for path in (
         best.save(options.out.with_suffix(".json")),
-        best.plot(options.out.with_suffix(".png")),
+        best.plot().save(options.out.with_suffix(".png")),
     ):
         print(path)
 

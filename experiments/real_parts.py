@@ -182,7 +182,10 @@ def main() -> None:
     print(best.table())
     print(design.levels(best.values))
     print(design.parts(best.values))
-    print(best.save(options.out.with_suffix(".json")), best.plot(options.out.with_suffix(".png")))
+    print(
+        best.save(options.out.with_suffix(".json")),
+        best.plot().save(options.out.with_suffix(".png")),
+    )
 
 
 if __name__ == "__main__":

@@ -89,7 +89,10 @@ def main() -> None:
     )
     best = search.run(options.colonies, study=options.out.with_suffix(".h5"))
     print(best.table())
-    print(best.save(options.out.with_suffix(".json")), best.plot(options.out.with_suffix(".png")))
+    print(
+        best.save(options.out.with_suffix(".json")),
+        best.plot().save(options.out.with_suffix(".png")),
+    )
 
 
 if __name__ == "__main__":

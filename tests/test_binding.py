@@ -149,7 +149,7 @@ def test_a_low_rate_is_warned_of_once_for_a_run():
 def test_progress_is_shown_where_it_is_wanted(capfd):
     for _ in tf.simulate(tf.scenes.microcolony(), until=0.25, progress=True):
         pass
-    assert "microcolony: 1 colonies" in capfd.readouterr().err
+    assert "microcolony: 1 colony" in capfd.readouterr().err
 
 
 def test_several_circuits_are_modules():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 
@@ -12,9 +13,14 @@ import torch
 from matplotlib.figure import Figure
 
 import torchfilm as tf
-from torchfilm.pictures import Frame, frame_of, outlines, scale_bar, sheet
+from torchfilm.pictures import Frame, frame_of, outlines, scale_bar
 from torchfilm.pictures.draw import WALL, add_walls, set_window
 from torchfilm.pictures.frames import RecordedFrames
+
+
+def sheet(what, path: Path, **options) -> Path:
+    """A state or a frame as a picture at `path`."""
+    return tf.show(what, out=path, **options).path
 
 
 def outline(axis, length=2.0, radius=0.5, position=(0.0, 0.0)) -> np.ndarray:
@@ -217,20 +223,55 @@ def recorded(tmp_path_factory) -> Path:
     return path
 
 
-def test_show_draws_the_last_frame_beside_the_file(recorded):
+def test_show_draws_the_last_frame_and_writes_no_file(recorded, tmp_path):
+    before = sorted(recorded.parent.iterdir())
     made = tf.show(recorded)
-    assert made == recorded.with_suffix(".png")
-    assert coloured(made) > 0.02
+    assert made.path is None and "not saved" in repr(made)
+    assert sorted(recorded.parent.iterdir()) == before
+    assert made.save(tmp_path / "a.png") == made.path == tmp_path / "a.png"
+    assert "a.png" in repr(made) and coloured(made.path) > 0.02
+
+
+def test_a_notebook_displays_what_is_saved(recorded, tmp_path):
+    made = tf.show(recorded, out=tmp_path / "a.png")
+    png, size = made._repr_png_()
+    shown, saved = (matplotlib.image.imread(x) for x in (io.BytesIO(png), made.path))
+    assert np.array_equal(shown, saved)
+    assert size == {"width": saved.shape[1] // 2, "height": saved.shape[0] // 2}
+
+
+def test_an_older_picture_is_replaced(recorded, tmp_path):
+    (tmp_path / "a.png").write_text("older")
+    assert coloured(tf.show(recorded, out=tmp_path / "a.png").path) > 0.02
+
+
+def test_show_takes_open_results_and_leaves_them_open(recorded, tmp_path):
+    with tf.Results(recorded) as results:
+        sheet(results, tmp_path / "a.png", frame=0)
+        assert len(results) > 1
+    sheet(recorded, tmp_path / "b.png", frame=0)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_what_show_cannot_take_is_reported(recorded, grown):
+    with pytest.raises(tf.InputError, match=r"results = 3 .*its path.*tf\.show\(state\)"):
+        tf.show(3)
+    with pytest.raises(tf.InputError, match=r"frame = 0 .*a state, which is of one time"):
+        tf.show(grown, frame=0)
+    with pytest.raises(tf.InputError, match="results have their own walls"):
+        tf.show(recorded, scene=tf.scenes.microcolony())
+    with pytest.raises(tf.InputError, match="another file than the results"):
+        tf.show(recorded, out=recorded)
 
 
 def test_show_draws_any_frame_anywhere(recorded, tmp_path):
-    first, last = (tf.show(str(recorded), frame=k, out=tmp_path / f"{k}.png") for k in (0, -1))
+    first, last = (sheet(str(recorded), tmp_path / f"{k}.png", frame=k) for k in (0, -1))
     assert first.read_bytes() != last.read_bytes()
-    assert tf.show(recorded, out=str(tmp_path / "a.svg")).read_text().lstrip().startswith("<?xml")
+    assert sheet(recorded, str(tmp_path / "a.svg")).read_text().lstrip().startswith("<?xml")
 
 
 def test_the_same_frame_makes_the_same_picture(recorded, tmp_path):
-    a, b = (matplotlib.image.imread(tf.show(recorded, out=tmp_path / f"{k}.png")) for k in "ab")
+    a, b = (matplotlib.image.imread(sheet(recorded, tmp_path / f"{k}.png")) for k in "ab")
     assert np.array_equal(a, b)
 
 
@@ -323,8 +364,8 @@ def test_a_sheet_of_a_state_has_the_walls_that_the_picture_of_its_file_has(tmp_p
         pictures = [
             matplotlib.image.imread(p)
             for p in (
-                tf.show(path),
-                sheet(state, tmp_path / "a.png", scene=scene, title="scene, t = 0.05 h"),
+                sheet(path, tmp_path / "file.png"),
+                sheet(state, tmp_path / "a.png", scene=scene),
                 sheet(state, tmp_path / "b.png", title="scene, t = 0.05 h"),
             )
         ]

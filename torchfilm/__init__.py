@@ -31,7 +31,7 @@ from torchfilm.signals.boundary_conditions import (
 )
 from torchfilm.simulation import rollout, simulate
 from torchfilm.state import Field, State
-from torchfilm.tools import checks, tables, tangents
+from torchfilm.tools import checks, displays, progress, tables, tangents
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.memory import keep_memory
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from torchfilm.explanation import explain
     from torchfilm.io.recorder import Recorder
     from torchfilm.io.results import Results
-    from torchfilm.pictures import show
+    from torchfilm.pictures import LivePlot, show
     from torchfilm.tuning.settings import Settings, preset
     from torchfilm.tuning.tuned import Tuned
     from torchfilm.tuning.tuner import tune
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 # Imported when first used: `import torchfilm` takes little longer than torch.
 _LAZY_MODULES = ("measure", "pictures", "scenes")
 _LAZY = {
+    "LivePlot": "torchfilm.pictures",
     "Recorder": "torchfilm.io.recorder",
     "Results": "torchfilm.io.results",
     "explain": "torchfilm.explanation",
@@ -77,6 +78,7 @@ __all__ = [
     "Growth",
     "GrowthRecording",
     "InputError",
+    "LivePlot",
     "LogNormal",
     "Mechanics",
     "Medium",
@@ -107,6 +109,7 @@ __all__ = [
     "advance",
     "checks",
     "digest",
+    "displays",
     "effect",
     "explain",
     "failures",
@@ -118,6 +121,7 @@ __all__ = [
     "physical",
     "pictures",
     "preset",
+    "progress",
     "rollout",
     "scenes",
     "show",

@@ -96,6 +96,10 @@ class Effect(metaclass=checks.KnownKeywords):
         own = getattr(kind, "title", None) == self.title
         return kind.__name__ if own else f"{kind.__name__} {self.title!r}"
 
+    def equations(self) -> dict[str, str]:
+        """Its equations as text, by title; a notebook shows them below the scene."""
+        return {}
+
     def kept_values(self) -> dict[str, Field]:
         """The field of each physical value that is drawn for a cell at its birth, by the value's
         name."""
@@ -341,13 +345,19 @@ def number_range(value: torch.Tensor) -> str:
 
 def summary(effect: Any) -> str:
     """An effect with the parameters that differ from their defaults, in a line."""
+    shown = ", ".join(f"{name}={value}" for name, value in given(effect))
+    return f"{type(effect).__name__}({shown})"
+
+
+def given(effect: Any) -> list[tuple[str, str]]:
+    """The parameters of an effect that differ from their defaults, with their values as text."""
     shown = []
     for f in dataclasses.fields(effect):
         value = getattr(effect, f.name)
         default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
         if f.repr and not _same(value, default):
-            shown.append(f"{f.name}={shorten(value)}")
-    return f"{type(effect).__name__}({', '.join(shown)})"
+            shown.append((f.name, shorten(value)))
+    return shown
 
 
 def _same(a: object, b: object) -> bool:

@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.effect import BUILT_IN, Effect, parameters, summary
+from torchfilm.effect import BUILT_IN, Effect, given, parameters, summary
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model, bind
 from torchfilm.state import OUTSIDE, Field, State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest, without_addresses
 from torchfilm.tools.warn_once import once, warn
 from torchfilm.version import __version__
@@ -179,6 +179,18 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(summary(e) for e in self.effects)}, name={self.name!r})"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (type(e).__name__, ", ".join(f"{name} = {value}" for name, value in given(e)))
+            for e in self.effects
+        ]
+        equations = [
+            displays.lines(title) + displays.text(found)
+            for e in self.effects
+            for title, found in e.equations().items()
+        ]
+        return displays.card(self.headline, displays.table(rows, ("effect", "given")), *equations)
 
 
 def _owners(effects: Sequence[Effect]) -> list[str]:

@@ -4,8 +4,8 @@ through the run."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from torchfilm.replay import Replay
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools import checks
-from torchfilm.tools.progress import progress_bar
+from torchfilm.tools.progress import RunBar, wanted
 from torchfilm.tools.timing import Timings
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ def simulate(
     observers: Sequence[Observer] = (),
     on_failure: str = "raise",
     timings: Timings | None = None,
-    progress: bool = False,
-) -> Iterator[State]:
+    progress: bool | None = False,
+) -> Generator[State, None, None]:
     """Run a scene, yielding the state after each step.
 
     scene: a scene, which is bound here to `colonies` colonies, or a model. seed, streams, device,
@@ -56,9 +56,11 @@ def simulate(
     from this one instead. until: time to stop at, h. cells: stop once every colony has this many
     cells, or none at all. At least one of the two; the first reached ends the run. dt: step, h; by
     default the scene's. record: path of a new results file (every tenth step and the last), or a
-    Recorder. observers: called with the first state and after every step. progress: show a progress
-    bar. on_failure: "raise" a SimulationError that names the colonies that failed (a solve that did
-    not converge, a cell too short to divide), or "drop" their cells, note it, and continue.
+    Recorder. observers: called with the first state and after every step; one that has `close()`,
+    such as a `LivePlot`, is closed at the end. progress: True shows a bar with hours or doublings,
+    cells and speed (it needs tqdm, the `app` extra); None shows it in a notebook and on a terminal
+    only. on_failure: "raise" a SimulationError that names the colonies that failed (a solve that
+    did not converge, a cell too short to divide), or "drop" their cells, note it, and continue.
     """
     _check_kinds("simulate", scene, state)
     dt = scene.dt if dt is None else checks.number("dt", dt, above=0.0)
@@ -81,8 +83,7 @@ def simulate(
     if recorder is not None:
         recorder.attach(model, dt)
     monitors = _monitors(recorder, observers, cells if until is None else None, on_failure, timings)
-    what = f"{model.scene.name}: {state.colonies} colonies"
-    bar = progress_bar(what, state, cells, until) if progress else None
+    bar = _run_bar(model, state, cells, until) if wanted(progress) else None
     first = (*((recorder,) if recorder else ()), *observers)
     step = partial(model.step, dt=dt, timings=timings)
     return _run(
@@ -91,9 +92,13 @@ def simulate(
         partial(_ended, last, cells),
         first,
         (*monitors, *((bar,) if bar else ())),
-        recorder,
-        bar,
+        (*((recorder,) if recorder else ()), *observers, *((bar,) if bar else ())),
     )
+
+
+def _run_bar(model: Model, state: State, cells: int | None, until: float | None) -> RunBar:
+    what = "1 colony" if state.colonies == 1 else f"{state.colonies} colonies"
+    return RunBar(f"{model.scene.name}: {what}", state, cells, until)
 
 
 def _new_recorder(path: str | Path, model: Model) -> Recorder:
@@ -166,16 +171,15 @@ def _ended(last: float, cells: int | None, state: State) -> bool:
     return state.step >= last or enough
 
 
-def _run(step, state, stop, first, monitors, recorder, bar) -> Iterator[State]:
-    try:
+def _run(step, state, stop, first, monitors, seen) -> Generator[State, None, None]:
+    """seen: who may have something to close at the end, each of them also after an error."""
+    with ExitStack() as end:
+        for observe in reversed(seen):
+            if callable(close := getattr(observe, "close", None)):
+                end.callback(close)
         for observe in first:
             observe(state)
         yield from advance(step, state, stop=stop, monitors=monitors)
-    finally:
-        if recorder:
-            recorder.close()
-        if bar:
-            bar.close()
 
 
 @checks.known_keywords

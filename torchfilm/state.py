@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilm.physics import capsule
 from torchfilm.signals.layout import Contact, Layout
-from torchfilm.tools import checks, random
+from torchfilm.tools import checks, displays, random
 from torchfilm.tools.ragged import Groups, offsets
 
 CELL, COLONY, GRID = "cell", "colony", "grid"
@@ -408,6 +408,14 @@ class State:
             f"State({self.colonies} colonies, {self.cells} cells, {self.dim}-D, t = {self.time:g}"
             f" h, step {self.step}, {str(self.dtype)[6:]} on {self.device}, fields:"
             f" {', '.join(self.fields) or 'none'})"
+        )
+
+    def _repr_html_(self) -> str:
+        sizes = {"cells of a colony": ("", self.counts), "length": ("µm", self.length)}
+        shown = {n: f for n, f in self.declared.items() if not f.internal}
+        own = {n: (f.unit, self.fields[n]) for n, f in shown.items()}
+        return displays.card(
+            repr(self).partition(", fields")[0] + ")", displays.ranges(sizes | own)
         )
 
 

@@ -20,7 +20,7 @@ from design.library.devices import (
 from design.library.logic import Netlist, netlist
 from design.library.ucf import Record, Records
 from design.library.wiring import Sensor, Wiring
-from torchfilm import checks
+from torchfilm import checks, displays
 
 
 def _read_gate(records: Records, gate: Record) -> Gate:
@@ -33,7 +33,7 @@ def _read_gate(records: Records, gate: Record) -> Gate:
         ) from error
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Library:
     """Gates with their parts, input sensors and reporters, by name.
 
@@ -44,6 +44,26 @@ class Library:
     gates: Mapping[str, Gate]
     sensors: Mapping[str, SensorDevice]
     reporters: Mapping[str, Reporter]
+
+    def __repr__(self) -> str:
+        groups = len({gate.group for gate in self.gates.values()})
+        return (
+            f"Library({len(self.gates)} gates of {groups} repressors, {len(self.sensors)} input"
+            f" sensors, {len(self.reporters)} output devices)"
+        )
+
+    def _repr_html_(self) -> str:
+        rows = [(g.name, g.group, g.ymin, g.ymax, g.K, g.n) for g in self.gates.values()]
+        head = ("gate", "repressor", "ymin, RPU", "ymax, RPU", "K, RPU", "n")
+        levels = [(s.name, s.ymin, s.ymax) for s in self.sensors.values()]
+        return displays.card(
+            repr(self),
+            displays.table(rows, head),
+            displays.table(levels, ("input sensor", "ymin, RPU", "ymax, RPU")) if levels else "",
+            displays.lines(
+                "output devices: " + ", ".join(self.reporters) if self.reporters else ""
+            ),
+        )
 
     @classmethod
     def read(cls, *files: str | Path, gates: Sequence[str] | None = None) -> Library:

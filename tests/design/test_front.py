@@ -78,7 +78,7 @@ def test_any_design_of_a_front_is_saved_and_drawn(tmp_path):
     assert best.values == front.values[1] and len(list(front)) == len(front)
     assert best.save(tmp_path / "one.json").exists()
     assert "level" not in best.table() or "burden" in best.table()
-    assert front.plot(tmp_path / "front.png").stat().st_size > 10_000
+    assert front.plot(tmp_path / "front.png").path.stat().st_size > 10_000
 
 
 def test_a_front_resumes(tmp_path):

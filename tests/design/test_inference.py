@@ -157,8 +157,8 @@ def test_calibration_counts_covered_truths(posterior, tmp_path):
     assert (found.ranks >= 0).all() and (found.ranks <= 99).all()
     assert all(share > 0.7 for share in found.coverage().values())
     assert "40 truths" in found.table()
-    assert found.plot(tmp_path / "ranks.png").stat().st_size > 1000
-    assert posterior.plot(tmp_path / "corner.png", truth={"rate": 1.4}).stat().st_size > 1000
+    assert found.plot(tmp_path / "ranks.png").path.stat().st_size > 1000
+    assert posterior.plot(tmp_path / "corner.png", truth={"rate": 1.4}).path.stat().st_size > 1000
 
 
 def test_coverage_of_even_ranks_is_the_level():

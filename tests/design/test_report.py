@@ -143,7 +143,7 @@ class Two(Level):
 
 
 def pictured(best, path) -> np.ndarray:
-    assert best.plot(path) == path
+    assert best.plot(path).path == path
     return matplotlib.image.imread(path)[..., :3]
 
 

@@ -317,8 +317,10 @@ def test_a_picture_has_a_panel_for_each_part(tmp_path, samples, panels):
     from matplotlib.image import imread
 
     design = best(lit, [MAKE], {"make": 2.0}, cells=2, replicates=1)
-    path = design.check(seeds=2, sizes=(2.0,), samples=samples, threshold=0.5, progress=False).plot(
-        tmp_path / "held.png"
+    path = (
+        design.check(seeds=2, sizes=(2.0,), samples=samples, threshold=0.5, progress=False)
+        .plot(tmp_path / "held.png")
+        .path
     )
     assert imread(path).shape[:2] == (512, 576 * panels)  # 3.2 × 3.6 inches at 160 dots
 

@@ -185,7 +185,8 @@ def test_without_tqdm_a_search_runs_without_a_bar(monkeypatch):
     monkeypatch.setitem(sys.modules, "tqdm", None)
     assert search().run(6, progress=False).loss >= 0
     with pytest.raises(tf.InputError, match=r"needs tqdm: pip install .*progress=False"):
-        search().run(6)
+        search().run(6, progress=True)
+    assert search().run(6).loss >= 0, "without a terminal a search shows no bar"
 
 
 def test_the_bar_shows_the_best_loss_and_the_failures(monkeypatch):

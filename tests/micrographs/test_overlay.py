@@ -46,7 +46,7 @@ def test_outlines_lie_over_the_cells_of_the_image(tmp_path):
     mask = rasterised([15, 60], [12, 45], [0.5, 0.5], [14, 14], [5, 5], SHAPE)
     pytest.importorskip("skimage")
     found = tf.Cells.from_masks(mask, pixel_size=0.1)
-    path = tf.pictures.overlay(found, mask, tmp_path / "check.png")
+    path = tf.pictures.overlay(found, mask, tmp_path / "check.png").path
     assert path == tmp_path / "check.png" and not len(coloured(path, OVERLAP))
     outline = coloured(path, PLAIN)
     upper, lower = outline[outline[:, 1] < 0.5], outline[outline[:, 1] >= 0.5]
@@ -71,7 +71,8 @@ def test_overlapping_cells_are_red(tmp_path):
 def test_centred_cells_lie_where_they_were(tmp_path):
     image = np.random.default_rng(0).normal(size=SHAPE)
     one, other = (
-        tf.pictures.overlay(cells(centre=c), image, tmp_path / f"{c}.png") for c in (False, True)
+        tf.pictures.overlay(cells(centre=c), image, tmp_path / f"{c}.png").path
+        for c in (False, True)
     )
     assert np.array_equal(pixels(one), pixels(other))
 

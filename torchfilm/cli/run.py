@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -248,33 +249,30 @@ def go(
         reload.watching = watch
     timings, begun = Timings(), time.perf_counter()
     interrupted = catch_interrupt()
-    form = "{desc} |{bar}| {percentage:3.0f}% {elapsed}<{remaining}{postfix}"
-    with tqdm(
-        total=_size(start, cells, until), bar_format=form, disable=None, mininterval=0.3
-    ) as bar:
-        bar.set_description(f"{model.scene.name}: {start.colonies} colonies")
-        bar.update(_done(start, cells, until))
-        state = start
-        for state in simulate(
-            model, start, until=until, cells=cells, dt=dt, record=recorder, timings=timings
-        ):
-            bar.update(_done(state, cells, until) - bar.n)
-            seconds = time.perf_counter() - begun
-            bar.set_postfix_str(
-                f"{state.cells} cells, t = {state.time:.2f} h,"
-                f" {(state.step - start.step) / seconds:.0f} steps/s",
-                refresh=False,
-            )
+    state = start
+    run = simulate(
+        model,
+        start,
+        until=until,
+        cells=cells,
+        dt=dt,
+        record=recorder,
+        timings=timings,
+        progress=None,
+    )
+    with closing(run):
+        for state in run:  # noqa: B007 (the last state is used below)
             for reload in reloads:
                 while reload.messages:
-                    bar.write(reload.messages.pop(0))
+                    tqdm.write(reload.messages.pop(0))
             if interrupted.is_set():
                 raise KeyboardInterrupt
     seconds = time.perf_counter() - begun
     print(f"results  {recorder.path}")
     if picture and state.cells:
         colour = colour or own_colour(state.declared)
-        print(f"picture  {pictures.show(recorder.path, colour=colour)}")
+        drawn = pictures.show(recorder.path, colour=colour)
+        print(f"picture  {drawn.save(own_picture(recorder.path))}")
     print(summary_table(model.scene, state, timings, seconds))
 
 
@@ -290,16 +288,3 @@ def catch_interrupt() -> threading.Event:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, note)
     return event
-
-
-def _size(state: State, cells: int | None, until: float | None) -> float:
-    """The full length of the progress bar: doublings, or hours."""
-    return float(torch.log2(torch.tensor(float(cells)))) if cells is not None else float(until or 0)
-
-
-def _done(state: State, cells: int | None, until: float | None) -> float:
-    """The progress: doublings of the smallest colony that has cells, or hours."""
-    if cells is not None:
-        smallest = int(state.counts[state.counts > 0].min()) if state.cells else cells
-        return min(float(torch.log2(torch.tensor(float(smallest)))), _size(state, cells, until))
-    return state.time

@@ -73,7 +73,8 @@ class Show:
                 self.overwrite,
                 "Choose another, or replace it with --overwrite.",
             )
-        print(self._draw(target, many))
+        self._draw(target, many)
+        print(target)
 
     def _check_one(self, many: bool) -> None:
         """Raise InputError for options that exclude one another."""
@@ -87,7 +88,7 @@ class Show:
             given = [name for name, is_given in {**chosen, "--out": both}.items() if is_given]
             raise InputError(f"{', '.join(given)}: give one of them.")
 
-    def _draw(self, out: Path, many: bool) -> Path:
+    def _draw(self, out: Path, many: bool) -> None:
         options: dict[str, Any] = {
             "colour": self.colour,
             "channels": cli_options.channels_of(self.channels),
@@ -99,12 +100,13 @@ class Show:
             "colonies": self.colonies or None,
         }
         if self.movie is not None:
-            return pictures.movie(self.file, out, fps=self.fps, **options)
-        if many:
-            return pictures.strip(
+            pictures.movie(self.file, out, fps=self.fps, **options)
+        elif many:
+            pictures.strip(
                 self.file, frames=self.strip, times=self.times or None, out=out, **options
             )
-        return pictures.show(self.file, frame=self.frame, out=out, **options)
+        else:
+            pictures.show(self.file, frame=self.frame, out=out, **options)
 
 
 def check_new(name: str, path: Path, overwrite: bool, hint: str) -> None:

@@ -33,6 +33,7 @@ from torchfilm.effects.circuit_checks import (
     check_rates,
     check_species,
     diluted_names,
+    equations_of,
     model_choices,
     names_of,
     shared_fields,
@@ -320,6 +321,10 @@ class Circuit(Effect):
                     " runs, by torch, if torch can compute it for all cells at once."
                 ) from why
         return found
+
+    def equations(self) -> dict[str, str]:
+        """Those of `graphs`, by title."""
+        return equations_of(self)
 
     def why_torch(self, device: torch.device) -> str:
         """Why torch computes the circuit on a device, or "" where compiled functions may."""

@@ -20,6 +20,18 @@ METHODS = (STIFF, *EXPLICIT, LEAP, DIRECT)
 GEOMETRY = ("volume", "area", "x", "y", "z")
 
 
+def equations_of(circuit: Any) -> dict[str, str]:
+    """The equations of a circuit as text, by title, or why they cannot be written."""
+    diluted = circuit.dilution is True or bool(circuit.dilution)
+    where = f"{circuit.value_owner()}{', before dilution by growth' if diluted else ''}"
+    try:
+        graphs = circuit.graphs
+    except checks.InputError as why:
+        return {where: str(why)}
+    of_type = lambda kind: f", in cells of type {kind}" if isinstance(kind, int) else ""
+    return {where + of_type(kind): str(graph) for kind, graph in graphs.items()}
+
+
 def names_of(species: Sequence[str], what: str = "species") -> tuple[str, ...]:
     """Names of species, checked."""
     names = (species,) if isinstance(species, str) else tuple(species)

@@ -30,7 +30,7 @@ from torchfilm.io.restoring import restore_state
 from torchfilm.io.table import Tables, data_frame
 from torchfilm.scene import Scene
 from torchfilm.state import State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, displays
 from torchfilm.tools.checks import InputError
 
 # Groups whose datasets grow with the run, beside frames/step.
@@ -63,6 +63,30 @@ class Results:
 
     def __len__(self) -> int:
         return frame_count(self.file)
+
+    def __repr__(self) -> str:
+        if not self.file:
+            return f"Results({str(self.path)!r}, closed)"
+        when = f", {self.times[0]:g} to {self.times[-1]:g} h" if len(self) else ""
+        frames = "1 frame" if len(self) == 1 else f"{len(self)} frames"
+        return f"Results({str(self.path)!r}, {len(self.colony_id)} colonies, {frames}{when})"
+
+    def _repr_html_(self) -> str:
+        if not self.file:
+            return displays.card(repr(self))
+        attributes, hidden = self.attributes, self.internal_fields
+        about = [("scene", str(attributes["scene"]).splitlines()[0])]
+        if len(self):
+            about += [
+                ("cells", f"{self.counts[0].sum()} at first, {self.counts[-1].sum()} at last")
+            ]
+        about += [
+            ("fields", ", ".join(n for n in self._names("cells") if n not in hidden)),
+            ("signals", ", ".join(self.signal_names)),
+            ("seed", str(attributes["seed"])),
+            ("torchfilm", str(attributes["torchfilm"])),
+        ]
+        return displays.card(repr(self), displays.pairs((n, v) for n, v in about if v))
 
     def _read(self, name: str, at: int | slice | EllipsisType = ...) -> Any:
         return read_dataset(self.file, name, at)

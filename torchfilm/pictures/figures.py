@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,8 @@ import numpy as np
 from torchfilm.io.results import Results
 from torchfilm.pictures.colours import CELLS, Limits, PlotStyle
 from torchfilm.pictures.frames import Frame, RecordedFrames, frame_of
-from torchfilm.pictures.page import PanelLayout, figure_class, fill, make_page, plan_layout, save
+from torchfilm.pictures.page import PanelLayout, figure_class, fill, make_page, plan_layout
+from torchfilm.pictures.picture import Picture
 from torchfilm.scene import Scene
 from torchfilm.state import State
 from torchfilm.tools import checks
@@ -24,9 +26,10 @@ WIDE = 2.0  # panels wider than this many heights are placed one below the other
 
 
 def show(
-    path: str | Path,
+    what: str | Path | Results | State | Frame,
     *,
     frame: int = -1,
+    scene: Scene | None = None,
     colour: str | None = None,
     channels: Mapping[str, str] | None = None,
     background: str | None = None,
@@ -35,10 +38,16 @@ def show(
     section: float | str = CELLS,
     whole: bool = False,
     colonies: Sequence[int] | None = None,
+    most: int = 36,
+    title: str | None = None,
     out: str | Path | None = None,
     dpi: float = 200,
-) -> Path:
-    """Draw one frame of a results file, with one panel per colony. Returns the picture's path.
+) -> Picture:
+    """Draw the colonies of a results file at one time, or those of a state, with one panel each.
+    A notebook displays the picture that is returned; a file is written only with `out`.
+
+    what: a results file, or its path, of which `frame` is drawn (the last by default); or a state,
+    with the `scene` whose walls are drawn: a state does not know them; or a `Frame`.
 
     colour: the quantity that colours the cells: "angle", the direction of their axes (the default),
     or any quantity per cell by name. channels: instead of colour, several quantities at once as in
@@ -52,54 +61,72 @@ def show(
     view: "xy", "xz" or "yz". section: where a signal in three dimensions is cut: at the height of
     the "cells" (their mean in each colony, the values that they read), its "mean" along the line of
     sight, or at a coordinate, µm. whole: show the whole box of the medium, not only the colony with
-    a margin. colonies: their ids; default the first 36. out: the picture; its suffix sets the
-    format (.png, .pdf, .svg); default the name of the results file with .png. dpi: pixels per inch;
-    a page is 7.2 inches wide.
+    a margin. colonies: their ids; default the first `most`, and the title says if there are more.
+
+    out: the picture's path; its suffix sets the format (.png, .pdf, .svg); it replaces an older
+    picture. dpi: pixels per inch; a page is 7.2 inches wide.
     """
     figure_class()
     style = PlotStyle(colour, channels, background, limits, view, section, whole)
-    with Results(path) as results:
-        frames = RecordedFrames(results, [frame], background)
-        target = output_path(path, out, ".png")
-        places, more = choose_colonies(frames.present, frames.results.colony_id, colonies, 36)
-        title = f"{frames.title}, t = {frames.times[0]:.5g} h{view_note(style)}{more}"
-        return save(sheet_figure(frames[0], places, style, title, dpi), target)
+    if isinstance(what, (State, Frame)):
+        shown, heading = _given_frame(what, scene, frame), name_of(scene)
+    else:
+        shown, heading = _recorded_frame(what, scene, frame, background, out)
+    places, more = choose_colonies(shown.counts > 0, shown.colony_id, colonies, most)
+    if title is None:
+        title = f"{heading}t = {shown.time:.5g} h{view_note(style)}"
+    return Picture(sheet_figure(shown, places, style, title + more, dpi), out)
 
 
-def sheet(
-    what: State | Frame,
-    path: str | Path,
-    *,
-    scene: Scene | None = None,
-    colour: str | None = None,
-    channels: Mapping[str, str] | None = None,
-    background: str | None = None,
-    limits: Limits | None = None,
-    view: str = "xy",
-    section: float | str = CELLS,
-    whole: bool = False,
-    colonies: Sequence[int] | None = None,
-    title: str = "",
-    most: int = 36,
-    dpi: float = 200,
-) -> Path:
-    """Draw the colonies of a state, one panel each, all with one scale, to the picture `path`.
-
-    scene: of the state, whose walls are drawn; a state does not know them, a frame does. most: the
-    greatest number of colonies; the title says if there are more. The other options are those of
-    `show`.
-    """
-    if scene is not None and isinstance(what, Frame):
-        raise checks.InputError("sheet got a frame and a scene: a frame has its own walls.")
-    figure_class()
-    style = PlotStyle(colour, channels, background, limits, view, section, whole)
-    frame = what if isinstance(what, Frame) else frame_of(what, scene)
+def state_figure(
+    state: State,
+    scene: Scene | None,
+    style: PlotStyle,
+    colonies: Sequence[int] | None,
+    most: int,
+    dpi: float,
+) -> Figure | None:
+    """A state as a figure, with the colonies of `colonies` that have cells; None without any."""
+    frame = frame_of(state, scene)
+    alive = set(frame.colony_id[frame.counts > 0].tolist())
+    if colonies is not None:
+        colonies = [c for c in colonies if c in alive]
+    if not alive or colonies == []:
+        return None
     places, more = choose_colonies(frame.counts > 0, frame.colony_id, colonies, most)
-    return save(sheet_figure(frame, places, style, title + more, dpi), path)
+    title = f"{name_of(scene)}t = {frame.time:.5g} h{view_note(style)}{more}"
+    return sheet_figure(frame, places, style, title, dpi)
+
+
+def name_of(scene: Scene | None) -> str:
+    """The scene's name as a title begins with it."""
+    return "" if scene is None else f"{scene.name}, "
+
+
+def _given_frame(what: State | Frame, scene: Scene | None, frame: int) -> Frame:
+    """The frame of a state."""
+    if frame != -1:
+        rule = "left out for a state, which is of one time"
+        raise checks.input_error("frame", frame, rule)
+    if isinstance(what, Frame) and scene is not None:
+        raise checks.InputError("show got a frame and a scene: a frame has its own walls.")
+    return what if isinstance(what, Frame) else frame_of(what, scene)
+
+
+def _recorded_frame(
+    what: object, scene: Scene | None, frame: int, background: str | None, out: str | Path | None
+) -> tuple[Frame, str]:
+    """A frame of a results file, and the words before the time in its title."""
+    if scene is not None:
+        raise checks.InputError("show got results and a scene: results have their own walls.")
+    with opened(what) as results:
+        check_not_results(results.path, out)
+        recorded = RecordedFrames(results, [frame], background)
+        return recorded[0], f"{recorded.title}, "
 
 
 def strip(
-    path: str | Path,
+    what: str | Path | Results,
     *,
     times: Sequence[float] | None = None,
     frames: int | None = None,
@@ -113,20 +140,20 @@ def strip(
     colonies: Sequence[int] | None = None,
     out: str | Path | None = None,
     dpi: float = 200,
-) -> Path:
+) -> Picture:
     """Draw one or more colonies at several times, with one scale and one range of colours.
 
     times: h; the recorded frame nearest to each time is drawn, with its own time as title. frames:
     instead, at most this many frames, evenly spaced from first to last; default 4. A colony is a
     row. Panels that are more than twice as wide as high are placed one below the other, and a
-    colony is a column. colonies: their ids; default the first 4. out: default NAME_strip.png in the
-    folder of NAME.h5. The other options are those of `show`.
+    colony is a column. colonies: their ids; default the first 4. what: a results file, or its path.
+    The other options are those of `show`.
     """
     figure_class()
     style = PlotStyle(colour, channels, background, limits, view, section, whole)
-    with Results(path) as results:
+    with opened(what) as results:
+        check_not_results(results.path, out)
         recorded = RecordedFrames(results, choose_frames(results.times, times, frames), background)
-        target = output_path(path, out, "_strip.png")
         places, more = choose_colonies(recorded.present, results.colony_id, colonies, 4)
         layout = plan_layout(recorded, places, style)
         one = (
@@ -134,10 +161,8 @@ def strip(
             if len(places) == 1 and len(results.colony_id) > 1
             else ""
         )
-        return save(
-            strip_figure(recorded, layout, f"{recorded.title}{one}{view_note(style)}{more}", dpi),
-            target,
-        )
+        title = f"{recorded.title}{one}{view_note(style)}{more}"
+        return Picture(strip_figure(recorded, layout, title, dpi), out)
 
 
 def sheet_figure(
@@ -257,17 +282,20 @@ def view_note(style: PlotStyle) -> str:
     return "" if style.view == "xy" else f", {style.view[0]} across and {style.view[1]} up"
 
 
-def output_path(path: str | Path, out: str | Path | None, ending: str) -> Path:
-    """The path of a picture. Raises InputError if it is the results file itself."""
-    if not isinstance(path, (str, Path)):
-        raise checks.input_error(
-            "results",
-            path,
-            "the path of a results file",
-            "For a state, use tf.pictures.sheet(state, out).",
-        )
-    own = Path(path)
-    target = Path(out) if out is not None else own.with_name(own.stem + ending)
-    if target.absolute() == own.absolute():
-        raise checks.input_error("out", str(target), "another file than the results")
-    return target
+@contextmanager
+def opened(what: object) -> Iterator[Results]:
+    """A results file, which stays open if it is given open."""
+    if isinstance(what, Results):
+        yield what
+    elif isinstance(what, (str, Path)):
+        with Results(what) as results:
+            yield results
+    else:
+        hint = "A state is drawn by tf.show(state)."
+        raise checks.input_error("results", what, "a results file, or its path", hint)
+
+
+def check_not_results(results: Path, out: str | Path | None) -> None:
+    """Raise InputError if a picture would replace the results that it shows."""
+    if out is not None and Path(out).absolute() == results.absolute():
+        raise checks.input_error("out", str(out), "another file than the results")

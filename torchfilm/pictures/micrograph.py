@@ -11,7 +11,8 @@ from torchfilm.initial_cells import Cells
 from torchfilm.micrographs.mask_files import read_image
 from torchfilm.micrographs.record import Micrograph
 from torchfilm.pictures.draw import scale_bar
-from torchfilm.pictures.page import figure_class, save, set_page_title
+from torchfilm.pictures.page import figure_class, set_page_title
+from torchfilm.pictures.picture import Picture
 from torchfilm.pictures.shapes import outlines
 from torchfilm.tools import checks
 
@@ -29,21 +30,21 @@ NAMED = 40  # how many overlapping cells are named
 def overlay(
     cells: Cells,
     over: Any,
-    out: str | Path,
+    out: str | Path | None = None,
     *,
     frame: int | None = None,
     depth: float | None = None,
     labels: bool = False,
     dpi: float = 200,
-) -> Path:
-    """Draw the outlines of cells over the image that they were read from. Returns the picture's
-    path.
+) -> Picture:
+    """Draw the outlines of cells over the image that they were read from.
 
     cells: of `Cells.from_masks`, or of `Cells.from_table` with a pixel size. over: the micrograph
     or the label image, an array (rows, columns) or (rows, columns, 3), or a .tif or .png file. out:
-    the picture (.png, .pdf, .svg). frame: of a stack. Cells that overlap by more than `depth` µm,
-    by default a tenth of their median width, are red and carry their labels. labels: name all
-    cells. Raises InputError if the cells are not from an image, or lie outside of this one.
+    the picture's path (.png, .pdf, .svg), as for `show`. frame: of a stack. Cells that overlap by
+    more than `depth` µm, by default a tenth of their median width, are red and carry their labels.
+    labels: name all cells. Raises InputError if the cells are not from an image, or lie outside of
+    this one.
     """
     figure_class()
     if not isinstance(cells, Cells):
@@ -75,7 +76,7 @@ def overlay(
         pairs = "1 pair overlaps" if len(found) == 1 else f"{len(found)} pairs overlap"
         words = f"{pairs} by over {depth:.2g} µm (red), by up to {found[0][2]:.2g} µm"
     set_page_title(figure, f"{cells.count} cells over {Path(source).name}; {words}")
-    return save(figure, out)
+    return Picture(figure, out)
 
 
 def _draw(

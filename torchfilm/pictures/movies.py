@@ -14,7 +14,14 @@ import numpy as np
 from torchfilm.io.results import Results
 from torchfilm.pictures.colours import CELLS, Limits, PlotStyle, paint_cells
 from torchfilm.pictures.draw import OUTSIDE_BOX
-from torchfilm.pictures.figures import choose_colonies, fill_sheet, output_path, square, view_note
+from torchfilm.pictures.figures import (
+    check_not_results,
+    choose_colonies,
+    fill_sheet,
+    opened,
+    square,
+    view_note,
+)
 from torchfilm.pictures.frames import RecordedFrames
 from torchfilm.pictures.page import (
     PanelLayout,
@@ -30,7 +37,7 @@ GREYS = 104  # of the 256 colours of a GIF
 
 
 def movie(
-    path: str | Path,
+    what: str | Path | Results,
     out: str | Path,
     *,
     every: int = 1,
@@ -45,20 +52,23 @@ def movie(
     colonies: Sequence[int] | None = None,
     dpi: float = 150,
 ) -> Path:
-    """Make a film of a results file, with one panel per colony. Returns the film's path.
+    """Make a film of a results file, with one panel per colony. Returns the film's path; an older
+    film of that name is replaced.
 
     The window, the scale and the range of colours are the same from beginning to end. out: its
     name, which ends in .mp4 (requires imageio-ffmpeg) or .gif. every: draw every n-th recorded
     frame, and the last. fps: drawn frames per second; a GIF has a resolution of hundredths of a
-    second. colonies: their ids; default the first 9. The other options are those of `show`.
+    second. what: a results file, or its path. colonies: their ids; default the first 9. The other
+    options are those of `show`.
     """
     figure_class()
-    target = output_path(path, out, "")
+    target = Path(out)
     write = _writer(target, fps)
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise checks.input_error("every", every, "a whole number from 1")
     style = PlotStyle(colour, channels, background, limits, view, section, whole)
-    with Results(path) as results:
+    with opened(what) as results:
+        check_not_results(results.path, out)
         last = len(results) - 1
         frames = RecordedFrames(results, sorted({*range(0, last + 1, every), last}), background)
         places, more = choose_colonies(frames.present, results.colony_id, colonies, 9)

@@ -322,8 +322,7 @@ def save(figure: Figure, path: str | Path) -> Path:
 
     Raises InputError if the format or the folder is not valid.
     """
-    if not Path(path).suffix:  # matplotlib would add a suffix, and perhaps replace another file
-        raise checks.input_error("picture", str(path), "a name that ends in .png, .pdf or .svg")
+    path = check_picture_path(path)
     try:
         figure.savefig(path, dpi=figure.dpi)
     except (OSError, ValueError) as error:  # no such folder; no such kind of picture
@@ -331,4 +330,13 @@ def save(figure: Figure, path: str | Path) -> Path:
             f"{path} cannot be written as a picture: {error}. Choose a folder that exists and a"
             " name that ends in .png, .pdf or .svg."
         ) from error
+    return path
+
+
+def check_picture_path(path: object) -> Path:
+    """The path of a picture. Raises InputError for what is no path, or has no suffix."""
+    # matplotlib would add a suffix, and perhaps replace another file
+    if not isinstance(path, (str, Path)) or not Path(path).suffix:
+        rule = "a path whose name ends in .png, .pdf or .svg"
+        raise checks.input_error("picture", str(path), rule)
     return Path(path)

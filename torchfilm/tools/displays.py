@@ -1,0 +1,98 @@
+"""Displays in notebooks: titles, tables and texts as HTML that reads well on light and on dark
+pages, and output that is redrawn in place. IPython is used where a notebook has loaded it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+from torch import Tensor
+
+# Colours are the page's own, or see-through grey.
+LINE = "1px solid rgba(128,128,128,.35)"
+CELL = "padding:.15em .9em .15em 0;vertical-align:top"
+
+
+def card(title: str, *parts: str) -> str:
+    """A title above parts, which are HTML by the functions of this module; empty ones are left
+    out."""
+    return (
+        f'<div style="margin:.2em 0"><div style="font-weight:600">{escape(title)}</div>'
+        f"{''.join(parts)}</div>"
+    )
+
+
+def table(rows: Iterable[Sequence[object]], head: Sequence[object] = ()) -> str:
+    """Rows of values as a table: text as it is, numbers at the right. head: titles of columns."""
+    style = f"text-align:left;font-weight:600;{CELL};border-bottom:{LINE}"
+    titles = "".join(f'<th style="{style}">{escape(str(x))}</th>' for x in head)
+    lines = [f"<tr>{titles}</tr>"] if titles else []
+    lines += [f"<tr>{''.join(map(_cell, row))}</tr>" for row in rows]
+    if not lines:
+        return ""
+    style = "border-collapse:collapse;margin:.3em 0;background:transparent"
+    return f'<table style="{style}">{"".join(lines)}</table>'
+
+
+def pairs(values: Iterable[tuple[str, object]]) -> str:
+    """Names and values as a table of two columns, the names in grey."""
+    names = (
+        f'<tr><td style="text-align:left;opacity:.65;{CELL}">{escape(name)}</td>{_cell(value)}</tr>'
+        for name, value in values
+    )
+    style = "border-collapse:collapse;margin:.3em 0;background:transparent"
+    return f'<table style="{style}">{"".join(names)}</table>'
+
+
+def ranges(values: Mapping[str, tuple[str, Tensor]]) -> str:
+    """Units and tensors by name as a table: the least, the mean and the greatest value of each."""
+    rows: list[tuple[object, ...]] = []
+    for name, (unit, x) in values.items():
+        x = x.detach().double()
+        found = [float(y) for y in (x.min(), x.mean(), x.max())] if x.numel() else ["", "", ""]
+        rows.append((name, unit, *found, " × ".join(map(str, x.shape))))
+    return table(rows, ("", "unit", "least", "mean", "greatest", "shape"))
+
+
+def lines(words: str) -> str:
+    """A text as a paragraph, with its line breaks."""
+    return f'<div style="margin:.3em 0;white-space:pre-line">{escape(words)}</div>' if words else ""
+
+
+def text(words: str) -> str:
+    """A text with its line breaks, in letters of one width."""
+    style = "margin:.3em 0;background:transparent;color:inherit;line-height:1.35"
+    return f'<pre style="{style}">{escape(words)}</pre>'
+
+
+def _cell(value: object) -> str:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    shown = f"{value:.6g}" if isinstance(value, float) else str(value)
+    align = "right" if number else "left"
+    return f'<td style="text-align:{align};{CELL}">{escape(shown)}</td>'
+
+
+def in_notebook() -> bool:
+    """Whether this process is the kernel of a notebook."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return getattr(shell, "kernel", None) is not None
+
+
+class Output:
+    """Output below a notebook's cell that can be replaced."""
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def show(self, data: dict[str, Any], metadata: dict[str, Any] | None = None) -> None:
+        """Show data by MIME type, in place of what was shown before."""
+        from IPython.display import display
+
+        metadata = metadata or {}
+        if self._handle is None:
+            self._handle = display(data, metadata=metadata, raw=True, display_id=True)
+        else:
+            self._handle.update(data, metadata=metadata, raw=True)
