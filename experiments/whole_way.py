@@ -174,7 +174,7 @@ def main() -> None:
     hours = (last - first) * options.frame_hours
     for k, found in zip((first, last), cells, strict=True):
         print(f"frame {k}\n{found.summary()}\n")
-    print(tf.pictures.overlay(cells[1], masks, out / "masks.png", frame=last))
+    print(tf.pictures.overlay(cells[1], masks, frame=last).save(out / "masks.png"))
 
     given = {"masks": str(masks.resolve()), "frame": first, "pixel_size": options.pixel_size}
     fitted = fit(given, cells[1], hours, options.colonies)
