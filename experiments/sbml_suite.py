@@ -31,7 +31,7 @@ from torchfilm.circuits.sbml.mathml import calculate
 from torchfilm.circuits.sbml.quantities import SPECIES, Quantities
 from torchfilm.circuits.sbml.reading import TIME
 from torchfilm.effects.circuit import OPTION_NAMES
-from torchfilm.effects.circuit_checks import model_choices
+from torchfilm.effects.circuit_sbml import model_choices
 
 # What a message of torchfilm is counted as, in the order in which they are tried.
 REASONS = {

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.micrographs.cell_tables import Reading, table_cells
-from torchfilm.micrographs.masks import mask_cells
-from torchfilm.micrographs.record import Micrograph, summarise
 from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.tables import Table
+
+if TYPE_CHECKING:
+    from torchfilm.micrographs.record import Micrograph
 
 
 @dataclass(frozen=True)
@@ -230,6 +230,8 @@ class Cells:
         with one label or one place, for several frames, and for arguments that nothing uses. Warns
         of angles that cannot be in their unit.
         """
+        from torchfilm.micrographs.cell_tables import Reading, table_cells
+
         reading = Reading(
             pixel_size, columns, angle_unit, angle_turns, y, length_with_caps, radius, frame,
             fields, centre,
@@ -261,6 +263,8 @@ class Cells:
         capsule or missing in it ("misfit": curved, or several cells in one), give a warning with
         their labels. drop: the kinds to leave out instead, such as "border" or ("border", "tiny").
         """
+        from torchfilm.micrographs.masks import mask_cells
+
         given = mask_cells(
             image,
             pixel_size=pixel_size,
@@ -289,6 +293,8 @@ class Cells:
             columns = {
                 n: np.asarray(d) for n, d in file[group].items() if isinstance(d, h5py.Dataset)
             }
+        from torchfilm.micrographs.cell_tables import Reading, table_cells
+
         return Cells(**table_cells(Table.read(columns, str(path)), Reading()))
 
     def relaxed(self, depth: float = 0.01) -> Cells:
@@ -321,6 +327,8 @@ class Cells:
     def summary(self) -> str:
         """What was read, for checking: counts, sizes and extent in µm, what was left out, overlaps,
         and how far `relaxed` moved the cells."""
+        from torchfilm.micrographs.record import summarise
+
         return summarise(self)
 
 

@@ -7,9 +7,8 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchfilm as tf
-from torchfilm.circuits.sbml.reading import describe
 from torchfilm.effects.circuit import OPTION_NAMES
-from torchfilm.effects.circuit_checks import model_choices
+from torchfilm.effects.circuit_sbml import keywords, model_choices
 
 SPACES = {
     (1, 2): "http://www.sbml.org/sbml/level1",
@@ -182,7 +181,7 @@ def read(text: str, **given) -> tf.Circuit:
     said = [given.pop(n, x) for n, x in zip(names, defaults, strict=True)]
     dilution = given.pop("dilution", True)
     choices = model_choices(*said, given, OPTION_NAMES)
-    return tf.Circuit._described(describe(text, "model.xml", choices), dilution, given)
+    return tf.Circuit(**keywords(text, "model.xml", choices, dilution, given))
 
 
 def course(circuit: tf.Circuit, hours: list[float]) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.circuits import run, sbml
+from torchfilm.circuits import run
 from torchfilm.circuits.graph import CircuitGraph, graph_of
 from torchfilm.circuits.names import label_of
 from torchfilm.circuits.partition import binomial
@@ -34,10 +34,8 @@ from torchfilm.effects.circuit_checks import (
     check_species,
     diluted_names,
     equations_of,
-    model_choices,
     names_of,
     shared_fields,
-    written_numbers,
 )
 from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, Field, State
@@ -178,11 +176,13 @@ class Circuit(Effect):
         values for constants by id, of the forms that a circuit takes, and its options. Raises
         InputError, with the line or the id, for what cannot be read or simulated.
         """
-        text = sbml.decoded(sbml.read_bytes(path), str(path))
-        given = model_choices(
+        from torchfilm.effects import circuit_sbml
+
+        choices = circuit_sbml.model_choices(
             signals, properties, without, time_unit, initial, options, OPTION_NAMES
         )
-        return cls._described(sbml.describe(text, str(path), given), dilution, options)
+        model = circuit_sbml.read_file(path)
+        return cls(**circuit_sbml.keywords(*model, choices, dilution, options))
 
     @classmethod
     def from_antimony(
@@ -198,26 +198,13 @@ class Circuit(Effect):
         **options: Any,
     ) -> Circuit:
         """The circuit of a model as Antimony text. Keywords and errors as of `from_sbml`."""
-        where = "the Antimony text"
-        given = model_choices(
+        from torchfilm.effects import circuit_sbml
+
+        choices = circuit_sbml.model_choices(
             signals, properties, without, time_unit, initial, options, OPTION_NAMES
         )
-        description = sbml.describe(sbml.antimony_to_sbml(text, where), where, given)
-        return cls._described(description, dilution, options)
-
-    @classmethod
-    def _described(
-        cls, found: sbml.Description, dilution: bool | Sequence[str], options: Mapping[str, Any]
-    ) -> Circuit:
-        """The circuit of a model that was read. options: those of a circuit, among others."""
-        return cls(
-            found.rates,
-            species=found.species,
-            initial=found.initial,
-            dilution=found.diluted if dilution is True else dilution,
-            **{n: x for n, x in options.items() if n in OPTION_NAMES},
-            **found.parameters,
-        )
+        model = circuit_sbml.from_antimony(text)
+        return cls(**circuit_sbml.keywords(*model, choices, dilution, options))
 
     def to_sbml(
         self,
@@ -234,26 +221,9 @@ class Circuit(Effect):
         place of first values and constants that are not one number. Raises InputError where a
         number is missing, and where the rates cannot be written as equations.
         """
-        if cell_type is None:
-            graph = self.graph
-        else:
-            checks.choice("cell_type", cell_type, tuple(self.rates))
-            graph = self.graphs[cell_type]
-        if self.shared:
-            raise checks.InputError(
-                f"{self.value_owner()} shares species of another circuit, so it is no whole model:"
-                " write a circuit that has them all."
-            )
-        part = self.rates[EVERY if cell_type is None else cell_type]
-        undiluted = [n for n in self.species if self.variables[n] not in self.diluted_fields]
-        text = sbml.sbml_text(
-            graph,
-            self.name or label_of(part),
-            written_numbers("initial", self.initial, initial or {}, self.species),
-            written_numbers("constant", self.parameters, values, tuple(self.parameters)),
-            undiluted,
-        )
-        sbml.write(path, text)
+        from torchfilm.effects import circuit_sbml
+
+        circuit_sbml.write_file(path, self, cell_type, initial or {}, values)
 
     @property
     def title(self) -> str:  # type: ignore[override]

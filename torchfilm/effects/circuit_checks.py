@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from numbers import Integral
 from typing import Any
 
-from torch import Tensor
-
-from torchfilm.circuits import integrators, sbml
+from torchfilm.circuits import integrators
 from torchfilm.circuits.names import unknown
 from torchfilm.state import RESERVED
 from torchfilm.tools import checks
@@ -134,54 +132,3 @@ def diluted_names(
             "Circuit.dilution", given, "True where molecules are counted", "Their number is kept."
         )
     return given
-
-
-def model_choices(
-    signals: Sequence[str] | Mapping[str, str],
-    properties: Mapping[str, str] | None,
-    without: Sequence[str],
-    time_unit: str | None,
-    initial: Mapping[str, Any] | None,
-    keywords: Mapping[str, Any],
-    options: Sequence[str],
-) -> sbml.Given:
-    """What a user says of a model to read; `options` are keywords of a circuit."""
-    if not isinstance(signals, Mapping):
-        signals = {n: n for n in ((signals,) if isinstance(signals, str) else signals)}
-    for name in ("species", "rates"):
-        if name in keywords:
-            raise checks.input_error(f"Circuit.{name}", keywords[name], "left to the model")
-    for name, given in (("properties", properties), ("initial", initial)):
-        if given is not None and not isinstance(given, Mapping):
-            raise checks.input_error(name, given, "a dict by ids of the model")
-    return sbml.Given(
-        signals=signals,
-        properties=properties or {},
-        without=(without,) if isinstance(without, str) else tuple(without),
-        time_unit=time_unit,
-        values={n: x for n, x in keywords.items() if n not in options},
-        initial=initial or {},
-        options=options,
-        fields=(*RESERVED, *GEOMETRY),
-    )
-
-
-def written_numbers(
-    what: str, values: Mapping[str, Any], given: Mapping[str, float], names: Sequence[str]
-) -> dict[str, float]:
-    """Numbers by name for a model to write: those given in place of the circuit's own."""
-    for name in given:
-        if name not in names:
-            raise checks.InputError(unknown(f"{what} {name!r} is not in the circuit", name, names))
-    found = {}
-    for name in names:
-        value = given.get(name, values.get(name, 0.0))
-        if isinstance(value, Tensor) and value.numel() == 1:
-            value = value.item()
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            hint = f"initial={{{name!r}: …}}" if what == "initial" else f"{name}=…"
-            raise checks.input_error(
-                f"{what} {name!r}", value, "one number to be written", f"Give it: {hint}."
-            )
-        found[name] = float(value)
-    return found
