@@ -1,4 +1,4 @@
-"""HDF5 files of the design layer: how one replaces an older one, and columns of values."""
+"""HDF5 files of the design layer: how one is read or replaced, and columns of values."""
 
 from __future__ import annotations
 
@@ -40,6 +40,29 @@ def replacing(
     except OSError as error:
         raise tf.SimulationError(
             f"could not write {path}: {error}. Is the disk full? The file keeps the {kept}."
+        ) from error
+
+
+@contextmanager
+def reading(path: Path, form: str, version: int, what: str) -> Iterator[h5py.File]:
+    """A file to read. what: what it should be, as messages name it. Raises InputError for a file of
+    another format or a later version, and for what is missing or broken in it."""
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != form:
+                found = file.attrs.get("format")
+                raise tf.InputError(f"{path} is not a {what} (its format is {found!r}).")
+            if int(file.attrs["version"]) > version:
+                raise tf.InputError(
+                    f"{path} has format version {file.attrs['version']}; this torchfilm reads"
+                    f" versions up to {version}. Update torchfilm."
+                )
+            yield file
+    except tf.InputError:
+        raise
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise tf.InputError(
+            f"{path} cannot be read: it is truncated or not a {what} ({error})."
         ) from error
 
 

@@ -18,7 +18,7 @@ import torch
 
 import torchfilm as tf
 from design import colonies
-from design.data_file import replacing, write_values
+from design.data_file import reading, replacing, write_values
 from design.parameters import Value
 from design.rollout import FailedColony, grow
 from design.scoring import WorkItem, cut_work_items
@@ -195,22 +195,10 @@ def _read(path: Path | None, task: Task) -> Simulations:
     names = observed_of(task).plan.names
     if path is None or not path.exists():
         return Simulations(np.empty((0, task.space.size)), np.empty((0, len(names))))
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT or int(file.attrs["version"]) > VERSION:
-                raise tf.InputError(
-                    f"{path} is no file of simulations that this torchfilm reads (format"
-                    f" {file.attrs.get('format')!r}, version {file.attrs.get('version')})."
-                )
-            kept, mine = json.loads(file.attrs["about"]), about(task)
-            reasons = {int(k): words for k, words in json.loads(file.attrs["reasons"]).items()}
-            found = Simulations(file["points"][...], file["statistics"][...], reasons)
-    except tf.InputError:
-        raise
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise tf.InputError(
-            f"{path} cannot be read: it is truncated or no file of simulations ({error})."
-        ) from error
+    with reading(path, FORMAT, VERSION, "file of simulations") as file:
+        kept, mine = json.loads(file.attrs["about"]), about(task)
+        reasons = {int(k): words for k, words in json.loads(file.attrs["reasons"]).items()}
+        found = Simulations(file["points"][...], file["statistics"][...], reasons)
     plain = json.loads(json.dumps(mine))
     differing = [name for name in plain | kept if kept.get(name) != plain.get(name)]
     if differing:

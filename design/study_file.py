@@ -26,8 +26,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-import torchfilm as tf
-from design.data_file import replacing, write_values
+from design.data_file import reading, replacing, write_values
 from design.entries import Entry
 from design.slopes import Slopes
 from torchfilm import checks
@@ -103,27 +102,11 @@ def read_study(path: Path) -> StudyData:
             "a study file",
             "This path is a folder." if path.is_dir() else "There is no such file.",
         )
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
-                raise tf.InputError(
-                    f"{path} is not a torchfilm study (its format is {file.attrs.get('format')!r})."
-                )
-            if int(file.attrs["version"]) > VERSION:
-                raise tf.InputError(
-                    f"{path} has format version {file.attrs['version']}; this torchfilm reads"
-                    f" versions up to {VERSION}. Update torchfilm."
-                )
-            about, streams = json.loads(file.attrs["about"]), tuple(file["streams"][...].tolist())
-            tuple(about["names"])
-            finals = _read_entries(file["finals"]) if "finals" in file else []
-            return StudyData(about, streams, _read_entries(file, streams), finals)
-    except tf.InputError:
-        raise
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise tf.InputError(
-            f"{path} cannot be read: it is truncated or not a study file ({error})."
-        ) from error
+    with reading(path, FORMAT, VERSION, "torchfilm study") as file:
+        about, streams = json.loads(file.attrs["about"]), tuple(file["streams"][...].tolist())
+        tuple(about["names"])
+        finals = _read_entries(file["finals"]) if "finals" in file else []
+        return StudyData(about, streams, _read_entries(file, streams), finals)
 
 
 def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> list[Entry]:

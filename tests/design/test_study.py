@@ -318,7 +318,9 @@ def test_a_method_that_proposes_other_points_is_refused(kept, tmp_path):
 def test_a_truncated_file_is_refused(kept, tmp_path, share):
     whole = kept.read_bytes()
     (tmp_path / "s.h5").write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(tf.InputError, match="cannot be read: it is truncated or not a study file"):
+    with pytest.raises(
+        tf.InputError, match="cannot be read: it is truncated or not a torchfilm study"
+    ):
         search().run(12, study=tmp_path / "s.h5", progress=False)
 
 
@@ -342,7 +344,9 @@ def spoiled(path, what):
 def test_a_spoiled_file_is_refused(kept, tmp_path, what):
     shutil.copy(kept, tmp_path / "s.h5")
     spoiled(tmp_path / "s.h5", what)
-    with pytest.raises(tf.InputError, match="cannot be read: it is truncated or not a study file"):
+    with pytest.raises(
+        tf.InputError, match="cannot be read: it is truncated or not a torchfilm study"
+    ):
         Study.read(tmp_path / "s.h5")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -84,8 +83,8 @@ def _find(name: str) -> tuple[str, Any]:
         else:
             return PREFIX[package] + ".".join(rest), thing
     last = {n.split(".")[-1].lower(): n for n in known}
-    near = difflib.get_close_matches(rest[-1].lower(), last, n=1)
-    hint = f"Did you mean {last[near[0]]}?" if near else "`torchfilm help` lists them."
+    near = checks.nearest(rest[-1].lower(), last)
+    hint = f"Did you mean {last[near]}?" if near else "`torchfilm help` lists them."
     raise checks.input_error("name", name, "a public name of torchfilm or design", hint)
 
 

@@ -37,9 +37,10 @@ def check_new_file(
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Where to write a file, beside `path`, which it takes at the end. An error or a kill before
-    leaves what was at `path`. Raises SimulationError where the file cannot be written."""
-    beside = path.with_name(f".{path.name}.new")
+    """Where to write a file, beside `path` and with its suffix, which it replaces at the end. An
+    error or a kill before leaves what was at `path`. Raises SimulationError where the file cannot
+    be written."""
+    beside = path.with_name(f".{path.stem}.new{path.suffix}")
     try:
         yield beside
         os.replace(beside, path)

@@ -72,10 +72,7 @@ def show(
         shown, heading = _given_frame(what, scene, frame), name_of(scene)
     else:
         shown, heading = _recorded_frame(what, scene, frame, background, out)
-    places, more = choose_colonies(shown.counts > 0, shown.colony_id, colonies, most)
-    if title is None:
-        title = f"{heading}t = {shown.time:.5g} h{view_note(style)}"
-    return Picture(sheet_figure(shown, places, style, title + more, dpi), out)
+    return Picture(_one_time(shown, heading, style, colonies, most, title, dpi), out)
 
 
 def state_figure(
@@ -93,9 +90,23 @@ def state_figure(
         colonies = [c for c in colonies if c in alive]
     if not alive or colonies == []:
         return None
+    return _one_time(frame, name_of(scene), style, colonies, most, None, dpi)
+
+
+def _one_time(
+    frame: Frame,
+    heading: str,
+    style: PlotStyle,
+    colonies: Sequence[int] | None,
+    most: int,
+    title: str | None,
+    dpi: float,
+) -> Figure:
+    """Colonies at one time. heading: the words before the time, where there is no title."""
     places, more = choose_colonies(frame.counts > 0, frame.colony_id, colonies, most)
-    title = f"{name_of(scene)}t = {frame.time:.5g} h{view_note(style)}{more}"
-    return sheet_figure(frame, places, style, title, dpi)
+    if title is None:
+        title = f"{heading}t = {frame.time:.5g} h{view_note(style)}"
+    return sheet_figure(frame, places, style, title + more, dpi)
 
 
 def name_of(scene: Scene | None) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torchfilm.io.new_file import written_whole
 from torchfilm.pictures.colours import CELLS, Limits, PlotStyle
 from torchfilm.pictures.figures import state_figure
 from torchfilm.pictures.page import check_picture_path, figure_class, save
@@ -99,6 +99,5 @@ class LivePlot:
             words = f"LivePlot({self.last})"
             self.output.show({"image/png": png, "text/plain": words}, {"image/png": size})
         if self.out is not None:  # at once, so that a viewer never reads half a picture
-            part = self.out.with_name(f".{self.out.stem}.part{self.out.suffix}")
-            save(figure, part)
-            os.replace(part, self.out)
+            with written_whole(self.out) as beside:
+                save(figure, beside)
