@@ -159,6 +159,7 @@ def _goals(task: Task, part: WorkResult, replicates: int) -> np.ndarray:
 
 
 @torch.no_grad()
+@tf.one_torch_thread()
 def _grow_and_score(
     task: Task, item: WorkItem, streams: tuple[int, ...], size: float
 ) -> WorkResult:

@@ -35,6 +35,7 @@ from torchfilm.tools import checks, displays, progress, tables, tangents
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.memory import keep_memory
+from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.timing import Timings
 from torchfilm.values import PerColony, physical
 from torchfilm.version import __version__
@@ -117,6 +118,7 @@ __all__ = [
     "keep_memory",
     "kinetics",
     "measure",
+    "one_torch_thread",
     "parts",
     "physical",
     "pictures",

@@ -18,6 +18,7 @@ import torch
 from torchfilm.resolver import BoundBatch, Resolved, Values, drawn_field, resolve
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, hashing
+from torchfilm.tools.threads import given_torch_threads, one_torch_thread
 from torchfilm.values import CELL, ByType, PerColony, Rule, checked, is_drawn
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ class Effect(metaclass=checks.KnownKeywords):
     may_repeat: ClassVar[bool] = True
     # What it reads and writes is known only after it has been tried.
     writes_anything: ClassVar[bool] = False
+    # Kernels compute its steps on the CPU, with few operations of torch between them.
+    by_kernels: ClassVar[bool] = False
     # Its cost depends on the voxels of the grid, not on the cells.
     works_on_grid: ClassVar[bool] = False
 
@@ -284,6 +287,16 @@ class BoundEffect:
     def step(self, state: State, dt: float) -> State:
         """The state after this effect has acted for dt hours."""
         return self.effect.step(state, dt, self.values)
+
+    def run_step(self, state: State, dt: float) -> State:
+        """As `step`; torch has one thread where kernels compute, and else those it was given."""
+        alone = self.by_kernels and state.device.type == "cpu"
+        with one_torch_thread() if alone else given_torch_threads():
+            return self.step(state, dt)
+
+    @property
+    def by_kernels(self) -> bool:
+        return self.effect.by_kernels
 
     def numerics(self, dt: float, state: State) -> list[str]:
         """By which methods it is computed, in lines."""

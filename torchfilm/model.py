@@ -27,6 +27,7 @@ from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.tangents import tracked
+from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.timing import Timings
 from torchfilm.tools.warn_once import once
 
@@ -87,10 +88,10 @@ class Model:
         with once(self._said) as self._said:
             for effect in self.effects:
                 if timings is None:
-                    state = effect.step(state, dt)
+                    state = effect.run_step(state, dt)
                 else:
                     with timings.of(effect.title, state.device):
-                        state = effect.step(state, dt)
+                        state = effect.run_step(state, dt)
         return advanced(state, dt)
 
     def opened(self, state: State) -> State:
@@ -303,6 +304,7 @@ def why_not_replayable(model: Model) -> str:
     return ""
 
 
+@one_torch_thread()
 def bind(
     scene: Scene,
     colonies: int | None = None,

@@ -25,6 +25,7 @@ from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, Births, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import expand_ranges, offsets
+from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.warn_once import once
 
 FIRST = -1  # the part of what happens before all effects
@@ -140,7 +141,7 @@ class GrowthRecording:
             noted.append(_change(FIRST, state, kept))
             state = kept
         for part, effect in enumerate(self.model.effects):
-            after = effect.step(state, self.dt)
+            after = effect.run_step(state, self.dt)
             if after is not state:
                 noted.append(_change(part, state, after))
             state = after
@@ -269,6 +270,7 @@ class Replay:
             listed = ", ".join(map(str, self.recording.streams))
             raise checks.input_error("streams", strange[0], f"of the recording: {listed}")
 
+    @one_torch_thread()
     def step(self, state: State) -> State:
         """The state one step later."""
         number = state.step
@@ -281,7 +283,7 @@ class Replay:
             state = self._apply(state, changes[FIRST], place)
         for effect, part in self.parts:
             if part is None:
-                state = effect.step(state, self.dt)
+                state = effect.run_step(state, self.dt)
             elif part in changes:
                 state = self._apply(state, changes[part], place)
         if any(step == number for step, _ in self.recording.failed.values()):

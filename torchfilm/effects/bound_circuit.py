@@ -232,6 +232,14 @@ class BoundCircuit(BoundEffect):
         }
         return state.with_fields(**found)
 
+    @property
+    def by_kernels(self) -> bool:
+        return not self.by_torch and not self._not_compiled()
+
+    def _not_compiled(self) -> list[str]:
+        """Why torch computes parts of it."""
+        return [x for x in self.compiled.values() if isinstance(x, str)]
+
     def numerics(self, dt: float, state: State) -> list[str]:
         c = self.effect
         molecules = (
@@ -250,7 +258,7 @@ class BoundCircuit(BoundEffect):
             f"{c.method}, {c.steps} equal step(s) of {dt / c.steps:g} h; nothing controls its error"
         )
         lines = [said.get(c.method, explicit)]
-        why = [x for x in self.compiled.values() if isinstance(x, str)]
+        why = self._not_compiled()
         lines += [f"computed by torch: {x}" for x in ([self.by_torch] * bool(self.by_torch) or why)]
         if not self.by_torch and not why:
             lines.append("computed by compiled functions of its equations")

@@ -46,6 +46,10 @@ class BoundMechanics(BoundEffect):
         ]
         self.compiled = effect.backend_on(binding.batch.device) == "compiled"
 
+    @property
+    def by_kernels(self) -> bool:
+        return self.compiled
+
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
             return state

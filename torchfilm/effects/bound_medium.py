@@ -55,6 +55,10 @@ class _MediumPart(BoundEffect):
         super().__init__(effect, binding)
         self.transport = transport
 
+    @property
+    def by_kernels(self) -> bool:
+        return self.transport.compiled
+
     def declares(self) -> list[Field]:
         return []
 
@@ -105,9 +109,8 @@ class BoundMedium(_MediumPart):
             raise checks.input_error(
                 "Medium.box", medium.box, "of three dimensions in a 3-D scene", hint
             )
-        assert state.layout is not None
         for name in medium.signals:
-            self.transport.carrier(name, state, state.layout.grid.batches[0], 1.0)
+            self.transport.check(name, state)
 
     def step(self, state: State, dt: float) -> State:
         return self.transport.carried(state, dt / 2 if self.effect.halves else dt)

@@ -71,6 +71,7 @@ class Division(Effect):
 
     stage = DIVISION
     title = "division"
+    by_kernels = True
     may_repeat = False
 
     def __post_init__(self) -> None:

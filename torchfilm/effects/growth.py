@@ -16,7 +16,6 @@ from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
-from torchfilm.tools.threads import in_this_thread
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, numbers, physical
 
@@ -60,6 +59,7 @@ class Growth(Effect):
 
     stage = GROWTH
     title = "growth"
+    by_kernels = True
     may_repeat = False
 
     def __post_init__(self) -> None:
@@ -132,11 +132,9 @@ class Growth(Effect):
         wanted = state.growth_rate * dt
         if self.law == "volume":
             # V = π r² (l + 4r/3), so l + 4r/3 grows like V
-            elongation = in_this_thread(torch.expm1, wanted) * (
-                state.length + state.radius * (4.0 / 3.0)
-            )
+            elongation = torch.expm1(wanted) * (state.length + state.radius * (4.0 / 3.0))
         elif self.law == "length":
-            elongation = in_this_thread(torch.expm1, wanted) * state.length
+            elongation = torch.expm1(wanted) * state.length
         else:
             elongation = wanted
         length = state.length + elongation

@@ -15,7 +15,8 @@ from torchfilm.resolver import snapshot
 from torchfilm.signals.boundary_conditions import BoundaryConditions
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.signals.layout import Layout
-from torchfilm.signals.transport import Carrier, carry, choose, prepare
+from torchfilm.signals.transport import Carrier, carry, check_method, choose, prepare
+from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_rates import build_operator
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
@@ -148,10 +149,26 @@ class Transport:
         moving = [] if callable(flow) else list(flow or ())
         return [signal.diffusion, signal.decay, signal.source, *faces, *moving]
 
+    def check(self, name: str, state: State) -> None:
+        """Raise InputError for a signal whose rates or method cannot be."""
+        assert state.layout is not None
+        check_method(self._operator(name, state, state.layout.grid.batches[0]), self.medium.method)
+
     def _prepare(
         self, name: str, state: State, batch: GridBatch, dt: float
     ) -> tuple[Carrier, bool]:
         """The step, and whether derivatives by its coefficients are wanted."""
+        made = self._operator(name, state, batch)
+        coefficients = (
+            made.decay,
+            made.source,
+            *(x for axis in made.axes for x in (axis.up, axis.down, axis.low, axis.high)),
+        )
+        wanted = tracked(*coefficients)
+        stepper = prepare(made, dt, self.medium.method or choose(made))
+        return Carrier(stepper, batch.shape, self.compiled and not wanted), wanted
+
+    def _operator(self, name: str, state: State, batch: GridBatch) -> Operator:
         signal, layout = self.signals[name], state.layout
         assert layout is not None
         ids = state.colony_id.index_select(0, batch.places)
@@ -163,7 +180,7 @@ class Transport:
             if callable(getattr(signal, x))
             else own(getattr(signal, x))
         )
-        made = build_operator(
+        return build_operator(
             batch.shape,
             layout.grid.spacing,
             diffusion=own(signal.diffusion),
@@ -182,14 +199,6 @@ class Transport:
             dtype=state.dtype,
             device=state.device,
         )
-        coefficients = (
-            made.decay,
-            made.source,
-            *(x for axis in made.axes for x in (axis.up, axis.down, axis.low, axis.high)),
-        )
-        wanted = tracked(*coefficients)
-        stepper = prepare(made, dt, self.medium.method or choose(made))
-        return Carrier(stepper, batch.shape, self.compiled and not wanted), wanted
 
 
 def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any], Any]) -> Any:

@@ -55,6 +55,7 @@ class Monod(Effect):
 
     stage = NUTRITION
     title = "nutrition"
+    by_kernels = True
     may_repeat = False
 
     def declares(self, dim: int) -> tuple[Field, ...]:

@@ -28,6 +28,7 @@ class Removal(Effect):
 
     stage = REMOVAL
     title = "removal"
+    by_kernels = True
 
     def __post_init__(self) -> None:
         for name, corner in zip(

@@ -12,7 +12,7 @@ from torchfilm.physics.step_records import StepInput, StepResult
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.ragged import Groups, offsets
-from torchfilm.tools.threads import pool
+from torchfilm.tools.threads import available, pool
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
 WORTH_THREADS = 300
@@ -94,7 +94,7 @@ def _kernel_of(settings: OneSidedSettings | ContactSettings):
 def _call(kernel, begin: np.ndarray, counts: np.ndarray, arguments: tuple) -> None:
     """Call the kernel for all colonies, shared among threads, of which this is one. Colonies never
     meet, so the result does not depend on the number of threads."""
-    threads = min(torch.get_num_threads(), counts.size)
+    threads = min(available(), counts.size)
     if threads < 2 or begin[-1] < WORTH_THREADS:
         kernel(np.arange(counts.size), *arguments)
         return

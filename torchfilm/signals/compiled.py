@@ -10,6 +10,9 @@ from torchfilm.signals.stencil import SLACK, Stencil
 from torchfilm.tools.numba_calls import as_array, unavailable
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import both, only_forward, tracked, with_tangent
+from torchfilm.tools.threads import shares_of
+
+WORTH_A_THREAD = 20_000  # cells for which another thread is worth to be woken
 
 
 def may_run(*given: Tensor) -> bool:
@@ -40,13 +43,18 @@ def stencil(
     node = torch.empty(count, 2 ** int(used.sum()), dtype=torch.int64)
     weight = torch.empty(node.shape, dtype=dtype)
     outside, blocked = torch.zeros(2, count, dtype=torch.bool)
-    put_stencil(
-        as_array(position, torch.float64), as_array(colony, torch.int64), grid.origin.numpy(),
-        grid.step.numpy(), grid.shape.numpy(), grid.offsets.numpy(), used.numpy(),
-        torch.tensor(periodic).numpy(), SLACK,
+    cells = as_array(position, torch.float64), as_array(colony, torch.int64)
+    grids = (
+        grid.origin.numpy(), grid.step.numpy(), grid.shape.numpy(), grid.offsets.numpy(),
+        used.numpy(), torch.tensor(periodic).numpy(), SLACK,
         torch.empty(0, dtype=torch.bool).numpy() if mask is None else mask.numpy(),
-        node.numpy(), weight.numpy(), outside.numpy(), blocked.numpy(),
     )  # fmt: skip
+    out = [x.numpy() for x in (node, weight, outside, blocked)]
+    shares_of(
+        count,
+        WORTH_A_THREAD,
+        lambda a, b: put_stencil(*(x[a:b] for x in cells), *grids, *(x[a:b] for x in out)),
+    )
     return Stencil(
         node, weight, outside, grid.voxel_volume, grid.nodes, None if mask is None else blocked
     )
@@ -59,7 +67,8 @@ def read(values: Tensor, stencil: Stencil) -> Tensor:
     dtype = values.dtype
     out = torch.empty(stencil.node.shape[0], dtype=dtype)
     weight = as_array(stencil.weight, dtype)
-    put(as_array(values, dtype), stencil.node.numpy(), weight, out.numpy())
+    found, of_cells = as_array(values, dtype), (stencil.node.numpy(), weight, out.numpy())
+    shares_of(len(out), WORTH_A_THREAD, lambda a, b: put(found, *(x[a:b] for x in of_cells)))
     return out
 
 

@@ -30,7 +30,11 @@ from torchfilm.signals.compiled_transport import (
     compiled_series,
 )
 from torchfilm.signals.grid import Grid, Shape
-from torchfilm.signals.transport_exponential import Exponential, prepare_exponential
+from torchfilm.signals.transport_exponential import (
+    Exponential,
+    check_separable,
+    prepare_exponential,
+)
 from torchfilm.signals.transport_implicit import prepare_implicit
 from torchfilm.signals.transport_iterative import prepare_crank_nicolson, prepare_euler
 from torchfilm.signals.transport_operator import Operator
@@ -65,10 +69,17 @@ def choose(operator: Operator) -> str:
     return "exponential" if operator.separable else "series"
 
 
-def prepare(operator: Operator, dt: float, method: str | None = None) -> Stepper:
-    """A step of `dt` hours by `method`; default: the suitable one."""
+def check_method(operator: Operator, method: str | None) -> None:
+    """Raise InputError for a method that does not exist, or not for this operator."""
     if method is not None:
         checks.choice("method", method, tuple(METHODS))
+    if method == "exponential":
+        check_separable(operator)
+
+
+def prepare(operator: Operator, dt: float, method: str | None = None) -> Stepper:
+    """A step of `dt` hours by `method`; default: the suitable one."""
+    check_method(operator, method)
     dt = checks.number("dt", dt, above=0.0, most=math.inf)
     return METHODS[choose(operator) if method is None else method](operator, dt)
 

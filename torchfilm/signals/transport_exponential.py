@@ -91,8 +91,8 @@ def padded(x: Tensor, rows: int, columns: int) -> Tensor:
     )
 
 
-def prepare_exponential(operator: Operator, dt: float) -> Exponential:
-    """The factors of a step of `dt` hours. Raises InputError if the operator is not separable."""
+def check_separable(operator: Operator) -> None:
+    """Raise InputError for an operator that is not a sum of one for each axis."""
     if not operator.separable:
         why = (
             "there is an obstacle (mask)"
@@ -105,6 +105,11 @@ def prepare_exponential(operator: Operator, dt: float) -> Exponential:
             f"another method, since {why}",
             'Use method="series", or None for the automatic choice.',
         )
+
+
+def prepare_exponential(operator: Operator, dt: float) -> Exponential:
+    """The factors of a step of `dt` hours. Raises InputError if the operator is not separable."""
+    check_separable(operator)
     # decay multiplies the factor of the longest axis, which always exists
     carrier = operator.shape.index(max(operator.shape))
     generators = [

@@ -3,25 +3,69 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
 
 import torch
-from torch import Tensor
-
-# For more numbers than this torch shares out an elementary function. Where other work is done on
-# the machine, it then waits for the other threads: milliseconds, for microseconds of work.
-FEW = 2048
 
 
-def in_this_thread(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """An elementary function of each of x (K,), on the CPU by this thread alone. It must be one of
-    those that `deterministic_math` lists: their values do not depend on the place in x."""
-    if x.device.type != "cpu" or x.numel() <= FEW:
-        return function(x)
-    return torch.cat([function(part) for part in x.split(FEW)])
+class _Given(threading.local):
+    """How many threads torch had in a thread of Python before `one_torch_thread`."""
+
+    count: int | None = None
+
+
+_given = _Given()
+
+
+def available() -> int:
+    """How many threads kernels may use: as many as torch was given, also in `one_torch_thread`."""
+    return _given.count or torch.get_num_threads()
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Torch computes in this thread alone, and has its threads again afterwards; kernels of
+    torchfilm keep as many threads as torch had.
+
+        with tf.one_torch_thread():
+            ...
+
+    For work by kernels with operations of torch between them, on the CPU. Each operation that torch
+    shares out leaves its other threads waiting in a loop, which keeps the kernels' threads, and
+    other programs, from the processor: on two cores that took up to ten times as long. Runs and
+    searches do so by themselves. It makes no difference to results.
+    """
+    if _given.count is not None:
+        yield
+        return
+    _given.count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(_given.count)
+        _given.count = None
+
+
+@contextmanager
+def given_torch_threads() -> Iterator[None]:
+    """Inside of `one_torch_thread`: torch has the threads that it was given."""
+    count = _given.count
+    if count is None:
+        yield
+        return
+    torch.set_num_threads(count)
+    _given.count = None
+    try:
+        yield
+    finally:
+        _given.count = count
+        torch.set_num_threads(1)
 
 
 @cache
@@ -37,7 +81,7 @@ def pool(threads: int) -> ThreadPoolExecutor:
 def shares_of(count: int, least: int, work: Callable[[int, int], object]) -> None:
     """Call work(first, last) for ranges that make up 0 … count: in threads, where each has `least`
     or more to do. The work must not depend on how it is divided."""
-    threads = min(torch.get_num_threads(), count // least)
+    threads = min(available(), count // least)
     if threads < 2:
         work(0, count)
         return
