@@ -71,6 +71,7 @@ ONE_EFFECT = {
     frozenset({"torchfilm.effects.circuit", "torchfilm.effects.circuit_checks"}),
     frozenset({"torchfilm.effects.circuit", "torchfilm.effects.circuit_sbml"}),
     frozenset({"torchfilm.effects.circuit_sbml", "torchfilm.effects.circuit_checks"}),
+    frozenset({"torchfilm.effects.bound_circuit", "torchfilm.effects.circuit_report"}),
     frozenset({"torchfilm.effects.medium", "torchfilm.effects.bound_medium"}),
     frozenset({"torchfilm.effects.medium", "torchfilm.effects.medium_transport"}),
     frozenset({"torchfilm.effects.bound_medium", "torchfilm.effects.medium_transport"}),

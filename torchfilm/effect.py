@@ -387,6 +387,8 @@ def shorten(value: object) -> str:
     if isinstance(value, ByType):
         return "{" + ", ".join(f"{kind}: {shorten(v)}" for kind, v in value.values.items()) + "}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        if not type(value).__dataclass_params__.repr:  # type: ignore[attr-defined]
+            return repr(value)  # a short one of its own
         inner = [
             f"{f.name}={shorten(getattr(value, f.name))}"
             for f in dataclasses.fields(value)

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, displays
 from torchfilm.tools.tables import Table
 
 if TYPE_CHECKING:
     from torchfilm.micrographs.record import Micrograph
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Cells:
     """Initial cells.
 
@@ -39,7 +39,7 @@ class Cells:
     cell_type: Any = None
     colony: Any = None
     extra: Mapping[str, Any] = field(default_factory=dict)
-    # not in the repr: it has no effect on a simulation, so it does not count for a scene's digest
+    # repr=False: it has no effect on a simulation, so it does not count for a scene's digest
     micrograph: Micrograph | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -228,15 +228,16 @@ class Cells:
 
         Raises InputError for a column that is missing, is not numbers or is used twice, for rows
         with one label or one place, for several frames, and for arguments that nothing uses. Warns
-        of angles that cannot be in their unit.
+        of angles that cannot be in their unit, and of widths that no bacteria have.
         """
         from torchfilm.micrographs.cell_tables import Reading, table_cells
+        from torchfilm.micrographs.record import with_usual_widths
 
         reading = Reading(
             pixel_size, columns, angle_unit, angle_turns, y, length_with_caps, radius, frame,
             fields, centre,
         )  # fmt: skip
-        return Cells(**table_cells(Table.read(table), reading))
+        return with_usual_widths(Cells(**table_cells(Table.read(table), reading)))
 
     @staticmethod
     @checks.known_keywords
@@ -264,6 +265,7 @@ class Cells:
         their labels. drop: the kinds to leave out instead, such as "border" or ("border", "tiny").
         """
         from torchfilm.micrographs.masks import mask_cells
+        from torchfilm.micrographs.record import with_usual_widths
 
         given = mask_cells(
             image,
@@ -273,7 +275,7 @@ class Cells:
             least_area=least_area,
             centre=centre,
         )
-        return Cells(**given)
+        return with_usual_widths(Cells(**given))
 
     @staticmethod
     @checks.known_keywords
@@ -323,6 +325,14 @@ class Cells:
             if getattr(self, name) is not None:
                 columns[name] = getattr(self, name)
         return columns | dict(self.extra)
+
+    def __repr__(self) -> str:
+        of = "" if self.colony is None else f" of {self.colonies} colonies"
+        more = f", with {', '.join(self.extra)}" if self.extra else ""
+        return f"Cells({self.count} cells{of}, {self.dim}-D{more})"
+
+    def _repr_html_(self) -> str:
+        return displays.card(repr(self), displays.lines(self.summary()))
 
     def summary(self) -> str:
         """What was read, for checking: counts, sizes and extent in µm, what was left out, overlaps,

@@ -69,7 +69,7 @@ def test_a_curved_cell_keeps_its_width():
     """Bent by 0.8 radians: within 5 % of the radius, where the moment across adds 8 %."""
     mask = bent((80, 80), (40, 30), 0.8, 30.0, 6.0)
     with pytest.warns(RuntimeWarning, match="not shaped like"):
-        assert read(mask, pixel_size=1.0).radius[0] == pytest.approx(6.0, rel=0.05)
+        assert read(mask, pixel_size=0.1).radius[0] == pytest.approx(0.6, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -86,15 +86,24 @@ def test_the_error_on_rasterised_capsules(radius, place, angle, length, width):
         side = int(size + 2 * radius + 8)
         x, y = side / 2 + rng.uniform(-0.5, 0.5, 2)
         mask = rasterised([x], [y], [a], [size], [radius], (side, side))
-        found = read(mask, pixel_size=1.0)
+        found = read(mask, pixel_size=0.1)
         turn = np.cross(np.append(found.axis[0], 0), (math.cos(a), -math.sin(a), 0))[2]
         errors.append(
-            (math.hypot(found.position[0, 0] - x, found.position[0, 1] + y),
+            (math.hypot(found.position[0, 0] / 0.1 - x, found.position[0, 1] / 0.1 + y),
              math.degrees(math.asin(min(abs(turn), 1.0))),
-             found.length[0] - size, found.radius[0] - radius)
+             found.length[0] / 0.1 - size, found.radius[0] / 0.1 - radius)
         )  # fmt: skip
     rms = np.sqrt((np.array(errors) ** 2).mean(0))
     assert (rms < (place, angle, length, width)).all(), rms
+
+
+@pytest.mark.parametrize("pixel_size", [65.0, 0.001])
+def test_widths_that_no_bacteria_have_give_a_warning(pixel_size):
+    with pytest.warns(UserWarning, match=rf"µm wide.*Is pixel_size = {pixel_size:g} µm right"):
+        read(masked(), pixel_size=pixel_size)
+    with pytest.warns(UserWarning, match="Are the columns in µm"):
+        columns = {"x": [0.0, 40.0], "y": [0.0, 0.0], "angle": [0.0, 0.0]}
+        tf.Cells.from_table(columns | {"length": [30.0, 31.0], "width": [9.0, 9.5]})
 
 
 # --- files ----------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchfilm.circuits import kinetics
 from torchfilm.circuits.expressions import LOGICAL, NAME, NUMBER, Builder, Expression, walk
 from torchfilm.circuits.names import Names
+from torchfilm.tools.hashing import digest
 
 Term = float | bool | Expression  # an expression, or a number or truth value known already
 Operand = float | bool | Tensor
@@ -97,7 +98,7 @@ def numeric(builder: Builder, x: Term) -> float | Expression:
     return float(x)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Equations:
     """A rate function (u, s, p, cell) made of expressions.
 
@@ -127,6 +128,10 @@ class Equations:
             place[node] = len(steps) - 1
         both = (tuple((n, place[e]) for n, e in found.items()) for found in (rates, releases))
         return Equations(label, species, tuple(steps), *both)
+
+    def __repr__(self) -> str:
+        listed = ", ".join(name for name, _ in (*self.rates, *self.releases))
+        return f"<equations {self.label}, of {listed} ({digest(self)[:8]})>"
 
     @property
     def __name__(self) -> str:

@@ -6,7 +6,6 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +24,7 @@ from torchfilm.circuits.network import build_network
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect, number_range
+from torchfilm.effects.circuit_report import Failures
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values, snapshot
 from torchfilm.state import CELL, OUTSIDE, State
@@ -48,22 +48,6 @@ OPTIONS = (
     "initial", "daughters", "method", "steps", "rtol", "atol", "molecules_per_unit", "name",
     "shared", "backend", "dilution",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class CircuitReport:
-    """`status` (B,): 0, or 1 where a cell's circuit could not be stepped, and `words`, by place in
-    the batch, what happened there. steps, (N,) int64: how many steps each cell's circuit took."""
-
-    status: Tensor
-    steps: Tensor
-    words: Mapping[int, str]
-    hint = (
-        "A smaller dt, or rates that stay finite and do not push a concentration below 0, may help"
-    )
-
-    def reason(self, place: int) -> str:
-        return self.words[place]
 
 
 class BoundCircuit(BoundEffect):
@@ -234,11 +218,12 @@ class BoundCircuit(BoundEffect):
 
     @property
     def by_kernels(self) -> bool:
-        return not self.by_torch and not self._not_compiled()
+        return not self._why_torch()
 
-    def _not_compiled(self) -> list[str]:
-        """Why torch computes parts of it."""
-        return [x for x in self.compiled.values() if isinstance(x, str)]
+    def _why_torch(self) -> list[str]:
+        """Why torch computes it, or parts of it."""
+        parts = [x for x in self.compiled.values() if isinstance(x, str)]
+        return [self.by_torch] if self.by_torch else parts
 
     def numerics(self, dt: float, state: State) -> list[str]:
         c = self.effect
@@ -258,10 +243,8 @@ class BoundCircuit(BoundEffect):
             f"{c.method}, {c.steps} equal step(s) of {dt / c.steps:g} h; nothing controls its error"
         )
         lines = [said.get(c.method, explicit)]
-        why = self._not_compiled()
-        lines += [f"computed by torch: {x}" for x in ([self.by_torch] * bool(self.by_torch) or why)]
-        if not self.by_torch and not why:
-            lines.append("computed by compiled functions of its equations")
+        why = [f"computed by torch: {x}" for x in self._why_torch()]
+        lines += why or ["computed by compiled functions of its equations"]
         if self._signals():
             names = ", ".join(self._signals())
             lines.append(
@@ -298,7 +281,7 @@ class BoundCircuit(BoundEffect):
             if circuit.is_stochastic
             else None
         )
-        report = _Report(state)
+        report = Failures(state)
         changed = {n: state.fields[n] for n in self.fields}
         for kind in self.rates:
             rows = _cells_of(state, kind)
@@ -395,46 +378,6 @@ def _coordinate(state: State, k: int) -> Tensor:
 
 def _time(state: State) -> Tensor:
     return state.length.new_tensor(state.time)
-
-
-class _Report:
-    """What went wrong where, gathered over the cells of all types."""
-
-    def __init__(self, state: State):
-        self.state = state
-        self.status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
-        self.steps = torch.zeros(state.cells, dtype=torch.int64, device=state.device)
-        self.words: dict[int, str] = {}
-
-    def note(
-        self,
-        cells: run.CircuitCells,
-        found: run.CircuitOutcome,
-        concentrations: Tensor,
-        method: str,
-        dt: float,
-    ) -> None:
-        state = self.state
-        self.steps = self.steps.index_copy(0, cells.rows, found.steps)
-        if not bool(found.failed.any()):
-            return
-        at = torch.nonzero(found.failed).squeeze(1)
-        owner = state.colony.index_select(0, cells.rows.index_select(0, at)).tolist()
-        for place in sorted(set(owner)):
-            mine = [k for k, o in zip(at.tolist(), owner, strict=True) if o == place]
-            row = int(cells.rows[mine[0]])
-            said = run.words(cells, found, concentrations, mine[0], method, dt)
-            kind = (
-                f" (type {int(state.fields['cell_type'][row])})"
-                if "cell_type" in state.fields
-                else ""
-            )
-            more = f"; and {len(mine) - 1} more cell(s)" if len(mine) > 1 else ""
-            self.words[place] = f"circuit of cell {int(state.uid[row])}{kind}: {said}{more}"
-            self.status[place] = 1
-
-    def report(self) -> CircuitReport:
-        return CircuitReport(self.status, self.steps, self.words)
 
 
 def _cells_of(state: State, kind: int | str) -> Tensor:

@@ -21,7 +21,7 @@ from torchfilm.circuits.names import label_of
 from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.tracing import Untraceable
-from torchfilm.effect import CIRCUIT, Binding, BoundEffect, Effect
+from torchfilm.effect import CIRCUIT, Binding, BoundEffect, Effect, shorten
 from torchfilm.effects.bound_circuit import BoundCircuit
 from torchfilm.effects.circuit_checks import (
     DIRECT,
@@ -39,7 +39,7 @@ from torchfilm.effects.circuit_checks import (
 )
 from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, Field, State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, displays
 from torchfilm.tools.numba_calls import unavailable
 from torchfilm.values import COLONY, Rule, Value, checked
 
@@ -50,7 +50,7 @@ EVERY = "every cell"  # where a circuit runs that is not given by type
 EACH_CELL = "initial[{!r}]"  # by which name the first value of a species is resolved
 
 
-@dataclass(frozen=True, init=False, eq=False)
+@dataclass(frozen=True, init=False, eq=False, repr=False)
 class Circuit(Effect):
     """Species in every cell and how they change: `Circuit(lux, species=("luxi", "ahl"), k1=1.0,
     …)`.
@@ -291,6 +291,17 @@ class Circuit(Effect):
                     " runs, by torch, if torch can compute it for all cells at once."
                 ) from why
         return found
+
+    def __repr__(self) -> str:
+        constants = "".join(f", {name}={shorten(x)}" for name, x in self.parameters.items())
+        parts = ", ".join(dict.fromkeys(label_of(part) for part in self.rates.values()))
+        return f"Circuit({parts}, species={list(self.species)}{constants})"
+
+    def _repr_html_(self) -> str:
+        rows = [(f"first {n}", shorten(x)) for n, x in self.initial.items()]
+        rows += [(n, shorten(x)) for n, x in self.parameters.items()]
+        parts = [displays.lines(a) + displays.text(b) for a, b in self.equations().items()]
+        return displays.card(self.title, displays.pairs(rows), *parts)
 
     def equations(self) -> dict[str, str]:
         """Those of `graphs`, by title."""

@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchfilm.tools.warn_once import warn
+
 if TYPE_CHECKING:
     from torchfilm.initial_cells import Cells
 
 
+WIDTHS = 0.2, 5.0  # µm, of bacteria
 LEAST = 0.01  # µm; overlaps below it are not worth a word
 
 
@@ -49,6 +52,24 @@ class Micrograph:
 def listed(labels: Sequence[str], most: int = 8) -> str:
     """Some labels as text."""
     return ", ".join(labels[:most]) + (f", … ({len(labels)} in all)" if len(labels) > most else "")
+
+
+def with_usual_widths(cells: Cells) -> Cells:
+    """The same cells; warns where their median width is not that of bacteria."""
+    if not cells.count:
+        return cells
+    width, seen = float(np.median(2 * cells.radius)), cells.micrograph
+    if not WIDTHS[0] <= width <= WIDTHS[1]:
+        hint = (
+            "Are the columns in µm? For pixels give pixel_size, in µm."
+            if seen is None
+            else f"Is pixel_size = {seen.pixel_size:g} µm right? It is not in nm."
+        )
+        warn(
+            f"the cells are {width:.3g} µm wide (median); bacteria are {WIDTHS[0]:g} to"
+            f" {WIDTHS[1]:g} µm wide. {hint}"
+        )
+    return cells
 
 
 def summarise(cells: Cells) -> str:

@@ -1,0 +1,68 @@
+"""What a step of a circuit reports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchfilm.circuits import run
+from torchfilm.state import State
+
+
+@dataclass(frozen=True)
+class CircuitReport:
+    """`status` (B,): 0, or 1 where a cell's circuit could not be stepped, and `words`, by place in
+    the batch, what happened there. steps, (N,) int64: how many steps each cell's circuit took."""
+
+    status: Tensor
+    steps: Tensor
+    words: Mapping[int, str]
+    hint = (
+        "A smaller dt, or rates that stay finite and do not push a concentration below 0, may help"
+    )
+
+    def reason(self, place: int) -> str:
+        return self.words[place]
+
+
+class Failures:
+    """What went wrong where, gathered over the cells of all types."""
+
+    def __init__(self, state: State):
+        self.state = state
+        self.status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
+        self.steps = torch.zeros(state.cells, dtype=torch.int64, device=state.device)
+        self.words: dict[int, str] = {}
+
+    def note(
+        self,
+        cells: run.CircuitCells,
+        found: run.CircuitOutcome,
+        concentrations: Tensor,
+        method: str,
+        dt: float,
+    ) -> None:
+        state = self.state
+        self.steps = self.steps.index_copy(0, cells.rows, found.steps)
+        if not bool(found.failed.any()):
+            return
+        at = torch.nonzero(found.failed).squeeze(1)
+        owner = state.colony.index_select(0, cells.rows.index_select(0, at)).tolist()
+        for place in sorted(set(owner)):
+            mine = [k for k, o in zip(at.tolist(), owner, strict=True) if o == place]
+            row = int(cells.rows[mine[0]])
+            said = run.words(cells, found, concentrations, mine[0], method, dt)
+            kind = (
+                f" (type {int(state.fields['cell_type'][row])})"
+                if "cell_type" in state.fields
+                else ""
+            )
+            more = f"; and {len(mine) - 1} more cell(s)" if len(mine) > 1 else ""
+            self.words[place] = f"circuit of cell {int(state.uid[row])}{kind}: {said}{more}"
+            self.status[place] = 1
+
+    def report(self) -> CircuitReport:
+        return CircuitReport(self.status, self.steps, self.words)
