@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -44,6 +44,8 @@ class Compiled:
     columns: tuple[str, ...]  # names that have a number for each cell
     numbers: tuple[str, ...]  # names that have one number
 
+    how: ClassVar[str] = ""  # it is computed, in words that follow its name
+
     @property
     def text(self) -> str:
         """Of the module."""
@@ -68,14 +70,13 @@ class Compiled:
         """work(first, last) for all cells, in threads where each has `least` or more. It is
         compiled by one thread, without cells; and that is said where it takes time."""
         if self.module.__name__ not in _compiled:
-            from torchfilm.kernels.compiling import announce, keep
+            from torchfilm.kernels.compiling import first_call
 
             names = ", ".join(n.partition(".")[2] for n in self.equations.variables)
-            said = announce(self.module.__name__, f"a circuit ({names}), some seconds")
-            work(0, 0)
+            what = f"a circuit ({names}){self.how}, some seconds"
+            with first_call(self.module.__name__, what):
+                work(0, 0)
             _compiled.add(self.module.__name__)
-            if said:
-                keep(self.module.__name__)
         shares_of(count, least, work)
 
     def values(

@@ -38,6 +38,8 @@ class CompiledMolecules(Compiled):
 
     network: Network
 
+    how = " molecule by molecule"
+
     @cached_property
     def text(self) -> str:  # type: ignore[override]
         made = Functions(self.equations).values()

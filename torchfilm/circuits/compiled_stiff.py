@@ -89,6 +89,8 @@ class CompiledTangents(Compiled):
     moving: tuple[str, ...]
     moving_numbers: tuple[str, ...]
 
+    how = " with derivatives"
+
     @cached_property
     def text(self) -> str:  # type: ignore[override]
         equations, size = self.equations, len(self.equations.variables)

@@ -3,6 +3,7 @@ starts from."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 import torch
@@ -50,6 +51,9 @@ def summary_table(scene: Scene, state: State, timings: Timings, seconds: float) 
         f"{'time for ' + name:<28}{s:.2f} s ({100 * s / total:.0f} %)"
         for name, s in timings.seconds.items()
     ]
+    if (kernels := sys.modules.get("torchfilm.kernels.compiling")) and kernels.seconds_spent():
+        spent = f"{kernels.seconds_spent():.1f} s of these, once for this installation"
+        lines.append(f"{'compiling':<28}{spent}")
     return "\n".join(lines)
 
 

@@ -7,6 +7,8 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,26 +81,29 @@ def _mark(name: str) -> Path | None:
     return FOLDER / f"{name.replace(', ', '-')}-{processor}.compiled"
 
 
-def is_kept(name: str) -> bool:
-    """Whether the kernels of this name, such as "2-D, float32", are in the cache."""
-    mark = _mark(name)
-    return mark is not None and mark.exists()
+# that this process has spent on compiling what was not in the cache
+_spent = [0.0]
 
 
-def keep(name: str) -> None:
-    """Note that the kernels of this name are in the cache."""
+def seconds_spent() -> float:
+    """How long this process has compiled, s."""
+    return _spent[0]
+
+
+@contextmanager
+def first_call(name: str, what: str) -> Iterator[None]:
+    """Around this process's first call of the kernels of this name, such as "2-D, float32". Says
+    that `what` has to be compiled, unless it is in the cache; then notes that it is."""
     mark = _mark(name)
+    if mark is not None and mark.exists():
+        yield
+        return
+    print(f"torchfilm: compiling {what}, once for this installation", file=sys.stderr)
+    begin = time.perf_counter()
+    yield
+    _spent[0] += time.perf_counter() - begin
     if mark is not None:
         mark.touch()
-
-
-def announce(name: str, what: str) -> bool:
-    """Say that `what` has to be compiled first, unless the kernels of this name are kept; whether
-    it was said. Call `keep` once they are."""
-    if is_kept(name):
-        return False
-    print(f"torchfilm: compiling {what}, once for this installation", file=sys.stderr)
-    return True
 
 
 def kernel(function=None, *, any_order: bool = False, inline: bool = False):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -37,14 +39,13 @@ def substeps(groups: Groups, position: Tensor, *of_cells: Tensor, longest: float
 def contact_steps(given: StepInput) -> StepResult:
     """As `one_sided.contact_steps` and `bilateral.contact_steps`."""
     from torchfilm.kernels import step as kernels
-    from torchfilm.kernels.compiling import announce, keep
+    from torchfilm.kernels.compiling import first_call
 
     dtype = given.radius.dtype
     name = f"{given.settings.dim}-D, {str(dtype).removeprefix('torch.')}"
     step_colonies, numbers = _kernel_of(given.settings)
     if isinstance(given.settings, ContactSettings):
         name = f"{name}, bilateral"
-    new = name not in _called and announce(name, f"contacts ({name}), some 20 s")
     counts = given.groups.counts
     begin, steps = offsets(counts).numpy(), given.steps.numpy()
     position, axis = given.position.clone(), given.axis.clone()
@@ -59,9 +60,9 @@ def contact_steps(given: StepInput) -> StepResult:
         *([] if isinstance(given.settings, ContactSettings) else [as_array(given.shortest, dtype)]),
         numbers, reports, (0,) * (4 if given.settings.dim == 2 else 8),
     )  # fmt: skip
-    _call(step_colonies, begin, counts.numpy(), arguments)
-    if new:
-        keep(name)
+    new = name not in _called
+    with first_call(name, f"contacts ({name}), some 20 s") if new else nullcontext():
+        _call(step_colonies, begin, counts.numpy(), arguments)
     _called.add(name)
     error = torch.from_numpy(reports[:, kernels.ERROR].copy())
     reports[:, kernels.ERROR] = 0  # may be no number; the others are integers
