@@ -247,6 +247,7 @@ def _scores(target: Target, finished: FinishedColonies) -> np.ndarray:
     return found.double().cpu().numpy()
 
 
+@tf.one_torch_thread()
 @torch.no_grad()
 def finished_colonies(
     task: Task, values: dict[str, Value], streams: tuple[int, ...]

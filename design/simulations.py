@@ -144,6 +144,7 @@ def _run_item(task: Task, item: WorkItem, first: int) -> Iterator[tuple[int, np.
         yield from _run_item(task, item.take(part), first)
 
 
+@tf.one_torch_thread()
 @torch.no_grad()
 def _grow_item(task: Task, item: WorkItem, first: int) -> list[tuple[int, np.ndarray, str]]:
     observed, each = observed_of(task), task.replicates
