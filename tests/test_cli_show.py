@@ -237,6 +237,10 @@ def test_info_of_a_scene_with_settings_and_of_a_file(command, capsys):
     Path("mine.py").write_text(OWN)
     command("info", "mine.py")
     assert capsys.readouterr().out.startswith("mine: 2-D")
+    Path("decay.ant").write_text("species A; A' = -k*A; A = 1; k = 1")
+    command("info", "decay.ant", "--set", "k=2.5")
+    out = capsys.readouterr().out
+    assert out.startswith("decay: 2-D") and "2.5" in out and "mechanics -> circuit" in out
 
 
 @pytest.mark.parametrize("name", ["a.h5", "results.dat"])

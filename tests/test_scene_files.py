@@ -313,9 +313,46 @@ def test_a_model_is_a_colony_with_its_circuit(folder, suffix):
         ({"strengt": 1.0}, "no constant 'strengt'.*'strength'"),
         ({"unread": 1.0}, "'unread' is no constant that an equation reads"),
         ({"signals": "red"}, "signals.*needs a medium"),
+        ({"initial": {"red": 1.0}}, "--set NAME=VALUE"),
     ],
 )
 def test_parameters_that_a_model_does_not_have_are_refused(folder, given, words):
     (folder / "toggle.ant").write_text(TOGGLE)
     with pytest.raises(tf.InputError, match=words):
         load_scene("toggle.ant", given)
+
+
+LACKING = "species A, B; A' = -k*A; B' = k*A - B; A = 2*k"
+
+
+def test_what_a_model_lacks_is_given_on_the_command_line(folder):
+    """No value is asked for that the settings give, and messages tell how to give one."""
+    (folder / "lacking.ant").write_text(LACKING)
+    made = load_scene("lacking.ant", {"k": 0.5, "B": 3.0})
+    circuit = next(e for e in made.effects if isinstance(e, tf.Circuit))
+    assert circuit.initial == {"A": 1.0, "B": 3.0} and circuit.parameters == {"k": 0.5}
+    with pytest.raises(tf.InputError, match=r"^lacking\.ant: .*'k' has no value: give --set k=…"):
+        load_scene("lacking.ant", {"B": 3.0})
+    with pytest.raises(tf.InputError, match=r"'B' has no first value: give --set B=…"):
+        load_scene("lacking.ant", {"k": 0.5})
+    with pytest.raises(tf.InputError, match=r"'k', so it must be one number .* by --set NAME=…"):
+        load_scene("lacking.ant", {"k": [0.5, 1.0], "B": 3.0})
+    assert load_scene("lacking.ant", {"k": [0.5, 1.0], "A": 1.0, "B": 3.0}).name == "lacking"
+
+
+def test_a_unit_of_time_is_given_on_the_command_line(folder):
+    (folder / "unit.ant").write_text("unit time_unit = metre; species A; A' = -A; A = 1")
+    with pytest.raises(tf.InputError, match=r"'metre' is no .*, as --set time_unit=s "):
+        load_scene("unit.ant", {})
+    assert load_scene("unit.ant", {"time_unit": "min"}).name == "unit"
+
+
+def test_a_model_with_signals_needs_a_medium(folder):
+    sensing = tf.Circuit.from_antimony(
+        "compartment c = 1, o = 1; species s in o, A in c; A = 1; s = 0; J: A -> s; c*A",
+        signals={"s": "ahl"},
+    )
+    sensing.to_sbml(folder / "sensing.xml")
+    words = r"sensing\.xml has signals \('ahl'\).*from_sbml\('sensing\.xml'\) and tf\.Medium\(ahl="
+    with pytest.raises(tf.InputError, match=words):
+        load_scene("sensing.xml", {})

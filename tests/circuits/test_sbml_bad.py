@@ -102,7 +102,7 @@ MODELS = {
         + "</listOfReactions>",
         2, 4,
     ),
-    "in 'rate of A': the formula uses 'delay'": sbml(
+    "in the rate of 'A': the formula uses 'delay'": sbml(
         HEAD + RATE.format(
             '<apply><csymbol encoding="text"'
             ' definitionURL="http://www.sbml.org/sbml/symbols/delay">delay</csymbol>'
@@ -210,11 +210,15 @@ ANTIMONY = {
     "species A\nA' = -k*A\nk = = 2": "the Antimony text, line 3: syntax error",
     "": "the Antimony text is empty",
     " \n": "the Antimony text is empty",
-    "toggle.ant": "looks like the name of a file",
+    "toggle.ant": r"looks like the name of a file: .*from_antimony\(Path\('toggle\.ant'\)\)",
+    "my models/toggle.xml": r"the name of a file: .*from_sbml\(Path\('my models/toggle\.xml'\)\)",
+    "<?xml version='1.0'?>\n<sbml>" + "x" * 500: r"looks like SBML .*from_sbml\(path\)",
     'model m\nimport "other.ant"\nend': "line 2: import reads another file",
     "species A\0; A' = 1": "zero byte",
     "species A; A = 1": None,
-    "species A; A = 1; at (A > 2): A = 1; A' = 1": "the event '.+' is not supported",
+    "species A; A = 1; at (A > 2): A = 1; A' = 1": r"an event without a name, at \(A > 2\), is",
+    "species A; A = 1; cut: at (A > 2): A = 1; A' = 1": "the event 'cut' is not supported",
+    "species A; A' = 1; A = 2*k; k = 3*j": "in the first value of 'k': the parameter 'j' has no",
 }
 
 
@@ -223,8 +227,41 @@ def test_antimony_that_cannot_be_read_is_refused_with_its_line(text):
     if ANTIMONY[text] is None:
         assert tf.Circuit.from_antimony(text).species == ("A",)
         return
-    with pytest.raises(tf.InputError, match=ANTIMONY[text]):
+    with pytest.raises(tf.InputError, match=ANTIMONY[text]) as error:
         tf.Circuit.from_antimony(text)
+    assert len(str(error.value)) < 250  # a text that is given is not echoed
+
+
+PLAIN = "species A; A' = -k*A; A = 1; k = 1"
+
+
+def test_a_file_in_antimony_is_read_by_its_path(tmp_path):
+    path = tmp_path / "decay.ant"
+    path.write_text(PLAIN)
+    assert tf.Circuit.from_antimony(path).parameters == {"k": 1.0}
+    path.write_text(PLAIN + "\nk = = 2")
+    with pytest.raises(tf.InputError, match=r"decay\.ant, line 2: syntax error"):
+        tf.Circuit.from_antimony(path)
+    path.write_text(TOGGLE)
+    with pytest.raises(tf.InputError, match=r"decay\.ant looks like SBML .*from_sbml"):
+        tf.Circuit.from_antimony(path)
+
+
+def test_what_is_no_sbml_file_says_what_reads_it(tmp_path):
+    path = tmp_path / "decay.ant"
+    path.write_text(PLAIN)
+    for given, words in (
+        (path, r"decay\.ant is no SBML: it looks like Antimony, .*from_antimony\(Path\('"),
+        (str(path), r"decay\.ant is no SBML: it looks like Antimony"),
+        (TOGGLE, r"path of a file, and not its text, .*: save the text in a file\.$"),
+        (PLAIN + "\n" + "#" * 900, r"path of a file, and not its text.*from_antimony\(text\)"),
+        (3, "path = 3 is not allowed: it must be the path of an SBML file"),
+    ):
+        with pytest.raises(tf.InputError, match=words) as error:
+            tf.Circuit.from_sbml(given)
+        assert len(str(error.value)) < 200 + 2 * len(str(path))
+    with pytest.raises(tf.InputError, match="text = None .* or the Path of its file"):
+        tf.Circuit.from_antimony(None)
 
 
 @pytest.mark.parametrize(

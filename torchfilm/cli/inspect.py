@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from torchfilm.cli.model_files import is_model
 from torchfilm.cli.scene_files import load_scene, parse_setting
 from torchfilm.cli.threads import use_threads
 from torchfilm.explanation import explain
@@ -27,15 +28,14 @@ class Info:
     results file contains."""
 
     what: Annotated[str, tyro.conf.Positional]
-    """Scene name, Python file, saved design, or results file."""
+    """Scene name, Python file, model (.xml, .sbml, .ant), saved design, or results file."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE."""
 
     def __call__(self) -> None:
         path = Path(self.what)
-        if path.suffix in (".h5", ".hdf5") or (
-            path.suffix not in (".py", ".json") and path.is_file()
-        ):
+        is_scene = path.suffix in (".py", ".json") or is_model(path)
+        if path.suffix in (".h5", ".hdf5") or (path.is_file() and not is_scene):
             return self._of_results()
         scene = load_scene(self.what, dict(map(parse_setting, self.set)))
         # binding tries the rules and circuits, which shows what they read and write
@@ -76,7 +76,7 @@ class Explain:
     is not simulated, and an estimate of time and memory."""
 
     scene: Annotated[str, tyro.conf.Positional]
-    """Scene name, Python file or saved design."""
+    """Scene name, Python file, model (.xml, .sbml, .ant) or saved design."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE."""
     cells: int = 1000
@@ -118,7 +118,7 @@ class Tune:
     with many settings, and compares each with a far more accurate run. It takes some minutes."""
 
     scene: Annotated[str, tyro.conf.Positional]
-    """Scene name, Python file or saved design."""
+    """Scene name, Python file, model (.xml, .sbml, .ant) or saved design."""
     error: str = "1%"
     """Greatest relative error of the observed quantities, such as 1% or 0.01."""
     set: list[str] = field(default_factory=list)

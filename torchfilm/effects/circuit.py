@@ -187,7 +187,7 @@ class Circuit(Effect):
     @classmethod
     def from_antimony(
         cls,
-        text: str,
+        text: str | Path,
         *,
         signals: Sequence[str] | Mapping[str, str] = (),
         properties: Mapping[str, str] | None = None,
@@ -197,13 +197,14 @@ class Circuit(Effect):
         dilution: bool | Sequence[str] = True,
         **options: Any,
     ) -> Circuit:
-        """The circuit of a model as Antimony text. Keywords and errors as of `from_sbml`."""
+        """The circuit of a model in Antimony: its text, or the `Path` of a file. Keywords and errors
+        as of `from_sbml`."""
         from torchfilm.effects import circuit_sbml
 
         choices = circuit_sbml.model_choices(
             signals, properties, without, time_unit, initial, options, OPTION_NAMES
         )
-        model = circuit_sbml.from_antimony(text)
+        model = circuit_sbml.read_antimony(text)
         return cls(**circuit_sbml.keywords(*model, choices, dilution, options))
 
     def to_sbml(

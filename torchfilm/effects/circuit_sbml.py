@@ -20,13 +20,33 @@ if TYPE_CHECKING:
 
 
 def read_file(path: str | Path) -> tuple[str, str]:
-    """A model's text and what to call it in messages."""
-    return sbml.decoded(sbml.read_bytes(path), str(path)), str(path)
+    """The text of an SBML file and what to call it in messages. Raises InputError for what is no
+    path, and for a file in Antimony."""
+    if not isinstance(path, (str, Path)):
+        raise checks.input_error("path", path, "the path of an SBML file")
+    if isinstance(path, str) and ("\n" in path or path.lstrip().startswith("<")):
+        of_text = "Circuit.from_antimony(text) reads text"
+        hint = of_text if sbml.looks_like_antimony(path) else "save the text in a file"
+        raise checks.InputError(
+            f"Circuit.from_sbml takes the path of a file, and not its text, which begins"
+            f" {sbml.shortened(path, 40)!r}: {hint}."
+        )
+    text = sbml.decoded(sbml.read_bytes(path), str(path))
+    if sbml.looks_like_antimony(text):
+        raise checks.InputError(
+            f"{path} is no SBML: it looks like Antimony, which"
+            f" Circuit.from_antimony(Path({str(path)!r})) reads."
+        )
+    return text, str(path)
 
 
-def from_antimony(text: str) -> tuple[str, str]:
-    """The same model in SBML, and what to call it in messages."""
-    where = "the Antimony text"
+def read_antimony(text: str | Path) -> tuple[str, str]:
+    """A model in Antimony, as text or a file, in SBML, and what to call it in messages."""
+    if not isinstance(text, (str, Path)):
+        raise checks.input_error("text", text, "a model in Antimony, or the Path of its file")
+    where = str(text) if isinstance(text, Path) else "the Antimony text"
+    if isinstance(text, Path):
+        text = sbml.decoded(sbml.read_bytes(text), where)
     return sbml.antimony_to_sbml(text, where), where
 
 

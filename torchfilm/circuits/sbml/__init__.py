@@ -1,11 +1,12 @@
 """Circuits from SBML and Antimony, and back: models of systems biology in their standard form."""
 
+from torchfilm.circuits.sbml.antimony_text import looks_like_antimony
 from torchfilm.circuits.sbml.antimony_text import to_sbml as antimony_to_sbml
-from torchfilm.circuits.sbml.document import decoded, read_bytes
-from torchfilm.circuits.sbml.reading import Description, Given, describe
+from torchfilm.circuits.sbml.document import decoded, read_bytes, shortened
+from torchfilm.circuits.sbml.reading import Description, Given, describe, variable_names
 from torchfilm.circuits.sbml.writing import sbml_text, write
 
 __all__ = [
-    "Description", "Given", "antimony_to_sbml", "decoded", "describe", "read_bytes", "sbml_text",
-    "write",
+    "Description", "Given", "antimony_to_sbml", "decoded", "describe", "looks_like_antimony",
+    "read_bytes", "sbml_text", "shortened", "variable_names", "write",
 ]  # fmt: skip

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import re
 
-from torchfilm.circuits.sbml.document import needed
+from torchfilm.circuits.sbml.document import needed, shortened
 from torchfilm.tools.checks import InputError
 
+SUFFIXES, XML = (".ant", ".antimony"), (".xml", ".sbml")
+# What a line of a model has: a reaction, a rate rule, or the beginning of a model.
+STATEMENT = re.compile(r"->|=>|^\s*\w+\s*'\s*=|^\s*\*?(model|module|species)\b", re.MULTILINE)
 COMMENTS = re.compile(r"/\*.*?\*/|//[^\n]*|#[^\n]*", re.DOTALL)
 IMPORT = re.compile(r"(?:^|[\n;])\s*import\b")
 ERROR = re.compile(r"Error in model string, line (\d+):\s*", re.DOTALL)
+
+
+def looks_like_antimony(text: str) -> bool:
+    """Whether a text that is no XML is probably a model in Antimony."""
+    return not text.lstrip().startswith("<") and STATEMENT.search(text) is not None
 
 
 def to_sbml(text: str, where: str) -> str:
@@ -17,17 +25,24 @@ def to_sbml(text: str, where: str) -> str:
 
     Raises InputError, with the line, for text that is no Antimony, and for what reads other files.
     """
-    if not isinstance(text, str):
-        raise InputError(f"{where} must be text, and is {type(text).__name__}.")
     if not text.strip():
         raise InputError(f"{where} is empty.")
     if "\0" in text:
         raise InputError(f"{where} is no text: it has a zero byte.")
-    # a name of a file is a statement, too: a model without anything in it
-    if not re.search(r"[\s;=>]", text.strip()):
+    if text.lstrip().startswith("<"):
         raise InputError(
-            f"{where} is {text.strip()!r}, which looks like the name of a file: give the text that"
-            " is in it."
+            f"{where} looks like SBML (it begins {shortened(text, 40)!r}): read the file with"
+            " Circuit.from_sbml(path)."
+        )
+    # a name of a file is a statement, too: a model without anything in it
+    name = text.strip()
+    is_name = not re.search(r"[\s;=>]", name)
+    if is_name or ("\n" not in name and name.lower().endswith((*SUFFIXES, *XML))):
+        reader = "from_sbml" if name.lower().endswith(XML) else "from_antimony"
+        raise InputError(
+            f"{where} is {shortened(name)!r}, which looks like the name of a file: give"
+            f" Circuit.{reader}(Path({shortened(name)!r})), with Path of pathlib, or the text that is"
+            " in it."
         )
     plain = COMMENTS.sub(lambda found: "\n" * found[0].count("\n"), text)
     found = IMPORT.search(plain)

@@ -3,6 +3,7 @@ refused with its line or its id."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -16,6 +17,7 @@ EXTRA = 'pip install "torchfilm[sbml]"'
 MAX_DEPTH = 250
 OWN_PACKAGES = ("l3v2extendedmath",)  # functions of Level 3 Version 2, which libsbml calls one
 DRAWINGS = ("layout", "render")  # packages that change no number
+UNNAMED_EVENT = r"_E\d+"  # what Antimony calls an event without a name
 ENCODINGS = ("utf-8", "ascii", "us-ascii")  # SBML is UTF-8, of which ASCII is a part
 # Errors of libsbml in names of units, which convert nothing; those of time are read by `units`.
 UNITS = (10313, *range(20217, 20222))
@@ -27,6 +29,12 @@ def needed(module: str, package: str) -> Any:
         return import_module(module)
     except ImportError as error:
         raise InputError(f"this needs {package}: {EXTRA}.") from error
+
+
+def shortened(text: str, most: int = 60) -> str:
+    """A text of the user's on one line, for messages."""
+    line = " ".join(text.split())
+    return line if len(line) <= most else line[: most - 1] + "…"
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -154,6 +162,18 @@ def name_of(thing: Any, place: int = 0) -> str:
     return repr(own) if own else f"number {place + 1}"
 
 
+def _event(event: Any) -> str:
+    """An event by its id, or by its trigger where the user gave it no name."""
+    own = event.getIdAttribute()
+    if own and not re.fullmatch(UNNAMED_EVENT, own):
+        return f"the event {own!r}"
+    trigger = event.getTrigger()
+    if trigger is None or not trigger.isSetMath():
+        return "an event without a name"
+    formula = needed("libsbml", "python-libsbml").formulaToL3String(trigger.getMath())
+    return f"an event without a name, at ({shortened(formula)}),"
+
+
 def _unsupported(document: Any, model: Any) -> Iterator[str]:
     """What the model has that torchfilm does not simulate, each named with its id."""
     packages = document.getNumPlugins() if document.getLevel() > 2 else 0
@@ -168,7 +188,7 @@ def _unsupported(document: Any, model: Any) -> Iterator[str]:
             yield f"it needs the package {prefix}, which torchfilm does not read"
     for k, event in enumerate(model.getListOfEvents()):
         late = " with a delay" if event.isSetDelay() else ""
-        yield f"the event {name_of(event, k)}{late} is not supported: torchfilm has no events"
+        yield f"{_event(event)}{late} is not supported: torchfilm has no events"
     for k, rule in enumerate(model.getListOfRules()):
         if rule.isAlgebraic():
             yield (

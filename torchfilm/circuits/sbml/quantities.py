@@ -127,20 +127,22 @@ class Quantities:
     def value(self, name: str) -> Term:
         """What an id stands for in a formula."""
         if name not in self._known:
-            self._known[name] = self._guarded(name, lambda: self._value(name))
+            self._known[name] = self._guarded(repr(name), name, lambda: self._value(name))
         return self._known[name]
 
-    def _guarded(self, name: str, work: Callable[[], Any]) -> Any:
-        if name in self._open:
-            loop = [*self._open[self._open.index(name) :], name]
+    def _guarded(self, what: str, name: str, work: Callable[[], Any]) -> Any:
+        """What `work` returns. what: what it works out of the id `name`, in words, for messages."""
+        if what in self._open:
+            loop = [*self._open[self._open.index(what) :], what]
             raise InputError(f"these depend on each other: {' → '.join(loop)}")
-        self._open.append(name)
+        self._open.append(what)
         try:
             return work()
         except InputError as error:
-            if not str(error).startswith(("in ", "these ")):
-                raise InputError(f"in {name!r}: {error}") from error
-            raise
+            said = str(error)
+            if said.startswith(("in ", "these ")) or repr(name) in said:  # it says where
+                raise
+            raise InputError(f"in {what}: {error}") from error
         finally:
             self._open.pop()
 
@@ -254,9 +256,9 @@ class Quantities:
 
     def rate(self, name: str) -> float | Expression:
         """The rate of a variable, in the model's time."""
-        key = f"rate of {name}"
+        key = f"the rate of {name!r}"
         if key not in self._known:
-            self._known[key] = self._guarded(key, lambda: self._rate(name))
+            self._known[key] = self._guarded(key, name, lambda: self._rate(name))
         return numeric(self.builder, self._known[key])
 
     def _rate(self, name: str) -> Term:
@@ -300,7 +302,8 @@ class Quantities:
     def first(self, name: str) -> float:
         """The value of a quantity at the start, as a number."""
         if name not in self._first:
-            self._first[name] = self._guarded(f"first {name}", lambda: self._first_value(name))
+            what = f"the first value of {name!r}"
+            self._first[name] = self._guarded(what, name, lambda: self._first_value(name))
         return self._first[name]
 
     def _first_value(self, name: str) -> float:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,8 +61,24 @@ def describe(text: str, where: str, given: Given) -> Description:
 
     Raises InputError, naming the file and the element, for what cannot be read or simulated.
     """
+    with _named(where):
+        document, quantities, marks = _opened(text, where, given)
+        return _describe(document, quantities, marks, given)
+
+
+def variable_names(text: str, where: str, given: Given) -> list[str]:
+    """The names of a model's variables, as its circuit will have them, without any value of the
+    model. Errors as of `describe`."""
+    with _named(where):
+        quantities = _opened(text, where, given)[1]
+        return [quantities.column(n) for n in quantities.variables()]
+
+
+@contextmanager
+def _named(where: str) -> Iterator[None]:
+    """Errors of a model begin with the name of its file."""
     try:
-        return _describe(text, where, given)
+        yield
     except RecursionError as error:
         raise InputError(f"{where}: a formula is nested too deeply, or calls itself.") from error
     except InputError as error:
@@ -71,15 +88,15 @@ def describe(text: str, where: str, given: Given) -> Description:
         raise InputError(f"{where}: {said.rstrip('.')}.") from error
 
 
-def _describe(text: str, where: str, given: Given) -> Description:
+def _opened(text: str, where: str, given: Given) -> tuple[Any, Quantities, own_marks.Marks]:
+    """libsbml's document, which must be kept, and the quantities of its model."""
     document = open_model(text, where)
     model = document.getModel()
     units.check_laws(model)
     builder = Builder()
     marks = own_marks.of(model)
     rename = {**_renamed(model, given), **marks.names}
-    back = {new: old for old, new in rename.items()}
-    by_id = lambda found: {back.get(n, n): x for n, x in found.items()}
+    by_id = _by_id(rename)
     per_hour = units.hours(model, given.time_unit)
     choices = Choices(
         signals=_signals(model, {**marks.signals, **given.signals}),
@@ -92,7 +109,19 @@ def _describe(text: str, where: str, given: Given) -> Description:
         cell_time=marks.cell_time,
     )
     formulas = Formulas(builder, _functions(model, builder))
-    quantities = Quantities(model, builder, formulas, choices)
+    return document, Quantities(model, builder, formulas, choices), marks
+
+
+def _by_id(rename: Mapping[str, str]) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+    """A function from values by name in the circuit to values by id in the model."""
+    back = {new: old for old, new in rename.items()}
+    return lambda found: {back.get(n, n): x for n, x in found.items()}
+
+
+def _describe(
+    document: Any, quantities: Quantities, marks: own_marks.Marks, given: Given
+) -> Description:
+    model, builder, per_hour = quantities.model, quantities.builder, quantities.choices.per_hour
     variables = _ordered(quantities)
     rates = {n: _per_hour(quantities, quantities.rate(n)) for n in variables}
     releases = dict(_releases(quantities, variables, bool(marks)))
@@ -103,13 +132,13 @@ def _describe(text: str, where: str, given: Given) -> Description:
         names[TIME], initial[TIME] = TIME, 0.0
     if not names:
         raise InputError("nothing in the model changes: it has no reaction and no rate rule")
-    _check_given(quantities, given, by_id)
+    _check_given(quantities, given)
     made = {names[n]: e for n, e in rates.items() if not e.is_number(0)}
     species = tuple(names.values())
     things = quantities.things
     diluted = [new for old, new in names.items() if old in things and things[old][0] == SPECIES]
     return Description(
-        Equations.of(model.getIdAttribute() or "model", species, made, releases),
+        Equations.of(_title(model), species, made, releases),
         species,
         initial,
         _constants(quantities, [*made.values(), *releases.values()], bool(marks)),
@@ -117,6 +146,12 @@ def _describe(text: str, where: str, given: Given) -> Description:
         quantities,
         document,
     )
+
+
+def _title(model: Any) -> str:
+    """What a circuit's messages call the model; Antimony calls one without a name __main."""
+    own = model.getIdAttribute()
+    return own if own and own != "__main" else "model"
 
 
 def _renamed(model: Any, given: Given) -> dict[str, str]:
@@ -297,7 +332,7 @@ def _constants(quantities: Quantities, rates: Sequence[Expression], ours: bool) 
     return {n: x for n, x in columns.items() if ours or n in read}
 
 
-def _check_given(quantities: Quantities, given: Given, by_id: Any) -> None:
+def _check_given(quantities: Quantities, given: Given) -> None:
     """Raise InputError for a value that nothing reads."""
     names = {quantities.column(n): n for n in quantities.things}
     constants = [quantities.column(n) for n in quantities.constants]
