@@ -9,7 +9,7 @@ import pytest
 from cell_scripts import DIVIDE, GROWS, HEAD, INIT, SETUP, UPDATE, signalling, written
 
 import torchfilm as tf
-from torchfilm.cellmodeller import is_script, loading
+from torchfilm.cellmodeller import is_script
 
 SLOW = "ignore:.*runs cell by cell:UserWarning"
 
@@ -114,11 +114,24 @@ def test_no_cell_and_no_init(tmp_path):
 
 
 @pytest.mark.parametrize("where", ["body = CLB", "cell.plasmids = 6", "import math"])
-def test_a_loop_for_ever_is_stopped(tmp_path, monkeypatch, where):
-    monkeypatch.setattr(loading, "SETUP_SECONDS", 0.2)
+def test_a_loop_for_ever_is_stopped(tmp_path, where):
     at = "" if where == "import math" else "\n    "
-    text = GROWS.replace(where, f"while True:{at or chr(10)}    pass{at or chr(10)}{where}")
-    assert "was stopped after 0.2 s" in refused(tmp_path, text)
+    text = GROWS.replace(where, f"while True: pass{at or chr(10)}{where}")
+    path = written(tmp_path, text)
+    line = line_of(text, "while True")
+    words = rf"^model\.py, line {line}: .* was stopped here after 0\.2 s\. .*--set seconds=1\.2"
+    with pytest.raises(tf.InputError, match=words):
+        tf.from_cellmodeller(path, seconds=0.2)
+
+
+def test_a_slow_script_may_take_longer(tmp_path):
+    text = GROWS.replace("import math", "import math, time; time.sleep(0.3)")
+    path = written(tmp_path, text)
+    with pytest.raises(tf.InputError, match=r"line 2: loading was stopped here after 0\.1 s"):
+        tf.from_cellmodeller(path, seconds=0.1)
+    assert tf.from_cellmodeller(path, seconds=60.0).name == "model"
+    with pytest.raises(tf.InputError, match="seconds = 0 is not allowed"):
+        tf.from_cellmodeller(path, seconds=0)
 
 
 def test_nothing_of_a_refused_script_stays(tmp_path):
@@ -314,8 +327,8 @@ def test_a_truth_value_may_become_a_number(tmp_path, loop):
 @pytest.mark.parametrize(
     "rates, words",
     [
-        ("for (int i=0; i<2; i++) rates[i] = 0;", "line 3 of its text: 'for' is not supported"),
-        ("#define K 2", "line 3 of its text: '#define K 2' is not supported"),
+        ("for (int i=0; i<2; i++) rates[i] = 0;", "'for' is not supported"),
+        ("#define K 2", "'#define K 2' is not supported"),
         ("rates[2] = 0;", "'rates[2]' is not supported: it has 2, counted from 0"),
         ("rates[0] = k9;", "'k9' is not supported: this name is not declared"),
         ("rates[0] = lgamma(2.0f);", "'lgamma(…)' is not supported: known are exp"),
@@ -333,7 +346,32 @@ def test_rates_by_line(tmp_path, rates, words):
     text = signalling().replace("rates[0] = 0;", rates)
     with pytest.raises(tf.InputError) as found:
         tf.from_cellmodeller(written(tmp_path, text)).bind()
-    assert words in str(found.value) and "specRateCL()" in str(found.value)
+    said = str(found.value)
+    assert words in said
+    after = "}" in words or ";" in words  # what is missing is noticed on a line below
+    line = line_of(text, rates) + after
+    assert said.startswith(f"model.py, line {line}: specRateCL(): ")
+
+
+def test_rates_that_the_file_does_not_hold_are_named_by_their_own_line(tmp_path):
+    together = 3 * "'" + " + 'wh' + 'ile (1) rates[1] = 0;' + " + 3 * "'"
+    text = signalling().replace("rates[0] = 0;", together).replace(" % 2.0", "").replace("%g", "2")
+    with pytest.raises(tf.InputError, match=r"^model\.py: specRateCL\(\), line 3 of its text: 'wh"):
+        tf.from_cellmodeller(written(tmp_path, text))
+
+
+def test_rates_that_stand_in_the_file_as_they_are_have_its_line(tmp_path):
+    """Also where a line stands there twice."""
+    whole = signalling().replace(" % 2.0", "").replace("%g", "2.0") + "# while (1)\n"
+    text = whole.replace("rates[0] = 0;", "rates[0] = 0;\n    while (1)")
+    said = refused(tmp_path, text)
+    assert said.startswith(f"model.py, line {line_of(text, 'while (1)')}: specRateCL(): 'while'")
+
+
+@pytest.mark.parametrize("name", ["specRateCL", "sigRateCL"])
+def test_rates_without_a_text_are_refused(tmp_path, name):
+    text = signalling().replace(f"def {name}():", f"def {name}():\n    return\n")
+    assert f"{name}() returned NoneType" in refused(tmp_path, text)
 
 
 def test_two_numbers_of_signals(tmp_path):

@@ -260,7 +260,7 @@ def test_what_is_no_sbml_file_says_what_reads_it(tmp_path):
         with pytest.raises(tf.InputError, match=words) as error:
             tf.Circuit.from_sbml(given)
         assert len(str(error.value)) < 200 + 2 * len(str(path))
-    with pytest.raises(tf.InputError, match="text = None .* or the Path of its file"):
+    with pytest.raises(tf.InputError, match=r"text = None .* or the Path of its file"):
         tf.Circuit.from_antimony(None)
 
 

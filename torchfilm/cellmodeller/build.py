@@ -10,7 +10,7 @@ import numpy as np
 
 from torchfilm.cellmodeller import draws
 from torchfilm.cellmodeller.columns import ColumnRule, Uneven
-from torchfilm.cellmodeller.loading import Script, importing, load
+from torchfilm.cellmodeller.loading import SECONDS, Script, importing, load
 from torchfilm.cellmodeller.rates import SIGNAL, SPECIES, TextRates
 from torchfilm.cellmodeller.rehearsal import rehearse
 from torchfilm.cellmodeller.script_rules import ScriptRules
@@ -43,21 +43,29 @@ BOUNDARIES = ("constant", "reflect", "nearest", "wrap")
 
 
 def from_cellmodeller(
-    path: str | Path, *, loop: str = "auto", contacts: str = "one-sided", method: str = "rosenbrock"
+    path: str | Path,
+    *,
+    loop: str = "auto",
+    contacts: str = "one-sided",
+    method: str = "rosenbrock",
+    seconds: float = SECONDS,
 ) -> Scene:
     """The scene of a CellModeller 4 script, which runs as Python: its file, `setup(sim)`, and in
     each step `update(cells)` and `divide(parent, d1, d2)`.
 
     loop: "columns", `update` acts on all cells at once; "cells", one cell after the other, which is
     slow; "auto", columns where the loop is plain. contacts: as for `Mechanics`. method: of
-    `Circuit`. Raises InputError, with the line of the script, for what is not supported.
+    `Circuit`. seconds: that the script may take to be loaded, and each function in a rehearsal
+    before the run; then it is stopped, with the line where it was. Raises InputError, with the line
+    of the script, for what is not supported.
     """
     checks.choice("loop", loop, LOOPS)
     path = Path(path)
     if not path.is_file():
         raise checks.input_error("script", str(path), "the path of a Python file", "No such file.")
     try:
-        return _scene(load(path), loop, contacts, method)
+        limit = checks.number("seconds", seconds, above=0.0)
+        return _scene(load(path, limit), loop, contacts, method)
     except InputError as error:
         if str(error).startswith(path.name):
             raise
@@ -213,22 +221,39 @@ def _chemistry(script: Script, method: str) -> list[Effect]:
     integrator, grid = script.request.integrator, script.request.grid
     if integrator is None:
         return []
-    texts: list[str | None] = []
-    for name, wanted in (("specRateCL", True), ("sigRateCL", grid is not None)):
-        function = script.function(name)
-        if wanted and function is None:
-            raise InputError(
-                f"{script.path.name}: {integrator['kind']} needs the function {name}()."
-            )
-        with draws.kept(), importing(script), script.errors(f"{name}()"):
-            texts.append(function() if wanted and function is not None else None)
+    kind = integrator["kind"]
+    species_text = _text_of(script, "specRateCL", kind)
+    signals_text = None if grid is None else _text_of(script, "sigRateCL", kind)
     volume = (
         None if grid is None else float(math.prod(_vector("GridDiffusion: size", grid["size"])))
     )
     count = integrator["species"]
-    rates = TextRates(texts[0], texts[1], count, grid["signals"] if grid else 0, volume)
+    rates = TextRates(
+        species_text,
+        signals_text,
+        count,
+        grid["signals"] if grid else 0,
+        volume,
+        script.path.name,
+        script.text,
+    )
     circuit = Circuit(rates, species=[SPECIES.format(k) for k in range(count)], method=method)
     return [circuit] if grid is None else [circuit, _medium(integrator, grid)]
+
+
+def _text_of(script: Script, name: str, kind: str) -> str:
+    """The OpenCL text that a function of a script returns. kind: the integrator, which needs it."""
+    function = script.function(name)
+    if function is None:
+        raise InputError(f"{script.path.name}: {kind} needs the function {name}().")
+    with draws.kept(), importing(script), script.errors(f"{name}()"), script.limited():
+        text = function()
+    if not isinstance(text, str):
+        raise InputError(
+            f"{script.path.name}: {name}() returned {type(text).__name__}: it must return OpenCL"
+            " text."
+        )
+    return text
 
 
 def _medium(integrator: dict[str, Any], grid: dict[str, Any]) -> Medium:

@@ -22,7 +22,7 @@ from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.warn_once import warn
 
-SETUP_SECONDS = 60.0  # that a script may take to be set up, and each function in its rehearsal
+SECONDS = 10.0  # that a script may take to be set up, and each function in its rehearsal
 FUNCTIONS = ("setup", "init", "update")
 # Random numbers that no call can seed anew.
 OTHER_RANDOM = re.compile(
@@ -35,13 +35,15 @@ OLD = re.compile(r"^\s*print\s+[^(\s=]", re.MULTILINE)
 @dataclass
 class Script:
     """A script that has been set up. text: its source. request: what it asked for. dt: h. helpers:
-    modules that it imports from its folder, which no other script sees."""
+    modules that it imports from its folder, which no other script sees. seconds: that it may take
+    to be set up, and each function in its rehearsal."""
 
     path: Path
     text: str
     module: ModuleType
     request: stand_ins.Request
     dt: float
+    seconds: float = SECONDS
     helpers: dict[str, ModuleType] = field(default_factory=dict)
 
     def function(self, name: str) -> Callable[..., Any] | None:
@@ -58,20 +60,20 @@ class Script:
         """Whether a word stands in the source."""
         return re.search(rf"\b{re.escape(name)}\b", self.text) is not None
 
-    @staticmethod
-    def limited() -> AbstractContextManager[None]:
-        """Within, the script may take SETUP_SECONDS."""
-        return time_limit(SETUP_SECONDS)
+    def limited(self) -> AbstractContextManager[None]:
+        """Within, the script may take `seconds`."""
+        return time_limit(self.seconds)
 
     @contextmanager
     def errors(self, doing: str) -> Iterator[None]:
         """Raise InputError, with the line of the script, for what fails within."""
         try:
             yield
-        except TooLong:
+        except TooLong as error:
             raise InputError(
-                f"{self.path.name} was stopped after {SETUP_SECONDS:g} s in {doing}: does it loop"
-                " for ever?"
+                f"{self._at(error)}: {doing} was stopped here after {self.seconds:g} s. Does it"
+                f" loop for ever? Otherwise let it take longer: --set seconds={6 * self.seconds:g},"
+                f" or from_cellmodeller(…, seconds={6 * self.seconds:g})."
             ) from None
         except SystemExit as error:
             raise InputError(f"{self._at(error)}: {doing} ends the program.") from error
@@ -102,8 +104,9 @@ def is_script(path: Path) -> bool:
     return all(re.search(rf"^def\s+{name}\s*\(", text, re.MULTILINE) for name in FUNCTIONS)
 
 
-def load(path: Path) -> Script:
-    """Run a script and its `setup(sim)`. Raises InputError, with the line, for what is refused."""
+def load(path: Path, seconds: float = SECONDS) -> Script:
+    """Run a script and its `setup(sim)`. seconds: that it may take. Raises InputError,
+    with the line, for what is refused."""
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -111,7 +114,7 @@ def load(path: Path) -> Script:
     module = ModuleType(path.stem)
     module.__file__ = str(path)
     request = stand_ins.Request()
-    script = Script(path, text, module, request, stand_ins.DT)
+    script = Script(path, text, module, request, stand_ins.DT, seconds)
     code = _compiled(path, text)
     sim = stand_ins.Simulator(request, module)
     with draws.kept(), importing(script), script.errors("loading"):

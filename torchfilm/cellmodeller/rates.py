@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.cellmodeller.rates_text import Node, parse, refusal
+from torchfilm.cellmodeller.rates_text import Node, Origin, parse, refusal
 from torchfilm.tools.hashing import digest
 
 SPECIES, SIGNAL = "species{}", "signal{}"  # names of the fields
@@ -76,7 +76,7 @@ class TextRates:
     species_text, signals_text: what `specRateCL` and `sigRateCL` return; None, there is none.
     grid_volume: of a voxel, µm³. CellModeller adds the rate of a signal, conc/h, to the voxels
     around a cell; here the medium gets the amount, rate · grid_volume, conc·µm³/h. A rate that the
-    text does not set is 0.
+    text does not set is 0. name, source: of the script, for messages.
     """
 
     __name__ = "specRateCL"  # by which the scene shows it
@@ -88,9 +88,15 @@ class TextRates:
         species: int,
         signals: int,
         grid_volume: float | None,
+        name: str = "",
+        source: str = "",
     ):
-        given = ((species_text, "specRateCL"), (signals_text, "sigRateCL"))
-        self.trees = [None if text is None else parse(text, owner) for text, owner in given]
+        self.origins = [
+            Origin("specRateCL", species_text or "", name, source),
+            Origin("sigRateCL", signals_text or "", name, source),
+        ]
+        given = zip((species_text, signals_text), self.origins, strict=True)
+        self.trees = [None if text is None else parse(origin) for text, origin in given]
         self.species, self.signals, self.grid_volume = species, signals, grid_volume
         self._word = digest(species_text, signals_text, species, signals, grid_volume)
 
@@ -101,11 +107,11 @@ class TextRates:
         inside, outside = self.trees
         rates: dict[str, Any] = {}
         if inside is not None:
-            run = _Run(self, u, s, cell, "specRateCL", self.species)
+            run = _Run(self, u, s, cell, self.origins[0], self.species)
             rates = {SPECIES.format(k): v for k, v in run.rates(inside).items()}
         if outside is None:
             return rates
-        run = _Run(self, u, s, cell, "sigRateCL", self.signals)
+        run = _Run(self, u, s, cell, self.origins[1], self.signals)
         found = run.rates(outside).items()
         return rates, {SIGNAL.format(k): v * self.grid_volume for k, v in found}
 
@@ -113,7 +119,7 @@ class TextRates:
 class _Run:
     """One evaluation of a text, on columns over cells."""
 
-    def __init__(self, text: TextRates, u: Any, s: Any, cell: Any, owner: str, count: int):
+    def __init__(self, text: TextRates, u: Any, s: Any, cell: Any, owner: Origin, count: int):
         self.text, self.u, self.s, self.cell = text, u, s, cell
         self.owner, self.count = owner, count
         self.like = u[SPECIES.format(0)]

@@ -39,20 +39,45 @@ class Node:
 
 
 @dataclass(frozen=True)
+class Origin:
+    """Where a text comes from, for messages. function: that returned it. name, source: of the
+    script and what stands in it, where they are known."""
+
+    function: str
+    text: str
+    name: str = ""
+    source: str = ""
+
+    def place(self, line: int) -> str:
+        """A line of the text, from 1; as a line of the script, if it stands there as it is."""
+        found = self._in_source(line)
+        if found is not None:
+            return f"{self.name}, line {found}: {self.function}()"
+        of_script = f"{self.name}: " if self.name else ""
+        return f"{of_script}{self.function}(), line {line} of its text"
+
+    def _in_source(self, line: int) -> int | None:
+        if self.text and self.source.count(self.text) == 1:
+            return self.source[: self.source.index(self.text)].count("\n") + line
+        # a text that was put together: the line alone
+        wanted = self.text.split("\n")[line - 1].strip()
+        same = [k for k, x in enumerate(self.source.split("\n"), 1) if wanted and wanted in x]
+        return same[0] if len(same) == 1 else None
+
+
+@dataclass(frozen=True)
 class Token:
     kind: str
     text: str
     line: int
 
 
-def parse(text: str, owner: str) -> Node:
-    """The block of statements in a text. owner: the function that returned it, for messages."""
-    if not isinstance(text, str):
-        raise InputError(f"{owner}() returned {type(text).__name__}: it must return OpenCL text.")
-    return _Parser(_tokens(text, owner), owner).block_to_end()
+def parse(owner: Origin) -> Node:
+    """The block of statements in a text."""
+    return _Parser(_tokens(owner.text, owner), owner).block_to_end()
 
 
-def _tokens(text: str, owner: str) -> list[Token]:
+def _tokens(text: str, owner: Origin) -> list[Token]:
     blank = lambda found: "\n" * found.group().count("\n") + " "
     plain = re.sub(r"/\*.*?\*/|//[^\n]*", blank, text, flags=re.DOTALL)
     found = []
@@ -72,15 +97,15 @@ def _tokens(text: str, owner: str) -> list[Token]:
     return found
 
 
-def refusal(owner: str, line: int, what: str, hint: str) -> InputError:
+def refusal(owner: Origin, line: int, what: str, hint: str) -> InputError:
     """The error for a part of the text that is not supported."""
-    return InputError(f"{owner}(), line {line} of its text: {what!r} is not supported: {hint}.")
+    return InputError(f"{owner.place(line)}: {what!r} is not supported: {hint}.")
 
 
 class _Parser:
     """Recursive descent over the tokens."""
 
-    def __init__(self, tokens: list[Token], owner: str):
+    def __init__(self, tokens: list[Token], owner: Origin):
         last = tokens[-1].line if tokens else 1
         self.tokens, self.at, self.owner = (
             [*tokens, Token("end", "end of the text", last)],

@@ -38,7 +38,7 @@ class ScriptRules(Effect):
     writes_anything = True
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_again, (str(self.script.path), self.loop))
+        return (_again, (str(self.script.path), self.loop, self.script.seconds))
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         return (CELL_TYPE, *(v.declared() for v in self.layout.variables.values()))
@@ -52,9 +52,9 @@ class ScriptRules(Effect):
         return (BoundScript(self, binding), ScriptDivision(self, binding))
 
 
-def _again(path: str, loop: str) -> ScriptRules:
+def _again(path: str, loop: str, seconds: float) -> ScriptRules:
     """The effect of a script that is loaded again, for another process."""
     from torchfilm.cellmodeller.build import script_rules
     from torchfilm.cellmodeller.loading import load
 
-    return script_rules(load(Path(path)), loop)
+    return script_rules(load(Path(path), seconds), loop)

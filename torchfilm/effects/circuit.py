@@ -197,8 +197,8 @@ class Circuit(Effect):
         dilution: bool | Sequence[str] = True,
         **options: Any,
     ) -> Circuit:
-        """The circuit of a model in Antimony: its text, or the `Path` of a file. Keywords and errors
-        as of `from_sbml`."""
+        """The circuit of a model in Antimony: its text, or the `Path` of a file. Keywords and
+        errors as of `from_sbml`."""
         from torchfilm.effects import circuit_sbml
 
         choices = circuit_sbml.model_choices(

@@ -40,9 +40,8 @@ def to_sbml(text: str, where: str) -> str:
     if is_name or ("\n" not in name and name.lower().endswith((*SUFFIXES, *XML))):
         reader = "from_sbml" if name.lower().endswith(XML) else "from_antimony"
         raise InputError(
-            f"{where} is {shortened(name)!r}, which looks like the name of a file: give"
-            f" Circuit.{reader}(Path({shortened(name)!r})), with Path of pathlib, or the text that is"
-            " in it."
+            f"{where} is {shortened(name)!r}, which looks like the name of a file: read it with"
+            f" Circuit.{reader}(Path({shortened(name)!r})), or give the text that is in it."
         )
     plain = COMMENTS.sub(lambda found: "\n" * found[0].count("\n"), text)
     found = IMPORT.search(plain)

@@ -186,7 +186,7 @@ def _unsupported(document: Any, model: Any) -> Iterator[str]:
         prefix = document.getUnknownPackagePrefix(k)
         if document.getPackageRequired(prefix):
             yield f"it needs the package {prefix}, which torchfilm does not read"
-    for k, event in enumerate(model.getListOfEvents()):
+    for event in model.getListOfEvents():
         late = " with a delay" if event.isSetDelay() else ""
         yield f"{_event(event)}{late} is not supported: torchfilm has no events"
     for k, rule in enumerate(model.getListOfRules()):
