@@ -46,23 +46,27 @@ def test_the_command_in_a_shell(run, tmp_path):
 def test_every_format(run, tmp_path, capsys):
     def export(name, **options):
         Export(run, tmp_path / name, **options)()
-        return [line.rpartition("/")[2] for line in capsys.readouterr().out.split()]
+        lines = capsys.readouterr().out.splitlines()
+        return [line.rpartition("/")[2] for line in lines if not line.startswith("label masks")]
 
     with tf.Results(run) as results:
         tree, table, frames = results.lineage(), results.table(-1), len(results)
         count = len(table["cell"])
-        assert export("a.vtkhdf", frames=[-1]) == ["a.vtkhdf", "a_signals.vtkhdf"]
+        assert export("a.vtkhdf", frames=["-1"]) == ["a.vtkhdf", "a_signals.vtkhdf"]
         assert len(polydata(tmp_path / "a.vtkhdf", 0)["Polygons"]) == 60 * count
         assert export("a.nwk", colonies=[1]) == ["a.nwk"]
         assert (tmp_path / "a.nwk").read_text() == tree.to_newick(1)
         assert export("a.graphml") == ["a.graphml"]
-        assert len(networkx.read_graphml(tmp_path / "a.graphml")) == len(tree)
+        graph = networkx.read_graphml(tmp_path / "a.graphml")
+        assert len(graph) == len(tree)
+        keys = sorted((node["colony"], node["cell"]) for _, node in graph.nodes(data=True))
+        assert keys == sorted(zip(tree.colony.tolist(), tree.cell.tolist(), strict=True))
     assert export("a.tif", colonies=[1], pixel_size=0.1) == ["a.tif"]
     masks = tifffile.imread(tmp_path / "a.tif")
     assert masks.shape[0] == frames
     assert len(np.unique(masks[-1])) == 1 + (table["colony"] == 1).sum()
     assert export(
-        "a.ome.tif", colonies=[1], pixel_size=0.1, channels=["gfp=10"], noise=0.0, frames=[-1],
+        "a.ome.tif", colonies=[1], pixel_size=0.1, channels=["gfp=10"], noise=0.0, frames=["-1"],
         window=[-10.0, -10.0, 10.0, 10.0],
     ) == ["a.ome.tif"]  # fmt: skip
     image = tifffile.imread(tmp_path / "a.ome.tif")
@@ -73,12 +77,52 @@ def test_every_format(run, tmp_path, capsys):
     assert "displacement_0" in (tmp_path / "a.csv").read_text().splitlines()[0]
 
 
+@pytest.mark.parametrize("name", ["a.tif", "a.ome.tif"])
+def test_images_say_what_they_are(run, tmp_path, name, capsys):
+    given = {"colonies": [1], "pixel_size": 0.2, "frames": ["0"]}
+    Export(run, tmp_path / name, **given)()
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].endswith(name) and len(said) == 2
+    assert said[1].startswith("label masks") and "--channels" in said[1]
+    Export(run, tmp_path / name, **given, channels=["gfp=10"], overwrite=True)()
+    assert len(capsys.readouterr().out.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "given, places",
+    [
+        (["1:3"], slice(1, 3)),
+        ([":2", "-1"], [0, 1, -1]),
+        (["::2"], slice(None, None, 2)),
+        (["-2:"], slice(-2, None)),
+        (["1:999"], slice(1, None)),
+    ],
+)
+def test_frames_are_numbers_and_ranges(run, tmp_path, given, places):
+    Export(run, tmp_path / "a.csv", frames=given)()
+    with open(tmp_path / "a.csv") as file:
+        found = list(dict.fromkeys(int(row["frame"]) for row in csv.DictReader(file)))
+    with tf.Results(run) as results:
+        assert found == np.arange(len(results))[places].tolist()
+
+
+def test_a_range_of_frames_in_a_shell(run, tmp_path):
+    done = shell("export", run, "a.csv", "--frames=-2:", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
+        ("a.csv", {"frames": ["2:x"]}, r"--frames = '2:x'.*START:STOP"),
+        ("a.csv", {"frames": ["1:2:3:4"]}, r"--frames = '1:2:3:4'.*START:STOP"),
+        ("a.csv", {"frames": ["1:5:0"]}, r"--frames = '1:5:0'.*START:STOP"),
+        ("a.csv", {"frames": ["800:"]}, r"--frames = '800:'.*at least one of the frames 0 to"),
+        ("a.csv", {"frames": ["900"]}, r"frames = \[900\].*each from"),
+        ("a.csv", {"frames": ["::-1"]}, r"in the order of time"),
         ("a.png", {}, r"OUT = .*\.csv, \.nwk, \.graphml, \.vtkhdf, \.tif, \.tiff"),
         ("a.csv", {"noise": 0.0}, r"--noise: not for a\.csv, which holds the table"),
-        ("a.nwk", {"frames": [0]}, r"--frames: not for a\.nwk, which holds the lineage"),
+        ("a.nwk", {"frames": ["0"]}, r"--frames: not for a\.nwk, which holds the lineage"),
         ("a.nwk", {"colonies": [0, 1]}, r"--colonies = \[0, 1\].*one colony"),
         ("a.tif", {}, "an image needs --pixel-size"),
         ("a.tif", {"pixel_size": 0.1}, "has the colonies 0, 1: say which"),

@@ -43,8 +43,9 @@ class Export:
     """Results file."""
     out: Annotated[Path, tyro.conf.Positional]
     """The new file: NAME.csv, .vtkhdf, .tif, .ome.tif, .nwk or .graphml."""
-    frames: list[int] = field(default_factory=list)
-    """Which frames, such as --frames 0 10 -1; by default all. (Not .nwk, .graphml.)"""
+    frames: list[str] = field(default_factory=list)
+    """Which frames, such as --frames 0 10 -1, or ranges START:STOP or START:STOP:STEP as in Python,
+    such as --frames 2:5 or --frames=-3:; by default all. (Not .nwk, .graphml.)"""
     colonies: list[int] = field(default_factory=list)
     """Which colonies, by their ids; by default all. Images need one, if the run has several; .nwk
     and .graphml take one or all. (Not .csv.)"""
@@ -99,6 +100,10 @@ class Export:
         with Results(self.file) as results:
             for path in writers[form](results):
                 print(path)
+        if form == "label masks":
+            print(
+                "label masks, in which a cell is its number + 1; for fluorescence give --channels"
+            )
 
     def _check_options(self, form: str) -> None:
         """Raise InputError for options that this format does not have."""
@@ -117,9 +122,13 @@ class Export:
                 f"{flags}: not for {self.out.name}, which holds {_content(form)}.{hint}"
             )
 
-    @property
-    def _frames(self) -> list[int] | None:
-        return self.frames or None
+    def _frames(self, results: Results) -> list[int] | None:
+        """The numbers of the chosen frames; None, all."""
+        if not self.frames:
+            return None
+        count = len(results)
+        chosen = [k for text in self.frames for k in _numbered(text, count, results.path)]
+        return check_frames(count, chosen, results.path)
 
     def _one(self) -> int | None:
         """The colony of an image or a lineage."""
@@ -129,7 +138,7 @@ class Export:
 
     def _table(self, results: Results) -> list[Path]:
         path = self._new(results, TABLE)
-        frames = check_frames(len(results), self._frames, results.path)
+        frames = check_frames(len(results), self._frames(results), results.path)
         tables = Tables(results, results.lineage(), self.internals)
         with written_whole(path) as beside:
             for number, k in enumerate(
@@ -156,21 +165,21 @@ class Export:
         return results.to_vtkhdf(
             self.out,
             colonies=self.colonies or None,
-            frames=self._frames,
+            frames=self._frames(results),
             rods=self.rods or "capsules",
             overwrite=self.overwrite,
         )
 
     def _labels(self, results: Results) -> list[Path]:
-        return [results.to_labels(self.out, z=self.z, **self._pages())]
+        return [results.to_labels(self.out, z=self.z, **self._pages(results))]
 
     def _fluorescence(self, results: Results) -> list[Path]:
         names = ("blur", "noise", "background", "offset", "profile", "seed")
         light = {n: getattr(self, n) for n in names if getattr(self, n) is not None}
         gains = dict(map(_gain, self.channels))
-        return [results.to_ome_tiff(self.out, channels=gains, **self._pages(), **light)]
+        return [results.to_ome_tiff(self.out, channels=gains, **self._pages(results), **light)]
 
-    def _pages(self) -> dict[str, Any]:
+    def _pages(self, results: Results) -> dict[str, Any]:
         if self.pixel_size is None:
             raise InputError("an image needs --pixel-size, µm, such as --pixel-size 0.065.")
         if len(self.window) not in (0, 4):
@@ -180,13 +189,30 @@ class Export:
         return {
             "pixel_size": self.pixel_size,
             "colony": self._one(),
-            "frames": self._frames,
+            "frames": self._frames(results),
             "window": (self.window[:2], self.window[2:]) if self.window else None,
             "overwrite": self.overwrite,
         }
 
     def _new(self, results: Results, suffix: str) -> Path:
         return check_new_file(self.out, (suffix,), self.overwrite, results.path)
+
+
+def _numbered(text: str, count: int, path: Path) -> list[int]:
+    """The frames that a word of --frames names, of a file with `count`."""
+    parts = text.split(":")
+    try:
+        numbers = [int(p) if p.strip() or len(parts) == 1 else None for p in parts]
+        if len(numbers) == 1:
+            return [int(text)]
+        found = list(range(count)[slice(*numbers)])
+    except (ValueError, TypeError):
+        rule = "numbers of frames, or ranges START:STOP or START:STOP:STEP, such as 0 or 2:5"
+        raise checks.input_error("--frames", text, rule) from None
+    if not found:
+        rule = f"a range with at least one of the frames 0 to {count - 1} of {path}"
+        raise checks.input_error("--frames", text, rule)
+    return found
 
 
 def _gain(text: str) -> tuple[str, float]:

@@ -107,10 +107,13 @@ class Lineage:
 
     def to_networkx(self, colony: int | None = None) -> Any:
         """The trees of one colony, or of all, as a networkx.DiGraph from mother to daughter. Nodes
-        are (colony, cell), with born, ended (h) and fate."""
+        are (colony, cell), with the attributes colony, cell, born, ended (h) and fate."""
         graph = needed("networkx", "tables").DiGraph()
         for row in self._of(colony):
+            colony_id, cell = self._node(row)
             about = {
+                "colony": colony_id,
+                "cell": cell,
                 "born": float(self.born[row]),
                 "ended": float(self.ended[row]),
                 "fate": str(self.fate[row]),
