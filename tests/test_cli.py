@@ -135,6 +135,22 @@ def test_a_scene_file_of_ones_own(command):
         assert results.recipe is None and results.attributes["scene"].startswith("mine:")
 
 
+def test_the_picture_of_a_model_shows_its_first_species(command, monkeypatch):
+    Path("decay.ant").write_text("species A, B; A' = -A; B' = A; A = 1; B = 0")
+    drawn = []
+    show = tf.pictures.show
+
+    def watched(*arguments, **options):
+        drawn.append(options["colour"])
+        return show(*arguments, **options)
+
+    monkeypatch.setattr(tf.pictures, "show", watched)
+    command("run", "decay.ant", "--until", 0.3)
+    command("resume", "decay.h5", "--scene", "decay.ant", "--until", 0.5)
+    command("run", "microcolony", "--until", 0.3)
+    assert drawn == ["A", "A", None]
+
+
 def test_a_scene_file_may_hold_the_scene_itself_and_import_its_neighbours(command):
     Path("parts.py").write_text("RATE = 0.25\n")
     Path("mine.py").write_text(
