@@ -82,10 +82,27 @@ def _find(name: str) -> tuple[str, Any]:
             thing = members[word]
         else:
             return PREFIX[package] + ".".join(rest), thing
-    last = {n.split(".")[-1].lower(): n for n in known}
+    inside = dict(_members_inside()) if len(rest) == 1 else {}
+    meant = [n for n in inside if n.split(".")[-1] == rest[-1]]
+    if len(meant) == 1:
+        return meant[0], inside[meant[0]]
+    last = {n.split(".")[-1].lower(): n for n in [*inside, *known]}
     near = checks.nearest(rest[-1].lower(), last)
     hint = f"Did you mean {last[near]}?" if near else "`torchfilm help` lists them."
+    if meant:
+        hint = f"Did you mean {', '.join(meant[:-1])} or {meant[-1]}?"
     raise checks.input_error("name", name, "a public name of torchfilm or design", hint)
+
+
+def _members_inside() -> Iterator[tuple[str, Any]]:
+    """The members of public classes and modules by their titles; a method that a class has from a
+    public base is named there only."""
+    for package in PACKAGES:
+        for name, thing in _members(import_module(package)):
+            of_bases = {n for base in _public_bases(thing).values() for n, _ in _members(base)}
+            for own, member in _members(thing):
+                if own not in of_bases:
+                    yield f"{PREFIX[package]}{name}.{own}", member
 
 
 def _members(thing: Any) -> Iterator[tuple[str, Any]]:
