@@ -100,10 +100,7 @@ class NeuralPosterior:
 def require_sbi() -> None:
     """Raises InputError where the package sbi is missing."""
     if find_spec("sbi") is None:
-        raise tf.InputError(
-            "inference needs the package sbi, which is not installed: pip install"
-            ' "torchfilm[infer]"'
-        )
+        raise tf.InputError(f"inference needs the package sbi: {tf.checks.install('infer')}.")
 
 
 class _NoTracker:

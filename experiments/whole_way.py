@@ -15,7 +15,7 @@
 
 All files are in the folder --out; whole_way.png shows the colonies. Look at masks.png too: the
 cells that were read, drawn over the masks. Requires
-pip install "torchfilm[app,design,images,tables,sbml]".
+pip install -e ".[app,design,images,tables,sbml]".
 """
 
 from __future__ import annotations
@@ -150,27 +150,52 @@ def draw(path: Path, cells: list[tf.Cells], fitted: Best, best: Best) -> None:
     figure.savefig(path)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def read(masks: Path, frame: int, pixel_size: float) -> tf.Cells:
+    """The cells of one frame of the masks. Ends the program where they cannot be read."""
+    try:
+        return tf.Cells.from_masks(masks, frame=frame, pixel_size=pixel_size, centre=True)
+    except tf.InputError as error:
+        raise SystemExit(
+            f"whole_way.py: {error} The fit needs two frames of the masks (--masks): say which by"
+            " --frames FIRST LAST."
+        ) from None
+
+
+class Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """The text above as it is, and the defaults."""
+
+
+def chosen() -> argparse.Namespace:
+    """The options of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=Help)
+    parser.add_argument(
+        "--masks",
+        type=Path,
+        default=argparse.SUPPRESS,
+        help="your label images, a stack (default: made here)",
     )
-    parser.add_argument("--masks", type=Path, help="your label images, a stack; default: made here")
     parser.add_argument("--pixel-size", type=float, default=PIXEL, help="µm a pixel")
     parser.add_argument("--frame-hours", type=float, default=FRAME_HOURS, help="h between frames")
     parser.add_argument("--frames", type=int, nargs=2, default=(5, 9), help="of the fit, from 0")
     parser.add_argument(
         "--colonies", type=int, default=480, help="of the fit; half as many of the design"
     )
-    parser.add_argument("--out", type=Path, default=Path("runs/whole_way"))
-    options = parser.parse_args()
+    parser.add_argument("--out", type=Path, default=Path("runs/whole_way"), help="folder of files")
+    options = parser.parse_args(namespace=argparse.Namespace(masks=None))
+    if not 0 <= options.frames[0] < options.frames[1]:
+        parser.error("--frames: give the earlier frame first, both counted from 0.")
+    return options
+
+
+def main() -> None:
+    options = chosen()
     out, (first, last) = options.out, options.frames
     out.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
     masks = options.masks or out / "masks.tif"
     if options.masks is None:
         make_masks(masks, last, options.frame_hours, options.pixel_size)
-    read = lambda k: tf.Cells.from_masks(masks, frame=k, pixel_size=options.pixel_size, centre=True)
-    cells = [read(first), read(last)]
+    cells = [read(masks, k, options.pixel_size) for k in (first, last)]
     hours = (last - first) * options.frame_hours
     for k, found in zip((first, last), cells, strict=True):
         print(f"frame {k}\n{found.summary()}\n")

@@ -279,6 +279,8 @@ def test_the_same_frame_makes_the_same_picture(recorded, tmp_path):
     ("options", "message"),
     [
         ({"colour": "nonsense"}, r"colour.*'nonsense'.*angle.*length"),
+        ({"colour": "lenght"}, r"colour = 'lenght'.*Did you mean 'length'\?"),
+        ({"color": "length"}, r"show has no parameter 'color'\. Did you mean colour\?"),
         ({"colour": "position"}, r"colour.*'position'"),
         ({"view": "up"}, r"view.*'up'.*'xy'"),
         ({"view": "xz"}, r"view.*'xz'.*2-D"),
@@ -289,6 +291,21 @@ def test_what_cannot_be_drawn_is_reported(recorded, tmp_path, options, message):
     with pytest.raises(tf.InputError, match=message):
         tf.show(recorded, out=tmp_path / "a.png", **options)
     assert not (tmp_path / "a.png").exists()
+
+
+def test_internal_quantities_are_not_listed_but_drawn(tmp_path):
+    scene = tf.scenes.microcolony()
+    path = tmp_path / "run.h5"
+    *_, state = tf.simulate(scene, until=0.2, record=path)
+    hidden = [f.name for f in state.declared.values() if f.internal]
+    with tf.Results(path) as results:
+        drawable = [n for n in hidden if results.frame()[n].ndim == 1]
+    assert drawable
+    for what in (path, state):
+        with pytest.raises(tf.InputError, match="growth_rate") as error:
+            tf.show(what, colour="nonsense")
+        assert not [n for n in hidden if n in str(error.value)]
+        assert tf.show(what, colour=drawable[0])
 
 
 def test_a_frame_without_cells_is_reported(tmp_path):

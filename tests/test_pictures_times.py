@@ -366,7 +366,7 @@ def test_a_film_that_cannot_be_made_is_reported(run, tmp_path, out, options, mes
 
 def test_mp4_names_what_it_needs(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(tf.InputError, match=r"imageio-ffmpeg.*torchfilm\[movie\].*\.gif"):
+    with pytest.raises(tf.InputError, match=r'imageio-ffmpeg.*pip install -e "\.\[movie\]".*\.gif'):
         tf.pictures.movie(run, tmp_path / "a.mp4")
     assert list(tmp_path.iterdir()) == []
 

@@ -196,9 +196,9 @@ def test_a_missing_extra_is_named(whole, monkeypatch):
     real = builtins.__import__
     monkeypatch.setattr("torchfilm.io.table.import_module", no_pandas)
     with tf.Results(whole[0]) as results:
-        with pytest.raises(tf.InputError, match=r'pandas: pip install "torchfilm\[tables\]"'):
+        with pytest.raises(tf.InputError, match=r'pandas: pip install -e "\.\[tables\]"'):
             results.to_pandas()
-        with pytest.raises(tf.InputError, match=r'networkx: pip install "torchfilm\[tables\]"'):
+        with pytest.raises(tf.InputError, match=r'networkx: pip install -e "\.\[tables\]"'):
             results.lineage().to_networkx()
 
 

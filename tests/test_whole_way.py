@@ -8,6 +8,7 @@ from importlib import util
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pandas as pd
 import pytest
 import tifffile
@@ -15,15 +16,53 @@ import tifffile
 SCRIPT = Path(__file__).parents[1] / "experiments" / "whole_way.py"
 
 
-@pytest.mark.slow
-def test_masks_become_a_fit_a_design_and_files(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def whole_way(monkeypatch):
+    """The script's `main`, as it runs with arguments."""
     spec = util.spec_from_file_location("whole_way", SCRIPT)
-    whole_way = util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "whole_way", whole_way)
-    spec.loader.exec_module(whole_way)
-    arguments = ["--frames", "3", "5", "--colonies", "16", "--out", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", ["whole_way.py", *arguments])
-    whole_way.main()
+    module = util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "whole_way", module)
+    spec.loader.exec_module(module)
+
+    def run(*arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["whole_way.py", *arguments])
+        module.main()
+
+    return run
+
+
+def test_masks_of_one_frame_are_refused_in_words(tmp_path, whole_way):
+    labels = np.zeros((60, 60), dtype=np.uint16)
+    labels[20:32, 10:50] = 1
+    tifffile.imwrite(tmp_path / "single.tif", labels)
+    given = ["--masks", str(tmp_path / "single.tif"), "--out", str(tmp_path / "out")]
+    with pytest.raises(
+        SystemExit, match=r"frame = 5 .*single\.tif has 1 frame.* --frames FIRST LAST"
+    ):
+        whole_way(*given)
+    with pytest.raises(SystemExit, match=r"none\.tif cannot be read: No such file.*--masks"):
+        whole_way("--masks", str(tmp_path / "none.tif"), "--out", str(tmp_path / "out"))
+
+
+def test_the_options_of_the_whole_way(whole_way, capsys):
+    with pytest.raises(SystemExit):
+        whole_way("--help")
+    said = " ".join(capsys.readouterr().out.split())
+    for words in (
+        "(default: made here)",
+        "(default: 0.065)",
+        "(default: (5, 9))",
+        "(default: 480)",
+    ):
+        assert words in said
+    with pytest.raises(SystemExit):
+        whole_way("--frames", "9", "5")
+    assert "the earlier frame first" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_masks_become_a_fit_a_design_and_files(tmp_path, whole_way, capsys):
+    whole_way("--frames", "3", "5", "--colonies", "16", "--out", str(tmp_path))
 
     said = capsys.readouterr().out
     rate = json.loads((tmp_path / "fit.json").read_text())["parameters"]["rate"]

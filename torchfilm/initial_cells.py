@@ -256,8 +256,9 @@ class Cells:
 
         image: an array (rows, columns) of whole numbers; a file .tif, .png or .npy (of Omnipose or
         Cellpose: NAME_cp_masks.tif); or a results file .nc of DeLTA. pixel_size: µm a pixel. frame:
-        of a stack. The centre of the first pixel is the origin, x goes to the right and y up, so
-        that cells have y ≤ 0. centre: move the mean of the centres to the origin.
+        of a stack, −1 is the last; of DeLTA, the number that it gave. The centre of the first pixel
+        is the origin, x goes to the right and y up, so that cells have y ≤ 0. centre: move the mean
+        of the centres to the origin.
 
         Regions smaller than least_area pixels ("tiny") or in several "pieces" raise InputError.
         Regions at the "border" of the image, or of which over 15 % of the area is outside of the

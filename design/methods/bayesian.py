@@ -41,8 +41,7 @@ class Bayesian(Turns):
             whole("Bayesian.first", self.first, least=2)
         if find_spec("botorch") is None:
             raise checks.InputError(
-                "Bayesian needs the package botorch, which is not installed: pip install"
-                ' "torchfilm[bayes]".'
+                f"Bayesian needs the package botorch: {checks.install('bayes')}."
             )
 
     def _begin(self) -> None:

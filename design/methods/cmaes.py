@@ -56,10 +56,7 @@ class CMAES(Turns):
         for name in ("restarts", "noisy"):
             checks.choice(f"CMAES.{name}", getattr(self, name), (True, False))
         if find_spec("cma") is None:
-            raise checks.InputError(
-                "CMAES needs the package cma, which is not installed: pip install"
-                ' "torchfilm[design]".'
-            )
+            raise checks.InputError(f"CMAES needs the package cma: {checks.install('design')}.")
 
     def _begin(self) -> None:
         space = self._started()

@@ -30,10 +30,7 @@ class NSGA2(Turns):
     def __post_init__(self) -> None:
         whole("NSGA2.population", self.population, least=4)
         if find_spec("pymoo") is None:
-            raise checks.InputError(
-                "NSGA2 needs the package pymoo, which is not installed: pip install"
-                ' "torchfilm[pareto]".'
-            )
+            raise checks.InputError(f"NSGA2 needs the package pymoo: {checks.install('pareto')}.")
 
     def _begin(self) -> None:
         self._points = _different(sobol_points(self._started(), self._seed, 0, self.population))

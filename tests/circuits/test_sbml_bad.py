@@ -269,5 +269,5 @@ def test_what_is_no_sbml_file_says_what_reads_it(tmp_path):
 )
 def test_a_missing_extra_is_named(module, package, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(tf.InputError, match=rf'{package}: pip install "torchfilm\[sbml\]"'):
+    with pytest.raises(tf.InputError, match=rf'{package}: pip install -e "\.\[sbml\]"'):
         tf.Circuit.from_antimony(QUORUM)

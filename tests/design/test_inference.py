@@ -221,5 +221,5 @@ def test_too_many_failures_are_refused(data, monkeypatch):
 
 def test_without_sbi_the_error_names_the_extra(monkeypatch, data):
     monkeypatch.setattr("design.neural_posterior.find_spec", lambda name: None)
-    with pytest.raises(tf.InputError, match=r"torchfilm\[infer\]"):
+    with pytest.raises(tf.InputError, match=r'pip install -e "\.\[infer\]"'):
         infer(colony, RATE, data)

@@ -215,13 +215,13 @@ def test_a_new_cloud_trusts_small_colonies_again():
 
 def test_without_botorch_the_error_names_the_extra(monkeypatch):
     monkeypatch.setattr("design.methods.bayesian.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r'pip install "torchfilm\[bayes\]"'):
+    with pytest.raises(InputError, match=r'pip install -e "\.\[bayes\]"'):
         Bayesian()
 
 
 def test_without_cma_the_error_names_the_extra(monkeypatch):
     monkeypatch.setattr("design.methods.cmaes.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r'pip install "torchfilm\[design\]"'):
+    with pytest.raises(InputError, match=r'pip install -e "\.\[design\]"'):
         CMAES()
 
 

@@ -150,7 +150,14 @@ def test_a_frame_of_a_stack(tmp_path):
     assert read(tmp_path / "stack.tif", frame=1).position[0, 0] == pytest.approx(3.0, abs=0.02)
     with pytest.raises(tf.InputError, match=r"stack\.tif has 2 frames.*from 0 to 1"):
         read(tmp_path / "stack.tif")
-    with pytest.raises(tf.InputError, match=r"frame = 2 .*from 0 to 1"):
+    last = read(tmp_path / "stack.tif", frame=-1)
+    assert np.array_equal(last.position, read(tmp_path / "stack.tif", frame=1).position)
+    first = read(stack, frame=-2).position
+    assert np.array_equal(first, read(stack, frame=0).position)
+    assert not np.array_equal(first, last.position)
+    with pytest.raises(tf.InputError, match=r"frame = -3 .*from -2 to 1: .* has 2 frames"):
+        read(tmp_path / "stack.tif", frame=-3)
+    with pytest.raises(tf.InputError, match=r"frame = 2 .*from -2 to 1: .* has 2 frames"):
         read(tmp_path / "stack.tif", frame=2)
     with pytest.raises(tf.InputError, match=r"frame = 'a'.*whole number"):
         read(stack, frame="a")
@@ -319,8 +326,8 @@ def test_files_of_other_kinds_are_reported(tmp_path, name, message):
 def test_the_extra_is_named_where_it_is_missing(monkeypatch, tmp_path):
     tifffile.imwrite(tmp_path / "masks.tif", masked())
     monkeypatch.setitem(__import__("sys").modules, "tifffile", None)
-    with pytest.raises(tf.InputError, match=r"torchfilm\[images\]"):
+    with pytest.raises(tf.InputError, match=r'pip install -e "\.\[images\]"'):
         read(tmp_path / "masks.tif")
     monkeypatch.setitem(__import__("sys").modules, "skimage.measure", None)
-    with pytest.raises(tf.InputError, match=r"torchfilm\[images\]"):
+    with pytest.raises(tf.InputError, match=r'pip install -e "\.\[images\]"'):
         read(masked())

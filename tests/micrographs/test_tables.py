@@ -346,6 +346,13 @@ BAD = {
     ),
     "a column that is no name": (ONE, {"columns": {"x": 3}}, r"columns\['x'\] = 3"),
     "fields": (ONE, {"fields": 3}, r"fields = 3.*names of columns"),
+    "a required column of text": (
+        table(length=["abc", "abc"]),
+        {},
+        r"column 'length': 'abc' is not a number \(in 2 of 2 rows\)\. This column is needed",
+    ),
+    "a radius of text": (table(radius=["abc", "abc"]), {}, r"'radius'.*Leave the column out"),
+    "a cell without a length": (table(length=[1.0, math.nan]), {}, r"'length'.*such cells out"),
     "a field of text": (table(strain=["a", "b"]), {}, r"'strain'.*Leave the column out"),
     "caps": (ONE, {"length_with_caps": "yes"}, r"length_with_caps = 'yes'.*True, False"),
     "centre": (ONE, {"centre": "x"}, r"centre = 'x'"),

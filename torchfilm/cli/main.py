@@ -9,7 +9,7 @@ import sys
 import warnings
 from typing import Any
 
-from torchfilm.tools.checks import InputError, SimulationError
+from torchfilm.tools.checks import InputError, SimulationError, install
 from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.warn_once import once
 
@@ -22,9 +22,7 @@ try:
     from torchfilm.cli.run import Resume, Run
     from torchfilm.cli.show import Show
 except ImportError as missing:  # pragma: no cover - depends on what is installed
-    raise SystemExit(
-        f'The command line needs {missing.name}: pip install "torchfilm[app]".'
-    ) from missing
+    raise SystemExit(f"The command line needs {missing.name}: {install('app')}.") from missing
 
 COMMANDS: dict[str, type[Any]] = {
     "run": Run,

@@ -283,6 +283,7 @@ class Results:
         """Every cell that ever lived, as arrays and as a tree."""
         return Lineage(self)
 
+    @checks.known_keywords
     def to_vtkhdf(
         self,
         path: str | Path,
@@ -305,6 +306,7 @@ class Results:
 
         return write_vtkhdf(self, path, colonies, frames, rods, overwrite)
 
+    @checks.known_keywords
     def to_labels(
         self,
         path: str | Path,
@@ -331,6 +333,7 @@ class Results:
         view = view_of(self, pixel_size, colony, frames, window, z, section=True)
         return write_labels(view, path, overwrite)
 
+    @checks.known_keywords
     def to_ome_tiff(
         self,
         path: str | Path,

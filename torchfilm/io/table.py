@@ -12,7 +12,7 @@ import torch
 from torchfilm.io.parameters import column_names
 from torchfilm.physics import capsule
 from torchfilm.state import OUTSIDE
-from torchfilm.tools.checks import InputError
+from torchfilm.tools.checks import InputError, install
 
 if TYPE_CHECKING:
     from torchfilm.io.lineage import Lineage
@@ -36,7 +36,7 @@ def needed(module: str, extra: str, package: str = "") -> Any:
         return import_module(module)
     except ImportError as error:
         name = package or module
-        raise InputError(f'this needs {name}: pip install "torchfilm[{extra}]".') from error
+        raise InputError(f"this needs {name}: {install(extra)}.") from error
 
 
 def data_frame(columns: dict[str, np.ndarray]) -> Any:

@@ -103,7 +103,7 @@ def table_cells(table: Table, reading: Reading) -> dict[str, Any]:
     for name in ("cell_type", "colony"):
         if (column := reading.named.get(name, name)) in table.columns:
             used.add(column)
-            found[name] = table.numbers(column)
+            found[name] = table.numbers(column, optional=True)
         elif name in reading.named:
             raise table.missing(column)
     _check_labels(table, label, found.get("colony"))
@@ -211,7 +211,7 @@ def _own_columns(
         if unit == "px":
             by.add(("pixels", ""))
         used.add(column[0])
-        values = table.numbers(column[0])
+        values = table.numbers(column[0], optional=name in ("radius", "width"))
         if kind == "angle":
             _warn_of_units(values, unit or "rad", 2 * math.pi, column[0], table.source)
         found[name] = units.factor(kind, unit, column[0]) * values if unit else values
@@ -330,7 +330,8 @@ def _set_columns(
             f" {minor[bad[0]]:.4g} pixels: a cell has a width, and its major axis is the longer one"
             f" (such cells: {bad.size}). Leave out regions of a few pixels."
         )
-    area = next((table.numbers(name) for name in known.area if name in table.columns), None)
+    there = [name for name in known.area if name in table.columns]
+    area = table.numbers(there[0], optional=True) if there else None
     if area is not None and (area <= 0).any():
         at = int(np.argmin(area))
         raise checks.InputError(
@@ -378,12 +379,12 @@ def _fields(table: Table, reading: Reading, used: set[str]) -> dict[str, np.ndar
         for column in named.values():
             if column not in table.columns:
                 raise table.missing(column)
-        return {name: table.numbers(column) for name, column in named.items()}
+        return {name: table.numbers(column, optional=True) for name, column in named.items()}
     if reading.columns is not None:
         return {}
     numbering = (*LABELS, *FRAMES, *ROWS)
     left = [n for n in table.columns if n not in used and n.lower() not in numbering]
-    return {name: table.numbers(name) for name in left}
+    return {name: table.numbers(name, optional=True) for name in left}
 
 
 def _shift(position: np.ndarray, colony: np.ndarray | None, centre: bool) -> np.ndarray:

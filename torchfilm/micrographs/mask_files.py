@@ -10,7 +10,7 @@ import numpy as np
 
 from torchfilm.tools import checks
 
-EXTRA = 'Images require scikit-image and tifffile: pip install "torchfilm[images]".'
+EXTRA = f"Images require scikit-image and tifffile: {checks.install('images')}."
 # files of programs that hold more than an image, and how to get at the image
 NOT_IMAGES = {
     ".mat": "Read it by scipy.io.loadmat, and give the array of labels (SuperSegger:"
@@ -24,8 +24,8 @@ def read_image(image: Any, frame: int | None, what: str) -> tuple[np.ndarray, st
     """An image (rows, columns) or (rows, columns, 3 or 4), and a name for messages.
 
     image: an array, or the path of a file: .tif, .tiff, .png, .jpg, .npy, or DeLTA's .nc, whose
-    label images are placed where their regions of interest were. frame: of a stack; required if it
-    has several. what: "mask" or "micrograph". Nothing in a file can execute.
+    label images are placed where their regions of interest were. frame: of a stack, −1 is the last;
+    required if it has several. what: "mask" or "micrograph". Nothing in a file can execute.
     """
     if isinstance(image, (str, Path)):
         path = Path(image)
@@ -58,9 +58,11 @@ def _one_frame(stack: np.ndarray, frame: int | None, source: str) -> tuple[np.nd
         frame = 0
     elif isinstance(frame, bool) or not isinstance(frame, (int, np.integer)):
         raise checks.input_error("frame", frame, "a whole number")
-    if not 0 <= frame < count:
-        raise checks.input_error("frame", frame, f"from 0 to {count - 1}, the frames of {source}")
-    return stack[frame], source if count == 1 else f"{source}, frame {frame}"
+    if not -count <= frame < count:
+        frames = "1 frame" if count == 1 else f"{count} frames"
+        rule = f"from {-count} to {count - 1}: {source} has {frames}"
+        raise checks.input_error("frame", frame, rule)
+    return stack[frame], source if count == 1 else f"{source}, frame {frame % count}"
 
 
 def _array(image: Any, what: str) -> np.ndarray:

@@ -135,11 +135,10 @@ class PlotStyle:
         for name in self.quantities:
             if name not in known and not (name == ANGLE and self.channels is None):
                 what = "colour" if self.channels is None else "channels"
-                raise checks.input_error(
-                    what,
-                    name,
-                    ("'angle' or " if self.channels is None else "") + "one of " + ", ".join(known),
-                )
+                listed = [n for n in known if n not in frame.internal]
+                rule = ("'angle' or " if self.channels is None else "") + "one of "
+                hint = checks.suggestion(name, [ANGLE, *listed])
+                raise checks.input_error(what, name, rule + ", ".join(listed), hint)
 
 
 def is_rgb(cells: Mapping[str, np.ndarray], name: str) -> bool:

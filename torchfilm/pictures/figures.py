@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 WIDE = 2.0  # panels wider than this many heights are placed one below the other
 
 
+@checks.known_keywords
 def show(
     what: str | Path | Results | State | Frame,
     *,
@@ -136,6 +137,7 @@ def _recorded_frame(
         return recorded[0], f"{recorded.title}, "
 
 
+@checks.known_keywords
 def strip(
     what: str | Path | Results,
     *,

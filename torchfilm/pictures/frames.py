@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -26,7 +26,8 @@ class Frame:
     cells: arrays by name as `Results.frame` gives them, the cells of one colony contiguous. time:
     h. colony_id: (B,). units: by name, signals under "out.NAME". signals: by name, one array (nx,
     ny, nz) per colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm. height:
-    z of the plane of 2-D cells, µm, if known. walls: as in `Results.walls`.
+    z of the plane of 2-D cells, µm, if known. walls: as in `Results.walls`. internal: the
+    quantities that serve the numerics, which messages do not list.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -39,6 +40,7 @@ class Frame:
     spacing: np.ndarray | None = None
     height: float | None = None
     walls: Sequence[Mapping[str, Any]] = ()
+    internal: Collection[str] = ()
 
     @property
     def dim(self) -> int:
@@ -68,8 +70,9 @@ def frame_of(state: State, scene: Scene | None = None) -> Frame:
     units = {f.name: f.unit for f in state.declared.values()}
     ids = state.colony_id.cpu().numpy()
     walls = [] if scene is None else walls_of(scene)
+    internal = [f.name for f in state.declared.values() if f.internal]
     if state.layout is None:
-        return Frame(cells, state.time, ids, units, walls=walls)
+        return Frame(cells, state.time, ids, units, walls=walls, internal=internal)
     grid = state.layout.grid
     cuts = grid.offsets.cpu().numpy()[1:-1]
     signals = {
@@ -90,6 +93,7 @@ def frame_of(state: State, scene: Scene | None = None) -> Frame:
         np.asarray(grid.spacing),
         state.layout.height,
         walls,
+        internal,
     )
 
 
@@ -121,7 +125,9 @@ class RecordedFrames(Sequence[Frame]):
         results, place = self.results, self.places[k]
         cells, ids, time = results.frame(place), results.colony_id, float(results.times[place])
         if not results.signal_names:
-            return Frame(cells, time, ids, self.units, walls=self.walls)
+            return Frame(
+                cells, time, ids, self.units, walls=self.walls, internal=results.internal_fields
+            )
         origin, shape, spacing = results.grid(place)
         signals = {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
         height = results.attributes.get("height")
@@ -136,6 +142,7 @@ class RecordedFrames(Sequence[Frame]):
             spacing,
             None if height is None else float(height),
             self.walls,
+            results.internal_fields,
         )
 
     def __iter__(self) -> Iterator[Frame]:

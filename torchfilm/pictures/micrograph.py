@@ -27,6 +27,7 @@ SHALLOW = 0.1  # of a width; masks that touch give capsules that overlap by some
 NAMED = 40  # how many overlapping cells are named
 
 
+@checks.known_keywords
 def overlay(
     cells: Cells,
     over: Any,

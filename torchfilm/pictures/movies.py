@@ -36,6 +36,7 @@ FASTEST_GIF = 50.0  # frames per second; viewers slow down faster films
 GREYS = 104  # of the 256 colours of a GIF
 
 
+@checks.known_keywords
 def movie(
     what: str | Path | Results,
     out: str | Path,
@@ -139,8 +140,8 @@ def _writer(target: Path, fps: float) -> Callable[[Path, Film, float], None]:
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
         raise checks.InputError(
-            'MP4 requires imageio-ffmpeg: pip install "torchfilm[movie]" or imageio-ffmpeg, or'
-            " give a name that ends in .gif."
+            f"MP4 requires imageio-ffmpeg: {checks.install('movie')}; or give a name that ends in"
+            " .gif."
         ) from error
     return _mp4
 

@@ -41,9 +41,7 @@ def figure_class() -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise checks.InputError(
-            'Pictures require matplotlib: pip install "torchfilm[app]".'
-        ) from error
+        raise checks.InputError(f"Pictures require matplotlib: {checks.install('app')}.") from error
     return Figure
 
 

@@ -38,6 +38,11 @@ def input_error(name: str, value: object, allowed: str, hint: str = "") -> Input
     )
 
 
+def install(extra: str) -> str:
+    """How to install an extra of torchfilm, which is on no package index, for messages."""
+    return f'pip install -e ".[{extra}]" in the folder of torchfilm'
+
+
 def nearest(given: str, known: Iterable[str]) -> str | None:
     """The known name that was probably meant: a similar one, or one that begins the given name or
     begins with it ("dim" for "dimension"). None: no name is near."""
@@ -95,7 +100,7 @@ def check_call(
     """Raise InputError for arguments that do not fit a signature. former: as in
     `unknown_keyword`."""
     kinds = {p.kind for p in signature.parameters.values()}
-    allowed = list(signature.parameters)
+    allowed = [n for n in signature.parameters if n != "self"]
     if inspect.Parameter.VAR_KEYWORD not in kinds:
         for keyword in given:
             if keyword not in allowed:

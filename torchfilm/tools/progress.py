@@ -36,7 +36,7 @@ def bar(total: float, label: str, form: str = FORM) -> tqdm:
         from tqdm import tqdm
     except ImportError as error:
         raise checks.InputError(
-            'a progress bar needs tqdm: pip install "torchfilm[app]", or give progress=False.'
+            f"a progress bar needs tqdm: {checks.install('app')}, or give progress=False."
         ) from error
     kind = _notebook_bar(tqdm) if in_notebook() else tqdm
     return kind(total=total, bar_format=form, desc=label, mininterval=0.3)

@@ -152,9 +152,9 @@ class Table:
         word = "row" if self.source == "the table" else "line"
         return f"{self.source}, {word} {self.lines[row]}"
 
-    def numbers(self, column: str) -> np.ndarray:
+    def numbers(self, column: str, *, optional: bool = False) -> np.ndarray:
         """A column of finite numbers, (N,) float64. Raises InputError with the first row that has
-        none."""
+        none. optional: whether the table may do without the column, for the message."""
         values = self.columns[column]
         try:
             if values.dtype.kind == "c":  # numpy would drop the imaginary part
@@ -165,10 +165,13 @@ class Table:
             found, bad = np.zeros(0), np.flatnonzero([not _is_number(v) for v in values])
         if len(bad):
             more = f" (in {len(bad)} of {self.rows} rows)" if len(bad) > 1 else ""
-            out = "the column" if len(bad) == self.rows else "such cells"
+            hint = "Leave such cells out."
+            if len(bad) == self.rows:
+                needed = "This column is needed: give a number for each cell."
+                hint = "Leave the column out." if optional else needed
             raise checks.InputError(
                 f"{self.place(int(bad[0]))}, column {column!r}: {str(values[bad[0]])!r} is not a"
-                f" number{more}. Leave {out} out."
+                f" number{more}. {hint}"
             )
         return found
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from torchfilm.tools.checks import InputError
+from torchfilm.tools.checks import InputError, install
 
-EXTRA = 'pip install "torchfilm[sbml]"'
 # Deeper than any model, and less deep than what would overflow the stack of a parser.
 MAX_DEPTH = 250
 OWN_PACKAGES = ("l3v2extendedmath",)  # functions of Level 3 Version 2, which libsbml calls one
@@ -28,7 +27,7 @@ def needed(module: str, package: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        raise InputError(f"this needs {package}: {EXTRA}.") from error
+        raise InputError(f"this needs {package}: {install('sbml')}.") from error
 
 
 def shortened(text: str, most: int = 60) -> str:
