@@ -13,6 +13,7 @@ from torchfilm.physics.walls import Wall
 from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
+from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.vectors import safe_norm
 
 
@@ -30,6 +31,7 @@ class Overlap:
     walls: Tensor
 
 
+@one_torch_thread()  # or its others wait in a loop while the next step is computed
 @torch.no_grad()
 def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     """Overlaps between cells and with the given walls, in float64.
@@ -94,6 +96,7 @@ def tilt(state: State) -> Tensor:
     return torch.asin(state.axis[:, 2].abs().clamp(max=1))
 
 
+@one_torch_thread()
 @torch.no_grad()
 def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:
     """Pairs of cells of one colony whose surfaces are less than `gap` µm apart, each pair once.
