@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+import ast
 import pickle
+import sys
 import threading
 import traceback
 import warnings
 from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from pathlib import Path
 
 import torchfilm as tf
 from design.scoring import WorkItem, WorkResult, run_work_item
 from design.task import Task
+from torchfilm import checks
 
 # how often a lost work item is submitted again; Dask itself tries four workers each time
 RETRIES = 1
@@ -27,8 +31,9 @@ def run_work_items(
     """Yield each work item once, with its result.
 
     A work item that the executor loses is submitted again. If it is lost again, this process runs
-    it and warns.
+    it and warns. Raises InputError for a pool whose workers would hang.
     """
+    check_executor(executor)
     lost: list[Exception] = []
     waiting = deque((item, _submit(executor, task, item, streams, size, 0), 0) for item in items)
     try:
@@ -59,6 +64,55 @@ def run_work_items(
             RuntimeWarning,
             stacklevel=3,
         )
+
+
+def check_executor(executor: Executor) -> None:
+    """Raises InputError for a pool of processes that would hang: one that forks, and one in a
+    script without a guard, which every worker would run from its beginning."""
+    if not isinstance(executor, ProcessPoolExecutor):
+        return
+    # the pool has no public name for it; without one, its workers are not checked
+    context = getattr(executor, "_mp_context", None)
+    if context is not None and context.get_start_method() == "fork":
+        raise checks.input_error(
+            "executor",
+            "a ProcessPoolExecutor that forks",
+            "one with new processes",
+            "Threads of torch do not survive a fork, so its workers would hang. Give it"
+            ' mp_context=multiprocessing.get_context("spawn").',
+        )
+    if _unguarded():
+        raise tf.InputError(
+            "executor: every worker imports this script and would begin the search again. Put what"
+            ' the script runs under if __name__ == "__main__":.'
+        )
+
+
+def _unguarded() -> bool:
+    """Whether a script is running, at its top level, that a worker imports (`__mp_main__`), or
+    that has no test of `__name__` to keep a worker from running it."""
+    frame = sys._getframe()
+    while frame.f_back is not None:
+        frame = frame.f_back
+        if frame.f_code.co_name != "<module>":
+            continue
+        name, path = frame.f_globals.get("__name__"), frame.f_globals.get("__file__")
+        if name == "__mp_main__":
+            return True
+        if name == "__main__" and path is not None and Path(path).is_file():
+            return not _has_guard(Path(path).read_bytes())
+    return False
+
+
+def _has_guard(source: bytes) -> bool:
+    """Whether a test at the top level of a script reads `__name__`; True where it is no source."""
+    try:
+        parsed = ast.parse(source)
+    except (SyntaxError, ValueError):
+        return True
+    tests = [node.test for node in parsed.body if isinstance(node, ast.If)]
+    names = [n.id for test in tests for n in ast.walk(test) if isinstance(n, ast.Name)]
+    return "__name__" in names
 
 
 def _submit(

@@ -19,6 +19,7 @@ import torch
 import torchfilm as tf
 from design import colonies
 from design.data_file import reading, replacing, write_values
+from design.executors import check_executor
 from design.parameters import Value
 from design.rollout import FailedColony, grow
 from design.scoring import WorkItem, cut_work_items
@@ -96,8 +97,11 @@ def simulate_designs(
 
     path: of the file that keeps them; those that it holds are not simulated again. executor: of the
     `concurrent.futures` kind. seen: called with the number of designs that are known. Simulation
-    k is the same in any batch and on any machine of the same kind.
+    k is the same in any batch and on any machine of the same kind. Raises InputError for an
+    executor that would hang.
     """
+    if executor is not None:
+        check_executor(executor)
     known = _read(path, task)
     seen(min(count, len(known)))
     points = np.random.default_rng(task.seed).random((max(count, len(known)), task.space.size))

@@ -25,9 +25,10 @@ import torch
 from searching import Level, lit, spots
 
 import torchfilm as tf
-from design import Objective, Parameter, Target, Task
+from design import Bands, Local, Objective, Parameter, Polish, Search, Target, Task
 from design.executors import run_work_items
 from design.scoring import cut_work_items
+from design.simulations import simulate_designs
 
 MAKE = Parameter("make", 0.1, 10, log=True)
 SPAWN = multiprocessing.get_context("spawn")  # a fork of a process that has run torch may hang
@@ -131,6 +132,63 @@ class Careless(Executor):
         else:
             future.set_result(fn(*args, **kwargs))
         return future
+
+
+class Pickling(Executor):
+    """Runs work items here, as copies that went through pickle."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        future: Future = Future()
+        fn, args = pickle.loads(pickle.dumps((fn, args)))
+        future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
+        return future
+
+
+@pytest.mark.parametrize("method", ["auto", Polish(after=4, starts=2), Local(starts=2, first=8)])
+def test_searches_that_descend_find_the_same_in_other_processes(method):
+    edges = Bands(("gfp",), (-4.0, 4.0), floor=0.5)
+    search = lambda: Search(lit, [MAKE], edges, cells=8, replicates=1, method=method, finals=None)
+    one, two = search(), search()
+    one.run(70, progress=False)
+    two.run(70, executor=Pickling(), work_items=2, progress=False)
+    assert any(e.slopes is not None for e in one.study.entries)
+    pairs = zip(one.study.entries, two.study.entries, strict=True)
+    assert all(np.array_equal(a.losses, b.losses) for a, b in pairs)
+
+
+@pytest.mark.parametrize(
+    "name, begin, allowed",
+    [
+        ("__main__", "", False),
+        ("__main__", 'if __name__ == "__main__":\n    ', True),
+        ("__mp_main__", "", False),
+        ("another", "", True),
+    ],
+)
+def test_a_script_that_every_worker_would_run_is_refused(tmp_path, name, begin, allowed):
+    script = tmp_path / "script.py"
+    script.write_text(f"{begin}objective().evaluate(points, executor=pool)\n")
+    pool = ProcessPoolExecutor(1, mp_context=SPAWN)
+    pool.shutdown()  # it starts no process
+    given = {"objective": objective, "points": POINTS[:1], "pool": pool}
+    run = lambda: exec(
+        compile(script.read_text(), str(script), "exec"),
+        {"__name__": name, "__file__": str(script), **given},
+    )
+    if allowed:
+        with pytest.warns(RuntimeWarning, match="lost 1 of 1"):
+            run()
+        return
+    with pytest.raises(tf.InputError, match='if __name__ == "__main__"'):
+        run()
+
+
+def test_a_pool_that_forks_is_refused():
+    pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork"))
+    with pytest.raises(tf.InputError, match="spawn"):
+        objective().evaluate(POINTS[:1], executor=pool)
+    with pytest.raises(tf.InputError, match="spawn"):
+        simulate_designs(objective().task, 2, executor=pool)
 
 
 GONE = [
