@@ -125,7 +125,7 @@ class Objective:
             )
         if task.target.reduced(np.zeros((1, task.replicates))) is not None:
             return "the loss is a statistic of several seeds"
-        return task.tried.why_rough
+        return task.why_rough
 
     @property
     def least_squares(self) -> bool:

@@ -4,6 +4,7 @@ before a search begins."""
 from __future__ import annotations
 
 import inspect
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,10 @@ from design import colonies
 from design.parameters import Choice, Parameter, Space, Value
 from design.targets.base import Target
 from torchfilm import checks
+
+
+# Structures whose options are tried together before the first derivatives.
+MOST_TOGETHER = 64
 
 
 class UnfitDesign(tf.InputError):
@@ -168,7 +173,7 @@ def try_scenes(
         example = example or family.scene([values])
         made_of.append((scene.effects, scene.founders))
         endless.append(tried.why_endless)
-        rough.append(_why_rough(scene, tried.why_regrown))
+        rough.append(why_rough(scene, tried.why_regrown))
     # one design that does not grow is scored as such; a search in which none grows is a mistake
     if example is None or all(endless):
         raise tf.InputError(unfit[0] if example is None else endless[0])
@@ -209,12 +214,33 @@ def _cannot_be_built(
     )
 
 
-def _why_rough(scene: tf.Scene, why_regrown: str) -> str:
+def why_rough(scene: tf.Scene, why_regrown: str) -> str:
     """Why the losses of a scene have no exact derivatives, or "". Options of a choice differ."""
     if why_regrown:
         return f"growth depends on the design ({why_regrown})"
     circuits = [e for e in scene.effects if isinstance(e, tf.Circuit) and e.is_stochastic]
     return "molecules are counted one by one" if circuits else ""
+
+
+def why_rough_together(family: SceneFamily, *, seed: int, dtype: torch.dtype, replay: bool) -> str:
+    """Why some scene has no exact derivatives, with options of several choices or whole numbers
+    together, or "". The first `MOST_TOGETHER` structures are tried. Those that cannot be built are
+    passed over: such designs fail."""
+    middle = {p.name: p.value(0.5) for p in family.space.parameters}
+    structural = [p for p in family.space.parameters if p.structural]
+    each = [[p.value((k + 0.5) / (p.levels or 1)) for k in range(p.levels or 1)] for p in structural]
+    for options in itertools.islice(itertools.product(*each), MOST_TOGETHER):
+        values = middle | {p.name: v for p, v in zip(structural, options, strict=True)}
+        try:
+            scene = family.scene([values], repeat=2)
+            tried = colonies.try_scene(
+                scene, 2, seed=seed, dtype=dtype, device=family.device, replay=replay, cells=None
+            )
+        except Exception:
+            continue
+        if why := why_rough(scene, tried.why_regrown):
+            return why
+    return ""
 
 
 def _trial_values(space: Space, middle: dict[str, Value]) -> list[dict[str, Value]]:

@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from design import colonies, memory
 from design.derivatives import Gathered
 from design.parameters import Value
 from design.rollout import FinishedColonies, grow
-from design.scene_family import UnfitDesign
+from design.scene_family import UnfitDesign, why_rough
 from design.slopes import Slopes, joined
 from design.targets.base import Target
 from design.targets.goals import Goals
@@ -167,11 +167,16 @@ def _grow_and_score(
     count, replicates = len(item.rows), len(streams)
     copies = 1 if item.turns is None else len(item.turns[0])
     with tf.tangents.forward_mode() if item.turns else contextlib.nullcontext():
+        scene = _scene(task, item, replicates)
         prepared = colonies.prepare(
-            _scene(task, item, replicates),
+            scene,
             [stream for _ in item.rows for stream in streams for _ in range(copies)],
             task.settings,
         )
+        if item.turns and why_rough(scene, prepared.why_regrown):
+            # no slope is better than a wrong one
+            plain = _grow_and_score(task, replace(item, turns=None), streams, size)
+            return replace(plain, slopes=Slopes.unknown(count * replicates, task.space.size))
         losses = np.full(count * replicates, task.target.failed, np.float64)
         goals = np.full((count * replicates, task.goals), np.nan)
         cells = np.zeros(count * replicates, np.int64)

@@ -24,6 +24,11 @@ class Slopes:
         """Of colonies that nothing is known of."""
         return Slopes(np.zeros((count, size)), np.full((count, size, size), np.nan))
 
+    @staticmethod
+    def unknown(count: int, size: int) -> Slopes:
+        """Of colonies whose slopes cannot be known: NaN, at which a descent ends."""
+        return Slopes(np.full((count, size), np.nan), np.full((count, size, size), np.nan))
+
     def put(self, rows: Sequence[int], other: Slopes) -> None:
         """Write those of some colonies."""
         self.gradient[rows], self.curvature[rows] = other.gradient, other.curvature

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -16,7 +17,13 @@ import torch
 import torchfilm as tf
 from design.colonies import RunSettings
 from design.parameters import Choice, Parameter, Space
-from design.scene_family import SceneFamily, TriedScenes, scene_function, try_scenes
+from design.scene_family import (
+    SceneFamily,
+    TriedScenes,
+    scene_function,
+    try_scenes,
+    why_rough_together,
+)
 from design.targets.base import Target
 from design.targets.goals import Goals, of_seeds
 from torchfilm import checks
@@ -113,6 +120,13 @@ class Task(TaskOptions):
     def space(self) -> Space:
         """The searched parameters and the unit cube that they span."""
         return self.family.space
+
+    @cached_property
+    def why_rough(self) -> str:
+        """Why the losses of some designs have no exact derivatives, or ""."""
+        return self.tried.why_rough or why_rough_together(
+            self.family, seed=self.seed, dtype=self.dtype, replay=self.replay
+        )
 
     @property
     def settings(self) -> RunSettings:

@@ -10,7 +10,7 @@ from patterned import crowded
 from searching import lit, objective_of, paced
 
 import torchfilm as tf
-from design import Choice, Parameter, Search, Study
+from design import Choice, Parameter, Search, Study, scene_family
 from design.methods import Local
 from design.slopes import Slopes
 from design.targets import Bands, Gradient, Ring, Stripe
@@ -242,3 +242,32 @@ def test_one_option_without_exact_derivatives_is_enough(options):
     assert not objective.least_squares
     found = objective.evaluate(np.array([[0.3, 0.6, 0.25], [0.3, 0.6, 0.75]]), slopes=True)
     assert not found.reasons and (found.slopes.gradient[:, :2] != 0).all()
+
+
+def slowed_together(make=1.0, decay=1.0, load="slow", site="plasmid"):
+    """Growth depends on the circuit with both first options together only."""
+    both = load == "slow" and site == "plasmid"
+    return slowed(make, decay, "slow" if both else "none")
+
+
+TOGETHER = [*TWO, Choice("load", ("slow", "none")), Choice("site", ("plasmid", "genome"))]
+
+
+def test_options_together_without_exact_derivatives_are_enough():
+    objective = objective_of(slowed_together, TOGETHER, EDGES, cells=8, replicates=1)
+    assert not objective.task.tried.why_rough  # none of them alone
+    assert "growth depends on the design" in objective.why_differences
+    assert not objective.least_squares
+    found = objective.evaluate(np.array([[0.3, 0.6, 0.25, 0.25]]), slopes=True)
+    assert not found.reasons and (found.slopes.gradient[:, :2] != 0).all()
+
+
+def test_a_structure_that_was_not_tried_has_no_slope_rather_than_a_wrong_one(monkeypatch):
+    monkeypatch.setattr(scene_family, "MOST_TOGETHER", 0)
+    objective = objective_of(slowed_together, TOGETHER, EDGES, cells=8, replicates=1)
+    points = np.array([[0.3, 0.6, 0.25, 0.25], [0.3, 0.6, 0.75, 0.25]])
+    found = objective.evaluate(points, slopes=True)
+    assert np.isnan(found.slopes.gradient[0]).all()
+    assert np.isfinite(found.slopes.gradient[1]).all()
+    assert not found.reasons
+    assert found.losses == pytest.approx(objective.evaluate(points).losses, abs=1e-5)
