@@ -67,10 +67,23 @@ def reading(path: Path, form: str, version: int, what: str) -> Iterator[h5py.Fil
 
 
 def write_values(group: h5py.Group, name: str, column: Sequence[Value]) -> None:
-    """The values of a parameter, as text where any of them is text."""
-    text = any(isinstance(v, str) for v in column)
-    group.create_dataset(
+    """The values of a parameter: as text where all are text, as JSON where some are."""
+    text = [isinstance(v, str) for v in column]
+    mixed = any(text) and not all(text)
+    found = group.create_dataset(
         f"values/{name}",
-        data=[str(v) for v in column] if text else column,
-        dtype=h5py.string_dtype() if text else None,
+        data=[json.dumps(v) for v in column] if mixed else column,
+        dtype=h5py.string_dtype() if any(text) else None,
     )
+    if mixed:
+        found.attrs["encoding"] = "JSON"
+
+
+def read_values(group: h5py.Group) -> dict[str, list[Value]]:
+    """The columns that `write_values` wrote, by name."""
+    out = {}
+    for name, column in group["values"].items():
+        found = (column.asstr() if h5py.check_string_dtype(column.dtype) else column)[...].tolist()
+        mixed = column.attrs.get("encoding") == "JSON"
+        out[name] = [json.loads(v) for v in found] if mixed else found
+    return out

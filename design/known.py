@@ -37,11 +37,27 @@ Start = HasValues | Mapping[str, Value] | Sequence[Any] | Study | str | Path
 @dataclass(frozen=True, eq=False)
 class KnownDesigns:
     """points (n, D) from which a search starts. entry: with their losses, where these hold for the
-    task of the search; None: they are grown again. why: they are, or ""."""
+    task of the search; None: they are grown again. why: they are, or "". known: designs of the
+    study from which they come; beyond: how many of them lie beyond the bounds."""
 
     points: np.ndarray
     entry: Entry | None = None
     why: str = ""
+    known: int = 0
+    beyond: int = 0
+
+    @property
+    def remark(self) -> str:
+        """What a user should know of the designs of a study: which are left out, and why."""
+        words = []
+        if self.beyond:
+            words.append(f"{self.beyond} of its {self.known} designs lie beyond the bounds")
+        if self.why:
+            words.append(
+                f"its losses do not hold here ({self.why}), so its {len(self.points)} best designs"
+                " are grown again"
+            )
+        return f"start: {'; '.join(words)}." if words else ""
 
     def describe(self) -> str:
         """What a study says of them."""
@@ -131,10 +147,11 @@ def _of_study(study: Study, task: Task) -> KnownDesigns:
         raise checks.input_error(
             "start", f"a study of {len(full)} designs", "one with a design within the bounds"
         )
+    beyond = len(full) - len(points)
     why = _why_other(study, task, fixed, added)
     if why:
         best = np.argsort([e.loss[k] for e, k in rows], kind="stable")[:MOST]
-        return KnownDesigns(np.array(points)[best], why=why)
+        return KnownDesigns(np.array(points)[best], None, why, len(full), beyond)
     join = lambda name: np.array([getattr(e, name)[k] for e, k in rows])
     kept = lambda name: join(name) if all(getattr(e, name) is not None for e, _ in rows) else None
     values_of = [task.space.values(point) for point in points]
@@ -157,7 +174,7 @@ def _of_study(study: Study, task: Task) -> KnownDesigns:
         goals=kept("goals"),
         each_goals=kept("each_goals"),
     )
-    return KnownDesigns(entry.points, entry)
+    return KnownDesigns(entry.points, entry, "", len(full), beyond)
 
 
 def _why_other(

@@ -58,7 +58,7 @@ class Search(TaskOptions):
     None leaves this out. start: designs from which the search starts: their values by name, a
     `Best`, the file of a saved design, or a `Study` or its file. A study of the same task with
     other bounds, or without some of the parameters, keeps its losses; of any other designs the best
-    are grown again. `TaskOptions` documents the other arguments; `search.objective.task` holds them
+    are grown again; `run` prints which are left out, and why. `TaskOptions` documents the other arguments; `search.objective.task` holds them
     checked. Raises the errors of `Task`, and InputError for a method, finals or a start that are
     not allowed.
     """
@@ -124,6 +124,8 @@ class Search(TaskOptions):
         study of another search, and where no design was grown to full size.
         """
         self._check_run(colonies, stop_at)
+        if self._known is not None and self._known.remark:
+            print(self._known.remark, file=sys.stderr)
         chosen = self._choose(colonies, study)
         self._progress.chosen = chosen
         self._progress.study = self._open_study(study, chosen.describe())

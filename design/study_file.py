@@ -8,7 +8,7 @@
                   was not grown; reasons, JSON by replicate; goals (N, G) and each_goals (N, R, G),
                   where there are several
     /slopes/K/    gradient (n, D) and curvature (n, D, D) of batch K, where they were wanted
-    /values/NAME  (N,) the values of each parameter
+    /values/NAME  (N,) the values of each parameter; as JSON where numbers are mixed with text
     /finals/      the same of the finals, the designs on fresh seeds
 
 After each batch a new file is written beside the old one and then replaces it, so that a kill at
@@ -26,7 +26,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from design.data_file import reading, replacing, write_values
+from design.data_file import read_values, reading, replacing, write_values
 from design.entries import Entry
 from design.slopes import Slopes
 from torchfilm import checks
@@ -112,10 +112,7 @@ def read_study(path: Path) -> StudyData:
 def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> list[Entry]:
     """streams: of the replicates; None: those that the file states."""
     batches, designs = ({n: d[...] for n, d in group[g].items()} for g in ("batches", "designs"))
-    columns = {
-        name: (d.asstr() if h5py.check_string_dtype(d.dtype) else d)[...].tolist()
-        for name, d in group["values"].items()
-    }
+    columns = read_values(group)
     values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     out: list[Entry] = []
     at = 0

@@ -68,12 +68,15 @@ def test_a_parameter_that_is_added_has_its_known_value():
     "options, words",
     [({"seed": 3}, "seed"), ({"cells": 4}, "cells"), ({"fixed": {"decay": 2.0}}, "fixed")],
 )
-def test_the_best_designs_of_another_task_are_grown_again(options, words):
+def test_the_best_designs_of_another_task_are_grown_again(options, words, capsys):
     old = search(NARROW)
     old.run(12, progress=False)
     made = search(start=old.study, **options)
     assert not made.study.entries and words in made._known.why
     made.run(12, progress=False)
+    said = capsys.readouterr().err
+    assert "its losses do not hold here (another " in said and words in said
+    assert "so its 6 best designs are grown again" in said
     least = np.sort([x for e in old.study.entries for x in e.loss])
     assert made.study.entries[0].colonies == 12 and len(least) == 6
     assert [v["make"] for v in made.study.entries[0].values] == pytest.approx(
@@ -85,12 +88,15 @@ def order_of(made):
     return np.argsort(np.concatenate([e.loss for e in made.study.entries]), kind="stable")
 
 
-def test_narrower_bounds_leave_designs_out():
+def test_narrower_bounds_leave_designs_out(capsys):
     old = search(WIDE)
     old.run(24, progress=False)
     made = search(NARROW, start=old.study)
     inside = [v for e in old.study.entries for v in e.values if 0.5 <= v["make"] <= 2.0]
     assert 0 < len(inside) < 12 and len(made.study.entries[0].points) == len(inside)
+    made.run(2, progress=False)
+    beyond = f"start: {12 - len(inside)} of its 12 designs lie beyond the bounds."
+    assert capsys.readouterr().err == beyond + "\n"
 
 
 def test_a_saved_design_and_a_best_are_starts(tmp_path):
