@@ -125,7 +125,8 @@ class TriedScenes:
     dt (h): of the scene. recipe: name and arguments of a ready scene, or None. listing: its effects
     as text. digest: of what a listing does not show, the founders and the code of functions.
     why_regrown: the reason why colonies cannot follow recorded growth, or "". why_rough: the reason
-    why losses have no exact derivatives, with one option of a choice at least, or "".
+    why losses have no exact derivatives, with one option of a choice at least, or "". stochastic:
+    whether circuits count molecules one by one.
     """
 
     founders: int
@@ -136,6 +137,7 @@ class TriedScenes:
     digest: str
     why_regrown: str
     why_rough: str
+    stochastic: bool
 
 
 def try_scenes(
@@ -192,6 +194,7 @@ def try_scenes(
         digest=tf.digest(made_of),
         why_regrown=why_regrown,
         why_rough=next(filter(None, rough), ""),
+        stochastic=_is_stochastic(scene),
     )
 
 
@@ -218,8 +221,12 @@ def why_rough(scene: tf.Scene, why_regrown: str) -> str:
     """Why the losses of a scene have no exact derivatives, or "". Options of a choice differ."""
     if why_regrown:
         return f"growth depends on the design ({why_regrown})"
-    circuits = [e for e in scene.effects if isinstance(e, tf.Circuit) and e.is_stochastic]
-    return "molecules are counted one by one" if circuits else ""
+    return "molecules are counted one by one" if _is_stochastic(scene) else ""
+
+
+def _is_stochastic(scene: tf.Scene) -> bool:
+    """Whether a circuit counts molecules one by one."""
+    return any(isinstance(e, tf.Circuit) and e.is_stochastic for e in scene.effects)
 
 
 def why_rough_together(family: SceneFamily, *, seed: int, dtype: torch.dtype, replay: bool) -> str:

@@ -267,6 +267,7 @@ class Search(TaskOptions):
             task.goals,
             task.target.pattern,
             self.objective.least_squares,
+            task.replicates if task.tried.stochastic else 0,
             before,
         )
 

@@ -14,6 +14,8 @@ from design.methods.racing import Racing
 BATCH, WIDTH = 24, 0.5
 # designs before the first descents (one race), and for each parameter of a descent, so that it ends
 BEFORE, EACH, MOST_STARTS = BATCH, 10, 3
+# designs of a batch where every one needs many replicates
+FEW = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +38,14 @@ def choose(
     goals: int,
     pattern: bool = True,
     squares: bool = False,
+    chance: int = 0,
     before: str = "",
 ) -> Chosen:
     """The method of a search that leaves the choice. dimensions: parameters; designs: that the
     budget can grow with all replicates; goals: 0 for one target; pattern: whether the target is a
     pattern, of which small colonies show something; squares: whether its loss is a sum of squares
-    with exact derivatives; before: what the study of a search that is resumed says of its method,
+    with exact derivatives; chance: where molecules are counted one by one, how many replicates
+    there are, else 0; before: what the study of a search that is resumed says of its method,
     which goes on."""
     cloud = CMAES(population=BATCH, sigma=WIDTH)
     few = Chosen(
@@ -54,6 +58,12 @@ def choose(
         f"{designs:.0f} designs for {dimensions} parameters: small colonies first, and CMA-ES"
         " learns from the best",
     )
+    lucky = Chosen(
+        Racing(inner=CMAES(population=FEW, sigma=WIDTH), small=max(chance, 1)),
+        f"{designs:.0f} designs for {dimensions} parameters: small colonies first, with all"
+        " replicates, since molecules are counted one by one and one colony says little; CMA-ES"
+        " learns from the best",
+    )
     descents = tuple(
         Chosen(
             Polish(inner=Racing(inner=cloud), after=BEFORE, starts=starts),
@@ -63,7 +73,7 @@ def choose(
         )
         for starts in range(1, MOST_STARTS + 1)
     )
-    for known in (few, race, *descents) if before else ():
+    for known in (few, race, lucky, *descents) if before else ():
         if known.describe() == before:
             return Chosen(known.method, "the study began with it")
     if goals:
@@ -72,5 +82,7 @@ def choose(
         return Chosen(cloud, "data of a colony of one size: a smaller one does not compare")
     if designs < 2 * BATCH:
         return few
+    if chance:
+        return lucky
     room = int((designs - BEFORE) / (EACH * dimensions))
     return descents[min(room, MOST_STARTS) - 1] if squares and room else race

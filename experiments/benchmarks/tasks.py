@@ -175,7 +175,8 @@ TASKS = {
         {"cells": 200},  # grown anew for each design
     ),
     "domain size": SearchTask(
-        "toggle_switch", domain_size.PARAMETERS, DomainSize(("red", "green"), 12.0)
+        "toggle_switch", domain_size.PARAMETERS, DomainSize(("red", "green"), 12.0),
+        {"replicates": 8},  # colonies of single molecules differ by luck
     ),
     "image": SearchTask(
         cross,

@@ -11,7 +11,7 @@ from design import CMAES, NSGA2, Local, Parameter, Polish, Racing, Search, Sobol
 from design.methods import choose
 from design.methods.local import unlike
 from design.slopes import Slopes
-from design.targets import Bands
+from design.targets import Bands, DomainSize
 from torchfilm.tools.checks import InputError
 
 EDGES = Bands(("gfp",), (-3.0, 3.0), floor=0.5)
@@ -145,6 +145,18 @@ def test_auto_descends_where_the_loss_is_a_sum_of_squares():
     assert isinstance(choose(5, 500, 0, squares=True, before=before).method, Racing)
     again = choose(5, 9000, 0, squares=True, before=choose(5, 80, 0, squares=True).describe())
     assert isinstance(again.method, Polish) and again.method.starts == 1
+
+
+def test_auto_races_with_all_replicates_where_molecules_are_counted():
+    parameters = [Parameter("strength", 3.0, 30.0, log=True)]
+    target = DomainSize(("red", "green"), 12.0)
+    search = Search("toggle_switch", parameters, target, cells=4, replicates=2, finals=None)
+    search.run(120, progress=False)
+    assert "one by one" in search.why_chosen
+    assert {(e.size, e.replicates) for e in search.study.entries} == {(0.25, 2), (1.0, 2)}
+    assert isinstance(choose(3, 20, 0, chance=8).method, CMAES)  # too few for races
+    again = choose(3, 20, 0, chance=8, before=choose(3, 200, 0, chance=8).describe())
+    assert again.method.small == 8
 
 
 def test_what_a_search_says_of_its_loss():
