@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SHOWN = 3  # replicates side by side
+LUCKY = 0.8  # of the band on fresh seeds: a search that saw less than this was misled
 NEAR = 0.005  # of a bound, as a share of the range (of its logarithm)
 
 
@@ -158,6 +159,12 @@ def _warnings(report: SearchReport) -> list[str]:
         lines.append(
             f"the best design is no better than {least!r}: it has found no pattern. Larger"
             " colonies, or a narrower target, tell patterns apart."
+        )
+    if best.fresh is not None and best.loss < LUCKY * best.fresh.band[0]:
+        lines.append(
+            f"the {report.task.replicates} seeds of the search were lucky: {best.loss:.4f} there,"
+            f" {best.fresh.loss:.4f} on fresh ones. Such losses mislead a search; give it more"
+            " replicates."
         )
     bound = [p.name for p in space.parameters if _at_bound(p, best.values[p.name])]
     if bound:

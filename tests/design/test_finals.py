@@ -76,6 +76,13 @@ def test_a_design_that_is_lucky_on_the_seeds_of_the_search_does_not_win():
     assert "loss on fresh seeds" in best.table() and f"{len(best.losses)} seeds" in best.table()
 
 
+def test_the_table_says_where_the_seeds_of_a_search_misled_it():
+    best = search(Lucky(most=100.0)).run(60, progress=False)
+    assert "the 2 seeds of the search were lucky: 0.0000 there" in best.table()
+    assert "more replicates" in best.table()
+    assert "lucky" not in search(Lucky(most=0.0)).run(60, progress=False).table()
+
+
 def test_the_budget_holds_the_finals_too():
     made = search()
     made.run(100, progress=False)

@@ -103,6 +103,7 @@ def boundary_detector(
     width: float = 32.0,
     rtol: float = 1e-4,
     length_drag: float = 10.0,
+    spacing: float = 4.0,
 ) -> Scene:
     """Detection of the boundary between two populations (Fig. 5), in one plane of a channel.
 
@@ -110,8 +111,8 @@ def boundary_detector(
     left) make AHL by LuxI and report it by CFP. Sinks (type 1) degrade AHL by AiiA and report it by
     YFP: only those at the boundary detect it. Constants are as published (hours, µm, arbitrary
     concentration); d3 = 0 is a strain without AiiA. flow: µm/h along the channel. rtol: relative
-    tolerance of the circuits in a step. The grid, with voxels of 4 µm, starts as the paper's 64 × 8
-    × 12 voxels around the cells' plane and grows along the channel with the colony.
+    tolerance of the circuits in a step. The grid, with voxels of `spacing` = 4 µm, starts as the
+    paper's 64 × 8 × 12 voxels around the cells' plane and grows along the channel with the colony.
 
     Pressure limits growth (length_drag 10, the paper's). With free growth (1e5) the published
     constants give no band: reporters are diluted faster than they are made.
@@ -142,7 +143,7 @@ def boundary_detector(
         Medium(
             ahl=Signal(diffusion=diffusion),
             box=((-128.0, -half, -24.0), (128.0, half, 24.0)),
-            spacing=4.0,
+            spacing=spacing,
             outside="grow",
             grows="x",
             flow=None if isinstance(flow, (int, float)) and flow == 0 else (flow, 0.0, 0.0),
