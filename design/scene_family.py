@@ -235,7 +235,9 @@ def why_rough_together(family: SceneFamily, *, seed: int, dtype: torch.dtype, re
     passed over: such designs fail."""
     middle = {p.name: p.value(0.5) for p in family.space.parameters}
     structural = [p for p in family.space.parameters if p.structural]
-    each = [[p.value((k + 0.5) / (p.levels or 1)) for k in range(p.levels or 1)] for p in structural]
+    each = [
+        [p.value((k + 0.5) / (p.levels or 1)) for k in range(p.levels or 1)] for p in structural
+    ]
     for options in itertools.islice(itertools.product(*each), MOST_TOGETHER):
         values = middle | {p.name: v for p, v in zip(structural, options, strict=True)}
         try:

@@ -20,7 +20,8 @@ from torchfilm import checks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-STRIP = 2.0  # µm: width of the strips of the profile along the stripe's axis
+STRIP = 1.0  # µm: width of the strips of the profile along the stripe's axis, that of a cell
+TOUCHING = 1e-9  # µm: the least distance between cells of two types, also where they overlap
 ACROSS = 4.0  # µm: width of the strips across, in which the middle of the stripe is located
 BLOCK = 2048  # cells whose distances to all others are in memory at once
 FEWEST = 3  # cells: the least number for the mean of a strip
@@ -32,7 +33,7 @@ class Stripe(ProfileTarget):
 
     at: "border", the border between the two populations (cell types) of the colony, or a place, µm.
     straight: False, the stripe follows the border wherever it winds. The distance of a cell from it
-    is that to the nearest cell of the other type, from centre to centre, less a cell's diameter.
+    is that to the nearest cell of the other type, from centre to centre, less a cell's diameter, 0 where cells overlap.
     True, the border is one straight line, at the place along the axis with the fewest cells on the
     wrong side. along: "x" or "y", the axis that the stripe lies across. cell_type: only cells of
     this type count. place: of the middle of the stripe from `at`, µm towards the type that lies
@@ -170,7 +171,7 @@ class Stripe(ProfileTarget):
 
         place_um: mean distance from `at` of the light above the level of far cells, those farther
         than 2·width from the target's middle; width_um: full width at half maximum of the profile
-        in strips of 2 µm; peak: the greatest mean of a strip; contrast: mean level inside the
+        in strips of 1 µm, with lines between their middles; peak: the greatest mean of a strip; contrast: mean level inside the
         target stripe over that of the far cells; straightness_um: root mean square distance from a
         straight line of the middle of the bright cells, over strips of 4 µm across. Bright cells
         have at least half the peak.
@@ -265,7 +266,7 @@ def _from_border(state: tf.State, low_type: Tensor) -> Tensor:
                 found[some] = torch.cdist(
                     position[some], position[those], compute_mode="donot_use_mm_for_euclid_dist"
                 ).amin(1)
-    found = found - 2.0 * state.radius.detach().double()
+    found = (found - 2.0 * state.radius.detach().double()).clamp(min=TOUCHING)
     return torch.where(kind == low_type.index_select(0, state.colony), -found, found)
 
 
@@ -328,12 +329,26 @@ def profile(
     there, first = np.unique(colony[top], return_index=True)
     chosen = np.full(colonies, -1)
     chosen[there] = run[top[first]]
-    mine = run == chosen[colony]
-    low, far = np.full(colonies, np.nan), np.full(colonies, np.nan)
-    np.fmin.at(low, colony[mine], centre[mine])
-    np.fmax.at(far, colony[mine], centre[mine])
-    width[there] = (far - low + STRIP)[there]
+    for k in there:
+        first, last = np.flatnonzero(run == chosen[k])[[0, -1]]
+        low, far = (
+            _half_place(colony, centre, mean, inner, side, 0.5 * peak[k])
+            for inner, side in ((first, -1), (last, 1))
+        )
+        width[k] = far - low
     return peak, width
+
+
+def _half_place(
+    colony: np.ndarray, centre: np.ndarray, mean: np.ndarray, inner: int, side: int, half: float
+) -> float:
+    """Where the profile falls to half the peak, on the line from the outermost bright strip to the
+    next on that side, µm; the edge of that strip where the colony ends there."""
+    outer = inner + side
+    if not 0 <= outer < len(colony) or colony[outer] != colony[inner]:
+        return float(centre[inner] + side * 0.5 * STRIP)
+    share = (mean[inner] - half) / (mean[inner] - mean[outer])
+    return float(centre[inner] + share * (centre[outer] - centre[inner]))
 
 
 def straightness(

@@ -117,7 +117,9 @@ def test_the_file_holds_numbers_and_text_only(tmp_path):
     assert json.loads(attributes["about"])["names"] == ["make", "decay"]
 
 
-@pytest.mark.parametrize("options", [("weak", "strong"), (1, "x", 2.5, False), (1.5, 2.5), (True, False)])
+@pytest.mark.parametrize(
+    "options", [("weak", "strong"), (1, "x", 2.5, False), (1.5, 2.5), (True, False)]
+)
 def test_values_of_all_kinds_are_written(tmp_path, options):
     """The file holds the parameters themselves, over several batches."""
     chosen = Choice("kind", options)

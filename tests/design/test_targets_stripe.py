@@ -12,7 +12,7 @@ from patterned import SHARP, crowded, placed, row
 
 import torchfilm as tf
 from design.targets import Stripe
-from design.targets.stripe import STRIP, border
+from design.targets.stripe import border
 
 
 def field(
@@ -142,8 +142,9 @@ def test_where_the_stripe_is(options, low, high):
 @pytest.mark.parametrize("turned", [False, True], ids=["x", "y"])
 @pytest.mark.parametrize("mirror", [False, True])
 def test_measures_of_a_stripe_laid_out_by_hand(turned, mirror):
-    """Six columns of 8, fourteen of 1/8, the first at the border: middle 3 µm from it, three strips
-    of 2 µm wide, and straight."""
+    """Six columns of 8, fourteen of 1/8, the first at the border: middle 3 µm from it, six strips of
+    1 µm wide, and straight. On the line between the middles of the sixth and the seventh, half the
+    peak is at 4/(8 − 1/8) of 1 µm."""
     state = field(shift=5.0, turned=turned)
     if mirror:
         state = state.replace(position=-state.position)
@@ -152,11 +153,8 @@ def test_measures_of_a_stripe_laid_out_by_hand(turned, mirror):
     ).measures(state)
     assert list(found) == ["place_um", "width_um", "peak", "straightness_um", "contrast"]
     assert float(found["place_um"]) == pytest.approx(-3 if mirror else 3, abs=1e-12)
-    assert (float(found["width_um"]), float(found["peak"]), float(found["contrast"])) == (
-        6.0,
-        8.0,
-        64.0,
-    )
+    assert float(found["width_um"]) == pytest.approx(5.5 + 4 / 7.875, rel=1e-12)
+    assert (float(found["peak"]), float(found["contrast"])) == (8.0, 64.0)
     assert float(found["straightness_um"]) == pytest.approx(0, abs=1e-12)
     assert all(v.shape == (1,) and v.dtype == torch.float64 for v in found.values())
 
@@ -193,7 +191,9 @@ def test_width_is_that_of_the_run_about_the_peak():
     level = np.select([(x > 4) & (x < 10), (x > 16) & (x < 20)], [4.0, 3.0], 0.5)
     state = placed(np.stack([x, y], 1), yfp=level)
     found = Stripe("yfp", at=0.0, width=6.0, place=7.0).measures(state)
-    assert (float(found["width_um"]), float(found["peak"])) == (6.0, 4.0)
+    # on both sides half the peak is at 2/(4 − 1/2) of 1 µm from the middle of a bright strip
+    assert float(found["width_um"]) == pytest.approx(5 + 2 * 2 / 3.5, rel=1e-12)
+    assert float(found["peak"]) == 4.0
 
 
 def test_a_dark_colony_has_no_width():
@@ -221,7 +221,10 @@ def test_measures_of_each_colony_are_its_own():
     )
     found = Stripe("yfp", straight=True, width=4.0, cell_type=1).measures(state)
     assert found["place_um"].tolist() == pytest.approx([3.0, 7.0, 11.0], abs=0.5)
-    assert found["width_um"].tolist() == [6.0, 6.0, 6.0] and STRIP == 2.0
+    # the border is an edge of the first; the others are dark on both sides
+    assert found["width_um"].tolist() == pytest.approx(
+        [5.5 + 4 / 7.875, *[5 + 8 / 7.875] * 2], rel=1e-12
+    )
 
 
 @pytest.mark.parametrize(
