@@ -99,7 +99,7 @@ def tasks(options: argparse.Namespace) -> dict:
         for method in options.methods:
             runs = [
                 one_search(task, method, seed, options.colonies, wanted)
-                for seed in range(1, 1 + options.seeds)
+                for seed in range(options.first, options.first + options.seeds)
             ]
             out[name][method] = runs
             needed = [np.inf if r["needed"] is None else r["needed"] for r in runs]
@@ -153,6 +153,7 @@ def main() -> None:
         "--methods", nargs="*", choices=list(METHODS), default=["auto", "sobol", "cmaes"]
     )
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=1, help="of the seeds")
     parser.add_argument("--colonies", type=int, default=2000)
     parser.add_argument("--cells", type=int, nargs="*", default=[100, 500])
     parser.add_argument("--designs", type=int, default=64)
