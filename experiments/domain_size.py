@@ -14,7 +14,7 @@ import argparse
 from pathlib import Path
 
 import torchfilm as tf
-from design import CMAES, DomainSize, Parameter, Search
+from design import DomainSize, Parameter, Search
 
 PARAMETERS = [
     Parameter("strength", 3.0, 30.0, log=True),
@@ -43,8 +43,7 @@ def main() -> None:
         PARAMETERS,
         DomainSize(("red", "green"), options.size),
         **COLONY,
-        method=CMAES(population=16),
-        replicates=4,
+        replicates=8,  # colonies of single molecules differ by luck
     )
     best = search.run(options.colonies, study=options.out.with_suffix(".h5"))
     print(best.table())

@@ -1,17 +1,19 @@
-"""Compares search methods on eight tasks by the colonies that they need, and measures designs per
-hour.
+"""Compares search methods on eight tasks by the colonies that they need, asks what small colonies
+and few replicates say of a design, and measures designs per hour.
 
     python experiments/benchmarks/search.py tasks      # an hour or two on two cores
     python experiments/benchmarks/search.py tasks --tasks stripe ring --methods auto --seeds 3
+    python experiments/benchmarks/search.py ranks --tasks "domain size"
     python experiments/benchmarks/search.py rate
 
 `tasks` runs searches that differ by their seed: random starts and random colonies. Each has 2,000
 colonies, finals included. The best design so far, at every batch that improved it, is grown on 16
 seeds that no search uses. Colonies to success are those simulated when it first held the threshold
 there; a search succeeds where the design that it returns holds it. `tasks.py` has the tasks and
-says how the thresholds were set. `rate` measures designs per hour: one design at a time, in
-batches, and on recorded growth. The script appends each run to a JSON file with its machine,
-versions and commit.
+says how the thresholds were set. `ranks` grows Sobol designs at several sizes with several
+replicates, and compares their order with that in 16 other colonies of full size. `rate` measures
+designs per hour: one design at a time, in batches, and on recorded growth. The script appends each
+run to a JSON file with its machine, versions and commit.
 """
 
 from __future__ import annotations
@@ -24,10 +26,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from record import machine
+from scipy.stats import kendalltau
 from tasks import CELLS, REPLICATES, SHARE, TASKS, UNSEEN, SearchTask
 
 import torchfilm as tf
 from design import CMAES, Local, Objective, Racing, Search, Sobol, Task
+from design.methods.base import sobol_points
 from design.trivial import trivial_losses
 
 # Batches of 24, because a large batch costs less per colony; a wide initial distribution, because
@@ -113,6 +117,31 @@ def tasks(options: argparse.Namespace) -> dict:
     return out
 
 
+def ranks(options: argparse.Namespace) -> dict:
+    """Returns, of each task, what losses at each size and with as many replicates say of designs:
+    Kendall's tau with the mean of 16 other colonies of full size, and that mean for the design with
+    the lowest loss; means over all groups of so many replicates."""
+    out: dict = {}
+    for name in options.tasks:
+        objective = Objective(TASKS[name].task())
+        points = sobol_points(objective.task.space, 7, 0, options.designs)
+        true = objective.evaluate(points, streams=UNSEEN).loss
+        for size in (0.25, 0.5, 1.0):
+            losses = objective.evaluate(points, streams=range(16), size=size).losses
+            for count in (1, 4, 8, 16):
+                groups = losses.reshape(len(points), -1, count).mean(2).T
+                tau = float(np.mean([kendalltau(group, true).statistic for group in groups]))
+                picked = float(np.mean([true[group.argmin()] for group in groups]))
+                found = {"tau": tau, "picked": picked, "best": float(true.min())}
+                out.setdefault(name, {})[f"size {size:g}, {count} replicates"] = found
+                print(
+                    f"{name}, size {size:g}, {count:>2} replicates: tau {tau:.2f}, the best of"
+                    f" {len(points)} designs has {picked:.3f} in truth (of {true.min():.3f})",
+                    flush=True,
+                )
+    return out
+
+
 def rate(options: argparse.Namespace) -> dict:
     """Returns designs per hour: one at a time, in batches, and in batches on recorded growth."""
     out: dict = {}
@@ -147,7 +176,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("part", choices=("tasks", "rate"))
+    parser.add_argument("part", choices=("tasks", "ranks", "rate"))
     parser.add_argument("--tasks", nargs="*", choices=list(TASKS), default=list(TASKS))
     parser.add_argument(
         "--methods", nargs="*", choices=list(METHODS), default=["auto", "sobol", "cmaes"]
@@ -163,7 +192,7 @@ def main() -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(options.threads)
     tf.keep_memory()
-    found = {"tasks": tasks, "rate": rate}[options.part](options)
+    found = {"tasks": tasks, "ranks": ranks, "rate": rate}[options.part](options)
     kept = json.loads(options.out.read_text()) if options.out.exists() else []
     options.out.write_text(json.dumps([*kept, {**machine(), options.part: found}], indent=1) + "\n")
 
