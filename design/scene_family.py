@@ -17,7 +17,6 @@ from design.parameters import Choice, Parameter, Space, Value
 from design.targets.base import Target
 from torchfilm import checks
 
-
 # Structures whose options are tried together before the first derivatives.
 MOST_TOGETHER = 64
 

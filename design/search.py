@@ -58,9 +58,9 @@ class Search(TaskOptions):
     None leaves this out. start: designs from which the search starts: their values by name, a
     `Best`, the file of a saved design, or a `Study` or its file. A study of the same task with
     other bounds, or without some of the parameters, keeps its losses; of any other designs the best
-    are grown again; `run` prints which are left out, and why. `TaskOptions` documents the other arguments; `search.objective.task` holds them
-    checked. Raises the errors of `Task`, and InputError for a method, finals or a start that are
-    not allowed.
+    are grown again; `run` prints which are left out, and why. `TaskOptions` documents the other
+    arguments; `search.objective.task` holds them checked. Raises the errors of `Task`, and
+    InputError for a method, finals or a start that are not allowed.
     """
 
     method: str | Method = field(default="auto", kw_only=True)

@@ -33,13 +33,14 @@ class Stripe(ProfileTarget):
 
     at: "border", the border between the two populations (cell types) of the colony, or a place, µm.
     straight: False, the stripe follows the border wherever it winds. The distance of a cell from it
-    is that to the nearest cell of the other type, from centre to centre, less a cell's diameter, 0 where cells overlap.
-    True, the border is one straight line, at the place along the axis with the fewest cells on the
-    wrong side. along: "x" or "y", the axis that the stripe lies across. cell_type: only cells of
-    this type count. place: of the middle of the stripe from `at`, µm towards the type that lies
-    higher on the axis. The default is 0; with "border" and a cell_type, the stripe adjoins the
-    border on the side of that type. floor: the level from which a cell counts as lit. edge_width:
-    µm, as for `Bands`. A colony that has lost one of its two types, or `cell_type`, has failed.
+    is that to the nearest cell of the other type, from centre to centre, less a cell's diameter, 0
+    where cells overlap. True, the border is one straight line, at the place along the axis with the
+    fewest cells on the wrong side. along: "x" or "y", the axis that the stripe lies across.
+    cell_type: only cells of this type count. place: of the middle of the stripe from `at`, µm
+    towards the type that lies higher on the axis. The default is 0; with "border" and a cell_type,
+    the stripe adjoins the border on the side of that type. floor: the level from which a cell
+    counts as lit. edge_width: µm, as for `Bands`. A colony that has lost one of its two types, or
+    `cell_type`, has failed.
     """
 
     species: str
@@ -171,10 +172,10 @@ class Stripe(ProfileTarget):
 
         place_um: mean distance from `at` of the light above the level of far cells, those farther
         than 2·width from the target's middle; width_um: full width at half maximum of the profile
-        in strips of 1 µm, with lines between their middles; peak: the greatest mean of a strip; contrast: mean level inside the
-        target stripe over that of the far cells; straightness_um: root mean square distance from a
-        straight line of the middle of the bright cells, over strips of 4 µm across. Bright cells
-        have at least half the peak.
+        in strips of 1 µm, with lines between their middles; peak: the greatest mean of a strip;
+        contrast: mean level inside the target stripe over that of the far cells; straightness_um:
+        root mean square distance from a straight line of the middle of the bright cells, over
+        strips of 4 µm across. Bright cells have at least half the peak.
         """
         y, (_, middle, x) = valid_levels(state, self.names)[0][:, 0], self.reference(state)
         # a colony without a border has no place: its cells are left out, and its measures are NaN

@@ -142,9 +142,9 @@ def test_where_the_stripe_is(options, low, high):
 @pytest.mark.parametrize("turned", [False, True], ids=["x", "y"])
 @pytest.mark.parametrize("mirror", [False, True])
 def test_measures_of_a_stripe_laid_out_by_hand(turned, mirror):
-    """Six columns of 8, fourteen of 1/8, the first at the border: middle 3 µm from it, six strips of
-    1 µm wide, and straight. On the line between the middles of the sixth and the seventh, half the
-    peak is at 4/(8 − 1/8) of 1 µm."""
+    """Six columns of 8, fourteen of 1/8, the first at the border: middle 3 µm from it, six strips
+    of 1 µm wide, and straight. On the line between the middles of the sixth and the seventh, half
+    the peak is at 4/(8 − 1/8) of 1 µm."""
     state = field(shift=5.0, turned=turned)
     if mirror:
         state = state.replace(position=-state.position)
