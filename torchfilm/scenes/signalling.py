@@ -118,28 +118,15 @@ def boundary_detector(
     constants give no band: reporters are diluted faster than they are made.
     """
     half = width / 2
+    circuit = Circuit(
+        {0: _sources, 1: _sinks}, species=("luxi", "ahl", "aiia", "cfp", "yfp"), rtol=rtol,
+        D1=D1, d1=d1, d2=d2, d3=d3, dr=dr, g1=g1, g2=g2, k1=k1, k2=k2, k3=k3, k4=k4, k5=k5, k6=k6,
+    )  # fmt: skip
     return Scene(
         Growth(rate=rate),
         Division(length=Uniform(3.5, 4.5)),
         Mechanics(dim=2, walls=[Channel(width)], length_drag=length_drag),
-        Circuit(
-            {0: _sources, 1: _sinks},
-            species=("luxi", "ahl", "aiia", "cfp", "yfp"),
-            rtol=rtol,
-            D1=D1,
-            d1=d1,
-            d2=d2,
-            d3=d3,
-            dr=dr,
-            g1=g1,
-            g2=g2,
-            k1=k1,
-            k2=k2,
-            k3=k3,
-            k4=k4,
-            k5=k5,
-            k6=k6,
-        ),
+        circuit,
         Medium(
             ahl=Signal(diffusion=diffusion),
             box=((-128.0, -half, -24.0), (128.0, half, 24.0)),
