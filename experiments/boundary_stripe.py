@@ -3,7 +3,7 @@ populations meet.
 
     python experiments/boundary_stripe.py                    # 2,000 colonies of 1,000 cells
     python experiments/boundary_stripe.py --colonies 800 --out runs/stripe
-    python experiments/boundary_stripe.py --colonies 640 --width 1 --spacing 2 --out narrow
+    python experiments/boundary_stripe.py --colonies 800 --cells 300 --width 1 --spacing 2
 
 You may stop the search at any time; running it again resumes it. Target: sinks (type 1) within 4 µm
 of a source are lit by YFP, well above 0.2, and all other sinks are dark. The constants printed in
@@ -75,6 +75,9 @@ def main() -> None:
     parser.add_argument("--colonies", type=int, default=2000, help="number to simulate")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--width", type=float, default=TARGET.width, help="of the stripe, µm")
+    parser.add_argument(
+        "--cells", type=int, default=COLONY["cells"], help="of the colonies of the search"
+    )
     parser.add_argument("--spacing", type=float, default=4.0, help="of the grid of AHL, µm")
     parser.add_argument(
         "--out",
@@ -88,8 +91,9 @@ def main() -> None:
 
     colony = {**COLONY, "fixed": {**COLONY["fixed"], "spacing": options.spacing}}
     target = replace(TARGET, width=options.width, edge_width=min(1.0, options.width / 2))
+    searched = {**colony, "cells": options.cells}
     search = Search(
-        "boundary_detector", PARAMETERS, target, **colony, replicates=4, seed=options.seed
+        "boundary_detector", PARAMETERS, target, **searched, replicates=4, seed=options.seed
     )
     best = search.run(options.colonies, study=options.out.with_suffix(".h5"))
     print(best.table())
