@@ -53,3 +53,16 @@ def test_the_site_lists_every_page_once():
     text = (ROOT / "mkdocs.yml").read_text()
     listed = re.findall(r": (\S+\.md)$", text, re.MULTILINE)
     assert sorted(listed) == sorted(p.name for p in PAGES if p.parent.name == "docs")
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=lambda page: page.name)
+def test_prose_is_at_most_100_columns_wide(page):
+    """Apart from tables, pictures, code and what a script wrote between its marks."""
+    long, code, written = [], False, False
+    for number, line in enumerate(page.read_text().splitlines(), 1):
+        code ^= line.startswith("```")
+        if line.startswith("<!--"):
+            written = "to here" not in line
+        if len(line) > 100 and not code and not written and not line.startswith(("|", "![")):
+            long.append(number)
+    assert long == []
