@@ -99,20 +99,32 @@ def _unguarded() -> bool:
         name, path = frame.f_globals.get("__name__"), frame.f_globals.get("__file__")
         if name == "__mp_main__":
             return True
+        spec = frame.f_globals.get("__spec__")
+        if spec is not None and spec.name.endswith("__main__"):
+            return False  # of a package, which workers do not import
         if name == "__main__" and path is not None and Path(path).is_file():
             return not _has_guard(Path(path).read_bytes())
     return False
 
 
 def _has_guard(source: bytes) -> bool:
-    """Whether a test at the top level of a script reads `__name__`; True where it is no source."""
+    """Whether a test outside of functions and classes of a script reads `__name__`; True where it
+    is no source."""
     try:
         parsed = ast.parse(source)
     except (SyntaxError, ValueError):
         return True
-    tests = [node.test for node in parsed.body if isinstance(node, ast.If)]
-    names = [n.id for test in tests for n in ast.walk(test) if isinstance(n, ast.Name)]
-    return "__name__" in names
+    inner = ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda
+    nodes: list[ast.AST] = list(parsed.body)
+    for node in nodes:
+        if isinstance(node, inner):
+            continue
+        if isinstance(node, (ast.If, ast.IfExp)):
+            names = [n.id for n in ast.walk(node.test) if isinstance(n, ast.Name)]
+            if "__name__" in names:
+                return True
+        nodes += ast.iter_child_nodes(node)
+    return False
 
 
 def _submit(

@@ -216,7 +216,13 @@ class Space:
 
     def values(self, point: np.ndarray) -> dict[str, Value]:
         """The values of one design by name, from its coordinates (D,)."""
-        found = {p.name: p.value(float(u)) for p, u in zip(self.parameters, point, strict=True)}
+        return self.resolved(
+            {p.name: p.value(float(u)) for p, u in zip(self.parameters, point, strict=True)}
+        )
+
+    def resolved(self, values: Mapping[str, Value]) -> dict[str, Value]:
+        """The values of a design whose choices do not exclude each other."""
+        found = dict(values)
         for resolve in self._resolving:
             found |= resolve(found)
         return found

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import inspect
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 import torchfilm as tf
@@ -155,9 +156,10 @@ def try_scenes(
     built, where the target does not suit it, where no scene can reach `cells` cells, and where all
     these designs are unfit.
     """
-    middle = {p.name: p.value(0.5) for p in family.space.parameters}
+    middle = family.space.values(np.full(family.space.size, 0.5))
     made_of, endless, unfit, rough = [], [], [], []
     example: tf.Scene | None = None
+    stochastic = False
     for values in _trial_values(family.space, middle):
         try:
             # two colonies: a tensor with one number would pass for a plain number
@@ -173,6 +175,7 @@ def try_scenes(
         target.check(tried.first)
         example = example or family.scene([values])
         made_of.append((scene.effects, scene.founders))
+        stochastic |= _is_stochastic(scene)
         endless.append(tried.why_endless)
         rough.append(why_rough(scene, tried.why_regrown))
     # one design that does not grow is scored as such; a search in which none grows is a mistake
@@ -193,7 +196,7 @@ def try_scenes(
         digest=tf.digest(made_of),
         why_regrown=why_regrown,
         why_rough=next(filter(None, rough), ""),
-        stochastic=_is_stochastic(scene),
+        stochastic=stochastic,
     )
 
 
@@ -232,13 +235,7 @@ def why_rough_together(family: SceneFamily, *, seed: int, dtype: torch.dtype, re
     """Why some scene has no exact derivatives, with options of several choices or whole numbers
     together, or "". The first `MOST_TOGETHER` structures are tried. Those that cannot be built are
     passed over: such designs fail."""
-    middle = {p.name: p.value(0.5) for p in family.space.parameters}
-    structural = [p for p in family.space.parameters if p.structural]
-    each = [
-        [p.value((k + 0.5) / (p.levels or 1)) for k in range(p.levels or 1)] for p in structural
-    ]
-    for options in itertools.islice(itertools.product(*each), MOST_TOGETHER):
-        values = middle | {p.name: v for p, v in zip(structural, options, strict=True)}
+    for values in itertools.islice(_structures(family.space), MOST_TOGETHER):
         try:
             scene = family.scene([values], repeat=2)
             tried = colonies.try_scene(
@@ -251,10 +248,25 @@ def why_rough_together(family: SceneFamily, *, seed: int, dtype: torch.dtype, re
     return ""
 
 
+def _structures(space: Space) -> Iterator[dict[str, Value]]:
+    """A design of each structure among the first 1,024 of the space, each once: choices that
+    exclude each other make some alike."""
+    each = [
+        [(k + 0.5) / (p.levels or 1) for k in range(p.levels or 1)] if p.structural else [0.5]
+        for p in space.parameters
+    ]
+    seen: list[dict[str, Value]] = []
+    for point in itertools.islice(itertools.product(*each), 1024):
+        values = space.values(np.array(point))
+        if values not in seen:
+            seen.append(values)
+            yield values
+
+
 def _trial_values(space: Space, middle: dict[str, Value]) -> list[dict[str, Value]]:
     trials = [middle]
     for p in space.parameters:
         ends = (p.low, p.high) if isinstance(p, Parameter) else p.options
         whole = isinstance(p, Parameter) and p.whole
-        trials += [{**middle, p.name: int(v) if whole else v} for v in ends]
+        trials += [space.resolved({**middle, p.name: int(v) if whole else v}) for v in ends]
     return trials

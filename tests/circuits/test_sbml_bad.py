@@ -271,3 +271,17 @@ def test_a_missing_extra_is_named(module, package, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(tf.InputError, match=rf'{package}: pip install -e "\.\[sbml\]"'):
         tf.Circuit.from_antimony(QUORUM)
+
+
+@pytest.mark.parametrize("end", ["net.xml", "the file is toggle.ant"])
+def test_a_line_of_antimony_may_end_like_a_file(end):
+    circuit = tf.Circuit.from_antimony(f"x_' = 1; x_ = 0; # {end}", time_unit="h")
+    assert circuit.species == ("x_",)
+
+
+def test_the_advice_for_a_renamed_variable_can_be_followed():
+    text = "species x; -> x; 1; x = 0;"
+    with pytest.raises(tf.InputError, match=r"give its first value, initial=\{'x_': …\}"):
+        tf.Circuit.from_antimony(text, time_unit="h", x=2.0)
+    circuit = tf.Circuit.from_antimony(text, time_unit="h", initial={"x_": 2.0})
+    assert circuit.initial["x_"] == 2.0

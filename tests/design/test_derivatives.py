@@ -262,6 +262,18 @@ def test_options_together_without_exact_derivatives_are_enough():
     assert not found.reasons and (found.slopes.gradient[:, :2] != 0).all()
 
 
+def test_options_that_exclude_each_other_are_not_tried_together():
+    def genome_only(values):
+        return {"site": "genome"} if values["load"] == "slow" else {}
+
+    choices = [
+        Choice("load", ("slow", "none"), resolve=genome_only),
+        Choice("site", ("genome", "plasmid"), resolve=genome_only),
+    ]
+    objective = objective_of(slowed_together, [*TWO, *choices], EDGES, cells=8, replicates=1)
+    assert not objective.why_differences and objective.least_squares
+
+
 def test_a_structure_that_was_not_tried_has_no_slope_rather_than_a_wrong_one(monkeypatch):
     monkeypatch.setattr(scene_family, "MOST_TOGETHER", 0)
     objective = objective_of(slowed_together, TOGETHER, EDGES, cells=8, replicates=1)

@@ -17,6 +17,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
 )
 from dataclasses import dataclass
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import numpy as np
@@ -156,24 +157,34 @@ def test_searches_that_descend_find_the_same_in_other_processes(method):
     assert all(np.array_equal(a.losses, b.losses) for a, b in pairs)
 
 
+RUN = "objective().evaluate(points, executor=pool)"
+AS_SCRIPT = "__name__ == '__main__'"
+
+
 @pytest.mark.parametrize(
-    "name, begin, allowed",
+    "name, text, spec, allowed",
     [
-        ("__main__", "", False),
-        ("__main__", 'if __name__ == "__main__":\n    ', True),
-        ("__mp_main__", "", False),
-        ("another", "", True),
+        ("__main__", RUN, None, False),
+        ("__main__", f"if {AS_SCRIPT}:\n    {RUN}", None, True),
+        ("__main__", f"{RUN} if {AS_SCRIPT} else None", None, True),
+        ("__main__", f"try:\n    if {AS_SCRIPT}:\n        {RUN}\nfinally:\n    pass", None, True),
+        ("__main__", f"def f():\n    if {AS_SCRIPT}:\n        pass\n{RUN}", None, False),
+        ("__main__", RUN, "package.__main__", True),  # which workers do not import
+        ("__main__", RUN, "package.script", False),
+        ("__mp_main__", RUN, None, False),
+        ("another", RUN, None, True),
     ],
 )
-def test_a_script_that_every_worker_would_run_is_refused(tmp_path, name, begin, allowed):
+def test_a_script_that_every_worker_would_run_is_refused(tmp_path, name, text, spec, allowed):
     script = tmp_path / "script.py"
-    script.write_text(f"{begin}objective().evaluate(points, executor=pool)\n")
+    script.write_text(text)
+    spec = None if spec is None else ModuleSpec(spec, None)
     pool = ProcessPoolExecutor(1, mp_context=SPAWN)
     pool.shutdown()  # it starts no process
     given = {"objective": objective, "points": POINTS[:1], "pool": pool}
     run = lambda: exec(
         compile(script.read_text(), str(script), "exec"),
-        {"__name__": name, "__file__": str(script), **given},
+        {"__name__": name, "__file__": str(script), "__spec__": spec, **given},
     )
     if allowed:
         with pytest.warns(RuntimeWarning, match="lost 1 of 1"):

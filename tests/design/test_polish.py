@@ -7,7 +7,8 @@ import pytest
 from asking import Room, begun
 from searching import Level, lit, paced
 
-from design import CMAES, NSGA2, Local, Parameter, Polish, Racing, Search, Sobol, Study
+import torchfilm as tf
+from design import CMAES, NSGA2, Choice, Local, Parameter, Polish, Racing, Search, Sobol, Study
 from design.methods import choose
 from design.methods.local import unlike
 from design.slopes import Slopes
@@ -157,6 +158,19 @@ def test_auto_races_with_all_replicates_where_molecules_are_counted():
     assert isinstance(choose(3, 20, 0, chance=8).method, CMAES)  # too few for races
     again = choose(3, 20, 0, chance=8, before=choose(3, 200, 0, chance=8).describe())
     assert again.method.small == 8
+
+
+@pytest.mark.parametrize("options", [("counted", "smooth"), ("smooth", "counted")])
+def test_one_option_that_counts_molecules_is_enough(options):
+    def grown(how="counted", strength=3.0):
+        made = [tf.Reaction({}, {"gfp": 1}, "strength")]
+        method = "direct" if how == "counted" else "rosenbrock"
+        circuit = tf.Circuit(made, species=("gfp",), method=method, strength=strength)
+        return tf.Scene(tf.Growth(rate=2.0), tf.Division(length=tf.Uniform(3, 4)), circuit)
+
+    parameters = [Choice("how", options), Parameter("strength", 1.0, 3.0)]
+    search = Search(grown, parameters, Level(), cells=4, replicates=2)
+    assert search.objective.task.tried.stochastic
 
 
 def test_what_a_search_says_of_its_loss():

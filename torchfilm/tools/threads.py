@@ -38,10 +38,11 @@ def one_torch_thread() -> Iterator[None]:
     For work by kernels with operations of torch between them, on the CPU. Each operation that torch
     shares out leaves its other threads waiting in a loop, which keeps the kernels' threads, and
     other programs, from the processor: on two cores that took up to ten times as long. Runs and
-    searches do so by themselves. It makes no difference to results.
+    searches do so by themselves. It makes no difference to kernels; large sums of torch itself may
+    differ in their last bits. A thread of Python that first uses torch meanwhile has one, too.
     """
-    if _given.count is not None:
-        yield
+    if _given.count is not None or torch.get_num_threads() == 1:
+        yield  # the default of threads to come stays as it is
         return
     _given.count = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -37,7 +37,8 @@ def to_sbml(text: str, where: str) -> str:
     # a name of a file is a statement, too: a model without anything in it
     name = text.strip()
     is_name = not re.search(r"[\s;=>]", name)
-    if is_name or ("\n" not in name and name.lower().endswith((*SUFFIXES, *XML))):
+    may_be = not re.search(r"[\n;=>']", name)  # with spaces in it
+    if is_name or (may_be and name.lower().endswith((*SUFFIXES, *XML))):
         reader = "from_sbml" if name.lower().endswith(XML) else "from_antimony"
         raise InputError(
             f"{where} is {shortened(name)!r}, which looks like the name of a file: read it with"

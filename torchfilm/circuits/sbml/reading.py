@@ -339,7 +339,7 @@ def _check_given(quantities: Quantities, given: Given) -> None:
     for name in given.values:
         own = names.get(name, name)
         if own in quantities.things and quantities.is_variable(own):
-            first = f"initial={{{name!r}: …}}"
+            first = f"initial={{{quantities.column(own)!r}: …}}"
             raise InputError(f"{name!r} is a variable: give its first value, {first}")
         if name in constants or own in quantities.used:
             continue
