@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from torchfilm import scenes
+from torchfilm.circuits import ANTIMONY_FILES, SBML_FILES
 from torchfilm.effects.circuit import OPTION_NAMES, Circuit
 from torchfilm.scene import Scene
 from torchfilm.scenes.recipes import to_plain
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 
-SBML, ANTIMONY = (".xml", ".sbml"), (".ant", ".antimony")
 # What messages of `Circuit.from_sbml` tell to give, and the same on the command line.
 IN_A_SHELL = (
     (re.compile(r"initial=\{'(\w+)': …\}"), r"--set \1=…"),
@@ -28,7 +28,7 @@ IN_A_SHELL = (
 
 def is_model(path: Path) -> bool:
     """Whether a file is a model, by its suffix."""
-    return path.suffix.lower() in (*SBML, *ANTIMONY)
+    return path.suffix.lower() in (*SBML_FILES, *ANTIMONY_FILES)
 
 
 def scene_of_model(path: Path, parameters: dict[str, Any]) -> Scene:
@@ -62,7 +62,7 @@ def _circuit(path: Path, parameters: dict[str, Any]) -> Circuit:
     from torchfilm.circuits import sbml
     from torchfilm.effects import circuit_sbml
 
-    of_sbml = path.suffix.lower() in SBML
+    of_sbml = path.suffix.lower() in SBML_FILES
     model = circuit_sbml.read_file(path) if of_sbml else circuit_sbml.read_antimony(path)
     choices = circuit_sbml.model_choices(
         (),
@@ -83,7 +83,7 @@ def _circuit(path: Path, parameters: dict[str, Any]) -> Circuit:
 def _needs_a_medium(path: Path, signals: Collection[str] = ()) -> str:
     """What to do with a model that has signals; by its own annotation, if they are given."""
     given = repr(str(path))
-    of_sbml = path.suffix.lower() in SBML
+    of_sbml = path.suffix.lower() in SBML_FILES
     reader = f"from_sbml({given}" if of_sbml else f"from_antimony(Path({given})"
     media = ", ".join(f"{n}=tf.Signal(…)" for n in signals or ("NAME",))
     return (

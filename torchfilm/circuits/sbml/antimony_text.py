@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 
+from torchfilm.circuits import ANTIMONY_FILES, SBML_FILES
 from torchfilm.circuits.sbml.document import needed, shortened
 from torchfilm.tools.checks import InputError
 
-SUFFIXES, XML = (".ant", ".antimony"), (".xml", ".sbml")
 # What a line of a model has: a reaction, a rate rule, or the beginning of a model.
 STATEMENT = re.compile(r"->|=>|^\s*\w+\s*'\s*=|^\s*\*?(model|module|species)\b", re.MULTILINE)
 COMMENTS = re.compile(r"/\*.*?\*/|//[^\n]*|#[^\n]*", re.DOTALL)
@@ -38,8 +38,8 @@ def to_sbml(text: str, where: str) -> str:
     name = text.strip()
     is_name = not re.search(r"[\s;=>]", name)
     may_be = not re.search(r"[\n;=>']", name)  # with spaces in it
-    if is_name or (may_be and name.lower().endswith((*SUFFIXES, *XML))):
-        reader = "from_sbml" if name.lower().endswith(XML) else "from_antimony"
+    if is_name or (may_be and name.lower().endswith((*ANTIMONY_FILES, *SBML_FILES))):
+        reader = "from_sbml" if name.lower().endswith(SBML_FILES) else "from_antimony"
         raise InputError(
             f"{where} is {shortened(name)!r}, which looks like the name of a file: read it with"
             f" Circuit.{reader}(Path({shortened(name)!r})), or give the text that is in it."
