@@ -156,11 +156,11 @@ def try_scenes(
     built, where the target does not suit it, where no scene can reach `cells` cells, and where all
     these designs are unfit.
     """
-    middle = family.space.values(np.full(family.space.size, 0.5))
+    trials = _trial_values(family.space)
     made_of, endless, unfit, rough = [], [], [], []
     example: tf.Scene | None = None
     stochastic = False
-    for values in _trial_values(family.space, middle):
+    for values in trials:
         try:
             # two colonies: a tensor with one number would pass for a plain number
             scene = family.scene([values], repeat=2)
@@ -171,7 +171,7 @@ def try_scenes(
             unfit.append(str(error))
             continue
         except Exception as error:
-            raise _cannot_be_built(error, values, middle) from error
+            raise _cannot_be_built(error, values, trials[0]) from error
         target.check(tried.first)
         example = example or family.scene([values])
         made_of.append((scene.effects, scene.founders))
@@ -233,8 +233,8 @@ def _is_stochastic(scene: tf.Scene) -> bool:
 
 def why_rough_together(family: SceneFamily, *, seed: int, dtype: torch.dtype, replay: bool) -> str:
     """Why some scene has no exact derivatives, with options of several choices or whole numbers
-    together, or "". The first `MOST_TOGETHER` structures are tried. Those that cannot be built are
-    passed over: such designs fail."""
+    together, or "". The first `MOST_TOGETHER` structures that `try_scenes` leaves out are tried.
+    Those that cannot be built are passed over: such designs fail."""
     for values in itertools.islice(_structures(family.space), MOST_TOGETHER):
         try:
             scene = family.scene([values], repeat=2)
@@ -249,13 +249,13 @@ def why_rough_together(family: SceneFamily, *, seed: int, dtype: torch.dtype, re
 
 
 def _structures(space: Space) -> Iterator[dict[str, Value]]:
-    """A design of each structure among the first 1,024 of the space, each once: choices that
-    exclude each other make some alike."""
+    """A design of each structure among the first 1,024 of the space, each once (choices that
+    exclude each other make some alike), without those of `_trial_values`."""
     each = [
         [(k + 0.5) / (p.levels or 1) for k in range(p.levels or 1)] if p.structural else [0.5]
         for p in space.parameters
     ]
-    seen: list[dict[str, Value]] = []
+    seen = _trial_values(space)
     for point in itertools.islice(itertools.product(*each), 1024):
         values = space.values(np.array(point))
         if values not in seen:
@@ -263,7 +263,9 @@ def _structures(space: Space) -> Iterator[dict[str, Value]]:
             yield values
 
 
-def _trial_values(space: Space, middle: dict[str, Value]) -> list[dict[str, Value]]:
+def _trial_values(space: Space) -> list[dict[str, Value]]:
+    """The middle of the space, then both bounds of every number and every option, one at a time."""
+    middle = space.values(np.full(space.size, 0.5))
     trials = [middle]
     for p in space.parameters:
         ends = (p.low, p.high) if isinstance(p, Parameter) else p.options
