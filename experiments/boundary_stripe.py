@@ -89,24 +89,23 @@ def main() -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     tf.keep_memory()
 
-    colony = {**COLONY, "fixed": {**COLONY["fixed"], "spacing": options.spacing}}
+    colony = lambda spacing: {**COLONY, "fixed": {**COLONY["fixed"], "spacing": spacing}}
     target = replace(TARGET, width=options.width, edge_width=min(1.0, options.width / 2))
-    searched = {**colony, "cells": options.cells}
+    searched = {**colony(options.spacing), "cells": options.cells}
     search = Search(
         "boundary_detector", PARAMETERS, target, **searched, replicates=4, seed=options.seed
     )
     best = search.run(options.colonies, study=options.out.with_suffix(".h5"))
     print(best.table())
     narrow = options.width <= NARROW["width_um"]
-    fixed = {**colony["fixed"], "spacing": options.spacing / 2}
-    judged = replace(target, width=max(target.width, NARROW["width_um"]))
-    same, finer = (
-        Objective(Task("boundary_detector", PARAMETERS, judged, **{**colony, "fixed": f}))
-        for f in (colony["fixed"], fixed)
+    judge = replace(target, width=max(target.width, NARROW["width_um"]))
+    judged = lambda spacing: Objective(
+        Task("boundary_detector", PARAMETERS, judge, **colony(spacing))
     )
+    same, finer = judged(options.spacing), options.spacing / 2
     columns = {"published": on_new_seeds(same, PUBLISHED), "best": on_new_seeds(same, best.values)}
     if narrow:
-        columns[f"{fixed['spacing']:g} µm voxels"] = on_new_seeds(finer, best.values)
+        columns[f"{finer:g} µm voxels"] = on_new_seeds(judged(finer), best.values)
     print(f"\n{'on 8 new seeds':<18}" + "".join(f"{title:>14}" for title in columns))
     for name in columns["best"]:
         print(f"{name:<18}" + "".join(f"{found[name]:>14.4g}" for found in columns.values()))
