@@ -12,12 +12,13 @@ import torch
 
 import torchfilm as tf
 from torchfilm.cost_estimate import COLUMNS, ROWS, Block, CostProbe, Spending, crowd, state_bytes
-from torchfilm.effects import KNOWN, bound_mechanics, medium_transport
+from torchfilm.effects import KNOWN, medium_transport
 from torchfilm.effects.bound_medium import FirstHalf, GridCoverage
 from torchfilm.effects.mechanics import TOLERANCE
 from torchfilm.explanation import left_out, replayed
 from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
+from torchfilm.physics import bilateral, compiled, one_sided
 from torchfilm.tools.counting import Operators
 
 BODY = (tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2))
@@ -203,17 +204,17 @@ def test_defaults_reported_of_contacts_are_those_used(dim, contacts):
 @pytest.mark.parametrize("backend", [None, "compiled", "torch"])
 def test_who_computes_contacts_is_who_is_reported(backend, contacts, monkeypatch):
     called = []
-    for name in ("compiled", "one_sided", "bilateral"):
-        part = getattr(bound_mechanics, name)
-        steps = lambda given, name=name, usual=part.contact_steps: (
-            called.append(name) or usual(given)
-        )
-        monkeypatch.setattr(part, "contact_steps", steps)
+    parts = {"compiled": compiled, "one-sided": one_sided, "bilateral": bilateral}
+    for name, part in parts.items():
+        function = "step" if name == "compiled" else "contact_steps"
+        usual = getattr(part, function)
+        steps = lambda given, name=name, usual=usual: called.append(name) or usual(given)
+        monkeypatch.setattr(part, function, steps)
     effect = tf.Mechanics(dim=2, backend=backend, contacts=contacts)
     model = tf.Scene(effect, tf.Growth(rate=1.0)).bind()
     model.step(model.start(), 0.025)
     by_torch = backend == "torch"
-    assert called == [contacts.replace("-", "_") if by_torch else "compiled"]
+    assert called == [contacts if by_torch else "compiled"]
     said = "torch," if by_torch else "compiled; by torch where gradients are required,"
     assert f"conjugate gradients, {said}" in " ".join(effect.numerics(0.025, model.start()))
 

@@ -320,10 +320,13 @@ class State:
         changed = {}
         for name in names:
             declared = self.declared[name]
-            if declared.scope == CELL and declared.at_division == "reset":
-                changed[name] = self.fields[name].index_copy(
-                    0, daughters, declared.start(self, daughters)
-                )
+            if declared.scope != CELL or declared.at_division != "reset":
+                continue
+            value, first = self.fields[name], declared.initial
+            if callable(first):
+                changed[name] = value.index_copy(0, daughters, declared.start(self, daughters))
+            else:
+                changed[name] = value.index_fill(0, daughters, first)
         return self.with_fields(**changed)
 
     def remove(self, gone: Tensor, fate: str) -> State:

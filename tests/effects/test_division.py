@@ -4,12 +4,12 @@ copying."""
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass
 
 import pytest
 import torch
 from helpers import ends, seeded, step
+from recorded import assert_same_state
 
 import torchfilm as tf
 from torchfilm.effect import Effect
@@ -515,20 +515,29 @@ def test_exactly_two_radii_may_divide():
     assert step(scene, flagged(scene), 0.1).length.tolist() == [0.0, 0.0]
 
 
-def test_cells_are_split_alike_by_a_kernel_and_by_torch(monkeypatch):
-    """Colonies in which none, some and all cells are due, and one without cells."""
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("axis_noise", [0.0, 0.01, [0.0, 0.1, 0.2, 0.3]])
+def test_cells_divide_alike_by_kernels_and_by_torch(dim, axis_noise, dtype, monkeypatch):
+    """Colonies in which none, some and all cells are due, and one without cells: the same bits,
+    since it must not matter whether numba has been loaded."""
     pytest.importorskip("numba")
-    counts = torch.tensor([3, 5, 0, 4])
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0), tf.Mechanics(dim=2))
-    one = scene.bind(4, seed=0).start()
+    counts, generator = torch.tensor([3, 5, 0, 4]), torch.Generator().manual_seed(dim)
+    divides = tf.Division(fraction=tf.Normal(0.5, 0.05), axis_noise=axis_noise)
+    model = tf.Scene(tf.Growth(rate=1.0), divides, dim=dim).bind(4, seed=3, dtype=dtype)
     rows = torch.repeat_interleave(torch.arange(4), counts)
-    state = one.take(rows).replace(
-        uid=torch.arange(12) + 7, parent=torch.arange(12) - 1, next_uid=torch.arange(4) * 100 + 20
-    )
+    draw = lambda *shape: torch.rand(*shape, generator=generator, dtype=dtype)
+    axis = torch.nn.functional.normalize(draw(12, dim) - 0.5, dim=1)
+    state = model.start().take(rows).replace(
+        uid=torch.arange(12) + 7, parent=torch.arange(12) - 1, next_uid=torch.arange(4) * 100 + 20,
+        length=3.0 + draw(12), radius=0.4 + 0.2 * draw(12), axis=axis,
+        position=50 * draw(12, dim).double(),
+    )  # fmt: skip
     due = torch.tensor([0, 0, 0, 1, 0, 1, 1, 0, 1, 1, 1, 1], dtype=torch.bool)
-    *by_kernel, ids = division._split(state, due)
-    monkeypatch.delitem(sys.modules, "numba", raising=False)
-    *by_torch, others = division._split(state, due)
-    assert by_kernel[0].tolist() == [3, 5, 6, 8, 9, 10, 11]
-    for a, b in zip([*by_kernel, *ids.values()], [*by_torch, *others.values()], strict=True):
-        assert torch.equal(a, b)
+    values = next(e for e in model.effects if e.title == "division").values
+    by_kernels = division.divide(state, due, values.fraction, values.axis_noise)
+    monkeypatch.setattr(division, "_by_kernels", lambda value: False)
+    by_torch = division.divide(state, due, values.fraction, values.axis_noise)
+    assert by_kernels.births[-1].rows.tolist() == [3, 5, 6, 8, 9, 10, 11]
+    assert_same_state(by_kernels, by_torch)
+    for name in ("first", "second", "uid", "rows"):
+        assert torch.equal(*(getattr(s.births[-1], name) for s in (by_kernels, by_torch)))

@@ -147,6 +147,25 @@ def test_draws_do_not_depend_on_company(seed, order, step, shift):
         )
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_kernels_draw_the_same_bits(dtype, monkeypatch):
+    """Whether numba has been loaded must not matter, nor how many cells there are."""
+    pytest.importorskip("numba")
+    for count in (0, 1, 2, 7, 8, 33, 1000):
+        uid = torch.arange(count) * 7919 + 2**33
+        stream = torch.arange(count) % 5
+        given = (2**40 + 3, stream, uid, 12, "test")
+        found = [random.words(*given), *(d(*given, dtype) for d in (random.uniform, random.normal))]
+        with monkeypatch.context() as patch:
+            patch.setattr(random, "_by_kernels", lambda uid: False)
+            by_torch = [
+                random.words(*given),
+                *(d(*given, dtype) for d in (random.uniform, random.normal)),
+            ]
+        assert all(torch.equal(a, b) for a, b in zip(found, by_torch, strict=True))
+        assert found[2].shape == (count, 4)
+
+
 def test_every_part_of_the_key_counts():
     """A change of seed, colony, uid, step or purpose changes the words, also beyond 32 bits."""
     base = {"seed": 1, "colony": 2, "uid": 3, "step": 4, "purpose": "a"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import reduce
 from typing import ClassVar
 
 import torch
@@ -16,6 +17,7 @@ from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, places, reads_are_free
+from torchfilm.tools.tangents import tracked
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 CRITERIA = ("length", "volume", "added")
@@ -259,39 +261,72 @@ def divide(state: State, due: Tensor, fraction: Resolved, axis_noise: Resolved) 
     Gradients pass through.
     """
     rows, daughters, source, ids = _split(state, due)
-    length, radius, axis = (
-        x.index_select(0, rows) for x in (state.length, state.radius, state.axis)
-    )
+    new = state.take(source, **ids)
     share = fraction.of_rows(state, rows, "Division.fraction")
-    rest = length - 2 * radius
-    lengths = torch.cat([rest * share, rest * (1 - share)])
-    shift = 0.5 * (lengths - torch.cat([length, length]))
-    shift = torch.cat([shift[: rows.numel()], -shift[rows.numel() :]]).unsqueeze(1)
-    shift = shift * torch.cat([axis, axis])
-
-    new = state.take(source)
-    new = new.replace(
-        length=new.length.index_copy(0, daughters, lengths),
-        position=new.position.index_add(0, daughters, shift.to(new.position.dtype)),
-        **ids,
-    )
+    noise = None
+    if not axis_noise.is_zero:
+        sd = axis_noise.of_rows(new, daughters, "axis_noise")
+        noise = sd, new.normal(daughters, "Division.axis_noise")
+    new = _placed(new, state, rows, daughters, share, noise)
     first, second = daughters.chunk(2)
     births = Births(first, second, new.uid.index_select(0, daughters), state, rows)
     colony_id = state.colony_id.index_select(0, state.colony.index_select(0, rows))
     note = Ended(colony_id, state.uid.index_select(0, rows), "divided")
-    new = new.replace(
-        axis=_with_noise(new, daughters, axis_noise),
-        births=(*new.births, births),
-        ended=(*new.ended, note),
-    )
+    new = new.replace(births=(*new.births, births), ended=(*new.ended, note))
     return new.reset_at_division(daughters, new.declared)
+
+
+def _by_kernels(value: Tensor) -> bool:
+    """Whether kernels compute, to the same bits; to load them here would cost more."""
+    return value.device.type == "cpu" and "numba" in sys.modules
+
+
+def _placed(
+    new: State,
+    state: State,
+    rows: Tensor,
+    daughters: Tensor,
+    share: Tensor,
+    noise: tuple[Tensor, Tensor] | None,
+) -> State:
+    """The new state with its daughters (2M,) as long as they are, where they lie, in which as yet
+    they are as their parents, `rows` (M,) of the state before. share: (M,). noise: of the axes, sd
+    (2M,) and standard normal draws (2M, 4)."""
+    of_cells = state.length, state.radius, state.axis, state.position
+    if _by_kernels(share) and not tracked(*of_cells, share, *(noise or ())):
+        from torchfilm.kernels.divisions import place_daughters
+
+        sd, draws = (share[:0], state.axis[:0]) if noise is None else noise
+        given = (rows, daughters, state.length, state.radius, state.axis, share, draws, sd)
+        changed = new.length, new.axis, new.position  # which no other state has
+        place_daughters(*(x.detach().contiguous().numpy() for x in (*given, *changed)))
+        return new
+    length, radius, axis = (x.index_select(0, rows) for x in of_cells[:3])
+    rest = length - 2 * radius
+    lengths = torch.cat([rest * share, rest * (1 - share)])
+    shift = 0.5 * (lengths - torch.cat([length, length]))
+    shift = torch.cat([shift[: rows.numel()], -shift[rows.numel() :]]).unsqueeze(1)
+    axis = torch.cat([axis, axis])
+    moved = (shift * axis).to(new.position.dtype)
+    if noise is not None:
+        sd, draws = noise[0].unsqueeze(1), noise[1][:, : new.dim]
+        turned = axis + sd * draws
+        # not sqrt, for which torch wakes all threads on the CPU, nor sum, whose order may vary
+        first, *others = (turned * turned).split(1, dim=1)
+        square = reduce(torch.add, others, first)
+        axis = torch.where(sd > 0, turned * square.rsqrt(), axis)
+    return new.replace(
+        length=new.length.index_copy(0, daughters, lengths),
+        position=new.position.index_add(0, daughters, moved),
+        axis=new.axis.index_copy(0, daughters, axis),
+    )
 
 
 def _split(state: State, due: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
     """The rows of the parents (M,), of their daughters in the new batch (2M,), from which row each
     new cell comes (N + M,), and the new uid, parent and next_uid: see `kernels.divisions.split`."""
     given = due, state.colony, state.uid, state.parent, state.next_uid
-    if due.device.type == "cpu" and "numba" in sys.modules:  # to load it here would cost more
+    if _by_kernels(due):
         from torchfilm.kernels.divisions import split
 
         found = split(*(x.contiguous().numpy() for x in given))
@@ -304,9 +339,8 @@ def _split(state: State, due: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str,
     source = repeated(every, copies, whole)
     first = torch.cumsum(copies, 0).index_select(0, rows) - 2
     daughters = torch.cat([first, first + 1])
-    new = state.take(source)
     parents = state.uid.index_select(0, rows)
-    new_ids = _new_ids(new, daughters, parents)
+    new_ids = _new_ids(state.take(source), daughters, parents)
     return rows, daughters, source, dict(zip(NAMES, new_ids, strict=True))
 
 
@@ -324,17 +358,6 @@ def _new_ids(new: State, daughters: Tensor, parents: Tensor) -> tuple[Tensor, Te
     parent = new.parent.clone()
     parent[daughters] = torch.cat([parents, parents])
     return uid, parent, new.next_uid + per_colony
-
-
-def _with_noise(new: State, daughters: Tensor, axis_noise: Resolved) -> Tensor:
-    if axis_noise.is_zero:
-        return new.axis
-    sd = axis_noise.of_rows(new, daughters, "axis_noise").unsqueeze(1)
-    noise = sd * new.normal(daughters, "Division.axis_noise")[:, : new.dim]
-    axis = new.axis.index_select(0, daughters) + noise
-    # not sqrt, for which torch wakes all threads on the CPU
-    axis = torch.where(sd > 0, axis * (axis * axis).sum(1, keepdim=True).rsqrt(), axis)
-    return new.axis.index_copy(0, daughters, axis)
 
 
 def _length_of_rows(state: State, rows: Tensor, values: Values) -> Tensor:

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchfilm.kernels.scheme import MOST_SUBSTEPS
+from torchfilm.kernels.scheme import BURIED, LONG, MOST_SUBSTEPS
 from torchfilm.physics.contact_records import ContactReport
 from torchfilm.physics.problem import BAD_DRAG, COLLAPSED, STATUS, TOO_FAST
 
-# A colony whose contacts do not hold has more than this share of its cells (of MANY, if it has
-# fewer) deep in others for LONG steps. Cells that start in a heap part within a few steps.
-BURIED, MANY, LONG = 0.1, 50, 20
 # What may help, by status; SOLVE for the others.
 SOLVE = "A smaller dt, a larger alpha or more max_iterations may help"
 HINTS = {

@@ -26,15 +26,6 @@ def cells_of(of, x, axis, last, roots, dof):
 
 
 @kernel
-def doubles_of(of, values):
-    """The values (N,) of the cells `of`, in float64."""
-    out = np.empty(of.shape[0])
-    for i in range(of.shape[0]):
-        out[i] = values[of[i]]
-    return out
-
-
-@kernel
 def put_back(of, own_x, own_axis, own_last, own_length, x, axis, last, length, dof):
     """Write what the cells `of` have become into the batch."""
     D = degrees(dof)

@@ -6,11 +6,24 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.batch import cells_of, doubles_of, put_back
+from torchfilm.kernels.batch import put_back
 from torchfilm.kernels.bilateral_moves import make_moves
 from torchfilm.kernels.bilateral_scheme import CANDIDATE, CLOSE, DEEP, NEAR, PENALTY
 from torchfilm.kernels.bilateral_scheme import TOLERANCE as USUAL_TOLERANCE
 from torchfilm.kernels.bilateral_solve import minimise
+from torchfilm.kernels.colonies import (
+    CLIPPED,
+    DEEPLY,
+    ERROR,
+    ITERATIONS,
+    PASSES,
+    STATUS,
+    SUBSTEPS,
+    alphas_of,
+    closed,
+    opened,
+    taken_out,
+)
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.moves import drags
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
@@ -24,7 +37,6 @@ from torchfilm.kernels.rows import (
     wall_rows,
 )
 from torchfilm.kernels.scheme import NOT_FINITE
-from torchfilm.kernels.step import CLIPPED, DEEPLY, ERROR, ITERATIONS, PASSES, STATUS
 
 # Places in the settings. OVERLAP, TOLERANCE: below 0 where they are not given.
 OVERLAP, TOLERANCE, MOST_PASSES, COARSE_PASSES, LIMIT, SOFT = range(6)
@@ -215,34 +227,43 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, st
 
 
 @kernel
-def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosity, length_drag,
-                  last, hardness, kinds, places, sizes, roots, is_soft, alphas, settings, reports,
+def step_colonies(which, begin, dt, longest, cells, drags, alphas, walls, settings, out, reports,
                   dof):  # fmt: skip
-    """Steps of the colonies `which`: arguments as in `kernels.step.step_colonies`; hardness is not
-    used."""
-    soft, limit = settings[SOFT] > 0, int(settings[LIMIT])
+    """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments."""
+    soft, limit, x, radius = settings[SOFT] > 0, int(settings[LIMIT]), cells[0], cells[4]
+    kinds, places, sizes, _, is_soft = walls
     for b in which:
-        if begin[b + 1] == begin[b] or steps[b] == 0:
+        first, end, report = begin[b], begin[b + 1], reports[b]
+        if first == end:
             continue
-        of = spatial_order(x[begin[b] : begin[b + 1]], 6.0 * radius[begin[b]]) + begin[b]
-        own_x, own_axis, own_start, own_roots = cells_of(of, x, axis, last, roots, dof)
-        own_length, share = doubles_of(of, length), doubles_of(of, growth) / steps[b]
-        own_radius, own_viscosity = doubles_of(of, radius), doubles_of(of, viscosity)
-        own_drag = doubles_of(of, length_drag)
-        own_alpha, own_last = alphas[of], own_start.copy()
-        coarse = steps[b] > 1
-        penalty = np.minimum(own_alpha * own_drag / PENALTY, 1.0)
-        overlap = np.full(of.shape[0], settings[OVERLAP])
-        if settings[OVERLAP] < 0:
-            overlap = (np.full_like(own_radius, CLOSE) if coarse else DEEP * own_radius) * penalty
-        tolerance = settings[TOLERANCE]
-        if tolerance < 0:
-            tolerance = USUAL_TOLERANCE * math.sqrt(math.sqrt(penalty.min()))
-        passes = int(settings[COARSE_PASSES] if coarse else settings[MOST_PASSES])
-        for _ in range(steps[b]):
-            own_length = step_colony(
-                own_x, own_axis, own_length, share, own_radius, own_viscosity, own_drag, own_alpha,
-                own_start, own_last, overlap, kinds, places[:, b], sizes[:, b], own_roots, is_soft,
-                passes, tolerance, limit, soft, reports[b], dof,
-            )  # fmt: skip
-        put_back(of, own_x, own_axis, own_last, own_length, x, axis, last, length, dof)
+        if opened(first, end, longest, cells, drags, out, report):
+            steps = int(report[SUBSTEPS])
+            of = spatial_order(x[first:end], 6.0 * radius[first]) + first
+            own_x, own_axis, start, roots, length, share, own_radius, viscosity, drag = taken_out(
+                of, steps, dt / steps, cells, drags, walls, dof
+            )
+            own_alpha, last = alphas_of(of, dt / steps, alphas), start.copy()
+            if own_alpha.shape[0] == 0:
+                own_alpha = (PENALTY / drag).astype(own_alpha.dtype)
+            overlap, tolerance = _asked(settings, own_alpha * drag, own_radius, steps > 1)
+            passes = int(settings[COARSE_PASSES] if steps > 1 else settings[MOST_PASSES])
+            for _ in range(steps):
+                length = step_colony(
+                    own_x, own_axis, length, share, own_radius, viscosity, drag, own_alpha, start,
+                    last, overlap, kinds, places[:, b], sizes[:, b], roots, is_soft, passes,
+                    tolerance, limit, soft, report, dof,
+                )  # fmt: skip
+            put_back(of, own_x, own_axis, last, length, out[0], out[1], out[3], out[2], dof)
+        closed(first, end, cells, 0.0, out, report)
+
+
+@kernel
+def _asked(settings, weight, radius, coarse):
+    """How deep contacts may be left, (n,) µm, and the tolerance of the solve. weight: α γ, (n,)."""
+    penalty = np.minimum(weight / PENALTY, 1.0)
+    overlap, tolerance = np.full(radius.shape[0], settings[OVERLAP]), settings[TOLERANCE]
+    if settings[OVERLAP] < 0:
+        overlap = (np.full_like(radius, CLOSE) if coarse else DEEP * radius) * penalty
+    if tolerance < 0:
+        tolerance = USUAL_TOLERANCE * math.sqrt(math.sqrt(penalty.min()))
+    return overlap, tolerance

@@ -1,4 +1,4 @@
-"""Divisions: which cells there are then, and what they are called."""
+"""Divisions: which cells there are then, what they are called, and where they lie."""
 
 from __future__ import annotations
 
@@ -34,3 +34,33 @@ def split(due, colony, uid, parent, next_uid):
                 following[colony[i]] += 1
             k += 1
     return rows, daughters, source, new_uid, new_parent, following
+
+
+@kernel
+def place_daughters(rows, daughters, length, radius, axis, share, noise, sd, new_length, new_axis,
+                    new_position):  # fmt: skip
+    """Puts length, axis and position of 2 M daughters (see `split`) into the new batch, in which
+    they have those of their parents. All but the position is of one type, as torch would compute.
+
+    length, radius (N,) and axis (N, d) of the batch before; share (M,) of the length that first
+    daughters get; noise (2 M, 4), of which a daughter's axis gets sd (2 M,) times the first d; both
+    (0, …) for none.
+    """
+    m, d = rows.shape[0], axis.shape[1]
+    half, one = length.dtype.type(0.5), length.dtype.type(1)
+    for k in range(2 * m):
+        parent, cell = rows[k % m], daughters[k]
+        rest, part = length[parent] - (radius[parent] + radius[parent]), share[k % m]
+        new_length[cell] = rest * (part if k < m else one - part)
+        shift = half * (new_length[cell] - length[parent])
+        for c in range(d):
+            moved = shift * axis[parent, c]
+            new_position[cell, c] += moved if k < m else -moved
+        if sd.shape[0] == 0 or not sd[k] > 0:
+            continue
+        total = one - one
+        for c in range(d):
+            new_axis[cell, c] = axis[parent, c] + sd[k] * noise[k, c]
+            total += new_axis[cell, c] * new_axis[cell, c]
+        for c in range(d):
+            new_axis[cell, c] *= one / np.sqrt(total)

@@ -1,6 +1,8 @@
-"""Philox4x32-10 for many cells: the words of `tools.random.philox`, to the bit."""
+"""Philox4x32-10 for many cells: the numbers of `tools.random`, to the bit."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -19,15 +21,43 @@ def philox_block(a, b, c, d, p, q):
 
 
 @kernel
+def _words_of(uid, stream, step, k0, k1):
+    """The four words of a cell."""
+    mask, own = np.uint64(0xFFFFFFFF), np.uint64(uid)
+    return philox_block(own & mask, own >> np.uint64(32), np.uint64(stream) & mask, step, k0, k1)
+
+
+@kernel
 def philox_words(uid, stream, step, k0, k1):
     """uid, stream: (M,) int64; step and the key k0, k1: uint64 words in [0, 2³²). Returns (4, M)
     int64."""
-    out, mask = np.empty((4, uid.shape[0]), np.int64), np.uint64(0xFFFFFFFF)
+    out = np.empty((4, uid.shape[0]), np.int64)
     for i in range(uid.shape[0]):
-        own, of_colony = np.uint64(uid[i]), np.uint64(stream[i]) & mask
-        a, b = own & mask, own >> np.uint64(32)
-        out[0, i], out[1, i], out[2, i], out[3, i] = philox_block(a, b, of_colony, step, k0, k1)
+        out[0, i], out[1, i], out[2, i], out[3, i] = _words_of(uid[i], stream[i], step, k0, k1)
     return out
+
+
+@kernel
+def uniforms(uid, stream, step, k0, k1):
+    """A number in (0, 1) for each cell, (M,), of the 23 upper bits of its first word."""
+    out = np.empty(uid.shape[0])
+    for i in range(uid.shape[0]):
+        first = _words_of(uid[i], stream[i], step, k0, k1)[0]
+        out[i] = (np.float64(first >> np.uint64(9)) + 0.5) * 2.0**-23
+    return out
+
+
+@kernel
+def box_muller_pairs(uid, stream, step, k0, k1):
+    """Two numbers in (0, 1), less 1, and two angles in (0, 2π), each (M, 2)."""
+    less_one, angle = np.empty((uid.shape[0], 2)), np.empty((uid.shape[0], 2))
+    for i in range(uid.shape[0]):
+        a, b, c, d = _words_of(uid[i], stream[i], step, k0, k1)
+        less_one[i, 0] = (np.float64(a) + 0.5) * 2.0**-32 - 1.0
+        less_one[i, 1] = (np.float64(c) + 0.5) * 2.0**-32 - 1.0
+        angle[i, 0] = 2 * math.pi * ((np.float64(b) + 0.5) * 2.0**-32)
+        angle[i, 1] = 2 * math.pi * ((np.float64(d) + 0.5) * 2.0**-32)
+    return less_one, angle
 
 
 @kernel

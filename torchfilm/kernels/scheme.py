@@ -44,5 +44,8 @@ ROUNDING = 1e-6
 CREEP = 0.5
 # Sub-steps at most.
 MOST_SUBSTEPS = 1000
+# A colony whose contacts do not hold has more than BURIED of its cells (of MANY, if it has fewer)
+# deep in others for LONG steps. Cells that start in a heap part within a few steps.
+BURIED, MANY, LONG = 0.1, 50, 20
 # The status of a solve or of a step; `physics.problem` has the words.
 CONVERGED, ITERATION_LIMIT, NOT_FINITE, TOO_FAST, BAD_DRAG, COLLAPSED = range(6)

@@ -7,7 +7,21 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.batch import cells_of, doubles_of, put_back
+from torchfilm.kernels.batch import put_back
+from torchfilm.kernels.colonies import (
+    CLIPPED,
+    DEEPLY,
+    ERROR,
+    ITERATIONS,
+    PASSES,
+    STATUS,
+    SUBSTEPS,
+    alphas_of,
+    closed,
+    opened,
+    shortest_of,
+    taken_out,
+)
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.moves import any_deeper, approach, drags, move_cells
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
@@ -38,11 +52,9 @@ from torchfilm.kernels.scheme import (
 )
 from torchfilm.kernels.solve import minimise
 
-# Places in the settings, and in a colony's report. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
+# Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
 # of contacts, radii.
 DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
-ITERATIONS, PASSES, ERROR, CLIPPED, DEEPLY, STATUS = range(6)
-REPORT = 6
 
 
 @kernel
@@ -302,34 +314,35 @@ def _following(e, soft, hardness, target, softest):
 
 
 @kernel
-def step_colonies(which, begin, steps, x, axis, length, growth, radius, viscosity, length_drag,
-                  last, hardness, kinds, places, sizes, roots, is_soft, alphas, shortest, settings,
-                  reports, dof):  # fmt: skip
-    """Steps of the colonies `which`, steps[b] sub-steps each: everything is changed in place.
-
-    Cells of colony b are begin[b] … begin[b + 1] − 1. x: (N, d) float64. length: before growth.
-    places: (S, B, 3); sizes: (S, B). reports: (B, REPORT). For the others see `step_colony`.
-    """
+def step_colonies(which, begin, dt, longest, cells, drags, alphas, walls, settings, out, reports,
+                  dof):  # fmt: skip
+    """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments."""
+    x, radius, contact_alpha = cells[0], cells[4], cells[7]
+    kinds, places, sizes, _, is_soft = walls
     for b in which:
-        if begin[b + 1] == begin[b] or steps[b] == 0:
+        first, end, report = begin[b], begin[b + 1], reports[b]
+        if first == end:
             continue
-        of = spatial_order(x[begin[b] : begin[b + 1]], 6.0 * radius[begin[b]]) + begin[b]
-        own_x, own_axis, own_last, own_roots = cells_of(of, x, axis, last, roots, dof)
-        own_length, share = doubles_of(of, length), doubles_of(of, growth) / steps[b]
-        own_settings = settings.copy()
-        if steps[b] > 1 and settings[DEEP] <= 0:
-            own_settings[DEEP] = DEEP_IN_SUBSTEPS * radius[begin[b] : begin[b + 1]].mean()
-        own_radius, own_viscosity = doubles_of(of, radius), doubles_of(of, viscosity)
-        own_drag, own_shortest = doubles_of(of, length_drag), doubles_of(of, shortest)
-        own_alphas = alphas[of] if alphas.shape[0] else alphas
-        for _ in range(steps[b]):
-            own_length = step_colony(
-                own_x, own_axis, own_length, share, own_radius, own_viscosity, own_drag,
-                own_shortest, own_last, hardness[b : b + 1], kinds, places[:, b], sizes[:, b],
-                own_roots, is_soft, own_alphas, own_settings, reports[b], dof,
-            )  # fmt: skip
-            if reports[b, STATUS] == NOT_FINITE:
-                break
-        if reports[b, STATUS] == NOT_FINITE:
-            continue
-        put_back(of, own_x, own_axis, own_last, own_length, x, axis, last, length, dof)
+        hardness = np.array([contact_alpha[first:end].max()], np.float64)
+        if opened(first, end, longest, cells, drags, out, report):
+            steps = int(report[SUBSTEPS])
+            of = spatial_order(x[first:end], 6.0 * radius[first]) + first
+            own_x, own_axis, last, roots, length, share, own_radius, viscosity, drag = taken_out(
+                of, steps, dt / steps, cells, drags, walls, dof
+            )
+            shortest = shortest_of(of, length, own_radius, cells)
+            own_alphas = alphas_of(of, dt / steps, alphas)
+            own_settings = settings.copy()
+            if steps > 1 and settings[DEEP] <= 0:
+                own_settings[DEEP] = DEEP_IN_SUBSTEPS * radius[first:end].mean()
+            for _ in range(steps):
+                length = step_colony(
+                    own_x, own_axis, length, share, own_radius, viscosity, drag, shortest, last,
+                    hardness, kinds, places[:, b], sizes[:, b], roots, is_soft, own_alphas,
+                    own_settings, report, dof,
+                )  # fmt: skip
+                if report[STATUS] == NOT_FINITE:
+                    break
+            if report[STATUS] != NOT_FINITE:
+                put_back(of, own_x, own_axis, last, length, out[0], out[1], out[3], out[2], dof)
+        closed(first, end, cells, hardness[0], out, report)

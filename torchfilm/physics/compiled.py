@@ -1,4 +1,4 @@
-"""Contact steps by compiled kernels: the same as `one_sided` and `bilateral`, on the CPU."""
+"""A step of mechanics by compiled kernels: the same as `torch_step`, on the CPU."""
 
 from __future__ import annotations
 
@@ -10,67 +10,80 @@ from torch import Tensor
 
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.one_sided_records import OneSidedSettings
-from torchfilm.physics.step_records import StepInput, StepResult
+from torchfilm.physics.step_records import MechanicsInput, MechanicsResult
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.tools.numba_calls import as_array
-from torchfilm.tools.ragged import Groups, offsets
 from torchfilm.tools.threads import available, pool
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
 WORTH_THREADS = 300
 
 
+NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
+
 _called: set[str] = set()  # names of kernels that this process has called
 
 
 @torch.no_grad()
-def substeps(groups: Groups, position: Tensor, *of_cells: Tensor, longest: float):
-    """As `physics.substeps.substeps`."""
-    from torchfilm.kernels.substeps import substeps as put
-
-    steps, status = torch.ones_like(groups.counts), torch.zeros_like(groups.counts)
-    dtype = of_cells[0].dtype
-    arrays = [as_array(position, torch.float64), *(as_array(x, dtype) for x in of_cells)]
-    put(groups.owner.numpy(), *arrays, longest, steps.numpy(), status.numpy())
-    return steps, status
-
-
-@torch.no_grad()
-def contact_steps(given: StepInput) -> StepResult:
-    """As `one_sided.contact_steps` and `bilateral.contact_steps`."""
-    from torchfilm.kernels import step as kernels
+def step(given: MechanicsInput) -> MechanicsResult:
+    """As `torch_step.step`."""
+    from torchfilm.kernels import colonies as kernels
     from torchfilm.kernels.compiling import first_call
 
-    dtype = given.radius.dtype
-    name = f"{given.settings.dim}-D, {str(dtype).removeprefix('torch.')}"
-    step_colonies, numbers = _kernel_of(given.settings)
-    if isinstance(given.settings, ContactSettings):
+    settings, dtype = given.settings, given.radius.dtype
+    name = f"{settings.dim}-D, {str(dtype).removeprefix('torch.')}"
+    if isinstance(settings, ContactSettings):
         name = f"{name}, bilateral"
-    counts = given.groups.counts
-    begin, steps = offsets(counts).numpy(), given.steps.numpy()
-    position, axis = given.position.clone(), given.axis.clone()
-    length, move = given.length.clone(), given.start.clone()
-    hardness = given.hardness.clone()
-    reports = np.zeros((counts.numel(), kernels.REPORT))
+    step_colonies, numbers = _kernel_of(settings)
+    counts = given.groups.counts.numpy()
+    begin = np.concatenate(([0], np.cumsum(counts)))
+    cells = (
+        as_array(given.position, torch.float64),
+        *(as_array(x, dtype) for x in (given.axis, given.length, given.elongation, given.radius,
+        given.move)), as_array(given.collapsed, torch.int64),
+        *(_array_or_none(x, dtype) for x in (given.contact_alpha, given.compression)),
+    )  # fmt: skip
+    changed = (cells[k] for k in (0, 1, 2, 5, 3, 6, 7, 8))  # in the order of `out`
+    out = tuple(np.empty_like(a) for a in changed)
+    drags = tuple(
+        _array_or_none(v, dtype) for v in (given.viscosity, given.length_drag, given.drag)
+    )
+    reports = np.zeros((counts.size, kernels.REPORT))
+    reports[:, kernels.SUBSTEPS] = 1
     arguments = (
-        begin, steps, position.numpy(), axis.numpy(), length.numpy(),
-        *(as_array(x, dtype) for x in (given.growth, given.radius, given.viscosity,
-        given.length_drag)), move.numpy(), hardness.numpy(), *_walls(given),
-        as_array(given.radius[:0] if given.alpha is None else given.alpha, dtype),
-        *([] if isinstance(given.settings, ContactSettings) else [as_array(given.shortest, dtype)]),
-        numbers, reports, (0,) * (4 if given.settings.dim == 2 else 8),
+        begin, float(given.dt), float(given.longest), cells, drags, _alphas(given, dtype),
+        _walls(given), numbers, out, reports, (0,) * (4 if settings.dim == 2 else 8),
     )  # fmt: skip
     new = name not in _called
     with first_call(name, f"contacts ({name}), some 20 s") if new else nullcontext():
-        _call(step_colonies, begin, counts.numpy(), arguments)
+        _call(step_colonies, begin, counts, arguments)
     _called.add(name)
-    error = torch.from_numpy(reports[:, kernels.ERROR].copy())
+    residual = torch.from_numpy(reports[:, kernels.ERROR].copy())
     reports[:, kernels.ERROR] = 0  # may be no number; the others are integers
     whole = torch.from_numpy(reports.T.astype(np.int64)).unbind()
-    return StepResult(
-        position, axis, length, move, hardness, whole[kernels.STATUS], whole[kernels.ITERATIONS],
-        error, whole[kernels.PASSES], whole[kernels.CLIPPED], whole[kernels.DEEPLY],
+    x, axis, length, move, elongation, collapsed, *of_one_sided = map(torch.from_numpy, out)
+    alpha, compression = of_one_sided if given.compression is not None else (None, None)
+    return MechanicsResult(
+        x, axis, length, move, elongation, collapsed, alpha, compression,
+        whole[kernels.STATUS], whole[kernels.ITERATIONS], residual, whole[kernels.PASSES],
+        whole[kernels.CLIPPED], whole[kernels.DEEPLY], whole[kernels.SUBSTEPS],
     )  # fmt: skip
+
+
+def _array_or_none(value: Tensor | None, dtype: torch.dtype) -> np.ndarray:
+    """(N,), or (1,) of a number for all cells; (0,) for None."""
+    if value is None:
+        return np.empty(0, NUMPY[dtype])
+    return as_array(value.reshape(-1), dtype)
+
+
+def _alphas(given: MechanicsInput, dtype: torch.dtype) -> tuple[int, np.ndarray]:
+    """How α is given, and its values or stiffness: see `kernels.colonies`."""
+    from torchfilm.kernels.colonies import GIVEN, NOT_GIVEN, OF_STIFFNESS
+
+    if given.stiffness is not None:
+        return OF_STIFFNESS, _array_or_none(given.stiffness, dtype)
+    return GIVEN if given.alpha is not None else NOT_GIVEN, _array_or_none(given.alpha, dtype)
 
 
 def _kernel_of(settings: OneSidedSettings | ContactSettings):
@@ -113,8 +126,8 @@ def _call(kernel, begin: np.ndarray, counts: np.ndarray, arguments: tuple) -> No
         call.result()
 
 
-def _walls(given: StepInput) -> tuple[np.ndarray, ...]:
-    """Kinds (S,), places (S, B, 3), sizes (S, B), D or stiffness · Δt (S, N), and which are soft
+def _walls(given: MechanicsInput) -> tuple[np.ndarray, ...]:
+    """Kinds (S,), places (S, B, 3), sizes (S, B), D or stiffness (S, N), and which are soft
     (S,)."""
     from torchfilm.kernels import rows
 
@@ -124,7 +137,7 @@ def _walls(given: StepInput) -> tuple[np.ndarray, ...]:
     sizes = np.zeros((len(surfaces), colonies))
     roots = np.ones((len(surfaces), given.radius.shape[0]))
     soft = np.zeros(len(surfaces), np.uint8)
-    ids = given.ids if surfaces else None
+    ids = given.colony_id
     for k, (surface, (kind, value)) in enumerate(zip(surfaces, given.walls, strict=True)):
         if isinstance(surface, FlatSurface):
             place, size, kinds[k] = surface.normal, surface.offset, rows.FLAT
@@ -136,12 +149,13 @@ def _walls(given: StepInput) -> tuple[np.ndarray, ...]:
         sizes[k] = _of_colonies(size, ids)
         soft[k] = kind == "stiffness"
         if value is not None:
-            roots[k] = value.numpy()
+            roots[k] = value.detach().numpy()
     return kinds, places, sizes, roots, soft
 
 
-def _of_colonies(given: float | Tensor, ids: Tensor | None):
+def _of_colonies(given: float | Tensor, ids: Tensor):
     """A wall's number for each colony of the batch."""
     if not isinstance(given, Tensor):
         return given
-    return given.double().numpy() if given.dim() == 0 else given.double()[ids].numpy()
+    values = given.detach().double()
+    return (values if values.dim() == 0 else values[ids]).numpy()

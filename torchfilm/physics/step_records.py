@@ -1,4 +1,5 @@
-"""What contact steps are given and return, of either kind of contacts."""
+"""What steps of mechanics, and their contact steps, are given and return, of either kind of
+contacts."""
 
 from __future__ import annotations
 
@@ -14,6 +15,64 @@ from torchfilm.physics.surfaces import Surface
 from torchfilm.tools.ragged import Groups
 
 Settings = TypeVar("Settings", OneSidedSettings, ContactSettings)
+
+
+@dataclass(frozen=True)
+class MechanicsInput(Generic[Settings]):
+    """What a step of mechanics is given of N cells in B colonies, and does not change.
+
+    dt: h. longest: µm, by which a cell may grow in one sub-step. position (N, d) float64 µm, axis
+    (N, d), length (N,) µm with its elongation (N,) of this step, radius (N,) µm; move (N, D), the
+    last one; collapsed (N,) int64, steps in a row in which contacts have not held the cell's
+    colony; contact_alpha (N,), α of the last step, and compression (N,) µm: None of bilateral
+    contacts. viscosity, length_drag, and alpha or stiffness where one of them is given: 0-dim or
+    (N,); drag (N,), a factor of viscosity, or None. colony_id (B,). walls: for each surface its
+    kind ("hard", "stiffness", "weight") and that value, 0-dim or (N,).
+    """
+
+    settings: Settings
+    dt: float
+    longest: float
+    groups: Groups
+    position: Tensor
+    axis: Tensor
+    length: Tensor
+    elongation: Tensor
+    radius: Tensor
+    move: Tensor
+    collapsed: Tensor
+    contact_alpha: Tensor | None
+    compression: Tensor | None
+    viscosity: Tensor
+    length_drag: Tensor
+    drag: Tensor | None
+    alpha: Tensor | None
+    stiffness: Tensor | None
+    colony_id: Tensor
+    surfaces: Sequence[Surface]
+    walls: Sequence[tuple[str, Tensor | None]]
+
+
+@dataclass(frozen=True)
+class MechanicsResult:
+    """What a step of mechanics makes of cells, as in `MechanicsInput`, and what its solves did in
+    each colony, (B,): as in `contact_records.ContactReport`, with the number of sub-steps."""
+
+    position: Tensor
+    axis: Tensor
+    length: Tensor
+    move: Tensor
+    elongation: Tensor
+    collapsed: Tensor
+    contact_alpha: Tensor | None
+    compression: Tensor | None
+    status: Tensor
+    iterations: Tensor
+    residual: Tensor
+    passes: Tensor
+    clipped: Tensor
+    deeply_overlapping: Tensor
+    substeps: Tensor
 
 
 @dataclass(frozen=True)

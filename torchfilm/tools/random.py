@@ -45,22 +45,39 @@ def purpose_code(purpose: str) -> int:
 
 def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> Tensor:
     """Four independent 32-bit words for each cell: stream, uid (M,) int64 -> (4, M) int64."""
-    mixed = (seed ^ (purpose_code(purpose) << 32)) & (2**64 - 1)
-    key = (mixed & MASK, (mixed >> 32) & MASK)
-    if uid.device.type == "cpu" and "numba" in sys.modules:  # to load it here would cost more
+    if _by_kernels(uid):
         from torchfilm.kernels.random import philox_words
 
-        constant = [np.uint64(x) for x in (step & MASK, *key)]
-        given = [x.expand(uid.shape).contiguous().numpy() for x in (uid, stream)]
-        return torch.from_numpy(philox_words(*given, *constant))
+        return torch.from_numpy(philox_words(*_arrays(seed, stream, uid, step, purpose)))
+    key = _key(seed, purpose)
     of_cells = (uid & MASK, (uid >> 32) & MASK, stream & MASK)
     return torch.stack(philox((*of_cells, torch.full_like(uid, step & MASK)), key))
+
+
+def _key(seed: int, purpose: str) -> tuple[int, int]:
+    mixed = (seed ^ (purpose_code(purpose) << 32)) & (2**64 - 1)
+    return mixed & MASK, (mixed >> 32) & MASK
+
+
+def _by_kernels(uid: Tensor) -> bool:
+    """Whether kernels draw, to the same bits; to load them here would cost more."""
+    return uid.device.type == "cpu" and "numba" in sys.modules
+
+
+def _arrays(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> list:
+    """The arguments of the kernels."""
+    given = [x.expand(uid.shape).contiguous().numpy() for x in (uid, stream)]
+    return [*given, *(np.uint64(x) for x in (step & MASK, *_key(seed, purpose)))]
 
 
 def uniform(
     seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype
 ) -> Tensor:
     """One draw per cell from the open interval (0, 1)."""
+    if _by_kernels(uid):
+        from torchfilm.kernels.random import uniforms
+
+        return torch.from_numpy(uniforms(*_arrays(seed, stream, uid, step, purpose))).to(dtype)
     w = words(seed, stream, uid, step, purpose)
     # 23 bits and half a unit: the most bits for which a float32 does not round a draw to 1
     return ((w[0] >> 9).to(torch.float64) + 0.5).mul(2.0**-23).to(dtype)
@@ -70,9 +87,17 @@ def normal(
     seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype
 ) -> Tensor:
     """Four standard normal draws per cell, (M, 4), by the Box–Muller method from four words."""
-    w = (words(seed, stream, uid, step, purpose).to(torch.float64) + 0.5) * 2.0**-32
+    # two pairs of uniform numbers, the first of each less 1, which is exact
+    if _by_kernels(uid):
+        from torchfilm.kernels.random import box_muller_pairs
+
+        pairs = box_muller_pairs(*_arrays(seed, stream, uid, step, purpose))
+        less_one, angle = (torch.from_numpy(x) for x in pairs)
+    else:
+        w = (words(seed, stream, uid, step, purpose).T.to(torch.float64) + 0.5) * 2.0**-32
+        less_one, angle = w[:, ::2] - 1.0, 2 * math.pi * w[:, 1::2]
     # Not log, sqrt, cos and sin: on the CPU torch wakes all threads for these, for a few numbers,
-    # too, and on a busy machine it waits milliseconds for them. w − 1 is exact.
-    square = -2.0 * torch.log1p(w[::2] - 1.0)
-    pairs = torch.polar(square * torch.rsqrt(square), 2 * math.pi * w[1::2])
-    return torch.view_as_real(pairs).transpose(1, 2).reshape(4, -1).T.to(dtype).contiguous()
+    # too, and on a busy machine it waits milliseconds for them.
+    square = -2.0 * torch.log1p(less_one)
+    drawn = torch.polar(square * torch.rsqrt(square), angle)
+    return torch.view_as_real(drawn).reshape(-1, 4).to(dtype)

@@ -49,7 +49,7 @@ def tangent(value: Tensor) -> Tensor | None:
 
 def has_tangent(*values: Tensor | None) -> bool:
     """Whether one of them carries a tangent."""
-    return any(x is not None and tangent(x) is not None for x in values)
+    return in_forward_mode() and any(x is not None and tangent(x) is not None for x in values)
 
 
 def tracked(*values: Tensor | None) -> bool:
