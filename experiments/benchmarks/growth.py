@@ -3,6 +3,7 @@
     python experiments/benchmarks/growth.py                     # the usual set, some minutes
     python experiments/benchmarks/growth.py --quick             # small sizes
     python experiments/benchmarks/growth.py --case 2d-32000 --regime free --threads 2
+    python experiments/benchmarks/growth.py --case 2d-1000000 --regime pressed --limit 3600
     python experiments/benchmarks/growth.py --case 2d-3000 --backend torch --device cuda
 
 Colonies grow in 2-D and in 3-D between agarose and coverslip. Growth 1/h by the length law, Δt
@@ -10,9 +11,10 @@ Colonies grow in 2-D and in 3-D between agarose and coverslip. Growth 1/h by the
 paper's) and, if asked for, bilateral (γ = 10, the paper's contacts, too). All other settings are
 the defaults. The time is that of `tf.simulate` with its checks and reports, and that of the
 processor, which other work disturbs less. Overlaps are measured every fifth step, with the clock
-stopped. Growth is the volume over that of the same colony without mechanics, where it grows freely.
-A first record has the time of one product with JᵀJ and that to copy its rows. The script appends
-each case to a JSON file with its machine, versions and commit.
+stopped. A run that has taken --limit seconds of the processor ends there, and its record tells how
+many cells it came to. Growth is the volume over that of the same colony without mechanics, where it
+grows freely. A first record has the time of one product with JᵀJ and that to copy its rows. The
+script appends each case to a JSON file with its machine, versions and commit.
 """
 
 from __future__ import annotations
@@ -30,8 +32,9 @@ import torchfilm as tf
 
 CASES = {
     "2d-1000": (2, 1, 1000), "2d-3000": (2, 1, 3000), "2d-10000": (2, 1, 10000),
-    "2d-32000": (2, 1, 32000), "2d-100000": (2, 1, 100000), "2d-32x1000": (2, 32, 1000),
-    "2d-64x100": (2, 64, 100), "3d-3000": (3, 1, 3000), "3d-32000": (3, 1, 32000),
+    "2d-32000": (2, 1, 32000), "2d-100000": (2, 1, 100000), "2d-1000000": (2, 1, 1000000),
+    "2d-32x1000": (2, 32, 1000), "2d-64x100": (2, 64, 100), "3d-3000": (3, 1, 3000),
+    "3d-32000": (3, 1, 32000),
 }  # fmt: skip
 USUAL = ("2d-1000", "2d-3000", "2d-10000", "2d-32x1000", "2d-64x100", "3d-3000")
 QUICK = ("2d-1000", "2d-64x100")
@@ -57,8 +60,8 @@ def scene(dim: int, regime: str | None, backend: str | None) -> tf.Scene:
     return tf.Scene(*effects, dim=dim, dt=0.025, name=f"growth {dim}-D")
 
 
-def grow(name: str, regime: str, backend: str | None, device: str, seed: int) -> dict:
-    """Returns costs and results of a case."""
+def grow(name: str, regime: str, backend: str | None, device: str, seed: int, limit: float) -> dict:
+    """Returns costs and results of a case, ended after `limit` seconds of the processor."""
     dim, colonies, cells = CASES[name]
     model = scene(dim, regime, backend).bind(colonies, seed=seed, device=device)
     kept = {"timings": tf.Timings()}
@@ -72,8 +75,9 @@ def grow(name: str, regime: str, backend: str | None, device: str, seed: int) ->
         if state.cells >= 100 * 2 ** len(marks) * colonies:
             seconds = time.perf_counter() - begin - looked
             marks.append({
-                "cells": state.cells, "seconds": round(seconds, 3), "steps": state.step,
-                "cell_steps": cell_steps, "iterations": iterations,
+                "cells": state.cells, "seconds": round(seconds, 3),
+                "processor_s": round(time.process_time() - processor - looked_cpu, 3),
+                "steps": state.step, "cell_steps": cell_steps, "iterations": iterations,
             })  # fmt: skip
         if state.step % LOOK == 0:
             stop, stop_cpu = time.perf_counter(), time.process_time()
@@ -82,6 +86,8 @@ def grow(name: str, regime: str, backend: str | None, device: str, seed: int) ->
                 course.append((float(found.mean[found.count > 0].mean()), float(found.worst.max())))
             looked += time.perf_counter() - stop
             looked_cpu += time.process_time() - stop_cpu
+        if time.process_time() - processor - looked_cpu > limit:
+            break
     seconds = time.perf_counter() - begin - looked
     processor = time.process_time() - processor - looked_cpu
     growth = None  # under pressure a colony takes so long that the free one would be too large
@@ -181,9 +187,10 @@ def table(records: list[dict]) -> str:
         who = f"{r['backend']}, {r['threads']} thread{'s' * (r['threads'] > 1)}, {r['device']}"
         worst = " / ".join(f"{r['overlap_worst_um'][q]:.3f}" for q in ("0.5", "0.99", "1"))
         seconds = r.get("processor_s", r["seconds"]) if r["threads"] == 1 else r["seconds"]
+        ended = "" if r["cells"] >= colonies * cells else f" (ended at {r['cells']})"
         growth = "–" if r["growth_over_free"] is None else f"{r['growth_over_free']:.3f}"
         lines.append(
-            f"| {colonies} × {cells}, {dim}-D | {r['regime']} | {who} | {seconds:.2f} |"
+            f"| {colonies} × {cells}{ended}, {dim}-D | {r['regime']} | {who} | {seconds:.2f} |"
             f" {1e6 * seconds / r['cell_steps']:.1f} | {r['iterations_per_step']:.0f} | {growth} |"
             f" {r['overlap_course_um']:.4f} | {worst} |"
         )
@@ -192,7 +199,8 @@ def table(records: list[dict]) -> str:
 
 def cost_of_size(record: dict) -> np.ndarray:
     """Returns rows of cells, µs a cell and step, and iterations a step, from mark to mark."""
-    names = ("cells", "seconds", "steps", "cell_steps", "iterations")
+    clock = "processor_s" if "processor_s" in record["marks"][0] else "seconds"
+    names = ("cells", clock, "steps", "cell_steps", "iterations")
     marks = np.array([[m[n] for n in names] for m in record["marks"]], float)
     (_, seconds, steps, cell_steps, iterations), cells = np.diff(marks, axis=0).T, marks[:, 0]
     middle = np.sqrt(cells[1:] * cells[:-1])
@@ -247,6 +255,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--limit", type=float, default=np.inf, help="of a run, s of processor time")
     parser.add_argument(
         "--page", action="store_true", help="write docs/performance.md, run nothing"
     )
@@ -271,7 +280,9 @@ def main() -> None:
             # compile, and load what the first steps load
             warm = scene(dim, regime, options.backend).bind(device=options.device)
             list(tf.simulate(warm.scene, warm.start(), cells=8))
-            result = grow(name, regime, options.backend, options.device, options.seed)
+            result = grow(
+                name, regime, options.backend, options.device, options.seed, options.limit
+            )
             show(result)
             records.append(machine() | result)
             options.out.write_text(json.dumps(records, indent=1) + "\n")
