@@ -22,10 +22,7 @@ from torchfilm.signals.boundary_conditions import (
     Periodic,
 )
 from torchfilm.signals.transport import METHODS, choose, prepare
-from torchfilm.signals.transport_iterative import (
-    prepare_backward_euler,
-    prepare_crank_nicolson,
-)
+from torchfilm.signals.transport_iterative import prepare_backward_euler, prepare_crank_nicolson
 from torchfilm.signals.transport_operator import apply
 from torchfilm.signals.transport_rates import build_operator
 from torchfilm.signals.transport_series import ABOVE, MOST

@@ -231,9 +231,7 @@ class Functions:
     def hoisted_from(self, places: Sequence[str]) -> str:
         """What was prepared, as a tuple, from places that hold it in float64."""
         return as_tuple(
-            [
-                _cast(self.emitter.kinds[e], p) for e, p in zip(self.hoisted, places, strict=True)
-            ]
+            [_cast(self.emitter.kinds[e], p) for e, p in zip(self.hoisted, places, strict=True)]
         )
 
     def rates_as_tuple(self, dtype: torch.dtype = torch.float64) -> str:

@@ -39,8 +39,7 @@ def _ratio(a, b):
 
 @kernel
 def conjugate_gradients(x, r, pad, grid, many, target, most, spare):
-    """As `transport_iterative._conjugate_gradients`: x and r in place; x, spare[0]: with padding.
-    """
+    """As `transport_iterative._conjugate_gradients`: x and r in place; x, spare: with padding."""
     size = r.size
     p, q = spare[0], spare[1, :size]
     for i in range(size):

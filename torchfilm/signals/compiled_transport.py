@@ -112,16 +112,15 @@ class CompiledSeries:
             max(1, WORTH_A_THREAD // (size * self.stepper.weights.shape[0])),
             lambda begin, end: mix(begin, end, starts, *self.arrays, source, target),
         )
-        if self.solve is None:
-            return
-        from torchfilm.kernels.transport_solve import solve
+        if self.solve is not None:
+            from torchfilm.kernels.transport_solve import solve
 
-        mixing, rest = self.arrays[:7], (self.symmetric, MAX_ITERATIONS, source, target)
-        shares_of(
-            starts.size,
-            max(1, WORTH_A_THREAD // (size * SOLVED_AS)),
-            lambda begin, end: solve(begin, end, starts, *mixing, *self.solve, *rest),
-        )
+            given = (*self.arrays[:7], *self.solve, self.symmetric, MAX_ITERATIONS)
+            shares_of(
+                starts.size,
+                max(1, WORTH_A_THREAD // (size * SOLVED_AS)),
+                lambda begin, end: solve(begin, end, starts, *given, source, target),
+            )
 
 
 def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:

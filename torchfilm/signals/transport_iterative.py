@@ -24,7 +24,7 @@ from torchfilm.tools.tangents import both, with_tangent
 
 Map = Callable[[Tensor], Tensor]
 # The residual allowed, relative to the norm of the right-hand side. The solve is in float64, where
-# this is far above rounding; but not where a step has very many exchanges, each of which is rounded.
+# this is far above rounding; but not where a step has very many exchanges, which are rounded.
 TOLERANCE = 1e-10
 ROUNDING = 1e-15
 MAX_ITERATIONS = 2000
