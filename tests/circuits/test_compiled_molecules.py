@@ -18,8 +18,9 @@ from traced import alone, circuits, ends, equal, one_step, plain_module
 
 import torchfilm as tf
 from torchfilm import parts
-from torchfilm.circuits import compiled, compiled_molecules, draws, stochastic
+from torchfilm.circuits import compiled, compiled_molecules, draws, molecules_text, stochastic
 from torchfilm.circuits.draws import KeyedDraws
+from torchfilm.kernels.functions import natural_log
 from torchfilm.kernels.poisson import poisson
 from torchfilm.kernels.random import two_uniforms
 
@@ -53,8 +54,8 @@ def test_the_repressilator_has_the_same_molecules(monkeypatch, dtype):
 def test_same_bits_for_any_number_of_threads():
     """Compiled for real, with work for two threads."""
     circuit = molecules(*parts.constitutive("a", 50.0), *parts.degradation("a", 1.0), species="a")
-    scene, found, before = alone(circuit, count=2 * 32 + 7), [], torch.get_num_threads()
-    assert compiled_molecules.WORTH_A_THREAD == 32
+    count = 2 * compiled_molecules.WORTH_A_THREAD + 7
+    scene, found, before = alone(circuit, count=count), [], torch.get_num_threads()
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
@@ -173,6 +174,17 @@ def test_a_draw_is_that_of_torch(name):
                         assert found == tuple(wanted[:, n].tolist())
 
 
+def test_a_logarithm_is_off_by_less_than_a_unit_in_the_last_place():
+    """Of numbers at both ends of the uniforms, around 1 and √½, and between, in 64 bits of
+    mantissa where the machine has them."""
+    g = np.random.default_rng(1)
+    ends = [2.0**-54, 2.0**-53, 1 - 2.0**-53, 1 - 2.0**-52, 0.5**0.5, 0.5, 1.0, 2.0**0.5]
+    near = [*(1 - 10.0 ** -g.uniform(0, 16, 400)), *(10.0 ** -g.uniform(0, 16, 400))]
+    for x in (*ends, *near, *g.uniform(size=400)):
+        exact = np.log(np.longdouble(x))
+        assert abs(natural_log(x) - exact) <= np.spacing(abs(float(exact)))
+
+
 @pytest.mark.parametrize(
     "mean", [0.0, 1e-9, 0.5, 4.1, 10.0, 10.1, 50.0, 99.0, 101.0, 3e3, 9e5, 1e8]
 )
@@ -187,6 +199,23 @@ def test_a_poisson_number_is_that_of_torch(mean):
 
 
 # --- independence of how the work is divided ------------------------------------------------------
+
+
+@both
+def test_same_bits_whatever_cells_are_side_by_side(method, monkeypatch, plain):
+    """In lanes for one, two or all of the cells, some of which need many more events."""
+    circuit = molecules(
+        *parts.constitutive("a", "make"), *parts.degradation("a", 1.0), species="a", method=method,
+        initial={}, make=tf.LogNormal(300.0, 1.5),
+    )  # fmt: skip
+    found = []
+    for lanes in (1, 2, 16):
+        monkeypatch.setitem(molecules_text.CONSTANTS, "LANES", lanes)
+        model = alone(circuit, count=9).bind(seed=3, dtype=F64)
+        found.append(model.step(model.start(), 0.3))
+        equal(found[0], found[-1])
+        assert torch.equal(steps_of(found[0]), steps_of(found[-1]))
+    assert int(steps_of(found[0]).max()) > 3 * int(steps_of(found[0]).min())
 
 
 @both

@@ -1,5 +1,5 @@
 """Circuits molecule by molecule by compiled functions: the draws and the molecules of
-`circuits.stochastic`, cell by cell without torch."""
+`circuits.stochastic`, some cells side by side, without torch."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from torchfilm.circuits.run import CircuitCells
 
 # A thread takes this many cells at least.
-WORTH_A_THREAD = 32
+WORTH_A_THREAD = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +42,9 @@ class CompiledMolecules(Compiled):
 
     @cached_property
     def text(self) -> str:  # type: ignore[override]
-        made = Functions(self.equations).values()
-        return self.head(CONSTANTS) + IMPORTS + made + method(self.network, self.leaves())
+        made = Functions(self.equations)
+        steps = method(self.network, made, self.leaves())
+        return self.head(CONSTANTS) + IMPORTS + made.values() + steps
 
     def advance(
         self,

@@ -226,7 +226,17 @@ class Functions:
         lines = [*read, *self.emitter.lines(self.hoisted, leaves)]
         text = _function("prepared", "leaf", lines, self._of(self.hoisted))
         rates = self.equations.rates
-        return text + _function("rates", "u, c", self.lines(rates), self._of(rates, dtype))
+        return text + _function("rates", "u, c", self.lines(rates), self.rates_as_tuple(dtype))
+
+    def hoisted_from(self, places: Sequence[str]) -> str:
+        """What was prepared, as a tuple, from places that hold it in float64."""
+        return as_tuple(
+            [_cast(self.emitter.kinds[e], p) for e, p in zip(self.hoisted, places, strict=True)]
+        )
+
+    def rates_as_tuple(self, dtype: torch.dtype = torch.float64) -> str:
+        """The rates in this type, after their `lines`."""
+        return self._of(self.equations.rates, dtype)
 
     def lines(self, roots: Iterable[Expression]) -> list[str]:
         """Assignments of all below the roots, from u and c."""
@@ -250,9 +260,13 @@ def functions(equations: Equations) -> str:
 def _leaf(
     emitter: Emitter, leaf: Expression, kind: Kind | None, place: int, home: str = "leaf"
 ) -> str:
-    casts: dict[Any, str] = {torch.float32: "np.float32({})", torch.bool: "{} != 0.0"}
-    value = casts.get(kind and kind[0], "{}").format(f"{home}[{place}]")
-    return f"{emitter.of(leaf)} = {value}"
+    return f"{emitter.of(leaf)} = {_cast(kind, f'{home}[{place}]')}"
+
+
+def _cast(kind: Kind | None, value: str) -> str:
+    """A number that is held in float64, in its own type."""
+    casts: dict[Any, str] = {torch.float32: "np.float32({})", torch.bool: "({} != 0.0)"}
+    return casts.get(kind and kind[0], "{}").format(value)
 
 
 def tangent_functions(equations: Equations, moving: Sequence[str]) -> str:

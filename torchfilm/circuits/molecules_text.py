@@ -1,15 +1,21 @@
 """The text of the stochastic methods for a network of a given form: `stochastic.tau_leap` and
-`stochastic.direct`, cell by cell.
+`stochastic.direct`, for a few cells side by side.
 
-The order of operations is that of `stochastic`, and so are its constants.
+Loops over these lanes have no branches and call no library, so that they become vectors of the
+processor. A cell that has reached the end gives its lane to the next one. The order of operations
+is that of `stochastic`, and so are its constants.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from torchfilm.circuits import stochastic
+from torchfilm.circuits.emission import Functions, as_tuple
 from torchfilm.circuits.network import Network
+
+# Cells side by side: two vectors of the widest processors, so that one works while one waits.
+LANES = 16
 
 CONSTANTS = {
     name: getattr(stochastic, name)
@@ -17,52 +23,42 @@ CONSTANTS = {
         "DONE", "TOO_MANY_EVENTS", "BAD_PROPENSITY", "FEW_EVENTS", "MAX_LEAP_HALVINGS", "EPSILON",
         "CRITICAL",
     )
-} | {"SHORT": 0.999 * stochastic.FEW_EVENTS}  # fmt: skip
+} | {"SHORT": 0.999 * stochastic.FEW_EVENTS, "LANES": LANES}  # fmt: skip
 
-IMPORTS = """from torchfilm.kernels.poisson import poisson
+IMPORTS = """from torchfilm.kernels.functions import natural_log
+from torchfilm.kernels.poisson import poisson
 from torchfilm.kernels.random import two_uniforms
 
+# What a lane does next: one event, a leap, or nothing more since a propensity is invalid.
+EVENT, LEAP, INVALID = 0, 1, 2
+# Rows of whole numbers in each lane; those of other numbers follow.
+CELL, UID, STREAM, PASSED, DOES, WRONG, ENDS = range(0, 7 * LANES, LANES)
 """
 
 RUN = '''@kernel
-def chosen(parts, aim):
-    """The first up to which the parts add up to more than `aim`; the last above 0 if there is
-    none, and the last of all where all are 0."""
-    bound, last = 0.0, {last}
-    for j in range({reactions}):
-        bound += parts[j]
-        if bound > aim:
-            return j
-        if parts[j] > 0:
-            last = j
-    return last
-
-
-@kernel
-def happened(x, which, after):
-    for k in range({size}):
-        after[k] = x[k] + GAIN[which, k]
-
-
-@kernel
-def single(x, a, total, left, own, event, code):
-    """One event, or the end if the event would come after it; the time that passed."""
-    u, v = two_uniforms(own, event, code)
-    wait = -math.log(u) / total
-    if wait < left:
-        happened(x, chosen(a, v * total), x)
-        return wait
-    return left
+def waited(lanes, w, i, words, code):
+    """The time until the next event, and the part of all propensities at which it is found."""
+    for l in range(lanes):
+        own = (np.uint64(i[UID + l]), np.uint64(i[STREAM + l]), words[0], words[1], words[2])
+        u, v = two_uniforms(own, i[PASSED + l], code)
+        total = w[TOTAL + l]
+        w[WAIT + l] = -natural_log(u) / total
+        w[AIM + l] = v * total
 
 
 @kernel
 def leap(x, often, seldom, longest, left, own, event, codes, events, after):
     """As `stochastic._Leap.leap`; the time that passed."""
-    until, which, total = np.inf, 0, added(seldom)
+    until, which, total = np.inf, 0, seldom[0]
+    for j in range(1, {reactions}):
+        total += seldom[j]
     if total > 0:
         u, v = two_uniforms(own, event, codes[1])
-        until = -math.log(u) / total
-        which = chosen(seldom, v * total)
+        until = -natural_log(u) / total
+        aim, bound = v * total, seldom[0]
+        while bound <= aim and which < {reactions} - 1:
+            which += 1
+            bound += seldom[which]
     far = _least(longest, left)
     for trial in range(MAX_LEAP_HALVINGS):
         time = min(far, until)
@@ -77,7 +73,8 @@ def leap(x, often, seldom, longest, left, own, event, codes, events, after):
                     events[j + 1] = poisson(often[j + 1] * time, v)
         fire(x, events, after)
         if until < far:
-            happened(after, which, after)
+            for k in range({size}):
+                after[k] += GAIN[which, k]
         if np.min(after) >= 0:
             x[:] = after
             return time
@@ -86,101 +83,191 @@ def leap(x, often, seldom, longest, left, own, event, codes, events, after):
 
 
 @kernel
+def leaped(l, w, i, words, codes, x, often, seldom, events, after):
+    """A leap in a lane if it would have more than a few events; whether it would."""
+    for k in range({size}):
+        x[k] = w[X + k * LANES + l]
+    longest, left = split(x, w, l, often, seldom), w[LEFT + l]
+    if not _least(longest, left) * w[TOTAL + l] >= FEW_EVENTS:
+        return False
+    own = (np.uint64(i[UID + l]), np.uint64(i[STREAM + l]), words[0], words[1], words[2])
+    time = leap(x, often, seldom, longest, left, own, i[PASSED + l], codes, events, after)
+    for k in range({size}):
+        w[X + k * LANES + l] = x[k]
+    w[LEFT + l] = left - time
+    return True
+
+
+@kernel
+def moved(w, i, l, other):
+    """What is in a lane, into another one."""
+    for k in range(0, w.size, LANES):
+        w[k + other] = w[k + l]
+    for k in range(0, i.size, LANES):
+        i[k + other] = i[k + l]
+
+
+@kernel
 def run(first, last, at, columns, numbers, uid, stream, words, codes, dt, most_steps, leaps, steps,
         status, wrong):
     """Cells first … last − 1 over dt hours; at (M, V) in place. columns (K, M), numbers (L,)."""
-    a, often, seldom = np.empty({reactions}), np.empty({reactions}), np.empty({reactions})
-    x, after, events = np.empty({size}), np.empty({size}), np.empty(2 * {pairs})
-    for n in range(first, last):
-        c = prepared({leaves})
-        own = (np.uint64(uid[n]), np.uint64(stream[n]), words[0], words[1], words[2])
-        x[:] = at[n]
-        left, code = dt, TOO_MANY_EVENTS
-        for event in range(most_steps):
-            bad = propensities(x, a, c)
-            if bad >= 0:
-                wrong[n] = bad
-                code = BAD_PROPENSITY
-                break
-            total, longest = added(a), 0.0
-            if leaps:
-                longest = split(x, a, often, seldom, total)
-            if _least(longest, left) * total >= FEW_EVENTS:
-                passed = leap(x, often, seldom, longest, left, own, event, codes, events, after)
+    w, i = np.empty(ROWS * LANES), np.empty(7 * LANES, np.int64)
+    often, seldom, events = np.empty({reactions}), np.empty({reactions}), np.empty(2 * {pairs})
+    x, after = np.empty({size}), np.empty({size})
+    lanes, waiting = 0, first
+    while lanes < LANES and waiting < last:
+        begun(lanes, waiting, at, columns, numbers, uid, stream, dt, w, i)
+        lanes, waiting = lanes + 1, waiting + 1
+    while lanes > 0:
+        propensities(lanes, w, i)
+        alone = lanes
+        if leaps and may_leap(lanes, w, i) > 0:
+            for l in range(lanes):
+                if i[DOES + l] == LEAP:
+                    if leaped(l, w, i, words, codes, x, often, seldom, events, after):
+                        alone -= 1
+                    else:
+                        i[DOES + l] = EVENT
+        if alone > 0:
+            waited(lanes, w, i, words, codes[0])
+        if fired(lanes, w, i, most_steps) == 0:
+            continue
+        l = 0
+        while l < lanes:
+            if i[ENDS + l] == 0:
+                l += 1
+                continue
+            n = i[CELL + l]
+            for k in range({size}):
+                at[n, k] = w[X + k * LANES + l]
+            steps[n] = i[PASSED + l]
+            if i[DOES + l] == INVALID:
+                status[n], wrong[n] = BAD_PROPENSITY, i[WRONG + l]
             else:
-                passed = single(x, a, total, left, own, event, codes[0])
-            left -= passed
-            steps[n] += 1
-            if left <= 0:
-                code = DONE
-                break
-        at[n] = x
-        status[n] = code
+                status[n] = DONE if w[LEFT + l] <= 0 else TOO_MANY_EVENTS
+            if waiting < last:
+                begun(l, waiting, at, columns, numbers, uid, stream, dt, w, i)
+                waiting, l = waiting + 1, l + 1
+            else:
+                lanes -= 1
+                moved(w, i, lanes, l)
 '''
 
 
-def method(network: Network, leaves: str) -> str:
-    """The steps and the loop over cells, for these reactions. leaves: the text of a cell's."""
+def method(network: Network, made: Functions, leaves: str) -> str:
+    """The steps and the loop over cells, for these reactions. made: of their propensities. leaves:
+    the text of a cell's."""
     gain = network.stoichiometry.tolist()
     orders = network.orders.tolist()
     reactions, size = len(gain), len(orders)
     taken = [{k: -g for k, g in enumerate(row) if g < 0} for row in gain]
-    text = f"GAIN = np.array({gain!r})\n\n\n"
-    text += _propensities(size, taken) + _added(reactions) + _split(gain, taken, orders)
-    text += _fire(gain)
-    return text + RUN.format(
-        reactions=reactions, last=reactions - 1, size=size, pairs=(reactions + 1) // 2,
-        leaves=leaves,
-    )  # fmt: skip
+    kept = len(made.hoisted)
+    places = {"X": size, "C": max(kept, 1), "A": reactions} | dict.fromkeys(
+        ("TOTAL", "LEFT", "WAIT", "AIM"), 1
+    )
+    text, row = "", 0
+    for name, rows in places.items():
+        text += f"{name} = {row} * LANES\n"
+        row += rows
+    text += f"ROWS = {row}\nGAIN = np.array({gain!r})\n\n\n"
+    text += _begun(size, kept, leaves) + _propensities(made, taken) + _fired(gain)
+    text += _leaps(gain, taken, orders) + _fire(gain)
+    return text + RUN.format(reactions=reactions, size=size, pairs=(reactions + 1) // 2)
 
 
-def _written(head: str, lines: Sequence[str]) -> str:
+def _written(head: str, lines: Iterable[str]) -> str:
     return f"@kernel\ndef {head}:\n" + "".join(f"    {line}\n" for line in lines) + "\n\n"
 
 
-def _many(form: str, count: int) -> str:
-    return "(" + ", ".join(form.replace("#", str(k)) for k in range(count)) + ",)"
+def _in_lanes(lines: Iterable[str]) -> list[str]:
+    return ["for l in range(lanes):", *(f"    {line}" for line in lines)]
 
 
-def _propensities(size: int, taken: Sequence[dict[int, float]]) -> str:
-    """0 where an event needs more molecules than there are; returns the first that is invalid."""
-    count = len(taken)
-    lines = [f"{_many('a#', count)} = rates({_many('x[#]', size)}, c)", "bad = -1"]
+def _at(name: str, k: int = 0) -> str:
+    """The k-th of the numbers of this name in the lane l."""
+    return f"w[{name} + {k} * LANES + l]"
+
+
+def _begun(size: int, kept: int, leaves: str) -> str:
+    """The cell n begins in the lane l."""
+    head = "begun(l, n, at, columns, numbers, uid, stream, dt, w, i)"
+    lines = [f"c = prepared({leaves})"]
+    lines += [f"{_at('C', k)} = c[{k}]" for k in range(kept)]
+    lines += [f"{_at('X', k)} = at[n, {k}]" for k in range(size)]
+    lines += [
+        "w[LEFT + l] = dt", "i[CELL + l], i[UID + l], i[STREAM + l] = n, uid[n], stream[n]",
+        "i[PASSED + l] = 0",
+    ]  # fmt: skip
+    return _written(head, lines)
+
+
+def _propensities(made: Functions, taken: Sequence[dict[int, float]]) -> str:
+    """0 where an event needs more molecules than there are; the sum of all, in order; the first
+    that is invalid."""
+    size, count = len(made.equations.variables), len(taken)
+    lines = [f"u = {as_tuple([_at('X', k) for k in range(size)])}"]
+    lines.append(f"c = {made.hoisted_from([_at('C', k) for k in range(len(made.hoisted))])}")
+    lines += made.lines(made.equations.rates)
+    lines.append(f"{as_tuple([f'a{j}' for j in range(count)])} = {made.rates_as_tuple()}")
+    lines.append("bad = -1")
     for j in reversed(range(count)):
-        lines += [f"if not (0.0 <= a{j} < np.inf):", f"    bad = {j}"]
-        enough = " and ".join(f"x[{k}] >= {t!r}" for k, t in taken[j].items())
-        lines.append(f"a[{j}] = a{j}" + (f" if {enough} else 0.0" if enough else ""))
-    return _written("propensities(x, a, c)", [*lines, "return bad"])
+        lines.append(f"bad = bad if (a{j} >= 0.0) & (a{j} < np.inf) else {j}")
+        enough = " & ".join(f"(u{k} >= {t!r})" for k, t in taken[j].items())
+        lines += [f"a{j} = a{j} if {enough} else 0.0"] if enough else []
+        lines.append(f"{_at('A', j)} = a{j}")
+    lines += ["total = a0", *(f"total += a{j}" for j in range(1, count))]
+    lines += [
+        "w[TOTAL + l] = total", "i[WRONG + l] = bad", "i[DOES + l] = EVENT if bad < 0 else INVALID"
+    ]  # fmt: skip
+    return _written("propensities(lanes, w, i)", _in_lanes(lines))
 
 
-def _added(count: int) -> str:
-    """The sum of all, in order."""
-    lines = ["total = a[0]", *(f"total += a[{j}]" for j in range(1, count)), "return total"]
-    return _written("added(a)", lines)
+def _fired(gain: Sequence[Sequence[float]]) -> str:
+    """The event found, if it comes before the end; how many lanes have ended. The reaction is the
+    first up to which propensities add up to more than the aim."""
+    # comparisons of one number with many would become a switch, which is no vector
+    lines = ["left, wait = w[LEFT + l], w[WAIT + l]", "does = i[DOES + l]"]
+    lines += ["alone = does == EVENT", "happens = alone & (wait < left)"]
+    lines += ["aim = w[AIM + l] if happens else np.inf", "bound, before = 0.0, 1.0"]
+    for j in range(len(gain)):
+        lines += [f"bound += {_at('A', j)}", "after = 1.0 if bound <= aim else 0.0"]
+        lines += [f"which{j} = before - after", "before = after"]
+    for k in range(len(gain[0])):
+        terms = "".join(f" + {row[k]!r} * which{j}" for j, row in enumerate(gain) if row[k])
+        lines += [f"{_at('X', k)} += {terms[3:]}"] if terms else []
+    lines += [
+        "passed = wait if happens else left", "left = left - passed if alone else left",
+        "steps = i[PASSED + l] + (does != INVALID)",
+        "ends = 1 if (left <= 0) | (steps >= most_steps) | (does == INVALID) else 0",
+        "w[LEFT + l], i[PASSED + l], i[ENDS + l] = left, steps, ends", "ended += ends",
+    ]  # fmt: skip
+    lines = ["ended = 0", *_in_lanes(lines), "return ended"]
+    return _written("fired(lanes, w, i, most_steps)", lines)
 
 
-def _split(
+def _leaps(
     gain: Sequence[Sequence[float]], taken: Sequence[dict[int, float]], orders: Sequence[float]
 ) -> str:
-    """Reactions that may leap and those that are critical; returns the longest leap, or 0 where it
-    would have few events, as most have: found out without divisions, and without branches, which
-    would be as good as random."""
+    """`may_leap`: lanes whose leap has more than a few events as far as can be found out without
+    divisions; most have not. `split`: reactions that may leap and those that are critical; returns
+    the longest leap."""
     count, size = len(gain), len(orders)
-    # everything is read first: what is read on a condition becomes a branch
-    lines = [f"{_many('x#', size)} = {_many('x[#]', size)}", "short = False"]
-    lines.append(f"{_many('a#', count)} = {_many('a[#]', count)}")
+    read = [f"x{k} = {_at('X', k)}" for k in range(size)]
+    read += [f"a{j} = {_at('A', j)}" for j in range(count)]
     for j, uses in enumerate(taken):
-        rare = " or ".join(f"x{k} < CRITICAL * {t!r}" for k, t in uses.items())
-        lines += [f"a{j} = 0.0 if {rare} else a{j}"] if rare else []
-    times = ["if short:", "    return 0.0", "longest = np.inf"]
+        rare = " | ".join(f"(x{k} < CRITICAL * {t!r})" for k, t in uses.items())
+        read += [f"a{j} = 0.0 if {rare} else a{j}"] if rare else []
+    tests, times = ["total, short = w[TOTAL + l], False"], ["longest = np.inf"]
     for k, given in enumerate(orders):
         changes = [(j, row[k]) for j, row in enumerate(gain) if row[k]]
         if given <= 0 or not changes:
             continue
         order = max(given, 1.0)
-        lines += [
+        read += [
             f"mean{k} = abs(" + " + ".join(f"{g!r} * a{j}" for j, g in changes) + ")",
             f"spread{k} = " + " + ".join(f"{g * g!r} * a{j}" for j, g in changes),
+        ]
+        tests += [
             f"most = _most(EPSILON / {order!r} * x{k}, 1.0)",
             f"short |= most * total < SHORT * mean{k}",
             f"short |= most * most * total < SHORT * spread{k}",
@@ -192,9 +279,15 @@ def _split(
             f"    time = _least(change / mean{k}, change * change / spread{k})",
             "    longest = _least(longest, time)",
         ]
-    apart = [f"often[{j}] = a{j}" for j in range(count)]
-    apart += [f"seldom[{j}] = a[{j}] - a{j}" for j in range(count)]
-    return _written("split(x, a, often, seldom, total)", [*lines, *times, *apart, "return longest"])
+    tests += [
+        "leaps = (not short) & (w[LEFT + l] * total >= FEW_EVENTS) & (i[DOES + l] == EVENT)",
+        "i[DOES + l] = LEAP if leaps else i[DOES + l]", "found += leaps",
+    ]  # fmt: skip
+    apart = [f"often[{j}], seldom[{j}] = a{j}, {_at('A', j)} - a{j}" for j in range(count)]
+    lines = ["found = 0", *_in_lanes([*read, *tests]), "return found"]
+    return _written("may_leap(lanes, w, i)", lines) + _written(
+        "split(x, w, l, often, seldom)", [*read, *times, *apart, "return longest"]
+    )
 
 
 def _fire(gain: Sequence[Sequence[float]]) -> str:

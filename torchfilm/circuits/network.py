@@ -122,11 +122,13 @@ class Network:
                 out.append(reaction.rate(u, s, p, cell) * size)
                 continue
             rate = per_cell(reaction.rate, p, cell, size) * size
+            # first what molecules do not change: compiled functions work it out once a cell
+            for name, order in reaction.consumes.items():
+                for _ in range(order):
+                    rate = rate / volumes[column[name]]
             for name, order in reaction.consumes.items():
                 # less than one molecule cannot react
                 rate = rate * falling(columns[column[name]].floor(), order)
-                for _ in range(order):
-                    rate = rate / volumes[column[name]]
             out.append(rate)
         return out
 

@@ -112,10 +112,8 @@ def _choose(parts: Tensor, u: Tensor) -> Tensor:
     for k in range(1, parts.shape[0]):
         bounds[k] += bounds[k - 1]
     aim = (u * bounds[-1]).unsqueeze(0)
-    chosen = (bounds <= aim).sum(0)
-    # u < 1, but u times the sum may round up to it: then the last with a part above 0 is taken
-    last = parts.shape[0] - 1 - (parts > 0).flip(0).to(torch.uint8).argmax(0)
-    return torch.minimum(chosen, last)
+    # u ≤ 1 − 2⁻⁵³, so that u times a sum above 0 is rounded to less than the sum
+    return (bounds <= aim).sum(0).clamp(max=parts.shape[0] - 1)
 
 
 class _Simulator:

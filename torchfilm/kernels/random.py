@@ -9,7 +9,7 @@ import numpy as np
 from torchfilm.kernels.compiling import kernel
 
 
-@kernel
+@kernel(inline=True)
 def philox_block(a, b, c, d, p, q):
     """Four words from a counter of four and a key of two: uint64 words in [0, 2³²), ten rounds."""
     mask, half = np.uint64(0xFFFFFFFF), np.uint64(32)
@@ -60,7 +60,7 @@ def box_muller_pairs(uid, stream, step, k0, k1):
     return less_one, angle
 
 
-@kernel
+@kernel(inline=True)
 def two_uniforms(own, event, code):
     """As `circuits.draws` draws a pair: in (0, 1) with 53 bits each, of the event of a cell.
 
@@ -78,7 +78,7 @@ def two_uniforms(own, event, code):
     return _uniform(a, b), _uniform(c, d)
 
 
-@kernel
+@kernel(inline=True)
 def _uniform(a, b):
     bits = (a >> np.uint64(5)) << np.uint64(26) | (b >> np.uint64(6))
     return min((np.float64(bits) + 0.5) * 2.0**-53, 1 - 2.0**-53)

@@ -11,12 +11,15 @@ from torch import Tensor
 from torchfilm.signals.compiled import may_run
 from torchfilm.signals.grid import Shape
 from torchfilm.signals.transport_exponential import Exponential
+from torchfilm.signals.transport_iterative import MAX_ITERATIONS
 from torchfilm.signals.transport_series import Series
 from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.threads import shares_of
 
 # A thread is worth starting for as many voxels.
 WORTH_A_THREAD = 1 << 17
+# A solve takes about as long as so many terms of the series.
+SOLVED_AS = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +83,15 @@ def compiled_exponential(stepper: Exponential, shape: Shape) -> CompiledExponent
 
 @dataclass(frozen=True, eq=False)
 class CompiledSeries:
-    """`Series` for one shape of grid, in arrays as `kernels.transport.mix` takes them."""
+    """`Series` for one shape of grid, in arrays as `kernels.transport.mix` takes them; and of the
+    colonies that take a solve instead, as `kernels.transport_solve.solve` takes them, or None.
+    symmetric: whether there is no flow."""
 
     stepper: Series
     shape: Shape
     arrays: tuple[np.ndarray, ...]
+    solve: tuple[np.ndarray, ...] | None
+    symmetric: bool
 
     def linear(self) -> CompiledSeries | None:
         """The step without what sources and boundaries add; None where another method takes the
@@ -105,14 +112,15 @@ class CompiledSeries:
             max(1, WORTH_A_THREAD // (size * self.stepper.weights.shape[0])),
             lambda begin, end: mix(begin, end, starts, *self.arrays, source, target),
         )
-        if self.stepper.far is None or self.stepper.split is None:
-            return
-        grids = [slice(s, s + size) for s in starts.tolist()]
-        u = torch.stack([values[grid] for grid in grids]).view(-1, *self.shape)
-        split = self.stepper.split.step(u).flatten(1)
-        for grid, far, found in zip(grids, self.stepper.far.expand(u.shape[0]), split, strict=True):
-            if far:
-                out[grid] = found
+        if self.solve is not None:
+            from torchfilm.kernels.transport_solve import solve
+
+            given = (*self.arrays[:7], *self.solve, self.symmetric, MAX_ITERATIONS)
+            shares_of(
+                starts.size,
+                max(1, WORTH_A_THREAD // (size * SOLVED_AS)),
+                lambda begin, end: solve(begin, end, starts, *given, source, target),
+            )
 
 
 def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
@@ -154,8 +162,16 @@ def compiled_series(stepper: Series, shape: Shape) -> CompiledSeries | None:
         whole(mixing.stay), joined(ups), joined(downs), *places, wraps[:, there], weights, terms,
         gained,
     )  # fmt: skip
+    packed = lambda *arrays: tuple(np.ascontiguousarray(x.numpy()) for x in arrays)
+    solve, symmetric = None, True
+    if stepper.far is not None and stepper.solved is not None:
+        one, operator = stepper.solved, stepper.solved.operator
+        symmetric = operator.symmetric
+        many = torch.where(stepper.far, stepper.exchanges, 0.0).expand(count)
+        more = nothing[:0].flatten(1)
+        if operator.gain is not None:
+            more = (one.dt * operator.gain.detach()).expand(-1, *shape).flatten(1)
+        solve = packed(many, one.tolerance.expand(count), more)
     return CompiledSeries(
-        stepper,
-        shape,
-        (np.array(strides, np.int64), *(np.ascontiguousarray(x.numpy()) for x in arrays)),
+        stepper, shape, (np.array(strides, np.int64), *packed(*arrays)), solve, symmetric
     )

@@ -3,8 +3,8 @@
 | method           | order in Δt | positive, conserves at any Δt | works for                    |
 |------------------|-------------|-------------------------------|------------------------------|
 | "exponential"    | exact       | yes                           | no obstacle, uniform flow    |
-| "series"         | exact       | yes                           | everything, up to a number   |
-|                  |             |                               | of terms; then "implicit"    |
+| "series"         | exact       | yes                           | everything; with too many    |
+|                  |             |                               | terms backward Euler, 1      |
 | "implicit"       | 1           | yes                           | everything                   |
 | "crank_nicolson" | 2           | oscillates, goes below 0      | everything; the paper's, for |
 |                  |             |                               | comparison                   |

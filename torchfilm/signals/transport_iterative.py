@@ -1,7 +1,10 @@
-"""Transport over a step by repeated application of the operator: Crank–Nicolson and explicit Euler.
+"""Transport over a step by repeated application of the operator: one solve of all axes at once, and
+explicit Euler.
 
-Both are for comparison. Crank–Nicolson, the paper's method, is second order, but its factor for the
-shortest waves tends to −1: on sharp data it oscillates for many steps and goes below zero. Euler is
+Backward Euler takes the steps that are too long for the series. It is first order, L-stable and
+positive, and a steady state is at rest under it at any step. Crank–Nicolson and explicit Euler are
+for comparison. Crank–Nicolson, the paper's method, is second order, but its factor for the shortest
+waves tends to −1: on sharp data it oscillates for many steps and goes below zero. Explicit Euler is
 first order and positive, with as many sub-steps as that requires.
 """
 
@@ -9,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
@@ -21,8 +24,9 @@ from torchfilm.tools.tangents import both, with_tangent
 
 Map = Callable[[Tensor], Tensor]
 # The residual allowed, relative to the norm of the right-hand side. The solve is in float64, where
-# this is far above rounding.
+# this is far above rounding; but not where a step has very many exchanges, which are rounded.
 TOLERANCE = 1e-10
+ROUNDING = 1e-15
 MAX_ITERATIONS = 2000
 
 
@@ -66,40 +70,55 @@ class TransportSolveReport:
 
 
 @dataclass(frozen=True, eq=False)
-class CrankNicolson:
-    """u ↦ (I − Δt/2 T)⁻¹ [(I + Δt/2 T) u + Δt gain], each colony converged by itself.
+class Unsplit:
+    """u ↦ (I − θΔt T)⁻¹ [(I + (1 − θ)Δt T) u + Δt gain], each colony converged by itself.
 
-    The solve uses conjugate gradients, or BiCGStab where there is flow.
+    θ: 1 for backward Euler, 1/2 for Crank–Nicolson. The solve uses conjugate gradients, or BiCGStab
+    where there is flow.
     """
 
     operator: Operator
     dt: float
+    theta: float
+
+    @cached_property
+    def tolerance(self) -> Tensor:
+        """Of the residual, relative to the right-hand side, (B or 1,)."""
+        exchanges = self.dt * self.operator.loss.detach().flatten(1).amax(1)
+        return (ROUNDING * exchanges).clamp(min=TOLERANCE)
 
     def step(self, u: Tensor) -> Tensor:
         """u (B, nx, ny, nz) one step later; NaN in a colony whose solve did not converge."""
         out, report = self.solve(u)
+        # the exact solution of backward Euler has nothing below 0
+        out = out.clamp(min=0.0) if self.theta == 1 else out
         return torch.where(report.converged.reshape(-1, 1, 1, 1), out, torch.nan)
 
     def solve(self, u: Tensor) -> tuple[Tensor, TransportSolveReport]:
         """u one step later, as far as the solve came, and its report."""
         wide = u.double()
         linear = lambda x: apply(self.operator, x, gain=False)
-        left = lambda x: x - 0.5 * self.dt * linear(x)
-        right = wide + 0.5 * self.dt * linear(wide)
+        left = lambda x: x - self.theta * self.dt * linear(x)
+        right = wide if self.theta == 1 else wide + (1 - self.theta) * self.dt * linear(wide)
         if self.operator.gain is not None:
             right = right + self.dt * self.operator.gain
         with torch.no_grad():
             bare = lambda x: both(x)[0]
             still = lambda x: bare(left(x))
-            x, report = krylov(still, bare(right), bare(wide), self.operator.symmetric)
+            solved = lambda b, first: krylov(
+                still, b, first, self.operator.symmetric, self.tolerance
+            )
+            x, report = solved(bare(right), bare(wide))
+            # the change is then what T makes of x, which conserves amount to rounding
+            x = x + (bare(right) - still(x))
             moved = both(right - left(x))[1]
             if moved is not None:  # x' = A⁻¹ (b' − A' x)
-                turned, _ = krylov(still, moved, torch.zeros_like(x), self.operator.symmetric)
+                turned, _ = solved(moved, torch.zeros_like(x))
                 return with_tangent(x, turned).to(u.dtype), report
         if torch.is_grad_enabled():
             remainder = right - left(x)
             if remainder.requires_grad:
-                x = _KrylovAdjoint.apply(remainder, x, left, self.operator.symmetric)
+                x = _KrylovAdjoint.apply(remainder, x, left, self)
         return x.to(u.dtype), report
 
 
@@ -110,14 +129,14 @@ class _KrylovAdjoint(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, remainder: Tensor, x: Tensor, left: Map, symmetric: bool) -> Tensor:
-        ctx.left, ctx.symmetric = left, symmetric
+    def forward(ctx, remainder: Tensor, x: Tensor, left: Map, of: Unsplit) -> Tensor:
+        ctx.left, ctx.of = left, of
         return x.clone()
 
     @staticmethod
     def backward(ctx, grad: Tensor):
-        left = ctx.left
-        if not ctx.symmetric:
+        left, symmetric = ctx.left, ctx.of.operator.symmetric
+        if not symmetric:
             with torch.enable_grad():
                 at = torch.zeros_like(grad, requires_grad=True)
                 value = ctx.left(at)
@@ -126,7 +145,8 @@ class _KrylovAdjoint(torch.autograd.Function):
                 return torch.autograd.grad(value, at, x, retain_graph=True)[0]
 
         with torch.no_grad():
-            found, report = krylov(left, grad, torch.zeros_like(grad), ctx.symmetric)
+            first, tolerance = torch.zeros_like(grad), ctx.of.tolerance
+            found, report = krylov(left, grad, first, symmetric, tolerance)
         return (
             torch.where(report.converged.reshape(-1, 1, 1, 1), found, torch.nan),
             None,
@@ -135,9 +155,14 @@ class _KrylovAdjoint(torch.autograd.Function):
         )
 
 
-def prepare_crank_nicolson(operator: Operator, dt: float) -> CrankNicolson:
+def prepare_crank_nicolson(operator: Operator, dt: float) -> Unsplit:
     """A step of `dt` hours."""
-    return CrankNicolson(operator, dt)
+    return Unsplit(operator, dt, 0.5)
+
+
+def prepare_backward_euler(operator: Operator, dt: float) -> Unsplit:
+    """A step of `dt` hours."""
+    return Unsplit(operator, dt, 1.0)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -158,14 +183,14 @@ def _ratio(a: Tensor, b: Tensor) -> Tensor:
 
 
 def krylov(
-    apply: Map, b: Tensor, start: Tensor, symmetric: bool
+    apply: Map, b: Tensor, start: Tensor, symmetric: bool, tolerance: Tensor
 ) -> tuple[Tensor, TransportSolveReport]:
     """Solve A x = b, (B, nx, ny, nz), in float64, one system per colony, each until it converges.
 
-    No gradient.
+    tolerance: of the residual, relative to b, (B or 1,). No gradient.
     """
     size = _dot(b, b)
-    target = TOLERANCE**2 * size
+    target = tolerance.reshape(-1, 1, 1, 1) ** 2 * size
     x, iterations = start.clone(), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
     # restarts from the true residual correct the rounding errors of the recurred one
     for _ in range(3):

@@ -7,7 +7,8 @@ With λ at least the greatest loss rate of a voxel, P = I + T/λ has no negative
 is a mean of its powers: what a random number of exchanges makes of the field. (Jensen's method, or
 uniformization, for Markov chains.) All axes exchange at once. So a steady state does not depend on
 Δt, as it does where one axis is solved after the other. Nothing becomes negative, and the weights
-add up to 1. The number of terms grows as λΔt; beyond MOST a colony takes a solve an axis instead.
+add up to 1. The number of terms grows as λΔt; beyond MOST a colony takes a step of backward Euler,
+all axes in one solve, which has the same steady states.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.signals.transport_implicit import Implicit, prepare_implicit
+from torchfilm.signals.transport_iterative import Unsplit, prepare_backward_euler
 from torchfilm.signals.transport_operator import Operator
 
 # λΔt up to which a colony takes the series: some 1,200 terms.
@@ -53,23 +54,25 @@ class Mixing:
 class Series:
     """u ↦ Σ_k weights_k P^k u + gained, in float64.
 
-    weights: (terms, B or 1). gained: None or (B or 1, nx, ny, nz). far: (B or 1,) bool, colonies
-    with λΔt over MOST, which take a step of `split` instead; None without such colonies.
+    exchanges: λΔt, (B or 1,). weights: (terms, B or 1). gained: None or (B or 1, nx, ny, nz).
+    far: (B or 1,) bool, colonies with λΔt over MOST, which take a step of `solved` instead; None
+    without such colonies.
     """
 
     mixing: Mixing
+    exchanges: Tensor
     weights: Tensor
     gained: Tensor | None
     far: Tensor | None
-    split: Implicit | None
+    solved: Unsplit | None
 
     def step(self, u: Tensor) -> Tensor:
         """u (B, nx, ny, nz) one step later."""
         out = _mean(self.mixing, self.weights, u.double())
         out = (out if self.gained is None else out + self.gained).to(u.dtype)
-        if self.far is None or self.split is None:
+        if self.far is None or self.solved is None:
             return out
-        return torch.where(self.far.reshape(-1, 1, 1, 1), self.split.step(u), out)
+        return torch.where(self.far.reshape(-1, 1, 1, 1), self.solved.step(u), out)
 
     @cached_property
     def terms(self) -> np.ndarray:
@@ -96,10 +99,11 @@ def prepare_series(operator: Operator, dt: float) -> Series:
     any_far = bool(far.any())
     return Series(
         mixing,
+        on_device(mean),
         on_device(weights),
         gained,
         on_device(far) if any_far else None,
-        prepare_implicit(operator, dt) if any_far else None,
+        prepare_backward_euler(operator, dt) if any_far else None,
     )
 
 

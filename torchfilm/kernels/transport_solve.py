@@ -1,0 +1,135 @@
+"""Transport of signals by backward Euler over the grids of all colonies: one solve of all axes a
+colony, (I − Δt T) u' = u + Δt gain, as `signals.transport_iterative` makes it.
+
+With P = I + T/λ the matrix is I + λΔt (I − P), so that it needs what the series needs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.transport import exchanged
+
+
+@kernel(any_order=True)
+def dot(a, b):
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i]
+    return total
+
+
+@kernel
+def product(v, out, pad, grid, many):
+    """out = (I + many (I − P)) v for one grid; v: with padding, out without. grid: strides, stay,
+    ups, downs, wrap_to, wrap_from, wraps as `transport.mix` takes them, of one colony."""
+    strides, stay, ups, downs, wrap_to, wrap_from, wraps, mixed = grid
+    exchanged(v, mixed, pad, strides, stay, ups, downs)
+    for w in range(wrap_to.size):
+        mixed[pad + wrap_to[w]] += wraps[w] * v[pad + wrap_from[w]]
+    for i in range(out.size):
+        out[i] = v[pad + i] + many * (v[pad + i] - mixed[pad + i])
+
+
+@kernel
+def _ratio(a, b):
+    return a / b if b != 0 else 0.0
+
+
+@kernel
+def conjugate_gradients(x, r, pad, grid, many, target, most, spare):
+    """As `transport_iterative._conjugate_gradients`: x and r in place; x, spare: with padding."""
+    size = r.size
+    p, q = spare[0], spare[1, :size]
+    for i in range(size):
+        p[pad + i] = r[i]
+    squared = dot(r, r)
+    for _ in range(most):
+        product(p, q, pad, grid, many)
+        alpha = _ratio(squared, dot(p[pad : pad + size], q))
+        for i in range(size):
+            x[pad + i] += alpha * p[pad + i]
+            r[i] -= alpha * q[i]
+        new = dot(r, r)
+        if not new > target:
+            return
+        beta, squared = _ratio(new, squared), new
+        for i in range(size):
+            p[pad + i] = r[i] + beta * p[pad + i]
+
+
+@kernel
+def bicgstab(x, r, pad, grid, many, target, most, spare):
+    """As `transport_iterative._bicgstab`: x and r in place; x, spare: with padding."""
+    size = r.size
+    p, s = spare[0], spare[1]
+    v, t, shadow = spare[2, :size], spare[3, :size], spare[4, :size]
+    for i in range(size):
+        p[pad + i] = shadow[i] = r[i]
+    rho = dot(r, r)
+    for _ in range(most):
+        product(p, v, pad, grid, many)
+        alpha = _ratio(rho, dot(shadow, v))
+        for i in range(size):
+            s[pad + i] = r[i] - alpha * v[i]
+        product(s, t, pad, grid, many)
+        omega = _ratio(dot(t, s[pad : pad + size]), dot(t, t))
+        for i in range(size):
+            x[pad + i] += alpha * p[pad + i] + omega * s[pad + i]
+            r[i] = s[pad + i] - omega * t[i]
+        if not dot(r, r) > target:
+            return
+        new = dot(shadow, r)
+        # a breakdown of the method: it restarts from the true residual
+        if alpha == 0 or omega == 0 or new == 0:
+            return
+        beta, rho = _ratio(new, rho) * _ratio(alpha, omega), new
+        for i in range(size):
+            p[pad + i] = r[i] + beta * (p[pad + i] - omega * v[i])
+
+
+@kernel
+def solve(
+    begin, end, starts, strides, stay, ups, downs, wrap_to, wrap_from, wraps, many, tolerance,
+    gained, symmetric, most, values, out,
+):  # fmt: skip
+    """The grids begin … end of one shape after a step of backward Euler, from values to out,
+    (voxels,) of all colonies; NaN where the solve did not converge.
+
+    strides … wraps: as `transport.mix` takes them. many: λΔt, (b or 1,), 0 where another method
+    carries a colony. tolerance: of the residual over the right-hand side, (b or 1,). gained: Δt ×
+    the gain, (b or 1 or 0, voxels). most: iterations before a restart.
+    """
+    size, pad = stay.shape[1], 0
+    for stride in strides:
+        pad = max(pad, stride)
+    wide = size + 2 * pad
+    mixed, x, spare = np.zeros(wide), np.zeros(wide), np.zeros((5, wide))
+    b, r = np.empty(size), np.empty(size)
+    for c in range(begin, end):
+        own = c if stay.shape[0] > 1 else 0
+        if many[own] == 0:
+            continue
+        grid = strides, stay[own], ups[own], downs[own], wrap_to, wrap_from, wraps[own], mixed
+        for i in range(size):
+            x[pad + i] = b[i] = values[starts[c] + i]
+        if gained.shape[0] > 0:
+            more = gained[c if gained.shape[0] > 1 else 0]
+            for i in range(size):
+                b[i] += more[i]
+        target = tolerance[own] ** 2 * dot(b, b)
+        for trial in range(4):
+            product(x, r, pad, grid, many[own])
+            for i in range(size):
+                r[i] = b[i] - r[i]
+            if trial == 3 or not dot(r, r) > target:
+                break
+            if symmetric:
+                conjugate_gradients(x, r, pad, grid, many[own], target, most, spare)
+            else:
+                bicgstab(x, r, pad, grid, many[own], target, most, spare)
+        good = dot(r, r) <= 100 * target
+        for i in range(size):
+            # with its residual the change is what T makes of x: it conserves amount to rounding
+            out[starts[c] + i] = max(x[pad + i] + r[i], 0.0) if good else np.nan
