@@ -11,8 +11,10 @@ from searching import lit, objective_of, paced
 
 import torchfilm as tf
 from design import Choice, Parameter, Search, Study, colonies, scene_family
+from design.derivatives import along
 from design.methods import Local
 from design.rollout import grow
+from design.scoring import cut_work_items, run_work_item
 from design.slopes import Slopes
 from design.targets import Bands, Burden, Gradient, Lasting, Ring, Stripe, Weighted
 
@@ -168,6 +170,26 @@ def test_a_descent_finds_a_pattern_that_lasts():
     best = search.run(120, progress=False)
     lowest = min(search.objective.evaluate(np.array([[u, v] for u in GRID for v in GRID])).loss)
     assert best.loss < lowest + 1e-4
+
+
+@pytest.mark.parametrize("target", [EDGES, LASTING], ids=["at the end", "lasting"])
+def test_slopes_do_not_depend_on_the_batch(target):
+    """Each colony alone, and all in one batch, in which larger colonies stand: the same bits."""
+    task = objective_of(lit, TWO, target, cells=30, replicates=4).task
+    values = [task.space.values(point) for point in POINTS]
+    turns = [along(task.space, point) for point in POINTS]
+
+    def slopes(rows, streams):
+        part = [values[k] for k in rows], len(streams), 1.0, 1, [turns[k] for k in rows]
+        (item,) = cut_work_items(task, *part)
+        return run_work_item(task, item, streams, 1.0).slopes
+
+    whole = slopes([0, 1], (0, 1, 2, 3))
+    for row in range(2):
+        for k in range(4):
+            alone = slopes([row], (k,))
+            assert np.array_equal(alone.gradient[0], whole.gradient[4 * row + k])
+            assert np.array_equal(alone.curvature[0], whole.curvature[4 * row + k])
 
 
 def test_parameters_with_levels_have_no_slope():
