@@ -46,7 +46,10 @@ class Gathered:
         value, tangent = tf.tangents.both(found)
         turned = torch.zeros_like(value) if tangent is None else tangent
         of_colonies = turned.double().cpu().numpy().reshape(-1, copies, value.shape[1])
-        for k, rows in zip(colony, of_colonies, strict=True):
+        for k, padded in zip(colony, of_colonies, strict=True):
+            # zeros stand beyond a colony's own cells, as many as its batch needs: with them the
+            # product would have other bits in another batch
+            rows = padded[:, padded.any(0)]
             self.slopes.curvature[k] = 0.0
             self.slopes.curvature[np.ix_([k], self.directions, self.directions)] = 2 * rows @ rows.T
 

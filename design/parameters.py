@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+import torchfilm as tf
 from torchfilm import checks
 
 # The value of a parameter: a number, or one of the options of a choice.
@@ -252,6 +253,15 @@ class Space:
 
     def describe(self) -> list[str]:
         return [p.describe() for p in self.parameters]
+
+    @property
+    def digest(self) -> str | None:
+        """A word that differs where choices are resolved by other functions, or other choices are;
+        None where none are."""
+        found = [
+            (p.name, p.resolve) for p in self.parameters if isinstance(p, Choice) and p.resolve
+        ]
+        return tf.digest(found) if found else None
 
 
 def _level(unit: float, count: int) -> int:

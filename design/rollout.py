@@ -20,7 +20,7 @@ PATIENCE = 100.0
 @dataclass(frozen=True)
 class FinishedColonies:
     """Colonies that reached their end in the same step, as a state of them alone, and their history
-    (T, B, k), or None."""
+    (T, B, k), or None; 0 where a step had fewer columns."""
 
     state: tf.State
     history: Tensor | None
@@ -45,7 +45,7 @@ def grow(
     first.
 
     The end of a colony depends on that colony alone, so its result does not depend on its batch.
-    note: called after every step; see `Target.note`.
+    note: called after every step; see `Target.note` and `Target.course`.
     """
     state = prepared.first
     count = state.colonies
@@ -105,7 +105,9 @@ def _at_end(state: tf.State, cells: int | None, until: float | None) -> Tensor:
 def _history(notes: list[Tensor], finished: tf.State) -> Tensor | None:
     if not notes:
         return None
-    return torch.stack([n.index_select(0, finished.colony_id) for n in notes])
+    widest = max(n.shape[1] for n in notes)
+    each = [n.index_select(0, finished.colony_id) for n in notes]
+    return torch.stack([torch.nn.functional.pad(n, (0, widest - n.shape[1])) for n in each])
 
 
 def _given_up(state: tf.State, stuck: Tensor, cells: int | None) -> Iterator[FailedColony]:

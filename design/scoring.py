@@ -183,7 +183,8 @@ def _grow_and_score(
         gathered = Gathered(task.space, count * replicates) if item.turns else None
         reasons: dict[tuple[int, int], str] = {}
         most_cells, until = task.end(size)
-        for event in grow(prepared, cells=most_cells, until=until, note=task.target.note):
+        note = task.target.course if item.turns else task.target.note
+        for event in grow(prepared, cells=most_cells, until=until, note=note):
             if not isinstance(event, FinishedColonies):
                 reasons[divmod(event.colony_id // copies, replicates)] = event.reason
                 continue

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-DIGESTS = ("founders and functions", "code of the target")
+DIGESTS = ("founders and functions", "code of the target", "code of resolve")
 LONGEST, SHORT = 300, 48  # characters of a refusal, and of one value in it
 
 

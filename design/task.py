@@ -210,6 +210,7 @@ class Task(TaskOptions):
             "effects": self.tried.listing,
             "founders and functions": self.tried.digest,
             "parameters": self.space.describe(),
+            "code of resolve": self.space.digest,
             "code of the target": tf.digest(self.target),
             "target": describe_target(self.target),
             "cells": self.cells,

@@ -69,16 +69,15 @@ class Turn:
         """Let a method learn the whole batch. Methods that never ask for slopes need not take
         any."""
         assert self.entry is not None
-        loss, slopes = self.entry.loss, self.entry.slopes
+        found = self.entry.loss if self.entry.goals is None else self.entry.goals
         if self.known:
             know = getattr(method, "know", None)
             if know is not None:
-                know(self.entry.points, loss)
+                know(self.entry.points, found)
             return
         batch = replace(self.batch, points=self.entry.points)
-        found = loss if self.entry.goals is None else self.entry.goals
         if batch.slopes:
-            method.tell(batch, found, slopes)  # type: ignore[call-arg]
+            method.tell(batch, found, self.entry.slopes)  # type: ignore[call-arg]
         else:
             method.tell(batch, found)
 

@@ -59,12 +59,14 @@ def test_names_that_are_not_public():
 
 
 def test_a_method_is_found_by_its_own_name():
-    assert describe("from_masks") == describe("Cells.from_masks")
+    assert describe("relaxed") == describe("Cells.relaxed")
     assert describe("to_labels()") == describe("Results.to_labels")
     assert describe("microcolony") == describe("tf.scenes.microcolony")
     with pytest.raises(
         tf.InputError, match=r"mean tf\.Cells\.from_table or design\.\w+\.from_table\?"
     ):
         describe("from_table")
-    with pytest.raises(tf.InputError, match=r"Did you mean tf\.Cells\.from_masks\?"):
-        describe("from_mask")
+    both = r"Did you mean tf\.Cells\.from_masks or design\.Observed\.from_masks\?"
+    for name in ("from_masks", "from_mask"):
+        with pytest.raises(tf.InputError, match=both):
+            describe(name)

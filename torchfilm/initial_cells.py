@@ -245,6 +245,8 @@ class Cells:
         image: Any,
         *,
         pixel_size: float,
+        fluorescence: Mapping[str, Any] | None = None,
+        background: str | float = "median",
         frame: int | None = None,
         drop: str | Sequence[str] = (),
         least_area: int = 30,
@@ -260,6 +262,11 @@ class Cells:
         is the origin, x goes to the right and y up, so that cells have y ≤ 0. centre: move the mean
         of the centres to the origin.
 
+        fluorescence: images of the mask's shape by field, {"gfp": "gfp.tif"}; frame picks from
+        them, too. Each cell gets the field `gfp`, the mean of the pixels in its region less the
+        background. background: "median", of the pixels outside of all regions; or counts, of which
+        0 leaves the pixels as they are.
+
         Regions smaller than least_area pixels ("tiny") or in several "pieces" raise InputError.
         Regions at the "border" of the image, or of which over 15 % of the area is outside of the
         capsule or missing in it ("misfit": curved, or several cells in one), give a warning with
@@ -271,6 +278,8 @@ class Cells:
         given = mask_cells(
             image,
             pixel_size=pixel_size,
+            fluorescence=fluorescence,
+            background=background,
             frame=frame,
             drop=drop,
             least_area=least_area,

@@ -69,7 +69,8 @@ class Method(Protocol):
     The result of `ask` must depend only on the arguments of `start`, the method's settings, and all
     calls of `tell`: a new method resumes a stopped search from the batches and losses of its study.
     A method with `describe() -> str` is recognised when a search is resumed. One with `know(points,
-    loss)` learns before its first batch of the designs from which a search starts.
+    loss)` learns before its first batch of the designs from which a search starts; `loss` is as for
+    `tell`.
     """
 
     def start(self, space: Dimensions, seed: int, replicates: int) -> None: ...

@@ -12,6 +12,8 @@ from design.methods.base import Batch, Turns, snap, sobol_points, whole
 from design.slopes import Slopes
 from torchfilm import checks
 
+SAME = 1e-9  # coordinates: less is rounding, as between the bounds of two studies
+
 
 @dataclass(kw_only=True, eq=False)
 class NSGA2(Turns):
@@ -19,9 +21,10 @@ class NSGA2(Turns):
     front of several goals.
 
     population: designs in a batch, kept from one to the next. The first batch is of Sobol points,
-    of which those with the same levels count once.
-    Designs that failed come after all others. `tell` takes the losses of all goals, (n, G), NaN for
-    a design that failed.
+    of which those with the same levels count once. Designs that were known before take their places
+    with the losses that they have: the best of them, and Sobol points only where they are fewer.
+    Designs that failed come after all others. `tell` and `know` take the losses of all goals,
+    (n, G), NaN for a design that failed.
     """
 
     population: int = 32
@@ -34,12 +37,24 @@ class NSGA2(Turns):
 
     def _begin(self) -> None:
         self._points = _different(sobol_points(self._started(), self._seed, 0, self.population))
+        self._known: tuple[np.ndarray, np.ndarray] | None = None
         self._search: Any = None
 
     def know(self, points: np.ndarray, loss: np.ndarray) -> None:
-        """The first batch begins with the best of them."""
-        best = points[np.argsort(loss, kind="stable")]
-        self._points = _different(np.concatenate([best, self._points]))[: self.population]
+        """They are the first population, or a part of it: the best that did not fail. The first
+        batch fills it up with designs that are not known."""
+        goals = _goals(points, loss)
+        first = np.sort(np.unique(points, axis=0, return_index=True)[1])
+        sound = first[~np.isnan(goals[first]).any(1)]
+        if not len(sound):
+            return
+        alike = (np.abs(self._points[:, None] - points[None]) < SAME).all(2).any(1)
+        self._points = self._points[~alike]
+        kept = sound[_fittest(goals[sound], self.population)]
+        self._known = points[kept], goals[kept]
+        self._points = self._points[: self.population - len(kept)]
+        if not len(self._points):
+            self._populate(*self._known)
 
     def _next(self) -> Batch:
         if self._search is None:
@@ -50,32 +65,62 @@ class NSGA2(Turns):
     def tell(self, batch: Batch, loss: np.ndarray, slopes: Slopes | None = None) -> None:
         self._started()
         self._meet(batch)
-        goals = np.array(loss, dtype=np.float64)
-        if goals.ndim != 2 or len(goals) != len(batch.points) or goals.shape[1] < 2:
-            raise checks.input_error(
-                "goals of shape", goals.shape, f"({len(batch.points)}, G) with two goals or more"
-            )
-        if self._search is None:
-            self._search = self._made(goals.shape[1])
-            self._asked = self._search.ask()
+        points, goals = batch.points, _goals(batch.points, loss)
+        if self._search is not None:
+            self._learn(points, goals)
+        elif self._known is None:
+            self._populate(points, goals)
+        else:
+            known, theirs = self._known
+            self._populate(np.concatenate([known, points]), np.concatenate([theirs, goals]))
+        self._batch = None
+
+    def _populate(self, points: np.ndarray, goals: np.ndarray) -> None:
+        """Begin with the first population."""
+        self._search = self._made(points, goals.shape[1])
+        self._asked = self._search.ask()
+        self._learn(points, goals)
+
+    def _learn(self, points: np.ndarray, goals: np.ndarray) -> None:
         failed = np.isnan(goals).any(axis=1, keepdims=True)
         # the constraint keeps failed designs behind; their goals only have to be numbers
-        self._asked.set("X", batch.points.copy())
+        self._asked.set("X", points.copy())
         self._asked.set("F", np.where(failed, 0.0, goals))
         self._asked.set("G", np.where(failed, 1.0, -1.0))
         self._search.tell(infills=self._asked)
-        self._batch = None
 
-    def _made(self, goals: int) -> Any:
+    def _made(self, points: np.ndarray, goals: int) -> Any:
         from pymoo.algorithms.moo.nsga2 import NSGA2 as Algorithm
         from pymoo.core.problem import Problem
         from pymoo.core.termination import NoTermination
 
         size = self._started().size
         problem = Problem(n_var=size, n_obj=goals, n_ieq_constr=1, xl=0.0, xu=1.0)
-        algorithm = Algorithm(pop_size=self.population, sampling=self._points)
+        algorithm = Algorithm(pop_size=self.population, sampling=points)
         algorithm.setup(problem, termination=NoTermination(), seed=self._seed)
         return algorithm
+
+
+def _goals(points: np.ndarray, loss: Any) -> np.ndarray:
+    """The losses of all goals, (n, G) float64. Raises InputError for another shape."""
+    goals = np.array(loss, dtype=np.float64)
+    if goals.ndim != 2 or len(goals) != len(points) or goals.shape[1] < 2:
+        raise checks.input_error(
+            "goals of shape", goals.shape, f"({len(points)}, G) with two goals or more"
+        )
+    return goals
+
+
+def _fittest(goals: np.ndarray, most: int) -> np.ndarray:
+    """The rows of the `most` designs that NSGA-II keeps of some, (k,): by front, and on the last of
+    them those that stand alone."""
+    from pymoo.core.population import Population
+    from pymoo.core.problem import Problem
+    from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
+
+    among = Population.new(F=goals, row=np.arange(len(goals)))
+    kept = RankAndCrowding().do(Problem(n_var=1, n_obj=goals.shape[1]), among, n_survive=most)
+    return np.sort(np.array([one.get("row") for one in kept]))
 
 
 def _different(points: np.ndarray) -> np.ndarray:

@@ -56,6 +56,11 @@ class Target:
         nothing."""
         return None
 
+    def course(self, state: tf.State) -> Tensor | None:
+        """What `residuals` needs of a state after every step, (B, k): the columns of `note`, and
+        more, whose number may change from step to step. It is asked where derivatives are."""
+        return self.note(state)
+
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """The loss of each colony, (B,) float64. history: the notes of all steps, (T, B, k)."""
         raise NotImplementedError(f"{type(self).__name__}.loss")
@@ -63,7 +68,8 @@ class Target:
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor | None:
         """Numbers whose squares add up to the loss, (B, K) float64 with 0 where a colony has fewer,
         with gradients as the loss has; None where a target has no such form. Least squares use
-        them."""
+        them. history: what `course` gave after all steps, (T, B, k), 0 where a step had fewer
+        columns."""
         return None
 
     @property

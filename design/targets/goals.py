@@ -175,7 +175,8 @@ class Weighted(Several):
 
     @property
     def squares(self) -> bool:
-        return all(part.squares for part in self.parts)
+        """The notes of parts stand side by side, so that none may have a course of its own."""
+        return all(p.squares and type(p).course is Target.course for p in self.parts)
 
     def describe(self) -> str:
         return " + ".join(f"{weight:g} × {part.describe()}" for part, weight in self.terms)

@@ -23,7 +23,9 @@ class Lasting(Target):
     from then to the end, the end alone where that comes first.
 
     target: scored by the state alone. Measures are those of the end, and `worst`, (B,), the
-    greatest loss on the way.
+    greatest loss on the way. Where the target has residuals, so has this: those of all steps that
+    count. They are kept while derivatives are asked: 16 bytes for each number, step and copy of a
+    colony.
     """
 
     target: Target
@@ -64,6 +66,34 @@ class Lasting(Target):
                 (state.colonies, 1), torch.nan, dtype=torch.float64, device=state.device
             )
         return self.target.loss(state).unsqueeze(1)
+
+    def course(self, state: tf.State) -> Tensor:
+        """The loss and, from `since` on, the residuals of the target, (B, 1 + K)."""
+        noted = self.note(state)
+        if state.time < self.since - 1e-9:
+            return noted
+        found = self.target.residuals(state)
+        return noted if found is None else torch.cat([noted, found], 1)
+
+    @property
+    def squares(self) -> bool:
+        return self.target.squares
+
+    def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor | None:
+        """Those of the target at all steps that count, over the root of their number, (B, T · K);
+        None where the history is of `note` alone."""
+        end = self.target.residuals(state)
+        if end is None or history is None or history.isnan().all():
+            return end
+        if history.shape[2] == 1:
+            return None
+        counted = ~history[:, :, 0].isnan()
+        steps = counted.sum(0)
+        share = steps.clamp(min=1).double().rsqrt()
+        kept = counted.any(1)
+        found = torch.where(counted[kept].unsqueeze(2), history[kept][:, :, 1:], 0.0)
+        found = (found * share.unsqueeze(1)).transpose(0, 1).flatten(1)
+        return torch.cat([torch.where((steps == 0).unsqueeze(1), end, 0.0), found], 1)
 
     def _losses(self, state: tf.State, history: Tensor | None) -> Tensor:
         """Those that count, (T, B), NaN before `since` and after a colony's end."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import Target, require, species_names
+from design.targets.observed_masks import masks_table
 from design.targets.observed_table import read_table
 from design.targets.statistics import (
     LOG_CELLS,
@@ -21,6 +22,7 @@ from design.targets.statistics import (
     SeenCells,
     birth_note,
     from_centre,
+    resampled_spread,
     seen_cells,
 )
 from torchfilm import checks
@@ -30,7 +32,6 @@ if TYPE_CHECKING:
 
 FARTHEST = 100.0  # spreads: a statistic that is farther off counts as so far
 ENOUGH = 3  # colonies from which on the spread between them is measured
-RESAMPLED = 200  # bootstrapped colonies
 FINEST = 0.01  # the least spread, relative to the greatest statistic of its group
 COUNT = 0.02  # the least spread of the logarithm of a number of cells
 INNER = 0.95  # share of the cells within the outermost ring
@@ -42,7 +43,7 @@ class Observed(Target):
 
     values: the statistics (K,), means over the observed colonies; spread: of each, above 0; plan:
     which they are. colonies: how many were observed; cells: how many in all. time: h, when they
-    were observed, or None. Make one by `from_table`, `from_state` or `from_results`.
+    were observed, or None. Make one by `from_table`, `from_masks`, `from_state` or `from_results`.
 
     The statistics are ln of the number of cells; the quantiles 10, 25, 50, 75 and 90 % of lengths
     and ages; the radius of gyration; cells per µm² in rings around the centre; the alignment of
@@ -115,16 +116,54 @@ class Observed(Target):
         relative to their mean in the colony, for a reporter in arbitrary units. rings: how many,
         out to where 95 % of the cells are. reach: µm; cells with closer centres are neighbours.
         time: h, when the colonies were observed. like: another `Observed`, whose rings and options
-        are taken, so that both compare the same statistics.
+        are taken, so that both compare the same statistics; and its species, where none are given.
 
         Raises InputError for a table without units or with several frames, a column that is
         missing or not numbers, and arguments that nothing uses.
         """
-        names = species_names("Observed.species", tuple(species)) if species else ()
+        names = _names(species, like)
         units = tf.tables.Units(pixel_size, length_unit, angle_unit, time_unit)
         cells = read_table(table, names, units, columns or {})
         plan = _plan(cells, names, rings, reach, length_with_caps, relative)
-        return _observed(cells, plan if like is None else like.plan, time)
+        return _observed(cells, plan if like is None else _shared(plan, like), time)
+
+    @staticmethod
+    def from_masks(
+        masks: Any,
+        *,
+        pixel_size: float,
+        fluorescence: Mapping[str, Any] | None = None,
+        background: str | float = "median",
+        species: Sequence[str] | None = None,
+        frame: int | None = None,
+        drop: str | Sequence[str] = (),
+        least_area: int = 30,
+        relative: bool = False,
+        rings: int = 4,
+        reach: float = 3.0,
+        time: float | None = None,
+        like: Observed | None = None,
+    ) -> Observed:
+        """The target of label images, each of which shows one colony (a replicate).
+
+        masks: one label image or a list of them; an image is a file or an array (rows, columns).
+        fluorescence: by reporter the image beside the mask, or a list of as many, in the order of
+        the masks: {"gfp": ["one_gfp.tif", "other_gfp.tif"]}. species: those to compare; by default
+        those of `like`, or all. pixel_size, background, frame, drop, least_area: as in
+        `Cells.from_masks`, which reads each of them. Lengths are those of the centreline. Else as
+        `from_table`. Raises InputError for what these two refuse, and for lists of other lengths.
+        """
+        if species is None:
+            species = tuple(fluorescence or ()) if like is None else like.plan.species
+        caps = like is not None and like.plan.length_with_caps
+        table = masks_table(
+            masks, fluorescence, caps, pixel_size=pixel_size, background=background, frame=frame,
+            drop=drop, least_area=least_area,
+        )  # fmt: skip
+        return Observed.from_table(
+            table, species=species, length_with_caps=caps, relative=relative, rings=rings,
+            reach=reach, time=time, like=like,
+        )  # fmt: skip
 
     @staticmethod
     def from_state(
@@ -140,8 +179,9 @@ class Observed(Target):
     ) -> Observed:
         """The target of the colonies of a state, each a replicate. history: the notes of
         `Observed.note` after every step, for ages. Else as `from_table`."""
-        names = species_names("Observed.species", tuple(species)) if species else ()
+        names = _names(species, like)
         require(state, names)
+        length_with_caps = length_with_caps if like is None else like.plan.length_with_caps
         whole = ColonyStatistics(
             True,
             history is not None,
@@ -155,7 +195,8 @@ class Observed(Target):
         )
         cells = seen_cells(state, whole, history)
         plan = _plan(cells, names, rings, reach, length_with_caps, relative)
-        return _observed(cells, plan if like is None else like.plan, state.time or None)
+        plan = plan if like is None else _shared(plan, like)
+        return _observed(cells, plan, state.time or None)
 
     @staticmethod
     def from_results(
@@ -171,6 +212,7 @@ class Observed(Target):
     ) -> Observed:
         """The target of a frame of a results file, with the ages of its cells. Else as
         `from_table`."""
+        length_with_caps = length_with_caps if like is None else like.plan.length_with_caps
         with tf.Results(path) as results:
             table, now = results.table(frame), float(results.times[frame])
         columns = {
@@ -180,7 +222,7 @@ class Observed(Target):
             "length_um": table["length"] + (2.0 * table["radius"] if length_with_caps else 0.0),
             "angle_rad": table["angle"],
             "age_h": table["age"],
-            **{name: table[name] for name in species if name in table},
+            **{name: table[name] for name in _names(species, like) if name in table},
         }
         return Observed.from_table(
             columns, species=species, length_with_caps=length_with_caps, relative=relative,
@@ -196,7 +238,14 @@ class Observed(Target):
         that no model of yours could show. `table()` lists them."""
         for group in groups:
             checks.choice("Observed.without", group, tuple(self.plan.groups))
-        plan = replace(self.plan, omitted=(*self.plan.omitted, *groups))
+        plan = self.plan
+        plan = replace(
+            plan,
+            omitted=(*plan.omitted, *groups),
+            lengths=plan.lengths and "length" not in groups,
+            ages=plan.ages and "age" not in groups,
+            alignment=plan.alignment and "alignment" not in groups,
+        )
         if not plan.names:
             raise checks.input_error("Observed.without", groups, "not all of the groups")
         kept = [self.plan.names.index(name) for name in plan.names]
@@ -266,6 +315,13 @@ class Observed(Target):
         return f"like {many}{when}, {self.cells} cells: {', '.join(self.plan.groups)}"
 
 
+def _names(species: Sequence[str], like: Observed | None) -> tuple[str, ...]:
+    """The species that are compared: those given, or those of `like`."""
+    if species:
+        return species_names("Observed.species", tuple(species))
+    return () if like is None else like.plan.species
+
+
 def _plan(
     cells: SeenCells,
     species: tuple[str, ...],
@@ -298,12 +354,31 @@ def _plan(
     )
 
 
+def _shared(known: ColonyStatistics, like: Observed) -> ColonyStatistics:
+    """The statistics of `like`. known: those that the data have. Raises InputError where they lack
+    one, or have other species."""
+    plan = like.plan
+    if plan.species != known.species:
+        rule = f"that of like, {list(plan.species)}"
+        raise checks.input_error("Observed(species)", list(known.species), rule)
+    for name, group in (("lengths", "length"), ("ages", "age"), ("positions", "extent"),
+                        ("alignment", "alignment")):  # fmt: skip
+        if getattr(plan, name) and not getattr(known, name):
+            raise checks.input_error(
+                "Observed(like)",
+                like.describe(),
+                f"of statistics that these data have: they have no {name}",
+                "" if name == "positions" else f"Give like=….without({group!r}).",
+            )
+    return plan
+
+
 def _observed(cells: SeenCells, plan: ColonyStatistics, time: float | None) -> Observed:
     """The target of some cells."""
     with torch.no_grad():
         each = plan.of(cells)
         count = len(cells.counts)
-        resampled = [_bootstrap(cells, plan, k) for k in range(count)]
+        resampled = [resampled_spread(cells, plan, k) for k in range(count)]
         spread = torch.stack(resampled).square().mean(0).sqrt()
         if count >= ENOUGH:
             between = each.std(0)
@@ -324,23 +399,3 @@ def _observed(cells: SeenCells, plan: ColonyStatistics, time: float | None) -> O
     total = int(cells.counts.sum())
     mean = tuple(each.mean(0).tolist())
     return Observed(mean, tuple(spread.tolist()), plan, colonies=count, cells=total, time=time)
-
-
-def _bootstrap(cells: SeenCells, plan: ColonyStatistics, colony: int) -> Tensor:
-    """The standard deviation of each statistic (K,) when the cells of one colony are drawn again
-    with replacement; of the logarithm of their number, 1/√N."""
-    rows = torch.nonzero(cells.colony == colony).squeeze(1).cpu()
-    count = len(rows)
-    drawn = np.random.default_rng(0).integers(count, size=(RESAMPLED, count))
-    drawn_rows = rows[torch.from_numpy(drawn.ravel())].to(cells.colony.device)
-    take = lambda value: None if value is None else value.index_select(0, drawn_rows)
-    again = SeenCells(
-        torch.arange(RESAMPLED, device=cells.colony.device).repeat_interleave(count),
-        torch.full((RESAMPLED,), count, device=cells.colony.device),
-        take(cells.position), take(cells.axis), take(cells.length), take(cells.age),
-        take(cells.levels),
-    )  # fmt: skip
-    found = plan.of(again).std(0)
-    if plan.names[0] == LOG_CELLS:
-        found[0] = 1.0 / math.sqrt(count)
-    return found

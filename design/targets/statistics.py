@@ -16,6 +16,7 @@ from design.targets.base import levels, ratio
 
 LOG_CELLS = "log_cells"
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+RESAMPLED = 200  # bootstrapped colonies
 STEADY = 1e-12  # variance, in squares of the mean, that rounding can cause
 
 
@@ -183,6 +184,26 @@ def _ages(state: tf.State, history: Tensor | None) -> Tensor:
     step = (uids.index_select(1, state.colony) <= state.uid).sum(0)
     born = times[step.clamp(max=len(times) - 1), state.colony]
     return state.time - torch.where(state.parent < 0, 0.0, born)
+
+
+def resampled_spread(cells: SeenCells, plan: ColonyStatistics, colony: int) -> Tensor:
+    """The standard deviation of each statistic (K,) when the cells of one colony are drawn again
+    with replacement; of the logarithm of their number, 1/√N."""
+    rows = torch.nonzero(cells.colony == colony).squeeze(1).cpu()
+    count = len(rows)
+    drawn = np.random.default_rng(0).integers(count, size=(RESAMPLED, count))
+    drawn_rows = rows[torch.from_numpy(drawn.ravel())].to(cells.colony.device)
+    take = lambda value: None if value is None else value.index_select(0, drawn_rows)
+    again = SeenCells(
+        torch.arange(RESAMPLED, device=cells.colony.device).repeat_interleave(count),
+        torch.full((RESAMPLED,), count, device=cells.colony.device),
+        take(cells.position), take(cells.axis), take(cells.length), take(cells.age),
+        take(cells.levels),
+    )  # fmt: skip
+    found = plan.of(again).std(0)
+    if plan.names[0] == LOG_CELLS:
+        found[0] = 1.0 / math.sqrt(count)
+    return found
 
 
 def _known(value: Tensor | None) -> Tensor:

@@ -3,6 +3,8 @@ each other; and designs that a scene function finds unfit."""
 
 from __future__ import annotations
 
+from types import FunctionType
+
 import numpy as np
 import pytest
 import torch
@@ -85,6 +87,59 @@ def test_choices_that_exclude_each_other_are_resolved_in_the_values():
             if first != second:
                 values = {"a": first, "b": second}
                 assert space.values(space.point(values)) == values
+
+
+def few_twins(design):
+    """As `no_twins`, but for twins that no trial of a task has."""
+    return no_twins(design) if design["a"] != "x" else {}
+
+
+def placed(a="x", b="y", decay=1.0) -> tf.Scene:
+    strength = {"x": 1.0, "y": 2.0, "z": 4.0}
+    make = strength[a] + 10.0 * strength[b]
+    circuit = tf.Circuit(filling, species=("gfp",), make=make, decay=decay)
+    return tf.Scene(tf.Growth(rate=2.0), tf.Division(length=tf.Uniform(3, 4)), circuit, dt=DT)
+
+
+def search_of_places(resolve, low=1.0, start=None) -> Search:
+    options = ("x", "y", "z")
+    parameters = [Choice(name, options, resolve=resolve) for name in "ab"]
+    return Search(
+        placed, [*parameters, Parameter("decay", low, 2.0)], Level(wanted=20.0), cells=3,
+        replicates=1, method=Sobol(batch=4), finals=None, start=start,
+    )  # fmt: skip
+
+
+def test_a_study_of_choices_that_are_resolved_otherwise_is_refused(tmp_path):
+    """Points stand for other designs there. The same function, made anew, is the same."""
+    search_of_places(no_twins).run(4, study=tmp_path / "s.h5", progress=False)
+    with pytest.raises(tf.InputError, match=r"Different: code of resolve\. Give another path"):
+        search_of_places(few_twins).run(8, study=tmp_path / "s.h5", progress=False)
+    with pytest.raises(tf.InputError, match=r"Different: .*, code of resolve\."):
+        search_of_places(None).run(8, study=tmp_path / "s.h5", progress=False)
+    same = FunctionType(no_twins.__code__, globals(), "another_name")
+    again = search_of_places(same)
+    again.run(8, study=tmp_path / "s.h5", progress=False)
+    assert len(again.study.entries) == 2
+
+
+def test_losses_of_choices_that_are_resolved_otherwise_do_not_hold(tmp_path):
+    old = search_of_places(no_twins)
+    old.run(4, study=tmp_path / "s.h5", progress=False)
+    kept = search_of_places(no_twins, low=0.5, start=tmp_path / "s.h5")
+    assert kept._known.why == "" and kept.study.entries[0].copies == 0
+    made = search_of_places(few_twins, low=0.5, start=tmp_path / "s.h5")
+    assert made._known.why == "another code of resolve" and not made.study.entries
+
+
+def test_what_resolves_choices_counts_for_their_space():
+    options = ("x", "y", "z")
+    space = lambda resolve, names="ab": Space(
+        [Choice(n, options, resolve=resolve if n in names else None) for n in "ab"]
+    )
+    words = [space(no_twins).digest, space(few_twins).digest, space(no_twins, "a").digest]
+    assert len(set(words)) == 3 and space(None).digest is None
+    assert space(no_twins).digest == words[0]
 
 
 def test_a_search_over_choices_of_each_colony_finds_the_best():

@@ -10,10 +10,13 @@ from patterned import crowded
 from searching import lit, objective_of, paced
 
 import torchfilm as tf
-from design import Choice, Parameter, Search, Study, scene_family
+from design import Choice, Parameter, Search, Study, colonies, scene_family
+from design.derivatives import along
 from design.methods import Local
+from design.rollout import grow
+from design.scoring import cut_work_items, run_work_item
 from design.slopes import Slopes
-from design.targets import Bands, Gradient, Ring, Stripe
+from design.targets import Bands, Burden, Gradient, Lasting, Ring, Stripe, Weighted
 
 TARGETS = {
     "bands": Bands(("yfp", "cfp"), (-6.0, 0.0, 6.0), floor=0.3),
@@ -25,6 +28,7 @@ TARGETS = {
 EDGES = Bands(("gfp",), (-3.0, 3.0), floor=0.5)
 TWO = [Parameter("make", 0.1, 10.0, log=True), Parameter("decay", 0.1, 5.0)]
 POINTS = np.array([[0.3, 0.6], [0.8, 0.2]])
+GRID = np.linspace(0.0, 1.0, 11)
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -80,6 +84,112 @@ def test_curvature_is_that_of_the_residuals():
     assert found.curvature[0] == pytest.approx(2 * j.T @ j / 2, rel=0.03)
     own = np.linalg.eigvalsh(found.curvature[0])
     assert own.min() >= -1e-12
+
+
+LASTING = Lasting(EDGES, since=0.4)
+
+
+def test_a_pattern_that_lasts_has_the_residuals_of_all_its_steps():
+    """By hand: of each step from `since` on, and their weights. Gradient and 2 JᵀJ are finite
+    differences of those."""
+    options = {"cells": 8, "replicates": 2, "dtype": torch.float64}
+    objective = objective_of(lit, TWO, LASTING, **options)
+    assert objective.least_squares
+
+    def courses(point):
+        """Residuals of each colony at its steps, put together by hand."""
+        out = []
+        task = objective.task
+        for stream in range(2):
+            scene = task.family.scene([task.space.values(point)], repeat=1)
+            prepared = colonies.prepare(scene, [stream], task.settings)
+            steps, losses = [], []
+
+            def seen(state, steps=steps, losses=losses):
+                if state.time > 0.4 - 1e-9:
+                    steps.append(EDGES.residuals(state)[0])
+                    losses.append(float(EDGES.loss(state)))
+
+            list(grow(prepared, cells=8, until=None, note=seen))
+            whole = torch.cat(steps).numpy() / np.sqrt(len(steps))
+            assert len(steps) > 5 and float(whole @ whole) == pytest.approx(np.mean(losses))
+            out.append(whole)
+        return out
+
+    found = objective.evaluate(POINTS, slopes=True)
+    plain = objective.evaluate(POINTS)
+    assert found.losses == pytest.approx(plain.losses, rel=1e-9)
+    middle = courses(POINTS[0])
+    assert plain.losses[0] == pytest.approx([r @ r for r in middle], rel=1e-9)
+    columns = []
+    for k in range(2):
+        step = np.eye(2)[k] * 2e-4
+        ends = zip(courses(POINTS[0] + step), courses(POINTS[0] - step), strict=True)
+        columns.append(np.concatenate([(a - b) / 4e-4 for a, b in ends]))
+    j, r = np.stack(columns, 1), np.concatenate(middle)
+    assert found.slopes.curvature[0] == pytest.approx(j.T @ j, rel=0.03)
+    assert found.slopes.gradient[0] == pytest.approx(j.T @ r, rel=0.03)
+
+
+def test_residuals_of_a_course_add_up_to_the_loss_of_each_colony():
+    """Also of a colony that ended before the others, and of one that ended before `since`."""
+    state = crowded()
+    target = Lasting(TARGETS["bands"], since=1.0)
+    run = [state.with_fields(yfp=state.yfp ** (1.0 + k)).replace(time=0.5 * k) for k in range(5)]
+    wide = [target.course(s) for s in run]
+    assert [w.shape[1] for w in wide[:2]] == [1, 1] and wide[2].shape[1] > 1
+    most = wide[2].shape[1]
+    history = torch.stack([torch.nn.functional.pad(w, (0, most - w.shape[1])) for w in wide])
+    history[3:, 1] = torch.nan
+    history[:, 2, 0] = torch.nan
+    found = target.residuals(run[-1], history).square().sum(1)
+    assert found.numpy() == pytest.approx(target.loss(run[-1], history).numpy(), abs=1e-12)
+    at_end = target.residuals(run[-1])
+    assert torch.equal(at_end, TARGETS["bands"].residuals(run[-1]))
+    notes = torch.stack([target.note(s) for s in run])
+    assert target.residuals(run[-1], notes) is None  # of losses alone
+    assert not Weighted([(target, 1.0), (TARGETS["ring"], 0.5)]).squares
+    assert Lasting(Weighted([(TARGETS["ring"], 0.5)]), since=0.0).squares
+    assert not Lasting(Burden(), since=0.0).squares
+
+
+def test_slopes_of_a_sum_with_a_lasting_pattern_are_those_of_its_loss():
+    target = Weighted([(LASTING, 1.0), (EDGES, 0.5)])
+    objective = objective_of(lit, TWO, target, cells=8, replicates=2, dtype=torch.float64)
+    found = objective.evaluate(POINTS[:1], slopes=True)
+    assert not objective.least_squares and np.isnan(found.slopes.curvature).all()
+    step = np.array([2e-4, 0.0])
+    more, less = (objective.evaluate(POINTS[:1] + s).loss for s in (step, -step))
+    assert found.slopes.gradient[:, 0] == pytest.approx((more - less) / 4e-4, rel=0.02)
+
+
+def test_a_descent_finds_a_pattern_that_lasts():
+    search = Search(
+        lit, TWO, LASTING, cells=8, replicates=2, method=Local(starts=1, first=4), finals=None
+    )
+    best = search.run(120, progress=False)
+    lowest = min(search.objective.evaluate(np.array([[u, v] for u in GRID for v in GRID])).loss)
+    assert best.loss < lowest + 1e-4
+
+
+@pytest.mark.parametrize("target", [EDGES, LASTING], ids=["at the end", "lasting"])
+def test_slopes_do_not_depend_on_the_batch(target):
+    """Each colony alone, and all in one batch, in which larger colonies stand: the same bits."""
+    task = objective_of(lit, TWO, target, cells=30, replicates=4).task
+    values = [task.space.values(point) for point in POINTS]
+    turns = [along(task.space, point) for point in POINTS]
+
+    def slopes(rows, streams):
+        part = [values[k] for k in rows], len(streams), 1.0, 1, [turns[k] for k in rows]
+        (item,) = cut_work_items(task, *part)
+        return run_work_item(task, item, streams, 1.0).slopes
+
+    whole = slopes([0, 1], (0, 1, 2, 3))
+    for row in range(2):
+        for k in range(4):
+            alone = slopes([row], (k,))
+            assert np.array_equal(alone.gradient[0], whole.gradient[4 * row + k])
+            assert np.array_equal(alone.curvature[0], whole.curvature[4 * row + k])
 
 
 def test_parameters_with_levels_have_no_slope():

@@ -26,6 +26,7 @@ from design import (
 from design import Spread as SpreadOfLosses
 from design.finals import FIRST_STREAM
 from design.pareto import nondominated, spread
+from design.targets.goals import Goals
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
 GOALS = [Level(wanted=1.0), Burden()]
@@ -34,6 +35,15 @@ GOALS = [Level(wanted=1.0), Burden()]
 def search(parameters=LIT, scene=lit, targets=GOALS, **options):
     options = {"method": NSGA2(population=8), "cells": 3, "replicates": 2, **options}
     return Search(scene, parameters, targets=targets, **options)
+
+
+class Sobol8(Sobol):
+    """Points of a Sobol sequence, for several goals."""
+
+    several = True
+
+    def tell(self, batch, loss, slopes=None):
+        super().tell(batch, np.zeros(len(batch.points)))
 
 
 # --- the front ------------------------------------------------------------------------------------
@@ -125,6 +135,78 @@ def test_a_study_of_goals_is_a_start_with_its_goals(tmp_path):
     assert len(again.study.entries) == 5 and len(front) >= 5
 
 
+def points_of(made):
+    return np.concatenate([e.points for e in made.study.entries])
+
+
+def test_known_designs_are_the_first_population_and_are_not_grown_again():
+    """40 designs are known, and a population has 8: the 8 that NSGA-II keeps, none of which fails.
+    The first batch are their daughters, and not Sobol points."""
+    old = search([Parameter("make", 0.5, 5, log=True), LIT[1]], finals=None, method=Sobol8())
+    old.run(80, progress=False)
+    made = search(start=old.study, finals=None)
+    known = made.study.entries[0]
+    assert known.copies == 0 and len(known.points) == 40
+    made.run(32, progress=False)
+    assert made.study.colonies == 32 and len(made.study.entries) == 3
+    fresh = points_of(made)[40:]
+    apart = np.abs(fresh[:, None] - known.points[None]).max(2).min(1)
+    assert (apart > 1e-6).all()
+    alone = search(finals=None)
+    alone.run(16, progress=False)
+    sobol = alone.study.entries[0].points
+    assert not any((np.abs(fresh - point).max(1) < 1e-6).any() for point in sobol)
+    # told the same batches, a method by hand is where the search was
+    method = NSGA2(population=8)
+    method.start(made.objective.task.space, 0, 2)
+    method.know(known.points, known.goals)
+    for entry in made.study.entries[1:]:
+        assert np.array_equal(method.ask().points, entry.points)
+        method.tell(method.ask(), entry.goals)
+
+
+def test_the_best_known_designs_are_kept():
+    """Of a front of three, and designs behind it, of which some failed."""
+    front = np.array([[0.0, 1.0], [0.5, 0.5], [1.0, 0.0]])
+    goals = np.concatenate([[[2.0, 2.0], [np.nan, np.nan]], front, [[3.0, 3.0]]])
+    points = np.array([[0.1, 0.1], [0.2, 0.2], [0.3, 0.3], [0.4, 0.4], [0.5, 0.5], [0.6, 0.6]])
+    method = NSGA2(population=4)
+    method.start(objective_of(lit, LIT, Goals(GOALS), cells=3).task.space, 0, 1)
+    method.know(points, goals)
+    kept = {tuple(one.X) for one in method._search.pop}
+    assert kept == {(0.3, 0.3), (0.4, 0.4), (0.5, 0.5), (0.1, 0.1)}
+    with pytest.raises(tf.InputError, match="with two goals or more"):
+        method.know(points, goals[:, 0])
+
+
+@pytest.mark.parametrize("failed", [0, 1])
+def test_fewer_known_designs_are_filled_up(failed):
+    """Also where one of them is what the first batch would have proposed, and where all failed."""
+    task = objective_of(lit, LIT, Goals(GOALS), cells=3).task
+    plain = NSGA2(population=8)
+    plain.start(task.space, 0, 1)
+    first = plain.ask().points
+    method = NSGA2(population=8)
+    method.start(task.space, 0, 1)
+    points = np.array([first[2] + 1e-14, [0.123, 0.456]])
+    goals = np.array([[1.0, 2.0], [2.0, 1.0]])
+    method.know(points, np.where(failed, np.nan, goals))
+    if failed:
+        assert np.array_equal(method.ask().points, first)
+        return
+    assert np.array_equal(method.ask().points, np.delete(first, 2, 0)[:6])
+    method.tell(method.ask(), np.random.default_rng(0).random((6, 2)))
+    assert len(method._search.pop) == 8 and len(method.ask().points) == 8
+
+
+def test_designs_by_name_are_grown_once():
+    start = [{"make": 1.1, "decay": 1.0}, {"make": 3.0, "decay": 1.0}]
+    made = search(start=start, finals=None)
+    made.run(36, progress=False)
+    assert [len(e.points) for e in made.study.entries] == [2, 6, 8, 2]
+    assert len(np.unique(points_of(made), axis=0)) == 18
+
+
 @pytest.mark.parametrize("sizes", [(1.0,), (0.5, 1.0)])
 def test_a_front_of_a_longer_search_keeps_all_its_designs(tmp_path, sizes):
     """The second finals grow again only the seeds that designs of the first finals lack."""
@@ -156,8 +238,9 @@ def test_designs_with_few_levels_are_grown_once_in_the_first_batch(start):
     few = [Parameter("genes", 1, 2, whole=True), Choice("promoter", ("weak", "strong"))]
     made = search(few, built, [Level("g0"), Burden()], finals=None, start=start)
     made.run(40, progress=False)
-    first = made.study.entries[0 if start is None else 1].points
-    assert len(first) == len(np.unique(first, axis=0)) == 4
+    known = 0 if start is None else 1
+    first = made.study.entries[known].points
+    assert len(first) == len(np.unique(first, axis=0)) == 4 - known
 
 
 def test_a_front_needs_no_more_than_the_replicates_of_one_design():

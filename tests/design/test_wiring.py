@@ -13,7 +13,7 @@ import torch
 from gate_library import GATES, inputs_and_outputs, version_1, version_2, write
 
 import torchfilm as tf
-from design import Image, Library, Search, Sensor, SensorDevice, UnfitDesign
+from design import Image, Library, Search, Sensor, SensorDevice, Space, UnfitDesign
 from design.library.logic import netlist
 
 LEFT = SensorDevice("pLeft", ymax=2.6, ymin=0.01)
@@ -290,6 +290,13 @@ def test_a_wiring_needs_as_many_repressors_as_gates(tmp_path):
     few = Library.read(path, gates=["B1_BetR", "B2_BetR", "D1_DelR"])
     with pytest.raises(tf.InputError, match="needs 3 repressors, and the library has 2: BetR, Del"):
         xor(few)
+
+
+def test_another_contrast_of_a_wiring_makes_another_task(library):
+    """The same choices then stand for other gates, where levels do not fit."""
+    words = lambda **options: Space(xor(library, **options).parameters).digest
+    assert words() == words() == Space(pickle.loads(pickle.dumps(xor(library))).parameters).digest
+    assert words(contrast=2.5) != words(contrast=12.0)
 
 
 def test_a_search_chooses_gates_in_one_batch_and_reports_those_that_are_used(library):

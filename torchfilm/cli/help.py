@@ -86,11 +86,13 @@ def _find(name: str) -> tuple[str, Any]:
     meant = [n for n in inside if n.split(".")[-1] == rest[-1]]
     if len(meant) == 1:
         return meant[0], inside[meant[0]]
-    last = {n.split(".")[-1].lower(): n for n in [*inside, *known]}
+    last: dict[str, list[str]] = {}
+    for title in [*inside, *known]:
+        last.setdefault(title.split(".")[-1].lower(), []).append(title)
     near = checks.nearest(rest[-1].lower(), last)
-    hint = f"Did you mean {last[near]}?" if near else "`torchfilm help` lists them."
-    if meant:
-        hint = f"Did you mean {', '.join(meant[:-1])} or {meant[-1]}?"
+    *others, one = meant or (last[near] if near else [""])
+    hint = f"Did you mean {', '.join(others) + ' or ' if others else ''}{one}?"
+    hint = hint if one else "`torchfilm help` lists them."
     raise checks.input_error("name", name, "a public name of torchfilm or design", hint)
 
 

@@ -25,7 +25,8 @@ def read_image(image: Any, frame: int | None, what: str) -> tuple[np.ndarray, st
 
     image: an array, or the path of a file: .tif, .tiff, .png, .jpg, .npy, or DeLTA's .nc, whose
     label images are placed where their regions of interest were. frame: of a stack, −1 is the last;
-    required if it has several. what: "mask" or "micrograph". Nothing in a file can execute.
+    required if it has several. what: "mask", "micrograph" or a word for another image. Nothing in
+    a file can execute.
     """
     if isinstance(image, (str, Path)):
         path = Path(image)
@@ -33,7 +34,7 @@ def read_image(image: Any, frame: int | None, what: str) -> tuple[np.ndarray, st
         if path.suffix.lower() == ".nc":
             return values, source
     else:
-        values, source = _array(image, what), f"the {what}"
+        values, source = _array(image, what), what if "[" in what else f"the {what}"
     if values.ndim == 3 and values.shape[-1] in (3, 4) and min(values.shape[:2]) > 4:
         return _one_frame(values[None], frame, source)
     while values.ndim > 3 and 1 in values.shape[:-2]:
@@ -82,8 +83,8 @@ def _file(path: Path, frame: int | None, what: str) -> np.ndarray:
     kind = path.suffix.lower()
     if kind in NOT_IMAGES:
         raise checks.InputError(f"{path} is not an image. {NOT_IMAGES[kind]}")
-    if kind in (".jpg", ".jpeg") and what == "mask":
-        raise checks.InputError(f"{path}: JPEG changes numbers. Save masks as .tif or .png.")
+    if kind in (".jpg", ".jpeg") and what != "micrograph":
+        raise checks.InputError(f"{path}: JPEG changes numbers. Save it as .tif or .png.")
     if kind not in (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".npy", ".nc"):
         raise checks.input_error(what, str(path), "a file .tif, .png, .npy or .nc, or an array")
     try:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchfilm.micrographs.capsule_fit import capsule_of_area
+from torchfilm.micrographs.fluorescence import check_fluorescence, mean_fluorescence
 from torchfilm.micrographs.mask_files import EXTRA, read_image
 from torchfilm.micrographs.record import Micrograph, listed
 from torchfilm.tools import checks
@@ -28,6 +29,8 @@ def mask_cells(
     image: Any,
     *,
     pixel_size: float,
+    fluorescence: Mapping[str, Any] | None,
+    background: str | float,
     frame: int | None,
     drop: str | Sequence[str],
     least_area: int,
@@ -42,6 +45,7 @@ def mask_cells(
     checks.number("pixel_size", pixel_size, above=0.0, hint="µm a pixel.")
     checks.number("least_area", least_area, least=4, hint="Pixels.")
     checks.choice("centre", centre, (True, False))
+    channels = check_fluorescence(fluorescence, background)
     drop = (drop,) if isinstance(drop, str) else drop
     if not isinstance(drop, Sequence):
         raise checks.input_error("drop", drop, "kinds of regions, such as ('border', 'tiny')")
@@ -64,6 +68,10 @@ def mask_cells(
         raise checks.InputError(
             f"{source}: no cell is left: drop={list(drop)} leaves out all {len(kept)} regions."
         )
+    light = {
+        name: mean_fluorescence(given, name, frame, mask, source, background)
+        for name, given in channels.items()
+    }
     length, radius = capsule_of_area(regions["area"], regions["along"])
     place = pixel_size * np.stack([regions["column"], -regions["row"]], 1)
     shift = np.broadcast_to(-place.mean(0) if centre else np.zeros(2), place.shape)
@@ -72,6 +80,7 @@ def mask_cells(
         "axis": regions["axis"] * (1.0, -1.0),
         "length": pixel_size * length,
         "radius": pixel_size * radius,
+        "extra": {name: mean[regions["label"]] for name, (mean, _) in light.items()},
         "micrograph": Micrograph(
             source,
             pixel_size,
@@ -79,6 +88,7 @@ def mask_cells(
             label=np.array([str(labels[k]) for k in regions["label"]]),
             image=(mask.shape[0], mask.shape[1]),
             left_out=left_out,
+            background={name: dark for name, (_, dark) in light.items()},
         ),
     }
 

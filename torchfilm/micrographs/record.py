@@ -26,7 +26,8 @@ class Micrograph:
     were moved from their places in the image, whose first pixel has its centre at the origin.
     y_down: whether that pixel is at the top (else at the bottom). label: (N,) texts, or None.
     image: (rows, columns), where known. left_out: the labels that were dropped, by the reason.
-    moved: (N,) µm, how far `Cells.relaxed` moved each cell, or None.
+    background: what was subtracted from the pixels of a field, by field. moved: (N,) µm, how far
+    `Cells.relaxed` moved each cell, or None.
     """
 
     source: str
@@ -36,6 +37,7 @@ class Micrograph:
     label: np.ndarray | None = None
     image: tuple[int, int] | None = None
     left_out: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    background: Mapping[str, float] = field(default_factory=dict)
     moved: np.ndarray | None = None
 
     def name(self, cell: int) -> str:
@@ -93,6 +95,11 @@ def summarise(cells: Cells) -> str:
         lines += [
             f"left out, {reason}: {len(labels)}, label {listed(labels)}"
             for reason, labels in seen.left_out.items()
+        ]
+        lines += [
+            f"{channel}: {span(cells.extra[channel])}, median {np.median(cells.extra[channel]):.3g}"
+            f" (mean of the pixels, less {dark:.4g} of background)"
+            for channel, dark in seen.background.items()
         ]
     found = cells.overlaps(LEAST)
     lines.append(
