@@ -21,9 +21,8 @@ from collections import Counter
 from dataclasses import replace
 
 import torch
-from fuzz_draws import DRAWS, PUSHING, Beside, Capsules, Contacts, Draw
+from fuzz_draws import DRAWS, PUSHING, Beside, Capsules, Contacts, Draw, for_each
 from fuzz_scenes import eats, mechanics, scene_of
-from hypothesis import HealthCheck, given, seed, settings
 from torch import Tensor
 
 import torchfilm as tf
@@ -292,15 +291,6 @@ def main() -> None:
     paths: Counter[str] = Counter()
     slowest: tuple[float, Draw | None] = (0.0, None)
 
-    @seed(chosen.seed)
-    @settings(
-        max_examples=chosen.examples,
-        deadline=None,
-        database=None,
-        suppress_health_check=list(HealthCheck),
-        print_blob=False,
-    )
-    @given(PUSHING if chosen.contacts else DRAWS)
     def every(draw: Draw) -> None:
         nonlocal slowest
         different.add(draw)
@@ -310,7 +300,8 @@ def main() -> None:
         if ended.total() % 500 == 0:
             print(dict(ended), dict(paths), flush=True)
 
-    every()
+    draws = PUSHING if chosen.contacts else DRAWS
+    for_each(draws, chosen.examples, chosen.seed, every)
     print(
         f"{ended.total()} examples, seed {chosen.seed}, {len(different)} of them different:"
         f" {dict(ended)}; the slowest took {slowest[0]:.1f} s: {slowest[1]}\n"

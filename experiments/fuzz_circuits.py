@@ -20,9 +20,8 @@ from collections import Counter
 from pathlib import Path
 
 import torch
-from fuzz_draws import OUTSIDE, Outside
+from fuzz_draws import OUTSIDE, Outside, for_each
 from fuzz_scenes import medium
-from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
 import torchfilm as tf
@@ -91,16 +90,12 @@ def main() -> None:
     compiled._module = plain_module
     ended: Counter[str] = Counter()
 
-    @seed(chosen.seed)
-    @settings(max_examples=chosen.examples, deadline=None, database=None,
-              suppress_health_check=list(HealthCheck), print_blob=False)  # fmt: skip
-    @given(CASES)
     def every(case: dict) -> None:
         ended[run(case)] += 1
         if ended.total() % 100 == 0:
             print(dict(ended), flush=True)
 
-    every()
+    for_each(CASES, chosen.examples, chosen.seed, every)
     print(f"{ended.total()} examples, seed {chosen.seed}: {dict(ended)}")
 
 
