@@ -6,10 +6,10 @@
 Each example draws a scene and runs it for a few steps under the laws of `run`. It draws sizes,
 crowding, walls, α or stiffness, γ, growth, division, circuits with Hill terms and stiff decay,
 signals on grids of odd shapes with boundary conditions, flow and obstacles, and steps from less
-than a second to hours; --contacts: cells, walls and growth alone, with one-sided contacts. The last
-step of one-sided contacts is computed by the compiled kernels and by the torch reference. Hypothesis reduces the first example that breaks a law and prints it as a
-`Draw`, which `run` accepts. docs/stability.md lists the findings. tests/test_fuzz.py runs a hundred
-examples.
+than a second to hours. With --contacts it draws cells, one-sided contacts, walls and growth alone.
+The last step of one-sided contacts is computed by the compiled kernels and by the torch reference.
+Hypothesis reduces the first example that breaks a law and prints it as a `Draw`, which `run`
+accepts. docs/stability.md lists the findings. tests/test_fuzz.py runs a hundred examples.
 """
 
 from __future__ import annotations
