@@ -3,8 +3,9 @@
     python experiments/fuzz_circuits.py --examples 1000 --seed 1
 
 Each example draws a circuit of up to eight species (mass action, Hill terms, exchange, one type of
-cells or all), as a function or as reactions, and a medium as experiments/fuzz.py draws them
-(boundary conditions, flow, obstacles, reservoirs, grids that grow). Cells grow meanwhile. The text
+cells or all), as a function or as reactions, a method (stiff, with equal steps, or molecule by
+molecule), and a medium as experiments/fuzz.py draws them (boundary conditions, flow, obstacles,
+reservoirs, grids that grow). Cells grow meanwhile. The text
 of the compiled functions is run as Python, since compiling each takes seconds;
 tests/circuits/test_compiled_circuits.py shows that compiled for real it gives the same bits. Media
 are computed by their compiled kernels on both sides. Laws, of all colonies and fields: the same
@@ -16,13 +17,15 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
-from fuzz_draws import OUTSIDE, Outside
+from fuzz_draws import OUTSIDE, Outside, for_each
 from fuzz_scenes import medium
-from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
 import torchfilm as tf
@@ -31,20 +34,42 @@ from torchfilm.circuits import compiled
 sys.path.append(str(Path(__file__).parents[1] / "tests"))  # circuits at random, texts as Python
 from traced import by, circuits, plain_module, row_of
 
+METHODS = ("rosenbrock", "rosenbrock", "rosenbrock", "rk4", "tau_leap", "direct")
+
+
+def taking_all(outside: Outside) -> Outside:
+    """A medium that refuses no cell and no box."""
+    bounded = "periodic" in outside.boundary or outside.outside == "error"
+    return replace(outside, outside="reservoir" if bounded else outside.outside)
+
+
 CASES = st.fixed_dictionaries({
     "circuit": circuits(signal="ahl"),
     "form": st.sampled_from(["function", "reactions"]),
-    "outside": OUTSIDE,
+    "method": st.sampled_from(METHODS),
+    "rtol": st.sampled_from([1e-2, 1e-4]),
+    "outside": OUTSIDE.map(taking_all),
     "dtype": st.sampled_from([torch.float32, torch.float64]),
     "dt": st.sampled_from([0.1, 1e-3, 1.0]),
     "steps": st.integers(1, 2),
 })  # fmt: skip
 
 
-def scene_of(made: dict, form: str, outside: Outside) -> tf.Scene:
+def scene_of(case: dict) -> tf.Scene:
     """Four cells of two types on a line, a circuit in them, and the medium about them."""
-    first = {n: tf.Uniform(0.0, 2.0) for n in made["species"]}
-    circuit = tf.Circuit(made[form], species=made["species"], initial=first, rtol=1e-4)
+    made, method, outside = case["circuit"], case["method"], case["outside"]
+    given: dict[str, Any] = {"rtol": case["rtol"]} if method == "rosenbrock" else {"method": method}
+    stochastic = method in ("tau_leap", "direct")
+    if stochastic:
+        given["molecules_per_unit"] = 4.0
+        # events are simulated one by one, those of a million molecules for hours
+        outside = replace(outside, start=min(outside.start, 1.0))
+    circuit = tf.Circuit(
+        made["reactions" if stochastic else case["form"]],
+        species=made["species"],
+        initial={n: tf.Uniform(0.0, 2.0) for n in made["species"]},
+        **given,
+    )
     dim = len(outside.shape)
     growth, cells = tf.Growth(rate=tf.Uniform(0.5, 1.0)), row_of(4, 2)
     if dim == 3:
@@ -67,7 +92,7 @@ def end(scene: tf.Scene, backend: str, case: dict) -> tf.State:
 def run(case: dict) -> str:
     """Runs an example under the laws: "refused", "failed" or "ran"."""
     try:
-        scene = scene_of(case["circuit"], case["form"], case["outside"])
+        scene = scene_of(case)
         ours = end(scene, "compiled", case)
     except tf.InputError as error:
         assert "compiled" not in str(error), "every circuit that is drawn has equations"
@@ -89,19 +114,23 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     compiled._module = plain_module
+    torch.set_num_threads(1)
     ended: Counter[str] = Counter()
+    slowest: tuple[float, dict] = (0.0, {})
 
-    @seed(chosen.seed)
-    @settings(max_examples=chosen.examples, deadline=None, database=None,
-              suppress_health_check=list(HealthCheck), print_blob=False)  # fmt: skip
-    @given(CASES)
     def every(case: dict) -> None:
+        nonlocal slowest
+        start = time.process_time()
         ended[run(case)] += 1
+        slowest = max(slowest, (time.process_time() - start, case), key=lambda pair: pair[0])
         if ended.total() % 100 == 0:
             print(dict(ended), flush=True)
 
-    every()
-    print(f"{ended.total()} examples, seed {chosen.seed}: {dict(ended)}")
+    for_each(CASES, chosen.examples, chosen.seed, every)
+    print(
+        f"{ended.total()} examples, seed {chosen.seed}: {dict(ended)}; the slowest took"
+        f" {slowest[0]:.1f} s: {slowest[1]}"
+    )
 
 
 if __name__ == "__main__":

@@ -60,8 +60,8 @@ def walls(draw: Contacts, capsules: Capsules) -> list[Wall]:
     return made[draw.wall]
 
 
-def each(draw: Contacts, value: float) -> Any:
-    """Returns the value of all cells, or a value for each around it."""
+def each(draw: Contacts, value: float | torch.Tensor) -> Any:
+    """Returns the value of all cells, or a value for each around it; `value` may be (B,)."""
     return tf.LogNormal(value, 1.0) if draw.uneven else value
 
 
@@ -72,11 +72,15 @@ def mechanics(draw: Contacts, capsules: Capsules) -> tf.Mechanics:
         given["alpha" if draw.give > 0 else "stiffness"] = each(draw, abs(draw.give))
     if draw.contacts == "one-sided":
         given |= {"passes": draw.passes, "max_elongation": draw.elongation}
+    length_drag, viscosity = draw.length_drag, draw.viscosity
+    if draw.drags:
+        columns = zip(*draw.drags[: len(capsules.counts)], strict=True)
+        length_drag, viscosity = (torch.tensor(x, dtype=torch.float64) for x in columns)
     made = tf.Mechanics(
         walls=walls(draw, capsules),
         dim=capsules.dim,
-        viscosity=each(draw, draw.viscosity),
-        length_drag=each(draw, draw.length_drag),
+        viscosity=each(draw, viscosity),
+        length_drag=each(draw, length_drag),
         contacts=draw.contacts,
         max_iterations=300,
         tolerance=draw.tolerance,
