@@ -156,9 +156,11 @@ def test_molecules_have_no_derivative():
             model.step(model.start(), 0.05)
 
 
-def test_contacts_refuse_forward_mode():
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_contacts_refuse_forward_mode(backend):
     with torch.no_grad(), forward_mode():
-        scene = tf.scenes.microcolony(rate=moved(1.0, 1.0, 0.0))
+        growth = tf.Growth(rate=moved(1.0, 1.0, 0.0))
+        scene = tf.Scene(growth, tf.Mechanics(dim=2, backend=backend))
         model = scene.bind(2, dtype=F64, per_colony=True)
         with pytest.raises(tf.InputError, match="contacts have a backward pass"):
             model.step(model.start(), 0.1)

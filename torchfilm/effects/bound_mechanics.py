@@ -48,7 +48,7 @@ class BoundMechanics(BoundEffect):
         if state.cells == 0:
             return state
         given = self._given(state, dt)
-        by_kernels = self.compiled and not _tracked(given)
+        by_kernels = not _tracked(given) and self.compiled
         found = (compiled if by_kernels else torch_step).step(given)
         fields = {"displacement": found.move, "collapsed_steps": found.collapsed}
         if "elongation" in state.fields:

@@ -131,5 +131,6 @@ def solve(
                 bicgstab(x, r, pad, grid, many[own], target, most, spare)
         good = dot(r, r) <= 100 * target
         for i in range(size):
-            # with its residual the change is what T makes of x: it conserves amount to rounding
+            # with its residual the change is what T makes of x: amount is conserved, but for the
+            # rounding of λΔt exchanges
             out[starts[c] + i] = max(x[pad + i] + r[i], 0.0) if good else np.nan

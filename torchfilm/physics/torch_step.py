@@ -31,7 +31,7 @@ def step(given: MechanicsInput) -> MechanicsResult:
     alpha = compression = None
     if given.compression is not None:
         alpha = given.groups.spread(found.hardness.to(base.dtype))
-        compression = (given.compression + base - found.length).clamp(min=0.0)
+        compression = (given.compression + (base - found.length)).clamp(min=0.0)
     status = torch.maximum(status, found.status)
     collapsed = _collapsed_steps(given, found)
     lasting = (collapsed >= LONG) & (status == CONVERGED)

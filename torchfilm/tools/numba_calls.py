@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
+
+# Read when numba is imported. Where Intel's vector library is installed, LLVM would call it for
+# whole vectors and another one for the rest: a number's bits would depend on its place.
+os.environ.setdefault("NUMBA_DISABLE_INTEL_SVML", "1")
 
 
 @cache
