@@ -83,10 +83,19 @@ def lawful(before: tf.State, after: tf.State, draw: Draw) -> list[int]:
     failed = sorted({f.place for f in found})
     sound = [k for k in range(after.colonies) if k not in failed]
     finite(after, sound)
+    # a heap with less room than its cells take is pushed out of it, and soon reported
+    held = [k for k in sound if not collapsed(after, k)]
+    if held:
+        walled(after.select(held), draw)
     if sound:
-        walled(after.select(sound), draw)
         kept(before.select(sound), after.select(sound), draw)
     return failed
+
+
+def collapsed(state: tf.State, place: int) -> bool:
+    """Whether contacts did not hold the cells of a colony apart in the last step."""
+    steps = state.fields.get("collapsed_steps")
+    return steps is not None and bool((steps[state.colony == place] > 0).any())
 
 
 def counted(before: tf.State, after: tf.State) -> None:

@@ -132,6 +132,39 @@ def test_the_fuzzer_notices_a_number_that_is_none(name):
         fuzz.finite(broken, [0, 1])
 
 
+CROWD = fuzz.Draw(
+    fuzz.Capsules((40,), 2.0, (2.0, 3.0), (2.0, 2.0), 2, 1),
+    fuzz.Contacts(None, 1.0, 1.0, "one-sided", None, "box", 0.3, None),
+    *(None, None, None, fuzz.Beside(False, None, False), 0.01, 1, "float64", 0),
+)
+
+
+def test_a_heap_without_room_is_pushed_through_its_walls_and_reported():
+    """Found by the fuzzer: 40 cells 4 µm wide in a box of 4.6 µm. Contacts push with the same force
+    as walls, so that cells are where no centre may be; but never without a word."""
+    assert fuzz.run(CROWD) == "ran"
+    scene, state = fuzz.scene_of(CROWD)
+    model = scene.bind(state=state)
+    state = model.step(state, CROWD.dt)
+    assert fuzz.collapsed(state, 0)
+    with pytest.raises(AssertionError, match="behind the wall"):
+        fuzz.walled(state, CROWD)
+    while not tf.failures(state):
+        state = model.step(state, CROWD.dt)
+    assert state.step == 20
+    assert "deeper in others than a radius" in tf.failures(state)[0].reason
+
+
+def test_the_fuzzer_notices_a_cell_behind_a_wall():
+    """And only in a colony whose cells its contacts hold apart."""
+    draw = replace(CROWD, capsules=replace(CROWD.capsules, counts=(1,), radii=(0.5, 0.5)))
+    scene, before = fuzz.scene_of(draw)
+    after = step(scene, before, draw.dt)
+    assert fuzz.lawful(before, after, draw) == []
+    with pytest.raises(AssertionError, match="behind the wall"):
+        fuzz.lawful(before, after.replace(position=after.position + 7.0), draw)
+
+
 def test_the_fuzzer_notices_cells_that_do_not_add_up():
     state = (
         tf.Scene(tf.Growth(rate=1.0), founders=tf.Cells([[0.0, 0.0], [9.0, 0.0]], [1.0, 0.0]))
