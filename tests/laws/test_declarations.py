@@ -86,8 +86,8 @@ class RecordingState(State):
     def with_fields(self, **values: torch.Tensor) -> State:
         return RecordingState.of(self.plain().with_fields(**values), self.log)
 
-    def take(self, index: torch.Tensor) -> State:
-        return RecordingState.of(self.plain().take(index), self.log)
+    def take(self, index: torch.Tensor, **known: torch.Tensor) -> State:
+        return RecordingState.of(self.plain().take(index, **known), self.log)
 
     def reset_at_division(self, daughters: torch.Tensor, names: Any) -> State:
         # the fields' own rules read here, not the effect that divides

@@ -87,7 +87,7 @@ def _find(name: str) -> tuple[str, Any]:
     if len(meant) == 1:
         return meant[0], inside[meant[0]]
     last: dict[str, list[str]] = {}
-    for title in [*inside, *known]:
+    for title in dict.fromkeys((*inside, *known)):
         last.setdefault(title.split(".")[-1].lower(), []).append(title)
     near = checks.nearest(rest[-1].lower(), last)
     *others, one = meant or (last[near] if near else [""])

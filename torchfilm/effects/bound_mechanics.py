@@ -59,9 +59,9 @@ class BoundMechanics(BoundEffect):
             found.status, found.iterations, found.residual, found.passes, found.clipped,
             found.deeply_overlapping, found.substeps,
         )  # fmt: skip
-        return state.replace(
+        return state.with_fields(**fields).replace(
             position=found.position, axis=found.axis, length=found.length,
-            fields={**state.fields, **fields}, reports={**state.reports, "mechanics": report},
+            reports={**state.reports, "mechanics": report},
         )  # fmt: skip
 
     def _given(self, state: State, dt: float) -> MechanicsInput:
