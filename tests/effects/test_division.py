@@ -535,7 +535,7 @@ def test_cells_divide_alike_by_kernels_and_by_torch(dim, axis_noise, dtype, monk
     due = torch.tensor([0, 0, 0, 1, 0, 1, 1, 0, 1, 1, 1, 1], dtype=torch.bool)
     values = next(e for e in model.effects if e.title == "division").values
     by_kernels = division.divide(state, due, values.fraction, values.axis_noise)
-    monkeypatch.setattr(division, "_by_kernels", lambda value: False)
+    monkeypatch.setattr(division, "kernels_loaded", lambda value: False)
     by_torch = division.divide(state, due, values.fraction, values.axis_noise)
     assert by_kernels.births[-1].rows.tolist() == [3, 5, 6, 8, 9, 10, 11]
     assert_same_state(by_kernels, by_torch)

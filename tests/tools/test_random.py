@@ -157,7 +157,7 @@ def test_kernels_draw_the_same_bits(dtype, monkeypatch):
         given = (2**40 + 3, stream, uid, 12, "test")
         found = [random.words(*given), *(d(*given, dtype) for d in (random.uniform, random.normal))]
         with monkeypatch.context() as patch:
-            patch.setattr(random, "_by_kernels", lambda uid: False)
+            patch.setattr(random, "kernels_loaded", lambda uid: False)
             by_torch = [
                 random.words(*given),
                 *(d(*given, dtype) for d in (random.uniform, random.normal)),

@@ -55,10 +55,7 @@ class BoundMechanics(BoundEffect):
             fields["elongation"] = found.elongation
         if found.contact_alpha is not None and found.compression is not None:
             fields |= {"contact_alpha": found.contact_alpha, "compression": found.compression}
-        report = MechanicsReport(
-            found.status, found.iterations, found.residual, found.passes, found.clipped,
-            found.deeply_overlapping, found.substeps,
-        )  # fmt: skip
+        report = MechanicsReport(**vars(found.report), substeps=found.substeps)
         return state.with_fields(**fields).replace(
             position=found.position, axis=found.axis, length=found.length,
             reports={**state.reports, "mechanics": report},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import reduce
 from typing import ClassVar
@@ -15,6 +14,7 @@ from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.numba_calls import kernels_loaded
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, places, reads_are_free
 from torchfilm.tools.tangents import tracked
@@ -276,11 +276,6 @@ def divide(state: State, due: Tensor, fraction: Resolved, axis_noise: Resolved) 
     return new.reset_at_division(daughters, new.declared)
 
 
-def _by_kernels(value: Tensor) -> bool:
-    """Whether kernels compute, to the same bits; to load them here would cost more."""
-    return value.device.type == "cpu" and "numba" in sys.modules
-
-
 def _placed(
     new: State,
     state: State,
@@ -293,7 +288,7 @@ def _placed(
     they are as their parents, `rows` (M,) of the state before. share: (M,). noise: of the axes, sd
     (2M,) and standard normal draws (2M, 4)."""
     of_cells = state.length, state.radius, state.axis, state.position
-    if _by_kernels(share) and not tracked(*of_cells, share, *(noise or ())):
+    if kernels_loaded(share) and not tracked(*of_cells, share, *(noise or ())):
         from torchfilm.kernels.divisions import place_daughters
 
         sd, draws = (share[:0], state.axis[:0]) if noise is None else noise
@@ -326,7 +321,7 @@ def _split(state: State, due: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str,
     """The rows of the parents (M,), of their daughters in the new batch (2M,), from which row each
     new cell comes (N + M,), and the new uid, parent and next_uid: see `kernels.divisions.split`."""
     given = due, state.colony, state.uid, state.parent, state.next_uid
-    if _by_kernels(due):
+    if kernels_loaded(due):
         from torchfilm.kernels.divisions import split
 
         found = split(*(x.contiguous().numpy() for x in given))

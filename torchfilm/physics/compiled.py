@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.physics.contact_records import ContactSettings
+from torchfilm.physics.contact_records import ContactReport, ContactSettings
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.step_records import MechanicsInput, MechanicsResult
 from torchfilm.physics.surfaces import FlatSurface
@@ -65,8 +65,10 @@ def step(given: MechanicsInput) -> MechanicsResult:
     alpha, compression = of_one_sided if given.compression is not None else (None, None)
     return MechanicsResult(
         x, axis, length, move, elongation, collapsed, alpha, compression,
-        whole[kernels.STATUS], whole[kernels.ITERATIONS], residual, whole[kernels.PASSES],
-        whole[kernels.CLIPPED], whole[kernels.DEEPLY], whole[kernels.SUBSTEPS],
+        ContactReport(
+            whole[kernels.STATUS], whole[kernels.ITERATIONS], residual, whole[kernels.PASSES],
+            whole[kernels.CLIPPED], whole[kernels.DEEPLY],
+        ), whole[kernels.SUBSTEPS],
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 from torch import Tensor
 
-from torchfilm.physics.contact_records import ContactSettings
+from torchfilm.physics.contact_records import ContactReport, ContactSettings
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.surfaces import Surface
 from torchfilm.tools.ragged import Groups
@@ -56,7 +56,7 @@ class MechanicsInput(Generic[Settings]):
 @dataclass(frozen=True)
 class MechanicsResult:
     """What a step of mechanics makes of cells, as in `MechanicsInput`, and what its solves did in
-    each colony, (B,): as in `contact_records.ContactReport`, with the number of sub-steps."""
+    each colony, with the number of sub-steps (B,)."""
 
     position: Tensor
     axis: Tensor
@@ -66,12 +66,7 @@ class MechanicsResult:
     collapsed: Tensor
     contact_alpha: Tensor | None
     compression: Tensor | None
-    status: Tensor
-    iterations: Tensor
-    residual: Tensor
-    passes: Tensor
-    clipped: Tensor
-    deeply_overlapping: Tensor
+    report: ContactReport
     substeps: Tensor
 
 

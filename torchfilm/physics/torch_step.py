@@ -8,7 +8,7 @@ from torch import Tensor
 from torchfilm.kernels.bilateral_scheme import PENALTY
 from torchfilm.kernels.scheme import BURIED, COLLAPSED, COMPRESSION, CONVERGED, LONG, MANY
 from torchfilm.physics import bilateral, one_sided
-from torchfilm.physics.contact_records import ContactSettings
+from torchfilm.physics.contact_records import ContactReport, ContactSettings
 from torchfilm.physics.step_records import MechanicsInput, MechanicsResult, StepInput, StepResult
 from torchfilm.physics.substeps import substeps
 from torchfilm.tools.ragged import Groups
@@ -38,8 +38,10 @@ def step(given: MechanicsInput) -> MechanicsResult:
     return MechanicsResult(
         found.position, found.axis, found.length, found.move, found.length - base,
         given.groups.spread(collapsed), alpha, compression,
-        torch.where(lasting, COLLAPSED, status), found.iterations, found.error, found.passes,
-        found.clipped, found.deeply_overlapping, steps,
+        ContactReport(
+            torch.where(lasting, COLLAPSED, status), found.iterations, found.error, found.passes,
+            found.clipped, found.deeply_overlapping,
+        ), steps,
     )  # fmt: skip
 
 
@@ -57,17 +59,15 @@ def _contacts(
         hardness = _of_colonies(given.contact_alpha, given.groups).double()
         left = COMPRESSION * (base + 2 * given.radius) - given.compression
         shortest = (base - left.clamp(min=0.0)).clamp(min=0.0)
-    walls = [
-        (kind, value if value is None else (value * (own_dt if kind == "stiffness" else 1.0)))
-        for kind, value in given.walls
-    ]
+    walls: list[tuple[str, Tensor | None]] = []
+    for kind, value in given.walls:
+        of_step = value * own_dt if value is not None and kind == "stiffness" else value
+        walls.append((kind, None if of_step is None else of_step.expand(base.numel())))
     return StepInput(
         given.settings, given.groups, given.position, given.axis, base, given.elongation,
         given.radius, *drags, steps, given.move, hardness,
         None if alpha is None else alpha.expand(base.numel()),
-        given.groups.spread(given.colony_id), given.surfaces,
-        [(kind, value if value is None else value.expand(base.numel())) for kind, value in walls],
-        shortest,
+        given.groups.spread(given.colony_id), given.surfaces, walls, shortest,
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from functools import cache
 
@@ -30,6 +31,12 @@ def unavailable() -> str:
         )
         return reason
     return ""
+
+
+def kernels_loaded(value: Tensor) -> bool:
+    """Whether kernels are at hand for this tensor, for work that torch does to the same bits: to
+    load them for that alone would cost more."""
+    return value.device.type == "cpu" and "numba" in sys.modules
 
 
 def as_array(value: Tensor, dtype: torch.dtype) -> np.ndarray:

@@ -8,12 +8,13 @@ products wrap without harm.
 from __future__ import annotations
 
 import math
-import sys
 import zlib
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from torchfilm.tools.numba_calls import kernels_loaded
 
 MASK = 0xFFFFFFFF
 MULTIPLIER = (0xD2511F53, 0xCD9E8D57)
@@ -45,7 +46,7 @@ def purpose_code(purpose: str) -> int:
 
 def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> Tensor:
     """Four independent 32-bit words for each cell: stream, uid (M,) int64 -> (4, M) int64."""
-    if _by_kernels(uid):
+    if kernels_loaded(uid):
         from torchfilm.kernels.random import philox_words
 
         return torch.from_numpy(philox_words(*_arrays(seed, stream, uid, step, purpose)))
@@ -59,11 +60,6 @@ def _key(seed: int, purpose: str) -> tuple[int, int]:
     return mixed & MASK, (mixed >> 32) & MASK
 
 
-def _by_kernels(uid: Tensor) -> bool:
-    """Whether kernels draw, to the same bits; to load them here would cost more."""
-    return uid.device.type == "cpu" and "numba" in sys.modules
-
-
 def _arrays(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> list:
     """The arguments of the kernels."""
     given = [x.expand(uid.shape).contiguous().numpy() for x in (uid, stream)]
@@ -74,7 +70,7 @@ def uniform(
     seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype
 ) -> Tensor:
     """One draw per cell from the open interval (0, 1)."""
-    if _by_kernels(uid):
+    if kernels_loaded(uid):
         from torchfilm.kernels.random import uniforms
 
         return torch.from_numpy(uniforms(*_arrays(seed, stream, uid, step, purpose))).to(dtype)
@@ -88,7 +84,7 @@ def normal(
 ) -> Tensor:
     """Four standard normal draws per cell, (M, 4), by the Box–Muller method from four words."""
     # two pairs of uniform numbers, the first of each less 1, which is exact
-    if _by_kernels(uid):
+    if kernels_loaded(uid):
         from torchfilm.kernels.random import box_muller_pairs
 
         pairs = box_muller_pairs(*_arrays(seed, stream, uid, step, purpose))
