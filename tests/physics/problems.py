@@ -142,7 +142,7 @@ class Problem:
         y, errors, counts = np.zeros(self.scale.shape), [], []
         for mine, rows, (alpha, low), cells, dof in self.of_kernels(dtype, applied_force):
             iterations, error, _ = solve.minimise(
-                *rows, alpha, low, cells, tolerance, np.inf, limit, dof
+                *rows, alpha, low, cells, tolerance, np.inf, limit, np.zeros(0, np.int64), dof
             )
             y[mine] = cells[:, : y.shape[1]]
             errors.append(error)

@@ -23,9 +23,9 @@ from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.lanes import add_scaled, dot, keep_greatest
 from torchfilm.kernels.rows import degrees, rows_of_cells
 from torchfilm.kernels.scheme import CONVERGED, ITERATION_LIMIT, NOT_FINITE
-from torchfilm.kernels.solve import (
+from torchfilm.kernels.solve import cg_step
+from torchfilm.kernels.solve_parts import (
     add_forces,
-    cg_step,
     next_direction,
     precondition,
     put_inverse,
@@ -58,7 +58,7 @@ def _put_gradient(H, one, two, alpha, y, e, pushed, g, dof):
     g[:] = 0
     for i in range(y.shape[0]):
         add_scaled(g, i, alpha[i], y, i, dof)
-    add_forces(H, one, two, -(e + pushed), g, dof)
+    add_forces(H, one, two, range(e.shape[0]), -(e + pushed), g, dof)
 
 
 @kernel
@@ -81,7 +81,7 @@ def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, target, li
     for i in range(g.shape[0]):
         rz += dot(g, i, z, i, dof)
     d[:], p[:] = 0, 0
-    next_direction(p, z, t[0])
+    next_direction(p, z, t[0], 0, z.shape[0])
     count = 0
     while count < limit:
         new = cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof)
@@ -90,7 +90,7 @@ def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, target, li
         if not (worst > target and worst < np.inf and new > 0):
             break
         t[0], rz = new / rz, new
-        next_direction(p, z, t[0])
+        next_direction(p, z, t[0], 0, z.shape[0])
     return count
 
 
@@ -134,7 +134,7 @@ def _search_line(H, one, two, gaps, pushed, alpha, low, y, e, g, d, dof):
             add_scaled(new, i, length[0], d, i, dof)
             if new[i, end] < low[i]:
                 new[i, end], stopped = low[i], True
-        times_rows(H, one, two, new, then, dof)
+        times_rows(H, one, two, new, then, 0, then.shape[0], dof)
         then[:] = gaps - then
         _put_gradient(H, one, two, alpha, new, then, pushed, ahead, dof)
         if not stopped:
@@ -163,10 +163,10 @@ def _rounding_residual(H, one, two, gaps, alpha, y, inverse, z, dof):
     """The residual that rounding alone may leave: see `physics.newton`."""
     sizes, forces = np.abs(H), np.empty_like(y)
     e, ones = np.empty_like(gaps), np.abs(y)
-    times_rows(sizes, one, two, ones, e, dof)
+    times_rows(sizes, one, two, ones, e, 0, e.shape[0], dof)
     none = np.zeros_like(gaps)
     _put_gradient(sizes, one, two, alpha, ones, -np.abs(gaps) - e, none, forces, dof)
-    precondition(inverse, forces, z, dof)
+    precondition(inverse, forces, z, 0, z.shape[0], dof)
     return ROUNDING_UNITS * np.finfo(y.dtype).eps * _worst(z, dof)
 
 
@@ -188,7 +188,7 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, rigid, y, tolerance, l
     for i in range(n):
         put_inverse(H, begin, halves, act, i, alpha[i], False, inverse, B, _floor(y), dof)
     _put_gradient(H, one, two, alpha, d, gaps, pushed, g, dof)
-    precondition(inverse, g, z, dof)
+    precondition(inverse, g, z, 0, z.shape[0], dof)
     scale = _worst(z, dof)
     still = scale == 0.0  # no row exerts a force: such a colony does not move at all
     for i in range(n):
@@ -196,13 +196,13 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, rigid, y, tolerance, l
     if still:
         y[:] = 0
     e = np.empty_like(gaps)
-    times_rows(H, one, two, y, e, dof)
+    times_rows(H, one, two, y, e, 0, e.shape[0], dof)
     e[:] = gaps - e
     _put_gradient(H, one, two, alpha, y, e, pushed, g, dof)
     total, previous, worst = 0, np.inf, np.inf
     for round_ in range(NEWTON_LIMIT + 1):
         _hold_lengths(H, begin, halves, act, alpha, y, low, rigid, g, held, inverse, dof)
-        precondition(inverse, g, z, dof)
+        precondition(inverse, g, z, 0, z.shape[0], dof)
         worst = _worst(z, dof)
         going = worst > tolerance * scale and worst < np.inf and total < limit
         if going and worst > STALLED * previous:

@@ -126,3 +126,16 @@ def kernel(function=None, *, any_order: bool = False, inline: bool = False):
         )(function)  # fmt: skip
     finally:
         config.CACHE_DIR = before
+
+
+def native(signature, function):
+    """Compile a function for this signature now, so that it has an address. It is kept as kernels
+    are."""
+    before = config.CACHE_DIR
+    config.CACHE_DIR = "" if FOLDER is None else str(FOLDER)
+    try:
+        compile_for: Any = numba.cfunc
+        kept = FOLDER is not None
+        return compile_for(signature, nopython=True, cache=kept, error_model="numpy")(function)
+    finally:
+        config.CACHE_DIR = before

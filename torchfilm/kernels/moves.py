@@ -115,31 +115,34 @@ def approach(x, length, radius, y, dof):
     return abs(stretch) * (longest + 2 * own) + 2 * own
 
 
-@kernel(inline=True)
-def _own_way(i, half, before, y, d, end):
-    """How far, at most, points of cell i have come by turning and by its change of length, µm."""
-    turn = 0.0
-    for k in range(d, end):
-        turn += y[i, k] ** 2
-    return half[i] * math.sqrt(turn) + abs(half[i] - before[i])
+@kernel
+def own_ways(half, before, y, dof):
+    """How far, at most, points of each cell have come by turning and by its change of length, µm,
+    and more than y is rounded by: (n,)."""
+    d, end, way = 2 if len(dof) == 4 else 3, degrees(dof) - 1, np.empty(y.shape[0])
+    for i in range(y.shape[0]):
+        turn, far = 0.0, 1.0
+        for k in range(d, end):
+            turn += y[i, k] ** 2
+        for k in range(d):
+            far += abs(y[i, k])
+        way[i] = half[i] * math.sqrt(turn) + abs(half[i] - before[i]) + 1e-5 * far
+    return way
 
 
 @kernel
-def any_deeper(x, axis, half, radius, y, before, found, deep, dof):
+def any_deeper(x, axis, half, radius, y, way, found, deep, dof):
     """Whether a contact is deeper than `deep` after the move y of `move_cells`. found: the contacts
-    before it, of `near_contacts`; before: half lengths then. Only pairs that may have come so near
-    are looked at closely."""
+    before it, of `near_contacts`; way: `own_ways`. Only pairs that may have come so near are looked
+    at closely."""
     first, second, keep, _, gap = found
-    d, end = 2 if len(dof) == 4 else 3, degrees(dof) - 1
+    d = 2 if len(dof) == 4 else 3
     for k in range(keep.shape[0]):
         i, j = first[keep[k]], second[keep[k]]
-        way, far = 0.0, 0.0
+        apart, room = 0.0, gap[k] + deep - way[i] - way[j]
         for c in range(d):
-            way += (y[i, c] - y[j, c]) ** 2
-            far += abs(y[i, c])
-        way = math.sqrt(way) + _own_way(i, half, before, y, d, end)
-        way += _own_way(j, half, before, y, d, end)
-        if gap[k] - way > -deep + 1e-5 * (1.0 + far):  # more than y is rounded by
+            apart += (y[i, c] - y[j, c]) ** 2
+        if room > 0 and apart < room * room:
             continue
         bz = x[j, 2] - x[i, 2] if d == 3 else 0.0
         az = axis[i, 2] if d == 3 else 0.0

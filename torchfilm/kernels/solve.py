@@ -4,6 +4,9 @@ E(y) = ½ Σ min(g − J y, 0)² + ½ Σ α y² over moves whose lengths are at 
 scaled move of n cells, (n, D): see `physics.problem`. Newton steps are projected: lengths that are
 at their bound and pushed further are held; others that would pass it stop at it. Where these
 keep all from going far, they take steps of their own, down their slope.
+
+The loops over rows and cells are in `solve_parts`. In a large colony the threads of a team share
+them: see `team` and `solve_pieces`.
 """
 
 from __future__ import annotations
@@ -13,81 +16,45 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.lanes import add_scaled, add_square, dot, invert, put_product
 from torchfilm.kernels.rows import degrees, rows_of_cells
-from torchfilm.kernels.scheme import (
-    CREEP,
-    FORCING,
-    LEVEL,
-    MOST_LOOKS,
-    MOST_ROUNDS,
-    RAISED,
-    ROUNDING,
+from torchfilm.kernels.scheme import CREEP, FORCING, LEVEL, MOST_LOOKS, MOST_ROUNDS
+from torchfilm.kernels.solve_parts import (
+    add_curvature,
+    add_forces,
+    add_product,
+    advance,
+    advance_rows,
+    first_direction,
+    go_along,
+    keep_pushing,
+    next_direction,
+    of_drag,
+    precondition,
+    put_forces,
+    put_scaled,
+    put_slopes,
+    refresh_blocks,
+    second_cells,
+    stop_at_bounds,
+    times_rows,
 )
-
-
-@kernel
-def times_rows(H, one, two, p, q, dof):
-    """q = J p. Here and below two[r] is one[r] for rows of one cell, whose second half is 0."""
-    for r in range(q.shape[0]):
-        q[r] = dot(H, 2 * r, p, one[r], dof) + dot(H, 2 * r + 1, p, two[r], dof)
-
-
-@kernel
-def add_forces(H, one, two, v, out, dof):
-    """out += Jᵀ v."""
-    for r in range(v.shape[0]):
-        add_scaled(out, one[r], v[r], H, 2 * r, dof)
-        add_scaled(out, two[r], v[r], H, 2 * r + 1, dof)
-
-
-@kernel
-def add_product(H, one, two, on, p, out, dof):
-    """out += Jᵀ J p of the rows `on`."""
-    for r in on:
-        i, j, h = one[r], two[r], 2 * r
-        t = dot(H, h, p, i, dof) + dot(H, h + 1, p, j, dof)
-        add_scaled(out, i, t, H, h, dof)
-        add_scaled(out, j, t, H, h + 1, dof)
-
-
-@kernel(inline=True)
-def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, floor, dof):
-    """The inverse of cell i's own block of JᵀAJ + α, worked out in B in float64; 0 in its last row
-    and column where the length is held. The diagonal is raised by its share `floor`: rounding must
-    leave it positive definite. Returns the entry of the length."""
-    end = degrees(dof) - 1
-    for k in range(len(dof)):
-        for m in range(len(dof)):
-            B[k, m] = 0.0
-    for q in range(begin[i], begin[i + 1]):
-        h = halves[q]
-        if act[h >> 1]:
-            add_square(B, H, h, dof)
-    for k in range(end + 1):
-        B[k, k] = B[k, k] * (1 + floor) + alpha
-    own = B[end, end]
-    if held:
-        for k in range(end):
-            B[end, k] = B[k, end] = 0.0
-        B[end, end] = 1.0
-    invert(B, dof)
-    if held:
-        B[end, end] = 0.0
-    for k in range(len(dof)):
-        for m in range(len(dof)):
-            inverse[i, k, m] = B[k, m]
-    return own
-
-
-@kernel
-def precondition(inverse, g, z, dof):
-    """z = P⁻¹ g; returns g · z."""
-    total = 0.0
-    for i in range(g.shape[0]):
-        put_product(z, i, inverse, g, dof)
-        total += dot(g, i, z, i, dof)
-    return total
+from torchfilm.kernels.solve_pieces import (
+    ADVANCE,
+    ALONG,
+    BOUNDS,
+    CELLS,
+    CHANGES,
+    CREEPS,
+    DIRECTION,
+    GAPS,
+    PRODUCT,
+    least_of,
+    pieces_for,
+    put_on_board,
+    rows_of_pieces,
+    total_of,
+)
+from torchfilm.kernels.team import BLOCK, share_out
 
 
 @kernel(any_order=True)
@@ -129,69 +96,6 @@ def search_line(e, q, c0, c1, most):
     return t, -0.5 * slope0 * t
 
 
-@kernel
-def _stop_at_bounds(y, d, low, lengths, slope, own, dof):
-    """Shorten the step d (n, D) of the lengths that would pass their bound; those that step alone
-    follow their slope. Returns how far all may go along the step."""
-    alone, stopped = lengths[1], lengths[2]
-    last, most = degrees(dof) - 1, np.inf
-    for i in range(y.shape[0]):
-        room = low[i] - y[i, last]
-        if alone[i]:
-            d[i, last] = -slope[i] / own[i]
-        stopped[i] = d[i, last] < room
-        if stopped[i]:
-            d[i, last] = room
-        if d[i, last] < 0:
-            most = min(most, room / d[i, last])
-    return most
-
-
-@kernel
-def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
-    """Go along the direction p: d += t p, and g becomes the gradient there and z = P⁻¹ g. z is 0
-    before; rz: g · P⁻¹ g before. Returns g · z."""
-    n = g.shape[0]
-    add_product(H, one, two, on, p, z, dof)
-    curvature = 0.0
-    for i in range(n):
-        add_scaled(z, i, alpha[i], p, i, dof)
-        curvature += dot(p, i, z, i, dof)
-    t[0], new = rz / curvature, 0.0
-    for i in range(n):
-        add_scaled(d, i, t[0], p, i, dof)
-        add_scaled(g, i, t[0], z, i, dof)
-        put_product(z, i, inverse, g, dof)
-        new += dot(g, i, z, i, dof)
-    return new
-
-
-@kernel
-def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit, dof):
-    """d = −(JᵀAJ + α)⁻¹ g, to FORCING of the residual; g becomes the residual. Iterations."""
-    t = np.zeros(1, g.dtype)  # a scalar of the same precision
-    d[:], p[:] = 0, 0
-    next_direction(p, z, t[0])
-    rz, count = gz, 0
-    while count < limit and rz > 0:
-        new = cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof)
-        count += 1
-        if not (new > FORCING * FORCING * gz and new < np.inf):
-            break
-        t[0], rz = new / rz, new
-        next_direction(p, z, t[0])
-    return count
-
-
-@kernel
-def next_direction(p, z, t):
-    """p = t p − z, and z = 0."""
-    p, z = p.reshape(-1), z.reshape(-1)
-    for k in range(p.shape[0]):
-        p[k] = t * p[k] - z[k]
-        z[k] = 0
-
-
 @kernel(any_order=True)
 def _squared_overlap(e, cap):
     """The sum of squared overlaps, each counted up to `cap`."""
@@ -202,138 +106,204 @@ def _squared_overlap(e, cap):
     return overlap
 
 
-@kernel
-def _put_forces(e, pushed, cap, v):
-    """v = the force of each row. Returns the sum of squared overlaps."""
-    for r in range(e.shape[0]):
-        v[r] = max(-e[r], 0 * e[r]) - pushed[r]
-    return _squared_overlap(e, cap)
+@kernel(any_order=True)
+def _work_of(pushed, q):
+    """Σ pushed · q."""
+    total = 0.0
+    for r in range(pushed.shape[0]):
+        total += pushed[r] * q[r]
+    return total
 
 
 @kernel
-def _switch_rows(e, one, two, act, on, stale):
-    """Mark which rows push; cells whose rows change are stale. Puts the rows that push into `on`;
-    returns how many."""
-    count = 0
-    for r in range(act.shape[0]):
-        push = e[r] < 0
-        on[count] = r
-        count += push
-        if push != act[r]:
-            act[r] = push
-            stale[one[r]] = stale[two[r]] = 1
+def cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof):
+    """Go along the direction p: d += t p, and g becomes the gradient there and z = P⁻¹ g. z is 0
+    before; rz: g · P⁻¹ g before. Returns g · z."""
+    n, curvature, new = g.shape[0], 0.0, 0.0
+    add_product(H, one, two, on, p, z, dof)
+    for a in range(0, n, BLOCK):
+        curvature += add_curvature(alpha, z, p, a, min(a + BLOCK, n), dof)
+    t[0] = rz / curvature
+    for a in range(0, n, BLOCK):
+        new += go_along(d, g, z, p, inverse, t[0], a, min(a + BLOCK, n), dof)
+    return new
+
+
+@kernel
+def _shared_cg_step(team, rz, t):
+    """As `cg_step`, by a team."""
+    share_out(team, PRODUCT)
+    t[0] = rz / total_of(team, 0)
+    share_out(team, ALONG)
+    return total_of(team, 0)
+
+
+@kernel
+def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit, t, team, dof):
+    """d = −(JᵀAJ + α)⁻¹ g, to FORCING of the residual, from `first_direction`; g becomes the
+    residual. t: (1,). Returns iterations."""
+    rz, count = gz, 0
+    while count < limit and rz > 0:
+        if team.shape[0]:
+            new = _shared_cg_step(team, rz, t)
+        else:
+            new = cg_step(H, one, two, on, alpha, inverse, g, z, p, d, rz, t, dof)
+        count += 1
+        if not (new > FORCING * FORCING * gz and new < np.inf):
+            break
+        t[0], rz = new / rz, new
+        if team.shape[0]:
+            share_out(team, DIRECTION)
+        else:
+            next_direction(p, z, t[0], 0, p.shape[0])
     return count
 
 
-@kernel
-def _refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, dof):
-    """Hold the lengths at their bound that are pushed further, and those that step alone; invert
-    the blocks of the cells that changed. own: (n,) of lengths, their diagonal."""
-    held, alone = lengths[0], lengths[1]
-    D, B = degrees(dof), np.empty((len(dof), len(dof)))
-    for i in range(y.shape[0]):
-        at_bound = y[i, D - 1] <= low[i] and g[i, D - 1] >= 0
-        alone[i] = alone[i] and not at_bound
-        if (at_bound or alone[i]) != held[i]:
-            held[i] = at_bound or alone[i]
-            stale[i] = 1
-        if stale[i]:
-            own[i] = put_inverse(
-                H, begin, halves, act, i, alpha[i], held[i], inverse, B, RAISED, dof
-            )
-            stale[i] = 0
+@kernel(inline=True)
+def _put_gaps(work, team, dof):
+    """The gaps after the move y, and the rows' forces."""
+    H, one, two, e, q, v, pushed, act, stale, _, _, y = work[:12]
+    t = work[27]
+    t[0] = 1.0
+    if team.shape[0]:
+        share_out(team, GAPS)
+        return
+    times_rows(H, one, two, y, q, 0, e.shape[0], dof)
+    advance_rows(e, q, t, 0, e.shape[0])
+    put_forces(e, pushed, v, one, two, act, stale, 0, e.shape[0])
+
+
+@kernel(inline=True)
+def _put_gradient(work, team, dof):
+    """The gradient, the blocks and the first direction of CG. Returns g · P⁻¹ g, and the same of
+    the lengths that step alone."""
+    (H, one, two, _, _, v, _, act, stale, alpha, low, y, g, z, d, p, inverse, slope, own, begin,
+     halves, lengths, _, mine, on, counts, _, _) = work  # fmt: skip
+    if team.shape[0]:
+        share_out(team, CELLS)
+        return total_of(team, 0), total_of(team, 1)
+    n, gz, of_alone = g.shape[0], 0.0, 0.0
+    counts[0] = keep_pushing(act, mine, on)
+    put_scaled(g, alpha, y, 0, n, dof)
+    forced = mine if work[6].shape[0] else on[: counts[0]]
+    add_forces(H, one, two, forced, v, g, dof)
+    B = np.empty((len(dof), len(dof)))
+    refresh_blocks(
+        H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, B, 0, n, dof
+    )
+    for a in range(0, n, BLOCK):
+        b = min(a + BLOCK, n)
+        gz += precondition(inverse, g, z, a, b, dof)
+        of_alone += put_slopes(g, lengths, slope, own, a, b, dof)
+    first_direction(d, p, z, 0, n)
+    return gz, of_alone
+
+
+@kernel(inline=True)
+def _bounded(work, team, dof):
+    """Bound the step d, and put its change of gaps into q. Returns how far all may go along it, and
+    the slope and curvature that drags give."""
+    H, one, two, e, q, _, _, _, _, alpha, low, y, _, _, d, _, _, slope, own = work[:19]
+    lengths, n, c0, c1 = work[21], y.shape[0], 0.0, 0.0
+    if team.shape[0]:
+        share_out(team, BOUNDS)
+        most, c0, c1 = least_of(team), total_of(team, 0), total_of(team, 1)
+        share_out(team, CHANGES)
+        return most, c0, c1
+    most = stop_at_bounds(y, d, low, lengths, slope, own, 0, n, dof)
+    for a in range(0, n, BLOCK):
+        slope0, curvature = of_drag(alpha, y, d, a, min(a + BLOCK, n), dof)
+        c0, c1 = c0 + slope0, c1 + curvature
+    times_rows(H, one, two, d, q, 0, e.shape[0], dof)
+    return most, c0, c1
+
+
+@kernel(inline=True)
+def _advance(work, share, team, dof):
+    """Go `share` of the step d, and put the rows' forces."""
+    _, one, two, e, q, v, pushed, act, stale, _, low, y, _, _, d = work[:15]
+    lengths, t = work[21], work[27]
+    t[0] = share
+    if team.shape[0]:
+        team[CREEPS] = share < CREEP
+        share_out(team, ADVANCE)
+        return
+    advance(y, d, low, lengths, share < CREEP, t, 0, y.shape[0], dof)
+    advance_rows(e, q, t, 0, e.shape[0])
+    put_forces(e, pushed, v, one, two, act, stale, 0, e.shape[0])
+
+
+@kernel(inline=True)
+def _work(H, one, two, rows, gaps, pushed, alpha, low, y, chunks, dof):
+    """The arrays of a solve: see `solve_pieces.put_on_board`."""
+    n, kind = y.shape[0], y.dtype
+    begin, halves = rows_of_cells(one, two, rows, n)
+    two = second_cells(H, one, two, rows)
+    if chunks > 1:
+        mine_begin, mine = rows_of_pieces(one, two, rows, n, chunks)
+    else:
+        mine_begin, mine = np.zeros(2, np.int64), np.arange(rows).astype(np.int32)
+    return (
+        H, one, two, gaps[:rows].copy(), np.empty(rows, kind), np.empty(rows, kind), pushed,
+        np.zeros(rows, np.uint8), np.ones(n, np.uint8), alpha, low, y, np.empty_like(y),
+        np.empty_like(y), np.empty_like(y), np.empty_like(y),
+        np.empty((n, len(dof), len(dof)), kind), np.empty(n, kind), np.empty(n, kind), begin,
+        halves, np.zeros((3, n), np.uint8), mine_begin, mine, np.empty_like(mine),
+        np.zeros(chunks, np.int64), np.empty((3, (n + BLOCK - 1) // BLOCK)), np.empty(1, kind),
+    )  # fmt: skip
 
 
 @kernel
-def _advance(y, d, low, e, q, share, dof):
-    """Go `share` of the step d; lengths at their bound are put on it."""
-    box = np.zeros(1, y.dtype)
-    box[0] = share
-    last = degrees(dof) - 1
-    for i in range(y.shape[0]):
-        add_scaled(y, i, box[0], d, i, dof)
-        if y[i, last] <= low[i] + ROUNDING * (abs(low[i]) + abs(d[i, last])):
-            y[i, last] = low[i]
-    for r in range(e.shape[0]):
-        e[r] -= box[0] * q[r]
+def _error(fall, left, overlap, cap):
+    """The relative error that is left."""
+    if left == 0.0:  # solved exactly
+        return 0.0
+    if not left < np.inf:  # also where it is no number
+        return np.inf
+    # where nothing overlaps any more, relative to contacts as deep as counted
+    return math.sqrt(max(fall, left, 0.0) / (overlap if overlap > 0 else cap * cap))
 
 
 @kernel
-def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, limit, dof):
+def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, limit, team, dof):
     """Minimise E from y, in place.
 
-    pushed: (rows,) what soft rows have already exerted in this step. low: (n,) least scaled Δl, at
-    most 0. Stops when the error that is left, estimated by the fall of E in the last round and by
-    the residual, is at most `tolerance` of the contacts' overlap: root mean square, overlaps
-    counted up to `cap` (µm), so that what has not converged does not loosen the rule. Returns
-    iterations, that relative error, and each row's gap after the move.
+    pushed: what soft rows have already exerted in this step, (rows,); or (0,) for nothing. low:
+    (n,) least scaled Δl, at most 0. team: a board, or (0,) where this thread is alone. Stops when
+    the error that is left, estimated by the fall of E in the last round and by the residual, is at
+    most `tolerance` of the contacts' overlap: root mean square, overlaps counted up to `cap` (µm),
+    so that what has not converged does not loosen the rule. Returns iterations, that relative
+    error, and each row's gap after the move.
     """
     n, D = y.shape[0], degrees(dof)
     if not np.any(gaps[:rows] < 0):  # nothing pushes: such a colony does not move at all
         y[:] = 0
         return 0, 0.0, gaps[:rows].copy()
-    v, q = np.empty(rows, y.dtype), np.empty(rows, y.dtype)
-    act, stale, on = np.zeros(rows, np.uint8), np.ones(n, np.uint8), np.empty(rows, np.int32)
-    lengths = np.zeros((3, n), np.uint8)  # held, alone, stopped
-    slope, own = np.empty(n, y.dtype), np.empty(n, y.dtype)  # of lengths
-    g, z, d, p = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
-    inverse = np.empty((n, len(dof), len(dof)), y.dtype)
-    begin, halves = rows_of_cells(one, two, rows, n)
-    one, two = one[:rows], second_cells(H, one, two, rows)
+    chunks = pieces_for(team, n)
+    team = team[: 0 if chunks == 1 else team.shape[0]]
+    work = _work(H, one, two, rows, gaps, pushed, alpha, low, y, chunks, dof)
+    if chunks > 1:
+        put_on_board(team, work, n, rows)
+    one, two, e, q, counts, t = work[1], work[2], work[3], work[4], work[25], work[27]
+    g, z, d, p, inverse, on = work[12], work[13], work[14], work[15], work[16], work[24]
     for i in range(n):
         y[i, D - 1] = max(y[i, D - 1], low[i])
-    times_rows(H, one, two, y, q, dof)
-    e = gaps[:rows] - q
     total, fall, error, stuck = 0, np.inf, 0.0, 0
+    _put_gaps(work, team, dof)
     for round_ in range(MOST_ROUNDS + 1):
-        overlap = _put_forces(e, pushed, cap, v)
-        pushing = _switch_rows(e, one, two, act, on, stale)
-        g[:] = 0
-        for i in range(n):
-            add_scaled(g, i, alpha[i], y, i, dof)
-        add_forces(H, one, two, v, g, dof)
-        _refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, dof)
-        gz, of_alone = precondition(inverse, g, z, dof), 0.0
-        for i in range(n):
-            slope[i] = g[i, D - 1]
-            if lengths[1, i]:
-                of_alone += slope[i] * slope[i] / own[i]
+        overlap = _squared_overlap(e, cap)
+        gz, of_alone = _put_gradient(work, team, dof)
         left = gz + of_alone
-        # where nothing overlaps any more, relative to contacts as deep as counted
-        error = math.sqrt(max(fall, left, 0.0) / (overlap if overlap > 0 else cap * cap))
-        if left == 0.0:  # solved exactly
-            error = 0.0
-        elif not left < np.inf:  # also where it is no number
-            error = np.inf
+        error = _error(fall, left, overlap, cap)
         done = error <= tolerance or not left < np.inf or stuck > 1
         if done or total >= limit or round_ == MOST_ROUNDS:
             break
         total += _conjugate_gradients(
-            H, one, two, on[:pushing], alpha, inverse, g, z, p, d, gz, limit - total, dof
-        )
-        most = _stop_at_bounds(y, d, low, lengths, slope, own, dof)
-        times_rows(H, one, two, d, q, dof)
-        c0, c1 = 0.0, 0.0
-        for i in range(n):
-            c0 += alpha[i] * dot(y, i, d, i, dof)
-            c1 += alpha[i] * dot(d, i, d, i, dof)
-        for r in range(rows):
-            c0 -= pushed[r] * q[r]
-        share, fall = search_line(e, q, c0, c1, most)
+            H, one, two, on[: counts[0]], alpha, inverse, g, z, p, d, gz, limit - total, t, team,
+            dof,
+        )  # fmt: skip
+        most, c0, c1 = _bounded(work, team, dof)
+        share, fall = search_line(e, q, c0 - _work_of(pushed, q), c1, most)
         stuck = stuck + 1 if share == 0 else 0
-        for i in range(n):
-            lengths[1, i] = share < CREEP and (lengths[1, i] or lengths[2, i])
-        _advance(y, d, low, e, q, share, dof)
+        _advance(work, share, team, dof)
     return total, error, e
-
-
-@kernel
-def second_cells(H, one, two, rows):
-    """The second cell of each row; the first where there is no second, whose half of the row is
-    made 0. So all rows are alike."""
-    other = two[:rows].copy()
-    for r in range(rows):
-        if two[r] < 0:
-            other[r] = one[r]
-            H[2 * r + 1] = 0.0
-    return other

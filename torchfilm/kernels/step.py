@@ -23,7 +23,7 @@ from torchfilm.kernels.colonies import (
     taken_out,
 )
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.moves import any_deeper, approach, drags, move_cells
+from torchfilm.kernels.moves import any_deeper, approach, drags, move_cells, own_ways
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
 from torchfilm.kernels.rows import (
     HARD,
@@ -112,7 +112,7 @@ def _after(x, axis, length, radius, y, before, margin, deep, found, dof):
     if approach(x, length, radius, y, dof) > margin + deep:  # other pairs may have met
         found = _contacts(x, axis, half, radius, margin, dof)
         return found, _deepest(found[4]) < -deep
-    if any_deeper(x, axis, half, radius, y, before, found, deep, dof):
+    if any_deeper(x, axis, half, radius, y, own_ways(half, before, y, dof), found, deep, dof):
         return _contacts(x, axis, half, radius, margin, dof), True
     return found, False
 
@@ -128,9 +128,9 @@ def _deepest(gap):
 @kernel
 def _wall_contacts(x, axis, half, radius, scale, at, found, like, dof):
     """Rows (H, gaps, one, two, soft) of cells at walls, with room for those of the contacts
-    `found`; how many there are, and the deepest gap. at: kinds, places and sizes of walls, weight
-    and reach by cell, and which walls are soft."""
-    kinds, places, sizes, root, reach, is_soft = at
+    `found`; how many there are, and the deepest gap. at: kinds, places and sizes of walls and
+    which are soft, and weight and reach by cell."""
+    (kinds, places, sizes, is_soft), root, reach = at
     room = 2 * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
     H, gaps = np.empty((2 * room, len(dof)), like.dtype), np.empty(room, like.dtype)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
@@ -167,7 +167,7 @@ def _put_start(y, last, scale, first_pass, rising):
 
 
 @kernel
-def _minimise_some(rows, m, numbers, count, alpha, low, y, cap, settings, report, dof):
+def _minimise_some(rows, m, numbers, count, alpha, low, y, cap, settings, report, team, dof):
     """Minimise from y with the first m of the rows: for all cells, where no numbers are given; or,
     in a later pass, in which soft walls have already pushed, for the numbered cells among the
     others at rest. Puts the move into y, 0 for cells at rest. Returns
@@ -175,9 +175,9 @@ def _minimise_some(rows, m, numbers, count, alpha, low, y, cap, settings, report
     H, gaps, one, two, soft = rows
     tolerance, limit = settings[TOLERANCE], int(settings[LIMIT])
     if numbers.shape[0] == 0:
-        none = np.zeros(m, y.dtype)
+        none = np.empty(0, y.dtype)
         iterations, error, e = minimise(
-            H, one, two, m, gaps, none, alpha, low, y, tolerance, cap, limit, dof
+            H, one, two, m, gaps, none, alpha, low, y, tolerance, cap, limit, team, dof
         )
         report[ITERATIONS] += iterations
         return error, e
@@ -192,7 +192,7 @@ def _minimise_some(rows, m, numbers, count, alpha, low, y, cap, settings, report
             some_alpha[numbers[i]], some_low[numbers[i]] = alpha[i], low[i]
             part[numbers[i]] = y[i]
     iterations, error, e = minimise(
-        H, one, two, m, gaps, pushed, some_alpha, some_low, part, tolerance, cap, limit, dof
+        H, one, two, m, gaps, pushed, some_alpha, some_low, part, tolerance, cap, limit, team, dof
     )
     for i in range(y.shape[0]):
         for k in range(degrees(dof)):
@@ -203,12 +203,12 @@ def _minimise_some(rows, m, numbers, count, alpha, low, y, cap, settings, report
 
 @kernel
 def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest, last, hardness,
-                kinds, places, sizes, roots, is_soft, alphas, settings, report, dof):  # fmt: skip
+                walls, roots, alphas, settings, report, team, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps; x, axis, last and hardness in place.
 
-    x: (n, d) float64. axis (n, d), base to length_drag (n,). No cell becomes shorter than shortest
-    (n,). last: (n, D) the first move before, from which this one starts. hardness: (1,) α. roots:
-    (S, n) D of each wall, or stiffness · Δt. alphas: (n,) given, or (0,). Returns lengths.
+    x, axis (n, d) float64. base to shortest, the least lengths: (n,). last: (n, D) the first move
+    before, from which this one starts. hardness: (1,) α. walls: kinds, places, sizes and which are
+    soft; roots: (S, n) their D, or stiffness · Δt. alphas: (n,), or (0,). Returns lengths.
     """
     margin, target, deep, softest, passes = _of_colony(base, growth, radius, viscosity, settings)
     tolerance, given = settings[TOLERANCE], alphas.shape[0] > 0
@@ -217,7 +217,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
     least = np.maximum(base - SHRINK * np.maximum(growth, 0.0), shortest)
     half, reach, root = 0.5 * length, np.empty_like(base), np.empty(roots.shape)
     alpha, low, y = np.empty_like(last[:, 0]), np.empty_like(last[:, 0]), np.empty_like(last)
-    at = kinds, places, sizes, root, reach, is_soft
+    at, is_soft = (walls, root, reach), walls[3]
     number, deeply, softer, rising, kept, held, kept_alpha = 0, False, 1.0, True, y, 0.0, 0.0
     found = _contacts(x, axis, half, radius, margin, dof)
     report[DEEPLY] = 0 if settings[SOFT] > 0 else deeply_overlapping(found, radius)
@@ -228,16 +228,16 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
             x, length, scale, growth, least, last, number == 0, hardness[0], softer, roots,
             is_soft, alphas, margin, alpha, low, reach, root, dof,
         )  # fmt: skip
-        rows, walls, deepest = _wall_contacts(x, axis, half, radius, scale, at, found, last, dof)
+        rows, at_walls, deepest = _wall_contacts(x, axis, half, radius, scale, at, found, last, dof)
         if number > 0 and not deeply:  # cells do not lie deep in others; but in a wall?
             if deepest >= -deep:
                 break
             found, deeply = _contacts_of(x, axis, half, radius, margin, found, dof), True
             continue
-        numbers, count = _deep_cells(found, rows, walls, deep, 0 if number == 0 else y.shape[0])
-        m = pair_rows(x, axis, half, radius, scale, found, walls, rows, dof)
+        numbers, count = _deep_cells(found, rows, at_walls, deep, 0 if number == 0 else y.shape[0])
+        m = pair_rows(x, axis, half, radius, scale, found, at_walls, rows, dof)
         error, e = _minimise_some(
-            rows, m, numbers, count, alpha, low, y, 2 * target, settings, report, dof
+            rows, m, numbers, count, alpha, low, y, 2 * target, settings, report, team, dof
         )
         failed = error > tolerance and error < np.inf
         if failed and rising and softer < MOST_SOFTER:
@@ -264,7 +264,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
         number, softer, rising = number + 1, 1.0, True
         if number < passes:
             found, deeply = _after(x, axis, length, radius, y, half, margin, deep, found, dof)
-        if not deeply and kinds.shape[0] == 0:
+        if not deeply and is_soft.shape[0] == 0:
             break
         half = 0.5 * length
     return length
@@ -314,9 +314,10 @@ def _following(e, soft, hardness, target, softest):
 
 
 @kernel
-def step_colonies(which, begin, dt, longest, cells, drags, alphas, walls, settings, out, reports,
-                  dof):  # fmt: skip
-    """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments."""
+def step_colonies(team, which, begin, dt, longest, cells, drags, alphas, walls, settings, out,
+                  reports, dof):  # fmt: skip
+    """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments.
+    team: a board of threads that assist, or (0,)."""
     x, radius, contact_alpha = cells[0], cells[4], cells[7]
     kinds, places, sizes, _, is_soft = walls
     for b in which:
@@ -338,8 +339,8 @@ def step_colonies(which, begin, dt, longest, cells, drags, alphas, walls, settin
             for _ in range(steps):
                 length = step_colony(
                     own_x, own_axis, length, share, own_radius, viscosity, drag, shortest, last,
-                    hardness, kinds, places[:, b], sizes[:, b], roots, is_soft, own_alphas,
-                    own_settings, report, dof,
+                    hardness, (kinds, places[:, b], sizes[:, b], is_soft), roots, own_alphas,
+                    own_settings, report, team, dof,
                 )  # fmt: skip
                 if report[STATUS] == NOT_FINITE:
                     break

@@ -1,0 +1,74 @@
+"""A team of threads solves a large colony to the same bits as one thread."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import torchfilm as tf
+from torchfilm.kernels import team
+from torchfilm.physics import compiled
+
+AGAR = [tf.Plane(z=-0.5, facing="+z", stiffness=16.0), tf.Plane(z=0.5, facing="-z")]
+SCENES = {
+    "free growth": (5.0, torch.float32, {"dim": 2}),
+    "pressed around a post": (
+        6.0,
+        torch.float32,
+        {"dim": 2, "length_drag": 10.0, "walls": [tf.Sphere((0.0, 3.0), 2.0, inside=False)]},
+    ),
+    "soft walls in space": (5.0, torch.float64, {"dim": 3, "walls": AGAR}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not team.AVAILABLE, reason="threads cannot wait for each other here")
+@pytest.mark.parametrize("name", SCENES)
+def test_a_team_changes_no_bit(name, monkeypatch):
+    """A colony of 200 cells, so that loops have several pieces, and a small one."""
+    until, dtype, given = SCENES[name]
+    scene = tf.Scene(
+        tf.Growth(rate=tf.PerColony([1.0, 0.5])),
+        tf.Division(length=tf.Uniform(2.5, 3.5)),
+        tf.Mechanics(**given),
+        dt=0.05,
+    )
+    teams, by_team = [], compiled._call_by_team
+    monkeypatch.setattr(compiled, "_call_by_team", lambda *a: (teams.append(a[1]), by_team(*a))[1])
+    monkeypatch.setattr(compiled, "WORTH_TEAM", 65)
+    before, runs = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3, 8):
+            torch.set_num_threads(threads)
+            *_, last = tf.simulate(scene, until=until, colonies=2, seed=3, dtype=dtype)
+            runs.append(last)
+    finally:
+        torch.set_num_threads(before)
+    assert set(teams) == {2, 3, 8}
+    for other in runs[1:]:
+        for field in ("position", "axis", "length", "displacement", "contact_alpha"):
+            assert torch.equal(getattr(runs[0], field), getattr(other, field)), field
+
+
+def test_pieces_are_whole_blocks_and_make_up_all_cells():
+    for n in (1, 64, 65, 1000, 4097):
+        board = team.new_board(3, 1, 0)
+        chunks = team.chunks_for(board, n)
+        ranges = [team.range_of(k, chunks, n) for k in range(chunks)]
+        assert ranges[0][0] == 0 and ranges[-1][1] == n
+        assert all(a < b for a, b in ranges)
+        assert all(ranges[k][1] == ranges[k + 1][0] for k in range(chunks - 1))
+        assert all(a % team.BLOCK == 0 for a, _ in ranges)
+
+
+def test_each_piece_is_taken_once_by_the_leader_or_by_another():
+    board = team.new_board(2, 1, 0)
+    assert team.take(board, True) == -1  # nothing is offered yet
+    board[team.OFFER] = (7 << 32) | 5
+    taken = [team.take(board, leads) for leads in (True, False, False, True, False)]
+    assert taken == [0, 4, 3, 1, 2]
+    assert team.take(board, True) == -1
+    board[team.OFFER] = team.OVER
+    assert team.take(board, False) == -1
+    assert np.all(board[team.NUMBERS :] == 0)
