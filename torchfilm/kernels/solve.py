@@ -160,10 +160,8 @@ def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit,
 
 
 @kernel(inline=True)
-def _put_gaps(work, team, dof):
+def _put_gaps(H, one, two, e, q, v, pushed, act, stale, y, t, team, dof):
     """The gaps after the move y, and the rows' forces."""
-    H, one, two, e, q, v, pushed, act, stale, _, _, y = work[:12]
-    t = work[27]
     t[0] = 1.0
     if team.shape[0]:
         share_out(team, GAPS)
@@ -174,19 +172,20 @@ def _put_gaps(work, team, dof):
 
 
 @kernel(inline=True)
-def _put_gradient(work, team, dof):
+def _put_gradient(H, one, two, v, pushed, act, stale, alpha, low, y, g, z, d, p, inverse, slope,
+                  own, begin, halves, lengths, on, counts, team, dof):  # fmt: skip
     """The gradient, the blocks and the first direction of CG. Returns g · P⁻¹ g, and the same of
     the lengths that step alone."""
-    (H, one, two, _, _, v, _, act, stale, alpha, low, y, g, z, d, p, inverse, slope, own, begin,
-     halves, lengths, _, mine, on, counts, _, _) = work  # fmt: skip
     if team.shape[0]:
         share_out(team, CELLS)
         return total_of(team, 0), total_of(team, 1)
     n, gz, of_alone = g.shape[0], 0.0, 0.0
-    counts[0] = keep_pushing(act, mine, on)
+    counts[0] = keep_pushing(act, range(act.shape[0]), on)
     put_scaled(g, alpha, y, 0, n, dof)
-    forced = mine if work[6].shape[0] else on[: counts[0]]
-    add_forces(H, one, two, forced, v, g, dof)
+    if pushed.shape[0]:
+        add_forces(H, one, two, range(act.shape[0]), v, g, dof)
+    else:
+        add_forces(H, one, two, on[: counts[0]], v, g, dof)
     B = np.empty((len(dof), len(dof)))
     refresh_blocks(
         H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, B, 0, n, dof
@@ -200,11 +199,10 @@ def _put_gradient(work, team, dof):
 
 
 @kernel(inline=True)
-def _bounded(work, team, dof):
+def _bounded(H, one, two, q, alpha, low, y, d, slope, own, lengths, team, dof):
     """Bound the step d, and put its change of gaps into q. Returns how far all may go along it, and
     the slope and curvature that drags give."""
-    H, one, two, e, q, _, _, _, _, alpha, low, y, _, _, d, _, _, slope, own = work[:19]
-    lengths, n, c0, c1 = work[21], y.shape[0], 0.0, 0.0
+    n, c0, c1 = y.shape[0], 0.0, 0.0
     if team.shape[0]:
         share_out(team, BOUNDS)
         most, c0, c1 = least_of(team), total_of(team, 0), total_of(team, 1)
@@ -214,15 +212,13 @@ def _bounded(work, team, dof):
     for a in range(0, n, BLOCK):
         slope0, curvature = of_drag(alpha, y, d, a, min(a + BLOCK, n), dof)
         c0, c1 = c0 + slope0, c1 + curvature
-    times_rows(H, one, two, d, q, 0, e.shape[0], dof)
+    times_rows(H, one, two, d, q, 0, q.shape[0], dof)
     return most, c0, c1
 
 
 @kernel(inline=True)
-def _advance(work, share, team, dof):
+def _advance(one, two, e, q, v, pushed, act, stale, low, y, d, lengths, share, t, team, dof):
     """Go `share` of the step d, and put the rows' forces."""
-    _, one, two, e, q, v, pushed, act, stale, _, low, y, _, _, d = work[:15]
-    lengths, t = work[21], work[27]
     t[0] = share
     if team.shape[0]:
         team[CREEPS] = share < CREEP
@@ -239,16 +235,14 @@ def _work(H, one, two, rows, gaps, pushed, alpha, low, y, chunks, dof):
     n, kind = y.shape[0], y.dtype
     begin, halves = rows_of_cells(one, two, rows, n)
     two = second_cells(H, one, two, rows)
-    if chunks > 1:
-        mine_begin, mine = rows_of_pieces(one, two, rows, n, chunks)
-    else:
-        mine_begin, mine = np.zeros(2, np.int64), np.arange(rows).astype(np.int32)
+    mine_begin, mine = rows_of_pieces(one, two, rows, n, chunks if chunks > 1 else 0)
     return (
         H, one, two, gaps[:rows].copy(), np.empty(rows, kind), np.empty(rows, kind), pushed,
         np.zeros(rows, np.uint8), np.ones(n, np.uint8), alpha, low, y, np.empty_like(y),
         np.empty_like(y), np.empty_like(y), np.empty_like(y),
         np.empty((n, len(dof), len(dof)), kind), np.empty(n, kind), np.empty(n, kind), begin,
-        halves, np.zeros((3, n), np.uint8), mine_begin, mine, np.empty_like(mine),
+        halves, np.zeros((3, n), np.uint8), mine_begin, mine,
+        np.empty(max(rows, mine.shape[0]), np.int32),
         np.zeros(chunks, np.int64), np.empty((3, (n + BLOCK - 1) // BLOCK)), np.empty(1, kind),
     )  # fmt: skip
 
@@ -284,15 +278,18 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
     work = _work(H, one, two, rows, gaps, pushed, alpha, low, y, chunks, dof)
     if chunks > 1:
         put_on_board(team, work, n, rows)
-    one, two, e, q, counts, t = work[1], work[2], work[3], work[4], work[25], work[27]
-    g, z, d, p, inverse, on = work[12], work[13], work[14], work[15], work[16], work[24]
+    (_, one, two, e, q, v, _, act, stale, _, _, _, g, z, d, p, inverse, slope, own, begin, halves,
+     lengths, _, _, on, counts, _, t) = work  # fmt: skip
     for i in range(n):
         y[i, D - 1] = max(y[i, D - 1], low[i])
     total, fall, error, stuck = 0, np.inf, 0.0, 0
-    _put_gaps(work, team, dof)
+    _put_gaps(H, one, two, e, q, v, pushed, act, stale, y, t, team, dof)
     for round_ in range(MOST_ROUNDS + 1):
         overlap = _squared_overlap(e, cap)
-        gz, of_alone = _put_gradient(work, team, dof)
+        gz, of_alone = _put_gradient(
+            H, one, two, v, pushed, act, stale, alpha, low, y, g, z, d, p, inverse, slope, own,
+            begin, halves, lengths, on, counts, team, dof,
+        )  # fmt: skip
         left = gz + of_alone
         error = _error(fall, left, overlap, cap)
         done = error <= tolerance or not left < np.inf or stuck > 1
@@ -302,8 +299,12 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
             H, one, two, on[: counts[0]], alpha, inverse, g, z, p, d, gz, limit - total, t, team,
             dof,
         )  # fmt: skip
-        most, c0, c1 = _bounded(work, team, dof)
+        most, c0, c1 = _bounded(
+            H, one, two, q, alpha, low, y, d, slope, own, lengths, team, dof
+        )  # fmt: skip
         share, fall = search_line(e, q, c0 - _work_of(pushed, q), c1, most)
         stuck = stuck + 1 if share == 0 else 0
-        _advance(work, share, team, dof)
+        _advance(
+            one, two, e, q, v, pushed, act, stale, low, y, d, lengths, share, t, team, dof
+        )  # fmt: skip
     return total, error, e

@@ -111,7 +111,7 @@ def refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, invers
             stale[i] = 0
 
 
-@kernel
+@kernel(inline=True)
 def put_scaled(g, alpha, y, first, end, dof):
     """g = α y."""
     for i in range(first, end):
@@ -120,7 +120,7 @@ def put_scaled(g, alpha, y, first, end, dof):
         add_scaled(g, i, alpha[i], y, i, dof)
 
 
-@kernel
+@kernel(inline=True)
 def precondition(inverse, g, z, first, end, dof):
     """z = P⁻¹ g; returns g · z."""
     total = 0.0
@@ -130,7 +130,7 @@ def precondition(inverse, g, z, first, end, dof):
     return total
 
 
-@kernel
+@kernel(inline=True)
 def add_curvature(alpha, z, p, first, end, dof):
     """z += α p; returns p · z."""
     total = 0.0
@@ -140,7 +140,7 @@ def add_curvature(alpha, z, p, first, end, dof):
     return total
 
 
-@kernel
+@kernel(inline=True)
 def go_along(d, g, z, p, inverse, t, first, end, dof):
     """d += t p, g += t z and z = P⁻¹ g; returns g · z."""
     total = 0.0
@@ -162,7 +162,7 @@ def next_direction(p, z, t, first, end):
         z[k] = 0
 
 
-@kernel
+@kernel(inline=True)
 def first_direction(d, p, z, first, end):
     """d = 0, p = −z, and z = 0."""
     a, b = first * p.shape[1], end * p.shape[1]
@@ -171,7 +171,7 @@ def first_direction(d, p, z, first, end):
         d[k], p[k], z[k] = 0, -z[k], 0
 
 
-@kernel
+@kernel(inline=True)
 def put_slopes(g, lengths, slope, own, first, end, dof):
     """The slopes of lengths; returns how far E may fall by the steps of those that step alone."""
     last, total = degrees(dof) - 1, 0.0
@@ -182,7 +182,7 @@ def put_slopes(g, lengths, slope, own, first, end, dof):
     return total
 
 
-@kernel
+@kernel(inline=True)
 def stop_at_bounds(y, d, low, lengths, slope, own, first, end, dof):
     """Shorten the step d (n, D) of the lengths that would pass their bound; those that step alone
     follow their slope. Returns how far all may go along the step."""
@@ -200,7 +200,7 @@ def stop_at_bounds(y, d, low, lengths, slope, own, first, end, dof):
     return most
 
 
-@kernel
+@kernel(inline=True)
 def of_drag(alpha, y, d, first, end, dof):
     """α y · d and α d · d."""
     slope, curvature = 0.0, 0.0
@@ -210,7 +210,7 @@ def of_drag(alpha, y, d, first, end, dof):
     return slope, curvature
 
 
-@kernel
+@kernel(inline=True)
 def advance(y, d, low, lengths, creeps, share, first, end, dof):
     """Go `share` (1,) of the step d; lengths at their bound are put on it. creeps: those that were
     stopped step alone next."""
@@ -222,7 +222,7 @@ def advance(y, d, low, lengths, creeps, share, first, end, dof):
             y[i, last] = low[i]
 
 
-@kernel
+@kernel(inline=True)
 def advance_rows(e, q, share, first, end):
     """What rows leave, e, after `share` (1,) of a step that changes them by −q."""
     e, q, t = e[first:end], q[first:end], share[0]
@@ -230,7 +230,7 @@ def advance_rows(e, q, share, first, end):
         e[r] -= t * q[r]
 
 
-@kernel
+@kernel(inline=True)
 def put_forces(e, pushed, v, one, two, act, stale, first, end):
     """v = the force of each row, less what it has exerted before: `pushed`, or (0,) for nothing.
     Marks which rows push; cells whose rows change are stale."""
@@ -247,13 +247,13 @@ def put_forces(e, pushed, v, one, two, act, stale, first, end):
             stale[one[r]] = stale[two[r]] = 1
 
 
-@kernel
+@kernel(inline=True)
 def keep_pushing(act, rows, on):
     """Puts those of the rows that push into `on`; returns how many."""
     count = 0
-    for k in range(rows.shape[0]):
-        on[count] = rows[k]
-        count += act[rows[k]]
+    for r in rows:
+        on[count] = r
+        count += act[r]
     return count
 
 

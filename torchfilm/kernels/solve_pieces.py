@@ -32,7 +32,9 @@ N, ROWS, CREEPS, FREE = range(NUMBERS, NUMBERS + 4)
 @kernel
 def rows_of_pieces(one, two, rows, n, chunks):
     """The rows of the cells of each piece, in their order: where each piece's begin, and the rows.
-    A row of two pieces stands in both."""
+    A row of two pieces stands in both. No rows where there are no pieces."""
+    if chunks == 0:
+        return np.empty(0, np.int64), np.empty(0, np.int32)
     owner = np.empty((n + BLOCK - 1) // BLOCK, np.int64)
     for k in range(chunks):
         first, end = range_of(k, chunks, n)
