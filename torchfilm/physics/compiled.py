@@ -18,9 +18,9 @@ from torchfilm.tools.threads import available, pool
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
 WORTH_THREADS = 300
-# Colonies with this many cells or more are each solved by all threads. With 3,000 cells two threads
-# gained nothing, from 5,000 to 10,000 a tenth, and with 10,000 in free growth a third.
-WORTH_TEAM = 8000
+# A large colony is solved by a team of threads, each with this many cells or more. With 3,000 cells
+# two threads gained nothing, from 5,000 to 10,000 a tenth, and with 10,000 in free growth a third.
+CELLS_A_THREAD = 4000
 
 NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
@@ -133,14 +133,15 @@ def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> No
 
 
 def _call_by_teams(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> None:
-    """As `_call`, for a kernel that a team can run. A colony with more than a thread's fair share
-    of the cells comes first, by a team of all threads."""
+    """As `_call`, for a kernel that a team can run. A large colony that has more than a thread's
+    fair share of the cells comes first, by a team."""
     from torchfilm.kernels.team import AVAILABLE
 
     threads, alone = available() if AVAILABLE else 1, np.zeros(0, np.int64)
-    large = (counts >= WORTH_TEAM) & (counts * threads > counts.sum()) & (threads > 1)
+    teams = np.minimum(counts // CELLS_A_THREAD, threads)
+    large = (teams > 1) & (counts * threads > counts.sum())
     for colony in which[large]:
-        _call_by_team(kernel, threads, colony, arguments)
+        _call_by_team(kernel, int(teams[colony]), colony, arguments)
     if not large.all():
         _call(partial(kernel, alone), which[~large], counts, arguments)
 
@@ -152,10 +153,12 @@ def _call_by_team(kernel, threads: int, colony: int, arguments: tuple) -> None:
     from torchfilm.kernels.team import OFFER, OVER, new_board
 
     take = taker(arguments[3][1].dtype.type, len(arguments[-1]))
-    board = new_board(threads, WORTH_TEAM, take.address)
-    calls = [
-        pool(threads).submit(take.ctypes, board.ctypes.data, False) for _ in range(threads - 1)
-    ]
+    board = new_board(threads, 2 * CELLS_A_THREAD, take.address)
+
+    def assist():
+        take.ctypes(board.ctypes.data, False)  # the board lives as long as this
+
+    calls = [pool(available()).submit(assist) for _ in range(threads - 1)]
     try:
         kernel(board, np.array([colony]), *arguments)
     finally:
