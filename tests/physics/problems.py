@@ -141,6 +141,8 @@ class Problem:
         """As `pushed` by compiled kernels: y (N, D), errors and iterations, (B,)."""
         y, errors, counts = np.zeros(self.scale.shape), [], []
         for mine, rows, (alpha, low), cells, dof in self.of_kernels(dtype, applied_force):
+            if applied_force is None:  # no row has pushed before
+                rows = (*rows[:-1], rows[-1][:0])
             iterations, error, _ = solve.minimise(
                 *rows, alpha, low, cells, tolerance, np.inf, limit, np.zeros(0, np.int64), dof
             )

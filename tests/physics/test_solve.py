@@ -206,6 +206,19 @@ def test_what_is_no_number_is_reported_by_kernels_of_its_colony():
     assert bool(report.residual[0].isnan()) and np.isfinite(y[p.colony == 1]).all()
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("others", [False, True])
+def test_a_row_that_is_no_number_fails_its_colony_by_kernels(others, bad):
+    """One-sided contacts: the row overlaps, alone or among others; the other colony is sound."""
+    p = Problem.random(6, [15, 10], 7)
+    if not others:
+        p.gap[p.colony[np.concatenate([p.first, p.at_wall])] == 0] = 1.0
+    p.gap[0], p.half_rows[0, 0, 1] = -0.1, bad
+    y, error, _ = p.pushed_by_kernels()
+    assert error[0] == np.inf and error[1] <= 1e-12
+    assert np.isfinite(y[p.colony == 1]).all()
+
+
 @PATHS
 def test_reported_error_is_never_below_the_true_residual(path):
     """The residual of one-sided contacts, computed here independently and relative to the overlap,

@@ -71,7 +71,7 @@ def _check(*arrays):
         raise TypeError(f"rows of {arrays} are not contiguous, or not of one type")
 
 
-def _long(context, builder, signature, arguments, k):
+def long_of(context, builder, signature, arguments, k):
     return context.cast(builder, arguments[k], signature.args[k], types.int64)
 
 
@@ -84,8 +84,8 @@ def dot(typing, a, i, b, j, dof):
         kinds = signature.args
         left = _Rows(context, builder, kinds[0], given[0], len(dof))
         right = _Rows(context, builder, kinds[2], given[2], len(dof))
-        x = left.load(_long(context, builder, signature, given, 1))
-        y = right.load(_long(context, builder, signature, given, 3))
+        x = left.load(long_of(context, builder, signature, given, 1))
+        y = right.load(long_of(context, builder, signature, given, 3))
         return _sum(builder, builder.fmul(x, y))
 
     return a.dtype(a, i, b, j, dof), emit
@@ -100,9 +100,9 @@ def add_scaled(typing, a, i, t, b, j, dof):
         kinds = signature.args
         left = _Rows(context, builder, kinds[0], given[0], len(dof))
         right = _Rows(context, builder, kinds[3], given[3], len(dof))
-        place = _long(context, builder, signature, given, 1)
+        place = long_of(context, builder, signature, given, 1)
         factor = context.cast(builder, given[2], kinds[2], kinds[0].dtype)
-        x = right.load(_long(context, builder, signature, given, 4))
+        x = right.load(long_of(context, builder, signature, given, 4))
         many = _filled(builder, left.vector, factor)
         left.store(place, _multiply_add(builder, x, many, left.load(place)))
         return context.get_dummy_value()
@@ -121,7 +121,7 @@ def keep_greatest(typing, most, z, i, dof):
         # without their sign, numbers are in the order of their bits, and NaN comes after infinity
         bits = ir.VectorType(ir.IntType(8 * out.bytes), len(dof))
         sizes = ir.Constant(bits, [2 ** (8 * out.bytes - 1) - 1] * len(dof))
-        x = builder.bitcast(rows.load(_long(context, builder, signature, given, 2)), bits)
+        x = builder.bitcast(rows.load(long_of(context, builder, signature, given, 2)), bits)
         first = ir.Constant(ir.IntType(64), 0)
         old, new = builder.bitcast(out.load(first), bits), builder.and_(x, sizes)
         greater = builder.select(builder.icmp_signed(">", new, old), new, old)
@@ -140,7 +140,7 @@ def put_product(typing, z, i, blocks, g, dof):
         kinds, width = signature.args, len(dof)
         out = _Rows(context, builder, kinds[0], given[0], width)
         rows = _Rows(context, builder, kinds[2], given[2], width)
-        place = _long(context, builder, signature, given, 1)
+        place = long_of(context, builder, signature, given, 1)
         first = builder.mul(place, ir.Constant(place.type, width))
         x = _Rows(context, builder, kinds[3], given[3], width).load(place)
         total = builder.fmul(rows.load(first), _spread(builder, x, 0))
@@ -161,7 +161,7 @@ def add_square(typing, B, H, h, dof):
         kinds, width = signature.args, len(dof)
         out = _Rows(context, builder, kinds[0], given[0], width)
         half = _Rows(context, builder, kinds[1], given[1], width)
-        x = half.load(_long(context, builder, signature, given, 2))
+        x = half.load(long_of(context, builder, signature, given, 2))
         if x.type != out.vector:
             x = builder.fpext(x, out.vector)
         for k in range(width):

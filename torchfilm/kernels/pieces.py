@@ -45,6 +45,7 @@ def _taker(dtype: type, lanes: int):
             k = take(board, leads)
         return count
 
+    take_pieces.__qualname__ += f"_{np.dtype(dtype).name}_{lanes}"  # kept in a file of its own
     name = f"{2 if lanes == 4 else 3}-D, {np.dtype(dtype).name}"
     with first_call(f"{name}, teams", f"contacts of large colonies ({name}), some 20 s"):
-        return native(types.int64(types.int64, types.boolean), take_pieces)
+        return native(types.int64(types.int64, types.int64), take_pieces)

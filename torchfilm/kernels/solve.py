@@ -160,6 +160,11 @@ def _conjugate_gradients(H, one, two, on, alpha, inverse, g, z, p, d, gz, limit,
 
 
 @kernel(inline=True)
+def _hold(work):
+    """Arrays whose addresses a team has must not be freed before this."""
+
+
+@kernel(inline=True)
 def _put_gaps(H, one, two, e, q, v, pushed, act, stale, y, t, team, dof):
     """The gaps after the move y, and the rows' forces."""
     t[0] = 1.0
@@ -307,4 +312,5 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
         _advance(
             one, two, e, q, v, pushed, act, stale, low, y, d, lengths, share, t, team, dof
         )  # fmt: skip
+    _hold(work)
     return total, error, e

@@ -233,18 +233,18 @@ def advance_rows(e, q, share, first, end):
 @kernel(inline=True)
 def put_forces(e, pushed, v, one, two, act, stale, first, end):
     """v = the force of each row, less what it has exerted before: `pushed`, or (0,) for nothing.
-    Marks which rows push; cells whose rows change are stale."""
+    Marks which rows push, or are no number; cells whose rows change are stale."""
     e, v, act = e[first:end], v[first:end], act[first:end]
     one, two, pushed = one[first:end], two[first:end], pushed[first:end]
     for r in range(e.shape[0]):
         v[r] = max(-e[r], 0 * e[r])
-    for r in range(pushed.shape[0]):
-        v[r] -= pushed[r]
     for r in range(e.shape[0]):
-        push = e[r] < 0
+        push = v[r] != 0
         if push != act[r]:
             act[r] = push
             stale[one[r]] = stale[two[r]] = 1
+    for r in range(pushed.shape[0]):
+        v[r] -= pushed[r]
 
 
 @kernel(inline=True)

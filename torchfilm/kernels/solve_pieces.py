@@ -59,7 +59,8 @@ def rows_of_pieces(one, two, rows, n, chunks):
 
 @kernel
 def put_on_board(board, work, n, rows):
-    """Tell the team where the arrays are: `work`, in the order of their places."""
+    """Tell the team where the arrays are: `work`, in the order of their places. They must be kept
+    as long as the team works on them."""
     (h, one, two, e, q, v, pushed, act, stale, alpha, low, y, g, z, d, p, inverse, slope, own,
      begin, halves, lengths, mine_begin, mine, on, counts, sums, box) = work  # fmt: skip
     board[N], board[ROWS], board[CHUNKS] = n, rows, counts.shape[0]

@@ -16,14 +16,13 @@ import os
 from typing import Any
 
 import numba
-import numba.extending
 import numpy as np
 from llvmlite import ir
 from numba import types
 
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.lanes import intrinsic, long_of
 
-intrinsic: Any = numba.extending.intrinsic  # calls leave out its first argument
 INT64 = ir.IntType(64)
 
 # Cells of a block, whose share of a sum is added up by itself.
@@ -37,15 +36,21 @@ OFFER, DONE, LOOP, THREADS, CHUNKS, TAKER, LEAST, NUMBERS = 0, 16, 32, 33, 34, 3
 WORDS = 80
 # What stands in the place of an offer when there will be no more.
 OVER = -1
-# An offer: its number, the first piece that nobody has, and one more than the last, in 16 bits
-# each.
+# An offer: the first piece that nobody has, and one more than the last, in 16 bits each. A thread
+# that was put aside may find the same offer again, of a later loop: that piece is free as well.
 SIXTEEN = 0xFFFF
 # Looks at the offer before a waiting thread lets others have the processor.
 LOOKS = 500
 
 # Whether threads can let others have the processor; where they cannot, there are no teams.
 AVAILABLE = hasattr(os, "sched_yield")
-_give_way: Any = types.ExternalFunction("sched_yield", types.int32())
+if AVAILABLE:
+    _give_way: Any = types.ExternalFunction("sched_yield", types.int32())
+else:
+
+    @kernel
+    def _give_way():
+        return 0
 
 
 def _place(context, builder, kind, board, index):
@@ -53,16 +58,12 @@ def _place(context, builder, kind, board, index):
     return builder.gep(data, [index])
 
 
-def _word(context, builder, signature, given, k):
-    return context.cast(builder, given[k], signature.args[k], types.int64)
-
-
 @intrinsic
 def look(typing, board, k):
     """board[k], and all that was written before it was put there."""
 
     def emit(context, builder, signature, given):
-        place = _word(context, builder, signature, given, 1)
+        place = long_of(context, builder, signature, given, 1)
         at = _place(context, builder, signature.args[0], given[0], place)
         return builder.load_atomic(at, "acquire", 8)
 
@@ -74,7 +75,7 @@ def put(typing, board, k, value):
     """board[k] = value, after all that was written before."""
 
     def emit(context, builder, signature, given):
-        place, word = (_word(context, builder, signature, given, m) for m in (1, 2))
+        place, word = (long_of(context, builder, signature, given, m) for m in (1, 2))
         at = _place(context, builder, signature.args[0], given[0], place)
         builder.store_atomic(word, at, "release", 8)
         return context.get_dummy_value()
@@ -87,7 +88,7 @@ def count_one(typing, board, k):
     """board[k] += 1, after all that was written before."""
 
     def emit(context, builder, signature, given):
-        place = _word(context, builder, signature, given, 1)
+        place = long_of(context, builder, signature, given, 1)
         at = _place(context, builder, signature.args[0], given[0], place)
         builder.atomic_rmw("add", at, ir.Constant(INT64, 1), "acq_rel")
         return context.get_dummy_value()
@@ -100,7 +101,7 @@ def exchange(typing, board, k, old, new):
     """board[k] = new, if it is old. Returns whether it was."""
 
     def emit(context, builder, signature, given):
-        place, was, wanted = (_word(context, builder, signature, given, m) for m in (1, 2, 3))
+        place, was, wanted = (long_of(context, builder, signature, given, m) for m in (1, 2, 3))
         at = _place(context, builder, signature.args[0], given[0], place)
         found = builder.cmpxchg(at, was, wanted, "acq_rel", "acquire")
         return builder.extract_value(found, 1)
@@ -144,9 +145,9 @@ def _call_taker(typing, function, board):
     """What the function at this address returns for the leader of this board."""
 
     def emit(context, builder, signature, given):
-        kind = ir.FunctionType(INT64, [INT64, ir.IntType(8)])
+        kind = ir.FunctionType(INT64, [INT64, INT64])
         function = builder.inttoptr(given[0], kind.as_pointer())
-        return builder.call(function, [given[1], ir.Constant(ir.IntType(8), 1)])
+        return builder.call(function, [given[1], ir.Constant(INT64, 1)])
 
     return types.int64(function, board), emit
 
@@ -156,8 +157,7 @@ def share_out(board, loop):
     """Do a loop together with those who assist."""
     board[LOOP] = loop
     put(board, DONE, 0)
-    number = (look(board, OFFER) >> 32) + 1
-    put(board, OFFER, ((number & SIXTEEN) << 32) | board[CHUNKS])
+    put(board, OFFER, board[CHUNKS])
     others = board[CHUNKS] - _call_taker(board[TAKER], board.ctypes.data)
     looks = 0
     while look(board, DONE) < others:
@@ -175,7 +175,7 @@ def take(board, leads):
         word = look(board, OFFER)
         if word == OVER:
             return -1
-        first, end = (word >> 16) & SIXTEEN, word & SIXTEEN
+        first, end = word >> 16, word & SIXTEEN
         if first < end:
             if exchange(board, OFFER, word, word + (1 << 16) if leads else word - 1):
                 return first if leads else end - 1

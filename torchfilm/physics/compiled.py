@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from contextlib import nullcontext
 from functools import partial
 
@@ -133,13 +134,13 @@ def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> No
 
 
 def _call_by_teams(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> None:
-    """As `_call`, for a kernel that a team can run. A large colony that has more than a thread's
-    fair share of the cells comes first, by a team."""
+    """As `_call`, for a kernel that a team can run. A colony so large that as many others would
+    leave threads of its team idle comes first, by a team."""
     from torchfilm.kernels.team import AVAILABLE
 
     threads, alone = available() if AVAILABLE else 1, np.zeros(0, np.int64)
     teams = np.minimum(counts // CELLS_A_THREAD, threads)
-    large = (teams > 1) & (counts * threads > counts.sum())
+    large = (teams > 1) & (counts * teams > counts.sum())
     for colony in which[large]:
         _call_by_team(kernel, int(teams[colony]), colony, arguments)
     if not large.all():
@@ -147,8 +148,8 @@ def _call_by_teams(kernel, which: np.ndarray, counts: np.ndarray, arguments: tup
 
 
 def _call_by_team(kernel, threads: int, colony: int, arguments: tuple) -> None:
-    """Call the kernel for one colony, by a team of threads that this one leads. It does not wait
-    for the others: those that come late find nothing to do."""
+    """Call the kernel for one colony, by a team of threads that this one leads. It waits for no
+    thread to begin: one that comes late finds nothing to do."""
     from torchfilm.kernels.pieces import taker
     from torchfilm.kernels.team import OFFER, OVER, new_board
 
@@ -156,10 +157,12 @@ def _call_by_team(kernel, threads: int, colony: int, arguments: tuple) -> None:
     board = new_board(threads, 2 * CELLS_A_THREAD, take.address)
 
     def assist():
-        take.ctypes(board.ctypes.data, False)  # the board lives as long as this
+        take.ctypes(board.ctypes.data, 0)  # the board lives as long as this
 
-    calls = [pool(available()).submit(assist) for _ in range(threads - 1)]
+    calls: list[Future] = []
     try:
+        for _ in range(threads - 1):
+            calls.append(pool(available()).submit(assist))
         kernel(board, np.array([colony]), *arguments)
     finally:
         board[OFFER] = OVER
