@@ -59,7 +59,7 @@ def step(given: MechanicsInput) -> MechanicsResult:
         _walls(given), numbers, out, reports, (0,) * (4 if settings.dim == 2 else 8),
     )  # fmt: skip
     new = name not in _called
-    with first_call(name, f"contacts ({name}), some 20 s") if new else nullcontext():
+    with first_call(name, f"contacts ({name}), 20 s to a minute") if new else nullcontext():
         by_team = isinstance(settings, OneSidedSettings)
         call = _call_by_teams if by_team else _call  # shares of work do not change the result
         call(step_colonies, np.arange(counts.size), counts, arguments)
