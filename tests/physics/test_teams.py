@@ -72,11 +72,11 @@ def test_a_team_reads_no_memory_that_has_been_freed():
 def test_pieces_are_whole_blocks_and_make_up_all_cells():
     for n in (1, 64, 65, 1000, 4097):
         board = team.new_board(3, 1, 0)
-        chunks = team.chunks_for(board, n)
-        ranges = [team.range_of(k, chunks, n) for k in range(chunks)]
+        pieces = team.pieces_for(board, n)
+        ranges = [team.range_of(k, pieces, n) for k in range(pieces)]
         assert ranges[0][0] == 0 and ranges[-1][1] == n
         assert all(a < b for a, b in ranges)
-        assert all(ranges[k][1] == ranges[k + 1][0] for k in range(chunks - 1))
+        assert all(ranges[k][1] == ranges[k + 1][0] for k in range(pieces - 1))
         assert all(a % team.BLOCK == 0 for a, _ in ranges)
 
 

@@ -106,6 +106,17 @@ def first_call(name: str, what: str) -> Iterator[None]:
         mark.touch()
 
 
+@contextmanager
+def _kept_in_folder() -> Iterator[bool]:
+    """Functions that Numba is given inside are kept in the folder, if there is one."""
+    before = config.CACHE_DIR
+    config.CACHE_DIR = "" if FOLDER is None else str(FOLDER)
+    try:
+        yield FOLDER is not None
+    finally:
+        config.CACHE_DIR = before
+
+
 def kernel(function=None, *, any_order: bool = False, inline: bool = False):
     """Compile a function at its first call with new types, without the interpreter's lock.
 
@@ -116,26 +127,16 @@ def kernel(function=None, *, any_order: bool = False, inline: bool = False):
     """
     if function is None:
         return partial(kernel, any_order=any_order, inline=inline)
-    before = config.CACHE_DIR
-    config.CACHE_DIR = "" if FOLDER is None else str(FOLDER)
     fast = {"reassoc", "contract", "nsz"} if any_order else False
-    try:
+    with _kept_in_folder() as kept:
         return numba.njit(
-            nogil=True, cache=FOLDER is not None, error_model="numpy", fastmath=fast,
-            forceinline=inline,
+            nogil=True, cache=kept, error_model="numpy", fastmath=fast, forceinline=inline
         )(function)  # fmt: skip
-    finally:
-        config.CACHE_DIR = before
 
 
 def native(signature, function):
     """Compile a function for this signature now, so that it has an address. It is kept as kernels
     are."""
-    before = config.CACHE_DIR
-    config.CACHE_DIR = "" if FOLDER is None else str(FOLDER)
-    try:
-        compile_for: Any = numba.cfunc
-        kept = FOLDER is not None
+    compile_for: Any = numba.cfunc
+    with _kept_in_folder() as kept:
         return compile_for(signature, nopython=True, cache=kept, error_model="numpy")(function)
-    finally:
-        config.CACHE_DIR = before

@@ -49,12 +49,11 @@ from torchfilm.kernels.solve_pieces import (
     GAPS,
     PRODUCT,
     least_of,
-    pieces_for,
     put_on_board,
     rows_of_pieces,
     total_of,
 )
-from torchfilm.kernels.team import BLOCK, share_out
+from torchfilm.kernels.team import BLOCK, pieces_for, share_out
 
 
 @kernel(any_order=True)
@@ -235,12 +234,12 @@ def _advance(one, two, e, q, v, pushed, act, stale, low, y, d, lengths, share, t
 
 
 @kernel(inline=True)
-def _work(H, one, two, rows, gaps, pushed, alpha, low, y, chunks, dof):
+def _work(H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof):
     """The arrays of a solve: see `solve_pieces.put_on_board`."""
     n, kind = y.shape[0], y.dtype
     begin, halves = rows_of_cells(one, two, rows, n)
     two = second_cells(H, one, two, rows)
-    mine_begin, mine = rows_of_pieces(one, two, rows, n, chunks if chunks > 1 else 0)
+    mine_begin, mine = rows_of_pieces(one, two, rows, n, pieces if pieces > 1 else 0)
     return (
         H, one, two, gaps[:rows].copy(), np.empty(rows, kind), np.empty(rows, kind), pushed,
         np.zeros(rows, np.uint8), np.ones(n, np.uint8), alpha, low, y, np.empty_like(y),
@@ -248,7 +247,7 @@ def _work(H, one, two, rows, gaps, pushed, alpha, low, y, chunks, dof):
         np.empty((n, len(dof), len(dof)), kind), np.empty(n, kind), np.empty(n, kind), begin,
         halves, np.zeros((3, n), np.uint8), mine_begin, mine,
         np.empty(max(rows, mine.shape[0]), np.int32),
-        np.zeros(chunks, np.int64), np.empty((3, (n + BLOCK - 1) // BLOCK)), np.empty(1, kind),
+        np.zeros(pieces, np.int64), np.empty((3, (n + BLOCK - 1) // BLOCK)), np.empty(1, kind),
     )  # fmt: skip
 
 
@@ -278,10 +277,10 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, y, tolerance, cap, lim
     if not np.any(gaps[:rows] < 0):  # nothing pushes: such a colony does not move at all
         y[:] = 0
         return 0, 0.0, gaps[:rows].copy()
-    chunks = pieces_for(team, n)
-    team = team[: 0 if chunks == 1 else team.shape[0]]
-    work = _work(H, one, two, rows, gaps, pushed, alpha, low, y, chunks, dof)
-    if chunks > 1:
+    pieces = pieces_for(team, n)
+    team = team[: 0 if pieces == 1 else team.shape[0]]
+    work = _work(H, one, two, rows, gaps, pushed, alpha, low, y, pieces, dof)
+    if pieces > 1:
         put_on_board(team, work, n, rows)
     (_, one, two, e, q, v, _, act, stale, _, _, _, g, z, d, p, inverse, slope, own, begin, halves,
      lengths, _, _, on, counts, _, t) = work  # fmt: skip

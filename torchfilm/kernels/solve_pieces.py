@@ -6,16 +6,7 @@ import numpy as np
 
 from torchfilm.kernels import solve_parts as parts
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.team import (
-    BLOCK,
-    CHUNKS,
-    LEAST,
-    LOOP,
-    NUMBERS,
-    array_at,
-    chunks_for,
-    range_of,
-)
+from torchfilm.kernels.team import BLOCK, LOOP, NUMBERS, PIECES, array_at, range_of
 
 # The loops: gaps after the first move, what the rows' forces ask of the cells, a product of CG, a
 # step along it, its next direction, the bounds on a step, its change of gaps, and the step.
@@ -30,23 +21,23 @@ N, ROWS, CREEPS, FREE = range(NUMBERS, NUMBERS + 4)
 
 
 @kernel
-def rows_of_pieces(one, two, rows, n, chunks):
+def rows_of_pieces(one, two, rows, n, pieces):
     """The rows of the cells of each piece, in their order: where each piece's begin, and the rows.
     A row of two pieces stands in both. No rows where there are no pieces."""
-    if chunks == 0:
+    if pieces == 0:
         return np.empty(0, np.int64), np.empty(0, np.int32)
     owner = np.empty((n + BLOCK - 1) // BLOCK, np.int64)
-    for k in range(chunks):
-        first, end = range_of(k, chunks, n)
+    for k in range(pieces):
+        first, end = range_of(k, pieces, n)
         owner[first // BLOCK : (end + BLOCK - 1) // BLOCK] = k
-    begin = np.zeros(chunks + 1, np.int64)
+    begin = np.zeros(pieces + 1, np.int64)
     for r in range(rows):
         a, b = owner[one[r] // BLOCK], owner[two[r] // BLOCK]
         begin[a + 1] += 1
         begin[b + 1] += a != b
-    for k in range(chunks):
+    for k in range(pieces):
         begin[k + 1] += begin[k]
-    fill, mine = begin[:-1].copy(), np.empty(begin[chunks], np.int32)
+    fill, mine = begin[:-1].copy(), np.empty(begin[pieces], np.int32)
     for r in range(rows):
         a, b = owner[one[r] // BLOCK], owner[two[r] // BLOCK]
         mine[fill[a]] = r
@@ -63,7 +54,7 @@ def put_on_board(board, work, n, rows):
     as long as the team works on them."""
     (h, one, two, e, q, v, pushed, act, stale, alpha, low, y, g, z, d, p, inverse, slope, own,
      begin, halves, lengths, mine_begin, mine, on, counts, sums, box) = work  # fmt: skip
-    board[N], board[ROWS], board[CHUNKS] = n, rows, counts.shape[0]
+    board[N], board[ROWS], board[PIECES] = n, rows, counts.shape[0]
     board[FREE] = pushed.shape[0] == 0
     board[H], board[ONE], board[TWO] = h.ctypes.data, one.ctypes.data, two.ctypes.data
     board[E], board[Q], board[V] = e.ctypes.data, q.ctypes.data, v.ctypes.data
@@ -109,8 +100,8 @@ def _sums(board):
 @kernel
 def _of_rows(board, loop, k, like, dof):
     """A piece of GAPS, CHANGES or ADVANCE: the rows."""
-    rows, chunks = board[ROWS], board[CHUNKS]
-    first, end = rows * k // chunks, rows * (k + 1) // chunks
+    rows, pieces = board[ROWS], board[PIECES]
+    first, end = rows * k // pieces, rows * (k + 1) // pieces
     h, one, two = _half_rows(board, like, dof)
     e, q = _row_numbers(board, E, like), _row_numbers(board, Q, like)
     if loop != ADVANCE:
@@ -128,7 +119,7 @@ def _of_rows(board, loop, k, like, dof):
 def _of_cells(board, k, like, dof):
     """A piece of CELLS."""
     n, rows = board[N], board[ROWS]
-    first, end = range_of(k, board[CHUNKS], n)
+    first, end = range_of(k, board[PIECES], n)
     h, one, two = _half_rows(board, like, dof)
     v, act = _row_numbers(board, V, like), _row_numbers(board, ACT, np.uint8)
     alpha, low = _column(board, ALPHA, like), _column(board, LOW, like)
@@ -162,7 +153,7 @@ def _of_cells(board, k, like, dof):
 @kernel
 def _of_product(board, k, like, dof):
     """A piece of PRODUCT."""
-    first, end = range_of(k, board[CHUNKS], board[N])
+    first, end = range_of(k, board[PIECES], board[N])
     h, one, two = _half_rows(board, like, dof)
     alpha, sums = _column(board, ALPHA, like), _sums(board)
     z, p = _moves(board, Z, like, dof), _moves(board, P, like, dof)
@@ -179,7 +170,7 @@ def _of_product(board, k, like, dof):
 def _of_step(board, loop, k, like, dof):
     """A piece of ALONG or DIRECTION."""
     n = board[N]
-    first, end = range_of(k, board[CHUNKS], n)
+    first, end = range_of(k, board[PIECES], n)
     z, p = _moves(board, Z, like, dof), _moves(board, P, like, dof)
     t = array_at(board, BOX, like, (1,))[0]
     if loop == DIRECTION:
@@ -196,7 +187,7 @@ def _of_step(board, loop, k, like, dof):
 def _of_move(board, loop, k, like, dof):
     """A piece of BOUNDS or ADVANCE: the cells."""
     n = board[N]
-    first, end = range_of(k, board[CHUNKS], n)
+    first, end = range_of(k, board[PIECES], n)
     y, d, low = _moves(board, Y, like, dof), _moves(board, D, like, dof), _column(board, LOW, like)
     lengths = array_at(board, LENGTHS, np.uint8, (3, n))
     if loop == ADVANCE:
@@ -240,12 +231,6 @@ def total_of(board, k):
 def least_of(board):
     """How far all cells may go along a step, after BOUNDS."""
     sums, most = _sums(board), np.inf
-    for k in range(board[CHUNKS]):
+    for k in range(board[PIECES]):
         most = min(most, sums[2, k])
     return most
-
-
-@kernel
-def pieces_for(board, n):
-    """Pieces of the loops over n cells; 1 where one thread does better."""
-    return chunks_for(board, n) if board.shape[0] and n >= board[LEAST] else 1

@@ -28,11 +28,11 @@ INT64 = ir.IntType(64)
 # Cells of a block, whose share of a sum is added up by itself.
 BLOCK = 64
 # Pieces of a loop for each thread of a team: more even out what threads get done, and cost more.
-PIECES = 2
+PIECES_A_THREAD = 2
 # Places on the board, of which those that threads write at the same time are far apart: the offer
 # and what is done of it; then which loop it is, threads, pieces and by what they are done, and the
 # cells from which a solve is shared; then what pieces need.
-OFFER, DONE, LOOP, THREADS, CHUNKS, TAKER, LEAST, NUMBERS = 0, 16, 32, 33, 34, 35, 36, 37
+OFFER, DONE, LOOP, THREADS, PIECES, TAKER, LEAST, NUMBERS = 0, 16, 32, 33, 34, 35, 36, 37
 WORDS = 80
 # What stands in the place of an offer when there will be no more.
 OVER = -1
@@ -157,8 +157,8 @@ def share_out(board, loop):
     """Do a loop together with those who assist."""
     board[LOOP] = loop
     put(board, DONE, 0)
-    put(board, OFFER, board[CHUNKS])
-    others = board[CHUNKS] - _call_taker(board[TAKER], board.ctypes.data)
+    put(board, OFFER, board[PIECES])
+    others = board[PIECES] - _call_taker(board[TAKER], board.ctypes.data)
     looks = 0
     while look(board, DONE) < others:
         looks += 1
@@ -188,13 +188,15 @@ def take(board, leads):
 
 
 @kernel
-def chunks_for(board, n):
-    """Pieces of the loops over n cells."""
-    return min((n + BLOCK - 1) // BLOCK, PIECES * board[THREADS])
+def pieces_for(board, n):
+    """Pieces of the loops over n cells; 1 where one thread does better."""
+    if board.shape[0] == 0 or n < board[LEAST]:
+        return 1
+    return min((n + BLOCK - 1) // BLOCK, PIECES_A_THREAD * board[THREADS])
 
 
 @kernel(inline=True)
-def range_of(k, chunks, n):
+def range_of(k, pieces, n):
     """The first of the cells of piece k, in whole blocks, and one more than the last."""
     blocks = (n + BLOCK - 1) // BLOCK
-    return blocks * k // chunks * BLOCK, min(blocks * (k + 1) // chunks * BLOCK, n)
+    return blocks * k // pieces * BLOCK, min(blocks * (k + 1) // pieces * BLOCK, n)

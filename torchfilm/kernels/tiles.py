@@ -6,14 +6,11 @@ sum of its terms one after the other, whatever the tile that it is in.
 
 from __future__ import annotations
 
-from typing import Any
-
-import numba.extending
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-intrinsic: Any = numba.extending.intrinsic  # calls leave out its first argument
+from torchfilm.kernels.lanes import intrinsic
 
 
 def _check(*arrays):

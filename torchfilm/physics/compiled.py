@@ -138,13 +138,16 @@ def _call_by_teams(kernel, which: np.ndarray, counts: np.ndarray, arguments: tup
     leave threads of its team idle comes first, by a team."""
     from torchfilm.kernels.team import AVAILABLE
 
-    threads, alone = available() if AVAILABLE else 1, np.zeros(0, np.int64)
-    teams = np.minimum(counts // CELLS_A_THREAD, threads)
+    by_one_thread = partial(kernel, np.zeros(0, np.int64))
+    if not AVAILABLE or counts.max(initial=0) < 2 * CELLS_A_THREAD:
+        _call(by_one_thread, which, counts, arguments)
+        return
+    teams = np.minimum(counts // CELLS_A_THREAD, available())
     large = (teams > 1) & (counts * teams > counts.sum())
     for colony in which[large]:
         _call_by_team(kernel, int(teams[colony]), colony, arguments)
     if not large.all():
-        _call(partial(kernel, alone), which[~large], counts, arguments)
+        _call(by_one_thread, which[~large], counts, arguments)
 
 
 def _call_by_team(kernel, threads: int, colony: int, arguments: tuple) -> None:
