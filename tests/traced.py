@@ -13,6 +13,7 @@ import pytest
 import torch
 from helpers import array
 from hypothesis import strategies as st
+from kernel_forms import for_python
 
 import torchfilm as tf
 from torchfilm import parts
@@ -42,14 +43,21 @@ def plain_module(text: str) -> ModuleType:
     """The module of a circuit without a compiler: a stand-in for `compiled._module`."""
     assert text.count(COMPILER) == 1
     module = ModuleType("plain")
-    exec(text.replace(COMPILER, "kernel = lambda function: function\n"), module.__dict__)
-    for name, made in vars(functions).items():
-        if name in module.__dict__ and hasattr(made, "py_func"):
-            module.__dict__[name] = made.py_func
+    module.__dict__["kernel"] = _as_it_is
+    exec(text.replace(COMPILER, ""), module.__dict__)
+    for name, made in list(module.__dict__.items()):
+        if hasattr(made, "py_func"):
+            is_short = made is getattr(functions, name, None)
+            module.__dict__[name] = made.py_func if is_short else for_python(made)
     module.__dict__["math"] = MATH
     for name in {"run", "run_moved"} & set(module.__dict__):
         module.__dict__[name] = _quiet(module.__dict__[name])
     return module
+
+
+def _as_it_is(function: Callable | None = None, **options: bool) -> Callable:
+    """Stands in for the decorator `kernel`."""
+    return _as_it_is if function is None else function
 
 
 def _quiet(run: Callable) -> Callable:

@@ -15,6 +15,7 @@ import torch
 from helpers import array
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from kernel_forms import for_python
 from traced import alone, by, circuits, close, ends, equal, one_step, plain_module
 
 import torchfilm as tf
@@ -354,7 +355,7 @@ def test_a_text_says_all_that_it_depends_on(monkeypatch):
     assert f"SAFETY = {SAFETY!r}\n" in text and "rosenbrock" not in text
     monkeypatch.setattr("torchfilm.kernels.compiling.FOLDER", None)
     made = compiled._module.__wrapped__(text)
-    assert made.times_slopes((1.0, 2.0, 3.0, 4.0), (1.0, 10.0)) == (21.0, 43.0)
+    assert for_python(made.times_slopes)((1.0, 2.0, 3.0, 4.0), (1.0, 10.0)) == (21.0, 43.0)
 
 
 # --- circuits at random ---------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from helpers import array
+from kernel_forms import for_python
 from scipy.optimize import minimize
 
 from torchfilm.kernels import bilateral_solve, solve
@@ -143,7 +144,7 @@ class Problem:
         for mine, rows, (alpha, low), cells, dof in self.of_kernels(dtype, applied_force):
             if applied_force is None:  # no row has pushed before
                 rows = (*rows[:-1], rows[-1][:0])
-            iterations, error, _ = solve.minimise(
+            iterations, error, _ = for_python(solve.minimise)(
                 *rows, alpha, low, cells, tolerance, np.inf, limit, np.zeros(0, np.int64), dof
             )
             y[mine] = cells[:, : y.shape[1]]
@@ -159,7 +160,9 @@ class Problem:
         for mine, rows, (alpha, low), cells, dof in self.of_kernels(dtype, applied_force):
             rigid = np.zeros(len(cells), dtype=bool)
             found.append(
-                bilateral_solve.minimise(*rows, alpha, low, rigid, cells, tolerance, limit, dof)
+                for_python(bilateral_solve.minimise)(
+                    *rows, alpha, low, rigid, cells, tolerance, limit, dof
+                )
             )
             y[mine] = cells[:, : y.shape[1]]
         iterations, residual, status = (torch.tensor(np.array(x)) for x in zip(*found, strict=True))

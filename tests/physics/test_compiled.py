@@ -127,7 +127,8 @@ import numpy as np
 from torchfilm.kernels import compiling, neighbours
 x = np.random.default_rng(0).random((50, 2)) * 20
 axis, half, radius = np.tile([1.0, 0.0], (50, 1)), np.ones(50), np.full(50, 0.5)
-first, second = neighbours.near_pairs(x, axis, half, radius, 0.3, (0,) * 4)
+near_pairs = compiling.kernel(neighbours.near_pairs.py_func, entry=True)
+first, second = near_pairs(x, axis, half, radius, 0.3, (0,) * 4)
 print(compiling.FOLDER is not None, first.size)
 """
 

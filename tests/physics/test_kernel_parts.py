@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import itertools
 from itertools import pairwise
 from pathlib import Path
@@ -11,12 +12,15 @@ import numba
 import numpy as np
 import pytest
 import torch
+from kernel_forms import for_python
 
+import torchfilm as tf
 from torchfilm.kernels import colonies, lanes, moves, neighbours, rows
 from torchfilm.physics import substeps
 from torchfilm.physics.problem import BAD_DRAG, CONVERGED, NOT_FINITE, TOO_FAST
 from torchfilm.tools.ragged import Groups
 
+KERNELS = "torchfilm.kernels."
 DOF = {2: (0,) * 4, 3: (0,) * 8}
 
 
@@ -100,7 +104,7 @@ def test_near_pairs_are_those_whose_boxes_meet(dim, count):
     """Against all pairs; lengths differ a hundredfold."""
     rng = np.random.default_rng(count)
     x, axis, half, radius = crowd(rng, count, dim)
-    first, second = neighbours.near_pairs(x, axis, half, radius, 0.3, DOF[dim])
+    first, second = for_python(neighbours.near_pairs)(x, axis, half, radius, 0.3, DOF[dim])
     side = np.abs(axis) * half[:, None] + radius[:, None] + 0.15
     away = np.abs(x[:, None] - x[None]) - side[:, None] - side[None]
     wanted = np.argwhere(np.triu((away <= 0).all(2), 1))
@@ -124,12 +128,14 @@ def test_no_cells_come_nearer_than_told(dim, spread, own):
     y[:, turns.stop] = 0.1 * own * rng.uniform(-1, 1, 60)
     margin, every = 100.0, np.array(list(itertools.combinations(range(60), 2)), np.int32)
     first, second = every.T.copy()
-    gaps = lambda: rows.near_contacts(x, axis, half, radius, first, second, margin, dof)[2]
+    near_contacts = for_python(rows.near_contacts)
+    gaps = lambda: near_contacts(x, axis, half, radius, first, second, margin, dof)[2]
     before, length = gaps(), 2 * half
     scale, least = np.ones_like(y), np.zeros(60)
-    moves.move_cells(x, axis, length, y, scale, np.zeros_like(y), 1e9, least, dof)
+    about = np.zeros_like(y)
+    for_python(moves.move_cells)(x, axis, length, y, scale, about, 1e9, least, dof)
     half = 0.5 * length
-    told, after = moves.approach(x, length, radius, y, dof), gaps()
+    told, after = for_python(moves.approach)(x, length, radius, y, dof), gaps()
     near = before - told < 0.3
     assert near.sum() > 50
     assert ((before - after)[near] <= told + 1e-9).all()
@@ -156,7 +162,7 @@ def test_substeps_by_kernels_and_by_torch():
     drags = viscosity.numpy(), np.array([10.0], np.float32), np.empty(0, np.float32)
     begin = np.cumsum([0, *counts])
     by_kernels = [
-        colonies.substeps(
+        for_python(colonies.substeps)(
             first, end, 0.5, (*arrays, owner.numpy(), length.numpy(), length.numpy()), drags
         )
         for first, end in pairwise(begin)
@@ -165,6 +171,21 @@ def test_substeps_by_kernels_and_by_torch():
     assert found[0].tolist() == [1, 4, 1, 1, 1, 1, 1, 1]
     wanted = [CONVERGED] * 2 + [TOO_FAST] + [NOT_FINITE] * 2 + [CONVERGED, BAD_DRAG, NOT_FINITE]
     assert found[1].tolist() == wanted
+
+
+def test_python_calls_only_kernels_that_have_a_form_for_it():
+    """A call of any other would end the process."""
+    package, seen = Path(tf.__file__).parent, set()
+    for file in sorted(package.rglob("*.py")):
+        if file.parent.name == "kernels":
+            continue
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith(KERNELS):
+                home = importlib.import_module(str(node.module))
+                found = [getattr(home, alias.name, None) for alias in node.names]
+                seen.update(x for x in found if hasattr(x, "py_func"))
+    inner = [x.py_func.__name__ for x in seen if x.targetoptions["no_cpython_wrapper"]]
+    assert not inner and len(seen) > 10
 
 
 def test_sums_in_any_order_write_to_no_array():

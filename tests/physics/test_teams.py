@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from kernel_forms import for_python
 
 import torchfilm as tf
 from torchfilm.kernels import team
@@ -70,10 +71,11 @@ def test_a_team_reads_no_memory_that_has_been_freed():
 
 
 def test_pieces_are_whole_blocks_and_make_up_all_cells():
+    pieces_for, range_of = for_python(team.pieces_for), for_python(team.range_of)
     for n in (1, 64, 65, 1000, 4097):
         board = team.new_board(3, 1, 0)
-        pieces = team.pieces_for(board, n)
-        ranges = [team.range_of(k, pieces, n) for k in range(pieces)]
+        pieces = pieces_for(board, n)
+        ranges = [range_of(k, pieces, n) for k in range(pieces)]
         assert ranges[0][0] == 0 and ranges[-1][1] == n
         assert all(a < b for a, b in ranges)
         assert all(ranges[k][1] == ranges[k + 1][0] for k in range(pieces - 1))
@@ -81,11 +83,11 @@ def test_pieces_are_whole_blocks_and_make_up_all_cells():
 
 
 def test_each_piece_is_taken_once_by_the_leader_or_by_another():
-    board = team.new_board(2, 1, 0)
-    assert team.take(board, True) == -1  # nothing is offered yet
+    board, take = team.new_board(2, 1, 0), for_python(team.take)
+    assert take(board, True) == -1  # nothing is offered yet
     board[team.OFFER] = 5
-    taken = [team.take(board, leads) for leads in (True, False, False, True, False)]
+    taken = [take(board, leads) for leads in (True, False, False, True, False)]
     assert taken == [0, 4, 3, 1, 2]
-    assert team.take(board, True) == -1
+    assert take(board, True) == -1
     board[team.OFFER] = team.OVER
-    assert team.take(board, False) == -1
+    assert take(board, False) == -1

@@ -26,7 +26,7 @@ STAGES: dict[str, tuple[tuple[str, ...], str]] = {
 RUN = '''T = np.{dtype}
 
 
-@kernel
+@kernel(entry=True)
 def run(first, last, at, columns, numbers, lengths):
     """Cells first … last − 1 in steps of these lengths; at (M, V) in place. columns (K, M), numbers
     (L,)."""

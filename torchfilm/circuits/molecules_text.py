@@ -107,7 +107,7 @@ def moved(w, i, l, other):
         i[k + other] = i[k + l]
 
 
-@kernel
+@kernel(entry=True)
 def run(first, last, at, columns, numbers, uid, stream, words, codes, dt, most_steps, leaps, steps,
         status, wrong):
     """Cells first … last − 1 over dt hours; at (M, V) in place. columns (K, M), numbers (L,)."""

@@ -141,7 +141,7 @@ def verdict(u, c, error, broken, ends, lost, bad):
     return NOT_FINITE, bad
 
 
-@kernel
+@kernel(entry=True)
 def run(first, last, at, columns, numbers, dt, rtol, atol, eps, largest, most_steps, accepted,
         rejected, status):
     """Cells first … last − 1 over dt hours; at (M, V) in place. columns (K, M), numbers (L,)."""

@@ -103,7 +103,7 @@ def step_moved(u, t, c, leaf, turn, h, eps):
     return corrected_moved(u, t, a, ta, {new}, {tn}, low, {noise}, m, j, tj, c, leaf, turn)
 
 
-@kernel
+@kernel(entry=True)
 def run_moved(first, last, at, moving, columns, turning, numbers, turned, dt, rtol, atol, eps,
               largest, most_steps, accepted, rejected, status):
     """As `run`, and the tangents `moving` (M, V) of the variables in place, for the tangents

@@ -1,4 +1,4 @@
-"""The cells of one colony, taken out of a batch and put back."""
+"""Rows of cells: copied, and those of one colony taken out of a batch and put back."""
 
 from __future__ import annotations
 
@@ -36,3 +36,11 @@ def put_back(of, own_x, own_axis, own_last, own_length, x, axis, last, length, d
         for k in range(D):
             last[of[i], k] = own_last[i, k]
         length[of[i]] = own_length[i]
+
+
+@kernel
+def put(rows, out):
+    """Writes rows (n, D) into out. `out[:] = rows` would take Numba seconds to compile."""
+    for i in range(rows.shape[0]):
+        for k in range(rows.shape[1]):
+            out[i, k] = rows[i, k]

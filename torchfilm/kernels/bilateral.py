@@ -190,7 +190,8 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, st
         drags(length, radius, viscosity, length_drag, grows, scale, dof)
         found = _contacts(x, axis, half, radius, hold, dof)
         if again:
-            left[:] = clipped
+            for i in range(n):
+                left[i] = clipped[i]
             if not soft:
                 _mark_deep(found, overlap, left)
         elif not soft:
@@ -205,7 +206,9 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, st
         if again:
             found, y[:] = _contacts_of(found, left), 0
         else:
-            y[:, : end + 1] = start[:, : end + 1] / scale[:, : end + 1]
+            for i in range(n):
+                for k in range(degrees(dof)):
+                    y[i, k] = start[i, k] / scale[i, k]
         m = pair_rows(x, axis, half, radius, scale, found, walls, rows, dof)
         m = _holding_rows(rows, walls, m, radius, hold, soft)
         low = ((base - length) / scale[:, end]).astype(last.dtype)
@@ -217,7 +220,9 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, st
         report[ERROR] = error if not error <= report[ERROR] else report[ERROR]
         report[STATUS] = max(report[STATUS], status)
         if not again:
-            last[:, : end + 1] = y[:, : end + 1] * scale[:, : end + 1]
+            for i in range(n):
+                for k in range(degrees(dof)):
+                    last[i, k] = y[i, k] * scale[i, k]
         if status == NOT_FINITE:
             y[:] = 0
         report[CLIPPED] = make_moves(
@@ -226,7 +231,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, st
     return length
 
 
-@kernel
+@kernel(entry=True)
 def step_colonies(which, begin, dt, longest, cells, drags, alphas, walls, settings, out, reports,
                   dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchfilm.kernels.batch import put
 from torchfilm.kernels.bilateral_scheme import (
     BEYOND_BOUND,
     BLOCK_FLOOR,
@@ -129,19 +130,21 @@ def _search_line(H, one, two, gaps, pushed, alpha, low, y, e, g, d, dof):
     new = np.empty_like(y)
     for _ in range(MAX_HALVINGS):
         stopped = False
-        new[:] = y
+        put(y, new)
         for i in range(y.shape[0]):
             add_scaled(new, i, length[0], d, i, dof)
             if new[i, end] < low[i]:
                 new[i, end], stopped = low[i], True
         times_rows(H, one, two, new, then, 0, then.shape[0], dof)
-        then[:] = gaps - then
+        for r in range(then.shape[0]):
+            then[r] = gaps[r] - then[r]
         _put_gradient(H, one, two, alpha, new, then, pushed, ahead, dof)
         if not stopped:
             break
-        step[:] = new - y
         slope, whole, rising = 0.0, 0.0, 0.0
         for i in range(y.shape[0]):
+            for k in range(y.shape[1]):
+                step[i, k] = new[i, k] - y[i, k]
             slope += dot(g, i, step, i, dof)
             whole += dot(g, i, d, i, dof)
             rising += dot(ahead, i, step, i, dof)
@@ -197,7 +200,8 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, rigid, y, tolerance, l
         y[:] = 0
     e = np.empty_like(gaps)
     times_rows(H, one, two, y, e, 0, e.shape[0], dof)
-    e[:] = gaps - e
+    for r in range(e.shape[0]):
+        e[r] = gaps[r] - e[r]
     _put_gradient(H, one, two, alpha, y, e, pushed, g, dof)
     total, previous, worst = 0, np.inf, np.inf
     for round_ in range(NEWTON_LIMIT + 1):
@@ -216,8 +220,9 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, rigid, y, tolerance, l
         total += _conjugate_gradients(
             H, one, two, on, alpha, inverse, g, z, p, d, FINISH * tolerance * scale, limit, dof
         )
-        y[:], e, g = _search_line(
+        new, e, g = _search_line(
             H, one, two, gaps, pushed, alpha, low, y, e, before, d, dof
         )  # fmt: skip
+        put(new, y)
     status = CONVERGED if worst <= tolerance * scale else ITERATION_LIMIT
     return total, worst / (1.0 if still else scale), status if worst < np.inf else NOT_FINITE

@@ -7,7 +7,7 @@ import numpy as np
 from torchfilm.kernels.compiling import kernel
 
 
-@kernel
+@kernel(entry=True)
 def split(due, colony, uid, parent, next_uid):
     """Makes two cells, side by side, of each of N that is due (N,) bool.
 
@@ -36,7 +36,7 @@ def split(due, colony, uid, parent, next_uid):
     return rows, daughters, source, new_uid, new_parent, following
 
 
-@kernel
+@kernel(entry=True)
 def place_daughters(rows, daughters, length, radius, axis, share, noise, sd, new_length, new_axis,
                     new_position):  # fmt: skip
     """Puts length, axis and position of 2 M daughters (see `split`) into the new batch, in which

@@ -20,7 +20,7 @@ def _two_voxels(at, size, periodic):
     return nearest, max(min(other, size - 1), 0), (at - near) * side
 
 
-@kernel
+@kernel(entry=True)
 def put_stencil(position, colony, origin, step, shape, first, used, periodic, slack, mask, node,
                 weight, outside, blocked):  # fmt: skip
     """Puts the voxels of each cell, the nearest first, and their weights into node and weight,
@@ -77,7 +77,7 @@ def _mask(i, node, weight, mask, outside, blocked):
     node[i, best], weight[i, best] = first, heavy
 
 
-@kernel
+@kernel(entry=True)
 def read(values, node, weight, out):
     """The concentration at each cell."""
     for i in range(node.shape[0]):
@@ -88,7 +88,7 @@ def read(values, node, weight, out):
         out[i] = found
 
 
-@kernel
+@kernel(entry=True)
 def pools(node, weight, volume, sums, out):
     """The voxel's volume over the greatest sum of weights at each cell's voxels. sums: (nodes,) of
     0."""
@@ -103,7 +103,7 @@ def pools(node, weight, volume, sums, out):
         out[i] = volume / (worst if worst > 0 else weight.dtype.type(1))
 
 
-@kernel
+@kernel(entry=True)
 def write(values, amount, there, node, weight, volume, near_one, taken, given, out):
     """Values after secretion and uptake; there: what each cell reads. taken, given: (nodes,) of
     0."""
@@ -123,7 +123,38 @@ def write(values, amount, there, node, weight, volume, near_one, taken, given, o
         out[k] = values[k] - values[k] * share + given[k]
 
 
-@kernel
+@kernel(entry=True)
+def write_moved(values, moved, amount, turned, there, shift, node, weight, volume, near_one, sums,
+                out):  # fmt: skip
+    """The tangent of `write`, into out: of values, amount and there it is moved, turned and shift.
+    sums: (3, nodes) of 0, for the parts taken, their tangents and those of what is given."""
+    half, one = values.dtype.type(0.5), values.dtype.type(1)
+    for i in range(node.shape[0]):
+        a, sign = amount[i], np.sign(amount[i])
+        # halves of |amount| ± amount: at 0 the derivatives of both then add up to 1
+        wanted, less = half * (abs(a) - a), half * (sign * turned[i] - turned[i])
+        more = half * (sign * turned[i] + turned[i]) / volume
+        if there[i] > 0:
+            content = there[i] * volume
+            part = wanted / content
+            less -= part * volume * shift[i]
+        else:
+            content = volume
+            part = values.dtype.type(np.inf) if wanted > 0 else wanted / content
+        less /= content
+        for c in range(node.shape[1]):
+            k, w = node[i, c], weight[i, c]
+            sums[0, k] += w * part
+            sums[1, k] += w * less
+            sums[2, k] += w * more
+    for k in range(values.shape[0]):
+        share, less = sums[0, k], sums[1, k]
+        if share > 1 and share < near_one:
+            share, less = one, one - one
+        out[k] = moved[k] * (one - share) - values[k] * less + sums[2, k]
+
+
+@kernel(entry=True)
 def spans(position, colony, low, high):
     """Put the least and the greatest coordinates of each colony's cells into low and high (B, 3),
     which hold inf and −inf; NaN where a coordinate is NaN."""
@@ -137,7 +168,7 @@ def spans(position, colony, low, high):
                 high[b, k] = x
 
 
-@kernel
+@kernel(entry=True)
 def beyond(position, colony, origin, step, shape, periodic, slack, left, first):
     """Cells outside the box: their number and the first of them, into left and first (B,)."""
     for i in range(position.shape[0]):

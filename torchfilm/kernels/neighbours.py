@@ -100,7 +100,8 @@ def near_pairs(x, axis, half, radius, margin, dof):
 @kernel
 def _longer(a):
     out = np.empty(2 * a.shape[0], a.dtype)
-    out[: a.shape[0]] = a
+    for i in range(a.shape[0]):  # an assigned slice takes Numba seconds
+        out[i] = a[i]
     return out
 
 

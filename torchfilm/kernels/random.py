@@ -27,7 +27,7 @@ def _words_of(uid, stream, step, k0, k1):
     return philox_block(own & mask, own >> np.uint64(32), np.uint64(stream) & mask, step, k0, k1)
 
 
-@kernel
+@kernel(entry=True)
 def philox_words(uid, stream, step, k0, k1):
     """uid, stream: (M,) int64; step and the key k0, k1: uint64 words in [0, 2³²). Returns (4, M)
     int64."""
@@ -37,7 +37,7 @@ def philox_words(uid, stream, step, k0, k1):
     return out
 
 
-@kernel
+@kernel(entry=True)
 def uniforms(uid, stream, step, k0, k1):
     """A number in (0, 1) for each cell, (M,), of the 23 upper bits of its first word."""
     out = np.empty(uid.shape[0])
@@ -47,7 +47,7 @@ def uniforms(uid, stream, step, k0, k1):
     return out
 
 
-@kernel
+@kernel(entry=True)
 def box_muller_pairs(uid, stream, step, k0, k1):
     """Two numbers in (0, 1), less 1, and two angles in (0, 2π), each (M, 2)."""
     less_one, angle = np.empty((uid.shape[0], 2)), np.empty((uid.shape[0], 2))

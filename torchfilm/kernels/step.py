@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.batch import put_back
+from torchfilm.kernels.batch import put, put_back
 from torchfilm.kernels.colonies import (
     CLIPPED,
     DEEPLY,
@@ -190,7 +190,8 @@ def _minimise_some(rows, m, numbers, count, alpha, low, y, cap, settings, report
     for i in range(y.shape[0]):
         if numbers[i] >= 0:
             some_alpha[numbers[i]], some_low[numbers[i]] = alpha[i], low[i]
-            part[numbers[i]] = y[i]
+            for k in range(y.shape[1]):
+                part[numbers[i], k] = y[i, k]
     iterations, error, e = minimise(
         H, one, two, m, gaps, pushed, some_alpha, some_low, part, tolerance, cap, limit, team, dof
     )
@@ -206,9 +207,9 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
                 walls, roots, alphas, settings, report, team, dof):  # fmt: skip
     """Grow one colony by `growth` and part what overlaps; x, axis, last and hardness in place.
 
-    x, axis (n, d) float64. base to shortest, the least lengths: (n,). last: (n, D) the first move
-    before, from which this one starts. hardness: (1,) α. walls: kinds, places, sizes and which are
-    soft; roots: (S, n) their D, or stiffness · Δt. alphas: (n,), or (0,). Returns lengths.
+    x, axis (n, d) float64. base to shortest: (n,). last: (n, D) the first move before, from which
+    this one starts. hardness: (1,) α. walls: kinds, places, sizes, which are soft; roots: (S, n)
+    their D, or stiffness · Δt. alphas: (n,), or (0,). Returns lengths.
     """
     margin, target, deep, softest, passes = _of_colony(base, growth, radius, viscosity, settings)
     tolerance, given = settings[TOLERANCE], alphas.shape[0] > 0
@@ -248,7 +249,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
             softer, rising = softer / SOFTER, False
             continue
         if failed and not rising and not given:
-            y[:], error = kept, held
+            y, error = kept, held
         if not _noted(report, error, tolerance):
             break
         if error <= tolerance and number == 0 and not given:
@@ -260,7 +261,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
                 continue
         about = last * (number == 0 and np.any(rows[1][:m] < 0))  # without a push nothing moves
         report[CLIPPED] = move_cells(x, axis, length, y, scale, about, margin, least, dof)
-        last[:] = y if number == 0 else last
+        put(y if number == 0 else last, last)
         number, softer, rising = number + 1, 1.0, True
         if number < passes:
             found, deeply = _after(x, axis, length, radius, y, half, margin, deep, found, dof)
@@ -313,7 +314,7 @@ def _following(e, soft, hardness, target, softest):
     return max(min(wanted, 2.0 * hardness), HARDEST * softest)
 
 
-@kernel
+@kernel(entry=True)
 def step_colonies(team, which, begin, dt, longest, cells, drags, alphas, walls, settings, out,
                   reports, dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments.

@@ -115,7 +115,7 @@ def along(axis, shape, factor, first, last, panel, u, out):
         along_other(n, factor, first, last, panel, given, made)
 
 
-@kernel
+@kernel(entry=True)
 def carry(begin, end, starts, shape, axes, factors, firsts, lasts, gained, values, out):
     """The grids begin … end of one shape one step later, from values to out, (voxels,) of all
     colonies.
@@ -166,7 +166,7 @@ def exchanged(v, new, pad, strides, stay, ups, downs):
                 out[i] = out[i] + up[i] * below[i] + down[i] * above[i]
 
 
-@kernel
+@kernel(entry=True)
 def mix(
     begin, end, starts, strides, stay, ups, downs, wrap_to, wrap_from, wraps, weights, terms,
     gained, values, out,

@@ -89,7 +89,7 @@ def bicgstab(x, r, pad, grid, many, target, most, spare):
             p[pad + i] = r[i] + beta * (p[pad + i] - omega * v[i])
 
 
-@kernel
+@kernel(entry=True)
 def solve(
     begin, end, starts, strides, stay, ups, downs, wrap_to, wrap_from, wraps, many, tolerance,
     gained, symmetric, most, values, out,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -95,15 +98,12 @@ def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps:
     """As `exchange.write`; there: what `read` gives."""
     from torchfilm.kernels.medium import write as put
 
-    dtype = values.dtype
-    near_one = torch.tensor(1 + ulps * torch.finfo(dtype).eps, dtype=dtype).numpy()[()]
-    volume = torch.tensor(stencil.voxel_volume, dtype=dtype).numpy()[()]
-    taken, given = torch.zeros(2, values.numel(), dtype=dtype)
+    taken, given = torch.zeros(2, values.numel(), dtype=values.dtype)
     out = torch.empty_like(values)
+    of_medium = _of_stencil(stencil, values.dtype, ulps)
     put(
-        *(as_array(x, dtype) for x in (values, amount, there)), stencil.node.numpy(),
-        as_array(stencil.weight, dtype), volume, near_one, taken.numpy(), given.numpy(),
-        out.numpy(),
+        *(as_array(x, values.dtype) for x in (values, amount, there)), *of_medium, taken.numpy(),
+        given.numpy(), out.numpy(),
     )  # fmt: skip
     return out
 
@@ -111,27 +111,28 @@ def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps:
 def write_with_tangent(
     values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps: int
 ) -> Tensor:
-    """As `write`, with the tangent of `exchange.write`, term by term."""
+    """As `write`, with the tangent of `exchange.write`."""
+    from torchfilm.kernels.medium import write_moved as put
+
+    dtype = values.dtype
     plain = [both(x) for x in (values, amount, there)]
-    (value, dv), (change, da), (found, dr) = (
-        (x, torch.zeros_like(x) if t is None else t) for x, t in plain
-    )
-    weight, volume = stencil.weight.to(value.dtype), stencil.voxel_volume
-    spread = lambda x: stencil.sum(weight * x.unsqueeze(1))
-    is_there = found > 0
-    content = torch.where(is_there, found, 1.0) * volume
-    wanted = 0.5 * (change.abs() - change)
-    turned = 0.5 * (change.sign() * da - da)
-    part = torch.where((wanted > 0) & ~is_there, torch.inf, wanted / content)
-    d_part = (turned - torch.where(is_there, part * volume * dr, 0.0)) / content
-    taken = spread(part)
-    emptied = (taken > 1) & (taken < 1 + ulps * torch.finfo(value.dtype).eps)
-    taken, d_taken = (
-        torch.where(emptied, end, x) for end, x in ((1.0, taken), (0.0, spread(d_part)))
-    )
-    d_given = spread(0.5 * (change.sign() * da + da) / volume)
-    moved = dv * (1.0 - taken) - value * d_taken + d_given
-    return with_tangent(write(value, change, found, stencil, ulps), moved)
+    pairs = [(x, torch.zeros_like(x) if t is None else t) for x, t in plain]
+    sums, moved = torch.zeros(3, values.numel(), dtype=dtype), torch.empty_like(plain[0][0])
+    put(
+        *(as_array(x, dtype) for pair in pairs for x in pair),
+        *_of_stencil(stencil, dtype, ulps), sums.numpy(), moved.numpy(),
+    )  # fmt: skip
+    return with_tangent(write(*(x for x, _ in plain), stencil, ulps), moved)
+
+
+def _of_stencil(
+    stencil: Stencil, dtype: torch.dtype, ulps: int
+) -> tuple[np.ndarray, np.ndarray, Any, Any]:
+    """Nodes, weights, the volume of a voxel, and the share up to which a voxel counts as emptied,
+    as kernels take them."""
+    near_one = torch.tensor(1 + ulps * torch.finfo(dtype).eps, dtype=dtype).numpy()[()]
+    volume = torch.tensor(stencil.voxel_volume, dtype=dtype).numpy()[()]
+    return stencil.node.numpy(), as_array(stencil.weight, dtype), volume, near_one
 
 
 def spans(position: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:
