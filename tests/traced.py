@@ -13,7 +13,6 @@ import pytest
 import torch
 from helpers import array
 from hypothesis import strategies as st
-from kernel_forms import for_python
 
 import torchfilm as tf
 from torchfilm import parts
@@ -23,6 +22,7 @@ from torchfilm.circuits.expressions import Builder
 from torchfilm.circuits.graph import evaluated
 from torchfilm.circuits.tracing import Column, lowered
 from torchfilm.kernels import functions
+from torchfilm.kernels.compiling import for_python
 
 COMPILER = "from torchfilm.kernels.compiling import kernel\n"
 

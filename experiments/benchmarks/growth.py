@@ -124,6 +124,7 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     """Returns the times of a product with JᵀJ and of a copy of its rows, s, best of 50, for a
     lattice of touching cells in the plane."""
     from torchfilm.kernels import neighbours, rows, solve
+    from torchfilm.kernels.compiling import for_python
 
     side, dof = round(cells**0.5), (0,) * 4
     grid = np.stack(np.meshgrid(np.arange(side) * 3.95, np.arange(side) * 0.99), -1)
@@ -131,14 +132,14 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     n = len(x)
     axis, half, radius = np.tile([1.0, 0.0], (n, 1)), np.full(n, 1.5), np.full(n, 0.5)
     scale = np.ones((n, 4))
-    first, second = neighbours.near_pairs(x, axis, half, radius, 0.3, dof)
-    contacts = rows.near_contacts(x, axis, half, radius, first, second, 0.3, dof)
+    first, second = for_python(neighbours.near_pairs)(x, axis, half, radius, 0.3, dof)
+    contacts = for_python(rows.near_contacts)(x, axis, half, radius, first, second, 0.3, dof)
     found = (first, second, *contacts)
     room = 2 * len(contacts[0])
     H, gaps = np.empty((2 * room, 4), np.float32), np.empty(room, np.float32)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
     places = H, gaps, one, two, one
-    count = rows.pair_rows(x, axis, half, radius, scale, found, 0, places, dof)
+    count = for_python(rows.pair_rows)(x, axis, half, radius, scale, found, 0, places, dof)
     p, out = np.ones((n, 4), np.float32), np.zeros((n, 4), np.float32)
     on = np.arange(count, dtype=np.int32)
     H = H[: 2 * count].copy()
@@ -152,7 +153,8 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
             times.append(time.perf_counter() - begin)
         return min(times)
 
-    product = best(lambda: solve.add_product(H, one, two, on, p, out, dof))
+    add_product = for_python(solve.add_product)
+    product = best(lambda: add_product(H, one, two, on, p, out, dof))
     copy = best(lambda: np.copyto(target, H))
     return {"rows": count, "product_us": round(1e6 * product, 1), "copy_us": round(1e6 * copy, 1)}
 

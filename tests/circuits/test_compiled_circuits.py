@@ -15,13 +15,13 @@ import torch
 from helpers import array
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from kernel_forms import for_python
 from traced import alone, by, circuits, close, ends, equal, one_step, plain_module
 
 import torchfilm as tf
 from torchfilm import parts
 from torchfilm.circuits import compiled, run
 from torchfilm.circuits.rosenbrock import SAFETY, rodas3
+from torchfilm.kernels.compiling import for_python
 from torchfilm.tools.deterministic_math import deterministic_functions
 
 F32, F64 = torch.float32, torch.float64

@@ -14,13 +14,13 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from kernel_forms import for_python
 from traced import alone, circuits, ends, equal, one_step, plain_module
 
 import torchfilm as tf
 from torchfilm import parts
 from torchfilm.circuits import compiled, compiled_molecules, draws, molecules_text, stochastic
 from torchfilm.circuits.draws import KeyedDraws
+from torchfilm.kernels.compiling import for_python
 from torchfilm.kernels.functions import natural_log
 from torchfilm.kernels.poisson import poisson
 from torchfilm.kernels.random import two_uniforms

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from helpers import array
-from kernel_forms import for_python
 from scipy.optimize import minimize
 
 from torchfilm.kernels import bilateral_solve, solve
+from torchfilm.kernels.compiling import for_python
 from torchfilm.physics import one_sided_solve
 from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.one_sided_solve import Minimum

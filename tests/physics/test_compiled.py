@@ -127,7 +127,7 @@ import numpy as np
 from torchfilm.kernels import compiling, neighbours
 x = np.random.default_rng(0).random((50, 2)) * 20
 axis, half, radius = np.tile([1.0, 0.0], (50, 1)), np.ones(50), np.full(50, 0.5)
-near_pairs = compiling.kernel(neighbours.near_pairs.py_func, entry=True)
+near_pairs = compiling.for_python(neighbours.near_pairs)
 first, second = near_pairs(x, axis, half, radius, 0.3, (0,) * 4)
 print(compiling.FOLDER is not None, first.size)
 """

@@ -12,10 +12,10 @@ import numba
 import numpy as np
 import pytest
 import torch
-from kernel_forms import for_python
 
 import torchfilm as tf
-from torchfilm.kernels import colonies, lanes, moves, neighbours, rows
+from torchfilm.kernels import colonies, functions, lanes, moves, neighbours, rows
+from torchfilm.kernels.compiling import for_python
 from torchfilm.physics import substeps
 from torchfilm.physics.problem import BAD_DRAG, CONVERGED, NOT_FINITE, TOO_FAST
 from torchfilm.tools.ragged import Groups
@@ -174,7 +174,9 @@ def test_substeps_by_kernels_and_by_torch():
 
 
 def test_python_calls_only_kernels_that_have_a_form_for_it():
-    """A call of any other would end the process."""
+    """A call of any other is an error."""
+    with pytest.raises(TypeError, match="natural_log has no form for Python: call for_python"):
+        functions.natural_log(1.0)
     package, seen = Path(tf.__file__).parent, set()
     for file in sorted(package.rglob("*.py")):
         if file.parent.name == "kernels":

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from kernel_forms import for_python
 
 import torchfilm as tf
 from torchfilm.kernels import team
+from torchfilm.kernels.compiling import for_python
 from torchfilm.physics import compiled
 
 AGAR = [tf.Plane(z=-0.5, facing="+z", stiffness=16.0), tf.Plane(z=0.5, facing="-z")]

@@ -10,12 +10,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
 import numba
+from numba.core.registry import CPUDispatcher
 
 config: Any = numba.config
 
@@ -136,20 +137,40 @@ def kernel(function=None, *, entry: bool = False, any_order: bool = False, inlin
     """Compile a function at its first call with new types, without the interpreter's lock.
 
     entry: Python calls it, so it gets a form for Python, and is kept. Others have neither, which
-    saves a third of the time to compile; kernels alone may call them, since a call by Python would
-    end the process. Sums keep their order, unless any_order: then the compiler may choose one, the
-    same for all calls with as many terms. Such a function must not write to arrays: the order would
-    depend on how near to each other they lie in memory. inline: compile it into its callers; a call
-    with many arrays costs more than the work of a short function.
+    saves a third of the time to compile; only kernels may call them (see `for_python`). Sums keep
+    their order, unless any_order: then the compiler may choose one, the same for all calls with as
+    many terms. Such a function must not write to arrays: the order would depend on how near to each
+    other they lie in memory. inline: compile it into its callers; a call with many arrays costs
+    more than the work of a short function.
     """
     if function is None:
         return partial(kernel, entry=entry, any_order=any_order, inline=inline)
     fast = {"reassoc", "contract", "nsz"} if any_order else False
+    compiler: Any = numba.njit
     with _kept_in_folder() as kept:
-        return numba.njit(
+        made: Any = compiler(
             nogil=True, cache=kept and entry, error_model="numpy", fastmath=fast,
             forceinline=inline, no_cpython_wrapper=not entry, no_cfunc_wrapper=True,
         )(function)  # fmt: skip
+    if not entry and isinstance(made, CPUDispatcher):
+        made.__class__ = _Inner
+    return made
+
+
+class _Inner(CPUDispatcher):
+    """A kernel that only kernels call. Numba would end the process at a call by Python."""
+
+    def __call__(self, *given: object, **named: object) -> object:
+        raise TypeError(
+            f"{self.py_func.__name__} has no form for Python: call for_python(it), or make it an"
+            " entry"
+        )
+
+
+@cache
+def for_python(inner):
+    """A kernel that only kernels call, for a test or a benchmark to call."""
+    return kernel(inner.py_func, entry=True)
 
 
 def native(signature, function):

@@ -122,7 +122,8 @@ def write_with_tangent(
         *(as_array(x, dtype) for pair in pairs for x in pair),
         *_of_stencil(stencil, dtype, ulps), sums.numpy(), moved.numpy(),
     )  # fmt: skip
-    return with_tangent(write(*(x for x, _ in plain), stencil, ulps), moved)
+    (value, _), (change, _), (found, _) = pairs
+    return with_tangent(write(value, change, found, stencil, ulps), moved)
 
 
 def _of_stencil(
