@@ -97,7 +97,8 @@ def _no_garbage_collected() -> Iterator[None]:
     """Python's collector stands still. Numba makes many small objects that live on, and looking
     through them again and again takes 6 % of its time."""
     enabled = gc.isenabled()
-    gc.disable()
+    if enabled:
+        gc.disable()
     try:
         yield
     finally:
@@ -170,7 +171,9 @@ class _Inner(CPUDispatcher):
 @cache
 def for_python(inner):
     """A kernel that only kernels call, for a test or a benchmark to call."""
-    return kernel(inner.py_func, entry=True)
+    options = inner.targetoptions
+    order, inline = bool(options["fastmath"]), bool(options["forceinline"])
+    return kernel(inner.py_func, entry=True, any_order=order, inline=inline)
 
 
 def native(signature, function):
