@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 .PHONY: help run colonies test quick lint types docs bench clean
 
 run: $(STAMP)  ## search for a circuit that draws a stripe (a minute or two)
-	$(BIN)/python experiments/boundary_stripe.py --colonies 600 --out runs/stripe
+	$(BIN)/python experiments/boundary_stripe.py --colonies 500 --out runs/stripe
 
 colonies: $(STAMP)  ## grow 16 colonies of 500 cells in one batch (half a minute)
 	$(BIN)/torchfilm run microcolony --colonies 16 --cells 500 --out runs/colonies.h5 --overwrite

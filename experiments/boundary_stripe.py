@@ -2,7 +2,7 @@
 populations meet.
 
     python experiments/boundary_stripe.py                    # 2,000 colonies of 1,000 cells
-    python experiments/boundary_stripe.py --colonies 600 --out runs/stripe
+    python experiments/boundary_stripe.py --colonies 500 --out runs/stripe
     python experiments/boundary_stripe.py --colonies 800 --cells 300 --width 1 --spacing 2
 
 You may stop the search at any time; running it again resumes it. Target: sinks (type 1) within 4 µm
