@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 
 import torchfilm as tf
 from torchfilm import parts
-from torchfilm.circuits import compiled, emission, run
+from torchfilm.circuits import compiled, emission
 from torchfilm.circuits.emission import Equations
 from torchfilm.circuits.expressions import Builder
 from torchfilm.circuits.graph import evaluated
 from torchfilm.circuits.tracing import Column, lowered
+from torchfilm.effects.bound_circuit import BoundCircuit
 from torchfilm.kernels import functions
 from torchfilm.kernels.compiling import for_python
 
@@ -154,16 +155,18 @@ def close(a: tf.State, b: tf.State, rel: float, least: float = 0.0) -> None:
 
 
 def one_step(scene: tf.Scene, dtype: torch.dtype = torch.float64):
-    """The circuit of a scene and the concentrations at the start of its first step."""
+    """The circuit of a scene, what its cells begin the first step with, and their concentrations
+    then."""
     seen = []
-    step = run.step
+    step = BoundCircuit._by_kernels
     try:
-        run.step = lambda *args: seen.append(args) or step(*args)
+        BoundCircuit._by_kernels = lambda self, *args: seen.append(args) or step(self, *args)
         model = scene.bind(seed=1, dtype=dtype)
         model.step(model.start(), 0.1)
     finally:
-        run.step = step
-    return seen[0][0], seen[0][1]
+        BoundCircuit._by_kernels = step
+    start, cells, *_ = seen[0]
+    return cells[0], start, start.concentrations(cells[0].rows)
 
 
 # --- circuits at random ---------------------------------------------------------------------------

@@ -25,6 +25,7 @@ class MediumExchange:
         assert contact is not None
         self.state, self.stencil, self.found = state, contact.stencil, contact.found
         self.pool, self.in_reservoir = contact.pool, contact.in_reservoir
+        self._in_voxels = contact.in_voxels
         self._given: dict[str, Tensor] = {}
         self._to_reservoir: dict[str, Tensor] = {}
 
@@ -54,8 +55,8 @@ class MediumExchange:
         """The state in which the medium has what was given to it."""
         state = self.state
         changed = {
-            OUTSIDE + name: write(state.fields[OUTSIDE + name], amount, self.stencil)
-            for name, amount in self._given.items()
+            OUTSIDE + n: write(state.fields[OUTSIDE + n], x, self.stencil, self._in_voxels[n])
+            for n, x in self._given.items()
         }
         for name, amount in self._to_reservoir.items():
             total = state.groups.sum(amount.unsqueeze(1)).squeeze(1)

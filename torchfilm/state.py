@@ -211,13 +211,8 @@ class State:
     @property
     def signals(self) -> dict[str, Tensor]:
         """Values of each signal by name, (nodes,), laid out as `layout.grid` says."""
-        return Signals(
-            {
-                name.removeprefix(OUTSIDE): value
-                for name, value in self.fields.items()
-                if name.startswith(OUTSIDE)
-            }
-        )
+        names = [n for n in self.fields if n.startswith(OUTSIDE)]
+        return Signals({n.removeprefix(OUTSIDE): self.fields[n] for n in names})
 
     @property
     def places(self) -> Tensor:
@@ -259,6 +254,12 @@ class State:
         for name, value in changes.items():
             parts[name] = MappingProxyType(dict(value)) if name in MAPPINGS else value
         made.__dict__.update(parts)
+        return made
+
+    def with_length(self, length: Tensor, volume: Tensor) -> State:
+        """A state whose cells have other lengths (N,), and the volumes (N,) that these mean."""
+        made = self.replace(length=length)
+        made.__dict__["volume"] = volume
         return made
 
     def with_fields(self, **values: Tensor) -> State:
@@ -350,9 +351,8 @@ class State:
         start = offsets(self.counts)
         counts = self.counts.index_select(0, places)
         owner = torch.repeat_interleave(torch.arange(places.numel(), device=self.device), counts)
-        within = torch.arange(owner.numel(), device=self.device) - offsets(counts)[
-            :-1
-        ].index_select(0, owner)
+        begin = offsets(counts)[:-1].index_select(0, owner)
+        within = torch.arange(owner.numel(), device=self.device) - begin
         taken = self.take(start.index_select(0, places).index_select(0, owner) + within)
         layout, nodes = (None, None) if self.layout is None else self.layout.take(places)
         kept = {CELL: None, COLONY: places, GRID: nodes}

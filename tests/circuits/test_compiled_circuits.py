@@ -20,6 +20,7 @@ from traced import alone, by, circuits, close, ends, equal, one_step, plain_modu
 import torchfilm as tf
 from torchfilm import parts
 from torchfilm.circuits import compiled, run
+from torchfilm.circuits.compiled_step import Changes, advance, readings
 from torchfilm.circuits.rosenbrock import SAFETY, rodas3
 from torchfilm.kernels.compiling import for_python
 from torchfilm.tools.deterministic_math import deterministic_functions
@@ -213,12 +214,16 @@ def test_same_bits_in_any_batch(plain):
 
 
 def test_same_bits_in_any_order(plain):
-    cells, concentrations = one_step(alone(toggle(k=tf.LogNormal(4.0, 0.3))))
-    order = torch.tensor([7, 2, 9, 0])
-    some = dataclasses.replace(cells, rows=cells.rows.index_select(0, order))
-    whole, _ = cells.compiled.rodas3(cells, concentrations, 0.4, 1e-4, 1e-9)
-    part, report = some.compiled.rodas3(some, concentrations[order], 0.4, 1e-4, 1e-9)
-    assert torch.equal(part, whole[order]) and len(report.status) == 4
+    cells, start, concentrations = one_step(alone(toggle(k=tf.LogNormal(4.0, 0.3))))
+    ends = []
+    for order in (range(len(cells.rows)), (7, 2, 9, 0)):
+        some = dataclasses.replace(cells, rows=torch.tensor(order))
+        into = Changes.of(start, (), reservoir=False, whole=True)
+        values = readings(some, start, 0.4)
+        code = advance(some, start, values, 0.4, 1e-4, 1e-9, into)
+        assert len(code) == len(order) and not code.any()
+        ends.append(into.species[:, [7, 2, 9, 0]])
+    assert torch.equal(*ends) and not torch.equal(ends[0].t(), concentrations[[7, 2, 9, 0]])
 
 
 def test_a_restart_gives_the_same_bits(plain):
@@ -230,8 +235,9 @@ def test_a_restart_gives_the_same_bits(plain):
 
 
 def test_no_time_changes_nothing(plain):
-    cells, concentrations = one_step(alone(toggle()))
+    cells, start, concentrations = one_step(alone(toggle()))
     settings = run.IntegrationSettings("rosenbrock", 1, 1e-4, 1e-9, 1.0)
+    assert readings(cells, start, 0.0) is None  # left to torch
     found = run.step(cells, concentrations, 0.0, settings)
     assert torch.equal(found.concentrations, concentrations) and not found.failed.any()
 
@@ -274,7 +280,7 @@ def test_failures_are_the_same(rates, k, said, dtype, plain):
 
 def test_equations_and_autograd_agree():
     """The torch path takes the derivatives of its equations; those of autograd give the same."""
-    cells, start = one_step(by("torch", alone(toggle(k=tf.LogNormal(4.0, 0.3)))))
+    cells, _, start = one_step(by("torch", alone(toggle(k=tf.LogNormal(4.0, 0.3)))))
     assert cells.by_torch and cells.compiled is not None
     one, _ = rodas3(cells.rates, start, 0.5, slopes=cells.slopes)
     other, _ = rodas3(cells.rates, start, 0.5)
@@ -350,7 +356,7 @@ def test_functions_that_fail_on_traced_columns_run_by_torch():
 
 def test_a_text_says_all_that_it_depends_on(monkeypatch):
     """Constants by value: so compiled functions of other constants are never found."""
-    cells, _ = one_step(by("torch", alone(toggle())))
+    cells, *_ = one_step(by("torch", alone(toggle())))
     text = cells.compiled.text
     assert f"SAFETY = {SAFETY!r}\n" in text and "rosenbrock" not in text
     monkeypatch.setattr("torchfilm.kernels.compiling.FOLDER", None)

@@ -285,7 +285,7 @@ def test_too_many_events_are_the_same(method, monkeypatch, plain):
 
 def test_no_time_changes_nothing(plain):
     circuit = molecules(*parts.constitutive("a", 9.0), species="a")
-    cells, concentrations = one_step(alone(circuit))
+    cells, _, concentrations = one_step(alone(circuit))
     draw = KeyedDraws(1, torch.zeros(12, dtype=torch.int64), torch.arange(12), 0)
     own = {"molecules_per_unit": torch.tensor(2.0)}
     end, report = cells.compiled.advance(cells, concentrations, own, 0.0, draw, True)

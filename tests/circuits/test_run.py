@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchfilm.circuits import run
-from torchfilm.circuits.columns import Columns, Lazy, column
+from torchfilm.circuits.columns import Columns, Lookup, column
 from torchfilm.circuits.names import UnknownName
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.tools.checks import InputError
@@ -181,12 +181,9 @@ def test_columns_are_picked_out_when_asked_for_and_noted():
         made.append(1)
         return torch.tensor([1.0, 2.0, 3.0])
 
-    columns = Columns(
-        {"a": torch.tensor([4.0, 5.0, 6.0]), "slow": Lazy(slow), "k": 7.0, "t": torch.tensor(8.0)},
-        torch.tensor([2, 0]),
-        "cell",
-        seen,
-    )
+    given = {"a": torch.tensor([4.0, 5.0, 6.0]), "k": 7.0, "t": torch.tensor(8.0)}
+    source = Lookup(lambda: [*given, "slow"], lambda n: slow() if n == "slow" else given[n])
+    columns = Columns(source, torch.tensor([2, 0]), "cell", seen)
     assert (
         columns.a.tolist() == [6.0, 4.0]
         and columns["k"] == 7.0
@@ -199,7 +196,7 @@ def test_columns_are_picked_out_when_asked_for_and_noted():
         "slow" in columns
         and "none" not in columns
         and len(columns) == 4
-        and list(columns) == ["a", "slow", "k", "t"]
+        and list(columns) == ["a", "k", "t", "slow"]
     )
     assert repr(columns) == "Columns(a, slow, k, t)"
     with pytest.raises(UnknownName, match=r"cell has no 'slwo'.*Did you mean 'slow'"):
@@ -211,9 +208,10 @@ def test_columns_are_picked_out_when_asked_for_and_noted():
 
 def test_a_lazy_column_is_worked_out_once_for_all_rows():
     made = []
-    lazy = Lazy(lambda: made.append(1) or torch.arange(3.0))
-    first, second = (Columns({"v": lazy}, torch.tensor([k]), "cell") for k in (0, 2))
-    assert (float(first.v), float(second.v), made) == (0.0, 2.0, [1])
+    source = Lookup(lambda: ["v"], lambda name: made.append(name) or torch.arange(3.0))
+    first, second = (Columns(source, torch.tensor([k]), "cell") for k in (0, 2))
+    assert (float(first.v), float(second.v), made) == (0.0, 2.0, ["v"])
+    assert (list(source), len(source), "w" in source) == (["v"], 1, False)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cached_property
 from typing import Any
 
 from torch import Tensor
@@ -13,8 +14,8 @@ from torchfilm.circuits.names import Names, UnknownName, unknown
 class Columns(Names):
     """Named columns over some of the cells.
 
-    source: per name a tensor over all cells, a number, or a function that returns the tensor. rows:
-    (M,) int64, the cells. seen: if given, it collects the names that were accessed.
+    source: per name a tensor over all cells, or a number. rows: (M,) int64, the cells. seen: if
+    given, it collects the names that were accessed.
     """
 
     __slots__ = ("_rows", "_seen", "_source")
@@ -37,8 +38,6 @@ class Columns(Names):
         if name not in self._source:
             raise UnknownName(unknown(f"{self._label} has no {name!r}", name, list(self._source)))
         value = self._source[name]
-        if callable(value) and not isinstance(value, Tensor):
-            value = value()
         if isinstance(value, Tensor) and value.dim():
             value = value.index_select(0, self._rows)
         if self._seen is not None:
@@ -59,17 +58,31 @@ class Columns(Names):
         return f"Columns({', '.join(self._source) or 'none'})"
 
 
-class Lazy:
-    """A column that is computed on first access."""
+class Lookup(Mapping[str, Any]):
+    """Columns over all cells by name, each worked out once, when it is first read. names: known
+    ones, found when somebody asks for them. find: the column of a name."""
 
-    def __init__(self, make: Callable[[], Tensor]):
-        self.make = make
-        self.value: Tensor | None = None
+    def __init__(self, names: Callable[[], Iterable[str]], find: Callable[[str], Tensor]):
+        self._names, self._find = names, find
+        self._known: dict[str, Tensor] = {}
 
-    def __call__(self) -> Tensor:
-        if self.value is None:
-            self.value = self.make()
-        return self.value
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self._known:
+            self._known[name] = self._find(name)
+        return self._known[name]
+
+    @cached_property
+    def _all(self) -> dict[str, None]:
+        return dict.fromkeys(self._names())
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._all
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all)
+
+    def __len__(self) -> int:
+        return len(self._all)
 
 
 def column(value: object, count: int, like: Tensor) -> Tensor | None:

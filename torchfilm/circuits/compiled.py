@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import operator
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -79,21 +80,42 @@ class Compiled:
             _compiled.add(self.module.__name__)
         shares_of(count, least, work)
 
+    @cached_property
+    def constants(self) -> dict[str, Tensor]:
+        """The literals by the names that `own` has for them, ()."""
+        each = {n.partition(".")[2]: x for n, x in self.literals.items()}
+        return {n: torch.tensor(x, dtype=torch.float64) for n, x in each.items()}
+
+    @cached_property
+    def _homes(self) -> list[tuple[str, ...]]:
+        return [(n, *n.split(".", 1)) for n in (*self.columns, *self.numbers)]
+
+    def sources(self, circuit: CircuitCells, own: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
+        """The columns (N,) over all cells and the numbers () of the names that are no variables.
+        own: those that no rate function reads."""
+        homes: dict[str, Any] = {"s": circuit.signals, "p": circuit.p, "cell": circuit.cell}
+        homes["own"] = {**own, **self.constants}
+        return {name: torch.as_tensor(homes[kind][inner]) for name, kind, inner in self._homes}
+
     def values(
         self, circuit: CircuitCells, rows: Tensor, own: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """The columns (M,) and numbers () of the names that are no variables, of the cells `rows`
-        (M,) among all. own: those that no rate function reads."""
-        _, s, p, cell = circuit.names(torch.empty(0, len(circuit.species)), rows)
-        homes: dict[str, Any] = {"s": s, "p": p, "cell": cell, "own": own}
+        """As `sources`, of the cells `rows` (M,) only, whose own columns are (M,)."""
+        found = self.sources(circuit, own)
+        all_cells = [n for n in found if not n.startswith("own.") and found[n].dim()]
+        return found | {n: found[n].index_select(0, rows) for n in all_cells}
 
-        def value(name: str) -> Tensor:
-            if name in self.literals:
-                return torch.tensor(self.literals[name], dtype=torch.float64)
-            kind, _, inner = name.partition(".")
-            return torch.as_tensor(homes[kind][inner])
+    @cached_property
+    def _last(self) -> list[tuple[list[Tensor], np.ndarray]]:
+        return [([], np.zeros(1))]
 
-        return {name: value(name) for name in self.equations.leaves}
+    def numbers_of(self, values: Mapping[str, Tensor]) -> np.ndarray:
+        """The numbers (L,) float64. Most are the same tensors in each step."""
+        given, (last, found) = [values[n] for n in self.numbers], self._last[0]
+        if len(given) != len(last) or not all(map(operator.is_, given, last)):
+            found = packed(values, self.numbers)
+            self._last[0] = given, found
+        return found
 
     def packed(self, values: Mapping[str, Tensor], count: int) -> tuple[np.ndarray, np.ndarray]:
         """Columns (K, M) and numbers (L,) as compiled functions take them, float64."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -18,7 +18,7 @@ from torchfilm.circuits.graph import evaluated
 from torchfilm.circuits.rosenbrock import MAX_STEPS, RosenbrockReport
 from torchfilm.circuits.stiff_text import CONSTANTS, method
 from torchfilm.circuits.tangent_text import tangent_method
-from torchfilm.tools.tangents import both, has_tangent, with_tangent
+from torchfilm.tools.tangents import both, has_tangent, in_forward_mode, only_forward, with_tangent
 
 if TYPE_CHECKING:
     from torchfilm.circuits.run import CircuitCells
@@ -48,31 +48,16 @@ class CompiledCircuit(Compiled):
         entry = lambda i, k: zero + at[i, k] if (i, k) in at else zero
         return torch.stack([torch.stack([entry(i, k) for k in range(count)]) for i in range(count)])
 
-    def rodas3(
+    def with_tangents(
         self, circuit: CircuitCells, start: Tensor, dt: float, rtol: float, atol: float
     ) -> tuple[Tensor, RosenbrockReport] | None:  # fmt: skip
         """As `rosenbrock.rodas3`, of the cells `circuit.rows`, with tangents in forward mode; None
-        where a backward pass is wanted, and over no time."""
-        if dt == 0:
+        where none is wanted, or a backward pass, and over no time."""
+        if dt == 0 or not in_forward_mode():
             return None
         values = self.values(circuit, circuit.rows, pools(circuit, circuit.rows))
-        every = [start, *values.values()]
-        if torch.is_grad_enabled() and any(x.requires_grad for x in every):
+        if not only_forward(start, *values.values()):
             return None
-        if has_tangent(*every):
-            return self._with_tangents(values, start, dt, rtol, atol)
-        # a copy, also of float64: the state must not change
-        at = torch.empty(start.shape, dtype=torch.float64).copy_(start)
-        report = torch.zeros(3, start.shape[0], dtype=torch.int64)
-        arrays = (at.numpy(), *self.packed(values, start.shape[0]))
-        rest, counts, run = _limits(dt, rtol, atol, start.dtype), report.numpy(), self.module.run
-        work = lambda first, last: run(first, last, *arrays, *rest, *counts)
-        self.run(start.shape[0], WORTH_A_THREAD, work)
-        return at.to(start.dtype), RosenbrockReport(*report)
-
-    def _with_tangents(
-        self, values: Mapping[str, Tensor], start: Tensor, dt: float, rtol: float, atol: float
-    ) -> tuple[Tensor, RosenbrockReport]:
         moving = {n for n, x in values.items() if has_tangent(x)}
         key = tuple(tuple(n for n in x if n in moving) for x in (self.columns, self.numbers))
         if key not in self._moved:
@@ -120,14 +105,16 @@ class CompiledTangents(Compiled):
             at.numpy(), moved.numpy(), columns, packed(turns, self.moving, count), numbers,
             packed(turns, self.moving_numbers),
         )  # fmt: skip
-        rest, counts = _limits(dt, rtol, atol, dtype), report.numpy()
+        rest, counts = limits(dt, rtol, atol, dtype), report.numpy()
         run = self.module.run_moved
         work = lambda first, last: run(first, last, *arrays, *rest, *counts)
         self.run(count, WORTH_A_THREAD, work)
         return with_tangent(at.to(dtype), moved.to(dtype)), RosenbrockReport(*report)
 
 
-def _limits(dt: float, rtol: float, atol: float, dtype: torch.dtype) -> tuple[float, ...]:
+@cache
+def limits(dt: float, rtol: float, atol: float, dtype: torch.dtype) -> tuple[float, ...]:
+    """What `run` is told of the step's length and tolerances."""
     limits = torch.finfo(dtype)
     return dt, max(rtol, 4 * limits.eps), atol, limits.eps, limits.max, MAX_STEPS
 

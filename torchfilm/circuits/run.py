@@ -223,7 +223,7 @@ def step(
         assert compiled is None or isinstance(compiled, CompiledCircuit)
         found = None
         if compiled is not None and not circuit.by_torch:
-            found = compiled.rodas3(circuit, start, dt, rtol, atol)
+            found = compiled.with_tangents(circuit, start, dt, rtol, atol)
         if found is None:
             slopes = None if compiled is None else circuit.slopes
             found = rosenbrock.rodas3(circuit.rates, start, dt, rtol=rtol, atol=atol, slopes=slopes)
@@ -359,15 +359,9 @@ MOLECULES = 100
 
 
 def words(
-    circuit: CircuitCells,
-    outcome: CircuitOutcome,
-    concentrations: Tensor,
-    k: int,
-    method: str,
-    dt: float,
+    circuit: CircuitCells, code: int, concentrations: Tensor, k: int, method: str, dt: float
 ) -> str:
     """Describes the failure of the k-th of the M cells, in a step from concentrations (M, S)."""
-    code = int(outcome.code[k])
     if method in ("tau_leap", "direct"):
         assert isinstance(circuit.part, Network)
         if code >= MOLECULES:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchfilm.circuits import run
-from torchfilm.circuits.columns import Lazy
+from torchfilm.circuits.columns import Lookup
 from torchfilm.circuits.compiled import Compiled
 from torchfilm.circuits.compiled_explicit import compiled_explicit
 from torchfilm.circuits.compiled_molecules import compiled_molecules
+from torchfilm.circuits.compiled_step import Changes, advance, readings
 from torchfilm.circuits.compiled_stiff import compiled_circuit
+from torchfilm.circuits.dilution import Start, half_way
 from torchfilm.circuits.draws import KeyedDraws
 from torchfilm.circuits.names import label_of, unknown
 from torchfilm.circuits.network import build_network
@@ -130,9 +131,8 @@ class BoundCircuit(BoundEffect):
             ).repeat(2)[:64]
             tried = self._cells(state, rows, kind, (), found, seen=seen)
             derivatives = circuit.method == "rosenbrock"
-            exchanged[kind] = try_circuit(
-                tried, self._concentrations(state, rows), derivatives=derivatives
-            )
+            each = [state.fields[n].index_select(0, rows) for n in self.fields]
+            exchanged[kind] = try_circuit(tried, torch.stack(each, 1), derivatives=derivatives)
         self._check_constants(seen["p"])
         self.exchanged = exchanged
         of_networks = [n for made in self.networks.values() for n in made.signals]
@@ -256,19 +256,68 @@ class BoundCircuit(BoundEffect):
     # --- stepping ------------------------------------------------------------------------
 
     def step(self, state: State, dt: float) -> State:
+        """Dilution, rates in the cells as they are half way, dilution: of second order in dt, and
+        keeps amounts."""
         if state.cells == 0:
             return state
-        circuit, volume = self.effect, self.effect.volume_field
-        # dilution, rates in the cell as it is half way, dilution: of second order in dt, and keeps
-        # amounts
-        middle, end = _half_way(state, volume), state.volume
-        diluted = {
-            n: scaled(state.fields[n], state.fields[volume] / middle.volume)
-            for n in circuit.diluted_fields
-        }
-        state = state.with_fields(**{volume: end}, **diluted)
-        medium = MediumExchange.of(state, self.signals)
+        circuit, medium = self.effect, MediumExchange.of(state, self.signals)
+        half = half_way(state.length, state.radius, state.fields[circuit.volume_field])
+        middle = state.with_length(half.length, half.volume)
         found = {} if medium is None else medium.found
+        same = self._constants(middle)
+        cells = [
+            self._cells(middle, rows, kind, self.exchanged[kind], found, medium, same=same)
+            for kind in self.rates
+            if (rows := _cells_of(state, kind)).numel()
+        ]
+        start = Start({n: state.fields[n] for n in self.fields}, circuit.diluted_fields, half)
+        report = Failures(state, circuit.method, dt)
+        changed, left = self._by_kernels(start, cells, medium, report)
+        if left:
+            changed = self._by_torch(state, start, left, medium, report, changed)
+        if medium is not None:
+            state = medium.settle()
+        state = state.with_fields(**{circuit.volume_field: state.volume}, **changed)
+        return state.replace(reports={**state.reports, self.title: report.report()})
+
+    def _by_kernels(
+        self,
+        start: Start,
+        cells: Sequence[run.CircuitCells],
+        medium: MediumExchange | None,
+        report: Failures,
+    ) -> tuple[dict[str, Tensor], list[run.CircuitCells]]:
+        """The species of all cells (N,) after the circuits that kernels step, and the circuits that
+        are left."""
+        read = [readings(c, start, report.dt) for c in cells]
+        left = [c for c, values in zip(cells, read, strict=True) if values is None]
+        taken = [(c, x) for c, x in zip(cells, read, strict=True) if x is not None]
+        if not taken:
+            return start.kept(), left
+        whole = sum(c.rows.numel() for c, _ in taken) == report.state.cells
+        names = tuple(dict.fromkeys(n for c, _ in taken for n in c.given))
+        into = Changes.of(start, names, any(c.in_reservoir is not None for c, _ in taken), whole)
+        for c, values in taken:
+            code = advance(c, start, values, report.dt, self.effect.rtol, self.effect.atol, into)
+            if code.any():
+                report.note(start, c, torch.from_numpy(code))
+        report.steps = into.steps
+        for k, name in enumerate(names):
+            assert medium is not None
+            medium.give(name, into.given[k], into.back[k] if len(into.back) else None)
+        return dict(zip(start.fields, into.species.unbind(), strict=True)), left
+
+    def _by_torch(
+        self,
+        state: State,
+        start: Start,
+        cells: Sequence[run.CircuitCells],
+        medium: MediumExchange | None,
+        report: Failures,
+        changed: dict[str, Tensor],
+    ) -> dict[str, Tensor]:
+        """The species of all cells after these circuits, of what they are after the others."""
+        circuit, keys = self.effect, None
         settings = run.IntegrationSettings(
             circuit.method,
             circuit.steps,
@@ -276,43 +325,22 @@ class BoundCircuit(BoundEffect):
             circuit.atol,
             self.values.molecules_per_unit.of_cells(state),
         )
-        keys = (
-            KeyedDraws(state.seed, state.own_stream, state.uid, state.step)
-            if circuit.is_stochastic
-            else None
-        )
-        report = Failures(state)
-        changed = {n: state.fields[n] for n in self.fields}
-        for kind in self.rates:
-            rows = _cells_of(state, kind)
-            if rows.numel() == 0:
-                continue
-            cells = self._cells(middle, rows, kind, self.exchanged[kind], found, medium)
-            concentrations = self._concentrations(state, rows)
+        if circuit.is_stochastic:
+            keys = KeyedDraws(state.seed, state.own_stream, state.uid, state.step)
+        for c in cells:
+            rows, whole = c.rows, c.rows.numel() == state.cells
+            concentrations = start.concentrations(rows)
             draw = None if keys is None else keys.of(rows, circuit.name)
-            made = run.step(cells, concentrations, dt, settings, draw)
-            report.note(cells, made, concentrations, circuit.method, dt)
+            made = run.step(c, concentrations, report.dt, settings, draw)
+            report.note(start, c, made.code, made.steps)
+            after = start.half.after if whole else start.half.after.index_select(0, rows)
             for name, value in zip(self.fields, made.concentrations.unbind(1), strict=True):
-                changed[name] = (
-                    value
-                    if rows.numel() == state.cells
-                    else changed[name].index_copy(0, rows, value)
-                )
-            for name in self.exchanged[kind]:
+                value = scaled(value, after) if name in start.diluted else value
+                changed[name] = value if whole else changed[name].index_copy(0, rows, value)
+            for name in c.given:
                 assert medium is not None
                 medium.give(name, made.pools[name], made.reservoir.get(name), rows)
-        if medium is not None:
-            state = medium.settle()
-        thinner = middle.volume / end
-        own = set(circuit.diluted_fields)
-        state = state.with_fields(
-            **{n: scaled(v, thinner) if n in own else v for n, v in changed.items()}
-        )
-        return state.replace(reports={**state.reports, self.title: report.report()})
-
-    def _concentrations(self, state: State, rows: Tensor) -> Tensor:
-        """Of the cells `rows` (M,), (M, S)."""
-        return torch.stack([state.fields[n].index_select(0, rows) for n in self.fields], 1)
+        return changed
 
     def _cells(
         self,
@@ -323,8 +351,10 @@ class BoundCircuit(BoundEffect):
         found: Mapping[str, Tensor],
         medium: MediumExchange | None = None,
         seen: dict[str, set[str]] | None = None,
+        same: Lookup | None = None,
     ) -> run.CircuitCells:
-        """The circuit in the cells of one type as they are in this state."""
+        """The circuit in the cells of one type as they are in this state. same: constants, where
+        the circuits of several types share what does not depend on the type."""
         part = self.networks.get(kind, self.rates[kind])
         label = label_of(part)
         label += "" if isinstance(kind, str) else f" (cell type {kind})"
@@ -332,14 +362,14 @@ class BoundCircuit(BoundEffect):
         if isinstance(part, run.Network):
             exchanged = part.signals
         own = None if isinstance(kind, str) else kind
-        p = {n: Lazy(partial(self.values[n].of_cells, state, own)) for n in self.effect.parameters}
+        same = same or self._constants(state)
         cells = run.CircuitCells(
             part,
             tuple(self.effect.variables),
             exchanged,
             rows,
-            _cell_columns(state, self.fields),
-            p,
+            Lookup(partial(_cell_names, state, self.fields), partial(_cell_column, state)),
+            same if own is None else self._constants(state, own, same),
             found,
             pool,
             in_reservoir,
@@ -348,36 +378,37 @@ class BoundCircuit(BoundEffect):
         )
         return cells if seen else self._compiled(kind, state, cells)
 
+    def _constants(
+        self, state: State, kind: int | None = None, same: Lookup | None = None
+    ) -> Lookup:
+        """The constants of all cells, or as if all were of this type."""
 
-def _half_way(state: State, volume_field: str) -> State:
-    """The cells as long as they were half way, in time, between the volume that their
-    concentrations refer to and their own."""
-    before = state.fields[volume_field]
-    volume = (before * state.volume).sqrt()
-    longer = volume / (math.pi * state.radius * state.radius) - state.radius * (4.0 / 3.0)
-    return state.replace(
-        length=torch.where(before == state.volume, state.length, longer.clamp(min=0.0))
-    )
+        def find(name: str) -> Tensor:
+            value = self.values[name]
+            if same is None or value.types is not None or value.draw is not None:
+                return value.of_cells(state, kind)
+            return same[name]
+
+        return Lookup(partial(tuple, self.effect.parameters), find)
 
 
-def _cell_columns(state: State, species: tuple[str, ...]) -> dict[str, Any]:
-    """What a rate function may read of its cell, by name, each looked up when it is read."""
+OF_CELLS = ("length", "radius", "volume", "area", "uid")
+
+
+def _cell_names(state: State, species: tuple[str, ...]) -> list[str]:
+    """What a rate function may read of its cell."""
     fields = [n for n in state.fields if state.declared[n].scope == CELL and n not in species]
-    columns: dict[str, Any] = {n: Lazy(partial(state.fields.__getitem__, n)) for n in fields}
-    for name in ("length", "radius", "volume", "area", "uid"):
-        columns[name] = Lazy(partial(getattr, state, name))
-    for k, letter in zip(range(state.dim), "xyz", strict=False):
-        columns[letter] = Lazy(partial(_coordinate, state, k))
-    columns["colony"] = Lazy(partial(getattr, state, "own_colony_id"))
-    return columns | {"time": Lazy(partial(_time, state))}
+    return [*fields, *OF_CELLS, *"xyz"[: state.dim], "colony", "time"]
 
 
-def _coordinate(state: State, k: int) -> Tensor:
-    return state.position[:, k].to(state.dtype)
-
-
-def _time(state: State) -> Tensor:
-    return state.length.new_tensor(state.time)
+def _cell_column(state: State, name: str) -> Tensor:
+    if name in OF_CELLS:
+        return getattr(state, name)
+    if name in ("x", "y", "z"):
+        return state.position[:, "xyz".index(name)].to(state.dtype)
+    if name == "colony":
+        return state.own_colony_id
+    return state.length.new_tensor(state.time) if name == "time" else state.fields[name]
 
 
 def _cells_of(state: State, kind: int | str) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits import run
+from torchfilm.circuits.dilution import Start
 from torchfilm.state import State
 
 
@@ -31,30 +32,28 @@ class CircuitReport:
 class Failures:
     """What went wrong where, gathered over the cells of all types."""
 
-    def __init__(self, state: State):
-        self.state = state
+    def __init__(self, state: State, method: str, dt: float):
+        self.state, self.method, self.dt = state, method, dt
         self.status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
         self.steps = torch.zeros(state.cells, dtype=torch.int64, device=state.device)
         self.words: dict[int, str] = {}
 
     def note(
-        self,
-        cells: run.CircuitCells,
-        found: run.CircuitOutcome,
-        concentrations: Tensor,
-        method: str,
-        dt: float,
+        self, start: Start, cells: run.CircuitCells, code: Tensor, steps: Tensor | None = None
     ) -> None:
+        """code: (M,), what `run.step` says of each cell, which began with `start`. steps: (M,)."""
         state = self.state
-        self.steps = self.steps.index_copy(0, cells.rows, found.steps)
-        if not bool(found.failed.any()):
+        if steps is not None:
+            self.steps = self.steps.index_copy(0, cells.rows, steps)
+        if not bool(code.any()):
             return
-        at = torch.nonzero(found.failed).squeeze(1)
+        at = torch.nonzero(code).squeeze(1)
         owner = state.colony.index_select(0, cells.rows.index_select(0, at)).tolist()
+        begin = start.concentrations(cells.rows)
         for place in sorted(set(owner)):
             mine = [k for k, o in zip(at.tolist(), owner, strict=True) if o == place]
             row = int(cells.rows[mine[0]])
-            said = run.words(cells, found, concentrations, mine[0], method, dt)
+            said = run.words(cells, int(code[mine[0]]), begin, mine[0], self.method, self.dt)
             kind = (
                 f" (type {int(state.fields['cell_type'][row])})"
                 if "cell_type" in state.fields

@@ -14,6 +14,11 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
+
 import llvmlite.binding as llvm
 import numba
 from numba.core.registry import CPUDispatcher
@@ -124,6 +129,34 @@ def first_call(name: str, what: str) -> Iterator[None]:
 
 
 @contextmanager
+def _alone(name: str) -> Iterator[None]:
+    """No other process is in here with this name. Numba reads the list of what it has kept of a
+    function, adds to it and writes it again; two processes that do so at once would give different
+    code one place."""
+    try:
+        file = None if FOLDER is None else (FOLDER / f"{name}.lock").open("w")
+    except OSError:  # the folder has gone
+        file = None
+    if file is None or fcntl is None:
+        yield
+        return
+    with file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
+        yield
+
+
+def _keep_alone(made: Any) -> None:
+    """Keep what is compiled of this function while no other process does."""
+    save = made._cache.save_overload
+
+    def save_alone(*given: object) -> None:
+        with _alone(made.py_func.__name__):
+            save(*given)
+
+    made._cache.save_overload = save_alone
+
+
+@contextmanager
 def _kept_in_folder() -> Iterator[bool]:
     """Functions that Numba is given inside are kept in the folder, if there is one."""
     before = config.CACHE_DIR
@@ -155,6 +188,8 @@ def kernel(function=None, *, entry: bool = False, any_order: bool = False, inlin
         )(function)  # fmt: skip
     if not entry and isinstance(made, CPUDispatcher):
         made.__class__ = _Inner
+    if kept and entry:
+        _keep_alone(made)
     return made
 
 
@@ -180,5 +215,5 @@ def native(signature, function):
     """Compile a function for this signature now, so that it has an address. It is kept as kernels
     are."""
     compile_for: Any = numba.cfunc
-    with _kept_in_folder() as kept:
+    with _kept_in_folder() as kept, _alone(function.__name__):
         return compile_for(signature, nopython=True, cache=kept, error_model="numpy")(function)

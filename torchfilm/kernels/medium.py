@@ -91,7 +91,7 @@ def read(values, node, weight, out):
 @kernel(entry=True)
 def pools(node, weight, volume, sums, out):
     """The voxel's volume over the greatest sum of weights at each cell's voxels. sums: (nodes,) of
-    0."""
+    0, and so again in the end."""
     for i in range(node.shape[0]):
         for c in range(node.shape[1]):
             sums[node[i, c]] += weight[i, c]
@@ -101,33 +101,42 @@ def pools(node, weight, volume, sums, out):
             if weight[i, c] > 0:
                 worst = max(worst, sums[node[i, c]])
         out[i] = volume / (worst if worst > 0 else weight.dtype.type(1))
+    for i in range(node.shape[0]):
+        for c in range(node.shape[1]):
+            sums[node[i, c]] = 0
 
 
 @kernel(entry=True)
-def write(values, amount, there, node, weight, volume, near_one, taken, given, out):
-    """Values after secretion and uptake; there: what each cell reads. taken, given: (nodes,) of
-    0."""
-    zero, one = values.dtype.type(0), values.dtype.type(1)
+def write(out, amount, there, node, weight, volume, near_one, sums):
+    """Values after secretion and uptake, in place; there: what each cell reads. sums: (nodes, 2) of
+    0, and so again in the end, for the part taken and what is given. Where no cell is, nothing is
+    done."""
+    zero, one = out.dtype.type(0), out.dtype.type(1)
     for i in range(node.shape[0]):
         wanted, more = max(-amount[i], zero), max(amount[i], zero) / volume
         part = wanted / ((there[i] if there[i] > 0 else one) * volume)
         if wanted > 0 and there[i] <= 0:
-            part = values.dtype.type(np.inf)
+            part = out.dtype.type(np.inf)
         for c in range(node.shape[1]):
-            taken[node[i, c]] += weight[i, c] * part
-            given[node[i, c]] += weight[i, c] * more
-    for k in range(values.shape[0]):
-        share = taken[k]
-        if share > 1 and share < near_one:
-            share = one
-        out[k] = values[k] - values[k] * share + given[k]
+            sums[node[i, c], 0] += weight[i, c] * part
+            sums[node[i, c], 1] += weight[i, c] * more
+    for i in range(node.shape[0]):
+        for c in range(node.shape[1]):
+            k = node[i, c]
+            share, more = sums[k, 0], sums[k, 1]
+            if share == 0 and more == 0:
+                continue  # also what another cell has done already
+            if share > 1 and share < near_one:
+                share = one
+            out[k] = out[k] - out[k] * share + more
+            sums[k, 0], sums[k, 1] = zero, zero
 
 
 @kernel(entry=True)
-def write_moved(values, moved, amount, turned, there, shift, node, weight, volume, near_one, sums,
-                out):  # fmt: skip
-    """The tangent of `write`, into out: of values, amount and there it is moved, turned and shift.
-    sums: (3, nodes) of 0, for the parts taken, their tangents and those of what is given."""
+def write_moved(values, out, amount, turned, there, shift, node, weight, volume, near_one, sums):
+    """The tangent of `write`, in place; of amount and there it is turned and shift. sums: (nodes,
+    3) of 0, and so again in the end, for the parts taken, their tangents and those of what is
+    given."""
     half, one = values.dtype.type(0.5), values.dtype.type(1)
     for i in range(node.shape[0]):
         a, sign = amount[i], np.sign(amount[i])
@@ -144,14 +153,19 @@ def write_moved(values, moved, amount, turned, there, shift, node, weight, volum
         less /= content
         for c in range(node.shape[1]):
             k, w = node[i, c], weight[i, c]
-            sums[0, k] += w * part
-            sums[1, k] += w * less
-            sums[2, k] += w * more
-    for k in range(values.shape[0]):
-        share, less = sums[0, k], sums[1, k]
-        if share > 1 and share < near_one:
-            share, less = one, one - one
-        out[k] = moved[k] * (one - share) - values[k] * less + sums[2, k]
+            sums[k, 0] += w * part
+            sums[k, 1] += w * less
+            sums[k, 2] += w * more
+    for i in range(node.shape[0]):
+        for c in range(node.shape[1]):
+            k = node[i, c]
+            share, less, more = sums[k, 0], sums[k, 1], sums[k, 2]
+            if share == 0 and less == 0 and more == 0:
+                continue
+            if share > 1 and share < near_one:
+                share, less = one, one - one
+            out[k] = out[k] * (one - share) - values[k] * less + more
+            sums[k, 0], sums[k, 1], sums[k, 2] = 0, 0, 0
 
 
 @kernel(entry=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import both, only_forward, tracked, with_tangent
 from torchfilm.tools.threads import shares_of
 
+CLOSE = torch.contiguous_format
+NO_MASK = np.zeros(0, bool)
 WORTH_A_THREAD = 20_000  # cells for which another thread is worth to be woken
 
 
@@ -41,16 +44,14 @@ def stencil(
     """As `exchange.stencil`."""
     from torchfilm.kernels.medium import put_stencil
 
-    count = position.shape[0]
-    used = (grid.shape > 1).any(0)
-    node = torch.empty(count, 2 ** int(used.sum()), dtype=torch.int64)
+    count, used = position.shape[0], grid.used
+    node = torch.empty(count, 2 ** sum(used), dtype=torch.int64)
     weight = torch.empty(node.shape, dtype=dtype)
     outside, blocked = torch.zeros(2, count, dtype=torch.bool)
     cells = as_array(position, torch.float64), as_array(colony, torch.int64)
     grids = (
         grid.origin.numpy(), grid.step.numpy(), grid.shape.numpy(), grid.offsets.numpy(),
-        used.numpy(), torch.tensor(periodic).numpy(), SLACK,
-        torch.empty(0, dtype=torch.bool).numpy() if mask is None else mask.numpy(),
+        np.array(used), np.array(periodic), SLACK, NO_MASK if mask is None else mask.numpy(),
     )  # fmt: skip
     out = [x.numpy() for x in (node, weight, outside, blocked)]
     shares_of(
@@ -87,10 +88,11 @@ def pool_volume(stencil: Stencil) -> Tensor:
     """As `exchange.pool_volume`."""
     from torchfilm.kernels.medium import pools
 
-    weight = stencil.weight.detach()
-    out, sums = torch.empty_like(weight[:, 0]), weight.new_zeros(stencil.nodes)
-    volume = torch.tensor(stencil.voxel_volume, dtype=weight.dtype).numpy()[()]
-    pools(stencil.node.numpy(), weight.numpy(), volume, sums.numpy(), out.numpy())
+    weight = as_array(stencil.weight, stencil.weight.dtype)
+    out = torch.empty(len(weight), dtype=stencil.weight.dtype)
+    volume = weight.dtype.type(stencil.voxel_volume)
+    sums = _zeros(stencil.nodes, 1, weight.dtype).reshape(-1)
+    pools(stencil.node.numpy(), weight, volume, sums, out.numpy())
     return out
 
 
@@ -98,13 +100,10 @@ def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps:
     """As `exchange.write`; there: what `read` gives."""
     from torchfilm.kernels.medium import write as put
 
-    taken, given = torch.zeros(2, values.numel(), dtype=values.dtype)
-    out = torch.empty_like(values)
+    out = values.detach().clone(memory_format=CLOSE)
+    each = (as_array(x, values.dtype) for x in (amount, there))
     of_medium = _of_stencil(stencil, values.dtype, ulps)
-    put(
-        *(as_array(x, values.dtype) for x in (values, amount, there)), *of_medium, taken.numpy(),
-        given.numpy(), out.numpy(),
-    )  # fmt: skip
+    put(out.numpy(), *each, *of_medium, _zeros(values.numel(), 2, of_medium[1].dtype))
     return out
 
 
@@ -115,15 +114,33 @@ def write_with_tangent(
     from torchfilm.kernels.medium import write_moved as put
 
     dtype = values.dtype
-    plain = [both(x) for x in (values, amount, there)]
-    pairs = [(x, torch.zeros_like(x) if t is None else t) for x, t in plain]
-    sums, moved = torch.zeros(3, values.numel(), dtype=dtype), torch.empty_like(plain[0][0])
+    (value, change), *pairs = [both(x) for x in (values, amount, there)]
+    moved = torch.zeros_like(value) if change is None else change.clone(memory_format=CLOSE)
+    (amount, _), (there, _) = pairs
+    each = [y for x, t in pairs for y in (x, torch.zeros_like(x) if t is None else t)]
+    of_medium = _of_stencil(stencil, dtype, ulps)
     put(
-        *(as_array(x, dtype) for pair in pairs for x in pair),
-        *_of_stencil(stencil, dtype, ulps), sums.numpy(), moved.numpy(),
+        *(as_array(x, dtype) for x in (value, moved, *each)), *of_medium,
+        _zeros(value.numel(), 3, of_medium[1].dtype),
     )  # fmt: skip
-    (value, _), (change, _), (found, _) = pairs
-    return with_tangent(write(value, change, found, stencil, ulps), moved)
+    return with_tangent(write(value, amount, there, stencil, ulps), moved)
+
+
+# of each type of numbers, what the last use left as 0
+_kept = threading.local()
+MOST_KEPT = 2**22  # numbers
+
+
+def _zeros(rows: int, size: int, dtype: Any) -> np.ndarray:
+    """(rows, size) of 0, for a kernel that leaves it so: setting all voxels to 0 takes longer than
+    what is done where cells are."""
+    if rows * size > MOST_KEPT:
+        return np.zeros((rows, size), dtype)
+    found = getattr(_kept, dtype.char, None)
+    if found is None or len(found) < rows * size:
+        found = np.zeros(rows * size, dtype)
+        setattr(_kept, dtype.char, found)
+    return found[: rows * size].reshape(rows, size)
 
 
 def _of_stencil(
@@ -131,9 +148,9 @@ def _of_stencil(
 ) -> tuple[np.ndarray, np.ndarray, Any, Any]:
     """Nodes, weights, the volume of a voxel, and the share up to which a voxel counts as emptied,
     as kernels take them."""
-    near_one = torch.tensor(1 + ulps * torch.finfo(dtype).eps, dtype=dtype).numpy()[()]
-    volume = torch.tensor(stencil.voxel_volume, dtype=dtype).numpy()[()]
-    return stencil.node.numpy(), as_array(stencil.weight, dtype), volume, near_one
+    weight, near_one = as_array(stencil.weight, dtype), 1 + ulps * torch.finfo(dtype).eps
+    number = weight.dtype.type
+    return stencil.node.numpy(), weight, number(stencil.voxel_volume), number(near_one)
 
 
 def spans(position: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:

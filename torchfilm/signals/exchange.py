@@ -119,7 +119,7 @@ def stencil(
     shape = grid.shape.index_select(0, colony)
     # in voxels from the lower corner
     scaled = (position - grid.origin.index_select(0, colony)) / grid.step
-    used = [axis for axis in range(3) if any(s[axis] > 1 for s in grid.shapes)]
+    used = [axis for axis in range(3) if grid.used[axis]]
     outside = _outside_scaled(scaled, shape, periodic)
     node, weight = _corners(grid, scaled, shape, colony, used, periodic, dtype)
     blocked = None
@@ -249,16 +249,16 @@ def pool_volume(stencil: Stencil) -> Tensor:
     return stencil.voxel_volume / torch.where(worst > 0, worst, 1.0)
 
 
-def write(values: Tensor, amount: Tensor, stencil: Stencil) -> Tensor:
+def write(values: Tensor, amount: Tensor, stencil: Stencil, there: Tensor | None = None) -> Tensor:
     """Values (nodes,) after secretion (amount > 0) or uptake (amount < 0) by each cell.
 
-    amount: (N,), concentration × µm³. Uptake must be at most `read` × `pool_volume`; then every
-    value ≥ 0 stays ≥ 0 exactly. The sum of amounts is conserved to rounding: in a voxel that is
-    emptied, a negative rounding error (a few units in the last place of its content) is set to 0. A
-    larger uptake shows as a value below 0, or as NaN where the voxel was empty. Uptake is taken
-    from the values before secretion.
+    amount: (N,), concentration × µm³. there: (N,), what `read` gives, if it is known. Uptake must
+    be at most `read` × `pool_volume`; then every value ≥ 0 stays ≥ 0 exactly. The sum of amounts is
+    conserved to rounding: in a voxel that is emptied, a negative rounding error (a few units in the
+    last place of its content) is set to 0. A larger uptake shows as a value below 0, or as NaN
+    where the voxel was empty. Uptake is taken from the values before secretion.
     """
-    there = read(values, stencil)
+    there = read(values, stencil) if there is None else there
     if compiled.may_run(values, amount, there):
         return compiled.write(values, amount, there, stencil, ULPS)
     if compiled.may_run_forward(values, amount, there) and compiled.may_run(stencil.weight):

@@ -97,6 +97,12 @@ class Grid:
         return tuple((x, y, z) for x, y, z in self.shape.tolist())
 
     @cached_property
+    def used(self) -> tuple[bool, bool, bool]:
+        """Along which axes a colony has more than one voxel."""
+        x, y, z = (self.shape > 1).any(0).tolist()
+        return x, y, z
+
+    @cached_property
     def counts(self) -> Tensor:
         """(B,) int64, voxels of each colony."""
         return self.shape[:, 0] * self.shape[:, 1] * self.shape[:, 2]

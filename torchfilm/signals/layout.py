@@ -23,12 +23,14 @@ class Contact:
     """Where cells meet the medium.
 
     found: the concentration of each signal at the cells, (N,) by name. in_reservoir: (N,) bool,
-    cells in the reservoir beyond the box, or None if there are none.
+    cells in the reservoir beyond the box, or None if there are none. in_voxels: as found, but also
+    for these what the voxels have.
     """
 
     stencil: Stencil
     found: dict[str, Tensor]
     in_reservoir: Tensor | None
+    in_voxels: dict[str, Tensor]
 
     @cached_property
     def pool(self) -> Tensor:
@@ -126,16 +128,17 @@ class Layout:
         where = self.stencil(position, colony, dtype)
         found = {name: read(value, where) for name, value in signals.items()}
         if self.reservoir is None:
-            return Contact(where, found, None)
+            return Contact(where, found, None, found)
         in_reservoir = where.outside if where.blocked is None else where.outside & ~where.blocked
         if not bool(in_reservoir.any()):
-            return Contact(where, found, None)
-        for name, value in found.items():
+            return Contact(where, found, None, found)
+        in_voxels = dict(found)
+        for name, value in in_voxels.items():
             given = torch.as_tensor(self.reservoir[name], dtype=value.dtype, device=value.device)
             found[name] = torch.where(
                 in_reservoir, given.index_select(0, ids) if given.dim() else given, value
             )
-        return Contact(where, found, in_reservoir)
+        return Contact(where, found, in_reservoir, in_voxels)
 
     def on_faces(
         self, flow: Callable[[Tensor], Tensor], batch: GridBatch

@@ -1,0 +1,75 @@
+"""Cells that grow dilute what they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.physics import capsule
+from torchfilm.tools.numba_calls import as_array, unavailable
+from torchfilm.tools.tangents import scaled, tracked
+
+
+@dataclass(frozen=True, eq=False)
+class HalfWay:
+    """N cells half way, in time, between the volume that their concentrations refer to and their
+    own. length: µm, volume: µm³. before, after: by which growth up to there, and from there on,
+    multiplies concentrations. (N,) each."""
+
+    length: Tensor
+    volume: Tensor
+    before: Tensor
+    after: Tensor
+
+
+def half_way(length: Tensor, radius: Tensor, volume: Tensor) -> HalfWay:
+    """length, radius: (N,) µm, of the cells now. volume: (N,) µm³, that their concentrations refer
+    to."""
+    given = length, radius, volume
+    # torch's square roots are not rounded to the nearest number
+    if length.device.type == "cpu" and not tracked(*given) and not unavailable():
+        from torchfilm.kernels.columns import half_way as put
+
+        dtype, out = length.dtype, torch.empty(4, len(length), dtype=length.dtype)
+        put(*(as_array(x, dtype) for x in given), *out.numpy())
+        return HalfWay(*out)
+    end = capsule.volume(length, radius)
+    middle = (volume * end).sqrt()
+    longer = middle / (torch.pi * radius * radius) - radius * (4.0 / 3.0)
+    own = torch.where(volume == end, length, longer.clamp(min=0.0))
+    middle = capsule.volume(own, radius)
+    return HalfWay(own, middle, volume / middle, middle / end)
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What N cells begin a step with. fields: concentrations of the species by name, (N,), before
+    growth has diluted them. diluted: those that it dilutes."""
+
+    fields: Mapping[str, Tensor]
+    diluted: Sequence[str]
+    half: HalfWay
+
+    @cached_property
+    def diluted_mask(self) -> np.ndarray:
+        """(S,) bool."""
+        return np.array([n in self.diluted for n in self.fields])
+
+    @cached_property
+    def _half_way(self) -> dict[str, Tensor]:
+        by, own = self.half.before, self.diluted
+        return {n: scaled(x, by) if n in own else x for n, x in self.fields.items()}
+
+    def concentrations(self, rows: Tensor) -> Tensor:
+        """Half way, of the cells `rows` (M,): (M, S)."""
+        return torch.stack([x.index_select(0, rows) for x in self._half_way.values()], 1)
+
+    def kept(self) -> dict[str, Tensor]:
+        """In cells that nothing but growth changes, (N,)."""
+        by, own = self.half.after, self.diluted
+        return {n: scaled(x, by) if n in own else x for n, x in self._half_way.items()}

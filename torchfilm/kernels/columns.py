@@ -1,0 +1,98 @@
+"""Columns of cells: gathered from where they lie in memory, and what has become of them stored.
+
+A table of places takes the place of arguments, whose number and types differ from circuit to
+circuit: so these loops are compiled once.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.team import array_at
+
+# What a place says: the column's address, from one of its numbers to the next, their type, the
+# address of factors or 0; in the result, where its first number stands, and from one to the next.
+ADDRESS, STRIDE, TYPE, FACTOR, BEGIN, STEP = range(6)
+ZERO, FLOAT32, FLOAT64, INT64, INT32, BOOL = range(6)  # types; ZERO: there is no column
+
+
+@kernel
+def _copy(first, last, rows, place, like, out):
+    """One column; the product with a factor is one of its type."""
+    by, begin, step = place[STRIDE], place[BEGIN], place[STEP]
+    x = array_at(place, ADDRESS, like, 1)
+    if place[FACTOR] == 0:
+        for m in range(first, last):
+            out[begin + m * step] = x[rows[m] * by]
+        return
+    factor = array_at(place, FACTOR, like, 1)
+    for m in range(first, last):
+        out[begin + m * step] = x[rows[m] * by] * factor[rows[m]]
+
+
+@kernel(entry=True)
+def gather(first, last, rows, places, out):
+    """Put the columns of the cells rows[first … last − 1] into out, float64. places (K, 6)."""
+    for k in range(places.shape[0]):
+        place = places[k]
+        kind = place[TYPE]
+        if kind == FLOAT32:
+            _copy(first, last, rows, place, np.float32, out)
+        elif kind == FLOAT64:
+            _copy(first, last, rows, place, np.float64, out)
+        elif kind == INT64:
+            _copy(first, last, rows, place, np.int64, out)
+        elif kind == INT32:
+            _copy(first, last, rows, place, np.int32, out)
+        elif kind == BOOL:
+            _copy(first, last, rows, place, np.uint8, out)
+        else:
+            for m in range(first, last):
+                out[place[BEGIN] + m * place[STEP]] = 0.0
+
+
+@kernel(entry=True)
+def store(first, last, rows, at, start, pool, thinner, diluted, signals, report, species, given,
+          back, steps):  # fmt: skip
+    """Store what the cells rows[first … last − 1] have become, at (M, V): their species (S, N), and
+    what they give to the signals, of which there are E here: start (E, M). given, back: (signals,
+    N), to pools and to a reservoir, if back has rows. report: (3, M)."""
+    size, count = diluted.shape[0], signals.shape[0]
+    number = species.dtype.type
+    for m in range(first, last):
+        n = rows[m]
+        for k in range(size):
+            x = number(at[m, k])
+            species[k, n] = x * thinner[n] if diluted[k] else x
+        for e in range(count):
+            gain = number(at[m, size + e]) - number(start[e, m])
+            given[signals[e], n] = gain * pool[n]
+            if back.shape[0]:
+                up, down = at[m, size + count + e], at[m, size + 2 * count + e]
+                back[signals[e], n] = number(up) - number(down)
+        steps[n] = report[0, m] + report[1, m]
+
+
+@kernel
+def _volume(length, radius, number):
+    return number(math.pi) * radius * radius * (length + radius * number(4.0 / 3.0))
+
+
+@kernel(entry=True)
+def half_way(length, radius, before, own_length, own_volume, thicker, thinner):
+    """Put the lengths and volumes of cells half way, in time, between the volume `before` and their
+    own, and the ratios of the volumes before, half way and in the end."""
+    number = length.dtype.type
+    for i in range(length.shape[0]):
+        r, end = radius[i], _volume(length[i], radius[i], number)
+        middle = length[i]
+        if before[i] != end:
+            volume = np.sqrt(before[i] * end)
+            longer = volume / (number(math.pi) * r * r) - r * number(4.0 / 3.0)
+            middle = max(longer, number(0.0)) if longer == longer else longer
+        volume = _volume(middle, r, number)
+        own_length[i], own_volume[i] = middle, volume
+        thicker[i], thinner[i] = before[i] / volume, volume / end
