@@ -19,6 +19,15 @@ def total(x):
 """
 
 # Between reading Numba's list and writing it again there is time enough for the other process.
+NO_LOCKS = """
+import errno, fcntl
+
+def flock(*given):
+    raise OSError(errno.ENOSYS, "no locks here")
+
+fcntl.flock = flock
+"""
+
 RUN = """
 import sys, time
 import numpy as np
@@ -35,20 +44,20 @@ print(len(total.stats.cache_hits), len(total.stats.cache_misses))
 """
 
 
+def settings(folder: Path) -> dict[str, str]:
+    """Of a process that keeps its kernels in this folder."""
+    paths = os.pathsep.join([str(folder), str(Path(__file__).parents[1])])
+    return {**os.environ, "XDG_CACHE_HOME": str(folder), "PYTHONPATH": paths}
+
+
 def test_what_two_processes_compile_at_once_is_all_kept(tmp_path: Path):
     (tmp_path / "summing.py").write_text(MODULE)
     (tmp_path / "run.py").write_text(RUN)
-    root = str(Path(__file__).parents[1])
-    settings = {
-        **os.environ,
-        "XDG_CACHE_HOME": str(tmp_path),
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), root]),
-    }
 
     def begun(*names: str) -> subprocess.Popen:
         command = [sys.executable, str(tmp_path / "run.py"), *names]
         pipe = subprocess.PIPE
-        return subprocess.Popen(command, env=settings, stdin=pipe, stdout=pipe, text=True)
+        return subprocess.Popen(command, env=settings(tmp_path), stdin=pipe, stdout=pipe, text=True)
 
     def said(*started: subprocess.Popen) -> list[str]:
         for one in started:
@@ -62,3 +71,11 @@ def test_what_two_processes_compile_at_once_is_all_kept(tmp_path: Path):
     names = "float32", "float64", "int64", "int32"
     assert said(begun(*names[:2]), begun(*names[2:])) == ["0 2", "0 2"]
     assert said(begun(*names)) == ["4 0"]
+
+
+def test_a_file_system_without_locks_is_none_the_worse(tmp_path: Path):
+    (tmp_path / "summing.py").write_text(MODULE)
+    text = NO_LOCKS + "import numpy as np\nfrom summing import total\nprint(total(np.ones(4)))"
+    command = [sys.executable, "-c", text]
+    out = subprocess.run(command, env=settings(tmp_path), capture_output=True, text=True)
+    assert (out.returncode, out.stdout, out.stderr) == (0, "4.0\n", "")

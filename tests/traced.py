@@ -17,11 +17,12 @@ from hypothesis import strategies as st
 import torchfilm as tf
 from torchfilm import parts
 from torchfilm.circuits import compiled, emission
+from torchfilm.circuits.compiled_step import readings
 from torchfilm.circuits.emission import Equations
 from torchfilm.circuits.expressions import Builder
 from torchfilm.circuits.graph import evaluated
 from torchfilm.circuits.tracing import Column, lowered
-from torchfilm.effects.bound_circuit import BoundCircuit
+from torchfilm.effects import bound_circuit
 from torchfilm.kernels import functions
 from torchfilm.kernels.compiling import for_python
 
@@ -158,15 +159,14 @@ def one_step(scene: tf.Scene, dtype: torch.dtype = torch.float64):
     """The circuit of a scene, what its cells begin the first step with, and their concentrations
     then."""
     seen = []
-    step = BoundCircuit._by_kernels
     try:
-        BoundCircuit._by_kernels = lambda self, *args: seen.append(args) or step(self, *args)
+        bound_circuit.readings = lambda *args: seen.append(args) or readings(*args)
         model = scene.bind(seed=1, dtype=dtype)
         model.step(model.start(), 0.1)
     finally:
-        BoundCircuit._by_kernels = step
-    start, cells, *_ = seen[0]
-    return cells[0], start, start.concentrations(cells[0].rows)
+        bound_circuit.readings = readings
+    cells, start, _ = seen[0]
+    return cells, start, start.concentrations(cells.rows)
 
 
 # --- circuits at random ---------------------------------------------------------------------------

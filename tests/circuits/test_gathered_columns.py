@@ -38,11 +38,47 @@ def marked(u, s, p, cell):
     return {"a": p.k + cell.mark - 0.5 * u.a + cell.x * 0.25}
 
 
+def decay(u, s, p, cell):
+    return {"a": p.k - 0.5 * u.a}
+
+
 @pytest.mark.parametrize("kind", TYPES, ids=str)
 def test_columns_of_every_type_are_read(kind, dtype):
     made = ends(alone(Marks(kind), tf.Circuit(marked, species="a", k=0.25)), 1, dtype=dtype)
     assert len(made[0].fields["mark"].unique()) > 1 and made[0].fields["mark"].dtype == kind
     equal(*made)
+
+
+@pytest.mark.parametrize("given", [torch.float64, torch.float32, torch.int64], ids=str)
+def test_species_of_another_type_become_numbers_of_the_state(given, dtype):
+    """Such as an array of numpy that a user has put in."""
+    model = alone(tf.Circuit(decay, species="a", k=0.25)).bind(seed=1, dtype=dtype)
+    state = model.start()
+    first = torch.arange(state.cells)
+    step = lambda x: model.step(state.with_fields(a=x), 0.25).fields["a"]
+    one, other = step(first.to(given)), step(first.to(dtype))
+    assert one.dtype == dtype and torch.equal(one, other)
+
+
+@pytest.mark.parametrize("shape", [(3,), (40,), (12, 1)])
+@pytest.mark.parametrize("name", ["a", "mark"])
+def test_columns_of_another_length_are_refused(name, shape):
+    scene = alone(Marks(F64), tf.Circuit(marked, species="a", k=0.25))
+    model = scene.bind(seed=1, dtype=F64)
+    state = model.start()
+    assert state.cells == 12
+    with pytest.raises(tf.InputError, match=rf"shape of (cell\.)?{name} = .*\(12,\)"):
+        model.step(state.with_fields(**{name: torch.ones(shape, dtype=F64)}), 0.25)
+
+
+def test_a_gradient_does_not_change_how_much_growth_dilutes(dtype):
+    """By torch, for the gradient, and by a kernel: the same bits."""
+    length, radius = torch.rand(2, 1000, generator=torch.Generator().manual_seed(1), dtype=dtype)
+    before = capsule.volume(length, radius) * 0.9
+    one = half_way(length, radius, before)
+    other = half_way(length.clone().requires_grad_(), radius, before)
+    for name in ("length", "volume", "before", "after"):
+        assert torch.equal(getattr(one, name), getattr(other, name).detach())
 
 
 def test_half_way_between_two_volumes(dtype):

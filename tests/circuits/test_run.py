@@ -198,7 +198,7 @@ def test_columns_are_picked_out_when_asked_for_and_noted():
         and len(columns) == 4
         and list(columns) == ["a", "k", "t", "slow"]
     )
-    assert repr(columns) == "Columns(a, slow, k, t)"
+    assert repr(columns) == "Columns(a, k, t, slow)"
     with pytest.raises(UnknownName, match=r"cell has no 'slwo'.*Did you mean 'slow'"):
         _ = columns.slwo
     with pytest.raises(UnknownName, match="can only be read"):

@@ -107,10 +107,12 @@ class Compiled:
 
     @cached_property
     def _last(self) -> list[tuple[list[Tensor], np.ndarray]]:
+        """The numbers' tensors of the last step, and what they were packed to."""
         return [([], np.zeros(1))]
 
     def numbers_of(self, values: Mapping[str, Tensor]) -> np.ndarray:
-        """The numbers (L,) float64. Most are the same tensors in each step."""
+        """The numbers (L,) float64. A model copies its values: the same tensor is the same number,
+        and in most steps all are."""
         given, (last, found) = [values[n] for n in self.numbers], self._last[0]
         if len(given) != len(last) or not all(map(operator.is_, given, last)):
             found = packed(values, self.numbers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +15,7 @@ from torch import Tensor
 from torchfilm.circuits.compiled import WORTH_A_THREAD
 from torchfilm.circuits.compiled_stiff import CompiledCircuit, limits
 from torchfilm.circuits.dilution import Start
+from torchfilm.tools import checks
 from torchfilm.tools.tangents import tracked
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def readings(cells: CircuitCells, start: Start, dt: float) -> dict[str, Tensor] 
     if not isinstance(compiled, CompiledCircuit) or cells.by_torch or dt == 0:
         return None
     found = compiled.sources(cells, {"pool": cells.pool, "away": cells.in_reservoir})
-    begin = (*start.fields.values(), start.half.before, *cells.signals.values())
+    begin = (*start.fields.values(), start.half.before, *(cells.signals[n] for n in cells.given))
     return None if tracked(*begin, *found.values()) else found
 
 
@@ -63,22 +64,24 @@ def advance(
 ) -> np.ndarray:  # fmt: skip
     """The circuit over dt hours in the cells `cells.rows` (M,) from `start`, with these `readings`.
     Returns the status of each, (M,), as `rosenbrock` has it."""
-    from torchfilm.kernels.columns import gather, store
+    from torchfilm.kernels.columns import WORDS, gather, store
 
     compiled, half = cells.compiled, start.half
     assert isinstance(compiled, CompiledCircuit)
-    read = [_known(values[n]) for n in compiled.columns] + [cells.signals[n] for n in cells.given]
-    begin = [*start.fields.values(), *read[len(compiled.columns) :]]
-    count, size = len(cells.rows), len(compiled.equations.variables)
-    rest, factor = len(read) * count, half.before.data_ptr()
+    count, size, begin = len(cells.rows), len(compiled.equations.variables), len(start.fields)
+    columns = {n: _known(values[n]) for n in compiled.columns}
+    found = {f"s.{n}": cells.signals[n] for n in cells.given}
+    row = partial(_row, cells=len(half.volume))
     table: list[int] = []
-    mask = start.diluted_mask.tolist()
-    for k, x in enumerate(read):
-        table += *_place(x), 0, k * count, 1
-    for k, x in enumerate(begin):
-        table += *_place(x), factor * (k < len(mask) and mask[k]), rest + k, size
-    for k in range(len(begin), size):  # what a reservoir is given and gives
-        table += 0, 0, 0, 0, rest + k, size
+    for k, (name, x) in enumerate([*columns.items(), *found.items()]):
+        table += row(name, x, 0, k * count, 1)
+    rest, factor = len(table) // WORDS * count, half.before.data_ptr()
+    for k, (name, x) in enumerate(start.fields.items()):
+        table += row(name, x, factor if name in start.diluted else 0, rest + k, size)
+    for k, (name, x) in enumerate(found.items(), begin):
+        table += row(name, x, 0, rest + k, size)
+    for k in range(begin + len(found), size):  # what a reservoir is given and gives
+        table += _row("", None, 0, rest + k, size)
     memory = np.empty(rest + size * count)
     at, rows = memory[rest:].reshape(count, size), cells.rows.numpy()
     each = memory[:rest].reshape(-1, count)  # columns, then signals at the start
@@ -86,11 +89,11 @@ def advance(
     given = (each, compiled.numbers_of(values), *limits(dt, rtol, atol, half.after.dtype), *report)
     pool = half.volume if cells.pool is None else cells.pool
     ends = (
-        at, each[len(compiled.columns) :], pool.numpy(), half.after.numpy(), start.diluted_mask,
+        at, each[len(columns) :], pool.numpy(), half.after.numpy(), start.diluted_mask,
         np.array([into.signals.index(n) for n in cells.given], np.int64), report,
         into.species.numpy(), into.given.numpy(), into.back.numpy(), into.steps.numpy(),
     )  # fmt: skip
-    places, run = np.array(table, np.int64).reshape(-1, 6), compiled.module.run
+    places, run = np.array(table, np.int64).reshape(-1, WORDS), compiled.module.run
 
     def work(low: int, high: int) -> None:
         gather(low, high, rows, places, memory)
@@ -116,6 +119,13 @@ def _known(x: Tensor) -> Tensor:
     return x if x.dtype in _types() else x.double()
 
 
-def _place(x: Tensor) -> tuple[int, int, int]:
-    """Address, stride and type of a column."""
-    return x.data_ptr(), x.stride(0), _types()[x.dtype]
+def _row(
+    name: str, column: Tensor | None, factor: int, begin: int, step: int, cells: int = 0
+) -> tuple[int, ...]:
+    """A place, as `gather` takes it, of a column (N,) of this name; None: of zeros."""
+    if column is None:
+        return 0, 0, 0, factor, begin, step
+    if column.shape != (cells,):
+        shape, wanted = tuple(column.shape), f"({cells},): one number for each cell"
+        raise checks.input_error(f"shape of {name}", shape, wanted)
+    return column.data_ptr(), column.stride(0), _types()[column.dtype], factor, begin, step

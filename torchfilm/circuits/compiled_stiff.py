@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -112,7 +112,7 @@ class CompiledTangents(Compiled):
         return with_tangent(at.to(dtype), moved.to(dtype)), RosenbrockReport(*report)
 
 
-@cache
+@lru_cache(64)
 def limits(dt: float, rtol: float, atol: float, dtype: torch.dtype) -> tuple[float, ...]:
     """What `run` is told of the step's length and tolerances."""
     limits = torch.finfo(dtype)

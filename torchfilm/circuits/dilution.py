@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchfilm.physics import capsule
 from torchfilm.tools.numba_calls import as_array, unavailable
-from torchfilm.tools.tangents import scaled, tracked
+from torchfilm.tools.tangents import both, scaled, tracked
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,6 @@ def half_way(length: Tensor, radius: Tensor, volume: Tensor) -> HalfWay:
     """length, radius: (N,) µm, of the cells now. volume: (N,) µm³, that their concentrations refer
     to."""
     given = length, radius, volume
-    # torch's square roots are not rounded to the nearest number
     if length.device.type == "cpu" and not tracked(*given) and not unavailable():
         from torchfilm.kernels.columns import half_way as put
 
@@ -39,11 +38,20 @@ def half_way(length: Tensor, radius: Tensor, volume: Tensor) -> HalfWay:
         put(*(as_array(x, dtype) for x in given), *out.numpy())
         return HalfWay(*out)
     end = capsule.volume(length, radius)
-    middle = (volume * end).sqrt()
+    middle = _root(volume * end)
     longer = middle / (torch.pi * radius * radius) - radius * (4.0 / 3.0)
     own = torch.where(volume == end, length, longer.clamp(min=0.0))
     middle = capsule.volume(own, radius)
     return HalfWay(own, middle, volume / middle, middle / end)
+
+
+def _root(x: Tensor) -> Tensor:
+    """√x to the nearest number, as kernels have it; torch's own may be the next one."""
+    found = x.sqrt()
+    if x.device.type != "cpu":
+        return found
+    plain, nearest = both(found)[0], torch.from_numpy(np.sqrt(both(x)[0].numpy()))
+    return found + torch.where(nearest == plain, 0.0, nearest - plain)
 
 
 @dataclass(frozen=True, eq=False)

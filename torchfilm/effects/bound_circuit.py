@@ -270,10 +270,15 @@ class BoundCircuit(BoundEffect):
             for kind in self.rates
             if (rows := _cells_of(state, kind)).numel()
         ]
-        start = Start({n: state.fields[n] for n in self.fields}, circuit.diluted_fields, half)
-        report = Failures(state, circuit.method, dt)
-        changed, left = self._by_kernels(start, cells, medium, report)
-        if left:
+        fields = {n: state.fields[n].to(state.dtype) for n in self.fields}
+        start, report = (
+            Start(fields, circuit.diluted_fields, half),
+            Failures(state, circuit.method, dt),
+        )
+        read = [(c, readings(c, start, dt)) for c in cells]
+        taken = [(c, values) for c, values in read if values is not None]
+        changed = self._by_kernels(start, taken, medium, report) if taken else start.kept()
+        if left := [c for c, values in read if values is None]:
             changed = self._by_torch(state, start, left, medium, report, changed)
         if medium is not None:
             state = medium.settle()
@@ -283,17 +288,12 @@ class BoundCircuit(BoundEffect):
     def _by_kernels(
         self,
         start: Start,
-        cells: Sequence[run.CircuitCells],
+        taken: Sequence[tuple[run.CircuitCells, Mapping[str, Tensor]]],
         medium: MediumExchange | None,
         report: Failures,
-    ) -> tuple[dict[str, Tensor], list[run.CircuitCells]]:
-        """The species of all cells (N,) after the circuits that kernels step, and the circuits that
-        are left."""
-        read = [readings(c, start, report.dt) for c in cells]
-        left = [c for c, values in zip(cells, read, strict=True) if values is None]
-        taken = [(c, x) for c, x in zip(cells, read, strict=True) if x is not None]
-        if not taken:
-            return start.kept(), left
+    ) -> dict[str, Tensor]:
+        """The species of all cells (N,) after these circuits, each with its readings; in cells of
+        others after growth alone."""
         whole = sum(c.rows.numel() for c, _ in taken) == report.state.cells
         names = tuple(dict.fromkeys(n for c, _ in taken for n in c.given))
         into = Changes.of(start, names, any(c.in_reservoir is not None for c, _ in taken), whole)
@@ -305,7 +305,7 @@ class BoundCircuit(BoundEffect):
         for k, name in enumerate(names):
             assert medium is not None
             medium.give(name, into.given[k], into.back[k] if len(into.back) else None)
-        return dict(zip(start.fields, into.species.unbind(), strict=True)), left
+        return dict(zip(start.fields, into.species.unbind(), strict=True))
 
     def _by_torch(
         self,

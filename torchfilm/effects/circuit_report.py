@@ -36,7 +36,7 @@ class Failures:
         self.state, self.method, self.dt = state, method, dt
         self.status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
         self.steps = torch.zeros(state.cells, dtype=torch.int64, device=state.device)
-        self.words: dict[int, str] = {}
+        self.words: dict[int, tuple[int, str]] = {}  # the first cell of a colony, and its words
 
     def note(
         self, start: Start, cells: run.CircuitCells, code: Tensor, steps: Tensor | None = None
@@ -60,8 +60,10 @@ class Failures:
                 else ""
             )
             more = f"; and {len(mine) - 1} more cell(s)" if len(mine) > 1 else ""
-            self.words[place] = f"circuit of cell {int(state.uid[row])}{kind}: {said}{more}"
+            text = f"circuit of cell {int(state.uid[row])}{kind}: {said}{more}"
+            self.words[place] = min((row, text), self.words.get(place, (row, text)))
             self.status[place] = 1
 
     def report(self) -> CircuitReport:
-        return CircuitReport(self.status, self.steps, self.words)
+        words = {place: text for place, (_, text) in self.words.items()}
+        return CircuitReport(self.status, self.steps, words)

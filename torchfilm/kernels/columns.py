@@ -16,6 +16,7 @@ from torchfilm.kernels.team import array_at
 # What a place says: the column's address, from one of its numbers to the next, their type, the
 # address of factors or 0; in the result, where its first number stands, and from one to the next.
 ADDRESS, STRIDE, TYPE, FACTOR, BEGIN, STEP = range(6)
+WORDS = 6
 ZERO, FLOAT32, FLOAT64, INT64, INT32, BOOL = range(6)  # types; ZERO: there is no column
 
 

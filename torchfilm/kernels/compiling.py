@@ -9,7 +9,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -133,15 +133,17 @@ def _alone(name: str) -> Iterator[None]:
     """No other process is in here with this name. Numba reads the list of what it has kept of a
     function, adds to it and writes it again; two processes that do so at once would give different
     code one place."""
-    try:
-        file = None if FOLDER is None else (FOLDER / f"{name}.lock").open("w")
-    except OSError:  # the folder has gone
-        file = None
-    if file is None or fcntl is None:
+    if FOLDER is None or fcntl is None:
         yield
         return
-    with file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
+    with ExitStack() as held:
+        try:
+            file = held.enter_context((FOLDER / f"{name}.lock").open("w"))
+            fcntl.flock(file, fcntl.LOCK_EX)
+            # not only closed: a process that was forked meanwhile has the file open, too
+            held.callback(fcntl.flock, file, fcntl.LOCK_UN)
+        except OSError:  # the folder has gone, or its file system knows no locks
+            pass
         yield
 
 
@@ -215,5 +217,6 @@ def native(signature, function):
     """Compile a function for this signature now, so that it has an address. It is kept as kernels
     are."""
     compile_for: Any = numba.cfunc
-    with _kept_in_folder() as kept, _alone(function.__name__):
+    name = function.__qualname__.replace("<locals>.", "")
+    with _kept_in_folder() as kept, _alone(name):
         return compile_for(signature, nopython=True, cache=kept, error_model="numpy")(function)
