@@ -148,19 +148,46 @@ def test_residuals_of_a_course_add_up_to_the_loss_of_each_colony():
     assert torch.equal(at_end, TARGETS["bands"].residuals(run[-1]))
     notes = torch.stack([target.note(s) for s in run])
     assert target.residuals(run[-1], notes) is None  # of losses alone
-    assert not Weighted([(target, 1.0), (TARGETS["ring"], 0.5)]).squares
+    assert Weighted([(target, 1.0), (TARGETS["ring"], 0.5)]).squares
     assert Lasting(Weighted([(TARGETS["ring"], 0.5)]), since=0.0).squares
     assert not Lasting(Burden(), since=0.0).squares
+    assert not Weighted([(target, 1.0), (Burden(), 0.5)]).squares
+
+
+def test_residuals_of_a_sum_of_courses_add_up_to_its_loss():
+    """Two patterns that last, from different times on, and one of the end; one sum in another."""
+    state = crowded()
+    late, early = Lasting(TARGETS["bands"], since=1.0), Lasting(TARGETS["stripe"], since=0.4)
+    inner = Weighted([(early, 0.3), (TARGETS["ring"], 0.5)])
+    target = Weighted([(late, 2.0), (TARGETS["bands"], 0.7), (inner, 0.6)])
+    assert target.squares
+    run = [state.with_fields(yfp=state.yfp ** (1.0 + k)).replace(time=0.5 * k) for k in range(5)]
+    wide = [target.course(s) for s in run]
+    assert len({w.shape[1] for w in wide}) == 3  # from 0.5 h on, and from 1 h on, there is more
+    most = max(w.shape[1] for w in wide)
+    history = torch.stack([torch.nn.functional.pad(w, (0, most - w.shape[1])) for w in wide])
+    history[3:, 1] = torch.nan  # a colony that ended
+    found = target.residuals(run[-1], history).square().sum(1)
+    assert found.numpy() == pytest.approx(target.loss(run[-1], history).numpy(), abs=1e-12)
+    notes = torch.stack([target.note(s) for s in run])
+    assert torch.equal(target.loss(run[-1], notes[:3]), target.loss(run[-1], history[:3]))
+    assert target.residuals(run[-1], notes) is None  # of losses alone
 
 
 def test_slopes_of_a_sum_with_a_lasting_pattern_are_those_of_its_loss():
     target = Weighted([(LASTING, 1.0), (EDGES, 0.5)])
     objective = objective_of(lit, TWO, target, cells=8, replicates=2, dtype=torch.float64)
     found = objective.evaluate(POINTS[:1], slopes=True)
-    assert not objective.least_squares and np.isnan(found.slopes.curvature).all()
+    assert objective.least_squares
     step = np.array([2e-4, 0.0])
     more, less = (objective.evaluate(POINTS[:1] + s).loss for s in (step, -step))
     assert found.slopes.gradient[:, 0] == pytest.approx((more - less) / 4e-4, rel=0.02)
+    parts = [
+        objective_of(lit, TWO, part, cells=8, replicates=2, dtype=torch.float64)
+        for part in (LASTING, EDGES)
+    ]
+    lasting, end = (o.evaluate(POINTS[:1], slopes=True).slopes.curvature for o in parts)
+    assert found.slopes.curvature == pytest.approx(lasting + 0.5 * end, rel=1e-9)
 
 
 def test_a_descent_finds_a_pattern_that_lasts():
