@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.walls import Wall
 from torchfilm.state import CELL_TYPE, RESERVED, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.tables import Table
@@ -309,16 +310,17 @@ class Cells:
 
         return Cells(**table_cells(Table.read(columns, str(path)), Reading()))
 
-    def relaxed(self, depth: float = 0.01) -> Cells:
-        """The same cells, pushed apart until none overlap by more than `depth` µm. Lengths and
-        radii do not change; one-sided contacts move and turn the cells. `summary` says how far
-        cells of a micrograph moved.
+    def relaxed(self, depth: float = 0.01, walls: Sequence[Wall] = ()) -> Cells:
+        """The same cells, pushed apart until none overlap by more than `depth` µm, and out of the
+        walls of a scene, soft ones too: `cells.relaxed(walls=[tf.Channel(…)])`. Lengths and radii
+        do not change; one-sided contacts move and turn the cells. `summary` says how far cells of a
+        micrograph moved.
 
         Raises SimulationError if they still overlap after 200 steps.
         """
         from torchfilm.micrographs.relaxing import relax
 
-        return relax(self, depth)
+        return relax(self, depth, walls)
 
     def table(self) -> dict[str, np.ndarray]:
         """The cells as columns (N,) with their units in the names, for `from_table`, for

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
-from torchfilm.physics.walls import Wall
+from torchfilm.physics.walls import Wall, depth_in_walls
 from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
@@ -45,11 +45,8 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     pairs = Groups(state.colony.index_select(0, i[deep]), state.colonies)
     count = pairs.counts
     mean = pairs.sum(depth[deep].unsqueeze(1)).squeeze(1) / count.clamp(min=1)
-    at_walls, ids = torch.zeros_like(length), state.own_colony_id
-    for surface in (s for wall in walls for s in wall.surfaces(state.dim)):
-        s = surface.deepest(state.position, axis, 0.5 * length, ids)
-        distance, _ = surface.gap_of_points(state.position + s.unsqueeze(1) * axis, ids)
-        at_walls = torch.maximum(at_walls, radius - distance)
+    placed = (state.position, axis, length, radius, state.own_colony_id)
+    at_walls = depth_in_walls(walls, *placed)
     return Overlap(mean, pairs.max(depth[deep]), count, state.groups.max(at_walls))
 
 

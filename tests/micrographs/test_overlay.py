@@ -153,6 +153,26 @@ def test_relaxed_cells_start_without_a_warning():
     assert state.position.dtype == torch.float64
 
 
+@pytest.mark.parametrize("stiffness", [None, 1.0])
+def test_relaxed_cells_lie_in_no_wall(stiffness):
+    """Two that overlap between two walls, and one that lies in a wall and overlaps no cell."""
+    walls = [
+        tf.Plane(y=-1.0, facing="+y", stiffness=stiffness),
+        tf.Plane(y=1.0, facing="-y", stiffness=stiffness),
+    ]
+    before = tf.Cells([[0.0, 0.0], [0.0, 0.3], [20.0, 0.7]], [1.0, 0.0], length=2.0, radius=0.5)
+    after = before.relaxed(walls=walls)
+    assert not after.overlaps(0.01) and abs(float(after.position[2, 0]) - 20.0) < 1e-6
+    reach = np.abs(after.position[:, 1]) + np.abs(after.axis[:, 1]) * after.length / 2 + 0.5
+    assert reach.max() < 1.01
+    alone = before.relaxed()
+    assert np.abs(alone.position[2] - before.position[2]).max() == 0.0
+    with pytest.raises(tf.SimulationError, match=r"still overlap.*cell and a wall by"):
+        tf.Cells([[0.0, 0.0]], [1.0, 0.0], radius=1.2).relaxed(walls=walls)
+    with pytest.raises(tf.InputError, match=r"Mechanics\.walls"):
+        before.relaxed(walls=["floor"])
+
+
 def test_a_depth_that_is_none_is_refused():
     with pytest.raises(tf.InputError, match="depth = 0"):
         cells().relaxed(0.0)

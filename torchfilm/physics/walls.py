@@ -63,6 +63,20 @@ class Wall(metaclass=checks.KnownKeywords):
         raise NotImplementedError
 
 
+def depth_in_walls(
+    walls: Sequence[Wall], position: Tensor, axis: Tensor, length: Tensor, radius: Tensor,
+    ids: Tensor,
+) -> Tensor:  # fmt: skip
+    """How deep each cell lies in a wall, where it is deepest, (N,) float64 µm; 0 in none. position,
+    axis: (N, d). ids: (N,), of the cells' colonies."""
+    deep, axis, half = torch.zeros_like(length.double()), axis.double(), 0.5 * length.double()
+    for surface in (s for wall in walls for s in wall.surfaces(position.shape[1])):
+        s = surface.deepest(position, axis, half, ids)
+        distance, _ = surface.gap_of_points(position + s.unsqueeze(1) * axis, ids)
+        deep = torch.maximum(deep, radius.double() - distance)
+    return deep
+
+
 def _each(given: Any) -> list[Any]:
     if isinstance(given, Tensor) or not hasattr(given, "values"):
         return [given]
