@@ -433,7 +433,8 @@ def test_spending_is_what_the_operators_are():
     """The step with every effect counted apart, against the same step counted as a whole: nothing
     is left between effects but the step's own clock."""
     model = tf.scenes.quorum_sensing().bind()
-    # two, since a state keeps what was worked out of it
+    # a model keeps its numbers as kernels take them, and a state what was worked out of it
+    model.step(model.start())
     one, other, spent = model.start(), model.start(), Spending()
     with Operators() as seen:
         model.step(one)
