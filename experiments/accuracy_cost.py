@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -38,7 +38,8 @@ import splitting  # noqa: E402
 from record import machine  # noqa: E402
 from study import Study, plot, table, write_csv  # noqa: E402
 
-STUDIES: dict[str, Callable[[bool], list[Study]]] = {
+# Each is stored as soon as it is done.
+STUDIES: dict[str, Callable[[bool], Iterator[Study]]] = {
     "mechanics": mechanics.studies,
     "circuits": circuits.studies,
     "signals": signals.studies,

@@ -10,7 +10,7 @@ S evaluations.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
@@ -332,15 +332,11 @@ def growing(quick: bool) -> Study:
     return Study(problem.name, problem.title, WORK, (ERROR,), points)
 
 
-def studies(quick: bool) -> list[Study]:
-    """Returns all studies of the circuits: one per problem without growth, and one with growth."""
-    if quick:
-        return [
-            *(
-                sweep(replace(p, until=2.0), quick)
-                for p in problems()
-                if p.name in ("circuits_toggle", "circuits_lux")
-            ),
-            growing(quick),
-        ]
-    return [*(sweep(p, quick) for p in problems()), growing(quick)]
+def studies(quick: bool) -> Iterator[Study]:
+    """Runs all studies of the circuits: one per problem without growth, and one with growth."""
+    for p in problems():
+        if not quick:
+            yield sweep(p, quick)
+        elif p.name in ("circuits_toggle", "circuits_lux"):
+            yield sweep(replace(p, until=2.0), quick)
+    yield growing(quick)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from contact_settings import (
@@ -330,6 +330,8 @@ def long(dim: int, quick: bool) -> Study:
     )
 
 
-def studies(quick: bool) -> list[Study]:
-    """Returns all studies of the mechanics."""
-    return [study(dim, quick) for study in (order, window, long) for dim in (2, 3)]
+def studies(quick: bool) -> Iterator[Study]:
+    """Runs all studies of the mechanics, one after the other."""
+    for study in (order, window, long):
+        for dim in (2, 3):
+            yield study(dim, quick)

@@ -415,11 +415,11 @@ def at_a_cell(quick: bool) -> Study:
     return Study("signals_cell", "What a cell reads of its own signal", WORK, shown, points)
 
 
-def studies(quick: bool) -> list[Study]:
-    """Returns all studies of transport."""
-    cases = [c for c in CASES if not quick or c.name != "signals_still"]
-    return [
-        *(in_time(c, quick) for c in cases),
-        *(in_space(*drift, quick) for drift in DRIFTS),
-        at_a_cell(quick),
-    ]
+def studies(quick: bool) -> Iterator[Study]:
+    """Runs all studies of transport, one after the other."""
+    for case in CASES:
+        if not quick or case.name != "signals_still":
+            yield in_time(case, quick)
+    for drift in DRIFTS:
+        yield in_space(*drift, quick)
+    yield at_a_cell(quick)

@@ -11,7 +11,7 @@ stencil. It has neither splitting nor pools.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -304,9 +304,9 @@ def boundary(quick: bool) -> Study:
     return Study("splitting_boundary", "Statistics: the boundary detector", work, shown, points)
 
 
-def studies(quick: bool) -> list[Study]:
-    """Returns all studies of the splitting: small systems at rest and a growing colony."""
-    return [
-        *(split_steps(c, quick) for c in cases() if not quick or c.name != "splitting_fixed"),
-        boundary(quick),
-    ]
+def studies(quick: bool) -> Iterator[Study]:
+    """Runs all studies of the splitting: small systems at rest and a growing colony."""
+    for case in cases():
+        if not quick or case.name != "splitting_fixed":
+            yield split_steps(case, quick)
+    yield boundary(quick)
