@@ -3,10 +3,9 @@ with circuits by both backends, and circuits at random."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import cache
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -29,17 +28,6 @@ from torchfilm.kernels.compiling import for_python
 COMPILER = "from torchfilm.kernels.compiling import kernel\n"
 
 
-def _numpy(name: str) -> Callable:
-    """A function of math as Numba has it: no error where a number overflows or is none."""
-    return lambda x: getattr(np, {"atan": "arctan"}.get(name, name))(x)
-
-
-MATH = SimpleNamespace(
-    **{n: _numpy(n) for n in ("exp", "expm1", "log", "sin", "cos", "tan", "tanh", "atan")},
-    floor=math.floor,
-)
-
-
 @cache
 def plain_module(text: str) -> ModuleType:
     """The module of a circuit without a compiler: a stand-in for `compiled._module`."""
@@ -51,7 +39,7 @@ def plain_module(text: str) -> ModuleType:
         if hasattr(made, "py_func"):
             is_short = made is getattr(functions, name, None)
             module.__dict__[name] = made.py_func if is_short else for_python(made)
-    module.__dict__["math"] = MATH
+    module.__dict__["WIDTH"] = 1  # one cell after the other
     for name in {"run", "run_moved"} & set(module.__dict__):
         module.__dict__[name] = _quiet(module.__dict__[name])
     return module
@@ -100,7 +88,7 @@ def emitted(function: Callable, **columns: torch.Tensor) -> np.ndarray:
     (simple,) = lowered([found.expression], leaves, builder)
     kinds = {n: (x.dtype, x.dim()) for n, x in columns.items()}
     equations = Equations((simple.expression,), ("x",), kinds, builder)
-    text = compiled.HEAD.format(what="one rate", constants="") + emission.functions(equations)
+    text = compiled.HEAD.format(what="one rate", constants="") + emission.functions(equations)[0]
     module = plain_module(text + "def run():\n    pass\n")
     out = []
     with np.errstate(all="ignore"):
@@ -155,13 +143,13 @@ def close(a: tf.State, b: tf.State, rel: float, least: float = 0.0) -> None:
         assert array(x) == pytest.approx(array(b.fields[name]), rel=rel, abs=least), name
 
 
-def one_step(scene: tf.Scene, dtype: torch.dtype = torch.float64):
+def one_step(scene: tf.Scene, dtype: torch.dtype = torch.float64, **bind):
     """The circuit of a scene, what its cells begin the first step with, and their concentrations
     then."""
     seen = []
     try:
         bound_circuit.readings = lambda *args: seen.append(args) or readings(*args)
-        model = scene.bind(seed=1, dtype=dtype)
+        model = scene.bind(seed=1, dtype=dtype, **bind)
         model.step(model.start(), 0.1)
     finally:
         bound_circuit.readings = readings

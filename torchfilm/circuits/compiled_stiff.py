@@ -16,7 +16,7 @@ from torchfilm.circuits.emission import functions, tangent_functions
 from torchfilm.circuits.expressions import Expression
 from torchfilm.circuits.graph import evaluated
 from torchfilm.circuits.rosenbrock import MAX_STEPS, RosenbrockReport
-from torchfilm.circuits.stiff_text import CONSTANTS, method
+from torchfilm.circuits.stiff_text import CONSTANTS, method, step
 from torchfilm.circuits.tangent_text import tangent_method
 from torchfilm.tools.tangents import both, has_tangent, in_forward_mode, only_forward, with_tangent
 
@@ -34,8 +34,12 @@ class CompiledCircuit(Compiled):
 
     @property
     def text(self) -> str:
-        size = len(self.equations.variables)
-        return self.head(CONSTANTS) + functions(self.equations) + method(size, self.leaves())
+        text, prepared = functions(self.equations)
+        return (
+            self.head(CONSTANTS)
+            + text
+            + method(len(self.equations.variables), prepared, self.leaves())
+        )
 
     def slopes_by_torch(self, circuit: CircuitCells, u: Tensor, rows: Tensor) -> Tensor:
         """∂fᵢ/∂uₖ (V, V, M) at u (V, M) of the cells `rows` (M,) among all."""
@@ -78,12 +82,14 @@ class CompiledTangents(Compiled):
 
     @cached_property
     def text(self) -> str:  # type: ignore[override]
-        equations, size = self.equations, len(self.equations.variables)
+        equations, (text, prepared) = self.equations, functions(self.equations)
         names = [n for n in equations.leaves if n in (*self.moving, *self.moving_numbers)]
         turns = places(names, self.moving, self.moving_numbers, ("turning", "turned"))
+        size, leaves = len(equations.variables), self.leaves()
+        fixed = {"c": prepared, "leaf": len(equations.leaves), "turn": len(names)}
         return "".join((
-            self.head(CONSTANTS), functions(equations), tangent_functions(equations, names),
-            method(size, self.leaves()), tangent_method(size, self.leaves(), turns),
+            self.head(CONSTANTS), text, tangent_functions(equations, names),
+            step(size), tangent_method(size, fixed, leaves, turns),
         ))  # fmt: skip
 
     def rodas3(

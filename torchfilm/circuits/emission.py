@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 
@@ -30,13 +29,12 @@ from torchfilm.circuits.tracing import CASTS, FULL, Kind, Untraceable, common_ty
 
 SIGNS = {
     "add": "+", "sub": "-", "mul": "*", "div": "/", "gt": ">", "ge": ">=", "lt": "<", "le": "<=",
-    "eq": "==", "ne": "!=", "and": "and", "or": "or",
+    "eq": "==", "ne": "!=", "and": "&", "or": "|",
 }  # fmt: skip
 CALLS = {
-    "exp": "math.exp", "expm1": "math.expm1", "log": "_log", "log1p": "_log1p", "sqrt": "_sqrt",
-    "log2": "_log2", "log10": "_log10", "sin": "math.sin", "cos": "math.cos", "tan": "math.tan",
-    "tanh": "math.tanh", "atan": "math.atan", "floor": "np.floor", "abs": "abs",
-    "sign": "_sign", "minimum": "_least", "maximum": "_most", "remainder": "_remainder",
+    **{n: f"np.{n}" for n in ("exp", "expm1", "log", "log1p", "log2", "log10", "sqrt")},
+    **{n: f"np.{n}" for n in ("sin", "cos", "tan", "tanh", "floor", "remainder")},
+    "atan": "np.arctan", "abs": "abs", "sign": "_sign", "minimum": "_least", "maximum": "_most",
 }  # fmt: skip
 
 
@@ -69,10 +67,12 @@ class Equations:
 
 
 class Emitter:
-    """Writes expressions as lines of assignments."""
+    """Writes expressions as lines of assignments, for numbers and for vectors (kernels.vectors)."""
 
     def __init__(self, equations: Equations, roots: Iterable[Expression]):
         self.equations = equations
+        # what is held in float64, whatever its own type
+        self.held: frozenset[Expression] = frozenset()
         self.kinds: dict[Expression, Kind | None] = {}
         self.varies: dict[Expression, bool] = {}
         self.number: dict[Expression, int] = {}
@@ -129,16 +129,28 @@ class Emitter:
         kind = self.kinds[node]
         if kind is None and dtype == torch.float64:
             return self.of(node)
-        same = kind is not None and kind[0] == dtype
-        names = {torch.float32: "np.float32", torch.float64: "np.float64"}
-        return self.of(node) if same else f"{names[dtype]}({self.of(node)})"
+        has = torch.float64 if node in self.held else kind and kind[0]
+        names = {torch.float32: "narrow", torch.float64: "wide"}
+        return self.of(node) if has == dtype else f"{names[dtype]}({self.of(node)})"
+
+    def unpacked(self, nodes: Iterable[Expression], home: str) -> list[str]:
+        """Assignments of nodes from a tuple of this name, which holds all in float64."""
+        lines = []
+        for place, node in enumerate(nodes):
+            if node not in self.kinds:
+                continue
+            kind = self.kinds[node]
+            is_bool = kind is not None and kind[0] == torch.bool
+            self.held |= set() if is_bool else {node}
+            lines.append(f"{self.of(node)} = {home}[{place}]{' != 0.0' * is_bool}")
+        return lines
 
     def _value(self, node: Expression) -> str:
         op, args = node.op, node.args
         if op in ("and", "or"):
             return f"{self.of(args[0])} {SIGNS[op]} {self.of(args[1])}"
         if op == "not":
-            return f"not {self.of(args[0])}"
+            return f"negated({self.of(args[0])})"
         if op == "detach" or op in CASTS:
             return self._as(args[0], kind_of(op, [self.kinds[args[0]]])[0])
         kind = self.kinds[node]
@@ -148,7 +160,7 @@ class Emitter:
             dtype = torch.float64  # holds whole numbers as they are
         if op == "where":
             yes, no = (self._as(a, dtype) for a in args[1:])
-            return f"{yes} if {self.of(args[0])} else {no}"
+            return f"where({self.of(args[0])}, {yes}, {no})"
         given = [self._as(a, dtype) for a in args]
         if op in SIGNS:
             return f"{given[0]} {SIGNS[op]} {given[1]}"
@@ -157,7 +169,7 @@ class Emitter:
         if op not in CALLS:
             raise Untraceable(f"it uses {op}, which has no compiled form")
         call = f"{CALLS[op]}({', '.join(given)})"
-        return f"np.float32({call})" if dtype == torch.float32 else call
+        return f"narrow({call})" if dtype == torch.float32 else call
 
 
 def _is_floating(kind: Kind | None) -> bool:
@@ -207,32 +219,18 @@ class Functions:
         roots = [*equations.rates, *more]
         self.equations, self.emitter = equations, Emitter(equations, roots)
         self.hoisted = self.emitter.constants(roots)
-        own = [f"u{k}" for k in range(len(equations.variables))]
-        self.unpack = [f"{as_tuple(own)} = u"]
-        if self.hoisted:
-            self.unpack.append(f"{self._of(self.hoisted)} = c")
 
-    def _of(self, nodes: Iterable[Expression], dtype: torch.dtype | None = None) -> str:
-        of = self.emitter.of if dtype is None else lambda e: self.emitter._as(e, dtype)
-        return as_tuple([of(e) for e in nodes])
+    def _of(self, nodes: Iterable[Expression], dtype: torch.dtype) -> str:
+        return as_tuple([self.emitter._as(e, dtype) for e in nodes])
 
     def values(self, dtype: torch.dtype = torch.float64) -> str:
         """The text of `prepared` and `rates`; dtype: of the rates."""
-        names = self.equations.leaves
-        leaves = [self.equations.builder.name(n) for n in names]
-        kinds = [self.equations.kinds[n] for n in names]
-        pairs = enumerate(zip(leaves, kinds, strict=True))
-        read = [_leaf(self.emitter, e, k, i) for i, (e, k) in pairs]
-        lines = [*read, *self.emitter.lines(self.hoisted, leaves)]
-        text = _function("prepared", "leaf", lines, self._of(self.hoisted))
+        leaves = [self.equations.builder.name(n) for n in self.equations.leaves]
+        self.emitter.held = frozenset()
+        lines = self.emitter.unpacked(leaves, "leaf") + self.emitter.lines(self.hoisted, leaves)
+        text = _function("prepared", "leaf", lines, self._of(self.hoisted, torch.float64))
         rates = self.equations.rates
         return text + _function("rates", "u, c", self.lines(rates), self.rates_as_tuple(dtype))
-
-    def hoisted_from(self, places: Sequence[str]) -> str:
-        """What was prepared, as a tuple, from places that hold it in float64."""
-        return as_tuple(
-            [_cast(self.emitter.kinds[e], p) for e, p in zip(self.hoisted, places, strict=True)]
-        )
 
     def rates_as_tuple(self, dtype: torch.dtype = torch.float64) -> str:
         """The rates in this type, after their `lines`."""
@@ -241,11 +239,15 @@ class Functions:
     def lines(self, roots: Iterable[Expression]) -> list[str]:
         """Assignments of all below the roots, from u and c."""
         variables = [self.equations.builder.name(n) for n in self.equations.variables]
-        return [*self.unpack, *self.emitter.lines(roots, [*self.hoisted, *variables])]
+        own = [f"u{k}" for k in range(len(variables))]
+        self.emitter.held = frozenset()
+        unpack = [f"{as_tuple(own)} = u", *self.emitter.unpacked(self.hoisted, "c")]
+        return unpack + self.emitter.lines(roots, [*self.hoisted, *variables])
 
 
-def functions(equations: Equations) -> str:
-    """The text of `prepared`, `rates`, `linearised`, `times_slopes`, `factored`, `solved`."""
+def functions(equations: Equations) -> tuple[str, int]:
+    """The text of `prepared`, `rates`, `linearised`, `times_slopes`, `factored`, `solved`; how many
+    numbers are prepared."""
     slopes = equations.slopes()
     order = sorted(slopes)
     made = Functions(equations, [*slopes.values()])
@@ -254,19 +256,7 @@ def functions(equations: Equations) -> str:
     safe = as_tuple([f"_finite({wide(slopes[k])})" for k in order])
     values = as_tuple([wide(e) for e in equations.rates])
     text = made.values() + _function("linearised", "u, c", lines, f"{values}, {safe}")
-    return text + _linear(Pattern.of(len(equations.variables), order))
-
-
-def _leaf(
-    emitter: Emitter, leaf: Expression, kind: Kind | None, place: int, home: str = "leaf"
-) -> str:
-    return f"{emitter.of(leaf)} = {_cast(kind, f'{home}[{place}]')}"
-
-
-def _cast(kind: Kind | None, value: str) -> str:
-    """A number that is held in float64, in its own type."""
-    casts: dict[Any, str] = {torch.float32: "np.float32({})", torch.bool: "({} != 0.0)"}
-    return casts.get(kind and kind[0], "{}").format(value)
+    return text + _linear(Pattern.of(len(equations.variables), order)), len(made.hoisted)
 
 
 def tangent_functions(equations: Equations, moving: Sequence[str]) -> str:
@@ -281,17 +271,12 @@ def tangent_functions(equations: Equations, moving: Sequence[str]) -> str:
     rates = [tangents(b, equations.rates, of).get(r, at_rest) for r in equations.rates]
     bent = tangents(b, slopes.values(), of)
     turned = [bent.get(slopes[k], at_rest) for k in sorted(slopes)]
-    wider = Equations(equations.rates, names, kinds, b)
-    emitter = Emitter(wider, [*rates, *turned])
-    read = emitter.number
+    emitter = Emitter(Equations(equations.rates, names, kinds, b), [*rates, *turned])
     lines = [f"{as_tuple([f'u{k}' for k in range(len(names))])} = u"]
-    for home, leaves in (("leaf", [b.name(n) for n in equations.leaves]),
-                         ("t", [named[n] for n in names]),
-                         ("turn", [named[n] for n in moving])):  # fmt: skip
-        lines += [
-            _leaf(emitter, e, kinds[e.name], i, home) for i, e in enumerate(leaves) if e in read
-        ]
-    known = [e for e in read if e.op == NAME]
+    lines += emitter.unpacked([b.name(n) for n in equations.leaves], "leaf")
+    lines += emitter.unpacked([named[n] for n in names], "t")
+    lines += emitter.unpacked([named[n] for n in moving], "turn")
+    known = [e for e in emitter.number if e.op == NAME]
     given, text = "u, leaf, t, turn", ""
     # slopes that are no numbers count as 0, in `linearised` too
     for name, roots, form in (("rates_moved", rates, "{}"),
@@ -327,10 +312,10 @@ def _linear(pattern: Pattern) -> str:
                     for n in range(k + 1, size) if (k, n) in pattern.filled
                 ]  # fmt: skip
     sound = [
-        f"abs(m{k}_{k}) > LEAST_PIVOT * (w" + (f" + abs(j{k}_{k}))" if (k, k) in at else ")")
+        f"(abs(m{k}_{k}) > LEAST_PIVOT * (w" + (f" + abs(j{k}_{k})))" if (k, k) in at else "))")
         for k in range(size)
     ]
-    lines.append("sound = " + " and ".join(sound))
+    lines.append("sound = " + " & ".join(sound))
     entries = as_tuple([f"m{i}_{k}" for i, k in sorted(pattern.filled)])
     text += _function("factored", "j, w", lines, f"{entries}, sound")
     lines = [f"{entries} = m", f"{as_tuple(x)} = b"]

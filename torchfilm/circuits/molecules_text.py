@@ -206,7 +206,7 @@ def _propensities(made: Functions, taken: Sequence[dict[int, float]]) -> str:
     that is invalid."""
     size, count = len(made.equations.variables), len(taken)
     lines = [f"u = {as_tuple([_at('X', k) for k in range(size)])}"]
-    lines.append(f"c = {made.hoisted_from([_at('C', k) for k in range(len(made.hoisted))])}")
+    lines.append(f"c = {as_tuple([_at('C', k) for k in range(len(made.hoisted))])}")
     lines += made.lines(made.equations.rates)
     lines.append(f"{as_tuple([f'a{j}' for j in range(count)])} = {made.rates_as_tuple()}")
     lines.append("bad = -1")

@@ -7,9 +7,10 @@ are held fixed, and so are the bounds below which no variable may fall, as in `r
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 
-from torchfilm.circuits.stiff_text import ADVANCE, each, substituted, tuple_of
+from torchfilm.circuits.stiff_text import each, loop, substituted, tuple_of
 
 STEP = '''@kernel
 def rate_moved(y, ty, low, j, tj, c, leaf, turn):
@@ -17,13 +18,16 @@ def rate_moved(y, ty, low, j, tj, c, leaf, turn):
     {y} = y
     {ty} = ty
     {low} = low
-    if not ({any_below}):
-        return rates_moved(y, leaf, ty, turn)
+    {below_of}
+    {f} = rates_moved(y, leaf, ty, turn)
+    below = {any_below}
+    if not any_of(below):
+        return {f_as_y}
     {inside_of}
-    {f} = rates_moved({inside}, leaf, {ty_inside}, turn)
+    {s} = rates_moved({inside}, leaf, {ty_inside}, turn)
     {g} = times_slopes(tj, {y_less_inside})
     {r} = times_slopes(j, {ty_less_inside})
-    return {f_plus_g_plus_r}
+    return {s_plus_g_plus_r_or_f}
 
 
 @kernel
@@ -98,25 +102,14 @@ def step_moved(u, t, c, leaf, turn, h, eps):
     {noise_of}
     {tn_noisy}
     {noisy}
-    if not ({new_below}):
+    {new_below_of}
+    below = {any_below}
+    if not any_of(below):
         return {tn}
-    return corrected_moved(u, t, a, ta, {new}, {tn}, low, {noise}, m, j, tj, c, leaf, turn)
+    {ts} = corrected_moved(u, t, a, ta, {new}, {tn}, low, {noise}, m, j, tj, c, leaf, turn)
+    return {ts_or_tn}
 
 
-@kernel(entry=True)
-def run_moved(first, last, at, moving, columns, turning, numbers, turned, dt, rtol, atol, eps,
-              largest, most_steps, accepted, rejected, status):
-    """As `run`, and the tangents `moving` (M, V) of the variables in place, for the tangents
-    `turning` (Q, M) of columns and `turned` (R,) of numbers."""
-    for n in range(first, last):
-        leaf = {leaves}
-        turn = {turns}
-        c = prepared(leaf)
-        u = {start}
-        t = {tstart}
-        {advance}
-        {store}
-        {tstore}
 '''
 
 
@@ -124,30 +117,42 @@ def run_moved(first, last, at, moving, columns, turning, numbers, turned, dt, rt
 NAMES = ("t", "ta", "tb", "td", "te", "tf", "tm", "tn", "tr", "ts", "ty")
 
 
-def tangent_method(size: int, leaves: str, turns: str) -> str:
-    """The step with its tangent, and the loop over cells, for so many variables. leaves, turns:
-    the text of a cell's values and of their tangents."""
+def tangent_method(size: int, fixed: Mapping[str, int], leaves: str, turns: str) -> str:
+    """The step with its tangent, and the loop over cells, for so many variables. fixed: how many
+    numbers are prepared (c), of the leaves, and turn. leaves, turns: the text of a cell's values
+    and of their tangents."""
+    carried = {"u": ("at", "new"), "t": ("moving", "step_moved(u, t, c, leaf, turn, h, eps)")}
+    given = "at, moving, columns, turning, numbers, turned"
+    what = (
+        "Also the\n    tangents `moving` (M, V) of the variables, for the tangents `turning` (Q, M)"
+        " of columns\n    (K, M) and `turned` (R,) of numbers (L,)."
+    )
+    begin = {"leaf": leaves, "turn": turns}
+    return tangent_step(size) + loop(size, carried, fixed, begin, given, what, "_moved")
+
+
+def tangent_step(size: int) -> str:
+    """The text of the step's derivative."""
     lines, many = partial(each, size=size), partial(tuple_of, size=size)
     return substituted(
         STEP,
         size,
-        leaves=leaves,
-        turns=turns,
-        advance=ADVANCE.format(taken="t, u = step_moved(u, t, c, leaf, turn, h, eps), new"),
         **{x: many(f"{x}#") for x in NAMES},
-        ty_inside=many("(0.0 if y# < low# else ty#)"),
-        ty_less_inside=many("(ty# if y# < low# else 0.0)"),
-        f_plus_g_plus_r=many("f# + g# + r#"),
+        ty_inside=many("where(below#, 0.0, ty#)"),
+        ty_less_inside=many("where(below#, ty#, 0.0)"),
+        s_plus_g_plus_r_or_f=many("where(below, s# + g# + r#, like(f#, y#))"),
+        f_plus_g=many("f# + g#"),
         tm_of=lines("tm# = t# + ta#"),
-        ts_of=lines("ts# = 0.0 if s# < low# and s# >= low# - noise# else tm# + ts#"),
+        ts_of=lines("ts# = where((s# < low#) & (s# >= low# - noise#), 0.0, tm# + ts#)"),
         tshare_of=lines(
-            "if new# < low# and (s# - low#) / (s# - new#) < share:\n"
-            "        share = (s# - low#) / (s# - new#)\n"
-            "        tshare = (ts# - share * (ts# - tn#)) / (s# - new#)"
+            "nearer = (s# - low#) / (s# - new#)\n"
+            "    moves = (new# < low#) & (nearer < share)\n"
+            "    share = where(moves, nearer, share)\n"
+            "    tshare = where(moves, (ts# - share * (ts# - tn#)) / (s# - new#), tshare)"
         ),
         tmoved=many(
-            "(ts# + share * (tn# - ts#) + tshare * (new# - s#)"
-            " if s# + share * (new# - s#) > low# else 0.0)"
+            "where(s# + share * (new# - s#) > low#,"
+            " ts# + share * (tn# - ts#) + tshare * (new# - s#), 0.0)"
         ),
         tsecond=many("tf# + 4.0 * p * ta#"),
         ty_of=lines("ty# = t# + 2.0 * ta#"),
@@ -155,7 +160,6 @@ def tangent_method(size: int, leaves: str, turns: str) -> str:
         ty_more=lines("ty# = ty# + td#"),
         tfourth=many("tr# + p * (ta# - tb# - (8.0 / 3.0) * td#)"),
         tn_of=lines("tn# = ty# + te#"),
-        tn_noisy=lines("tn# = 0.0 if new# < low# and new# >= low# - noise# else tn#"),
-        tstart=many("moving[n, #]"),
-        tstore=many("moving[n, #]") + " = t",
+        tn_noisy=lines("tn# = where((new# < low#) & (new# >= low# - noise#), 0.0, tn#)"),
+        ts_or_tn=many("where(below, ts#, tn#)"),
     )

@@ -1,66 +1,44 @@
-"""Functions of numbers as torch defines them, also where there is no number."""
+"""Functions of numbers, and of vectors of them, as torch defines them, also where there is no
+number."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.vectors import near_inverse_cube_root, where
 
 
-@kernel
+@kernel(inline=True)
 def _finite(x):
     """x, or 0 where it is infinite or no number: the slope of a root at 0."""
-    return x if abs(x) < np.inf else 0.0
+    return where(abs(x) < np.inf, x, 0.0)
 
 
-@kernel
+@kernel(inline=True)
 def _least(a, b):
     """The smaller; no number where one of them is none."""
-    return a if a < b or a != a else b
+    return where((a < b) | (a != a), a, b)
 
 
-@kernel
+@kernel(inline=True)
 def _most(a, b):
     """The greater; no number where one of them is none."""
-    return a if a > b or a != a else b
+    return where((a > b) | (a != a), a, b)
 
 
-@kernel
+@kernel(inline=True)
 def _sign(x):
-    return (x > 0) * 1.0 - (x < 0) * 1.0
+    return where(x > 0, 1.0, 0.0) - where(x < 0, 1.0, 0.0)
 
 
-@kernel
-def _remainder(a, b):
-    """a − b ⌊a/b⌋, of the sign of b."""
-    return np.remainder(a, b)
-
-
-@kernel
-def _sqrt(x):
-    return math.sqrt(x) if x >= 0 else np.nan
-
-
-@kernel
-def _log(x):
-    return math.log(x) if x > 0 else (-np.inf if x == 0 else np.nan)
-
-
-@kernel
-def _log2(x):
-    return np.log2(x)
-
-
-@kernel
-def _log10(x):
-    return np.log10(x)
-
-
-@kernel
-def _log1p(x):
-    return math.log1p(x) if x > -1 else (-np.inf if x == -1 else np.nan)
+@kernel(inline=True)
+def inverse_cube_root(x):
+    """x^(−1/3) of a normal number above 0, with an error of a few units in the last place."""
+    y = near_inverse_cube_root(x)
+    for _ in range(4):  # Newton's method: each step squares the error, at first below 0.1
+        y = y * (4.0 / 3.0 - (1.0 / 3.0) * x * (y * y * y))
+    return y
 
 
 @kernel(inline=True)
