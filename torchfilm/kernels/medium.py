@@ -7,17 +7,22 @@ import numpy as np
 from torchfilm.kernels.compiling import kernel
 
 
-@kernel
-def _two_voxels(at, size, periodic):
-    """The nearest voxel along an axis, the next one, and the weight of that."""
-    at = at if abs(at) < np.inf else 0.0
+@kernel(inline=True)
+def _along(at, size, periodic, slack, used):
+    """Along an axis, from a place in voxels: the nearest voxel, the next one, the weights of both,
+    and whether the place is beyond the box."""
+    finite = abs(at) < np.inf
+    away = not finite if periodic else not (at >= -slack and at <= size + slack)
+    if not used:
+        return np.int64(0), np.int64(0), 0.0, away
+    at = at - 0.5 if finite else 0.0
     at = np.remainder(at, float(size)) if periodic else max(min(at, size - 1.0), 0.0)
     near = np.rint(at)
     side = 1.0 if at >= near else -1.0
     nearest, other = np.int64(near), np.int64(near + side)
     if periodic:
-        return nearest % size, other % size, (at - near) * side
-    return nearest, max(min(other, size - 1), 0), (at - near) * side
+        return nearest % size, other % size, (at - near) * side, away
+    return nearest, max(min(other, size - 1), 0), (at - near) * side, away
 
 
 @kernel(entry=True)
@@ -25,28 +30,32 @@ def put_stencil(position, colony, origin, step, shape, first, used, periodic, sl
                 weight, outside, blocked):  # fmt: skip
     """Puts the voxels of each cell, the nearest first, and their weights into node and weight,
     (N, K). used: (3,) bool, the axes with more than one voxel. mask: (nodes,), or empty."""
-    corners, zero, one = node.shape[1], weight.dtype.type(0), weight.dtype.type(1)
+    number = weight.dtype.type
+    corners, zero, one = node.shape[1], number(0), number(1)
+    ux, uy, uz = used[0], used[1], used[2]
     for i in range(position.shape[0]):
-        b, made, away = colony[i], 1, False
-        node[i, 0], weight[i, 0] = first[b], one
-        for k in range(3):
-            at, size = (position[i, k] - origin[b, k]) / step[k], shape[b, k]
-            if periodic[k]:
-                away |= not abs(at) < np.inf
-            else:
-                away |= not (at >= -slack and at <= size + slack)
-            if not used[k]:
-                continue
-            nearest, other, share = _two_voxels(at - 0.5, size, periodic[k])
-            stride = shape[b, 1] * shape[b, 2] if k == 0 else shape[b, 2] if k == 1 else 1
-            far = weight.dtype.type(share)
-            near = one - far
-            for c in range(made - 1, -1, -1):  # each corner so far has two along this axis
-                n, w = node[i, c], weight[i, c]
-                node[i, 2 * c], weight[i, 2 * c] = n + nearest * stride, w * near
-                node[i, 2 * c + 1], weight[i, 2 * c + 1] = n + other * stride, w * far
-            made *= 2
-        outside[i] = away
+        b = colony[i]
+        nx, ny, nz = shape[b, 0], shape[b, 1], shape[b, 2]
+        x = (position[i, 0] - origin[b, 0]) / step[0]
+        y = (position[i, 1] - origin[b, 1]) / step[1]
+        z = (position[i, 2] - origin[b, 2]) / step[2]
+        x0, x1, tx, away_x = _along(x, nx, periodic[0], slack, ux)
+        y0, y1, ty, away_y = _along(y, ny, periodic[1], slack, uy)
+        z0, z1, tz, away_z = _along(z, nz, periodic[2], slack, uz)
+        wx1, wy1, wz1 = number(tx), number(ty), number(tz)
+        wx0, wy0, wz0 = one - wx1, one - wy1, one - wz1
+        c, start = 0, first[b]
+        for kx in range(2 if ux else 1):
+            n = start + (x1 if kx else x0) * (ny * nz)
+            w = wx1 if kx else wx0
+            for ky in range(2 if uy else 1):
+                m = n + (y1 if ky else y0) * nz
+                v = w * (wy1 if ky else wy0)
+                for kz in range(2 if uz else 1):
+                    node[i, c] = m + (z1 if kz else z0)
+                    weight[i, c] = v * (wz1 if kz else wz0)
+                    c += 1
+        outside[i] = away_x or away_y or away_z
         if mask.shape[0]:
             _mask(i, node, weight, mask, outside, blocked)
         if corners > 1:
@@ -107,29 +116,31 @@ def pools(node, weight, volume, sums, out):
 
 
 @kernel(entry=True)
-def write(out, amount, there, node, weight, volume, near_one, sums):
+def write(out, amount, there, node, weight, volume, near_one, sums, seen):
     """Values after secretion and uptake, in place; there: what each cell reads. sums: (nodes, 2) of
-    0, and so again in the end, for the part taken and what is given. Where no cell is, nothing is
-    done."""
-    zero, one = out.dtype.type(0), out.dtype.type(1)
+    0, and so again in the end, for the part taken and what is given. seen: (N K,), for the voxels
+    where cells are: nothing is done elsewhere."""
+    zero, one, count = out.dtype.type(0), out.dtype.type(1), 0
     for i in range(node.shape[0]):
         wanted, more = max(-amount[i], zero), max(amount[i], zero) / volume
         part = wanted / ((there[i] if there[i] > 0 else one) * volume)
         if wanted > 0 and there[i] <= 0:
             part = out.dtype.type(np.inf)
         for c in range(node.shape[1]):
-            sums[node[i, c], 0] += weight[i, c] * part
-            sums[node[i, c], 1] += weight[i, c] * more
-    for i in range(node.shape[0]):
-        for c in range(node.shape[1]):
             k = node[i, c]
-            share, more = sums[k, 0], sums[k, 1]
-            if share == 0 and more == 0:
-                continue  # also what another cell has done already
-            if share > 1 and share < near_one:
-                share = one
-            out[k] = out[k] - out[k] * share + more
-            sums[k, 0], sums[k, 1] = zero, zero
+            seen[count] = k  # noted without a branch, which would be hard to foresee
+            count += sums[k, 0] == 0 and sums[k, 1] == 0
+            sums[k, 0] += weight[i, c] * part
+            sums[k, 1] += weight[i, c] * more
+    for n in range(count):
+        k = seen[n]
+        share, more = sums[k, 0], sums[k, 1]
+        if share == 0 and more == 0:
+            continue  # nothing is done, or it is done already
+        if share > 1 and share < near_one:
+            share = one
+        out[k] = out[k] - out[k] * share + more
+        sums[k, 0], sums[k, 1] = zero, zero
 
 
 @kernel(entry=True)

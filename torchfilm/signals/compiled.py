@@ -103,7 +103,8 @@ def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps:
     out = values.detach().clone(memory_format=CLOSE)
     each = (as_array(x, values.dtype) for x in (amount, there))
     of_medium = _of_stencil(stencil, values.dtype, ulps)
-    put(out.numpy(), *each, *of_medium, _zeros(values.numel(), 2, of_medium[1].dtype))
+    sums = _zeros(values.numel(), 2, of_medium[1].dtype)
+    put(out.numpy(), *each, *of_medium, sums, _room(stencil.node.numel()))
     return out
 
 
@@ -141,6 +142,14 @@ def _zeros(rows: int, size: int, dtype: Any) -> np.ndarray:
         found = np.zeros(rows * size, dtype)
         setattr(_kept, dtype.char, found)
     return found[: rows * size].reshape(rows, size)
+
+
+def _room(size: int) -> np.ndarray:
+    """(size,) int64 of anything."""
+    found = getattr(_kept, "room", None)
+    if found is None or len(found) < size:
+        found = _kept.room = np.empty(size, np.int64)
+    return found
 
 
 def _of_stencil(
