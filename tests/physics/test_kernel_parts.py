@@ -55,10 +55,15 @@ def products(z, blocks, g, dof):
 
 
 @numba.njit
-def inverse_of_squares(H, dof):
-    B = np.zeros((len(dof), len(dof)))
-    for h in range(H.shape[0]):
-        lanes.add_square(B, H, h, dof)
+def of_rows(H, p, one, two, dof):
+    rows = range(H.shape[0] // 2)
+    return np.array([lanes.dot_row(H, r, p, one[r], two[r], dof) for r in rows])
+
+
+@numba.njit
+def inverse_of_squares(H, halves, first, act, dof):
+    B = np.ones((len(dof), len(dof)))
+    lanes.put_squares(B, H, halves, first, halves.shape[0], act, dof)
     before = B.copy()
     lanes.invert(B, dof)
     return before, B
@@ -82,9 +87,15 @@ def test_whole_rows_as_vectors(dim, kind):
     products(z, blocks, b, dof)
     np.testing.assert_allclose(z, np.einsum("nij,nj->ni", blocks, b), rtol=near, atol=10 * near)
     assert not a[:, degrees:].any() and not z[:, degrees:].any()
-    H = draw(12, width)
-    square, inverse = inverse_of_squares(H, dof)
-    wide = H.astype(float)
+    H = draw(40, width)
+    one, two = rng.integers(0, 9, (2, 20))
+    np.testing.assert_allclose(
+        of_rows(H, b, one, two, dof), (H[::2] * b[one] + H[1::2] * b[two]).sum(1), rtol=near,
+        atol=near,
+    )  # fmt: skip
+    halves, act = rng.permutation(40).astype(np.int32), (rng.random(20) < 0.7).astype(np.uint8)
+    square, inverse = inverse_of_squares(H, halves, 3, act, dof)
+    wide = H[halves[3:]][act[halves[3:] // 2] == 1].astype(float)
     np.testing.assert_allclose(square, wide.T @ wide, rtol=1e-12, atol=1e-12)
     one = inverse[:degrees, :degrees] @ square[:degrees, :degrees]
     np.testing.assert_allclose(one, np.eye(degrees), atol=1e-9)

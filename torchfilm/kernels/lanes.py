@@ -12,6 +12,7 @@ from typing import Any
 import numba.extending
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 
 intrinsic: Any = numba.extending.intrinsic  # calls leave out its first argument
 INDEX = ir.IntType(32)
@@ -110,6 +111,37 @@ def add_scaled(typing, a, i, t, b, j, dof):
     return types.void(a, i, t, b, j, dof), emit
 
 
+def _joined(builder, low, high):
+    """One vector of two."""
+    count = low.type.count
+    places = ir.Constant(ir.VectorType(INDEX, 2 * count), list(range(2 * count)))
+    return builder.shuffle_vector(low, high, places)
+
+
+def _parted(builder, vector):
+    """The two vectors of one."""
+    half = vector.type.count // 2
+    at = lambda first: ir.Constant(ir.VectorType(INDEX, half), list(range(first, first + half)))
+    return [builder.shuffle_vector(vector, vector, at(first)) for first in (0, half)]
+
+
+@intrinsic
+def dot_row(typing, H, r, p, i, j, dof):
+    """H[2 r] · p[i] + H[2 r + 1] · p[j]."""
+    _check(H, p)
+
+    def emit(context, builder, signature, given):
+        kinds, width = signature.args, len(dof)
+        both = _Rows(context, builder, kinds[0], given[0], 2 * width)
+        each = _Rows(context, builder, kinds[2], given[2], width)
+        x = [each.load(long_of(context, builder, signature, given, k)) for k in (3, 4)]
+        row = both.load(long_of(context, builder, signature, given, 1))
+        product = builder.fmul(row, _joined(builder, *x))
+        return _sum(builder, builder.fadd(*_parted(builder, product)))
+
+    return H.dtype(H, r, p, i, j, dof), emit
+
+
 @intrinsic
 def keep_greatest(typing, most, z, i, dof):
     """most[0] = the greater of it and |z[i]|, lane by lane; what is no number is the greatest."""
@@ -154,22 +186,35 @@ def put_product(typing, z, i, blocks, g, dof):
 
 
 @intrinsic
-def add_square(typing, B, H, h, dof):
-    """B += H[h] H[h]ᵀ, for B (len(dof), len(dof)) in float64."""
+def put_squares(typing, B, H, halves, first, last, act, dof):
+    """B = the sum of H[h] H[h]ᵀ over the halves[first … last − 1] whose rows act, for B (len(dof),
+    len(dof)) in float64."""
 
     def emit(context, builder, signature, given):
         kinds, width = signature.args, len(dof)
         out = _Rows(context, builder, kinds[0], given[0], width)
-        half = _Rows(context, builder, kinds[1], given[1], width)
-        x = half.load(long_of(context, builder, signature, given, 2))
-        if x.type != out.vector:
-            x = builder.fpext(x, out.vector)
-        for k in range(width):
-            row = ir.Constant(ir.IntType(64), k)
-            out.store(row, _multiply_add(builder, _spread(builder, x, k), x, out.load(row)))
+        rows = _Rows(context, builder, kinds[1], given[1], width)
+        which, acts = (context.make_array(kinds[k])(context, builder, given[k]) for k in (2, 5))
+        ends = [long_of(context, builder, signature, given, k) for k in (3, 4)]
+        one = ir.Constant(ends[0].type, 1)
+        nothing = ir.Constant(out.vector, [0.0] * width)
+        sums = [cgutils.alloca_once_value(builder, nothing) for _ in range(width)]
+        for total in sums:
+            builder.store(nothing, total)
+        with cgutils.for_range_slice(builder, *ends, one) as (q, _):
+            h = builder.zext(builder.load(builder.gep(which.data, [q])), ends[0].type)
+            on = builder.load(builder.gep(acts.data, [builder.lshr(h, one)]))
+            with builder.if_then(builder.icmp_unsigned("!=", on, ir.Constant(on.type, 0))):
+                x = rows.load(h)
+                x = x if x.type == out.vector else builder.fpext(x, out.vector)
+                for k, total in enumerate(sums):
+                    new = _multiply_add(builder, _spread(builder, x, k), x, builder.load(total))
+                    builder.store(new, total)
+        for k, total in enumerate(sums):
+            out.store(ir.Constant(ends[0].type, k), builder.load(total))
         return context.get_dummy_value()
 
-    return types.void(B, H, h, dof), emit
+    return types.void(B, H, halves, first, last, act, dof), emit
 
 
 @intrinsic

@@ -7,7 +7,7 @@ the share of a block of cells: see `team`.
 from __future__ import annotations
 
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.lanes import add_scaled, add_square, dot, invert, put_product
+from torchfilm.kernels.lanes import add_scaled, dot, dot_row, invert, put_product, put_squares
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import RAISED, ROUNDING
 
@@ -18,8 +18,7 @@ def times_rows(H, one, two, p, q, first, end, dof):
     whose second half is 0."""
     one, two, q = one[first:end], two[first:end], q[first:end]
     for r in range(q.shape[0]):
-        h = 2 * (first + r)
-        q[r] = dot(H, h, p, one[r], dof) + dot(H, h + 1, p, two[r], dof)
+        q[r] = dot_row(H, first + r, p, one[r], two[r], dof)
 
 
 @kernel
@@ -45,7 +44,7 @@ def add_product(H, one, two, on, p, out, dof):
     """out += Jᵀ J p of the rows `on`."""
     for r in on:
         i, j, h = one[r], two[r], 2 * r
-        t = dot(H, h, p, i, dof) + dot(H, h + 1, p, j, dof)
+        t = dot_row(H, r, p, i, j, dof)
         add_scaled(out, i, t, H, h, dof)
         add_scaled(out, j, t, H, h + 1, dof)
 
@@ -55,7 +54,7 @@ def add_own_product(H, one, two, on, p, out, first, end, dof):
     """As `add_product`, to the cells first … end − 1 alone."""
     for r in on:
         i, j, h = one[r], two[r], 2 * r
-        t = dot(H, h, p, i, dof) + dot(H, h + 1, p, j, dof)
+        t = dot_row(H, r, p, i, j, dof)
         if i >= first and i < end:
             add_scaled(out, i, t, H, h, dof)
         if j >= first and j < end:
@@ -68,13 +67,7 @@ def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, floor, dof):
     and column where the length is held. The diagonal is raised by its share `floor`: rounding must
     leave it positive definite. Returns the entry of the length."""
     end = degrees(dof) - 1
-    for k in range(len(dof)):
-        for m in range(len(dof)):
-            B[k, m] = 0.0
-    for q in range(begin[i], begin[i + 1]):
-        h = halves[q]
-        if act[h >> 1]:
-            add_square(B, H, h, dof)
+    put_squares(B, H, halves, begin[i], begin[i + 1], act, dof)
     for k in range(end + 1):
         B[k, k] = B[k, k] * (1 + floor) + alpha
     own = B[end, end]
