@@ -189,6 +189,21 @@ def test_functions_differ_by_rounding_only(dtype, plain):
 # --- independence of how the work is divided ------------------------------------------------------
 
 
+def switched(u, s, p, cell):
+    return {
+        "a": 1.0 - u.a * torch.logical_not(u.a - 1.0),
+        "b": p.k - u.b * (u.a > 0.5) - u.b * (u.a > 0.4),
+    }
+
+
+def test_slopes_that_are_switches(dtype, plain):
+    """∂/∂b is − (a > 0.5) − (a > 0.4): numbers, also for torch, which negates and adds no bools."""
+    scene = alone(tf.Circuit(switched, species=("a", "b"), initial={"a": 1.0, "b": 0.5}, k=0.3))
+    a, b = ends(scene, dtype=dtype)
+    equal(a, b)
+    assert float(a.fields["b"].max()) < 0.5
+
+
 def test_same_bits_for_any_number_of_threads():
     """Compiled for real: 1,200 cells are two threads' worth."""
     found = []

@@ -234,6 +234,13 @@ def evaluated(roots: Sequence[Expression], leaf: Callable[[Expression], Tensor])
 def _given(op: str, args: list[Any]) -> list[Any]:
     """Arguments with numbers as tensors of the type that torch would give them; laws and powers
     take numbers as they are."""
+    if op in ("add", "sub", "mul", "neg"):  # a slope of what is switched may be a switch
+        args = [
+            a.to(torch.get_default_dtype())
+            if isinstance(a, Tensor) and a.dtype == torch.bool
+            else a
+            for a in args
+        ]
     tensors = [a for a in (args[1:] if op == "where" else args) if isinstance(a, Tensor)]
     if len(tensors) == len(args) or (op in LAWS and tensors):
         return args

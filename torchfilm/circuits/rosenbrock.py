@@ -306,7 +306,8 @@ def _advance(
         if some_nan:
             nonfinite = nonfinite + error.isnan()
             lost |= nonfinite > MAX_NONFINITE_STEPS
-            lost |= ~torch.isfinite(method.evaluate(u.detach(), rows)).all(0)  # no step can help
+            known = torch.isfinite(method.evaluate(u.detach(), rows)).all(0)
+            lost |= error.isnan() & ~known  # no step can help
             (leaving,) = numbers((ends | lost).sum())
         failed = torch.where(
             torch.isfinite(error), torch.where(broken, BELOW_ZERO, TOO_MANY_STEPS), NOT_FINITE

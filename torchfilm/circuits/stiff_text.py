@@ -150,20 +150,21 @@ def run{kind}(first, last, {given}, dt, rtol, atol, eps, largest, most_steps, ac
     if first >= last:
         return
     w, at_work = np.empty(({rows}, WIDTH)), np.empty(WIDTH, np.int64)
-    for l in range(WIDTH):  # lanes without a cell of their own go on with the last one, unread
+    for l in range(WIDTH):  # lanes without a cell of their own hold the last one
         begun{kind}(min(first + l, last - 1), l, dt, {given}, w, at_work)
         if first + l >= last:
-            at_work[l] = -1
+            at_work[l], w[{next}, l] = -1, 0.0
     going, waiting = min(last - first, WIDTH), first + WIDTH
     while going > 0:
         {load}
         h = load(w, {next})
+        awake = h > 0.0  # a lane that has no cell any more takes steps of no length, into nothing
         new, error, broken = step(u, c, h, rtol, atol, eps, largest)
         good, ends, lost, left, next_h = controlled(error, broken, load(w, {left}), h, dt)
         if any_of(good):
             {taken}
         known = error == error
-        if any_of(negated(known)):  # a cell is lost at once where its rates are no numbers
+        if any_of(awake & negated(known)):  # a cell is lost at once where its rates are no numbers
             {f} = rates(u, c)
             bad = load(w, {bad}) + where(known, 0.0, 1.0)
             store(w, {bad}, bad)
@@ -176,7 +177,7 @@ def run{kind}(first, last, {given}, dt, rtol, atol, eps, largest, most_steps, ac
         store(w, {good}, load(w, {good}) + where(good, 1.0, 0.0))
         store(w, {left}, left)
         store(w, {next}, next_h)
-        if not any_of(code != GOES_ON):
+        if not any_of(awake & (code != GOES_ON)):
             continue
         store(w, {code}, code)
         for l in range(WIDTH):
@@ -190,7 +191,7 @@ def run{kind}(first, last, {given}, dt, rtol, atol, eps, largest, most_steps, ac
                 begun{kind}(waiting, l, dt, {given}, w, at_work)
                 waiting += 1
             else:
-                at_work[l] = -1
+                at_work[l], w[{left}, l], w[{next}, l] = -1, 0.0, 0.0
                 going -= 1
 '''
 

@@ -189,6 +189,8 @@ def put_product(typing, z, i, blocks, g, dof):
 def put_squares(typing, B, H, halves, first, last, act, dof):
     """B = the sum of H[h] H[h]ᵀ over the halves[first … last − 1] whose rows act, for B (len(dof),
     len(dof)) in float64."""
+    for array in (B, H, halves, act):
+        _check(array)
 
     def emit(context, builder, signature, given):
         kinds, width = signature.args, len(dof)
@@ -201,7 +203,7 @@ def put_squares(typing, B, H, halves, first, last, act, dof):
         sums = [cgutils.alloca_once_value(builder, nothing) for _ in range(width)]
         for total in sums:
             builder.store(nothing, total)
-        with cgutils.for_range_slice(builder, *ends, one) as (q, _):
+        with cgutils.for_range_slice(builder, ends[0], ends[1], one) as (q, _):
             h = builder.zext(builder.load(builder.gep(which.data, [q])), ends[0].type)
             on = builder.load(builder.gep(acts.data, [builder.lshr(h, one)]))
             with builder.if_then(builder.icmp_unsigned("!=", on, ir.Constant(on.type, 0))):

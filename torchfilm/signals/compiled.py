@@ -146,6 +146,8 @@ def _zeros(rows: int, size: int, dtype: Any) -> np.ndarray:
 
 def _room(size: int) -> np.ndarray:
     """(size,) int64 of anything."""
+    if size > MOST_KEPT:
+        return np.empty(size, np.int64)
     found = getattr(_kept, "room", None)
     if found is None or len(found) < size:
         found = _kept.room = np.empty(size, np.int64)
