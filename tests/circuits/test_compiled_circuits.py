@@ -186,9 +186,6 @@ def test_functions_differ_by_rounding_only(dtype, plain):
     assert torch.equal(a.reports["circuit"].steps, b.reports["circuit"].steps)
 
 
-# --- independence of how the work is divided ------------------------------------------------------
-
-
 def switched(u, s, p, cell):
     return {
         "a": 1.0 - u.a * torch.logical_not(u.a - 1.0),
@@ -202,6 +199,9 @@ def test_slopes_that_are_switches(dtype, plain):
     a, b = ends(scene, dtype=dtype)
     equal(a, b)
     assert float(a.fields["b"].max()) < 0.5
+
+
+# --- independence of how the work is divided ------------------------------------------------------
 
 
 def test_same_bits_for_any_number_of_threads():

@@ -49,7 +49,8 @@ def _spread(builder, vector, k):
     return builder.shuffle_vector(vector, vector, places)
 
 
-def _filled(builder, vector_type, value):
+def filled(builder, vector_type, value):
+    """A vector of this type that has a value in all lanes."""
     empty = ir.Constant(vector_type, ir.Undefined)
     return _spread(builder, builder.insert_element(empty, value, _lane(0)), 0)
 
@@ -104,7 +105,7 @@ def add_scaled(typing, a, i, t, b, j, dof):
         place = long_of(context, builder, signature, given, 1)
         factor = context.cast(builder, given[2], kinds[2], kinds[0].dtype)
         x = right.load(long_of(context, builder, signature, given, 4))
-        many = _filled(builder, left.vector, factor)
+        many = filled(builder, left.vector, factor)
         left.store(place, _multiply_add(builder, x, many, left.load(place)))
         return context.get_dummy_value()
 
@@ -201,8 +202,6 @@ def put_squares(typing, B, H, halves, first, last, act, dof):
         one = ir.Constant(ends[0].type, 1)
         nothing = ir.Constant(out.vector, [0.0] * width)
         sums = [cgutils.alloca_once_value(builder, nothing) for _ in range(width)]
-        for total in sums:
-            builder.store(nothing, total)
         with cgutils.for_range_slice(builder, ends[0], ends[1], one) as (q, _):
             h = builder.zext(builder.load(builder.gep(which.data, [q])), ends[0].type)
             on = builder.load(builder.gep(acts.data, [builder.lshr(h, one)]))
@@ -235,7 +234,7 @@ def invert(typing, B, dof):
         for k in degrees:
             pivot = builder.fdiv(one, builder.extract_element(B[k], _lane(k)))
             row = builder.insert_element(B[k], one, _lane(k))
-            B[k] = builder.fmul(row, _filled(builder, rows.vector, pivot))
+            B[k] = builder.fmul(row, filled(builder, rows.vector, pivot))
             for m in degrees:
                 if m != k:
                     factor = _spread(builder, builder.fneg(B[m]), k)

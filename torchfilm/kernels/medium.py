@@ -9,7 +9,7 @@ from torchfilm.kernels.compiling import kernel
 
 @kernel(inline=True)
 def _along(at, size, periodic, slack, used):
-    """Along an axis, from a place in voxels: the nearest voxel, the next one, the weights of both,
+    """Along an axis, from a place in voxels: the nearest voxel, the next one, the weight of that,
     and whether the place is beyond the box."""
     finite = abs(at) < np.inf
     away = not finite if periodic else not (at >= -slack and at <= size + slack)

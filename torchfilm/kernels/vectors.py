@@ -20,11 +20,12 @@ from numba import types
 from numba.core import cgutils
 from numba.core.datamodel.models import PrimitiveModel
 
+from torchfilm.kernels.lanes import INDEX, filled
+
 # One of the widest vectors that processors have; where they are shorter, two or four.
 WIDTH = 8
 
 extending: Any = numba.extending
-INDEX = ir.IntType(32)
 IN_LLVM = {
     types.float64: ir.DoubleType(),
     types.float32: ir.FloatType(),
@@ -99,25 +100,19 @@ def near_inverse_cube_root(x):
 # --- and what it is compiled to -------------------------------------------------------------------
 
 
-def _spread(builder, number):
-    """A vector that has a number in all lanes."""
-    empty = ir.Constant(ir.VectorType(number.type, WIDTH), ir.Undefined)
-    places = ir.Constant(ir.VectorType(INDEX, WIDTH), [0] * WIDTH)
-    return builder.shuffle_vector(builder.insert_element(empty, number, INDEX(0)), empty, places)
-
-
 def _converted(context, builder, value, kind, wanted):
     """A value of this kind as a vector of the wanted kind."""
     if not isinstance(kind, Vector):
-        return _spread(builder, context.cast(builder, value, kind, wanted.dtype))
+        number = context.cast(builder, value, kind, wanted.dtype)
+        return filled(builder, ir.VectorType(number.type, WIDTH), number)
     if kind == wanted:
         return value
-    number = IN_LLVM[wanted.dtype]
+    vector = ir.VectorType(IN_LLVM[wanted.dtype], WIDTH)
     if kind == MASK:
-        one, zero = (_spread(builder, ir.Constant(number, x)) for x in (1.0, 0.0))
+        one, zero = (ir.Constant(vector, [x] * WIDTH) for x in (1.0, 0.0))
         return builder.select(value, one, zero)
     convert = builder.fpext if wanted == DOUBLES else builder.fptrunc
-    return convert(value, ir.VectorType(number, WIDTH))
+    return convert(value, vector)
 
 
 def _common(*kinds):
