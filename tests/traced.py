@@ -16,12 +16,11 @@ from hypothesis import strategies as st
 import torchfilm as tf
 from torchfilm import parts
 from torchfilm.circuits import compiled, emission
-from torchfilm.circuits.compiled_step import readings
 from torchfilm.circuits.emission import Equations
 from torchfilm.circuits.expressions import Builder
 from torchfilm.circuits.graph import evaluated
 from torchfilm.circuits.tracing import Column, lowered
-from torchfilm.effects import bound_circuit
+from torchfilm.effects.bound_circuit import BoundCircuit
 from torchfilm.kernels import functions
 from torchfilm.kernels.compiling import for_python
 
@@ -146,14 +145,11 @@ def close(a: tf.State, b: tf.State, rel: float, least: float = 0.0) -> None:
 def one_step(scene: tf.Scene, dtype: torch.dtype = torch.float64, **bind):
     """The circuit of a scene, what its cells begin the first step with, and their concentrations
     then."""
-    seen = []
-    try:
-        bound_circuit.readings = lambda *args: seen.append(args) or readings(*args)
-        model = scene.bind(seed=1, dtype=dtype, **bind)
-        model.step(model.start(), 0.1)
-    finally:
-        bound_circuit.readings = readings
-    cells, start, _ = seen[0]
+    model = scene.bind(seed=1, dtype=dtype, **bind)
+    (circuit,) = (e for e in model.effects if isinstance(e, BoundCircuit))
+    middle, start = circuit.begun(model.start())
+    (kind,) = circuit.rates
+    cells = circuit.cells(middle, torch.arange(middle.cells), kind)
     return cells, start, start.concentrations(cells.rows)
 
 

@@ -74,6 +74,14 @@ class Resolved:
         found = self.of_colonies(state)
         return found if found.dim() == 0 else state.groups.spread(found)
 
+    def constant(self, kind: int | None = None) -> Tensor | None:
+        """What it is in every state, 0-dim or (B,) by colony id, for cells of this type; None where
+        it may differ from cell to cell."""
+        if self.value is None or self.types is None:
+            return self.value
+        known = self.types.tolist()
+        return self.value[known.index(kind)] if kind in known else None
+
     def of_rows(self, state: State, rows: Tensor, purpose: str | None = None) -> Tensor:
         """(M,) for the cells `rows` (M,); drawn now, by the key `purpose`, where the value is a
         distribution and no field keeps it."""

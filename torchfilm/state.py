@@ -230,7 +230,7 @@ class State:
         if self.layout is None:
             return None
         values = self.signals if names is None else {n: self.fields[OUTSIDE + n] for n in names}
-        return self.layout.contact(self.places, self.colony, self.own_colony_id, values, self.dtype)
+        return self.layout.contact(self.places, self.colony, self.colony_id, values, self.dtype)
 
     @property
     def own_colony_id(self) -> Tensor:
@@ -256,10 +256,10 @@ class State:
         made.__dict__.update(parts)
         return made
 
-    def with_length(self, length: Tensor, volume: Tensor) -> State:
-        """A state whose cells have other lengths (N,), and the volumes (N,) that these mean."""
+    def with_length(self, length: Tensor, volume: Tensor, area: Tensor) -> State:
+        """A state whose cells have other lengths (N,), which mean these volumes and areas."""
         made = self.replace(length=length)
-        made.__dict__["volume"] = volume
+        made.__dict__.update(volume=volume, area=area)
         return made
 
     def with_fields(self, **values: Tensor) -> State:

@@ -20,7 +20,7 @@ from traced import alone, by, circuits, close, ends, equal, one_step, plain_modu
 import torchfilm as tf
 from torchfilm import parts
 from torchfilm.circuits import compiled, run
-from torchfilm.circuits.compiled_step import Changes, advance, readings
+from torchfilm.circuits.compiled_step import Changes, KernelStep, Surroundings
 from torchfilm.circuits.rosenbrock import SAFETY, rodas3
 from torchfilm.kernels.compiling import for_python
 from torchfilm.tools.deterministic_math import deterministic_functions
@@ -230,14 +230,15 @@ def test_same_bits_in_any_batch(plain):
 
 def test_same_bits_in_any_order(plain):
     cells, start, concentrations = one_step(alone(toggle(k=tf.LogNormal(4.0, 0.3))))
+    step, found = KernelStep(cells.compiled, (), {}), cells.compiled.sources(cells, {})
+    around = Surroundings({}, None, torch.zeros_like(cells.rows))
     ends = []
     for order in (range(len(cells.rows)), (7, 2, 9, 0)):
         some = dataclasses.replace(cells, rows=torch.tensor(order))
         into = Changes.of(start, (), reservoir=False, whole=True)
-        values = readings(some, start, 0.4)
-        code = advance(some, start, values, 0.4, 1e-4, 1e-9, into)
+        code = step(some.rows, start, found, around, 0.4, 1e-4, 1e-9, into)
         assert len(code) == len(order) and not code.any()
-        ends.append(into.species[:, [7, 2, 9, 0]])
+        ends.append(torch.from_numpy(into.species[:, [7, 2, 9, 0]]))
     assert torch.equal(*ends) and not torch.equal(ends[0].t(), concentrations[[7, 2, 9, 0]])
 
 
@@ -250,9 +251,8 @@ def test_a_restart_gives_the_same_bits(plain):
 
 
 def test_no_time_changes_nothing(plain):
-    cells, start, concentrations = one_step(alone(toggle()))
+    cells, _, concentrations = one_step(alone(toggle()))
     settings = run.IntegrationSettings("rosenbrock", 1, 1e-4, 1e-9, 1.0)
-    assert readings(cells, start, 0.0) is None  # left to torch
     found = run.step(cells, concentrations, 0.0, settings)
     assert torch.equal(found.concentrations, concentrations) and not found.failed.any()
 

@@ -77,7 +77,7 @@ def test_a_gradient_does_not_change_how_much_growth_dilutes(dtype):
     before = capsule.volume(length, radius) * 0.9
     one = half_way(length, radius, before)
     other = half_way(length.clone().requires_grad_(), radius, before)
-    for name in ("length", "volume", "before", "after"):
+    for name in ("length", "volume", "area", "before", "after"):
         assert torch.equal(getattr(one, name), getattr(other, name).detach())
 
 
@@ -98,7 +98,7 @@ def test_half_way_between_two_volumes(dtype):
     assert torch.equal(made.length[:1], length[:1]) and float(made.length[2]) == 0.0
     grown = length.clone().requires_grad_()
     again = half_way(grown, radius, before)  # by torch, for a gradient
-    for name in ("length", "volume", "before", "after"):
+    for name in ("length", "volume", "area", "before", "after"):
         one, other = getattr(made, name), getattr(again, name)
         assert array(one) == pytest.approx(array(other.detach()), rel=close)
     assert again.volume.requires_grad

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import operator
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -104,20 +103,6 @@ class Compiled:
         found = self.sources(circuit, own)
         all_cells = [n for n in found if not n.startswith("own.") and found[n].dim()]
         return found | {n: found[n].index_select(0, rows) for n in all_cells}
-
-    @cached_property
-    def _last(self) -> list[tuple[list[Tensor], np.ndarray]]:
-        """The numbers' tensors of the last step, and what they were packed to."""
-        return [([], np.zeros(1))]
-
-    def numbers_of(self, values: Mapping[str, Tensor]) -> np.ndarray:
-        """The numbers (L,) float64. A model copies its values: the same tensor is the same number,
-        and in most steps all are."""
-        given, (last, found) = [values[n] for n in self.numbers], self._last[0]
-        if len(given) != len(last) or not all(map(operator.is_, given, last)):
-            found = packed(values, self.numbers)
-            self._last[0] = given, found
-        return found
 
     def packed(self, values: Mapping[str, Tensor], count: int) -> tuple[np.ndarray, np.ndarray]:
         """Columns (K, M) and numbers (L,) as compiled functions take them, float64."""

@@ -5,21 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
-from typing import TYPE_CHECKING
+from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.compiled import WORTH_A_THREAD
+from torchfilm.circuits.compiled import WORTH_A_THREAD, packed
 from torchfilm.circuits.compiled_stiff import CompiledCircuit, limits
 from torchfilm.circuits.dilution import Start
 from torchfilm.tools import checks
 from torchfilm.tools.tangents import tracked
-
-if TYPE_CHECKING:
-    from torchfilm.circuits.run import CircuitCells
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,80 +24,135 @@ class Changes:
     species (S, N); amounts given to the pools of each of `signals`, and to its reservoir if there
     is one, conc·µm³ (E, N); steps (N,) int64."""
 
-    species: Tensor
+    species: np.ndarray
     signals: Sequence[str]
-    given: Tensor
-    back: Tensor
-    steps: Tensor
+    given: np.ndarray
+    back: np.ndarray
+    steps: np.ndarray
 
     @staticmethod
     def of(start: Start, signals: Sequence[str], reservoir: bool, whole: bool) -> Changes:
         """Nothing given so far, no steps. whole: the circuits will fill in all cells."""
-        dtype, count = start.half.volume.dtype, len(start.half.volume)
-        shape = len(start.fields), count
-        species = torch.empty(shape, dtype=dtype)
+        volume = start.half.volume.numpy()
+        count, dtype = len(volume), volume.dtype
+        species = np.empty((len(start.fields), count), dtype)
         if not whole:
-            torch.stack(list(start.kept().values()), out=species)
-        given = torch.zeros(len(signals), count, dtype=dtype)
-        back = torch.zeros_like(given) if reservoir else given[:0]
-        return Changes(species, signals, given, back, torch.zeros(count, dtype=torch.int64))
+            torch.stack(list(start.kept().values()), out=torch.from_numpy(species))
+        given = np.zeros((len(signals), count), dtype)
+        back = np.zeros_like(given) if reservoir else given[:0]
+        return Changes(species, signals, given, back, np.zeros(count, np.int64))
 
 
-def readings(cells: CircuitCells, start: Start, dt: float) -> dict[str, Tensor] | None:
-    """What these cells' compiled circuit reads, by name: columns (N,) and numbers (). None where
-    kernels do not step it."""
-    compiled = cells.compiled
-    if not isinstance(compiled, CompiledCircuit) or cells.by_torch or dt == 0:
-        return None
-    found = compiled.sources(cells, {"pool": cells.pool, "away": cells.in_reservoir})
-    begin = (*start.fields.values(), start.half.before, *(cells.signals[n] for n in cells.given))
-    return None if tracked(*begin, *found.values()) else found
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What N cells find: the concentration of each signal, (N,) by name; the pool, (N,) µm³, where
+    there is a medium; and the ids of their colonies, (N,)."""
+
+    signals: Mapping[str, Tensor]
+    pool: Tensor | None
+    colony_id: Tensor
 
 
-def advance(
-    cells: CircuitCells, start: Start, values: Mapping[str, Tensor], dt: float, rtol: float,
-    atol: float, into: Changes,
-) -> np.ndarray:  # fmt: skip
-    """The circuit over dt hours in the cells `cells.rows` (M,) from `start`, with these `readings`.
-    Returns the status of each, (M,), as `rosenbrock` has it."""
-    from torchfilm.kernels.columns import WORDS, gather, store
+class KernelStep:
+    """A stiff circuit in the cells of one type, stepped by kernels.
 
-    compiled, half = cells.compiled, start.half
-    assert isinstance(compiled, CompiledCircuit)
-    count, size, begin = len(cells.rows), len(compiled.equations.variables), len(start.fields)
-    columns = {n: _known(values[n]) for n in compiled.columns}
-    found = {f"s.{n}": cells.signals[n] for n in cells.given}
-    row = partial(_row, cells=len(half.volume))
-    table: list[int] = []
-    for k, (name, x) in enumerate([*columns.items(), *found.items()]):
-        table += row(name, x, 0, k * count, 1)
-    rest, factor = len(table) // WORDS * count, half.before.data_ptr()
-    for k, (name, x) in enumerate(start.fields.items()):
-        table += row(name, x, factor if name in start.diluted else 0, rest + k, size)
-    for k, (name, x) in enumerate(found.items(), begin):
-        table += row(name, x, 0, rest + k, size)
-    for k in range(begin + len(found), size):  # what a reservoir is given and gives
-        table += _row("", None, 0, rest + k, size)
-    memory = np.empty(rest + size * count)
-    at, rows = memory[rest:].reshape(count, size), cells.rows.numpy()
-    each = memory[:rest].reshape(-1, count)  # columns, then signals at the start
-    report = np.zeros((3, count), np.int64)
-    given = (each, compiled.numbers_of(values), *limits(dt, rtol, atol, half.after.dtype), *report)
-    pool = half.volume if cells.pool is None else cells.pool
-    ends = (
-        at, each[len(columns) :], pool.numpy(), half.after.numpy(), start.diluted_mask,
-        np.array([into.signals.index(n) for n in cells.given], np.int64), report,
-        into.species.numpy(), into.given.numpy(), into.back.numpy(), into.steps.numpy(),
-    )  # fmt: skip
-    places, run = np.array(table, np.int64).reshape(-1, WORDS), compiled.module.run
+    given: the signals that it exchanges. constants: what its names have in every state, one number,
+    (), or one for each colony by its id, (B,). Their places are found once, and those of all else
+    in every step.
+    """
 
-    def work(low: int, high: int) -> None:
-        gather(low, high, rows, places, memory)
-        run(low, high, at, *given)
-        store(low, high, rows, *ends)
+    def __init__(
+        self, compiled: CompiledCircuit, given: Sequence[str], constants: Mapping[str, Tensor]
+    ):
+        self.compiled, self.given = compiled, tuple(given)
+        known = dict(constants) | {f"own.{n}": x for n, x in compiled.constants.items()}
+        read = [*compiled.columns, *compiled.numbers]
+        self.constants = {n: known[n] for n in read if n in known}
+        self.changing = tuple(n for n in read if n not in known)
+        fixed = all(n in known for n in compiled.numbers)
+        self._numbers = packed(known, compiled.numbers) if fixed else None
 
-    compiled.run(count, WORTH_A_THREAD, work)
-    return report[2]
+    def may_run(self, start: Start, *read: Tensor) -> bool:
+        """Whether no derivative is wanted."""
+        constants = self.constants.values()
+        return not tracked(*start.fields.values(), start.half.before, *read, *constants)
+
+    def __call__(
+        self, rows: Tensor, start: Start, found: Mapping[str, Tensor], around: Surroundings,
+        dt: float, rtol: float, atol: float, into: Changes,
+    ) -> np.ndarray:  # fmt: skip
+        """The circuit over dt hours in the cells `rows` (M,) from `start`. found: what is
+        `changing`, by name: columns (N,) and numbers (). Returns the status of each cell, (M,), as
+        `rosenbrock` has it."""
+        from torchfilm.kernels.columns import gather, store
+
+        compiled, half, count = self.compiled, start.half, len(rows)
+        size = len(compiled.equations.variables)
+        signals = {f"s.{n}": around.signals[n] for n in self.given}
+        places, rest = self._places(start, found, around.colony_id, signals, count)
+        numbers = self._numbers
+        if numbers is None:
+            numbers = packed({**self.constants, **found}, compiled.numbers)
+        memory = np.empty(rest + size * count)
+        at = memory[rest:].reshape(count, size)
+        each = memory[:rest].reshape(-1, count)  # columns, then signals at the start
+        report = np.zeros((3, count), np.int64)
+        given = (each, numbers, *limits(dt, rtol, atol, half.after.dtype), *report)
+        pool = half.volume if around.pool is None else around.pool
+        ends = (
+            at, each[len(compiled.columns) :], pool.numpy(), half.after.numpy(), start.diluted_mask,
+            np.array([into.signals.index(n) for n in self.given], np.int64), report,
+            into.species, into.given, into.back, into.steps,
+        )  # fmt: skip
+        of_cells, run = rows.numpy(), compiled.module.run
+
+        def work(low: int, high: int) -> None:
+            gather(low, high, of_cells, places, memory)
+            run(low, high, at, *given)
+            store(low, high, of_cells, *ends)
+
+        compiled.run(count, WORTH_A_THREAD, work)
+        return report[2]
+
+    def _places(
+        self, start: Start, found: Mapping[str, Tensor], colony_id: Tensor,
+        signals: Mapping[str, Tensor], count: int,
+    ) -> tuple[np.ndarray, int]:  # fmt: skip
+        """Where `gather` finds what, and how many numbers stand before the variables."""
+        compiled, constants = self.compiled, self.constants
+        size, begin, cells = len(compiled.equations.variables), len(start.fields), len(colony_id)
+        table: list[int] = []
+        for k, name in enumerate(compiled.columns):
+            x = constants.get(name)
+            if x is None:
+                table += _row(name, found[name], 0, k * count, 1, cells)
+            else:  # one number, or one for each colony
+                by = x.dim() and x.stride(0)
+                index = colony_id.data_ptr() if x.dim() else 0
+                table += x.data_ptr(), by, _types()[x.dtype], 0, k * count, 1, index
+        rest = (len(compiled.columns) + len(signals)) * count
+        for k, (name, x) in enumerate(signals.items(), len(compiled.columns)):
+            table += _row(name, x, 0, k * count, 1, cells)
+        factor = start.half.before.data_ptr()
+        for k, (name, x) in enumerate(start.fields.items()):
+            table += _row(name, x, factor if name in start.diluted else 0, rest + k, size, cells)
+        for k, (name, x) in enumerate(signals.items(), begin):
+            table += _row(name, x, 0, rest + k, size, cells)
+        for k in range(begin + len(signals), size):  # what a reservoir is given and gives
+            table += 0, 0, 0, 0, rest + k, size, 0
+        return np.array(table, np.int64).reshape(-1, _words()), rest
+
+
+def known(x: Tensor) -> Tensor:
+    """A column of a type that `gather` knows."""
+    return x if x.dtype in _types() else x.double()
+
+
+@cache
+def _words() -> int:
+    from torchfilm.kernels import columns
+
+    return columns.WORDS
 
 
 @cache
@@ -114,18 +165,11 @@ def _types() -> dict[torch.dtype, int]:
     }  # fmt: skip
 
 
-def _known(x: Tensor) -> Tensor:
-    """A column of a type that `gather` knows."""
-    return x if x.dtype in _types() else x.double()
-
-
 def _row(
-    name: str, column: Tensor | None, factor: int, begin: int, step: int, cells: int = 0
+    name: str, column: Tensor, factor: int, begin: int, step: int, cells: int
 ) -> tuple[int, ...]:
-    """A place, as `gather` takes it, of a column (N,) of this name; None: of zeros."""
-    if column is None:
-        return 0, 0, 0, factor, begin, step
+    """A place, as `gather` takes it, of a column (N,) of this name."""
     if column.shape != (cells,):
         shape, wanted = tuple(column.shape), f"({cells},): one number for each cell"
         raise checks.input_error(f"shape of {name}", shape, wanted)
-    return column.data_ptr(), column.stride(0), _types()[column.dtype], factor, begin, step
+    return column.data_ptr(), column.stride(0), _types()[column.dtype], factor, begin, step, 0

@@ -18,11 +18,12 @@ from torchfilm.tools.tangents import both, scaled, tracked
 @dataclass(frozen=True, eq=False)
 class HalfWay:
     """N cells half way, in time, between the volume that their concentrations refer to and their
-    own. length: µm, volume: µm³. before, after: by which growth up to there, and from there on,
-    multiplies concentrations. (N,) each."""
+    own. length: µm, volume: µm³, area: µm². before, after: by which growth up to there, and from
+    there on, multiplies concentrations. (N,) each."""
 
     length: Tensor
     volume: Tensor
+    area: Tensor
     before: Tensor
     after: Tensor
 
@@ -34,15 +35,16 @@ def half_way(length: Tensor, radius: Tensor, volume: Tensor) -> HalfWay:
     if length.device.type == "cpu" and not tracked(*given) and not unavailable():
         from torchfilm.kernels.columns import half_way as put
 
-        dtype, out = length.dtype, torch.empty(4, len(length), dtype=length.dtype)
-        put(*(as_array(x, dtype) for x in given), *out.numpy())
-        return HalfWay(*out)
+        arrays = [as_array(x, length.dtype) for x in given]
+        out = [np.empty_like(arrays[0]) for _ in range(5)]
+        put(*arrays, *out)
+        return HalfWay(*map(torch.from_numpy, out))
     end = capsule.volume(length, radius)
     middle = _root(volume * end)
     longer = middle / (torch.pi * radius * radius) - radius * (4.0 / 3.0)
     own = torch.where(volume == end, length, longer.clamp(min=0.0))
     middle = capsule.volume(own, radius)
-    return HalfWay(own, middle, volume / middle, middle / end)
+    return HalfWay(own, middle, capsule.area(own, radius), volume / middle, middle / end)
 
 
 def _root(x: Tensor) -> Tensor:

@@ -16,7 +16,6 @@ from torchfilm.circuits.columns import Lookup
 from torchfilm.circuits.compiled import Compiled
 from torchfilm.circuits.compiled_explicit import compiled_explicit
 from torchfilm.circuits.compiled_molecules import compiled_molecules
-from torchfilm.circuits.compiled_step import Changes, advance, readings
 from torchfilm.circuits.compiled_stiff import compiled_circuit
 from torchfilm.circuits.dilution import Start, half_way
 from torchfilm.circuits.draws import KeyedDraws
@@ -25,10 +24,12 @@ from torchfilm.circuits.network import build_network
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
 from torchfilm.effect import Binding, BoundEffect, number_range
+from torchfilm.effects.circuit_cells import Kind, cell_column, cell_names, cells_of_type
+from torchfilm.effects.circuit_kernels import CircuitKernels
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values, snapshot
-from torchfilm.state import CELL, OUTSIDE, State
+from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
 from torchfilm.tools.tangents import scaled
 from torchfilm.tools.warn_once import warn
@@ -64,10 +65,11 @@ class BoundCircuit(BoundEffect):
         ]:  # cells of other types need no constants
             self.values = Values({n: self.values[n].needed_by(kinds) for n in self.values})
         self.rates = snapshot(effect.rates, "Circuit.rates", binding.batch)
-        self.networks: dict[int | str, run.Network] = {}
-        self.exchanged: dict[int | str, tuple[str, ...]] = {}
+        self.networks: dict[Kind, run.Network] = {}
+        self.exchanged: dict[Kind, tuple[str, ...]] = {}
         # by cell type and whether there is a reservoir: the compiled circuit, or why there is none
-        self.compiled: dict[tuple[int | str, bool], Compiled | str] = {}
+        self.compiled: dict[tuple[Kind, bool], Compiled | str] = {}
+        self.kernels = CircuitKernels(self)
         self.by_torch = effect.why_torch(binding.batch.device)
         self.traced_reads: tuple[str, ...] = ()
         self.signals: tuple[str, ...] = ()  # that rates read or change
@@ -124,12 +126,12 @@ class BoundCircuit(BoundEffect):
         found = {} if contact is None else contact.found
         exchanged = {}
         for kind in self.rates:
-            rows = _cells_of(state, kind)
+            rows = cells_of_type(state, kind)
             # at least two, so that a function that works for a single cell only is found out
             rows = (
                 rows if rows.numel() else torch.zeros(1, dtype=torch.int64, device=state.device)
             ).repeat(2)[:64]
-            tried = self._cells(state, rows, kind, (), found, seen=seen)
+            tried = self._named(state, rows, kind, (), found, seen)
             derivatives = circuit.method == "rosenbrock"
             each = [state.fields[n].index_select(0, rows) for n in self.fields]
             exchanged[kind] = try_circuit(tried, torch.stack(each, 1), derivatives=derivatives)
@@ -146,14 +148,13 @@ class BoundCircuit(BoundEffect):
             geometry.add("position")
         outside = {OUTSIDE + n for n in self.signals}
         self.traced_reads = tuple(sorted({*geometry, *outside}))
-        self.compiled = {}
+        self.compiled, self.kernels = {}, CircuitKernels(self)
         medium = MediumExchange.of(state, self.signals)
-        found = {} if medium is None else medium.found
         for kind in self.rates:
-            self._cells(state, _cells_of(state, kind), kind, self.exchanged[kind], found, medium)
+            self.cells(state, cells_of_type(state, kind), kind, medium=medium)
         return state
 
-    def _compiled(self, kind: int | str, state: State, cells: run.CircuitCells) -> run.CircuitCells:
+    def _compiled(self, kind: Kind, state: State, cells: run.CircuitCells) -> run.CircuitCells:
         """The cells with their circuit's equations, where there are: torch's derivatives, too."""
         key, stiff = (kind, cells.in_reservoir is not None), self.effect.method == "rosenbrock"
         if cells.rows.numel() == 0 or (self.by_torch and not stiff):
@@ -260,52 +261,31 @@ class BoundCircuit(BoundEffect):
         keeps amounts."""
         if state.cells == 0:
             return state
-        circuit, medium = self.effect, MediumExchange.of(state, self.signals)
-        half = half_way(state.length, state.radius, state.fields[circuit.volume_field])
-        middle = state.with_length(half.length, half.volume)
-        found = {} if medium is None else medium.found
-        same = self._constants(middle)
-        cells = [
-            self._cells(middle, rows, kind, self.exchanged[kind], found, medium, same=same)
-            for kind in self.rates
-            if (rows := _cells_of(state, kind)).numel()
-        ]
-        fields = {n: state.fields[n].to(state.dtype) for n in self.fields}
-        start, report = (
-            Start(fields, circuit.diluted_fields, half),
-            Failures(state, circuit.method, dt),
-        )
-        read = [(c, readings(c, start, dt)) for c in cells]
-        taken = [(c, values) for c, values in read if values is not None]
-        changed = self._by_kernels(start, taken, medium, report) if taken else start.kept()
-        if left := [c for c, values in read if values is None]:
-            changed = self._by_torch(state, start, left, medium, report, changed)
+        medium = MediumExchange.of(state, self.signals)
+        middle, start = self.begun(state)
+        report = Failures(state, self.effect.method, dt)
+        rows = {k: x for k in self.rates if (x := cells_of_type(state, k)).numel()}
+        taken = self.kernels.taken(middle, rows, medium, start) if dt else {}
+        run = self.kernels.run
+        changed = run(taken, middle, rows, medium, start, report) if taken else start.kept()
+        if left := [k for k in rows if k not in taken]:
+            same = self._constants(middle)
+            cells = [self.cells(middle, rows[k], k, medium=medium, same=same) for k in left]
+            changed = self._by_torch(state, start, cells, medium, report, changed)
         if medium is not None:
             state = medium.settle()
-        state = state.with_fields(**{circuit.volume_field: state.volume}, **changed)
+        state = state.with_fields(**{self.effect.volume_field: state.volume}, **changed)
         return state.replace(reports={**state.reports, self.title: report.report()})
 
-    def _by_kernels(
-        self,
-        start: Start,
-        taken: Sequence[tuple[run.CircuitCells, Mapping[str, Tensor]]],
-        medium: MediumExchange | None,
-        report: Failures,
-    ) -> dict[str, Tensor]:
-        """The species of all cells (N,) after these circuits, each with its readings; in cells of
-        others after growth alone."""
-        whole = sum(c.rows.numel() for c, _ in taken) == report.state.cells
-        names = tuple(dict.fromkeys(n for c, _ in taken for n in c.given))
-        into = Changes.of(start, names, any(c.in_reservoir is not None for c, _ in taken), whole)
-        for c, values in taken:
-            code = advance(c, start, values, report.dt, self.effect.rtol, self.effect.atol, into)
-            if code.any():
-                report.note(start, c, torch.from_numpy(code))
-        report.steps = into.steps
-        for k, name in enumerate(names):
-            assert medium is not None
-            medium.give(name, into.given[k], into.back[k] if len(into.back) else None)
-        return dict(zip(start.fields, into.species.unbind(), strict=True))
+    def begun(self, state: State) -> tuple[State, Start]:
+        """The cells as they are half way through their growth, and what a step begins with."""
+        circuit = self.effect
+        half = half_way(state.length, state.radius, state.fields[circuit.volume_field])
+        fields = {n: state.fields[n].to(state.dtype) for n in self.fields}
+        return (
+            state.with_length(half.length, half.volume, half.area),
+            Start(fields, circuit.diluted_fields, half),
+        )
 
     def _by_torch(
         self,
@@ -342,41 +322,53 @@ class BoundCircuit(BoundEffect):
                 medium.give(name, made.pools[name], made.reservoir.get(name), rows)
         return changed
 
-    def _cells(
+    def cells(
         self,
         state: State,
         rows: Tensor,
-        kind: int | str,
+        kind: Kind,
+        *,
+        medium: MediumExchange | None = None,
+        same: Lookup | None = None,
+    ) -> run.CircuitCells:
+        """The circuit in the cells of one type as they are in this state, half way. same:
+        constants, where the circuits of several types share what does not depend on the type."""
+        found = {} if medium is None else medium.found
+        cells = self._named(state, rows, kind, self.exchanged[kind], found, same=same)
+        if medium is not None:
+            pool, away = medium.pool, medium.in_reservoir
+            cells = dataclasses.replace(cells, pool=pool, in_reservoir=away)
+        return self._compiled(kind, state, cells)
+
+    def _named(
+        self,
+        state: State,
+        rows: Tensor,
+        kind: Kind,
         exchanged: tuple[str, ...],
         found: Mapping[str, Tensor],
-        medium: MediumExchange | None = None,
         seen: dict[str, set[str]] | None = None,
         same: Lookup | None = None,
     ) -> run.CircuitCells:
-        """The circuit in the cells of one type as they are in this state. same: constants, where
-        the circuits of several types share what does not depend on the type."""
+        """As `cells`, without a pool. seen: it collects the names that are read."""
         part = self.networks.get(kind, self.rates[kind])
         label = label_of(part)
         label += "" if isinstance(kind, str) else f" (cell type {kind})"
-        pool, in_reservoir = (None, None) if medium is None else (medium.pool, medium.in_reservoir)
         if isinstance(part, run.Network):
             exchanged = part.signals
         own = None if isinstance(kind, str) else kind
         same = same or self._constants(state)
-        cells = run.CircuitCells(
+        return run.CircuitCells(
             part,
             tuple(self.effect.variables),
             exchanged,
             rows,
-            Lookup(partial(_cell_names, state, self.fields), partial(_cell_column, state)),
+            Lookup(partial(cell_names, state, self.fields), partial(cell_column, state)),
             same if own is None else self._constants(state, own, same),
             found,
-            pool,
-            in_reservoir,
-            label,
+            label=label,
             seen=seen or {},
         )
-        return cells if seen else self._compiled(kind, state, cells)
 
     def _constants(
         self, state: State, kind: int | None = None, same: Lookup | None = None
@@ -390,29 +382,3 @@ class BoundCircuit(BoundEffect):
             return same[name]
 
         return Lookup(partial(tuple, self.effect.parameters), find)
-
-
-OF_CELLS = ("length", "radius", "volume", "area", "uid")
-
-
-def _cell_names(state: State, species: tuple[str, ...]) -> list[str]:
-    """What a rate function may read of its cell."""
-    fields = [n for n in state.fields if state.declared[n].scope == CELL and n not in species]
-    return [*fields, *OF_CELLS, *"xyz"[: state.dim], "colony", "time"]
-
-
-def _cell_column(state: State, name: str) -> Tensor:
-    if name in OF_CELLS:
-        return getattr(state, name)
-    if name in ("x", "y", "z"):
-        return state.position[:, "xyz".index(name)].to(state.dtype)
-    if name == "colony":
-        return state.own_colony_id
-    return state.length.new_tensor(state.time) if name == "time" else state.fields[name]
-
-
-def _cells_of(state: State, kind: int | str) -> Tensor:
-    """The cells in which a circuit runs, (M,)."""
-    if isinstance(kind, str):
-        return torch.arange(state.cells, device=state.device)
-    return torch.nonzero(torch.eq(state.fields["cell_type"], kind)).squeeze(1)

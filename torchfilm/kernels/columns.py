@@ -14,9 +14,10 @@ from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.team import array_at
 
 # What a place says: the column's address, from one of its numbers to the next, their type, the
-# address of factors or 0; in the result, where its first number stands, and from one to the next.
-ADDRESS, STRIDE, TYPE, FACTOR, BEGIN, STEP = range(6)
-WORDS = 6
+# address of factors or 0; in the result, where its first number stands, and from one to the next;
+# the address of each cell's place in the column, int64, or 0 where it has one number for each cell.
+ADDRESS, STRIDE, TYPE, FACTOR, BEGIN, STEP, INDEX = range(7)
+WORDS = 7
 ZERO, FLOAT32, FLOAT64, INT64, INT32, BOOL = range(6)  # types; ZERO: there is no column
 
 
@@ -25,6 +26,11 @@ def _copy(first, last, rows, place, like, out):
     """One column; the product with a factor is one of its type."""
     by, begin, step = place[STRIDE], place[BEGIN], place[STEP]
     x = array_at(place, ADDRESS, like, 1)
+    if place[INDEX] != 0:
+        index = array_at(place, INDEX, np.int64, 1)
+        for m in range(first, last):
+            out[begin + m * step] = x[index[rows[m]] * by]
+        return
     if place[FACTOR] == 0:
         for m in range(first, last):
             out[begin + m * step] = x[rows[m] * by]
@@ -36,7 +42,7 @@ def _copy(first, last, rows, place, like, out):
 
 @kernel(entry=True)
 def gather(first, last, rows, places, out):
-    """Put the columns of the cells rows[first … last − 1] into out, float64. places (K, 6)."""
+    """Put the columns of the cells rows[first … last − 1] into out, float64. places (K, WORDS)."""
     for k in range(places.shape[0]):
         place = places[k]
         kind = place[TYPE]
@@ -83,9 +89,9 @@ def _volume(length, radius, number):
 
 
 @kernel(entry=True)
-def half_way(length, radius, before, own_length, own_volume, thicker, thinner):
-    """Put the lengths and volumes of cells half way, in time, between the volume `before` and their
-    own, and the ratios of the volumes before, half way and in the end."""
+def half_way(length, radius, before, own_length, own_volume, own_area, thicker, thinner):
+    """Put the lengths, volumes and areas of cells half way, in time, between the volume `before`
+    and their own, and the ratios of the volumes before, half way and in the end."""
     number = length.dtype.type
     for i in range(length.shape[0]):
         r, end = radius[i], _volume(length[i], radius[i], number)
@@ -96,4 +102,5 @@ def half_way(length, radius, before, own_length, own_volume, thicker, thinner):
             middle = max(longer, number(0.0)) if longer == longer else longer
         volume = _volume(middle, r, number)
         own_length[i], own_volume[i] = middle, volume
+        own_area[i] = number(2.0 * math.pi) * r * (middle + number(2.0) * r)
         thicker[i], thinner[i] = before[i] / volume, volume / end

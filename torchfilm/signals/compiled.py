@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchfilm.signals.grid import Grid
 from torchfilm.signals.stencil import SLACK, Stencil
-from torchfilm.tools.numba_calls import as_array, unavailable
+from torchfilm.tools.numba_calls import as_array, in_numpy, unavailable
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import both, only_forward, tracked, with_tangent
 from torchfilm.tools.threads import shares_of
@@ -44,36 +44,33 @@ def stencil(
     """As `exchange.stencil`."""
     from torchfilm.kernels.medium import put_stencil
 
-    count, used = position.shape[0], grid.used
-    node = torch.empty(count, 2 ** sum(used), dtype=torch.int64)
-    weight = torch.empty(node.shape, dtype=dtype)
-    outside, blocked = torch.zeros(2, count, dtype=torch.bool)
+    count, number = position.shape[0], in_numpy(dtype)
+    shape = count, 2 ** sum(grid.used)
+    node, weight = np.empty(shape, np.int64), np.empty(shape, number)
+    outside, blocked = np.empty(count, bool), np.zeros(count, bool)
     cells = as_array(position, torch.float64), as_array(colony, torch.int64)
-    grids = (
-        grid.origin.numpy(), grid.step.numpy(), grid.shape.numpy(), grid.offsets.numpy(),
-        np.array(used), np.array(periodic), SLACK, NO_MASK if mask is None else mask.numpy(),
-    )  # fmt: skip
-    out = [x.numpy() for x in (node, weight, outside, blocked)]
-    shares_of(
-        count,
-        WORTH_A_THREAD,
-        lambda a, b: put_stencil(*(x[a:b] for x in cells), *grids, *(x[a:b] for x in out)),
-    )
-    return Stencil(
-        node, weight, outside, grid.voxel_volume, grid.nodes, None if mask is None else blocked
-    )
+    fixed = np.array(periodic), SLACK, NO_MASK if mask is None else mask.numpy()
+    out = node, weight, outside, blocked
+
+    def work(a: int, b: int) -> None:
+        put_stencil(*(x[a:b] for x in cells), *grid.arrays, *fixed, *(x[a:b] for x in out))
+
+    shares_of(count, WORTH_A_THREAD, work)
+    nodes, weights, away, within = map(torch.from_numpy, out)
+    size = grid.voxel_volume, grid.nodes
+    return Stencil(nodes, weights, away, *size, None if mask is None else within)
 
 
 def read(values: Tensor, stencil: Stencil) -> Tensor:
     """As `exchange.read`."""
     from torchfilm.kernels.medium import read as put
 
-    dtype = values.dtype
-    out = torch.empty(stencil.node.shape[0], dtype=dtype)
-    weight = as_array(stencil.weight, dtype)
-    found, of_cells = as_array(values, dtype), (stencil.node.numpy(), weight, out.numpy())
-    shares_of(len(out), WORTH_A_THREAD, lambda a, b: put(found, *(x[a:b] for x in of_cells)))
-    return out
+    found = as_array(values, values.dtype)
+    node, weight = _of_stencil(stencil, values.dtype)
+    out = np.empty(len(node), found.dtype)
+    work = lambda a, b: put(found, node[a:b], weight[a:b], out[a:b])
+    shares_of(len(out), WORTH_A_THREAD, work)
+    return torch.from_numpy(out)
 
 
 def read_with_tangent(values: Tensor, stencil: Stencil) -> Tensor:
@@ -88,12 +85,11 @@ def pool_volume(stencil: Stencil) -> Tensor:
     """As `exchange.pool_volume`."""
     from torchfilm.kernels.medium import pools
 
-    weight = as_array(stencil.weight, stencil.weight.dtype)
-    out = torch.empty(len(weight), dtype=stencil.weight.dtype)
-    volume = weight.dtype.type(stencil.voxel_volume)
+    node, weight = stencil.arrays
+    out, number = np.empty(len(weight), weight.dtype), weight.dtype.type
     sums = _zeros(stencil.nodes, 1, weight.dtype).reshape(-1)
-    pools(stencil.node.numpy(), weight, volume, sums, out.numpy())
-    return out
+    pools(node, weight, number(stencil.voxel_volume), sums, out)
+    return torch.from_numpy(out)
 
 
 def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps: int) -> Tensor:
@@ -102,9 +98,9 @@ def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps:
 
     out = values.detach().clone(memory_format=CLOSE)
     each = (as_array(x, values.dtype) for x in (amount, there))
-    of_medium = _of_stencil(stencil, values.dtype, ulps)
-    sums = _zeros(values.numel(), 2, of_medium[1].dtype)
-    put(out.numpy(), *each, *of_medium, sums, _room(stencil.node.numel()))
+    node, weight = _of_stencil(stencil, values.dtype)
+    rest = *_limits(stencil, values.dtype, ulps), _zeros(values.numel(), 2, weight.dtype)
+    put(out.numpy(), *each, node, weight, *rest, _room(node.size))
     return out
 
 
@@ -119,10 +115,10 @@ def write_with_tangent(
     moved = torch.zeros_like(value) if change is None else change.clone(memory_format=CLOSE)
     (amount, _), (there, _) = pairs
     each = [y for x, t in pairs for y in (x, torch.zeros_like(x) if t is None else t)]
-    of_medium = _of_stencil(stencil, dtype, ulps)
+    node, weight = _of_stencil(stencil, dtype)
     put(
-        *(as_array(x, dtype) for x in (value, moved, *each)), *of_medium,
-        _zeros(value.numel(), 3, of_medium[1].dtype),
+        *(as_array(x, dtype) for x in (value, moved, *each)), node, weight,
+        *_limits(stencil, dtype, ulps), _zeros(value.numel(), 3, weight.dtype),
     )  # fmt: skip
     return with_tangent(write(value, amount, there, stencil, ulps), moved)
 
@@ -154,14 +150,17 @@ def _room(size: int) -> np.ndarray:
     return found
 
 
-def _of_stencil(
-    stencil: Stencil, dtype: torch.dtype, ulps: int
-) -> tuple[np.ndarray, np.ndarray, Any, Any]:
-    """Nodes, weights, the volume of a voxel, and the share up to which a voxel counts as emptied,
-    as kernels take them."""
-    weight, near_one = as_array(stencil.weight, dtype), 1 + ulps * torch.finfo(dtype).eps
-    number = weight.dtype.type
-    return stencil.node.numpy(), weight, number(stencil.voxel_volume), number(near_one)
+def _of_stencil(stencil: Stencil, dtype: torch.dtype) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes, and weights of this type."""
+    node, weight = stencil.arrays
+    return node, weight.astype(in_numpy(dtype), copy=False)
+
+
+def _limits(stencil: Stencil, dtype: torch.dtype, ulps: int) -> tuple[Any, Any]:
+    """The volume of a voxel, and the share up to which a voxel counts as emptied, as kernels take
+    them."""
+    number = in_numpy(dtype)
+    return number(stencil.voxel_volume), number(1 + ulps * torch.finfo(dtype).eps)
 
 
 def spans(position: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:
@@ -186,8 +185,8 @@ def beyond(
     left = torch.zeros(groups.size, dtype=torch.int64)
     first = torch.full_like(left, position.shape[0])
     put(
-        as_array(position, torch.float64), as_array(groups.owner, torch.int64), grid.origin.numpy(),
-        grid.step.numpy(), grid.shape.numpy(), torch.tensor(periodic).numpy(), SLACK, left.numpy(),
+        as_array(position, torch.float64), as_array(groups.owner, torch.int64), *grid.arrays[:3],
+        torch.tensor(periodic).numpy(), SLACK, left.numpy(),
         first.numpy(),
     )  # fmt: skip
     return left, first

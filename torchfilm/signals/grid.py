@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -130,6 +131,12 @@ class Grid:
     def step(self) -> Tensor:
         """(3,) float64, the spacing as a tensor."""
         return self.origin.new_tensor(self.spacing)
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """On the CPU, for kernels: origin, step, shape, offsets and used."""
+        tensors = self.origin, self.step, self.shape, self.offsets
+        return *(x.numpy() for x in tensors), np.array(self.used)
 
     @property
     def high(self) -> Tensor:

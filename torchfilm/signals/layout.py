@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from torchfilm.signals.exchange import Stencil, beyond, counted, pool_volume, re
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups, expand_ranges
+from torchfilm.tools.tangents import tracked
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +84,10 @@ class Layout:
         """The positions of cells at (N, d) in the grid's three dimensions, (N, 3) float64, µm."""
         if position.shape[1] == 3:
             return position.double()
+        if position.device.type == "cpu" and not tracked(position):
+            found = np.full((len(position), 3), self.height)
+            found[:, :2] = position.detach().numpy()
+            return torch.from_numpy(found)
         return torch.cat(
             [
                 position.double(),
@@ -123,7 +129,7 @@ class Layout:
     ) -> Contact:
         """The concentration of each signal (nodes,) at cells at (N, d) µm of colonies (N,).
 
-        ids: (N,), the ids of the cells' colonies.
+        ids: (B,), those of the colonies.
         """
         where = self.stencil(position, colony, dtype)
         found = {name: read(value, where) for name, value in signals.items()}
@@ -132,11 +138,11 @@ class Layout:
         in_reservoir = where.outside if where.blocked is None else where.outside & ~where.blocked
         if not bool(in_reservoir.any()):
             return Contact(where, found, None, found)
-        in_voxels = dict(found)
+        in_voxels, own = dict(found), ids.index_select(0, colony)
         for name, value in in_voxels.items():
             given = torch.as_tensor(self.reservoir[name], dtype=value.dtype, device=value.device)
             found[name] = torch.where(
-                in_reservoir, given.index_select(0, ids) if given.dim() else given, value
+                in_reservoir, given.index_select(0, own) if given.dim() else given, value
             )
         return Contact(where, found, in_reservoir, in_voxels)
 

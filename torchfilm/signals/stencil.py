@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 from torch import Tensor
 
+from torchfilm.tools.numba_calls import as_array
 from torchfilm.tools.ragged import Groups
 
 # A cell beyond a face by at most this part of a voxel counts as inside. Positions are float64: 1e5
@@ -32,6 +34,11 @@ class Stencil:
     voxel_volume: float
     nodes: int
     blocked: Tensor | None = None
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """On the CPU, for kernels: node and weight."""
+        return self.node.numpy(), as_array(self.weight, self.weight.dtype)
 
     @cached_property
     def groups(self) -> Groups:

@@ -44,3 +44,8 @@ def as_array(value: Tensor, dtype: torch.dtype) -> np.ndarray:
     value = value.detach() if value.requires_grad else value
     value = value if value.dtype == dtype else value.to(dtype)
     return (value if value.is_contiguous() else value.contiguous()).numpy()
+
+
+def in_numpy(dtype: torch.dtype) -> type:
+    """NumPy's numbers of this type."""
+    return np.float32 if dtype == torch.float32 else np.float64
