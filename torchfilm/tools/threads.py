@@ -87,6 +87,10 @@ def shares_of(count: int, least: int, work: Callable[[int, int], object]) -> Non
         work(0, count)
         return
     ends = [count * k // threads for k in range(threads + 1)]
-    calls = [pool(threads).submit(work, a, b) for a, b in pairwise(ends)]
-    for call in calls:
-        call.result()
+    (first, last), *others = pairwise(ends)
+    calls = [pool(threads).submit(work, a, b) for a, b in others]
+    try:
+        work(first, last)  # by this thread, which need not be woken
+    finally:
+        for call in calls:
+            call.result()
