@@ -98,7 +98,7 @@ ERRORS = {
     "resume good.h5": ("--cells", "--until"),
     "resume good.h5 --until 0.1": ("until", r"0\.1"),
     "info missing.h5": (r"missing\.h5", "No such file"),
-    "info microcolony --set rtol=1": ("rtol", "one of dim", "accuracy setting"),
+    "info microcolony --set rtol=1": ("rtol", "It has: dim", "accuracy setting"),
     "resume missing.h5 --until 1": (r"missing\.h5", "No such file"),
     "resume text.h5 --until 1": (r"text\.h5", "not a results file"),
     "resume foreign.h5 --until 1": (r"foreign\.h5", "not a torchfilm results file"),

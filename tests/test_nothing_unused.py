@@ -61,6 +61,28 @@ def test_a_misspelt_option_of_a_circuit_is_an_error():
         (lambda: tf.Sphere((0, 0), radious=1.0), "Sphere has no parameter 'radious'. Did you mean"),
         (lambda: tf.Box((0, 0), (1, 1), stifness=1.0), "Did you mean stiffness?"),
         (lambda: tf.Mechanics(unilateral=True), 'contacts="one-sided", the default'),
+        (lambda: tf.Signal(D=10.0), "Signal has no parameter 'D'. Did you mean diffusion?"),
+        (lambda: tf.Cells([[0, 0]], celltype=[1]), "'celltype'. Did you mean cell_type?"),
+        (lambda: tf.Cells([[0, 0]], angle=[0.3]), "Write axis=[[cos, sin], …], or Cells.from_tab"),
+        (lambda: tf.Scene(tf.Growth(rate=1.0), dtt=0.1), "Scene has no parameter 'dtt'. Did you"),
+        (lambda: tf.scenes.microcolony().bind(colonie=2), "Did you mean colonies?"),
+        (lambda: tf.Uniform(low=1.0, hihg=2.0), "Uniform has no parameter 'hihg'. Did you mean h"),
+        (lambda: tf.Dirichlet(valeu=1.0), "Dirichlet has no parameter 'valeu'. Did you mean value"),
+        (lambda: tf.BoundaryConditions(xx=tf.Open()), "BoundaryConditions has no parameter 'xx'"),
+        (lambda: tf.Settings(penalti=0.1), "Settings has no parameter 'penalti'. Did you mean pen"),
+        (
+            lambda: tf.Scene(effects=[tf.Growth(rate=1.0)]),
+            "'effects'. Effects come first, without a name: (*effects, name=…). It has: *effects,",
+        ),
+        (
+            lambda: tf.scenes.microcolony().replace(effects=[]),
+            "'effects'. Effects come first, without a name: (*effects, name=…). It has: *effects,",
+        ),
+        (lambda: tf.scenes.microcolony(rates=1.0), "microcolony has no parameter 'rates'. Did you"),
+        (lambda: tf.explain(tf.scenes.microcolony(), cell=9), "explain has no parameter 'cell'"),
+        (lambda: tf.LivePlot(color="gfp"), "LivePlot has no parameter 'color'. Did you mean col"),
+        (lambda: tf.from_cellmodeller("a.py", cel=2), "from_cellmodeller has no parameter 'cel'"),
+        (lambda: tf.tune(tf.scenes.microcolony(), errors=0.1), "tune has no parameter 'errors'"),
     ],
 )
 def test_a_keyword_that_nothing_takes_is_an_error(make, words):
@@ -76,8 +98,27 @@ def test_a_keyword_that_nothing_takes_is_an_error(make, words):
         (lambda: tf.Sphere(center=(0, 0)), "Sphere: missing a required argument: 'radius'."),
         (lambda: tf.Box((0, 0)), "Box: missing a required argument: 'high'."),
         (lambda: tf.Plane(0.5), "Plane: too many positional arguments."),
+        (
+            lambda: tf.Medium(tf.Signal(diffusion=1.0)),
+            "Name each signal: Medium(ahl=tf.Signal(…), box=…, spacing=…). Its parameters: box,",
+        ),
         (tf.Monod, "Monod: missing a required argument: 'signal'."),
         (tf.simulate, "simulate: missing a required argument: 'scene'."),
+        (tf.Signal, "Signal: missing a required argument: 'diffusion'. Its parameters: diffusion,"),
+        (lambda: tf.Cells([[0, 0]]), "Cells: missing a required argument: 'axis'."),
+        (lambda: tf.LogNormal(1.0), "LogNormal: missing a required argument: 'sigma'."),
+        (lambda: tf.Reaction.of("a -> b"), "of: missing a required argument: 'rate'."),
+        (lambda: tf.parts.degradation("a"), "degradation: missing a required argument: 'rate'."),
+        (lambda: tf.scenes.microcolony(*range(9)), "microcolony: too many positional arguments."),
+        (tf.Results, "Results: missing a required argument: 'path'."),
+        (tf.Recorder, "Recorder: missing a required argument: 'path'."),
+        (
+            tf.Circuit.from_sbml,
+            "from_sbml: missing a required argument: 'path'. Its parameters: pa",
+        ),
+        (lambda: tf.Field("heat"), "Field: missing a required argument: 'meaning'."),
+        (tf.Replay, "Replay: missing a required argument: 'model'."),
+        (tf.preset, "preset: missing a required argument: 'name'."),
     ],
 )
 def test_an_argument_that_is_missing_is_named(make, words):
@@ -193,5 +234,17 @@ def test_brackets_and_lists():
         tf.Scene([tf.Growth(rate=1.0), tf.Mechanics(dim=2)])
     with pytest.raises(tf.InputError, match=r"Write Growth\(\) with its brackets"):
         tf.Scene(tf.Growth)
-    with pytest.raises(tf.InputError, match=r"Names in use: .*x"):
-        tf.Circuit(made, species=("x",), strength=1.0)
+
+
+@pytest.mark.parametrize(
+    "name, words",
+    [
+        ("x", "'x' is the place of a cell; call the species x_, or by another name."),
+        ("length", "'length' is the length of a cell; call the species length_, or by"),
+        ("take", "the state uses 'take' itself; call the species take_, or by another name."),
+    ],
+)
+def test_a_species_of_a_name_that_cells_have_is_told_what_the_name_is(name, words):
+    with pytest.raises(tf.InputError) as caught:
+        tf.Circuit(made, species=(name,), strength=1.0)
+    assert words in str(caught.value) and len(str(caught.value)) < 200

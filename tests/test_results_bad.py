@@ -383,3 +383,11 @@ def test_a_disk_that_is_really_full(tmp_path, every_step):
         done.stderr[-1000:],
     )
     assert_same_file(every_step[0], tmp_path / "run.h5")
+
+
+def test_a_state_needs_its_scene_first(tmp_path):
+    scene = make_scene()
+    record(scene, scene.bind().start(), tmp_path / "run.h5", until=DT)
+    words = r"scene = -1.*results\.state\(scene\) for the last"
+    with tf.Results(tmp_path / "run.h5") as results, pytest.raises(tf.InputError, match=words):
+        results.state(-1)

@@ -117,7 +117,10 @@ def test_a_design_of_one_colony_starts_as_the_ready_scene_does(folder):
             {**READY, "file": "other.json"},
             "'other.json'.*a ready scene, or the path of a Python file",
         ),
-        ({**READY, "parameters": {"rates": 1.0}}, "parameter of microcolony = 'rates'.*one of dim"),
+        (
+            {**READY, "parameters": {"rates": 1.0}},
+            "microcolony has no parameter 'rates'. Did you mean rate",
+        ),
         ({**READY, "parameters": {"rate": "fast"}}, "rate = 'fast'.*a number"),
         ({**READY, "dt": 0}, "dt in .*best.json = 0.*above 0"),
         ({**READY, "dt": "0.1"}, "dt in .*best.json = '0.1'.*a number"),

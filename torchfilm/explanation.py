@@ -13,6 +13,7 @@ from torchfilm.tools import checks
 from torchfilm.tools.warn_once import once
 
 
+@checks.known_keywords
 @once()  # it binds the scene again to estimate its cost
 def explain(
     scene: Scene,

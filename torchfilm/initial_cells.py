@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, repr=False)
-class Cells:
+class Cells(metaclass=checks.KnownKeywords):
     """Initial cells.
 
     position: (N, d) µm. axis: (N, d), of any length above 0. length: (N,) µm of the centreline.
@@ -42,6 +42,10 @@ class Cells:
     extra: Mapping[str, Any] = field(default_factory=dict)
     # repr=False: it has no effect on a simulation, so it does not count for a scene's digest
     micrograph: Micrograph | None = field(default=None, repr=False)
+
+    instead: ClassVar[Mapping[str, str]] = {
+        "angle": "Write axis=[[cos, sin], …], or Cells.from_table({'angle': …, …})."
+    }
 
     def __post_init__(self) -> None:
         position = _array("position", self.position, np.float64)

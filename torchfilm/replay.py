@@ -61,7 +61,7 @@ class RecordingReport:
         return self.words[place]
 
 
-class GrowthRecording:
+class GrowthRecording(metaclass=checks.KnownKeywords):
     """The growth and motion of some colonies of a scene, without the effects that only follow:
     grown step by step as far as it is read, and kept.
 
@@ -229,7 +229,7 @@ def _sources(before: State, after: State) -> Tensor:
     return order.index_select(0, torch.where(was_there, at, above))
 
 
-class Replay:
+class Replay(metaclass=checks.KnownKeywords):
     """A model of designs on recorded growth: `step` as the model's, with the same result, without
     growth and mechanics.
 

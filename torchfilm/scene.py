@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from torchfilm.circuits.names import without_medium
 from torchfilm.effect import BUILT_IN, Effect, given, parameters, summary
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model, bind
@@ -21,9 +22,10 @@ from torchfilm.tools.warn_once import once, warn
 from torchfilm.version import __version__
 
 CHANGEABLE = ("name", "dt", "founders", "recipe", "settings", "accuracy", "dim")
+NO_KEYWORD = {"effects": "Effects come first, without a name: (*effects, name=…)."}
 
 
-class Scene:
+class Scene(metaclass=checks.KnownKeywords):
     """Effects that act on a state in each step, in the paper's order (rules, division, growth,
     mechanics, …), whatever order they are listed in. A scene never changes; `replace` makes another
     one.
@@ -48,6 +50,8 @@ class Scene:
     code: list[str]
     declared_by: dict[str, str]
     _said: frozenset[str]  # warnings given when it was made
+
+    instead: ClassVar[Mapping[str, str]] = NO_KEYWORD
 
     def __init__(
         self,
@@ -112,11 +116,13 @@ class Scene:
         …"""
         for name in changes:
             if name not in CHANGEABLE:
-                raise checks.unknown_keyword("Scene.replace", name, CHANGEABLE)
+                known = ("*effects", *CHANGEABLE)
+                raise checks.unknown_keyword("Scene.replace", name, known, NO_KEYWORD)
         kept = {name: getattr(self, name) for name in CHANGEABLE}
         with once(self._said):  # what this scene has warned of, its copies need not
             return Scene(*(effects or self.effects), **{**kept, **changes})
 
+    @checks.known_keywords
     def bind(
         self,
         colonies: int | None = None,
@@ -317,10 +323,7 @@ def _signal_hint(name: str, declared: Iterable[str]) -> str:
     """What to do where an effect needs a signal that no Medium has."""
     has = ", ".join(n.removeprefix(OUTSIDE) for n in declared if n.startswith(OUTSIDE))
     if not has:
-        return (
-            f" That is the signal {name!r}, and the scene has no Medium: list"
-            f" tf.Medium({name}=tf.Signal(…), …)."
-        )
+        return f" That is the signal {name!r}, and {without_medium(name)}"
     return (
         f" That is the signal {name!r}; the Medium has {has}: name one of these, or give the Medium"
         f" {name}=tf.Signal(…)."

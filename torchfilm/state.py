@@ -26,7 +26,7 @@ DivisionRule = str | Callable[["State", "Tensor"], "Tensor"]
 
 
 @dataclass(frozen=True)
-class Field:
+class Field(metaclass=checks.KnownKeywords):
     """A named quantity that an effect declares. What no effect declares does not exist.
 
     scope: "cell" (one row a cell), "colony" (one row a colony) or "grid" (one row a voxel of the

@@ -43,7 +43,7 @@ FORMS_OF_TYPE = (
 
 
 @dataclass(frozen=True, eq=False)
-class PerColony:
+class PerColony(metaclass=checks.KnownKeywords):
     """One value per colony, stated: `tf.PerColony([0.6, 1.2])`."""
 
     values: Tensor | Sequence[float]
@@ -178,7 +178,7 @@ def is_inherited(value: Any) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Distribution:
+class Distribution(metaclass=checks.KnownKeywords):
     """A random value, drawn once for each cell at its birth. Subclasses: Uniform, Normal,
     LogNormal.
 

@@ -106,11 +106,11 @@ AT_SEED = {
     ),
     "a signal without a medium": (
         lambda u, s, p, cell: {"m": s.ahl},
-        r"(?i)no Medium|without a Medium",
+        r"s has no 'ahl', since the scene has no Medium: list tf\.Medium\(ahl=tf\.Signal\(dif",
     ),
     "a signal given without a medium": (
         lambda u, s, p, cell: ({"m": u.m}, {"ahl": u.m}),
-        r"'ahl', which is no signal",
+        r"'ahl', which is no signal: the scene has no Medium: list tf\.Medium\(ahl=",
     ),
     "a wrong shape": (
         lambda u, s, p, cell: {"m": u.m.unsqueeze(1)},
@@ -203,7 +203,7 @@ REACTIONS = {
     "unknown species": ([tf.parts.constitutive("w", "k")], r"'w made' has the unknown name 'w'"),
     "signal without a medium": (
         [tf.parts.exchange("m", "k", "ahl")],
-        r"needs the signal 'ahl': list tf\.Medium",
+        r"needs the signal 'ahl': the scene has no Medium: list tf\.Medium",
     ),
 }
 

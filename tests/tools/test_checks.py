@@ -35,7 +35,7 @@ def test_an_unknown_keyword_gets_the_nearest_known_one(given, allowed, message):
     ("call", "message"),
     [
         (lambda: tf.scenes.build("microcoloni"), "Did you mean 'microcolony'?"),
-        (lambda: tf.scenes.build("microcolony", {"raet": 1.0}), "Did you mean 'rate'?"),
+        (lambda: tf.scenes.build("microcolony", {"raet": 1.0}), "Did you mean rate?"),
         (lambda: tf.Mechanics(backend="compile"), "Did you mean 'compiled'?"),
     ],
 )

@@ -42,6 +42,7 @@ SPREAD = {"CLEulerSigIntegrator": 1 / 6, "CLCrankNicIntegrator": 1 / 12}
 BOUNDARIES = ("constant", "reflect", "nearest", "wrap")
 
 
+@checks.known_keywords
 def from_cellmodeller(
     path: str | Path,
     *,

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torchfilm.circuits.names import Names, UnknownName, unknown
+from torchfilm.circuits.names import Names, UnknownName, unknown, without_medium
 
 
 class Columns(Names):
@@ -56,6 +56,20 @@ class Columns(Names):
 
     def __repr__(self) -> str:
         return f"Columns({', '.join(self._source) or 'none'})"
+
+
+class NoSignals(Names):
+    """The signals of a scene without a medium."""
+
+    __slots__ = ()
+
+    def __init__(self) -> None:
+        super().__init__((), (), "s")
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise UnknownName(f"s has no {name!r}, since {without_medium(name)}")
 
 
 class Lookup(Mapping[str, Any]):

@@ -67,6 +67,13 @@ class Names:
         return f"Names({', '.join(self.__dict__) or 'none'})"
 
 
+def without_medium(name: str) -> str:
+    """What to do about a signal in a scene that has none."""
+    return (
+        f"the scene has no Medium: list tf.Medium({name}=tf.Signal(diffusion=…), box=…, spacing=…)."
+    )
+
+
 def label_of(part: object) -> str:
     """What messages call the rates of a circuit: a function by its name, a module by its class."""
     kind = type(part).__name__ if callable(part) else "the list of reactions"

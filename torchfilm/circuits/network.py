@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.names import Names, unknown
+from torchfilm.circuits.names import Names, unknown, without_medium
 from torchfilm.circuits.reactions import OUTSIDE, Reaction, concentration, falling, per_cell
 from torchfilm.tools import checks
 
@@ -176,7 +176,7 @@ def build_network(
                     signal = name.removeprefix(OUTSIDE)
                     raise checks.InputError(
                         f"the reaction {reaction.name or str(reaction)!r} needs the signal"
-                        f" {signal!r}: list tf.Medium({signal}=tf.Signal(…))."
+                        f" {signal!r}: {without_medium(signal)}"
                     )
                 raise checks.InputError(
                     unknown(

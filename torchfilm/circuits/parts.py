@@ -19,6 +19,7 @@ from torchfilm.circuits.reactions import (
     constant,
     per_cell,
 )
+from torchfilm.tools import checks
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +97,13 @@ def _regulated(
     return [Reaction({}, {species: 1}, law, f"{species} {what} by {by}", order=_steepness(power))]
 
 
+@checks.known_keywords
 def constitutive(species: str, rate: Constant) -> list[Reaction]:
     """∅ → species at `rate`, conc/h."""
     return [Reaction({}, {species: 1}, rate, f"{species} made")]
 
 
+@checks.known_keywords
 def activated(
     species: str, by: str, rate: Constant, half: Constant, power: Constant = 1.0
 ) -> list[Reaction]:
@@ -108,6 +111,7 @@ def activated(
     return _regulated(species, by, rate, half, power, False)
 
 
+@checks.known_keywords
 def repressed(
     species: str, by: str, rate: Constant, half: Constant, power: Constant = 1.0
 ) -> list[Reaction]:
@@ -115,11 +119,13 @@ def repressed(
     return _regulated(species, by, rate, half, power, True)
 
 
+@checks.known_keywords
 def degradation(species: str, rate: Constant) -> list[Reaction]:
     """species → ∅ at rate × concentration; rate 1/h."""
     return [Reaction({species: 1}, {}, rate, f"{species} lost")]
 
 
+@checks.known_keywords
 def conversion(
     substrate: str, product: str | None = None, *, enzyme: str, rate: Constant, half: Constant
 ) -> list[Reaction]:
@@ -140,6 +146,7 @@ def conversion(
     ]
 
 
+@checks.known_keywords
 def exchange(species: str, rate: Constant, signal: str | None = None) -> list[Reaction]:
     """Exchange through the membrane, both ways: D₁ A/V × concentration, rate = D₁ in µm/h.
 

@@ -27,7 +27,7 @@ TERM = re.compile(r"(?:(\d+)\s*\*?\s*)?((?:out\.)?[A-Za-z_]\w*)")
 
 
 @dataclass(frozen=True, eq=False)
-class Reaction:
+class Reaction(metaclass=checks.KnownKeywords):
     """Molecules `consumes` turn into `produces` at `rate`; both map names to numbers of molecules.
 
     rate: a constant (a number, one per colony, or a parameter's name) gives mass action, rate × Π
@@ -58,6 +58,7 @@ class Reaction:
             )
 
     @staticmethod
+    @checks.known_keywords
     def of(
         equation: str, rate: Constant | RateFunction, name: str = "", *, order: int = 2
     ) -> Reaction:

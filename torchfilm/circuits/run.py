@@ -17,14 +17,14 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits import integrators, rosenbrock, stochastic
-from torchfilm.circuits.columns import Columns, column
+from torchfilm.circuits.columns import Columns, NoSignals, column
 from torchfilm.circuits.compiled import Compiled
 from torchfilm.circuits.compiled_explicit import CompiledExplicit
 from torchfilm.circuits.compiled_molecules import CompiledMolecules
 from torchfilm.circuits.compiled_stiff import CompiledCircuit
 from torchfilm.circuits.draws import Draw, KeyedDraws
 from torchfilm.circuits.graph import both_of, check_returned
-from torchfilm.circuits.names import Names, unknown
+from torchfilm.circuits.names import Names, unknown, without_medium
 from torchfilm.circuits.network import Network
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.deterministic_math import deterministic_functions
@@ -78,13 +78,8 @@ class CircuitCells:
         among the N."""
         size = len(self.species)
         columns = u.unbind(1)
-        outside: dict[str, Any] = dict(self.signals)
-        s = Columns(
-            outside,
-            rows,
-            "s" if outside else "without a Medium in the scene, s",
-            self.seen.get("s"),
-        )
+        signals: dict[str, Any] = dict(self.signals)
+        s = Columns(signals, rows, "s", self.seen.get("s")) if signals else NoSignals()
         for name, value in zip(self.given, columns[size:], strict=False):
             s.__dict__[name] = value
         return (
@@ -119,13 +114,10 @@ class CircuitCells:
         out = {}
         for name, value in found.items():
             if name not in known:
-                raise InputError(
-                    unknown(
-                        f"{self.label} returned a rate for {name!r}, which is no {what}",
-                        str(name),
-                        list(known),
-                    )
-                )
+                wrong = f"{self.label} returned a rate for {name!r}, which is no {what}"
+                if what == "signal" and not known:
+                    raise InputError(f"{wrong}: {without_medium(str(name))}")
+                raise InputError(unknown(wrong, str(name), list(known)))
             made = column(value, rows.numel(), u)
             if made is None:
                 shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__

@@ -153,6 +153,7 @@ class Circuit(Effect):
             object.__setattr__(self, key, value)
 
     @classmethod
+    @checks.known_keywords
     def from_sbml(
         cls,
         path: str | Path,
@@ -185,6 +186,7 @@ class Circuit(Effect):
         return cls(**circuit_sbml.keywords(*model, choices, dilution, options))
 
     @classmethod
+    @checks.known_keywords
     def from_antimony(
         cls,
         text: str | Path,

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchfilm.circuits import integrators
 from torchfilm.circuits.names import unknown
-from torchfilm.state import RESERVED
+from torchfilm.state import PER_CELL, RESERVED
 from torchfilm.tools import checks
 from torchfilm.values import FORMS
 
@@ -48,16 +48,23 @@ def _fit(names: Sequence[Any]) -> bool:
 def check_species(names: tuple[str, ...], shared: Mapping[str, str]) -> None:
     taken = [n for n in (*names, *shared) if n in RESERVED or n in GEOMETRY]
     if taken:
-        listed = ", ".join(sorted(n for n in {*RESERVED, *GEOMETRY} if not n.startswith("_")))
         raise checks.input_error(
             "Circuit.species",
             taken[0],
             "a name that cells do not have already",
-            f"Names in use: {listed}.",
+            f"{_meaning(taken[0])}; call the species {taken[0]}_, or by another name.",
         )
     both = [n for n in names if n in shared]
     if both:
         raise checks.input_error("Circuit.shared", both[0], "no species of the circuit's own")
+
+
+def _meaning(name: str) -> str:
+    """What a name that is in use stands for, in words."""
+    if name in ("x", "y", "z"):
+        return f"{name!r} is the place of a cell"
+    of_cells = name in (*PER_CELL, *GEOMETRY)
+    return f"{name!r} is the {name} of a cell" if of_cells else f"the state uses {name!r} itself"
 
 
 def check_rates(by_type: Mapping[int | str, Any], typed: bool) -> None:

@@ -78,7 +78,7 @@ class Mechanics(Effect):
     stage = MECHANICS
     title = "mechanics"
     may_repeat = False
-    former_keywords: ClassVar[Mapping[str, str]] = {
+    instead: ClassVar[Mapping[str, str]] = {
         "unilateral": (
             'Contacts that only push are contacts="one-sided", the default; unilateral=False is'
             ' contacts="bilateral" now.'

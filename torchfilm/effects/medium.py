@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -33,7 +33,7 @@ EXACT = ("exponential", "series")
 
 
 @dataclass(frozen=True, eq=False)
-class Signal:
+class Signal(metaclass=checks.KnownKeywords):
     """A substance outside the cells.
 
     diffusion: K, µm²/h, one number or one per colony. decay: 1/h. initial: concentration at the
@@ -50,6 +50,11 @@ class Signal:
     boundary: BoundaryConditions | None = None
     flow: Flow = None
     reservoir: float | Tensor = 0.0
+
+    instead: ClassVar[Mapping[str, str]] = {
+        "D": "Did you mean diffusion?",
+        "K": "Did you mean diffusion?",
+    }
 
     def __post_init__(self) -> None:
         _check_boundary("Signal.boundary", self.boundary)
@@ -111,6 +116,7 @@ class Medium(Effect):
     title = "transport"
     may_repeat = False
     works_on_grid = True
+    unnamed = "Name each signal: Medium(ahl=tf.Signal(…), box=…, spacing=…)."
 
     def __init__(
         self,

@@ -49,7 +49,7 @@ except ImportError:  # not on Windows
 SPARE_BYTES = 65536  # that HDF5 may need in addition to the arrays of a frame
 
 
-class Recorder:
+class Recorder(metaclass=checks.KnownKeywords):
     """An observer that writes every `every`-th step of a run to an HDF5 file, and on `close` the
     last one.
 

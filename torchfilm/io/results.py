@@ -46,7 +46,7 @@ GROWING = (
 )
 
 
-class Results:
+class Results(metaclass=checks.KnownKeywords):
     """A results file to read: `len(results)` frames; `results.frame(k)`, `results.table(k)`,
     `results.lineage()`, `results.state(scene, k)`. Raises InputError if the file is not a readable
     results file."""
@@ -382,4 +382,7 @@ class Results:
         scene: the recorded one; with `changed`, any scene with the same fields. device: "cpu" by
         default. Raises InputError for another scene, and names what differs.
         """
+        if not isinstance(scene, Scene):
+            hint = "Write results.state(scene) for the last frame, or results.state(scene, frame)."
+            raise checks.input_error("scene", scene, "the Scene that was recorded", hint)
         return restore_state(self, scene, self._index(frame), device, changed)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SHARE = 0.2  # of the time of a run, which drawing takes at most
 
 
-class LivePlot:
+class LivePlot(metaclass=checks.KnownKeywords):
     """Draws the colonies of a run while it goes on: an observer for `tf.simulate`.
 
         for state in tf.simulate(scene, cells=500, observers=[tf.LivePlot(colour="yfp")]):

@@ -25,12 +25,23 @@ def _is_list_of_numbers(given: Any) -> bool:
     )
 
 
+def _accuracy_settings() -> dict[str, str]:
+    """What to write in place of each accuracy setting, given as a parameter of a scene."""
+    from torchfilm.tuning.settings import Settings  # only where a message needs it
+
+    instead = "It is an accuracy setting: use --settings FILE or tf.Settings(…)."
+    return {f.name: instead for f in dataclasses.fields(Settings)}
+
+
 def _ready(make: Callable[..., Scene]) -> Callable[..., Scene]:
     """Store the name and the parameters in the scene, so that a results file can rebuild it."""
 
     @functools.wraps(make)
     def build(*args: Any, **parameters: Any) -> Scene:
-        bound = inspect.signature(make).bind(*args, **parameters)
+        signature = inspect.signature(make)
+        knobs = {} if parameters.keys() <= signature.parameters.keys() else _accuracy_settings()
+        checks.check_call(make.__name__, signature, args, parameters, knobs)
+        bound = signature.bind(*args, **parameters)
         bound.apply_defaults()
         # a recipe has lists, and a list times a number is not a list of products
         scene = make(
@@ -73,12 +84,6 @@ READY: dict[str, Callable[..., Scene]] = {
 }
 
 
-def _accuracy_settings() -> set[str]:
-    from torchfilm.tuning.settings import Settings  # only where a message needs it
-
-    return {f.name for f in dataclasses.fields(Settings)}
-
-
 def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
     """The ready-made scene `name`. Raises InputError for an unknown name or parameter."""
     if name not in READY:
@@ -88,15 +93,4 @@ def build(name: str, parameters: dict[str, Any] | None = None) -> Scene:
             "one of " + ", ".join(READY) + ", or the path of a Python file that defines `scene`",
             checks.suggestion(name, READY),
         )
-    allowed = inspect.signature(READY[name]).parameters
-    for given in parameters or {}:
-        if given not in allowed:
-            knob = (
-                "It is an accuracy setting: use --settings FILE or tf.Settings(…)."
-                if given in _accuracy_settings()
-                else checks.suggestion(given, allowed)
-            )
-            raise checks.input_error(
-                f"parameter of {name}", given, "one of " + ", ".join(allowed), knob
-            )
     return READY[name](**from_plain(parameters or {}))

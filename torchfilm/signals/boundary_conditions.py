@@ -12,7 +12,7 @@ AXES = "xyz"
 
 
 @dataclass(frozen=True)
-class Face:
+class Face(metaclass=checks.KnownKeywords):
     """The base of all faces."""
 
     def outside_value(self) -> float | Tensor:
@@ -73,7 +73,7 @@ class Open(Face):
 
 
 @dataclass(frozen=True)
-class BoundaryConditions:
+class BoundaryConditions(metaclass=checks.KnownKeywords):
     """The six faces of a box: for each axis one face for both ends, or (low, high).
 
     Example: `BoundaryConditions(x=(Dirichlet(1.0), Open()), y=Periodic())`.

@@ -63,13 +63,13 @@ def suggestion(given: object, known: Iterable[object]) -> str:
 
 
 def unknown_keyword(
-    name: str, given: str, allowed: Sequence[str], former: Mapping[str, str] | None = None
+    name: str, given: str, allowed: Sequence[str], instead: Mapping[str, str] | None = None
 ) -> InputError:
     """The error for a keyword that a function or class does not have, with the nearest one that it
-    has; raise what this returns. name: of the function or class, such as "Growth". former: what to
-    write instead of keywords of earlier versions."""
+    has; raise what this returns. name: of the function or class, such as "Growth". instead: what to
+    write in place of certain keywords, such as those of earlier versions."""
     near = nearest(given, allowed)
-    hint = (former or {}).get(given) or (f"Did you mean {near}?" if near else "")
+    hint = (instead or {}).get(given) or (f"Did you mean {near}?" if near else "")
     return InputError(
         f"{name} has no parameter {given!r}."
         + (f" {hint}" if hint else "")
@@ -95,33 +95,43 @@ def check_call(
     signature: inspect.Signature,
     args: Sequence[Any],
     given: Mapping[str, Any],
-    former: Mapping[str, str] | None = None,
+    instead: Mapping[str, str] | None = None,
+    unnamed: str = "",
 ) -> None:
-    """Raise InputError for arguments that do not fit a signature. former: as in
-    `unknown_keyword`."""
-    kinds = {p.kind for p in signature.parameters.values()}
-    allowed = [n for n in signature.parameters if n != "self"]
-    if inspect.Parameter.VAR_KEYWORD not in kinds:
+    """Raise InputError for arguments that do not fit a signature. instead: as in `unknown_keyword`.
+    unnamed: what to write where there are too many arguments without a name."""
+    found = {n: p.kind for n, p in signature.parameters.items() if n not in ("self", "cls")}
+    stars: dict[Any, str] = {
+        inspect.Parameter.VAR_POSITIONAL: "*",
+        inspect.Parameter.VAR_KEYWORD: "**",
+    }
+    allowed = [stars.get(kind, "") + n for n, kind in found.items()]
+    if inspect.Parameter.VAR_KEYWORD not in found.values():
         for keyword in given:
             if keyword not in allowed:
-                raise unknown_keyword(name, keyword, allowed, former)
+                raise unknown_keyword(name, keyword, allowed, instead)
     try:
         signature.bind(*args, **given)
     except TypeError as error:
-        raise InputError(f"{name}: {error}. Its parameters: {', '.join(allowed)}.") from None
+        hint = unnamed if str(error).startswith("too many positional") else ""
+        raise InputError(
+            f"{name}: {error}.{hint and ' ' + hint} Its parameters: {', '.join(allowed)}."
+        ) from None
 
 
 class KnownKeywords(type):
     """The metaclass of classes that raise InputError, with the nearest name, for a keyword that
     they do not take, and for an argument that is missing.
 
-    former_keywords: of such a class, what to write instead of keywords of earlier versions.
+    instead, unnamed: of such a class, what to write in place of certain keywords, such as those of
+    earlier versions, and of too many arguments without a name.
     """
 
-    former_keywords: Mapping[str, str] = {}
+    instead: Mapping[str, str] = {}
+    unnamed: str = ""
 
     def __call__(cls, *args: Any, **given: Any) -> Any:
-        check_call(cls.__name__, inspect.signature(cls), args, given, cls.former_keywords)
+        check_call(cls.__name__, inspect.signature(cls), args, given, cls.instead, cls.unnamed)
         return super().__call__(*args, **given)
 
     @property

@@ -20,7 +20,7 @@ FORMAT = "torchfilm settings"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class Settings(metaclass=checks.KnownKeywords):
     """Knobs of accuracy. None keeps the scene's own value.
 
     dt: step, h. penalty: how far contacts give way; 0.1 is the default. Overlap of one-sided
@@ -132,6 +132,7 @@ PRESETS: dict[str, tuple[float, Settings]] = {
 }
 
 
+@checks.known_keywords
 def preset(name: str, scene: Scene) -> Settings:
     """Named settings for a scene: "draft" for a first view, "standard" for the scene's own values,
     "reference" to compare others with. Raises InputError for any other name."""

@@ -31,6 +31,7 @@ from torchfilm.tuning.settings_search import SettingsSearch
 from torchfilm.tuning.tuned import Tuned
 
 
+@checks.known_keywords
 @once()  # it binds the scene many times
 def tune(
     scene: Scene,
