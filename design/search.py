@@ -143,15 +143,27 @@ class Search(TaskOptions):
         except KeyboardInterrupt:
             self._report_interrupt(colonies)
             raise
-        if self.study.entries and all(len(e.reasons) == e.losses.size for e in self.study.entries):
+        self._remark(colonies)
+        return self.front() if self.objective.task.goals else self.best()
+
+    def _remark(self, colonies: int) -> None:
+        """Say what makes the outcome of a search worth little."""
+        entries = self.study.entries
+        if entries and all(len(e.reasons) == e.losses.size for e in entries):
             reason = self.study.failures()[0][0]
             print(f"every colony failed; the most frequent reason: {reason}", file=sys.stderr)
-        return self.front() if self.objective.task.goals else self.best()
+        each = self.objective.task.replicates
+        if sum(len(e.points) for e in entries) == 1 and colonies < 2 * each:
+            print(
+                f"one design was tried, so it is the best: each takes {_colonies(each)}, and the"
+                f" search had {_colonies(colonies)}.",
+                file=sys.stderr,
+            )
 
     def _check_run(self, colonies: int, stop_at: float | None) -> None:
         least = self.objective.task.replicates
         if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < least:
-            hint = "One design has so many replicates." if least > 1 else ""
+            hint = f"One design takes replicates={least} colonies." if least > 1 else ""
             raise checks.input_error("colonies", colonies, f"a whole number from {least}", hint)
         if stop_at is not None:
             checks.number("stop_at", stop_at)
@@ -305,6 +317,10 @@ def _show(bar: tqdm | None, study: Study) -> None:
     failed = study.failed
     best = "no full-size colony yet" if found is None else f"best loss {found[1]:.4f}"
     bar.set_postfix_str(best + (f", {failed} colonies failed" if failed else ""))
+
+
+def _colonies(count: int) -> str:
+    return "1 colony" if count == 1 else f"{count} colonies"
 
 
 def _none_yet() -> tf.InputError:

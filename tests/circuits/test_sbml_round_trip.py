@@ -90,9 +90,10 @@ def _leaves(circuit):
 def test_numbers_take_the_place_of_values_per_colony(tmp_path):
     circuit = tf.Circuit(decay, species="k", initial={"k": tf.Uniform(0.0, 1.0)},
                          k=torch.tensor([1.0, 2.0]))  # fmt: skip
-    with pytest.raises(tf.InputError, match=r"initial 'k' .*one number.*initial=\{'k': …\}"):
+    both = r"initial 'k' = Uniform\(.*\), constant 'k' = .*one number.*initial=\{'k': …\}, k=…\."
+    with pytest.raises(tf.InputError, match=both):
         circuit.to_sbml(tmp_path / "a.xml")
-    with pytest.raises(tf.InputError, match=r"constant 'k' .*one number.*Give it: k=…"):
+    with pytest.raises(tf.InputError, match=r"^constant 'k' .*one number for each\. Give k=…\.$"):
         circuit.to_sbml(tmp_path / "a.xml", initial={"k": 1.0})
     with pytest.raises(tf.InputError, match=r"constant 'kk' is not in the circuit.*'k'"):
         circuit.to_sbml(tmp_path / "a.xml", initial={"k": 1.0}, kk=2.0)
@@ -102,11 +103,14 @@ def test_numbers_take_the_place_of_values_per_colony(tmp_path):
 
 
 def test_rates_of_one_cell_type_are_written(tmp_path):
-    circuit = tf.Circuit({0: decay, 3: lambda u, s, p, cell: {"k": p.k}}, species="k", k=1.0)
-    with pytest.raises(tf.InputError, match=r"cell type \(0, 3\)"):
+    circuit = tf.Circuit(
+        {0: decay, 3: lambda u, s, p, cell: {"k": p.k}}, species="k", k={0: 1.0, 3: 2.0}
+    )
+    with pytest.raises(tf.InputError, match=r"by cell type: .* cell_type=0 or 3\."):
         circuit.to_sbml(tmp_path / "a.xml")
     circuit.to_sbml(tmp_path / "a.xml", cell_type=3)
-    assert str(tf.Circuit.from_sbml(tmp_path / "a.xml").graph) == "d k/dt = k"
+    again = tf.Circuit.from_sbml(tmp_path / "a.xml")
+    assert str(again.graph) == "d k/dt = k" and again.parameters == {"k": 2.0}
 
 
 def test_letters_that_sbml_lacks_are_refused(tmp_path):

@@ -154,10 +154,22 @@ def test_a_users_own_method_proposes_and_learns():
     assert made.study.entries[0].replicates == 2  # the method requests nine; the task has two
 
 
+def test_a_search_that_tried_one_design_says_so(capsys):
+    made = search()
+    made.run(3, progress=False)
+    words = "one design was tried, so it is the best: each takes 2 colonies, and the search had 3 "
+    assert words + "colonies.\n" in capsys.readouterr().err
+    made.run(4, progress=False)
+    assert "one design" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "given, words",
     [
-        ({"colonies": 1}, "colonies = 1.*whole number from 2.*One design has so many replicates"),
+        (
+            {"colonies": 1},
+            "colonies = 1.*whole number from 2.*One design takes replicates=2 colonies",
+        ),
         ({"colonies": 1.5}, "colonies = 1.5.*whole number"),
         ({"colonies": True}, "colonies = True"),
         ({"colonies": 6, "stop_at": float("nan")}, "stop_at = nan.*finite"),

@@ -220,9 +220,9 @@ class Circuit(Effect):
         """Write the equations as an SBML model (Level 3 Version 2), in hours. `from_sbml` reads
         the same circuit again: the same equations and numbers.
 
-        cell_type: whose rates, where they differ. initial, and further keywords: numbers by name in
-        place of first values and constants that are not one number. Raises InputError where a
-        number is missing, and where the rates cannot be written as equations.
+        cell_type: whose rates and constants, where they differ. initial, and further keywords:
+        numbers by name in place of first values and constants that are not one number. Raises
+        InputError where a number is missing, and where rates cannot be written as equations.
         """
         from torchfilm.effects import circuit_sbml
 

@@ -11,9 +11,11 @@ from torch import Tensor
 
 from torchfilm.circuits import sbml
 from torchfilm.circuits.names import label_of, unknown
+from torchfilm.effect import shorten
 from torchfilm.effects.circuit_checks import GEOMETRY
 from torchfilm.state import RESERVED
 from torchfilm.tools import checks
+from torchfilm.values import ByType
 
 if TYPE_CHECKING:
     from torchfilm.effects.circuit import Circuit
@@ -96,24 +98,44 @@ def model_choices(
 
 
 def written_numbers(
-    what: str, values: Mapping[str, Any], given: Mapping[str, float], names: Sequence[str]
-) -> dict[str, float]:
-    """Numbers by name for a model to write: those given in place of the circuit's own."""
-    for name in given:
-        if name not in names:
-            raise checks.InputError(unknown(f"{what} {name!r} is not in the circuit", name, names))
-    found = {}
-    for name in names:
-        value = given.get(name, values.get(name, 0.0))
-        if isinstance(value, Tensor) and value.numel() == 1:
-            value = value.item()
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            hint = f"initial={{{name!r}: …}}" if what == "initial" else f"{name}=…"
-            raise checks.input_error(
-                f"{what} {name!r}", value, "one number to be written", f"Give it: {hint}."
-            )
-        found[name] = float(value)
-    return found
+    circuit: Circuit,
+    cell_type: int | None,
+    initial: Mapping[str, float],
+    values: Mapping[str, float],
+) -> tuple[dict[str, float], dict[str, float]]:
+    """First values and constants for a model to write, by name: those given in place of the
+    circuit's own. Raises InputError that names all of which there is not one number."""
+    found: list[dict[str, float]] = []
+    lacking: list[dict[str, str]] = []
+    for what, own, given, names in (
+        ("initial", circuit.initial, initial, circuit.species),
+        ("constant", circuit.parameters, values, tuple(circuit.parameters)),
+    ):
+        for name in given:
+            if name not in names:
+                wrong = f"{what} {name!r} is not in the circuit"
+                raise checks.InputError(unknown(wrong, name, names))
+        each = {n: _number_of(given.get(n, own.get(n, 0.0)), cell_type) for n in names}
+        numbers = {n: x for n, x in each.items() if isinstance(x, (int, float))}
+        found.append({n: float(x) for n, x in numbers.items() if not isinstance(x, bool)})
+        lacking.append({n: shorten(x) for n, x in each.items() if n not in found[-1]})
+    if any(lacking):
+        first, constants = lacking
+        shown = [f"initial {n!r} = {x}" for n, x in first.items()]
+        shown += [f"constant {n!r} = {x}" for n, x in constants.items()]
+        give = [f"initial={{{', '.join(f'{n!r}: …' for n in first)}}}"] if first else []
+        raise checks.InputError(
+            f"{', '.join(shown)} cannot be written: a model has one number for each. Give"
+            f" {', '.join([*give, *(f'{n}=…' for n in constants)])}."
+        )
+    return found[0], found[1]
+
+
+def _number_of(value: Any, cell_type: int | None) -> Any:
+    """The number that a value is for the cells of a type; or the value, if it is none."""
+    if isinstance(value, ByType) and cell_type is not None:
+        value = value.values.get(cell_type, value)
+    return value.item() if isinstance(value, Tensor) and value.numel() == 1 else value
 
 
 def write_file(
@@ -124,6 +146,12 @@ def write_file(
     values: Mapping[str, float],
 ) -> None:
     """Write a circuit's equations as an SBML model; see `Circuit.to_sbml`."""
+    kinds = [kind for kind in circuit.rates if isinstance(kind, int)]
+    if cell_type is None and kinds:
+        raise checks.InputError(
+            f"{circuit.value_owner()} has rates by cell type: say whose a model is to have, with"
+            f" cell_type={' or '.join(map(str, kinds))}."
+        )
     if cell_type is None:
         graph, part = circuit.graph, next(iter(circuit.rates.values()))
     else:
@@ -137,8 +165,7 @@ def write_file(
     text = sbml.sbml_text(
         graph,
         circuit.name or label_of(part),
-        written_numbers("initial", circuit.initial, initial, circuit.species),
-        written_numbers("constant", circuit.parameters, values, tuple(circuit.parameters)),
+        *written_numbers(circuit, cell_type, initial, values),
         [n for n in circuit.species if circuit.variables[n] not in circuit.diluted_fields],
     )
     sbml.write(path, text)
