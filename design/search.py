@@ -155,8 +155,9 @@ class Search(TaskOptions):
         each = self.objective.task.replicates
         if sum(len(e.points) for e in entries) == 1 and colonies < 2 * each:
             print(
-                f"one design was tried, so it is the best: each takes {_colonies(each)}, and the"
-                f" search had {_colonies(colonies)}.",
+                f"one design was tried, so it is the best: each takes"
+                f" {tf.displays.counted(each, 'colony', 'colonies')}, and the search had"
+                f" {tf.displays.counted(colonies, 'colony', 'colonies')}.",
                 file=sys.stderr,
             )
 
@@ -317,10 +318,6 @@ def _show(bar: tqdm | None, study: Study) -> None:
     failed = study.failed
     best = "no full-size colony yet" if found is None else f"best loss {found[1]:.4f}"
     bar.set_postfix_str(best + (f", {failed} colonies failed" if failed else ""))
-
-
-def _colonies(count: int) -> str:
-    return "1 colony" if count == 1 else f"{count} colonies"
 
 
 def _none_yet() -> tf.InputError:

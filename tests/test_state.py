@@ -258,9 +258,11 @@ def test_draws_are_keyed_by_seed_colony_cell_step_and_purpose():
 def test_repr_is_one_line_of_what_matters():
     assert (
         repr(batch())
-        == "State(4 colonies, 6 cells, 2-D, t = 0 h, step 0, float32 on cpu, fields: growth_rate,"
-        " elongation)"
+        == "State(4 colonies, 6 cells, 2-D, t = 0 h, step 0, float32 on cpu, fields: growth_rate)"
     )
+    one = tf.scenes.microcolony().bind().start()
+    assert repr(one).startswith("State(1 colony, 1 cell, 2-D")
+    assert repr(one).endswith("fields: division_threshold, growth_rate)")
 
 
 def test_volumes_that_were_asked_for_without_gradients_still_have_them():

@@ -24,7 +24,7 @@ from torchfilm.effect import BUILT_IN, Binding, BoundEffect, parameters
 from torchfilm.initial_cells import Cells
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, Field, State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest
 from torchfilm.tools.tangents import tracked
 from torchfilm.tools.threads import one_torch_thread
@@ -265,9 +265,8 @@ class Model:
 
     def __repr__(self) -> str:
         b = self.batch
-        return (
-            f"Model({self.scene.name!r}, {b.colonies} colonies, {str(b.dtype)[6:]} on {b.device})"
-        )
+        colonies = displays.counted(b.colonies, "colony", "colonies")
+        return f"Model({self.scene.name!r}, {colonies}, {str(b.dtype)[6:]} on {b.device})"
 
 
 def advanced(state: State, dt: float) -> State:

@@ -19,7 +19,7 @@ from torchfilm.model import Model
 from torchfilm.replay import Replay
 from torchfilm.scene import Scene
 from torchfilm.state import State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, displays
 from torchfilm.tools.progress import RunBar, wanted
 from torchfilm.tools.timing import Timings
 
@@ -97,7 +97,7 @@ def simulate(
 
 
 def _run_bar(model: Model, state: State, cells: int | None, until: float | None) -> RunBar:
-    what = "1 colony" if state.colonies == 1 else f"{state.colonies} colonies"
+    what = displays.counted(state.colonies, "colony", "colonies")
     return RunBar(f"{model.scene.name}: {what}", state, cells, until)
 
 

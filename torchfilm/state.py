@@ -386,37 +386,35 @@ class State:
     def uniform(self, rows: Tensor, purpose: str) -> Tensor:
         """A draw from (0, 1) for each of the given cells (M,), the same whatever the batch: keyed
         by seed, stream, uid, step, purpose."""
-        return random.uniform(
-            self.seed,
-            self.stream.index_select(0, self.colony.index_select(0, rows)),
-            self.uid.index_select(0, rows),
-            self.step,
-            purpose,
-            self.dtype,
-        )
+        return self._drawn(random.uniform, rows, purpose)
 
     def normal(self, rows: Tensor, purpose: str) -> Tensor:
         """Four standard normal draws for each of the given cells, (M, 4), keyed as `uniform`."""
-        return random.normal(
-            self.seed,
-            self.stream.index_select(0, self.colony.index_select(0, rows)),
-            self.uid.index_select(0, rows),
-            self.step,
-            purpose,
-            self.dtype,
-        )
+        return self._drawn(random.normal, rows, purpose)
+
+    def _drawn(self, law: Callable[..., Tensor], rows: Tensor, purpose: str) -> Tensor:
+        stream = self.stream.index_select(0, self.colony.index_select(0, rows))
+        uid = self.uid.index_select(0, rows)
+        return law(self.seed, stream, uid, self.step, purpose, self.dtype)
+
+    def _own_fields(self) -> list[str]:
+        """The fields but those that serve the numerics."""
+        return [n for n in self.fields if not self.declared[n].internal]
 
     def __repr__(self) -> str:
+        counts = (
+            f"{displays.counted(self.colonies, 'colony', 'colonies')},"
+            f" {displays.counted(self.cells, 'cell')}"
+        )
         return (
-            f"State({self.colonies} colonies, {self.cells} cells, {self.dim}-D, t = {self.time:g}"
-            f" h, step {self.step}, {str(self.dtype)[6:]} on {self.device}, fields:"
-            f" {', '.join(self.fields) or 'none'})"
+            f"State({counts}, {self.dim}-D, t = {self.time:g} h, step {self.step},"
+            f" {str(self.dtype)[6:]} on {self.device}, fields:"
+            f" {', '.join(self._own_fields()) or 'none'})"
         )
 
     def _repr_html_(self) -> str:
         sizes = {"cells of a colony": ("", self.counts), "length": ("µm", self.length)}
-        shown = {n: f for n, f in self.declared.items() if not f.internal}
-        own = {n: (f.unit, self.fields[n]) for n, f in shown.items()}
+        own = {n: (self.declared[n].unit, self.fields[n]) for n in self._own_fields()}
         return displays.card(
             repr(self).partition(", fields")[0] + ")", displays.ranges(sizes | own)
         )

@@ -18,9 +18,8 @@ if TYPE_CHECKING:
 
 # "out.ahl" is the signal at the cell; "ahl" is the level inside the cell
 OUTSIDE = "out."
-# What effects of torchfilm keep for themselves; of a circuit with a name, this is the end of the
-# field. A target may read it, but it is none to offer.
-INTERNAL = ("divide_flag", "division_threshold", "birth_length", "elongation", "circuit_volume")
+# A target may read these, and what serves the numerics, but they are none to offer.
+OF_DIVISION = ("division_threshold", "birth_length")
 
 
 class Target:
@@ -116,7 +115,7 @@ def require(state: tf.State, names: tuple[str, ...]) -> None:
     there = known(state)
     for name in names:
         if name not in there:
-            offered = [n for n in there if not n.endswith(INTERNAL)]
+            offered = [n for n in there if n not in OF_DIVISION and not state.declared[n].internal]
             near = difflib.get_close_matches(name, offered, 1, cutoff=0.5)
             hint = f"Did you mean {near[0]!r}?" if near else ""
             raise checks.input_error(

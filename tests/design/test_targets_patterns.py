@@ -232,3 +232,13 @@ def test_an_unknown_species_is_refused_with_the_known_ones(name):
         TARGETS[name].check(crowded(names=("yfq", "cfp")))
     TARGETS[name].check(crowded())
     assert "yfp" in TARGETS[name].describe()
+
+
+def test_a_species_that_is_not_there_is_named_with_those_that_are():
+    """And with nothing that serves the numerics or divisions."""
+    made = tf.Circuit(lambda u, s, p, cell: {"gfp": 1.0 - u.gfp}, species="gfp")
+    scene = tf.Scene(
+        tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2), made
+    )
+    with pytest.raises(tf.InputError, match=r"'yfp'.*one of 'growth_rate', 'gfp'\."):
+        OnFraction("yfp", 0.2, 3.0).check(scene.bind().start())

@@ -68,8 +68,9 @@ class Results(metaclass=checks.KnownKeywords):
         if not self.file:
             return f"Results({str(self.path)!r}, closed)"
         when = f", {self.times[0]:g} to {self.times[-1]:g} h" if len(self) else ""
-        frames = "1 frame" if len(self) == 1 else f"{len(self)} frames"
-        return f"Results({str(self.path)!r}, {len(self.colony_id)} colonies, {frames}{when})"
+        colonies = displays.counted(len(self.colony_id), "colony", "colonies")
+        frames = displays.counted(len(self), "frame")
+        return f"Results({str(self.path)!r}, {colonies}, {frames}{when})"
 
     def _repr_html_(self) -> str:
         if not self.file:

@@ -56,6 +56,11 @@ def ranges(values: Mapping[str, tuple[str, Tensor]]) -> str:
     return table(rows, ("", "unit", "least", "mean", "greatest", "shape"))
 
 
+def counted(count: int, one: str, several: str = "") -> str:
+    """A number of things in words: "1 colony", "3 colonies". several: by default `one` + "s"."""
+    return f"1 {one}" if count == 1 else f"{count} {several or one + 's'}"
+
+
 def lines(words: str) -> str:
     """A text as a paragraph, with its line breaks."""
     return f'<div style="margin:.3em 0;white-space:pre-line">{escape(words)}</div>' if words else ""
