@@ -145,6 +145,17 @@ def test_a_full_turn_in_radians_is_no_degrees():
     tf.Cells.from_table(table(angle=[2 * math.pi, -2 * math.pi]))
 
 
+@pytest.mark.parametrize("angle", ["angle_deg", "angle_degrees"])
+@pytest.mark.parametrize("micro", ["um", "µm", "\u03bcm"])
+def test_units_are_known_as_people_write_them(micro, angle):
+    names = {f"{n}_{micro}": [2.0] for n in ("x", "y", "length")}
+    cells = tf.Cells.from_table({**names, angle: [90.0]})
+    assert cells.length.tolist() == [2.0] and cells.extra == {}
+    assert cells.axis.tolist()[0] == pytest.approx([0.0, 1.0], abs=1e-15)
+    same = tf.Cells.from_table({**names, "angle": [90.0]}, angle_unit="deg")
+    assert same.axis.tolist() == cells.axis.tolist()
+
+
 def test_radians_taken_for_degrees_are_noticed():
     many = {"x": np.arange(9.0), "y": np.zeros(9), "length": np.ones(9)}
     with pytest.warns(RuntimeWarning, match=r"all 9 values.*within ±1\.5.*radians"):
@@ -287,7 +298,7 @@ BAD = {
     "pixel size 0": (ONE, {"pixel_size": 0.0}, r"pixel_size = 0\.0"),
     "pixel size nan": (ONE, {"pixel_size": math.nan}, r"pixel_size = nan"),
     "two units": ({**ONE, "x_um": [0.0]}, {}, r"'x' and 'x_um': keep one"),
-    "angle unit": (ONE, {"angle_unit": "deg"}, r"angle_unit = 'deg'.*'degrees', 'radians'"),
+    "angle unit": (ONE, {"angle_unit": "turns"}, r"angle_unit = 'turns'.*'degrees', 'radians'"),
     "angle unit without angles": (
         {"x": [0.0], "y": [0.0], "axis_x": [1.0], "axis_y": [0.0], "length": [1.0]},
         {"angle_unit": "degrees"},

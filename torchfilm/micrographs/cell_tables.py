@@ -356,7 +356,7 @@ def _warn_of_units(angle: np.ndarray, unit: str, widest: float, column: str, sou
         warnings.warn(
             f"{source}: the column {column!r} reaches {most:g}, and torchfilm reads it in radians"
             f" ({beyond} of {angle.size} values are over {widest:.4g}). If they are degrees, give"
-            ' angle_unit="degrees".',
+            ' angle_unit="degrees", or call the column "angle_deg".',
             RuntimeWarning,
             stacklevel=6,
         )
@@ -364,7 +364,7 @@ def _warn_of_units(angle: np.ndarray, unit: str, widest: float, column: str, sou
         warnings.warn(
             f"{source}: all {angle.size} values of the column {column!r} lie within ±{most:.3g},"
             " and torchfilm reads them in degrees. If they are radians, give"
-            ' angle_unit="radians".',
+            ' angle_unit="radians", or call the column "angle_rad".',
             RuntimeWarning,
             stacklevel=6,
         )

@@ -19,12 +19,14 @@ UNITS: dict[str, dict[str, float | None]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180.0},
     "time": {"h": 1.0, "min": 1.0 / 60.0},
 }
+# the same units as people write them, too; there are two signs for micro
+SPELLINGS = {"µm": "um", "\u03bcm": "um", "degrees": "deg", "radians": "rad"}
 
 
 @dataclass(frozen=True)
 class Units:
-    """The units that arguments state. pixel_size: µm a pixel. length_unit: "um" or "px".
-    angle_unit: "degrees" or "radians". time_unit: "h" or "min"."""
+    """The units that arguments state. pixel_size: µm a pixel. length_unit: "um" ("µm") or "px".
+    angle_unit: "degrees" ("deg") or "radians" ("rad"). time_unit: "h" or "min"."""
 
     pixel_size: float | None = None
     length_unit: str | None = None
@@ -34,28 +36,27 @@ class Units:
     def __post_init__(self) -> None:
         if self.pixel_size is not None:
             checks.number("pixel_size", self.pixel_size, above=0.0, hint="µm a pixel.")
-        for name, allowed in (
-            ("length_unit", ("um", "px")),
-            ("angle_unit", ("degrees", "radians")),
-            ("time_unit", ("h", "min")),
+        for name, kind, usual in (
+            ("length_unit", "length", ("um", "px")),
+            ("angle_unit", "angle", ("degrees", "radians")),
+            ("time_unit", "time", ("h", "min")),
         ):
-            if getattr(self, name) is not None:
-                checks.choice(name, getattr(self, name), allowed)
-        if self.length_unit == "um" and self.pixel_size is not None:
+            given = getattr(self, name)
+            if given is not None and _unit(given) not in UNITS[kind]:
+                checks.choice(name, given, usual)
+        if _unit(self.length_unit) == "um" and self.pixel_size is not None:
             raise checks.input_error(
                 "pixel_size",
                 self.pixel_size,
-                'left out with length_unit="um"',
+                f'left out with length_unit="{self.length_unit}"',
                 "Lengths are in µm.",
             )
 
     def stated(self, kind: str) -> str:
         """The unit of a kind of column, as a name ends; "" where none is stated."""
         if kind == "length":
-            return self.length_unit or ("" if self.pixel_size is None else "px")
-        if kind == "angle":
-            return {"degrees": "deg", "radians": "rad", None: ""}[self.angle_unit]
-        return self.time_unit or ""
+            return _unit(self.length_unit) or ("" if self.pixel_size is None else "px")
+        return _unit(self.angle_unit if kind == "angle" else self.time_unit)
 
     def factor(self, kind: str, unit: str, column: str) -> float:
         """What turns numbers of a unit into µm, rad or h."""
@@ -84,6 +85,11 @@ class Units:
             raise checks.input_error(
                 "pixel_size", self.pixel_size, "left out: no column is in pixels"
             )
+
+
+def _unit(given: object) -> str:
+    """A unit as a name ends; "" where none is given, or what is no text."""
+    return SPELLINGS.get(given, given) if isinstance(given, str) else ""
 
 
 @dataclass(frozen=True)
@@ -184,7 +190,8 @@ class Table:
         """
         if name in columns and columns[name] not in self.columns:
             raise self.missing(columns[name])
-        allowed = (name, *(f"{name}_{unit}" for unit in UNITS[kind]))
+        spelt = (*UNITS[kind], *(other for other, unit in SPELLINGS.items() if unit in UNITS[kind]))
+        allowed = (name, *(f"{name}_{unit}" for unit in spelt))
         given = [columns[name]] if name in columns else [n for n in allowed if n in self.columns]
         if len(given) > 1:
             raise checks.InputError(
@@ -192,7 +199,7 @@ class Table:
             )
         if not given:
             return None
-        end = given[0].rpartition("_")[2]
+        end = _unit(given[0].rpartition("_")[2])
         return given[0], end if end in UNITS[kind] and "_" in given[0] else ""
 
     def missing(self, column: str, hint: str = "") -> checks.InputError:
