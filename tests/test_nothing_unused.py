@@ -26,11 +26,70 @@ def test_a_constant_that_no_rate_reads_is_warned_of():
     scene = tf.Scene(
         tf.Mechanics(dim=2), tf.Circuit(made, species=("m",), strength=1.0, leftover=3.0)
     )
-    with pytest.warns(UserWarning, match=r"Circuit\.leftover is a constant that no rate reads"):
+    with pytest.warns(UserWarning, match=r"Circuit\.leftover is a constant that no rate") as told:
         scene.bind()
+    assert [w.filename for w in told] == [__file__]
     quiet(
         lambda: tf.Scene(tf.Mechanics(dim=2), tf.Circuit(made, species=("m",), strength=1.0)).bind()
     )
+
+
+def senses(u, s, p, cell):
+    return {"m": s.ahl - u.m}
+
+
+def gives(u, s, p, cell):
+    return {"m": 1.0 - u.m}, {"ahl": u.m}
+
+
+def with_medium(rates, *more, boundary=None, outside="error", **signal):
+    box = {"box": ((-16, -16), (16, 16)), "spacing": 4.0, "boundary": boundary}
+    medium = tf.Medium(ahl=tf.Signal(diffusion=10.0, **signal), outside=outside, **box)
+    return tf.Scene(tf.Mechanics(dim=2), tf.Circuit(rates, species=("m",)), medium, *more)
+
+
+def test_a_signal_that_stays_0_is_warned_of_at_the_users_line():
+    with pytest.warns(UserWarning, match=r"'ahl' of the Medium is 0 and stays 0.*source=") as told:
+        with_medium(senses).bind()
+    assert [w.filename for w in told] == [__file__]
+    with pytest.warns(UserWarning, match="stays 0"):  # whether or not anything reads it
+        with_medium(lambda u, s, p, cell: {"m": 1.0 - u.m}).bind()
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"source": 1.0},
+        {"initial": 0.5},
+        {"source": lambda places: places[:, 0].abs()},
+        {"reservoir": 1.0, "outside": "reservoir"},
+        {"boundary": tf.BoundaryConditions(x=tf.Dirichlet(1.0))},
+        {"boundary": tf.BoundaryConditions(y=(tf.NoFlux(), tf.Open(2.0)))},
+    ],
+    ids=lambda how: next(iter(how)),
+)
+def test_a_signal_that_something_supplies_is_not(how):
+    quiet(lambda: with_medium(senses, **how).bind())
+
+
+def test_a_signal_that_cells_or_rules_may_give_is_not():
+    quiet(lambda: with_medium(gives).bind())
+    quiet(lambda: with_medium(senses, tf.Rules(lambda cells: None)).bind())
+
+
+def test_rates_for_a_type_without_cells_are_warned_of():
+    circuit = tf.Circuit({0: made, 7: made}, species=("m",), strength=1.0)
+    parts = (tf.Mechanics(dim=2), circuit)
+    with pytest.warns(UserWarning, match=r"cells of type 7, of which.*are of type 0\.") as told:
+        tf.Scene(*parts).bind()
+    assert [w.filename for w in told] == [__file__]
+
+    def turned(cells):
+        cells.cell_type = 7
+
+    quiet(lambda: tf.Scene(*parts, tf.Rules(turned)).bind())
+    both = tf.Cells([[0, 0], [5, 0]], [[1, 0], [1, 0]], cell_type=[0, 7])
+    quiet(lambda: tf.Scene(*parts, founders=both).bind())
 
 
 def test_a_misspelt_option_of_a_circuit_is_an_error():

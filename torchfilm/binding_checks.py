@@ -1,5 +1,5 @@
 """What is checked of the effects of a bound scene together: that the names exist which they read
-and write, and that a run to a number of cells can end."""
+and write, that none is idle, and that a run to a number of cells can end."""
 
 from __future__ import annotations
 
@@ -61,6 +61,15 @@ def check_end(effects: Sequence[BoundEffect], state: State, cells: int) -> None:
     _check_adds(effects, state, cells)
 
 
+def warn_of_idle(effects: Sequence[BoundEffect], state: State) -> None:
+    """Warn of what does nothing from this first state on, unless an effect may set what it lacks:
+    signals that stay 0, rates for a type of cells of which there are none."""
+    for bound in {id(bound.effect): bound for bound in effects}.values():
+        for name, text in bound.effect.idle_without(state).items():
+            if not _sets(effects, name, bound):
+                warn(text)
+
+
 def _sets(effects: Sequence[BoundEffect], name: str, effect: BoundEffect) -> bool:
     """Whether another effect may set a field, or lengthen or add cells in its own way."""
     others = [e for e in effects if e.effect is not effect.effect]
@@ -107,6 +116,6 @@ def _check_adds(effects: Sequence[BoundEffect], state: State, cells: int) -> Non
         " (until=…, --until)."
     )
     if any(e.effect.writes_anything or "cells" in e.writes() for e in effects):
-        warn(f"{text} The run ends only if every such colony loses all cells. {hint}", stacklevel=6)
+        warn(f"{text} The run ends only if every such colony loses all cells. {hint}")
         return
     raise checks.InputError(f"{text} {hint}")

@@ -137,6 +137,11 @@ class Effect(metaclass=checks.KnownKeywords):
         """Fields that must not be 0 everywhere in a colony if it is to have more cells."""
         return ()
 
+    def idle_without(self, state: State) -> Mapping[str, str]:
+        """Fields without whose change by another effect this one, or a part of it, does nothing
+        from this first state on; with a warning of it."""
+        return {}
+
     def clash_hint(self, name: str) -> str:
         """What to do where another effect declares a field of this name, too."""
         return ""

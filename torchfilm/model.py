@@ -338,6 +338,8 @@ def bind(
     model.check(first)
     for effect in model.effects if check_first else ():
         effect.check(first)
+    if check_first and places is None:
+        binding_checks.warn_of_idle(model.effects, first)
     return model
 
 

@@ -266,8 +266,7 @@ def _dimension(effects: Sequence[Effect], founders: Cells | None, given: int | N
         return founders.dim
     warn(
         "the scene has no Mechanics and no founders, so that its dimension is not stated: it is"
-        " 3-D. Write Scene(…, dim=2) or Scene(…, dim=3).",
-        stacklevel=3,
+        " 3-D. Write Scene(…, dim=2) or Scene(…, dim=3)."
     )
     return 3
 

@@ -154,7 +154,8 @@ def test_a_misspelt_option_is_not_taken_for_a_parameter(
     resting(
         tf.Circuit(lambda u, s, p, cell: {"m": p.rate}, species=("m",), rate=1.0), 2
     ).bind().start()
-    resting(tf.Circuit(spelt, species=("m",), k=1.0, spare=1.0), 2).bind().start()
+    with pytest.warns(UserWarning, match=r"Circuit\.spare is a constant that no rate reads"):
+        resting(tf.Circuit(spelt, species=("m",), k=1.0, spare=1.0), 2).bind().start()
     resting(
         tf.Circuit([tf.parts.constitutive("m", "rate")], species=("m",), rate=1.0), 2
     ).bind().start()

@@ -65,6 +65,7 @@ def test_each_type_runs_its_own_circuit_and_others_are_only_diluted(dtype, devic
     assert float(last.m[3] + last.w[3]) == pytest.approx(thin, rel=exact)
 
 
+@pytest.mark.filterwarnings("ignore:Circuit has rates for cells of type:UserWarning")  # by hand
 def test_a_type_that_changes_takes_up_the_other_circuit():
     circuit = tf.Circuit({0: idle, 1: made}, species=("m",), k=1.0, g=0.0)
     scene = resting(circuit, 2)
@@ -74,6 +75,7 @@ def test_a_type_that_changes_takes_up_the_other_circuit():
     assert state.m.tolist() == pytest.approx([0.0, 0.3])
 
 
+@pytest.mark.filterwarnings("ignore:Circuit has rates for cells of type:UserWarning")  # by hand
 @pytest.mark.parametrize("types", [[0, 1], [0, 0]])
 def test_constants_drawn_by_type_are_not_needed_by_cells_without_the_circuit(types):
     """They are drawn for these cells too, so that they have one should they become of the type."""

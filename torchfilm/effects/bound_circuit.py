@@ -202,8 +202,7 @@ class BoundCircuit(BoundEffect):
                     f". Did you mean {like[0]!r}?"
                     if like
                     else ": remove it, or use it as p." + name + "."
-                ),
-                stacklevel=2,
+                )
             )
 
     def _whole_molecules(self, state: State) -> State:

@@ -35,6 +35,7 @@ from torchfilm.effects.circuit_checks import (
     diluted_names,
     equations_of,
     names_of,
+    no_cells_of,
     shared_fields,
 )
 from torchfilm.resolver import Values
@@ -360,6 +361,13 @@ class Circuit(Effect):
 
     def writes(self) -> tuple[str, ...]:
         return (*self.variables.values(), self.volume_field)
+
+    def idle_without(self, state: State) -> Mapping[str, str]:
+        kinds = [k for k in self.rates if isinstance(k, int)]
+        there = state.fields["cell_type"].unique().tolist() if kinds and state.cells else kinds
+        if not (lacking := [k for k in kinds if k not in there]):
+            return {}
+        return {"cell_type": no_cells_of(self.value_owner(), lacking, there)}
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (BoundCircuit(self, binding),)

@@ -79,6 +79,16 @@ def check_rates(by_type: Mapping[int | str, Any], typed: bool) -> None:
             )
 
 
+def no_cells_of(owner: str, kinds: Sequence[int], there: Sequence[int]) -> str:
+    """The warning of rates for types of cells of which there are none."""
+    types = ", ".join(map(str, kinds))
+    return (
+        f"{owner} has rates for cells of type {types}, of which there are none, and nothing sets"
+        f" cell_type: the first cells are of type {', '.join(map(str, there))}. Leave these rates"
+        " out, or give founders=tf.Cells(…, cell_type=[…])."
+    )
+
+
 def check_initial(initial: object, names: tuple[str, ...]) -> None:
     if initial is not None and not isinstance(initial, Mapping):
         raise checks.input_error(

@@ -105,8 +105,7 @@ class Growth(Effect):
         if self.rate is None and not sets and "growth_rate" not in founders.extra:
             warn(
                 "Growth() has no rate, and no rule or nutrition sets growth_rate: nothing grows."
-                " Write tf.Growth(rate=1.0), in 1/h.",
-                stacklevel=3,
+                " Write tf.Growth(rate=1.0), in 1/h."
             )
 
     def check_step(self, dt: float, divides: bool) -> None:
@@ -182,8 +181,7 @@ class _BoundGrowth(BoundEffect):
             warn(
                 f"Growth.rate is {usual:g} per hour: a doubling takes"
                 f" {math.log(2.0) / usual:.0f} h. Rates are per hour; a rate per minute is to"
-                f" be multiplied by 60 ({60 * usual:g}).",
-                stacklevel=2,
+                f" be multiplied by 60 ({60 * usual:g})."
             )
 
     def warn_of_others(self) -> None:
@@ -197,8 +195,7 @@ class _BoundGrowth(BoundEffect):
                 " that acts last overrides the others. Keep one of them"
                 + (" (such as Growth() without a rate)" if given else "")
                 + ", or let the later one read growth_rate and change it (an effect of your own"
-                " names what it reads in reads()).",
-                stacklevel=5,
+                " names what it reads in reads())."
             )
 
 

@@ -226,6 +226,18 @@ class Medium(Effect):
     def writes(self) -> tuple[str, ...]:
         return tuple(OUTSIDE + name for name in self.signals)
 
+    def idle_without(self, state: State) -> Mapping[str, str]:
+        return {OUTSIDE + n: _stays_0(n) for n in self.signals if not self._is_supplied(n)}
+
+    def _is_supplied(self, name: str) -> bool:
+        """Whether a signal may be above 0 though no effect gives it. A value that is not a plain
+        number may be."""
+        signal = self.signals[name]
+        faces = [face for pair in self.boundary_of(name).pairs for face in pair]
+        values = [signal.initial, signal.source, *(face.outside_value() for face in faces)]
+        values += [signal.reservoir] if self.outside == "reservoir" else []
+        return any(not isinstance(x, (int, float)) or x != 0 for x in values)
+
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         transport = Transport(self, binding)
         main = BoundMedium(self, binding, transport)
@@ -299,6 +311,16 @@ class Medium(Effect):
             "grow": f"the box grows with its colony along {self.grows}, {BLOCK} voxels at a time",
             "reservoir": "cells outside the box meet a reservoir of constant concentration",
         }[self.outside]
+
+
+def _stays_0(name: str) -> str:
+    """The warning of a signal that nothing supplies."""
+    return (
+        f"the signal {name!r} of the Medium is 0 and stays 0: no effect gives it, and it has no"
+        " source, no first value, and no face or reservoir that supplies it. Let cells give it (the"
+        f" second dict of a circuit, {{{name!r}: …}}), write {name}=tf.Signal(…, source=…) or"
+        " initial=…, or leave it out."
+    )
 
 
 def _check_signals(signals: Mapping[str, Any]) -> None:
