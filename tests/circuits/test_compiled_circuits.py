@@ -22,6 +22,7 @@ from torchfilm import parts
 from torchfilm.circuits import compiled, run
 from torchfilm.circuits.compiled_step import Changes, KernelStep, Surroundings
 from torchfilm.circuits.rosenbrock import SAFETY, rodas3
+from torchfilm.kernels import compiling
 from torchfilm.kernels.compiling import for_python
 from torchfilm.tools.deterministic_math import deterministic_functions
 
@@ -444,3 +445,27 @@ def test_failures_of_equal_steps_are_the_same(method, rates, k, said, plain):
 def test_equal_steps_compiled_for_real(dtype):
     a, b = ends(alone(toggle(method="rk4", steps=3)), dtype=dtype)
     equal(a, b)
+
+
+def test_what_is_compiled_is_told_by_cell_type_and_names_each_thing_once(capsys, monkeypatch):
+    """A user knows then why there are two lines, and why a circuit of the same name has another
+    one."""
+    monkeypatch.setattr(compiling, "_mark", lambda name: None)  # none is in the cache
+
+    def leaking(u, s, p, cell):
+        out = p.leak * (u.ahl - s.ahl) * cell.area
+        return {"odd": p.k * s.food**2, "ahl": -out / cell.volume}, {"ahl": out}
+
+    signals = {n: tf.Signal(diffusion=9.0, initial=1.0) for n in ("ahl", "food")}
+    scene = tf.Scene(
+        tf.Circuit({0: leaking}, species=("odd", "ahl"), leak=tf.Uniform(0.5, 1.0), k=2.0),
+        tf.Medium(**signals, box=((-8, -8), (8, 8)), spacing=4.0),
+        dim=2,
+    )
+    for _ in tf.simulate(scene, until=0.025):
+        pass
+    said = [x for x in capsys.readouterr().err.splitlines() if "circuit" in x]
+    assert said == [
+        "torchfilm: compiling the circuit leaking (cell type 0); species odd, ahl; signals ahl,"
+        " food; constants with a value for each cell leak; some seconds, once for this installation"
+    ]

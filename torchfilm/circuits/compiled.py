@@ -7,7 +7,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -43,6 +43,7 @@ class Compiled:
     literals: Mapping[str, float]  # numbers in the rates, by the names that stand for them
     columns: tuple[str, ...]  # names that have a number for each cell
     numbers: tuple[str, ...]  # names that have one number
+    label: str = field(default="", kw_only=True)  # of the circuit, for people
 
     how: ClassVar[str] = ""  # it is computed, in words that follow its name
 
@@ -72,12 +73,24 @@ class Compiled:
         if self.module.__name__ not in _compiled:
             from torchfilm.kernels.compiling import first_call
 
-            names = ", ".join(n.partition(".")[2] for n in self.equations.variables)
-            what = f"a circuit ({names}){self.how}, some seconds"
-            with first_call(self.module.__name__, what):
+            with first_call(self.module.__name__, self._described()):
                 work(0, 0)
             _compiled.add(self.module.__name__)
         shares_of(count, least, work)
+
+    def _described(self) -> str:
+        """What is compiled, for people: each name once."""
+        read = (*self.equations.variables, *self.columns)
+        named = lambda home, names: ", ".join(
+            dict.fromkeys(n.partition(".")[2] for n in names if n.startswith(f"{home}."))
+        )
+        parts = {
+            "species": named("u", read),
+            "signals": named("s", read),
+            "constants with a value for each cell": named("p", self.columns),
+        }
+        listed = "".join(f"; {what} {names}" for what, names in parts.items() if names)
+        return f"the circuit {self.label}{self.how}{listed}; some seconds"
 
     @cached_property
     def constants(self) -> dict[str, Tensor]:

@@ -53,4 +53,6 @@ class CompiledExplicit(Compiled):
 
 def compiled_explicit(circuit: CircuitCells, name: str, dtype: torch.dtype) -> CompiledExplicit:
     """The circuit in these cells, of which one is enough. Raises Untraceable."""
-    return CompiledExplicit(*rates_of(circuit, dtype), method=name, dtype=dtype)
+    return CompiledExplicit(
+        *rates_of(circuit, dtype), method=name, dtype=dtype, label=circuit.label
+    )

@@ -103,4 +103,4 @@ def compiled_molecules(circuit: CircuitCells, molecules_per_unit: Tensor) -> Com
         lambda: network.propensity_columns(counts, p, cell, molecules_per_unit=each, pools=pool)
     )
     rates = trace.simple([trace.spread(x) for x in found], torch.float64)
-    return CompiledMolecules(*trace.equations(rates), network=network)
+    return CompiledMolecules(*trace.equations(rates), network=network, label=circuit.label)

@@ -66,7 +66,7 @@ class CompiledCircuit(Compiled):
         key = tuple(tuple(n for n in x if n in moving) for x in (self.columns, self.numbers))
         if key not in self._moved:
             self._moved[key] = CompiledTangents(
-                self.equations, self.literals, self.columns, self.numbers, *key
+                self.equations, self.literals, self.columns, self.numbers, *key, label=self.label
             )
         return self._moved[key].rodas3(values, start, dt, rtol, atol)
 
@@ -129,4 +129,4 @@ def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
     """The circuit in these cells, of which one is enough. Raises Untraceable."""
     found = rates_of(circuit, torch.float64)
     functions(found[0])  # raises where a derivative has no compiled form
-    return CompiledCircuit(*found, slopes=found[0].slopes())
+    return CompiledCircuit(*found, slopes=found[0].slopes(), label=circuit.label)
