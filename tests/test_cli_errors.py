@@ -83,6 +83,12 @@ ERRORS = {
     "run microcolony --until 1 --dt 0": ("dt", "0"),
     "run microcolony --every 0": ("every", "0"),
     "run microcolony --seed -1": ("seed", "-1"),
+    "run microcolony --cell 50": (
+        "run has no parameter '--cell'",
+        "Did you mean --cells?",
+        "It has",
+    ),
+    "show good.h5 --color=length": ("show has no parameter '--color'", "Did you mean --colour?"),
     "run microcolony --device banana": ("device", "banana"),
     "run microcolony --start missing.csv": (r"missing\.csv", ""),
     "run microcolony --start missing.h5": (r"missing\.h5", ""),

@@ -63,7 +63,7 @@ def test_a_medium_does_not_grow_without_end():
     """Found by the fuzzer: cells 1 mm apart on a grid of 0.3 µm asked for 3.7e10 voxels, which no
     machine has. Refused at the start."""
     scene, cells = far_apart(1e3)
-    with pytest.raises(tf.InputError, match=r"too small for colony 0.*at most 67,108,864 voxels"):
+    with pytest.raises(tf.InputError, match=r"too small for colony 0.*at most 67 million voxels"):
         scene.bind(2, cells=cells).start()
 
 

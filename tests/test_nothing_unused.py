@@ -120,6 +120,10 @@ def test_a_misspelt_option_of_a_circuit_is_an_error():
         (lambda: tf.Sphere((0, 0), radious=1.0), "Sphere has no parameter 'radious'. Did you mean"),
         (lambda: tf.Box((0, 0), (1, 1), stifness=1.0), "Did you mean stiffness?"),
         (lambda: tf.Mechanics(unilateral=True), 'contacts="one-sided", the default'),
+        (
+            lambda: tf.Mechanics(gamma=10),
+            "Mechanics has no parameter 'gamma'. Did you mean length_d",
+        ),
         (lambda: tf.Signal(D=10.0), "Signal has no parameter 'D'. Did you mean diffusion?"),
         (lambda: tf.Cells([[0, 0]], celltype=[1]), "'celltype'. Did you mean cell_type?"),
         (lambda: tf.Cells([[0, 0]], angle=[0.3]), "Write axis=[[cos, sin], …], or Cells.from_tab"),

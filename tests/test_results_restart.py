@@ -18,6 +18,7 @@ import torch
 from recorded import DT, UNTIL, assert_same_file, assert_same_state, make_scene, record
 
 import torchfilm as tf
+from torchfilm.io.identity import check_same_scene
 
 
 @pytest.mark.parametrize("frame", [0, 3, 8])
@@ -130,6 +131,31 @@ def test_another_scene_is_refused(whole, tmp_path):
             results.state(
                 tf.Scene(tf.Growth(rate=1.0), tf.Division(added=1.0), tf.Mechanics(dim=2))
             )
+
+
+def test_of_another_scene_only_what_differs_is_named():
+    """A circuit has a text of some hundred letters."""
+
+    def scene(leak, high, *more):
+        made = tf.Circuit(
+            lambda u, s, p, cell: {"gfp": p.make - p.leak * u.gfp},
+            species="gfp", initial={"gfp": tf.Uniform(0.0, 2.0)}, make=3.0, leak=leak, **dict(more),
+        )  # fmt: skip
+        return tf.Scene(tf.Division(length=tf.Uniform(3.0, high)), made, dim=2)
+
+    def said(there, here):
+        with pytest.raises(tf.InputError) as caught:
+            check_same_scene({"effects": json.dumps(there.listing())}, "run.h5", here)
+        return str(caught.value).removeprefix("run.h5 is of another scene: ").partition(". If")[0]
+
+    first = scene(0.5, 4.0)
+    assert said(first, scene(0.6, 4.0)) == "Circuit: 'leak: 0.5' there, 'leak: 0.6' in this scene"
+    assert said(first, scene(0.5, 4.5)).startswith("Division: 'high=4.0' there, 'high=4.5' in")
+    assert said(first, scene(0.5, 4.0, ("steps", 2))) == (
+        "Circuit: nothing there, 'steps=2' in this scene"
+    )
+    added = tf.Scene(*first.effects, tf.Growth(rate=1.0), dim=2)
+    assert said(first, added) == "this scene has 'Growth(rate=1.0)'"
 
 
 def ruled(factor: float) -> tf.Scene:

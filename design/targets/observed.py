@@ -287,6 +287,9 @@ class Observed(Target):
         found.pop(LOG_CELLS, None)
         return {"cells": state.counts.double(), **found}
 
+    def __str__(self) -> str:
+        return self.table()
+
     def table(self) -> str:
         """The statistics with their spreads, a line each."""
         lines = [f"{self.describe()}:"]

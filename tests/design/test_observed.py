@@ -295,6 +295,15 @@ def test_bad_tables_are_refused(table, options, message):
         Observed.from_table(table, **options)
 
 
+@pytest.mark.parametrize("unit", ["um", "µm"])
+def test_lengths_may_be_in_micrometres_as_people_write_them(unit):
+    seen = Observed.from_table({"length": [2.0, 3.0]}, length_unit=unit)
+    assert seen == Observed.from_table({"length_um": [2.0, 3.0]})
+    assert str(seen) == seen.table() and len(str(seen).splitlines()) > 5
+    with pytest.raises(tf.InputError, match=f'left out with length_unit="{unit}"'):
+        Observed.from_table(PLACES, length_unit=unit, pixel_size=0.1)
+
+
 def test_a_csv_file_is_read_and_its_faults_are_named(tmp_path):
     path = tmp_path / "cells.csv"
     path.write_text("Length_px,alter_min\n20,30\n30,60\n")

@@ -9,7 +9,7 @@ import sys
 import warnings
 from typing import Any
 
-from torchfilm.tools.checks import InputError, SimulationError, install
+from torchfilm.tools.checks import InputError, SimulationError, install, unknown_keyword
 from torchfilm.tools.memory import keep_memory
 from torchfilm.tools.warn_once import once
 
@@ -50,6 +50,10 @@ def main() -> None:
 
 
 def _command() -> None:
+    try:
+        check_options(sys.argv[1:])
+    except InputError as error:
+        raise SystemExit(f"torchfilm: {error}") from None
     command = tyro.extras.subcommand_cli_from_dict(
         {**COMMANDS},
         prog="torchfilm",
@@ -77,6 +81,21 @@ def _command() -> None:
 def _format_warning(message: Warning | str, *_: object, **__: object) -> str:
     """A warning without the line of code that raised it, which is not the user's."""
     return f"warning: {message}\n"
+
+
+def check_options(args: list[str]) -> None:
+    """Raise InputError for an option that a command does not have, with the nearest one. The parser
+    would list those of all commands."""
+    command = COMMANDS.get(args[0]) if args else None
+    if command is None:
+        return
+    fields = [f for f in dataclasses.fields(command) if "Positional" not in str(f.type)]
+    known = {f"--{f.name.replace('_', '-')}": str(f.type) for f in fields}
+    off = {f"--no-{name[2:]}" for name, kind in known.items() if kind == "bool"}
+    for arg in args[1:]:
+        name = arg.partition("=")[0].replace("_", "-")
+        if arg.startswith("--") and name not in (*known, *off, "--help"):
+            raise unknown_keyword(args[0], arg.partition("=")[0], list(known))
 
 
 def gather_repeated(args: list[str]) -> list[str]:

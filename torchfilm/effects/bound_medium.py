@@ -34,8 +34,8 @@ class MediumReport:
     first: Tensor
     hint = (
         "Make the box of the Medium larger (one that is flat is a single layer), let it grow with"
-        f" the colony, Medium(…, outside='grow'), with a spacing that needs at most {MOST_VOXELS:,}"
-        " voxels a colony, or move the obstacle"
+        " the colony, Medium(…, outside='grow'), or move the obstacle. A box has at most"
+        f" {MOST_VOXELS / 1e6:.0f} million voxels; a larger spacing needs fewer"
     )
 
     def reason(self, place: int) -> str:

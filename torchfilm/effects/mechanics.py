@@ -82,7 +82,9 @@ class Mechanics(Effect):
         "unilateral": (
             'Contacts that only push are contacts="one-sided", the default; unilateral=False is'
             ' contacts="bilateral" now.'
-        )
+        ),
+        "gamma": "Did you mean length_drag? (γ)",
+        "mu": "Did you mean viscosity? (μ)",
     }
 
     def __post_init__(self) -> None:

@@ -55,11 +55,11 @@ def checked_box(
             )
     voxels = math.prod(round((b - a) / h) for a, b, h in zip(low, high, voxel, strict=True))
     if voxels > MOST_VOXELS:
-        hint = f"It has {voxels:,}; give a larger spacing or a smaller box."
+        hint = f"It has {voxels / 1e6:,.0f} million; give a larger spacing or a smaller box."
         raise checks.input_error(
             "Medium.box",
             (low, high),
-            f"of at most {MOST_VOXELS:,} voxels of {spacing} µm per colony",
+            f"of at most {MOST_VOXELS / 1e6:.0f} million voxels of {spacing} µm per colony",
             hint,
         )
     if depth is not None:
