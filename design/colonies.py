@@ -135,9 +135,13 @@ def _why_endless(model: tf.Model, first: tf.State, cells: int) -> str:
     return ""
 
 
-def grid_nodes(scene: tf.Scene, dtype: torch.dtype) -> int:
+def first_state(scene: tf.Scene, dtype: torch.dtype) -> tf.State:
+    """The first state of one colony, on the CPU."""
+    return scene.bind(dtype=dtype, device="cpu", per_colony=True).start()
+
+
+def grid_nodes(first: tf.State) -> int:
     """The number of grid nodes of one colony; 0 without a medium."""
-    first = scene.bind(dtype=dtype, device="cpu", per_colony=True).start()
     return 0 if first.layout is None else first.layout.grid.nodes // first.colonies
 
 

@@ -11,19 +11,41 @@ import torch
 # Measured peak of a step of the boundary detector (5 species, stiff, one signal), bytes in float32,
 # plus half as much again as a reserve
 BYTES_A_CELL, BYTES_A_VOXEL = 6000, 60
+# Measured peak of a number that a target keeps after every step, with its derivative, from the note
+# to the residuals (`Lasting`, 320 copies of colonies of 200 cells, 120 steps), rounded up
+BYTES_A_NOTE = 60
 USE = 0.5  # share of the free memory: other batches and other programs use it too
 CELLS = 1000  # assumed cells of a colony whose end is a time
+HOURS = 1.0  # assumed for its cells to double, where its end is a number of cells
 
 
-def max_colonies(nodes: int, cells: int | None, dtype: torch.dtype, device: str) -> int:
+def max_colonies(
+    nodes: int, cells: int | None, dtype: torch.dtype, device: str, notes: float = 0.0
+) -> int:
     """The greatest number of colonies to grow at once, at least 1.
 
-    nodes: grid nodes of a colony; cells: at its end, or None where its end is a time.
+    nodes: grid nodes of a colony; cells: at its end, or None where its end is a time; notes: the
+    numbers for each cell that its target keeps in all (`kept_notes`).
     """
     wide = 2 if dtype == torch.float64 else 1
+    count = cells or CELLS
     # a colony may have up to twice the requested cells when it is measured
-    bytes_a_colony = wide * (BYTES_A_CELL * 2 * (cells or CELLS) + BYTES_A_VOXEL * nodes)
+    bytes_a_colony = (
+        wide * (BYTES_A_CELL * 2 * count + BYTES_A_VOXEL * nodes) + BYTES_A_NOTE * notes * count
+    )
     return max(1, math.floor(USE * free_bytes(device) / bytes_a_colony))
+
+
+def kept_notes(
+    each: float, founders: int, cells: int | None, until: float | None, dt: float
+) -> float:
+    """The numbers for each cell that a target keeps until the end of a colony.
+
+    each: after one step (`Target.kept`); founders: cells at the start; cells, until (h): the end,
+    whichever comes first; dt: h.
+    """
+    hours = math.inf if cells is None else HOURS * math.log2(max(cells / founders, 2.0))
+    return each * min(hours, math.inf if until is None else until) / dt
 
 
 def free_bytes(device: str) -> int:

@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -75,7 +76,7 @@ def cut_work_items(
     out = []
     apart = (_unfit_apart(task, values, rows) for rows in groups.values())
     for rows in itertools.chain.from_iterable(apart):
-        most = task.most or _max_colonies(task, [values[r] for r in rows], size)
+        most = task.most or _max_colonies(task, [values[r] for r in rows], size, turns is not None)
         wanted = max(
             math.ceil(len(rows) / max(1, most // colonies_each)),
             math.ceil(least * len(rows) / len(values)),
@@ -108,13 +109,17 @@ def _unfit_apart(
     return [*([fit] if fit else []), *([row] for row in unfit)]
 
 
-def _max_colonies(task: Task, values: Sequence[dict[str, Value]], size: float) -> int:
+def _max_colonies(task: Task, values: Sequence[dict[str, Value]], size: float, slopes: bool) -> int:
     """How many colonies of designs with the same structure fit into memory at once."""
+    cells, until = task.end(size)
     for design in values:
         # the scene may refuse a design; the first that it accepts shows the grid
         with contextlib.suppress(tf.InputError):
-            nodes = colonies.grid_nodes(task.family.scene([design]), task.dtype)
-            return memory.max_colonies(nodes, task.end(size)[0], task.dtype, task.device)
+            first = colonies.first_state(task.family.scene([design]), task.dtype)
+            nodes, founders = colonies.grid_nodes(first), task.tried.founders
+            each = task.target.kept(first) if slopes else 0.0
+            notes = memory.kept_notes(each, founders, cells, until, cast(float, task.dt))
+            return memory.max_colonies(nodes, cells, task.dtype, task.device, notes)
     return 1
 
 

@@ -60,6 +60,11 @@ class Target:
         more, whose number may change from step to step. It is asked where derivatives are."""
         return self.note(state)
 
+    def kept(self, state: tf.State) -> float:
+        """How many numbers `course` keeps of each cell after every step, as told by a first state:
+        the memory of a batch depends on them. 0 where they do not grow with the colony."""
+        return 0.0
+
     def loss(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """The loss of each colony, (B,) float64. history: the notes of all steps, (T, B, k)."""
         raise NotImplementedError(f"{type(self).__name__}.loss")

@@ -107,6 +107,9 @@ class Several(Target):
         found = [note for note in (part.note(state) for part in self.parts) if note is not None]
         return torch.cat(found, 1) if found else None
 
+    def kept(self, state: tf.State) -> float:
+        return sum(part.kept(state) for part in self.parts)
+
     def _each(
         self, of: Callable[[Target, Tensor | None], Any], state: tf.State, history: Tensor | None
     ) -> list[Any]:

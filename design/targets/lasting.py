@@ -75,6 +75,10 @@ class Lasting(Target):
         found = self.target.residuals(state)
         return noted if found is None else torch.cat([noted, found], 1)
 
+    def kept(self, state: tf.State) -> float:
+        found = self.target.residuals(state)
+        return 0.0 if found is None else found.shape[1] / int(state.counts.max())
+
     @property
     def squares(self) -> bool:
         return self.target.squares

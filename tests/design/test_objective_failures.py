@@ -11,7 +11,8 @@ from scored import alike, objective
 from searching import DT, Level, Spread, banned, fragile, grown, objective_of, paced, short, spots
 
 import torchfilm as tf
-from design import Parameter, Target, rollout, scoring
+from design import Lasting, Parameter, Ring, Target, Weighted, rollout, scoring
+from design.derivatives import along
 from design.rollout import FinishedColonies
 
 # --- what fails -----------------------------------------------------------------------------------
@@ -172,6 +173,27 @@ def test_other_errors_and_one_design_that_does_not_fit_pass_through(monkeypatch,
     with pytest.raises(type(error)) as caught:
         objective().evaluate(spots(1, 2))
     assert caught.value is error
+
+
+RINGED = Ring("gfp", 3.0, 2.0)
+LASTING = Lasting(RINGED, since=1.0)
+
+
+@pytest.mark.parametrize("end", [{"cells": 64}, {"cells": None, "until": 4.0}], ids=str)
+@pytest.mark.parametrize("target", [LASTING, Weighted([(RINGED, 1.0), (LASTING, 2.0)])], ids=str)
+def test_residuals_that_are_kept_take_memory(monkeypatch, target, end):
+    """One number a cell and one more after each of 40 to 60 steps, in batches with derivatives."""
+    monkeypatch.setattr("design.memory.free_bytes", lambda device: 2**30)
+
+    def batches(target, slopes):
+        task = objective(target=target, **end).task
+        points = spots(200, 2)
+        turns = [along(task.space, point) for point in points] if slopes else None
+        values = [task.space.values(point) for point in points]
+        return len(scoring.cut_work_items(task, values, 3, 1.0, 1, turns))
+
+    assert batches(target, False) == batches(RINGED, False)
+    assert batches(target, True) > batches(RINGED, True) > 1
 
 
 def test_colonies_at_their_ends_are_those_that_were_scored():
