@@ -12,8 +12,9 @@ from design.methods.racing import Racing
 
 # designs of a batch, and the width of its first cloud: the settings that were measured
 BATCH, WIDTH = 24, 0.5
-# designs before the first descents (one race), and for each parameter of a descent, so that it ends
-BEFORE, EACH, MOST_STARTS = BATCH, 10, 3
+# designs before the first descents (less than one race, whose end they await), and for each
+# parameter of a descent, so that it ends
+BEFORE, EACH, MOST_STARTS = 5, 10, 3
 # designs of a batch where every one needs many replicates
 FEW = 12
 
@@ -68,8 +69,8 @@ def choose(
         Chosen(
             Polish(inner=Racing(inner=cloud), after=BEFORE, starts=starts),
             f"{designs:.0f} designs for {dimensions} parameters: one race of small colonies, then"
-            " down the slope from the best, since the loss is a sum of squares with exact"
-            " derivatives",
+            " down the slope from the best, of one replicate at first, since the loss is a sum of"
+            " squares with exact derivatives",
         )
         for starts in range(1, MOST_STARTS + 1)
     )

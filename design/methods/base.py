@@ -96,7 +96,8 @@ class Source(Method, Protocol):
         """(count, D) points of its current distribution."""
 
     def take(self, rows: np.ndarray, loss: np.ndarray) -> None:
-        """Learn from `wanted` of the points that were drawn last: their rows and losses."""
+        """Learn from `wanted` of the points that were drawn last, or from fewer where it is
+        `fresh`: their rows and losses."""
 
 
 class Turns:

@@ -15,8 +15,9 @@ from torchfilm import checks
 FIRST, MOST = 1e-2, 1e6
 LONGEST = 0.3  # of a step, in each coordinate
 LEAST_STEP, LEAST_GAIN = 1e-4, 1e-4  # coordinates; share of the loss
-# Steps in a row whose decrease is not what the derivatives promised, after which they mislead.
-MISSES = 4
+# Steps in a row whose decrease is not what the derivatives promised, after which they mislead: with
+# those of all replicates, and of fewer.
+MISSES, FEW_MISSES = 4, 2
 FAIR = 0.1  # share of the promised decrease that a step should bring at least
 APART = 0.05  # starts that are nearer than this in every coordinate lead to the same end
 
@@ -24,10 +25,18 @@ APART = 0.05  # starts that are nearer than this in every coordinate lead to the
 @dataclass(eq=False)
 class Descent:
     """A way down from one start: the best point (D,) so far with its loss and slopes, and the
-    point that was proposed last, with the decrease that it promised."""
+    point that was proposed last, with the decrease that it promised.
+
+    most: replicates of a design; seen: of how many its slopes are. sloped: whether they are known
+    at the point. moved (D,): the step that led there.
+    """
 
     point: np.ndarray
-    loss: float = np.inf
+    loss: float
+    most: int
+    seen: int = 1
+    sloped: bool = False
+    moved: np.ndarray = field(default_factory=lambda: np.zeros(1))
     gradient: np.ndarray = field(default_factory=lambda: np.empty(0))
     curvature: np.ndarray = field(default_factory=lambda: np.empty(0))
     damping: float = FIRST
@@ -39,9 +48,6 @@ class Descent:
 
     def propose(self) -> np.ndarray:
         """The next point to evaluate, (D,)."""
-        if not np.isfinite(self.loss):
-            self.proposed = self.point
-            return self.point
         step = self._step()
         self.proposed = np.clip(self.point + step, 0.0, 1.0)
         moved = self.proposed - self.point
@@ -63,43 +69,45 @@ class Descent:
         longest = np.abs(step).max()
         return step * min(1.0, LONGEST / longest) if longest > 0 else step
 
-    def learn(self, loss: float, gradient: np.ndarray, curvature: np.ndarray) -> None:
-        """What was found at the proposed point."""
+    def turn(self, gradient: np.ndarray, curvature: np.ndarray) -> None:
+        """The slopes at the point."""
         if not np.isfinite(gradient).all():
-            self.over = "a derivative is no number"
+            self._doubt("a derivative is no number")
             return
-        if not np.isfinite(self.loss):
-            self._take(loss, gradient, curvature, np.zeros_like(gradient))
-            return
-        moved = self.proposed - self.point
-        gain = self.loss - loss
+        if not np.isfinite(curvature).all():
+            curvature = self._quasi_newton(gradient)
+        self.gradient, self.curvature, self.sloped = gradient, curvature, True
+        self.moved = np.zeros_like(gradient)
+
+    def learn(self, loss: float) -> None:
+        """The loss at the proposed point."""
+        moved, before = self.proposed - self.point, self.loss
+        gain = before - loss
         ratio = gain / self.promised if self.promised > 0 else -1.0
         self.misses = 0 if ratio > FAIR else self.misses + 1
         if gain > 0:
-            before = self.loss
-            self._take(loss, gradient, curvature, moved)
+            self.point, self.loss, self.moved, self.sloped = self.proposed, loss, moved, False
             # Nielsen (1999)
             self.damping *= max(1 / 3, 1 - (2 * min(ratio, 1.5) - 1) ** 3)
             self.growth = 2.0
-            if gain < LEAST_GAIN * before and ratio > FAIR:
-                self.over = "converged"
         else:
             self.damping, self.growth = self.damping * self.growth, 2 * self.growth
-        if self.misses >= MISSES:
-            self.over = "derivatives mislead"
-        if np.abs(moved).max() < LEAST_STEP or self.damping > MOST:
-            self.over = "converged"
+        little = gain > 0 and gain < LEAST_GAIN * before and ratio > FAIR
+        if little or np.abs(moved).max() < LEAST_STEP or self.damping > MOST:
+            self._doubt("converged")
+        elif self.misses >= (MISSES if self.seen == self.most else FEW_MISSES):
+            self._doubt("derivatives mislead")
 
-    def _take(
-        self, loss: float, gradient: np.ndarray, curvature: np.ndarray, moved: np.ndarray
-    ) -> None:
-        if not np.isfinite(curvature).all():
-            curvature = self._quasi_newton(gradient, moved)
-        self.point, self.loss = self.proposed, loss
-        self.gradient, self.curvature = gradient, curvature
+    def _doubt(self, why: str) -> None:
+        """Slopes of more replicates; where they are of all, the descent is over."""
+        if self.seen < self.most:
+            self.seen, self.sloped, self.misses = min(2 * self.seen, self.most), False, 0
+        else:
+            self.over = why
 
-    def _quasi_newton(self, gradient: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    def _quasi_newton(self, gradient: np.ndarray) -> np.ndarray:
         """The curvature after a step by BFGS's formula, damped as by Powell (1978)."""
+        moved = self.moved
         if not moved.any():
             return max(float(np.linalg.norm(gradient)), 1e-12) / LONGEST * np.eye(len(gradient))
         known, change = self.curvature, gradient - self.gradient
@@ -136,8 +144,11 @@ class Local(Turns):
     first ones follows it, and then new Sobol designs. The bounds hold, and dimensions with levels
     keep the level of their start. Targets without residuals have quasi-Newton steps (BFGS).
 
-    Each design is grown once for each parameter, or twice and once more where the derivatives are
-    differences (`Objective.why_differences` says why); all these colonies count.
+    For the slopes at a point, a design is grown once for each parameter, or twice and once more
+    where the derivatives are differences (`Objective.why_differences` says why); all these colonies
+    count. So slopes are those of one replicate at first. Every step is scored with all replicates,
+    without slopes. Where two steps in a row miss what was promised, and where a descent would end,
+    it takes slopes of twice as many replicates, until they are of all.
     """
 
     starts: int = 4
@@ -155,12 +166,13 @@ class Local(Turns):
                 ' method, such as "racing".'
             )
         self._tried = 0
-        self._waiting: list[np.ndarray] = []
+        self._waiting: list[tuple[np.ndarray, float]] = []
         self._descents: list[Descent] = []
+        self._asked: list[Descent] = []
 
     def know(self, points: np.ndarray, loss: np.ndarray) -> None:
         """The first descents begin at these, the best first."""
-        self._waiting = [points[k] for k in unlike(points, loss, len(points))]
+        self._wait(points, loss, len(points))
 
     @property
     def idle(self) -> bool:
@@ -170,22 +182,30 @@ class Local(Turns):
     def _next(self) -> Batch:
         self._descents = [d for d in self._descents if not d.over]
         while self._waiting and len(self._descents) < self.starts:
-            self._descents.append(Descent(self._waiting.pop(0)))
+            self._descents.append(Descent(*self._waiting.pop(0), self._replicates))
         if not self._descents:
             count = self.first or 16 * self.starts
             points = sobol_points(self._started(), self._seed, self._tried, count)
             self._tried += count
             return Batch(points)
-        return Batch(np.array([d.propose() for d in self._descents]), slopes=True)
+        flat = [d for d in self._descents if not d.sloped]
+        if not flat:
+            return Batch(np.array([d.propose() for d in self._descents]))
+        seen = min(d.seen for d in flat)
+        self._asked = [d for d in flat if d.seen == seen]
+        return Batch(np.array([d.point for d in self._asked]), replicates=seen, slopes=True)
 
     def _take(self, batch: Batch, loss: np.ndarray) -> None:
-        self._keep_best(batch.points, loss)
+        if self._descents:
+            for descent, found in zip(self._descents, loss.tolist(), strict=True):
+                descent.learn(found)
+        else:  # a quarter of the designs: the others are worse than where a descent would end
+            self._wait(batch.points, loss, max(self.starts, len(loss) // 4))
 
-    def _keep_best(self, points: np.ndarray, loss: np.ndarray) -> None:
-        """A quarter of the designs: the others are worse than where a descent would end."""
-        best = unlike(points, loss, max(self.starts, len(loss) // 4))
-        self._waiting = [points[k] for k in best]
+    def _wait(self, points: np.ndarray, loss: np.ndarray, most: int) -> None:
+        """The best of some designs are the next starts."""
+        self._waiting = [(points[k], float(loss[k])) for k in unlike(points, loss, most)]
 
     def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:
-        for k, descent in enumerate(self._descents):
-            descent.learn(float(loss[k]), slopes.gradient[k], slopes.curvature[k])
+        for k, descent in enumerate(self._asked):
+            descent.turn(slopes.gradient[k], slopes.curvature[k])

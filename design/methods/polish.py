@@ -72,8 +72,11 @@ class Polish(Turns):
         return self._local.ask() if self._descending else self._inner.ask()
 
     def _take(self, batch: Batch, loss: np.ndarray) -> None:
-        self._count(batch, loss)
-        self._inner.tell(batch, loss)
+        if self._descending:
+            self._local.tell(batch, loss)
+        else:
+            self._count(batch, loss)
+            self._inner.tell(batch, loss)
 
     def _count(self, batch: Batch, loss: np.ndarray) -> None:
         """Count what `inner` grows, and keep its designs where they may be starts."""

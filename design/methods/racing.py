@@ -28,7 +28,8 @@ class Racing(Turns):
     last. agree: the race is skipped where the order of the finalists in small and full colonies
     agrees less than this (Kendall's tau, smoothed over races, from 1). Then as many points as
     `inner` needs are grown to full size at once. -1 never skips. A new cloud of CMAES trusts small
-    colonies again.
+    colonies again. first: finalists of a race from which a cloud is to begin, since only the best
+    of them counts there; before them, `keep` chooses among full colonies of `small` replicates.
 
     A race is one bracket of successive halving (Jamieson and Talwalkar, AISTATS 2016), and a
     pre-selection for CMA-ES (Ulmer, Streichert and Zell, CEC 2003): all points come from the
@@ -44,6 +45,7 @@ class Racing(Turns):
     keep: float = 0.33
     small: int = 1
     agree: float = 0.1
+    first: int = 5
 
     def __post_init__(self) -> None:
         self._source: Source = CMAES() if self.inner is None else self.inner
@@ -71,6 +73,7 @@ class Racing(Turns):
         checks.number("Racing.keep", self.keep, least=0.01, most=0.99)
         whole("Racing.small", self.small, least=1)
         checks.number("Racing.agree", self.agree, least=-1.0, most=1.0)
+        whole("Racing.first", self.first, least=2)
 
     def _begin(self) -> None:
         self._source.start(self._started(), self._seed, self._replicates)
@@ -90,34 +93,39 @@ class Racing(Turns):
         self._left = np.empty(0, dtype=np.int64)
         self._early: np.ndarray | None = None  # losses of all drawn points, at the first size
 
-    @property
-    def _last(self) -> int:
-        return len(self.sizes) - 1
-
-    def _count(self, rung: int) -> int:
-        """How many points start at a size, so that enough reach the last."""
-        return math.ceil(self._source.wanted / self.keep ** (self._last - rung) - 1e-9)
+    def _draw(self) -> None:
+        """Begin a race: its rungs, each a size, replicates and how many points, and the points."""
+        small, last = min(self.small, self._replicates), self._source.wanted
+        rungs: list[tuple[float, int | None]] = [(size, small) for size in self.sizes[:-1]]
+        if self._source.fresh:
+            self._trust = 1.0
+            if small < self._replicates:
+                rungs.append((1.0, small))
+                last = min(last, self.first)
+            else:  # these are all replicates
+                last = min(last, _before(self.first, self.keep))
+        rungs.append((1.0, None))
+        counts = [last]
+        while len(counts) < len(rungs):
+            counts.insert(0, _before(last, self.keep ** len(counts)))
+        self._rungs = [(*rung, count) for rung, count in zip(rungs, counts, strict=True)]
+        if self._trust < self.agree:
+            self._rungs = self._rungs[-1:]
+        self._points = self._source.draw(self._rungs[0][2])
+        self._left = np.arange(len(self._points))
 
     def _next(self) -> Batch:
         if not len(self._left):
-            if self._source.fresh:
-                self._trust = 1.0
-            if self._trust < self.agree:
-                self._rung = self._last
-            self._points = self._source.draw(self._count(self._rung))
-            self._left = np.arange(len(self._points))
-        return Batch(
-            self._points[self._left],
-            size=self.sizes[self._rung],
-            replicates=min(self.small, self._replicates) if self._rung < self._last else None,
-        )
+            self._draw()
+        size, replicates, _ = self._rungs[self._rung]
+        return Batch(self._points[self._left], size=size, replicates=replicates)
 
     def _take(self, batch: Batch, loss: np.ndarray) -> None:
-        if self._rung < self._last:
+        if self._rung < len(self._rungs) - 1:
             if self._early is None:
                 self._early = loss
             self._rung += 1
-            best = np.argsort(loss, kind="stable")[: self._count(self._rung)]
+            best = np.argsort(loss, kind="stable")[: self._rungs[self._rung][2]]
             self._left = self._left[np.sort(best)]
             return
         if self._early is not None:
@@ -127,3 +135,8 @@ class Racing(Turns):
                 self._trust += RATE * (found - self._trust)
         self._source.take(self._left, loss)
         self._open()
+
+
+def _before(count: int, keep: float) -> int:
+    """How many points, of which a share is kept, leave so many."""
+    return math.ceil(count / keep - 1e-9)

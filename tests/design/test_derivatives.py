@@ -250,7 +250,7 @@ def test_derivatives_by_nothing_are_refused():
 # --- the method ----------------------------------------------------------------------------------
 
 
-def descend(local, function, dimensions=3, batches=60, residuals=True):
+def descend(local, function, dimensions=3, batches=120, residuals=True):
     """All points that a local search asks for, their losses, and the colonies that it took. A
     function gives residuals and their Jacobian at a point."""
     local.start(Room((None,) * dimensions), 1, 1)
@@ -284,6 +284,41 @@ def valley(point):
 def test_it_finds_the_bottom_of_a_bent_valley(residuals, least):
     _, losses, _ = descend(Local(starts=2), valley, residuals=residuals)
     assert losses.min() < least
+
+
+@pytest.mark.parametrize("replicates", [1, 3, 4])
+def test_slopes_of_few_replicates_come_first_and_of_more_where_they_mislead(replicates):
+    """The slopes point the wrong way, but for those of all replicates."""
+    centre = np.array([0.3, 0.6, 0.4])
+    local = Local(starts=1, first=4)
+    local.start(Room((None,) * 3), 1, replicates)
+    seen, losses = [], []
+    for _ in range(30):
+        batch = local.ask()
+        apart = batch.points - centre
+        loss = (apart**2).sum(1)
+        if batch.slopes:
+            seen.append(batch.replicates)
+            right = 1.0 if batch.replicates == replicates else -1.0
+            local.tell(batch, loss, Slopes(2 * right * apart, 2 * np.eye(3)[None]))
+        else:
+            assert batch.replicates is None
+            losses.append(loss.min())
+            local.tell(batch, loss)
+    assert list(dict.fromkeys(seen)) == {1: [1], 3: [1, 2, 3], 4: [1, 2, 4]}[replicates]
+    assert min(losses) < 1e-12
+
+
+def test_slopes_of_few_replicates_are_enough_while_they_lead_down():
+    local = Local(starts=1, first=4)
+    local.start(Room((None,) * 3), 1, 4)
+    for _ in range(7):
+        batch = local.ask()
+        apart = batch.points - 0.3
+        assert not batch.slopes or batch.replicates == 1
+        slopes = Slopes(2 * apart, 2 * np.eye(3)[None])
+        local.tell(batch, (apart**2).sum(1), *([slopes] if batch.slopes else []))
+    assert not batch.slopes and (np.abs(batch.points - 0.3) < 1e-4).all()
 
 
 def test_it_stops_at_a_bound():
@@ -343,8 +378,9 @@ def test_a_search_with_slopes_resumes(tmp_path):
     kept = Study.read(tmp_path / "a.h5")
     assert [e.copies for e in kept.entries] == [e.copies for e in whole.study.entries]
     assert kept.colonies == whole.study.colonies
-    # 4 first designs × 2 replicates, then 2 descents × 2 replicates × 2 parameters
-    assert [e.colonies for e in kept.entries][:2] == [8.0, 8.0]
+    # 4 first designs × 2 replicates, the slopes of 2 of them × 1 replicate × 2 parameters, and the
+    # losses where they lead × 2 replicates
+    assert [e.colonies for e in kept.entries][:3] == [8.0, 4.0, 4.0]
     for one, other in zip(kept.entries, whole.study.entries, strict=True):
         assert (one.slopes is None) == (other.slopes is None)
         if one.slopes is not None:

@@ -182,7 +182,8 @@ def test_a_method_by_its_name(name):
         (CMAES(), "cmaes(population=None, sigma=0.3, restarts=True, noisy=False)"),
         (
             Racing(inner=Sobol(batch=9)),
-            "racing(inner=sobol(batch=9), sizes=(0.25, 1.0), keep=0.33, small=1, agree=0.1)",
+            "racing(inner=sobol(batch=9), sizes=(0.25, 1.0), keep=0.33, small=1, agree=0.1,"
+            " first=5)",
         ),
     ],
 )
@@ -209,6 +210,7 @@ def test_other_objects_are_refused_as_methods(bad):
         lambda: Racing(keep=1.0),
         lambda: Racing(small=0),
         lambda: Racing(agree=2.0),
+        lambda: Racing(first=1),
         lambda: Racing(inner=Racing()),  # type: ignore[arg-type]
         lambda: Racing(inner=CMAES),  # type: ignore[arg-type]
         lambda: Batch(np.zeros((0, 2))),

@@ -124,7 +124,7 @@ def test_a_race_grows_all_small_and_the_best_in_full():
         SPACES["cube"],
         replicates=5,
     )
-    history = follow(given, sphere, 3)
+    history = follow(given, sphere, 7)[4:]  # after the first race, from which the cloud begins
     assert [(len(b.points), b.size, b.replicates) for b, _ in history] == [
         (81, 0.1, 2),
         (27, 0.5, 2),
@@ -136,6 +136,26 @@ def test_a_race_grows_all_small_and_the_best_in_full():
         assert {row.tobytes() for row in after.points} <= {row.tobytes() for row in before.points}
 
 
+@pytest.mark.parametrize(
+    ("small", "first"),
+    [
+        (1, [(36, 0.25, 1), (12, 1.0, 1), (4, 1.0, None)]),
+        (3, [(27, 0.25, 3), (9, 1.0, None)]),  # no more than the cloud needs
+    ],
+)
+def test_where_a_cloud_begins_few_are_grown_with_all_replicates(small, first):
+    inner = CMAES(population=9, sigma=0.01)
+    given = begun(
+        Racing(inner=inner, keep=1 / 3, small=small, first=4), SPACES["cube"], replicates=3
+    )
+    history = follow(given, sphere, len(first))
+    assert [(len(b.points), b.size, b.replicates) for b, _ in history] == first
+    best, loss = history[-1]
+    after = given.ask()
+    assert len(after.points) == 27
+    assert np.abs(after.points.mean(0) - best.points[loss.argmin()]).max() < 0.02
+
+
 def test_the_inner_method_learns_only_from_full_colonies(monkeypatch):
     inner, heard = CMAES(population=6), []
     take = inner.take
@@ -143,10 +163,12 @@ def test_the_inner_method_learns_only_from_full_colonies(monkeypatch):
         inner, "take", lambda rows, loss: [heard.append(loss.copy()), take(rows, loss)]
     )
     given = begun(Racing(inner=inner), SPACES["cube"])
-    for _ in range(20):
+    for _ in range(21):
         batch = given.ask()
-        given.tell(batch, ellipsoid(batch.points) + (0 if batch.size == 1 else 100))
-    assert len(heard) >= 10 and all(len(loss) == 6 and loss.max() < 100 for loss in heard)
+        small = batch.size < 1 or batch.replicates is not None
+        given.tell(batch, ellipsoid(batch.points) + (100 if small else 0))
+    assert [len(loss) for loss in heard] == [5] + [6] * 9
+    assert max(loss.max() for loss in heard) < 100
 
 
 def test_no_more_replicates_than_there_are():
@@ -198,14 +220,14 @@ def test_races_stop_where_small_colonies_mislead(agree, races):
 def test_a_new_cloud_trusts_small_colonies_again():
     inner = CMAES(population=6, noisy=False)
     given = begun(Racing(inner=inner), SPACES["line"])
-    drawn, size = [], 1.0
+    drawn, new = [], True
     for _ in range(400):
-        new, fresh = size == 1.0, inner.fresh
+        fresh = inner.fresh
         batch = given.ask()
-        size = batch.size
         if new:
-            drawn.append((fresh, size))
-        given.tell(batch, sphere(batch.points) * (1 if size == 1 else -1))
+            drawn.append((fresh, batch.size))
+        new = batch.size == 1.0 and batch.replicates is None
+        given.tell(batch, sphere(batch.points) * (1 if new else -1))
     plain = drawn.index((False, 1.0))
     assert (True, 0.25) in drawn[plain:] and (True, 1.0) not in drawn
 

@@ -49,33 +49,37 @@ def run(method, batches):
 
 
 def test_designs_come_first_then_descents_then_the_method_goes_on():
-    history = run(begun(Polish(inner=Sobol(batch=8), after=20, starts=2), ROOM), 20)
-    kinds = [batch.slopes for batch, _ in history]
+    history = run(begun(Polish(inner=Sobol(batch=8), after=20, starts=2), ROOM), 40)
+    kinds = [len(batch.points) < 8 for batch, _ in history]  # of a descent
     first, last = kinds.index(True), len(kinds) - 1 - kinds[::-1].index(True)
     assert first == 3 and all(kinds[first : last + 1]) and last < len(kinds) - 1
     points = np.concatenate([b.points for b, _ in history[:3]])
     losses = np.concatenate([x for _, x in history[:3]])
     assert (history[3][0].points == points[unlike(points, losses, 2)]).all()
+    # slopes at a point, and the loss where they lead
+    assert [b.slopes for b, _ in history[first : first + 4]] == [True, False, True, False]
     # the method inside sees nothing of the descents: it goes on with its own sequence
     plain = begun(Sobol(batch=8), ROOM)
     own = run(plain, len(kinds) - (last + 1 - first))
-    mine = [batch for batch, _ in history if not batch.slopes]
+    mine = [batch for batch, kind in zip((b for b, _ in history), kinds, strict=True) if not kind]
     assert all((a.points == b.points).all() for a, (b, _) in zip(mine, own, strict=True))
 
 
 def test_a_descent_ends_on_the_floor():
-    history = run(begun(Polish(inner=Sobol(batch=8), after=8, starts=1), ROOM), 6)
+    history = run(begun(Polish(inner=Sobol(batch=8), after=8, starts=1), ROOM), 11)
     assert min(loss.min() for _, loss in history) < 1e-12
 
 
 def test_small_colonies_count_by_their_size():
-    """A race of 24 designs in full grows 73 at a quarter of the size, in one replicate of 4."""
+    """The first race is of 46 × ¼ + 16 + 5 × 4 colonies, 11.9 designs with 4 replicates."""
     inner = Racing(inner=CMAES(population=24, sigma=0.5))
-    history = run(begun(Polish(inner=inner, after=28), ROOM, replicates=4), 3)
-    assert [(len(b.points), b.size, b.slopes) for b, _ in history] == [
-        (73, 0.25, False),
-        (24, 1.0, False),
-        (3, 1.0, True),
+    history = run(begun(Polish(inner=inner, after=12), ROOM, replicates=4), 5)
+    assert [(len(b.points), b.size, b.replicates, b.slopes) for b, _ in history] == [
+        (46, 0.25, 1, False),
+        (16, 1.0, 1, False),
+        (5, 1.0, None, False),
+        (73, 0.25, 1, False),
+        (3, 1.0, 1, True),
     ]
 
 
@@ -87,7 +91,7 @@ def test_descents_wait_for_a_design_of_full_size():
 
 
 def test_the_method_inside_may_descend_too():
-    history = run(begun(Polish(inner=Local(starts=2, first=4), after=5, starts=1), ROOM), 12)
+    history = run(begun(Polish(inner=Local(starts=2, first=4), after=5, starts=1), ROOM), 24)
     sizes = [len(b.points) for b, _ in history if b.slopes]
     # two side by side, then one from the best so far
     assert sizes[0] == 2 and 1 in sizes
