@@ -29,7 +29,8 @@ class Racing(Turns):
     agrees less than this (Kendall's tau, smoothed over races, from 1). Then as many points as
     `inner` needs are grown to full size at once. -1 never skips. A new cloud of CMAES trusts small
     colonies again. first: finalists of a race from which a cloud is to begin, since only the best
-    of them counts there; before them, `keep` chooses among full colonies of `small` replicates.
+    of them counts there; before them, `keep` chooses among full colonies of `small` replicates. A
+    cloud that needs no more losses has a race like all others.
 
     A race is one bracket of successive halving (Jamieson and Talwalkar, AISTATS 2016), and a
     pre-selection for CMA-ES (Ulmer, Streichert and Zell, CEC 2003): all points come from the
@@ -99,11 +100,11 @@ class Racing(Turns):
         rungs: list[tuple[float, int | None]] = [(size, small) for size in self.sizes[:-1]]
         if self._source.fresh:
             self._trust = 1.0
-            if small < self._replicates:
-                rungs.append((1.0, small))
-                last = min(last, self.first)
-            else:  # these are all replicates
+            if small == self._replicates:
                 last = min(last, _before(self.first, self.keep))
+            elif last > self.first:
+                rungs.append((1.0, small))
+                last = self.first
         rungs.append((1.0, None))
         counts = [last]
         while len(counts) < len(rungs):

@@ -137,19 +137,20 @@ def test_a_race_grows_all_small_and_the_best_in_full():
 
 
 @pytest.mark.parametrize(
-    ("small", "first"),
+    ("settings", "race"),
     [
-        (1, [(36, 0.25, 1), (12, 1.0, 1), (4, 1.0, None)]),
-        (3, [(27, 0.25, 3), (9, 1.0, None)]),  # no more than the cloud needs
+        ({"first": 4}, [(36, 0.25, 1), (12, 1.0, 1), (4, 1.0, None)]),
+        ({"first": 2, "small": 3}, [(18, 0.25, 3), (6, 1.0, None)]),
+        # no more than the cloud needs
+        ({"first": 4, "small": 3}, [(27, 0.25, 3), (9, 1.0, None)]),
+        ({"first": 9}, [(27, 0.25, 1), (9, 1.0, None)]),
     ],
 )
-def test_where_a_cloud_begins_few_are_grown_with_all_replicates(small, first):
+def test_where_a_cloud_begins_few_are_grown_with_all_replicates(settings, race):
     inner = CMAES(population=9, sigma=0.01)
-    given = begun(
-        Racing(inner=inner, keep=1 / 3, small=small, first=4), SPACES["cube"], replicates=3
-    )
-    history = follow(given, sphere, len(first))
-    assert [(len(b.points), b.size, b.replicates) for b, _ in history] == first
+    given = begun(Racing(inner=inner, keep=1 / 3, **settings), SPACES["cube"], replicates=3)
+    history = follow(given, sphere, len(race))
+    assert [(len(b.points), b.size, b.replicates) for b, _ in history] == race
     best, loss = history[-1]
     after = given.ask()
     assert len(after.points) == 27
