@@ -20,6 +20,8 @@ import torchfilm as tf
 from torchfilm.effect import Effect
 from torchfilm.state import PER_CELL
 
+INDEX_ENTRY = 64  # bytes for a chunk of a dataset, in the index of its chunks, at most
+
 # --- round trip -----------------------------------------------------------------------------------
 
 
@@ -97,6 +99,42 @@ def test_a_file_holds_numbers_and_text_only(whole):
             file["cells/position"].compression == "gzip"
             and file["cells/position"].chunks is not None
         )
+
+
+def test_a_file_is_as_large_as_its_data(tmp_path):
+    """No chunk is left behind when it is written again: the space beside the data is for names,
+    attributes and indices, and grows with a frame by an index entry of each dataset."""
+
+    def beside(every):
+        path, scene = tmp_path / f"{every}.h5", tf.scenes.quorum_sensing(size=24.0)
+        state = scene.bind(3, seed=2).start()
+        record(scene, state, path, until=1.0, every=every)
+        data = []
+
+        def add(_, item):
+            if isinstance(item, h5py.Dataset):
+                data.append(item.id.get_storage_size())
+
+        with h5py.File(path) as file:
+            file.visititems(add)
+            return os.path.getsize(path) - sum(data), len(file["frames/step"]), len(data)
+
+    few, frames, tables = beside(10)
+    many, more, _ = beside(1)
+    assert more > 5 * frames
+    assert many - few < INDEX_ENTRY * tables * (more - frames), (few, many)
+
+
+def test_each_frame_begins_with_a_chunk_and_the_rows_between_are_blank(whole):
+    with h5py.File(whole[0]) as file:
+        uid, position = file["cells/uid"], file["cells/position"][:]
+        first, counts = file["frames/first_row"][:], file["frames/counts"][:].sum(1)
+        assert not (first % uid.chunks[0]).any() and (np.diff(first) >= counts[:-1]).all()
+        held = np.zeros(len(uid), bool)
+        for a, n in zip(first, counts, strict=True):
+            held[a : a + n] = True
+        assert (~held).any() and (uid[:][~held] == -1).all() and (uid[:][held] >= 0).all()
+        assert np.isnan(position[~held]).all() and np.isfinite(position[held]).all()
 
 
 def test_colonies_of_a_selection_keep_their_ids(tmp_path):

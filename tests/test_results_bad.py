@@ -14,6 +14,7 @@ from helpers import step
 from recorded import DT, UNTIL, assert_same_file, assert_same_state, make_scene, record
 
 import torchfilm as tf
+from torchfilm.io import recorder
 
 # --- bad files ------------------------------------------------------------------------------------
 
@@ -205,14 +206,14 @@ def test_a_folder_in_the_place_of_the_file_is_reported(tmp_path):
 def test_a_full_disk_is_reported_and_loses_no_frame(tmp_path, monkeypatch, every_step):
     """Writing fails with ENOSPC from the 20th frame on; after that there is room again."""
     path, scene = tmp_path / "run.h5", make_scene()
-    real, full = h5py.Dataset.__setitem__, []
+    real, full = recorder.write_rows, []
 
-    def write(self, key, value):
+    def write(table, at, value):
         if full:
             raise OSError(28, "No space left on device")
-        return real(self, key, value)
+        return real(table, at, value)
 
-    monkeypatch.setattr(h5py.Dataset, "__setitem__", write)
+    monkeypatch.setattr(recorder, "write_rows", write)
     run = tf.simulate(
         scene, scene.bind(3, seed=11).start(), until=UNTIL, record=tf.Recorder(path, scene, every=1)
     )
@@ -250,15 +251,15 @@ def test_a_frame_broken_off_at_any_column_is_no_frame(
     """Writing breaks off once, somewhere in the 20th frame: no frame may hold half of it, and what
     is resumed is whole."""
     path, scene = tmp_path / "run.h5", make_scene()
-    real, armed = h5py.Dataset.__setitem__, []
+    real, armed = recorder.write_rows, []
 
-    def write(self, key, value):
-        if armed and self.name == f"/{column}":
+    def write(table, at, value):
+        if armed and table.name == f"/{column}":
             armed.clear()
             raise failure
-        return real(self, key, value)
+        return real(table, at, value)
 
-    monkeypatch.setattr(h5py.Dataset, "__setitem__", write)
+    monkeypatch.setattr(recorder, "write_rows", write)
     run = tf.simulate(
         scene, scene.bind(3, seed=11).start(), until=UNTIL, record=tf.Recorder(path, scene, every=1)
     )

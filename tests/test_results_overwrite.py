@@ -13,7 +13,7 @@ import pytest
 from recorded import DT, UNTIL, assert_same_file, make_scene, record
 
 import torchfilm as tf
-from torchfilm.io import replacing
+from torchfilm.io import recorder, replacing
 
 READER = """
 import sys
@@ -135,15 +135,15 @@ def test_resuming_beside_a_reader_in_another_process(tmp_path, whole, process):
 def test_a_run_that_fails_before_its_first_frame_leaves_the_old_file(
     old, whole, monkeypatch, column, failure
 ):
-    scene, real = make_scene(), h5py.Dataset.__setitem__
+    scene, real = make_scene(), recorder.write_rows
 
-    def write(self, key, value):
-        if self.name == f"/{column}":
+    def write(table, at, value):
+        if table.name == f"/{column}":
             raise failure
-        return real(self, key, value)
+        return real(table, at, value)
 
     with monkeypatch.context() as broken:
-        broken.setattr(h5py.Dataset, "__setitem__", write)
+        broken.setattr(recorder, "write_rows", write)
         with pytest.raises((tf.SimulationError, KeyboardInterrupt)) as caught:
             record(scene, scene.bind().start(), old, overwrite=True)
     if isinstance(failure, OSError):

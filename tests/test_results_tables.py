@@ -122,12 +122,35 @@ def test_values_that_a_resumed_run_changed_stay_those_of_the_earlier_frames(tmp_
 
 
 def as_earlier(path, tmp_path):
-    """The file as an earlier version wrote it."""
+    """The file as an earlier version wrote it: long chunks, in which frame follows frame."""
     old = tmp_path / "old.h5"
     with h5py.File(path, "r") as source, h5py.File(old, "w", libver="latest") as file:
-        for name in source:
-            if name not in ("parameters", "signals_at_cells"):
-                source.copy(name, file)
+
+        def copy(name, item):
+            group = name.split("/")[0]
+            if isinstance(item, h5py.Group) or group in ("parameters", "signals_at_cells"):
+                return
+            if group == "cells" or group == "signals":
+                first = source["frames/first_row" if group == "cells" else first_voxel][:]
+                rows = [item[a:b] for a, b in zip(first, first + sizes[group], strict=True)]
+                data, chunk = np.concatenate(rows), 8192
+            else:
+                data, chunk = item[...], 64
+            if name in ("frames/first_row", first_voxel):
+                size = sizes["cells" if name == "frames/first_row" else "signals"]
+                data = np.cumsum(size) - size
+            chunks = (chunk, *data.shape[1:]) if item.chunks else None
+            longest = (None, *data.shape[1:]) if item.chunks else None
+            packed = "gzip" if item.chunks else None
+            about = {"chunks": chunks, "maxshape": longest, "compression": packed}
+            file.create_dataset(name, data=data, **about)
+
+        first_voxel = "frames/grid/first_voxel"
+        sizes = {
+            "cells": source["frames/counts"][:].sum(1),
+            "signals": source["frames/grid/shape"][:].prod(2).sum(1),
+        }
+        source.visititems(copy)
         for name, value in source.attrs.items():
             if name != "internal":
                 file.attrs[name] = value

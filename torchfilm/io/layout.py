@@ -2,14 +2,14 @@
 
     /                     attributes: format, version, scene, recipe, seed, dim, dtype, versions
     /colony_id, /stream   (B,)
-    /cells/NAME           one row per cell, all frames in sequence: colony, uid, parent, position,
-                          axis, length, radius, fields per cell
+    /cells/NAME           one row per cell, frame after frame: colony, uid, parent, position, axis,
+                          length, radius, fields per cell. Rows between frames are −1 or NaN
     /frames/NAME          one row per frame: first_row, counts (B), next_uid (B), births, ends,
                           time, step
     /frames/colony/NAME   one row per frame: fields per colony
     /frames/grid/NAME     one row per frame: origin, shape (B, 3), first_voxel
-    /signals/NAME         scenes with a medium only: one row per voxel, all colonies and frames in
-                          sequence
+    /signals/NAME         scenes with a medium only: one row per voxel, all colonies of a frame
+                          after one another, frames as in /cells
     /signals_at_cells/NAME  scenes with a medium only: one row per cell, as in /cells: the
                           concentration that the cell finds
     /parameters/PATH      (B,), parameters with one value per colony: see `torchfilm.io.parameters`
@@ -19,10 +19,16 @@
 A frame holds the whole state, so every frame is a checkpoint. `frames/step` is written last: a
 frame without an entry there is incomplete and is ignored. Files contain data only; torchfilm
 executes nothing from them.
+
+A file that can be read while it is written keeps the old place of a compressed chunk when the chunk
+is written again. So each chunk is written once: rows of cells and voxels are compressed, and a
+frame begins with a chunk (`frames/first_row`, `frames/grid/first_voxel`). The small tables, to
+which a frame adds a few rows, are not compressed: their chunks are written again in place.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -45,7 +51,9 @@ INTERNAL_BEFORE = (
 )
 INTERNAL_ENDING_BEFORE = "circuit_volume"
 FATES = ("divided", "removed", "left", "failed")
-CHUNK_ROWS, CHUNK_VOXELS, CHUNK_FRAMES = 8192, 32768, 64
+CHUNK_ROWS, CHUNK_VOXELS = 512, 32768  # at most so many voxels
+CHUNK_BYTES = 1024  # of the tables that are not compressed
+BLANK = {"f": np.nan, "i": -1}  # between frames, by the kind of dtype
 LINEAGE = {
     "births": ("colony_id", "uid", "parent", "step"),
     "ends": ("colony_id", "uid", "step", "fate"),
@@ -96,10 +104,11 @@ def grid_columns(state: State, first_voxel: int = 0) -> dict[str, np.ndarray]:
     }
 
 
-def create_growing(
+def create_framed(
     file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk: int
 ) -> None:
-    """Create an empty dataset of rows of this shape, compressed, to which rows can be added."""
+    """Create an empty dataset of rows of this shape, compressed, to which whole frames are
+    added."""
     file.create_dataset(
         name,
         shape=(0, *shape),
@@ -108,7 +117,43 @@ def create_growing(
         chunks=(chunk, *(max(1, s) for s in shape)),
         compression="gzip",
         compression_opts=1,
+        fillvalue=BLANK.get(np.dtype(dtype).kind),
     )
+
+
+def create_table(file: h5py.File, name: str, dtype: Any, shape: Sequence[int]) -> None:
+    """Create an empty dataset of rows of this shape, to which a few rows at a time are added."""
+    row = max(1, np.dtype(dtype).itemsize * math.prod(shape))
+    chunk = max(1, CHUNK_BYTES // row)
+    file.create_dataset(
+        name,
+        shape=(0, *shape),
+        maxshape=(None, *shape),
+        dtype=dtype,
+        chunks=(chunk, *(max(1, s) for s in shape)),
+    )
+
+
+def voxels_per_chunk(voxels: int) -> int:
+    """Chunks that hold a frame of so many voxels with little room left."""
+    pieces = max(1, math.ceil(voxels / CHUNK_VOXELS))
+    return max(1, math.ceil(voxels / pieces))
+
+
+def write_rows(table: h5py.Dataset, at: int, value: np.ndarray) -> None:
+    """Make these the last rows of a dataset, from `at` on. By HDF5's own functions: those of h5py
+    take longer than the rows of a small frame."""
+    value = np.ascontiguousarray(value)
+    table.id.set_extent((at + len(value), *value.shape[1:]))
+    if value.size:
+        place = table.id.get_space()
+        place.select_hyperslab((at,) + (0,) * (value.ndim - 1), value.shape)
+        table.id.write(h5py.h5s.create_simple(value.shape), place, value)
+
+
+def next_chunk(table: h5py.Dataset, rows: int) -> int:
+    """The first row at or after `rows` at which a chunk begins."""
+    return math.ceil(rows / table.chunks[0]) * table.chunks[0]
 
 
 def create_tables(file: h5py.File, state: State) -> None:
@@ -116,7 +161,7 @@ def create_tables(file: h5py.File, state: State) -> None:
     file.create_dataset("colony_id", data=numpy_of(state.colony_id))
     file.create_dataset("stream", data=numpy_of(state.stream))
     for name, value in cell_columns(state).items():
-        create_growing(file, f"cells/{name}", value.dtype, value.shape[1:], CHUNK_ROWS)
+        create_framed(file, f"cells/{name}", value.dtype, value.shape[1:], CHUNK_ROWS)
     colonies = (state.colonies,)
     shapes = {
         "counts": (colonies, np.int64),
@@ -125,17 +170,18 @@ def create_tables(file: h5py.File, state: State) -> None:
     }
     for name in FRAME_COLUMNS:
         shape, dtype = shapes.get(name, ((), np.int64))
-        create_growing(file, f"frames/{name}", dtype, shape, CHUNK_FRAMES)
+        create_table(file, f"frames/{name}", dtype, shape)
     for name, value in colony_columns(state).items():
-        create_growing(file, f"frames/colony/{name}", value.dtype, value.shape, CHUNK_FRAMES)
+        create_table(file, f"frames/colony/{name}", value.dtype, value.shape)
     if state.layout is not None:
         file.attrs["spacing"] = state.layout.grid.spacing
         file.attrs["height"] = state.layout.height
         for name, value in voxel_columns(state).items():
-            create_growing(file, f"signals/{name}", value.dtype, (), CHUNK_VOXELS)
-            create_growing(file, f"{AT_CELLS}/{name}", value.dtype, (), CHUNK_ROWS)
+            chunk = voxels_per_chunk(len(value))
+            create_framed(file, f"signals/{name}", value.dtype, (), chunk)
+            create_framed(file, f"{AT_CELLS}/{name}", value.dtype, (), CHUNK_ROWS)
         for name, value in grid_columns(state).items():
-            create_growing(file, f"frames/grid/{name}", value.dtype, value.shape, CHUNK_FRAMES)
+            create_table(file, f"frames/grid/{name}", value.dtype, value.shape)
     for table, columns in LINEAGE.items():
         for name in columns:
-            create_growing(file, f"lineage/{table}/{name}", np.int64, (), CHUNK_ROWS)
+            create_table(file, f"lineage/{table}/{name}", np.int64, ())

@@ -24,12 +24,14 @@ from torchfilm.io.layout import (
     VERSION,
     cell_columns,
     colony_columns,
-    create_growing,
+    create_framed,
     create_tables,
     found_columns,
     grid_columns,
+    next_chunk,
     numpy_of,
     voxel_columns,
+    write_rows,
 )
 from torchfilm.io.parameters import write_parameters
 from torchfilm.io.reading import committed, inode_of_open
@@ -221,9 +223,8 @@ class Recorder(metaclass=checks.KnownKeywords):
         rows = committed(file)["rows"]
         for name, value in found_columns(state).items():
             if f"{AT_CELLS}/{name}" not in file:
-                create_growing(file, f"{AT_CELLS}/{name}", value.dtype, (), CHUNK_ROWS)
+                create_framed(file, f"{AT_CELLS}/{name}", value.dtype, (), CHUNK_ROWS)
                 file[f"{AT_CELLS}/{name}"].resize(rows, axis=0)
-                file[f"{AT_CELLS}/{name}"][:] = np.nan
 
     def _check_resumed(self, kept: Results, state: State) -> None:
         """Raise InputError unless the file ends with this state, of this scene."""
@@ -307,9 +308,11 @@ class Recorder(metaclass=checks.KnownKeywords):
 
     def _check_free_bytes(self, state: State) -> None:
         """Stop while the file is still whole: a full disk damages an HDF5 file."""
-        columns = (*cell_columns(state).values(), *voxel_columns(state).values())
+        columns = (cell_columns, voxel_columns, colony_columns, grid_columns)
         needed = (
-            sum(v.nbytes for v in columns)
+            sum(v.nbytes for of in columns for v in of(state).values())
+            + numpy_of(state.counts).nbytes
+            + numpy_of(state.next_uid).nbytes
             + state.cells * len(state.signals) * state.length.element_size()
             + sum(c.nbytes for e in (*self.births, *self.ends) for c in e)
             + SPARE_BYTES
@@ -330,11 +333,11 @@ class Recorder(metaclass=checks.KnownKeywords):
         """Write rows at `at` and flush them. A dataset closed with rows in its cache would hide a
         failure to write them."""
         assert self.file is not None
-        table = self.tables.setdefault(name, self.file[name])
+        if name not in self.tables:
+            self.tables[name] = self.file[name]
+        table = self.tables[name]
         try:
-            table.resize(at + len(value), axis=0)
-            if len(value):
-                table[at:] = value
+            write_rows(table, at, value)
             table.flush()
         except BaseException:
             table.resize(at, axis=0)  # no half-written row stays, whatever the failure
@@ -342,18 +345,20 @@ class Recorder(metaclass=checks.KnownKeywords):
 
     def _write_frame(self, file: h5py.File, state: State) -> None:
         columns = cell_columns(state)
-        unknown = [n for n in columns if f"cells/{n}" not in file]
+        known = set(file["cells"])
+        unknown = [n for n in columns if n not in known]
         if unknown:
             raise SimulationError(
                 f"the field {unknown[0]!r} appeared during the run, after {self.path} was laid out:"
                 " give it a first value in Rules(…, variables=…) and start the run again."
             )
         sizes = committed(file)
-        frame, first_voxel = sizes["frames"], sizes["voxels"]
+        frame, first_voxel = sizes["frames"], 0
+        first_row = next_chunk(file["cells/uid"], sizes["rows"])
         for name, value in columns.items():
-            self._append(f"cells/{name}", value, sizes["rows"])
+            self._append(f"cells/{name}", value, first_row)
         for name, value in found_columns(state).items():
-            self._append(f"{AT_CELLS}/{name}", value, sizes["rows"])
+            self._append(f"{AT_CELLS}/{name}", value, first_row)
         for table, events in (("births", self.births), ("ends", self.ends)):
             names = LINEAGE[table]
             merged = (
@@ -367,12 +372,13 @@ class Recorder(metaclass=checks.KnownKeywords):
         for name, value in colony_columns(state).items():
             self._append(f"frames/colony/{name}", value[None], frame)
         for name, value in voxel_columns(state).items():
+            first_voxel = next_chunk(file[f"signals/{name}"], sizes["voxels"])
             self._append(f"signals/{name}", value, first_voxel)
         for name, value in grid_columns(state, first_voxel).items():
             self._append(f"frames/grid/{name}", value[None], frame)
         file.flush()
         row = {
-            "first_row": sizes["rows"],
+            "first_row": first_row,
             "counts": numpy_of(state.counts),
             "next_uid": numpy_of(state.next_uid),
             "births": sizes["births"],

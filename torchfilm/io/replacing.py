@@ -10,12 +10,13 @@ from typing import Any
 
 import h5py
 
-from torchfilm.io.layout import AT_CELLS, CHUNK_ROWS, FORMAT, create_growing
+from torchfilm.io.layout import AT_CELLS, CHUNK_ROWS, FORMAT, create_framed, create_table
 from torchfilm.io.reading import committed, open_results
 from torchfilm.tools import checks
 
 # POSIX renames an open file, and replaces one that others have open. Windows does neither.
 RENAMES_OPEN_FILES = os.name != "nt"
+CHUNKS_AT_ONCE = 16  # that are copied: whole ones, so that each is compressed once
 
 
 def beside(path: Path) -> Path:
@@ -115,11 +116,19 @@ def copy_committed(source: Path, target: Path) -> h5py.File:
             if size is None:
                 out.create_dataset(name, data=item[...])
                 return
-            create_growing(out, name, item.dtype, item.shape[1:], item.chunks[0])
-            out[name].resize(size, axis=0)
-            for start in range(0, size, CHUNK_ROWS):
-                stop = min(size, start + CHUNK_ROWS)
-                out[name][start:stop] = item[start:stop]
+            if name.startswith(("cells/", f"{AT_CELLS}/")):
+                # files of earlier versions have longer chunks
+                create_framed(out, name, item.dtype, item.shape[1:], CHUNK_ROWS)
+            elif name.startswith("signals/"):
+                create_framed(out, name, item.dtype, item.shape[1:], item.chunks[0])
+            else:
+                create_table(out, name, item.dtype, item.shape[1:])
+            copied = out[name]
+            copied.resize(size, axis=0)
+            several = CHUNKS_AT_ONCE * copied.chunks[0]
+            for start in range(0, size, several):
+                stop = min(size, start + several)
+                copied[start:stop] = item[start:stop]
 
         file.visititems(copy)
     return out
