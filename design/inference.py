@@ -81,9 +81,18 @@ def infer(
     )  # fmt: skip
     found = _simulate(task, simulations, None if path is None else Path(path), executor, progress)
     rows = found.sound
-    estimator = NeuralPosterior.learn(
-        found.points[rows], found.statistics[rows], seed=seed, flows=flows, epochs=epochs
-    )
+    with open_bar(flows, progress, "infer", counted="flows") as bar:
+
+        def begun(flow: int) -> None:
+            if bar is not None:
+                bar.update(flow - bar.n)
+                bar.set_postfix_str(f"learning flow {flow + 1} of {flows}")
+
+        estimator = NeuralPosterior.learn(
+            found.points[rows], found.statistics[rows], seed=seed, flows=flows, epochs=epochs,
+            begun=begun,
+        )  # fmt: skip
+        advance(bar, 1)
     return Posterior.of(task, found, estimator, observed, samples)
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -37,16 +38,24 @@ class NeuralPosterior:
     used: np.ndarray
 
     @staticmethod
+    @tf.one_torch_thread()  # flows are so small that threads take longer to meet than to compute
     def learn(
-        points: np.ndarray, statistics: np.ndarray, *, seed: int, flows: int, epochs: int
+        points: np.ndarray,
+        statistics: np.ndarray,
+        *,
+        seed: int,
+        flows: int,
+        epochs: int,
+        begun: Callable[[int], None] = lambda _: None,
     ) -> NeuralPosterior:
         """Learn from simulations: points (n, D) in [0, 1], statistics (n, K), all finite.
 
         The method is that of Papamakarios and Murray (NeurIPS 2016) with masked autoregressive
         flows, by the package sbi; the mean of several flows is less sure of itself than each
         (Hermans et al., TMLR 2022). epochs: passes through the data at most; learning ends before,
-        20 passes after the loss on a tenth of the data has ceased to fall. Needs sbi (the `infer`
-        extra). The state of torch's random numbers is kept.
+        20 passes after the loss on a tenth of the data has ceased to fall. begun: called with the
+        number of each flow, from 0, before it is learnt. Needs sbi (the `infer` extra). The state
+        of torch's random numbers is kept.
         """
         require_sbi()
         spread, level = statistics.std(0), np.abs(statistics).max(0)
@@ -60,14 +69,18 @@ class NeuralPosterior:
         learner = NeuralPosterior((), centre, scale, used)
         theta, x = _logit(torch.as_tensor(points)).float(), learner._inputs(statistics)
         with torch.random.fork_rng(devices=[]):
-            found = tuple(_learn_flow(theta, x, seed + k, epochs) for k in range(flows))
-        return NeuralPosterior(found, centre, scale, used)
+            found = []
+            for k in range(flows):
+                begun(k)
+                found.append(_learn_flow(theta, x, seed + k, epochs))
+        return NeuralPosterior(tuple(found), centre, scale, used)
 
     def _inputs(self, statistics: np.ndarray) -> Tensor:
         found = (torch.as_tensor(statistics[:, self.used]) - self.centre) / self.scale
         return found.clamp(-FARTHEST, FARTHEST).float()
 
     @torch.no_grad()
+    @tf.one_torch_thread()
     def sample(self, statistics: np.ndarray, count: int, *, seed: int) -> np.ndarray:
         """Samples of the parameters for each row of statistics (m, K): (m, count, D) coordinates
         in [0, 1]. Every flow gives an equal share of them."""
@@ -85,6 +98,7 @@ class NeuralPosterior:
         return torch.sigmoid(torch.cat(parts, 1).double()).transpose(0, 1).contiguous().numpy()
 
     @torch.no_grad()
+    @tf.one_torch_thread()
     def log_density(self, points: np.ndarray, statistics: np.ndarray) -> np.ndarray:
         """The logarithm of the density of coordinates, (m, n), for points (m, n, D) and one row of
         statistics each, (m, K)."""

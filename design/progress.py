@@ -1,4 +1,4 @@
-"""The progress bar of a search and of a robustness check: colonies simulated."""
+"""The progress bars of searches, robustness checks and inference."""
 
 from __future__ import annotations
 
@@ -10,22 +10,27 @@ import torchfilm as tf
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-FORM = "{desc} |{bar}| {n:.0f}/{total:.0f} colonies {elapsed}<{remaining}{postfix}"
+FORM = "{desc} |{bar}| {n:.0f}/{total:.0f} COUNTED {elapsed}<{remaining}{postfix}"
 
 
 def open_bar(
-    total: float, progress: bool | None, name: str = "search", note: str = ""
+    total: float,
+    progress: bool | None,
+    name: str = "search",
+    note: str = "",
+    *,
+    counted: str = "colonies",
 ) -> AbstractContextManager[tqdm | None]:
-    """A bar of `total` colonies, or None where `progress` wants none; None as progress: a bar in a
-    notebook and on a terminal. Needs tqdm (the `app` extra)."""
+    """A bar of `total` colonies, or of what else is counted, or None where `progress` wants none;
+    None as progress: a bar in a notebook and on a terminal. Needs tqdm (the `app` extra)."""
     if not tf.progress.wanted(progress):
         return nullcontext()
-    bar = tf.progress.bar(total, name, FORM)
+    bar = tf.progress.bar(total, name, FORM.replace("COUNTED", counted))
     bar.set_postfix_str(note)
     return bar
 
 
 def advance(bar: tqdm | None, colonies: float) -> None:
-    """Add colonies to a bar, if there is one."""
+    """Add to what a bar counts, if there is one."""
     if bar is not None:
         bar.update(colonies)

@@ -14,7 +14,7 @@ import torch
 from searching import grown
 
 import torchfilm as tf
-from design import Calibration, Choice, Observed, Parameter, Task, infer
+from design import Calibration, Choice, Observed, Parameter, Task, infer, neural_posterior
 from design.simulations import simulate_designs, simulate_points
 
 RATE = [Parameter("rate", 0.8, 2.0, log=True)]
@@ -122,6 +122,29 @@ def posterior(data):
     )  # fmt: skip
     assert torch.equal(torch.random.get_rng_state(), state)
     return found
+
+
+@needs_sbi
+def test_flows_are_learnt_by_one_thread_and_it_is_shown(data, capsys, monkeypatch):
+    """Threads make no difference, and slow such small flows down; the bar names the flow."""
+    seen, real = [], neural_posterior._learn_flow
+
+    def learn(*about):
+        seen.append(torch.get_num_threads())
+        return real(*about)
+
+    monkeypatch.setattr(neural_posterior, "_learn_flow", learn)
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        infer(colony, RATE, data, simulations=50, dt=0.1, flows=2, epochs=2, samples=10,
+              progress=True)  # fmt: skip
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1, 1]
+    shown = capsys.readouterr().err
+    assert all(f"learning flow {k} of 2" in shown for k in (1, 2)) and "2/2 flows" in shown
 
 
 def test_the_posterior_finds_the_hidden_rate(posterior):
