@@ -118,12 +118,14 @@ class Observed(Target):
         time: h, when the colonies were observed. like: another `Observed`, whose rings and options
         are taken, so that both compare the same statistics; and its species, where none are given.
 
+        Levels may be negative: less their background, those of dark cells are.
+
         Raises InputError for a table without units or with several frames, a column that is
-        missing or not numbers, and arguments that nothing uses.
+        missing or not numbers, negative lengths and ages, and arguments that nothing uses.
         """
         names = _names(species, like)
         units = tf.tables.Units(pixel_size, length_unit, angle_unit, time_unit)
-        cells = read_table(table, names, units, columns or {})
+        cells = read_table(table, names, units, columns or {}, length_with_caps)
         plan = _plan(cells, names, rings, reach, length_with_caps, relative)
         return _observed(cells, plan if like is None else _shared(plan, like), time)
 

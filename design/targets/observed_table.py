@@ -28,11 +28,12 @@ def read_table(
     species: tuple[str, ...],
     units: tables.Units,
     columns: Mapping[str, str],
+    length_with_caps: bool,
 ) -> SeenCells:
     """The cells of a table, sorted by colony. columns: names in the table where they differ.
 
-    Raises InputError for a column that is missing, is not numbers or has no unit, and for several
-    frames.
+    Raises InputError for a column that is missing, is not numbers or has no unit, for several
+    frames, and for lengths and ages that no cell has.
     """
     given = tables.Table.read(table)
     meant = (*KIND, COLONY, *species)
@@ -56,7 +57,10 @@ def read_table(
         factor = units.factor(kind, unit, column)
         if tables.UNITS[kind][unit] is None:
             used.add(("pixels", ""))
-        found[name] = factor * torch.from_numpy(given.numbers(column))
+        numbers = given.numbers(column)
+        if name in ("length", "age"):
+            _check_positive(given, column, numbers, name == "length" and length_with_caps)
+        found[name] = factor * torch.from_numpy(numbers)
     units.check_used(used)
     for name in species:
         column = columns.get(name, name)
@@ -71,6 +75,19 @@ def read_table(
             f" {', '.join(given.columns)}. Name yours by columns={{…}}."
         )
     return _cells(found, species, _colonies(given, columns))
+
+
+def _check_positive(given: tables.Table, column: str, numbers: np.ndarray, above: bool) -> None:
+    """Raise InputError, which names the first such row, for numbers below 0; `above`: and for 0,
+    which is the length of a centreline of a round cell, but of no cell with its caps."""
+    bad = np.flatnonzero(numbers <= 0.0 if above else numbers < 0.0)
+    if len(bad):
+        more = f" (in {len(bad)} of {given.rows} rows)" if len(bad) > 1 else ""
+        raise tf.InputError(
+            f"{given.place(int(bad[0]))}, column {column!r}: {numbers[bad[0]]:g} is not"
+            f" {'above 0' if above else '0 or more'}{more}. Leave such cells out, or give the"
+            " column that is meant by columns={…}."
+        )
 
 
 def _check_one_frame(table: tables.Table, columns: Mapping[str, str]) -> None:

@@ -278,6 +278,9 @@ PLACES = {"x": [0.0, 1.0], "y": [0.0, 2.0], "length": [2.0, 3.0]}
         ({"x_um": [0.0]}, {}, "lacks the column 'y'"),
         ({"length_um": [2.0]}, {"species": ["gfp"]}, "lacks the column 'gfp'"),
         ({"length_um": [2.0, math.nan]}, {}, "row 2, column 'length_um': 'nan' is not a number"),
+        ({"length_um": [2.0, -3.0, -5.0]}, {}, "row 2, column 'length_um': -3 is not 0 or more .in 2 of 3 rows"),
+        ({"length_um": [2.0, 0.0]}, {"length_with_caps": True}, "'length_um': 0 is not above 0"),
+        ({"length_um": [2.0, 2.0], "age_h": [0.0, -1.0]}, {}, "row 2, column 'age_h': -1 is not"),
         ({"length_um": [2.0], "length_px": [3.0]}, {}, "keep one of them"),
         ({"length_um": [2.0], "x_um": [1.0, 2.0]}, {}, "the same length"),
         ({"length_um": []}, {}, "at least one"),
@@ -314,6 +317,7 @@ def test_a_csv_file_is_read_and_its_faults_are_named(tmp_path):
     for text, message in (
         ("x_um,y_um\n1,2\n1", "line 3"),
         ("x_um,y_um\n1,a\n", "line 2.*'a' is not"),
+        ("x_um,y_um,length_um\n1,2,2\n1,5,-2\n", "line 3, column 'length_um': -2 is not 0 or"),
         ("x_um,y_um\n", "has no cell"),
     ):
         path.write_text(text)
@@ -321,6 +325,11 @@ def test_a_csv_file_is_read_and_its_faults_are_named(tmp_path):
             Observed.from_table(path)
     with pytest.raises(tf.InputError, match="cannot be read"):
         Observed.from_table(tmp_path / "none.csv")
+
+
+def test_round_cells_and_cells_darker_than_their_background_are_observed():
+    target = Observed.from_table({"length_um": [0.0, 2.0], "gfp": [-1.0, 3.0]}, species=["gfp"])
+    assert dict(zip(target.plan.names, target.values, strict=True))["gfp_mean"] == pytest.approx(1.0)
 
 
 def test_cells_of_a_micrograph_are_observed():
