@@ -17,6 +17,7 @@ from design.rollout import FinishedColonies
 from design.study import Study
 from design.targets.base import Target
 from design.targets.goals import Goals
+from design.targets.observed import Observed
 from design.task import Task
 from design.trivial import trivial_losses
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 SHOWN = 3  # replicates side by side
 LUCKY = 0.8  # of the band on fresh seeds: a search that saw less than this was misled
+FITS = 2.0  # a greater loss is not that of colonies like the observed ones, which is about 1
 NEAR = 0.005  # of a bound, as a share of the range (of its logarithm)
 
 
@@ -68,10 +70,15 @@ def table(report: SearchReport) -> str:
     rows.append(("cells", "", *(_cells(design.colonies) for design in (first, best)), ""))
     target = report.task.target
     old, new = (each_measured(target, design.colonies) for design in (first, best))
+    seen = {name: f"{value:.4g} ± {by:.2g}" for name, (value, by) in target.observed.items()}
+    if seen:
+        rows = [(*row, "") for row in rows]
+        rows[0] = (*rows[0][:5], "observed")
     for name in new:
         means = (show_value(_mean(values)) for values in (old.get(name, []), new[name]))
-        rows.append((name, "", *means, _spread(new[name])))
-    wide = [max(len(r[k]) for r in rows) for k in range(5)]
+        row = (name, "", *means, _spread(new[name]))
+        rows.append((*row, seen.get(name, "")) if seen else row)
+    wide = [max(len(r[k]) for r in rows) for k in range(len(rows[0]))]
     lines = [
         "  ".join(
             x.rjust(w) if k in (2, 3) else x.ljust(w)
@@ -148,7 +155,8 @@ def _goals(report: SearchReport) -> list[tuple[str, ...]]:
 def _warnings(report: SearchReport) -> list[str]:
     """The losses of trivial answers, and what they and the bounds say of the best design."""
     best, space = report.best, report.task.space
-    answers, lines = {}, []
+    answers: dict[str, float] = {}
+    lines: list[str] = []
     target = report.task.target
     # a sum of goals compares nothing; data, and a target without species, have no trivial answers
     if target.names and target.pattern and not report.task.goals and best.colonies:
@@ -160,6 +168,8 @@ def _warnings(report: SearchReport) -> list[str]:
             f"the best design is no better than {least!r}: it has found no pattern. Larger"
             " colonies, or a narrower target, tell patterns apart."
         )
+    if isinstance(target, Observed) and best.loss > FITS:
+        lines.append(_poor_fit(target, best))
     if best.fresh is not None and best.loss < LUCKY * best.fresh.band[0]:
         lines.append(
             f"the {report.task.replicates} seeds of the search were lucky: {best.loss:.4f} there,"
@@ -170,6 +180,18 @@ def _warnings(report: SearchReport) -> list[str]:
     if bound:
         lines.append(f"at a bound: {', '.join(bound)}; better values may lie beyond it.")
     return lines
+
+
+def _poor_fit(target: Observed, best: ReportedDesign) -> str:
+    """What a design that is unlike the data misses most."""
+    seen, found = target.observed, measured(target, best.colonies)
+    apart = {n: abs(found[n] - value) / by for n, (value, by) in seen.items() if n in found}
+    worst = sorted((n for n in apart if np.isfinite(apart[n])), key=lambda n: -apart[n])[:SHOWN]
+    words = ", ".join(f"{n} by {apart[n]:.1f} spreads" for n in worst)
+    return (
+        "colonies that grew as the observed ones did have a loss of about 1. The best design is off"
+        f" most in {words}. Search longer, free more parameters, or change the model."
+    )
 
 
 def _at_bound(parameter: Parameter | Choice, value: Value) -> str:

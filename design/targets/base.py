@@ -90,6 +90,11 @@ class Target:
         """What the losses of a first batch (n,) should make a user reconsider; "" mostly."""
         return ""
 
+    @property
+    def observed(self) -> dict[str, tuple[float, float]]:
+        """What was observed of each measure, and its spread, where the target is data."""
+        return {}
+
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         """Measures of the pattern that a colony has, (B,) by name; NaN where one is not
         defined."""

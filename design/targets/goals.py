@@ -128,6 +128,10 @@ class Several(Target):
         each = self._each(lambda part, own: part.loss(state, own).double(), state, history)
         return torch.stack(each, 1)
 
+    @property
+    def observed(self) -> dict[str, tuple[float, float]]:
+        return {name: seen for part in self.parts for name, seen in part.observed.items()}
+
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         each = self._each(lambda part, own: part.measures(state, own), state, history)
         return {name: value for part in each for name, value in part.items()}

@@ -292,6 +292,14 @@ class Observed(Target):
     def __str__(self) -> str:
         return self.table()
 
+    @property
+    def observed(self) -> dict[str, tuple[float, float]]:
+        found = dict(zip(self.plan.names, zip(self.values, self.spread, strict=True), strict=True))
+        if LOG_CELLS not in found:
+            return found
+        log, spread = found.pop(LOG_CELLS)
+        return {"cells": (math.exp(log), math.exp(log) * spread), **found}
+
     def table(self) -> str:
         """The statistics with their spreads, a line each."""
         lines = [f"{self.describe()}:"]

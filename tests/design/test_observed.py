@@ -241,7 +241,18 @@ def test_a_search_fits_a_rate_to_data(tmp_path):
     best = search.run(16, progress=False)
     assert "log_cells" not in best.table() and "cells" in best.table()
     assert "pattern" not in best.table()
+    head, *lines = best.table().splitlines()
+    assert head.endswith("observed")
+    seen = {line.split()[0]: line for line in lines}
+    k = target.plan.names.index("length_50_um")
+    assert seen["length_50_um"].endswith(f"{target.values[k]:.4g} ± {target.spread[k]:.2g}")
+    cells = math.exp(target.values[0])
+    assert seen["cells"].endswith(f"{cells:.4g} ± {cells * target.spread[0]:.2g}")
+    assert ("off most in" in best.table()) == (best.loss > 2.0)
     best.plot(tmp_path / "fit.png")
+    far = [Parameter("rate", 1.5, 1.6), Parameter("make", 7.0, 8.0)]
+    found = Search(colony, far, target, until=2.5, replicates=2, method="sobol")
+    assert "off most in gfp_" in found.run(4, progress=False).table()
 
 
 def test_colonies_of_another_time_fail(seen):
