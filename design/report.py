@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 SHOWN = 3  # replicates side by side
 LUCKY = 0.8  # of the band on fresh seeds: a search that saw less than this was misled
+SUCCESS = 0.25  # of the loss of the best trivial answer: as in the comparison of methods
 FITS = 2.0  # a greater loss is not that of colonies like the observed ones, which is about 1
 NEAR = 0.005  # of a bound, as a share of the range (of its logarithm)
 
@@ -86,6 +87,7 @@ def table(report: SearchReport) -> str:
         ).rstrip()
         for r in rows
     ]
+    lines += _undefined(target, new)
     lines += _warnings(report)
     failed = study.failed
     lines += [
@@ -168,6 +170,12 @@ def _warnings(report: SearchReport) -> list[str]:
             f"the best design is no better than {least!r}: it has found no pattern. Larger"
             " colonies, or a narrower target, tell patterns apart."
         )
+    elif least and best.loss > SUCCESS * answers[least]:
+        lines.append(
+            f"the pattern is weak: the best design has {best.loss / answers[least]:.2f} of the loss"
+            f" of {least!r}, and a good one {SUCCESS:g} or less. Simulate more colonies, free more"
+            " parameters, or grow larger colonies."
+        )
     if isinstance(target, Observed) and best.loss > FITS:
         lines.append(_poor_fit(target, best))
     if best.fresh is not None and best.loss < LUCKY * best.fresh.band[0]:
@@ -180,6 +188,12 @@ def _warnings(report: SearchReport) -> list[str]:
     if bound:
         lines.append(f"at a bound: {', '.join(bound)}; better values may lie beyond it.")
     return lines
+
+
+def _undefined(target: Target, found: Mapping[str, list[float]]) -> list[str]:
+    """Why measures are undefined in some colonies."""
+    reasons = {n: target.why_undefined(n) for n, v in found.items() if np.isnan(v).any()}
+    return [f"{name} is undefined: {why}." for name, why in reasons.items() if why]
 
 
 def _poor_fit(target: Observed, best: ReportedDesign) -> str:

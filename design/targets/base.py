@@ -100,6 +100,11 @@ class Target:
         defined."""
         return {}
 
+    def why_undefined(self, measure: str) -> str:
+        """What a colony lacks in which this measure is NaN, and what to do; "" where the target
+        does not say."""
+        return ""
+
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """Draw the target of the colony at `place` of the batch, on axes that show that colony, in
         µm."""

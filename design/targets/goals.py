@@ -132,6 +132,9 @@ class Several(Target):
     def observed(self) -> dict[str, tuple[float, float]]:
         return {name: seen for part in self.parts for name, seen in part.observed.items()}
 
+    def why_undefined(self, measure: str) -> str:
+        return next((why for part in self.parts if (why := part.why_undefined(measure))), "")
+
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         each = self._each(lambda part, own: part.measures(state, own), state, history)
         return {name: value for part in each for name, value in part.items()}

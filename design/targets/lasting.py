@@ -118,6 +118,9 @@ class Lasting(Target):
         worst = self._losses(state, history).nan_to_num(-torch.inf).amax(0)
         return {**self.target.measures(state), "worst": worst.detach()}
 
+    def why_undefined(self, measure: str) -> str:
+        return self.target.why_undefined(measure)
+
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         self.target.draw(ax, state, place)
 

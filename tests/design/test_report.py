@@ -14,6 +14,7 @@ from searching import Level, Spread, banned, built, fragile, lit
 
 import torchfilm as tf
 from design import Bands, Batch, Choice, Objective, Parameter, Search, Sobol, Stripe, Target, Task
+from design.report import table
 from design.trivial import trivial_losses
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
@@ -257,6 +258,28 @@ def test_a_pattern_that_an_even_level_has_is_no_pattern():
     line = next(x for x in text.splitlines() if x.startswith("without a pattern"))
     assert "all dark 1.000" in line and "all lit 0.000" in line
     assert "no better than 'all lit'" in text or "no better than 'best even level'" in text
+
+
+@pytest.mark.parametrize(
+    "share, words",
+    [(1.1, "no better than"), (0.5, "is weak: the best design has 0.50 of the loss"), (0.2, "")],
+)
+def test_a_pattern_is_told_from_a_weak_one_and_from_none(share, words):
+    target = Bands(("gfp",), (-1.0, 1.0), floor=0.5)
+    found = searched(lit, PAIR, target, 4)._report()
+    least = min(trivial_losses(target, found.best.colonies).values())
+    assert least > 0.01, "every answer is good"
+    best = dataclasses.replace(found.best, loss=share * least, fresh=None)
+    text = table(dataclasses.replace(found, best=best))
+    assert words in text and ("weak" in text or "no better" in text) == bool(words)
+
+
+def test_the_table_says_why_a_measure_is_undefined():
+    text = searched(lit, PAIR, Stripe("gfp", at=0.0, width=20.0)).table()
+    assert "(undefined in 2 of 2)" in text
+    line = next(x for x in text.splitlines() if x.startswith("contrast is undefined: "))
+    assert "farther than 40 µm" in line and "grow larger colonies" in line
+    assert "is undefined" not in searched(lit, PAIR, WIDE).table()
 
 
 def test_trivial_answers_are_those_of_the_target():
