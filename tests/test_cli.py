@@ -21,6 +21,7 @@ import torch
 from commands import ENVIRONMENT, OWN, assert_same, drawn, frames, shell
 
 import torchfilm as tf
+from torchfilm.pictures import figures
 
 # --- run ------------------------------------------------------------------------------------------
 
@@ -138,17 +139,18 @@ def test_a_scene_file_of_ones_own(command):
 def test_the_picture_of_a_model_shows_its_first_species(command, monkeypatch):
     Path("decay.ant").write_text("species A, B; A' = -A; B' = A; A = 1; B = 0")
     drawn = []
-    show = tf.pictures.show
+    plan = figures.plan_layout
 
-    def watched(*arguments, **options):
-        drawn.append(options["colour"])
-        return show(*arguments, **options)
+    def watched(*arguments):
+        made = plan(*arguments)
+        drawn.append(made.scales[0].name)
+        return made
 
-    monkeypatch.setattr(tf.pictures, "show", watched)
+    monkeypatch.setattr(figures, "plan_layout", watched)
     command("run", "decay.ant", "--until", 0.3)
     command("resume", "decay.h5", "--scene", "decay.ant", "--until", 0.5)
     command("run", "microcolony", "--until", 0.3)
-    assert drawn == ["A", "A", None]
+    assert drawn == ["A", "A", "angle"]
 
 
 def test_a_scene_file_may_hold_the_scene_itself_and_import_its_neighbours(command):

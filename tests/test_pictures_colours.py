@@ -10,6 +10,7 @@ from drawn import NEAR, Drawn, frame, ramp, viridis
 import torchfilm as tf
 from torchfilm.pictures import frame_of
 from torchfilm.pictures.colours import FLOOR, NO_VALUE, PlotStyle
+from torchfilm.pictures.frames import RecordedFrames
 from torchfilm.pictures.page import plan_layout, signal_section
 from torchfilm.pictures.shapes import section
 from torchfilm.signals.exchange import read, stencil
@@ -41,6 +42,22 @@ def test_one_range_for_all_colonies():
     assert drawn.at(0, 0, 0) == pytest.approx(viridis(0.0), abs=NEAR) and drawn.at(
         0, 0, 1
     ) == pytest.approx(viridis(1.0), abs=NEAR)
+
+
+def test_the_default_shows_types_else_a_species_else_angles(tmp_path):
+    """What the first frame has decides, so that all frames of a film have one colouring."""
+    two = tf.scenes.boundary_detector()
+    one = tf.scenes.quorum_sensing(size=24.0)
+    plain = tf.scenes.microcolony()
+    for scene, drawn in ((two, "cell_type"), (one, "luxi"), (plain, "angle")):
+        given = frame_of(scene.bind().start())
+        assert plan_layout([given], [0], PlotStyle()).scales[0].name == drawn
+        assert plan_layout([given], [0], PlotStyle(colour="length")).scales[0].name == "length"
+    for _ in tf.simulate(two, until=0.1, record=tmp_path / "two.h5"):
+        pass
+    with tf.Results(tmp_path / "two.h5") as results:
+        frames = RecordedFrames(results, [0, 1])
+        assert plan_layout(frames, [0], PlotStyle()).scales[0].kinds == (0, 1)
 
 
 def test_three_values_are_a_colour():

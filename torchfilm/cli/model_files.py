@@ -51,13 +51,6 @@ def scene_of_model(path: Path, parameters: dict[str, Any]) -> Scene:
     return made.replace(name=path.stem, settings=to_plain(parameters))
 
 
-def first_species(path: str | Path, scene: Scene) -> str | None:
-    """The first species of a model, which colours the picture of its run; None for other files."""
-    if not is_model(Path(path)):
-        return None
-    return next(e.own_fields[0] for e in scene.effects if isinstance(e, Circuit))
-
-
 def _circuit(path: Path, parameters: dict[str, Any]) -> Circuit:
     from torchfilm.circuits import sbml
     from torchfilm.effects import circuit_sbml

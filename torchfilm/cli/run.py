@@ -16,7 +16,6 @@ from tqdm import tqdm
 
 from torchfilm import pictures, scenes
 from torchfilm.cellmodeller import own_colour
-from torchfilm.cli.model_files import first_species
 from torchfilm.cli.report import (
     empty_colonies_note,
     extra_columns_note,
@@ -88,7 +87,7 @@ class Run:
     watch: bool = False
     """Reload the rules file (Rules("file.py")) when it is edited during the run."""
     picture: bool = True
-    """Draw the last frame beside the results; of a model, coloured by its first species."""
+    """Draw the last frame beside the results."""
 
     def __call__(self) -> None:
         scene = accurate(
@@ -124,7 +123,6 @@ class Run:
         if start is not None:
             print_notes(str(self.start), start, model, state)
         colour = next((n for n in plan.get("species", ()) if n in state.fields), None)
-        colour = colour or first_species(self.scene, scene)
         go(
             model,
             state,
@@ -213,7 +211,7 @@ class Resume:
             dt=dt,
             watch=self.watch,
             picture=self.picture,
-            colour=None if self.scene is None else first_species(self.scene, scene),
+            colour=None,
         )
 
 

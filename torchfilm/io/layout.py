@@ -104,9 +104,7 @@ def grid_columns(state: State, first_voxel: int = 0) -> dict[str, np.ndarray]:
     }
 
 
-def create_framed(
-    file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk: int
-) -> None:
+def create_framed(file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk: int) -> None:
     """Create an empty dataset of rows of this shape, compressed, to which whole frames are
     added."""
     file.create_dataset(

@@ -141,6 +141,16 @@ class PlotStyle:
                 raise checks.input_error(what, name, rule + ", ".join(listed), hint)
 
 
+def default_colour(frame: Frame) -> str:
+    """What shows most of a scene: the types of cells, where there are several; else the first
+    species of its circuits; else the angle."""
+    types = frame.cells.get("cell_type")
+    if types is not None and len(np.unique(types)) > 1:
+        return "cell_type"
+    species = (n for n, unit in frame.units.items() if unit == "conc" and n in frame.cells)
+    return next(species, ANGLE)
+
+
 def is_rgb(cells: Mapping[str, np.ndarray], name: str) -> bool:
     """Whether a quantity of the cells is a colour: three values, red, green and blue."""
     found = cells.get(name)

@@ -50,10 +50,12 @@ def show(
     what: a results file, or its path, of which `frame` is drawn (the last by default); or a state,
     with the `scene` whose walls are drawn: a state does not know them; or a `Frame`.
 
-    colour: the quantity that colours the cells: "angle", the direction of their axes (the default),
-    or any quantity per cell by name. channels: instead of colour, several quantities at once as in
-    fluorescence microscopy, each with the colour of its light; the colours add up: {"cfp": "cyan",
-    "yfp": "yellow"}. background: a signal of the medium, white lowest and black highest.
+    colour: the quantity that colours the cells: "angle", the direction of their axes, or any
+    quantity per cell by name. The default is the type of the cells where there are several, else
+    the first species of a circuit, else the angle. channels: instead of colour, several quantities
+    at once as in fluorescence microscopy, each with the colour of its light; the colours add up:
+    {"cfp": "cyan", "yfp": "yellow"}. background: a signal of the medium, white lowest and black
+    highest.
 
     limits: the range of colours by name of a drawn quantity, such as {"yfp": (0, 2)}. A signal with
     the name of a quantity of the cells is "out.NAME". The default is the range of all that is drawn

@@ -5,13 +5,22 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchfilm.pictures.colours import CELLS, MEAN, PlotStyle, Scale, ValueRange, is_rgb, scale_of
+from torchfilm.pictures.colours import (
+    CELLS,
+    MEAN,
+    PlotStyle,
+    Scale,
+    ValueRange,
+    default_colour,
+    is_rgb,
+    scale_of,
+)
 from torchfilm.pictures.draw import (
     add_cells,
     add_signal,
@@ -69,8 +78,10 @@ class PanelLayout:
 def plan_layout(frames: Sequence[Frame], places: Sequence[int], style: PlotStyle) -> PanelLayout:
     """The layout for some frames: one window per colony, and one range per quantity.
 
-    It reads the frames once.
+    It reads the frames once. Without a colour, the first frame says what colours the cells.
     """
+    if style.colour is None and style.channels is None:
+        style = replace(style, colour=default_colour(frames[0]))
     seen = {
         name: ValueRange()
         for name in (*style.quantities, *([style.signal] if style.signal else []))
