@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 import torchfilm as tf
-from design import report
+from design import report, report_plot
 from design.finals import FreshLosses
 from design.objective import Objective
 from design.parameters import Value
@@ -124,7 +124,7 @@ class Best:
         """Draw the first guess, the best design, the target and the course of the search. A
         notebook displays the picture; with `out` it is saved there, in place of an older one. Needs
         matplotlib (the `app` extra)."""
-        return tf.pictures.Picture(report.draw(self._report()), out)
+        return tf.pictures.Picture(report_plot.draw(self._report()), out)
 
     def table(self) -> str:
         """The parameters with their bounds and the first guess, the losses and the measures."""

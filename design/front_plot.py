@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import torchfilm as tf
-from design import report
+from design import report_plot
 from design.rollout import FinishedColonies
 from design.targets.base import Target
 
@@ -52,7 +52,7 @@ def draw_front(
     right = figure.add_subplot(grid[0, max(1, (2 * columns) // 3) :])
     right.plot(*course, color="C3")
     right.set(xlabel="colonies simulated", ylabel="hypervolume", ylim=(0, None))
-    report.draw_colonies(
+    report_plot.draw_colonies(
         [figure.add_subplot(grid[1, k]) for k in range(len(colonies))],
         target,
         list(colonies.values()),

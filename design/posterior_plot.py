@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,11 @@ def draw_corner(space: Space, points: np.ndarray, truth: np.ndarray | None) -> F
     samples are. Axes are drawn in coordinates and labelled with values. truth: (D,) to mark, or
     None."""
     count = space.size
-    figure = tf.pictures.new_figure(1.0 + 1.8 * count, 0.6 + 1.8 * count, dpi=130)
+    figure = tf.pictures.new_figure(1.0 + 1.8 * count, 1.0 + 1.8 * count, dpi=130)
+    legend = "histograms: samples; shaded: 90 % interval; blue: pairs of samples"
+    legend = legend if count > 1 else legend.rpartition(";")[0]
+    legend += "" if truth is None else "; red: truth"
+    figure.suptitle(textwrap.fill(legend, 14 + 30 * count), fontsize=8)
     edges = [_edges(p, points[:, k], truth, k) for k, p in enumerate(space.parameters)]
     grid: Any = figure.subplots(count, count, squeeze=False)
     for row, column in np.ndindex(count, count):
@@ -46,11 +51,23 @@ def draw_corner(space: Space, points: np.ndarray, truth: np.ndarray | None) -> F
         ax.set_xticks(at, labels if row == count - 1 else [""] * len(at), fontsize=7)
         at, labels = ([], []) if row == column else _ticks(space.parameters[row], edges[row])
         ax.set_yticks(at, [""] * len(at) if column else labels, fontsize=7)
+        if row == column:
+            ax.set_ylabel("samples", fontsize=7)
+            ax.yaxis.set_label_position("right")
         if row == count - 1:
-            ax.set_xlabel(space.names[column], fontsize=9)
+            ax.set_xlabel(
+                f"{space.names[column]}\n({_bounds(space.parameters[column])})", fontsize=9
+            )
         if row and not column:
             ax.set_ylabel(space.names[row], fontsize=9)
     return figure
+
+
+def _bounds(parameter: Any) -> str:
+    """What the prior allows."""
+    if parameter.levels is not None and hasattr(parameter, "options"):
+        return f"{len(parameter.options)} options"
+    return f"from {parameter.low:g} to {parameter.high:g}"
 
 
 def _edges(parameter: Any, unit: np.ndarray, truth: np.ndarray | None, k: int) -> np.ndarray:

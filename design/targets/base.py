@@ -91,6 +91,11 @@ class Target:
         return ""
 
     @property
+    def mark(self) -> str:
+        """What `draw` shows, in words, such as "red lines"; "" where it draws nothing."""
+        return ""
+
+    @property
     def observed(self) -> dict[str, tuple[float, float]]:
         """What was observed of each measure, and its spread, where the target is data."""
         return {}

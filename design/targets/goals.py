@@ -129,6 +129,10 @@ class Several(Target):
         return torch.stack(each, 1)
 
     @property
+    def mark(self) -> str:
+        return "; ".join(dict.fromkeys(part.mark for part in self.parts if part.mark))
+
+    @property
     def observed(self) -> dict[str, tuple[float, float]]:
         return {name: seen for part in self.parts for name, seen in part.observed.items()}
 

@@ -118,6 +118,10 @@ class Lasting(Target):
         worst = self._losses(state, history).nan_to_num(-torch.inf).amax(0)
         return {**self.target.measures(state), "worst": worst.detach()}
 
+    @property
+    def mark(self) -> str:
+        return self.target.mark
+
     def why_undefined(self, measure: str) -> str:
         return self.target.why_undefined(measure)
 

@@ -293,6 +293,10 @@ class Observed(Target):
         return self.table()
 
     @property
+    def mark(self) -> str:
+        return "lines: rings" if self.plan.positions else ""
+
+    @property
     def observed(self) -> dict[str, tuple[float, float]]:
         found = dict(zip(self.plan.names, zip(self.values, self.spread, strict=True), strict=True))
         if LOG_CELLS not in found:

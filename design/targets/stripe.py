@@ -206,6 +206,12 @@ class Stripe(ProfileTarget):
         }
         return found | {"contrast": contrast(bright, dark)}
 
+    @property
+    def mark(self) -> str:
+        if self.winds:
+            return "red dots: cells that should be lit"
+        return "red lines" + (", dotted: the border" if self.at == "border" else "")
+
     def why_undefined(self, measure: str) -> str:
         if measure == "contrast":
             return (

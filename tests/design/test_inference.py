@@ -15,6 +15,8 @@ from searching import grown
 
 import torchfilm as tf
 from design import Calibration, Choice, Observed, Parameter, Task, infer, neural_posterior
+from design.parameters import Space
+from design.posterior_plot import draw_corner
 from design.simulations import simulate_designs, simulate_points
 
 RATE = [Parameter("rate", 0.8, 2.0, log=True)]
@@ -194,6 +196,18 @@ def test_coverage_of_even_ranks_is_the_level():
 
 def kinds(kind="fast", copies=1, make=1.0):
     return grown(tf.LogNormal({"slow": 0.8, "fast": 1.8}[kind], 0.2), make * copies)
+
+
+def test_the_picture_of_a_posterior_says_what_it_shows():
+    space = Space([Parameter("rate", 0.7, 1.6), Choice("kind", ("slow", "fast"))])
+    points = np.random.default_rng(0).uniform(size=(50, 2))
+    figure = draw_corner(space, points, points[0])
+    title = " ".join(figure._suptitle.get_text().split())
+    assert "90 % interval" in title and "red: truth" in title
+    labels = {ax.get_xlabel() for ax in figure.axes} | {ax.get_ylabel() for ax in figure.axes}
+    assert {"rate\n(from 0.7 to 1.6)", "kind\n(2 options)", "samples"} <= labels
+    alone = draw_corner(Space([Parameter("rate", 0.7, 1.6)]), points[:, :1], None)
+    assert "pairs" not in alone._suptitle.get_text() and "truth" not in alone._suptitle.get_text()
 
 
 @needs_sbi

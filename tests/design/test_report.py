@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 
 import matplotlib.image
+import matplotlib.text
 import numpy as np
 import pytest
 import torch
@@ -15,6 +16,7 @@ from searching import Level, Spread, banned, built, fragile, lit
 import torchfilm as tf
 from design import Bands, Batch, Choice, Objective, Parameter, Search, Sobol, Stripe, Target, Task
 from design.report import table
+from design.report_plot import draw
 from design.trivial import trivial_losses
 
 LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
@@ -135,6 +137,8 @@ def test_a_measure_is_the_mean_over_the_colonies_that_have_it():
 
 @dataclasses.dataclass(frozen=True)
 class Two(Level):
+    pattern = False  # no scene here has the signal, so nothing without a pattern is scored
+
     @property
     def names(self):
         return ("g0", "g1", "out.ahl")
@@ -239,6 +243,27 @@ def test_both_designs_are_drawn_with_one_scale_of_colours(tmp_path, monkeypatch)
     searched(lit, LIT, Bands(("gfp",), edges=(-2.0, 2.0))).plot(tmp_path / "best.png")
     assert len(seen) == 4 and len(set(levels)) > 1
     assert all(limits == {"gfp": (0.0, max(levels))} for limits in seen)
+
+
+def test_a_picture_says_what_it_shows():
+    """The target and its marks in the title, the best trivial loss as a line, the unit at the
+    colours."""
+    target = Stripe("gfp", at=0.0, width=2.0)
+    found = searched(lit, LIT, target)._report()
+    figure = draw(found)
+    assert figure._suptitle.get_text() == f"target: {target.describe()}\nred lines"
+    words = [t.get_text() for ax in figure.axes for t in ax.texts]
+    answers = trivial_losses(target, found.best.colonies)
+    least = min(answers, key=answers.get)
+    assert f"without a pattern: {least}" in words
+    levels = [line.get_ydata()[0] for ax in figure.axes for line in ax.lines]
+    assert answers[least] in levels
+    unit = found.best.colonies[0].state.declared["gfp"].unit
+    assert unit and any(f"gfp ({unit})" in t.get_text() for t in _texts(figure))
+
+
+def _texts(figure):
+    return [t for t in figure.findobj(matplotlib.text.Text) if t.get_text()]
 
 
 def test_a_bad_picture_name_is_refused(tmp_path):

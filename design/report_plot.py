@@ -1,0 +1,208 @@
+"""The picture of a search: the first guess, the best design, the target and the course."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import torchfilm as tf
+from design.parameters import Parameter, show_value
+from design.report import SearchReport, trivial_answers
+from design.rollout import FinishedColonies
+from design.targets.base import Target
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SHOWN = 3  # replicates side by side
+
+
+def draw(report: SearchReport) -> Figure:
+    """Draw the first guess above and the best design below, with the target over each colony, and
+    the course of the search beside them. Needs matplotlib (the `app` extra)."""
+    designs = (report.first, report.best)
+    grown = [_one_by_one(d.colonies)[:SHOWN] for d in designs]
+    columns = max(1, *(len(g) for g in grown))
+    target = report.task.target
+    frames = [[tf.pictures.frame_of(d.state).colony(k) for d, k in g] for g in grown]
+    every = [cells for row in frames for cells in row]
+    size = tuple(np.max([_extent(cells) for cells in every], axis=0)) if every else (1.0, 1.0)
+    height = 6.2 if size[1] > 0.6 * size[0] else 4.6  # wide colonies leave room above
+    figure = tf.pictures.new_figure(2.6 * columns + 4.2, height)
+    words = [f"target: {target.describe()}", *([target.mark] if target.mark else [])]
+    width = 26 * columns + 42
+    figure.suptitle("\n".join(textwrap.fill(line, width) for line in words), fontsize=10)
+    grid = figure.add_gridspec(
+        3, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 1.0, 0.05]
+    )
+    limits = _limits(target, every)
+    scales: list[Any] = []
+    for row, one in enumerate(designs):
+        axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
+        title = f"{one.title}, loss {one.loss:.3f}"
+        if one.fresh is not None:
+            title += f"\n({one.fresh.loss:.3f} on fresh seeds)"  # no wider than a panel
+        scales = _draw_row(axes, grown[row], frames[row], target, size, limits, title) or scales
+    bars = [figure.add_subplot(grid[2, k]) for k in range(columns)]
+    units = {n: f.unit for d in report.best.colonies for n, f in d.state.declared.items()}
+    for bar, scale in zip(bars, scales, strict=False):
+        tf.pictures.colour_bar(bar, replace(scale, unit=scale.unit or units.get(scale.name, "")))
+    for bar in bars[len(scales) :]:
+        bar.set_visible(False)
+    _draw_convergence(figure.add_subplot(grid[0, columns]), report)
+    _draw_parameters(figure.add_subplot(grid[1:, columns]), report)
+    return figure
+
+
+def draw_colonies(
+    axes: Sequence[Axes],
+    target: Target,
+    designs: Sequence[list[FinishedColonies]],
+    titles: Sequence[str],
+) -> None:
+    """Draw the first colony of each design on axes of its own, with the target over it, in one
+    scale of colours."""
+    grown = [_one_by_one(finished)[:1] for finished in designs]
+    frames = [[tf.pictures.frame_of(d.state).colony(k) for d, k in g] for g in grown]
+    every = [cells for row in frames for cells in row]
+    size = tuple(np.max([_extent(cells) for cells in every], axis=0)) if every else (1.0, 1.0)
+    limits = _limits(target, every)
+    for ax, one, cells, title in zip(axes, grown, frames, titles, strict=True):
+        _draw_row([ax], one, cells, target, size, limits, title)
+
+
+def _one_by_one(finished: list[FinishedColonies]) -> list[tuple[FinishedColonies, int]]:
+    """Single colonies as (batch, place in it), in order of their ids."""
+    return sorted(
+        ((d, k) for d in finished for k in range(d.state.colonies)),
+        key=lambda x: int(x[0].state.colony_id[x[1]]),
+    )
+
+
+def _extent(cells: dict[str, np.ndarray]) -> np.ndarray:
+    """Half the sides of a rectangle that contains a colony, (2,) µm; neither below a third of the
+    other, so that a panel holds its title."""
+    place = cells["position"][:, :2]
+    half = np.ptp(place, axis=0) / 2 + (cells["length"] / 2 + cells["radius"]).max() + 0.5
+    return np.maximum(half, half.max() / 3)
+
+
+def _colour(name: str, place: int) -> str:
+    """The colour of a species: the one that its name states, or one of a list."""
+    known = {
+        "cfp": "cyan",
+        "gfp": "lime",
+        "yfp": "yellow",
+        "rfp": "red",
+        "blue": "dodgerblue",
+        "white": "white",
+        "red": "red",
+        "green": "lime",
+    }
+    return known.get(name.lower(), ("yellow", "cyan", "magenta", "red", "lime", "white")[place % 6])
+
+
+def _limits(target: Target, frames: list[dict[str, np.ndarray]]) -> dict[str, tuple[float, float]]:
+    """The range of colours of each species that the target reads in cells: one for both designs, so
+    that these can be compared."""
+    names = [n for n in target.names if not n.startswith("out.")]
+    return {n: (0.0, max((float(f[n].max()) for f in frames), default=1.0) or 1.0) for n in names}
+
+
+def _draw_row(
+    axes: list[Axes],
+    grown: list[tuple[FinishedColonies, int]],
+    frames: list[dict[str, np.ndarray]],
+    target: Target,
+    size: tuple[float, float],
+    limits: dict[str, tuple[float, float]],
+    title: str,
+) -> list[Any]:
+    """Draw colonies of one design, coloured by the species of the target. Returns the scales of the
+    colours; none without species or colonies."""
+    names = list(limits)
+    colour = names[0] if len(names) == 1 else None
+    channels = {n: _colour(n, k) for k, n in enumerate(names)} if len(names) > 1 else None
+    scales: list[Any] = []
+    for ax, (done, k), cells in zip(axes, grown, frames, strict=False):
+        x, y = (cells["position"][:, :2].max(0) + cells["position"][:, :2].min(0)) / 2
+        window = (x - size[0], x + size[0], y - size[1], y + size[1])
+        if channels:
+            ax.set_facecolor("black")
+        scales = tf.pictures.draw_cells(
+            ax, cells, colour=colour, channels=channels, limits=limits, window=window
+        )
+        target.draw(ax, done.state, k, done.history)
+        tf.pictures.scale_bar(ax)
+        ax.set_title(
+            title if ax is axes[0] else f"replicate {int(done.state.colony_id[k])}", fontsize=9
+        )
+    for ax in axes[len(grown) :]:
+        ax.set_visible(False)
+    return scales if names else []
+
+
+def _draw_convergence(ax: Axes, report: SearchReport) -> None:
+    """The loss of every full-size design, and the lowest so far; and of the best trivial answer."""
+    study = report.study
+    spent = np.concatenate([[0.0], study.convergence()[0]])
+    places, losses = [np.empty(0)], [np.empty(0)]
+    for entry, begin, end in zip(study.entries, spent[:-1], spent[1:], strict=True):
+        if study.is_full(entry):
+            places.append(np.linspace(begin, end, len(entry.loss) + 1)[1:])
+            losses.append(entry.loss)
+    x, y = np.concatenate(places), np.concatenate(losses)
+    ax.plot(x, y, ".", color="0.75", ms=2, zorder=0)
+    ax.step(x, np.minimum.accumulate(y), where="post", color="C3")
+    answers = trivial_answers(report)
+    if answers:
+        name = min(answers, key=lambda n: answers[n])
+        ax.axhline(answers[name], color="0.3", lw=0.8, ls="--")
+        ax.annotate(
+            f"without a pattern: {name}", (1.0, answers[name]), xycoords=("axes fraction", "data"),
+            xytext=(-2, 2), textcoords="offset points", ha="right", fontsize=7, color="0.3",
+        )  # fmt: skip
+    ax.set(xlabel="colonies simulated", ylabel="loss", ylim=(0, None))
+    ax.set_title("every design (grey), the best so far (red)", fontsize=9)
+
+
+def _draw_parameters(ax: Axes, report: SearchReport) -> None:
+    """The best design and the first guess between the bounds."""
+    space, first, best = report.task.space, report.first, report.best
+    rows = np.arange(space.size)[::-1]
+    ax.hlines(rows, 0, 1, color="0.85", lw=4, zorder=0)
+    ax.plot(first.point, rows, "o", color="0.55", label=first.title)
+    ax.plot(best.point, rows, "D", color="C3", label=best.title)
+    for y, p in zip(rows, space.parameters, strict=True):
+        low, high = (
+            (f"{p.low:g}", f"{p.high:g}")
+            if isinstance(p, Parameter)
+            else (str(p.options[0]), str(p.options[-1]))
+        )
+        for x, bound, side in ((0, low, "right"), (1, high, "left")):
+            ax.annotate(
+                bound,
+                (x, y),
+                xytext=(-7 if side == "right" else 7, 0),  # clear of a marker at the bound
+                textcoords="offset points",
+                ha=side,
+                va="center",
+                fontsize=7,
+                color="0.4",
+            )
+    ax.set(
+        yticks=rows,
+        yticklabels=[f"{p.name} = {show_value(best.values[p.name])}" for p in space.parameters],
+        xticks=[],
+        xlim=(-0.28, 1.28),
+    )
+    ax.set_ylim(-0.7, space.size - 0.3)
+    ax.tick_params(left=False)
+    for side in ("left", "right", "top", "bottom"):
+        ax.spines[side].set_visible(False)
+    ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False)
