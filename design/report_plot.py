@@ -165,7 +165,8 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
         ax.axhline(answers[name], color="0.3", lw=0.8, ls="--")
         ax.annotate(
             f"without a pattern: {name}", (1.0, answers[name]), xycoords=("axes fraction", "data"),
-            xytext=(-2, 2), textcoords="offset points", ha="right", fontsize=7, color="0.3",
+            xytext=(-2, -2), textcoords="offset points", ha="right", va="top", fontsize=7,
+            color="0.3",
         )  # fmt: skip
     ax.set(xlabel="colonies simulated", ylabel="loss", ylim=(0, None))
     ax.set_title("every design (grey), the best so far (red)", fontsize=9)
