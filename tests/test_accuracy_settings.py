@@ -14,7 +14,7 @@ from torchfilm.effects.mechanics import TOLERANCE
 from torchfilm.kernels.scheme import OVERLAP
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.tools.checks import InputError
-from torchfilm.tuning.settings import PRESETS
+from torchfilm.tuning.settings import PRESETS, typed
 
 
 def made(u, s, p, cell):
@@ -226,3 +226,46 @@ def test_results_say_how_accurately_and_go_on_so(tmp_path):
         assert torch.equal(results.state(built).position, last.position)
         with pytest.raises(InputError, match="another scene"):
             results.state(first)
+
+
+@pytest.mark.parametrize(
+    "given, settings, words",
+    [
+        ({}, {}, {"contact_overlap": f"{OVERLAP:g}", "tolerance": f"{FORCE_TOLERANCE:g}"}),
+        (
+            {},
+            {"penalty": 0.03, "tolerance": 0.2},
+            {"contact_overlap": "0.0042", "tolerance": "0.28"},
+        ),
+        ({"alpha": [0.1, 0.2]}, {}, {"alpha": "0.1 to 0.2", "tolerance": "0.07"}),
+        ({"stiffness": 100.0}, {"penalty": 0.03}, {"tolerance": "0.07"}),
+        (BILATERAL, {}, {"alpha": "0.01", "passes": "1", "tolerance": "default"}),
+        (
+            BILATERAL,
+            {"penalty": 0.03, "tolerance": 0.2, "passes": 4},
+            {"alpha": "0.003", "passes": "4", "overlap": "0.006", "tolerance": "0.2"},
+        ),
+    ],
+)
+def test_settings_are_told_as_the_user_types_them(given, settings, words):
+    """Typed in place of the settings, they give the same contacts."""
+    first = scene(**given)
+    second = tf.Settings(dt=0.01, rtol=1e-2, **settings).apply(first)
+    told = typed(second)
+    assert told == {"dt": "0.01", "rtol": "0.01", **words}
+    if settings:
+        numbers = {n: float(v) for n, v in words.items() if n != "passes"}
+        passes = {"passes": int(words["passes"])} if "passes" in words else {}
+        again = of(scene(**given, **numbers, **passes), tf.Mechanics)
+        right = dataclasses.asdict(of(second, tf.Mechanics).settings)
+        assert dataclasses.asdict(again.settings) == pytest.approx(right)
+
+
+def test_circuits_of_several_tolerances_are_told_apart():
+    two = tf.Scene(
+        tf.Growth(rate=1.0),
+        tf.Circuit(made, species=("m",), rtol=1e-3),
+        tf.Circuit(made, species=("m",), name="other"),
+        tf.Circuit([tf.parts.constitutive("n", 1.0)], species="n", method="tau_leap", name="third"),
+    )
+    assert typed(two)["rtol"] == "0.001 and 0.0001"

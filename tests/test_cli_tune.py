@@ -47,8 +47,11 @@ def test_tune_prints_what_it_chose_and_writes_it_for_a_run(folder):
         "2",
         "--out",
         "s.json",
+        "--plot",
+        "cost.png",
     )
     assert "mine: 5 % in cells, volume" in out and "settings  s.json" in out
+    assert "picture   cost.png" in out and (folder / "cost.png").stat().st_size > 0
     saved = tf.Settings.load(folder / "s.json")
     assert f"dt {saved.dt:g} h" in out and f"rtol {saved.rtol:g}" in out
     done(
@@ -111,6 +114,9 @@ def test_explain_says_what_a_preset_would_do(folder):
             "give one of the two",
         ),
         (("tune", "mine.py", "--out", "mine.py"), "no file yet"),
+        (("tune", "mine.py", "--plot", "mine.py"), "ends in .png, .pdf or .svg"),
+        (("tune", "mine.py", "--plot", "nowhere/cost.png"), "in a folder that exists"),
+        (("tune", "mine.py", "--plot", "old.png"), "--plot = 'old.png'"),
         (
             ("run", "mine.py", "--preset", "draft", "--settings", "s.json", "--cells", "2"),
             "give one of the two",
@@ -121,6 +127,7 @@ def test_explain_says_what_a_preset_would_do(folder):
 )
 def test_what_makes_no_sense_is_refused_before_anything_runs(folder, arguments, words):
     (folder / "empty.json").write_text(json.dumps({}))
+    (folder / "old.png").write_text("")
     ran = shell(*arguments, folder=folder)
     assert ran.returncode == 1 and words in ran.stderr and "Traceback" not in ran.stderr
     assert not list(folder.glob("*.h5"))

@@ -178,6 +178,11 @@ class Effect(metaclass=checks.KnownKeywords):
         """The accuracy settings that it takes, with their usual values."""
         return {}
 
+    def accuracy_parameters(self) -> Mapping[str, str]:
+        """Its own parameters that accuracy settings change, with their values as text, defaults
+        filled in."""
+        return {}
+
     def without_noise(self) -> Effect:
         """The same effect without random events, for the measurement of numerical errors."""
         return self

@@ -14,6 +14,7 @@ import tyro
 
 from torchfilm.cli.model_files import is_model
 from torchfilm.cli.scene_files import load_scene, parse_setting
+from torchfilm.cli.show import check_new_picture
 from torchfilm.cli.threads import use_threads
 from torchfilm.explanation import explain
 from torchfilm.io.results import Results
@@ -141,10 +142,15 @@ class Tune:
     OMP_NUM_THREADS, if set, takes the place of the cores."""
     out: Path | None = None
     """Write the settings to this new file, for `torchfilm run SCENE --settings FILE`."""
+    plot: Path | None = None
+    """Draw error against computing time of all settings that ran to this new file (.png, .pdf or
+    .svg)."""
 
     def __call__(self) -> None:
         if self.out is not None:
             Settings.check_new(self.out)
+        if self.plot is not None:
+            check_new_picture("--plot", self.plot)
         scene = load_scene(self.scene, dict(map(parse_setting, self.set)))
         use_threads(self.threads)  # tune itself chooses the number of colonies
         with _status_line() as watch:
@@ -161,6 +167,8 @@ class Tune:
         print(tuned)
         if self.out is not None:
             print(f"settings  {tuned.settings.save(self.out)}")
+        if self.plot is not None:
+            print(f"picture   {tuned.plot(self.plot).path}")
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import tyro
 
 from torchfilm import pictures
 from torchfilm.pictures import cli_options
+from torchfilm.pictures.page import figure_class
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 
@@ -113,6 +114,15 @@ def check_new(name: str, path: Path, overwrite: bool, hint: str) -> None:
     """Raise InputError if the file exists and may not be replaced."""
     if path.exists() and not overwrite:
         raise checks.input_error(name, str(path), "a path where there is no file yet", hint)
+
+
+def check_new_picture(name: str, path: Path) -> None:
+    """Raise InputError if a picture cannot be made at this path, or if there is a file."""
+    figure_class()
+    if path.suffix not in (".png", ".pdf", ".svg") or not path.parent.is_dir():
+        rule = "in a folder that exists, with a name that ends in .png, .pdf or .svg"
+        raise checks.input_error(name, str(path), rule)
+    check_new(name, path, False, "Choose another.")
 
 
 def own_picture(results: Path, out: Path | None = None) -> Path:

@@ -377,6 +377,9 @@ class Circuit(Effect):
     def accuracy_knobs(self) -> Mapping[str, float]:
         return {"rtol": self.rtol} if self.method == STIFF else {}
 
+    def accuracy_parameters(self) -> Mapping[str, str]:
+        return {"rtol": f"{self.rtol:g}"} if self.method == STIFF else {}
+
     def with_settings(self, settings: Any) -> Circuit:
         if self.method != STIFF or settings.rtol is None:
             return self

@@ -344,6 +344,22 @@ class Mechanics(Effect):
         usual = replace(self, passes=None).settings.passes
         return {"passes": usual, "tolerance": TOLERANCE, **penalty}
 
+    def accuracy_parameters(self) -> Mapping[str, str]:
+        settings, found = self.settings, {}
+        if self.alpha is not None:
+            found["alpha"] = number_range(numbers(self.alpha))
+        elif self.stiffness is None and isinstance(settings, OneSidedSettings):
+            found["contact_overlap"] = f"{settings.contact_overlap:g}"
+        elif self.stiffness is None:
+            found["alpha"] = number_range(PENALTY / numbers(self.length_drag))
+        if isinstance(settings, ContactSettings):
+            found["passes"] = f"{settings.passes}"
+            if self.overlap is not None:
+                found["overlap"] = f"{self.overlap:g}"
+        tolerance = settings.tolerance
+        found["tolerance"] = "default" if tolerance is None else f"{tolerance:g}"
+        return found
+
     def with_settings(self, settings: Any) -> Mechanics:
         if self.one_sided:
             return self._one_sided_with(settings)

@@ -71,6 +71,13 @@ def largest_error(errors: dict[str, Error]) -> float:
     return max((e.value for e in errors.values()), default=0.0)
 
 
+def greater(errors: dict[str, Error], others: dict[str, Error]) -> dict[str, Error]:
+    """The errors, each replaced by the other one of its name if that has the greater upper
+    bound."""
+    larger = lambda name, e: max(e, others.get(name, e), key=lambda x: x.upper_bound)
+    return {name: larger(name, e) for name, e in errors.items()}
+
+
 def is_looser(one: Settings, other: Settings) -> bool:
     """Whether every knob except the step is at least as loose as in `other`. Both must set the
     same knobs."""

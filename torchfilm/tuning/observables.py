@@ -83,6 +83,11 @@ class Error:
         )
 
 
+def percent(error: float) -> str:
+    """A relative error as text, without its uncertainty."""
+    return "failed" if math.isinf(error) else f"{100 * error:.2g} %"
+
+
 @dataclass(frozen=True)
 class WindowRun:
     """One run of the window.

@@ -122,6 +122,16 @@ class Settings(metaclass=checks.KnownKeywords):
         return Settings(**knobs)
 
 
+def typed(scene: Scene) -> dict[str, str]:
+    """The accuracy settings of a scene as its parameters: by name, as the user types them."""
+    found: dict[str, list[str]] = {"dt": [f"{scene.dt:g}"]}
+    for effect in scene.effects:
+        for name, value in effect.accuracy_parameters().items():
+            found.setdefault(name, []).append(value)
+    # several circuits may have several tolerances
+    return {name: " and ".join(dict.fromkeys(values)) for name, values in found.items()}
+
+
 # By name: the step as a multiple of the scene's own, and the other knobs. docs/accuracy.md compares
 # their cost and error. With a step much longer than a draft's, cells of usual growth take substeps,
 # which cost more than they save.

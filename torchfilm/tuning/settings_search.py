@@ -21,14 +21,15 @@ from torchfilm.tuning.candidates import (
     TIGHT,
     TIGHT_CONTACTS,
     WORTH,
+    greater,
     is_looser,
     knobs_of,
     largest_error,
     smallest_colony,
 )
-from torchfilm.tuning.observables import WINDOW, AccuracyProbe, Error, Seen, WindowRun
+from torchfilm.tuning.observables import WINDOW, AccuracyProbe, Error, Seen, WindowRun, percent
 from torchfilm.tuning.settings import Settings
-from torchfilm.tuning.tuned import Trial, Tuned, percent, settings_text
+from torchfilm.tuning.tuned import Trial, Tuned, settings_text
 
 
 class SettingsSearch:
@@ -61,7 +62,8 @@ class SettingsSearch:
         self.refuted: dict[Settings, dict[str, Error]] = {}
         # the probe with more colonies and its reference, made when first needed
         self.larger_probe: tuple[AccuracyProbe, Seen] | None = None
-        self.retested: set[Settings] = set()  # settings that ran in the larger probe
+        # errors of settings that ran in the larger probe, with greater ones of the other colonies
+        self.retested: dict[Settings, dict[str, Error]] = {}
 
     def settings(self, steps: int, contacts: tuple[float, int, float], rtol: float) -> Settings:
         """Settings from these values. Knobs of effects that the scene does not list stay None."""
@@ -80,23 +82,34 @@ class SettingsSearch:
         left_out = self._run_references()
         own = self._try(Settings())
         best, confirmed = self._confirmed()
+        parts = self._parts(best)
         return Tuned(
-            best.settings.apply(self.probe.given),
-            best.settings,
-            self.error,
-            best,
-            own,
-            confirmed,
-            self._parts(best),
-            self.unsure,
-            left_out,
-            list(self.tries.values()),
-            len(self.runs),
-            self.probe.dt * WINDOW,
-            self.probe.start.cells,
-            smallest_colony(self.probe),
-            self.finest,
+            scene=best.settings.apply(self.probe.given),
+            given=self.probe.given,
+            settings=best.settings,
+            error=self.error,
+            chosen=best,
+            own=own,
+            confirmed=confirmed,
+            parts=parts,
+            unsure=self.unsure,
+            left_out=left_out,
+            tries=self._tries(),
+            window=self.probe.dt * WINDOW,
+            cells=self.probe.start.cells,
+            least=smallest_colony(self.probe),
+            finest=self.finest,
         )
+
+    def _tries(self) -> list[Trial]:
+        """Everything that ran in the first probe, for comparison too, each with the best that is
+        known of its errors: those of the larger probe, and greater ones of the other colonies."""
+        tries = []
+        for settings, run in self.runs.items():
+            errors = self._found(settings) | self.retested.get(settings, {})
+            errors = greater(errors, self.refuted.get(settings, {}))
+            tries.append(Trial(settings, errors, run.seconds, run.spent))
+        return tries
 
     def _run_references(self) -> dict[str, str]:
         """Runs the references. Returns the observables that they cannot resolve, with the reason.
@@ -175,12 +188,13 @@ class SettingsSearch:
             self.larger_probe = probe, self._reference_in(probe)
         probe, reference = self.larger_probe
         for tried in sorted(unsure, key=lambda t: t.seconds)[:MOST_UNSURE]:
-            self.retested.add(tried.settings)
             errors = self._errors_in(probe, tried, reference)
+            self.retested[tried.settings] = errors
             if max(e.upper_bound for e in errors.values()) <= self.error:
                 others = self._errors_in(self.other, tried, right)
                 if largest_error(others) <= self.error:
                     return dataclasses.replace(tried, errors=errors), others
+                self.retested[tried.settings] = greater(errors, others)
         return None
 
     def _reference_in(self, probe: AccuracyProbe) -> Seen:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+from torchfilm.pictures.picture import Picture
 from torchfilm.scene import Scene
-from torchfilm.tuning.observables import Error
+from torchfilm.tuning.front import cost_front, draw_front, front_rows
+from torchfilm.tuning.observables import Error, percent
 from torchfilm.tuning.settings import Settings
 
 
@@ -27,25 +29,32 @@ class Trial:
     @property
     def worst(self) -> float:
         """The greatest upper bound of the errors."""
-        return max(e.upper_bound for e in self.errors.values())
+        return self.errors[self.worst_name].upper_bound
+
+    @property
+    def worst_name(self) -> str:
+        """The observable whose error has the greatest upper bound."""
+        return max(self.errors, key=lambda name: self.errors[name].upper_bound)
 
 
 @dataclass(frozen=True)
 class Tuned:
     """Settings that keep the error within a limit, and the evidence for this.
 
-    scene: the scene with the settings. error: the limit that the user gave. chosen: the chosen
-    trial; its errors are those of the larger probe, if only that could resolve them. own: the
-    scene's own settings, for comparison. confirmed: errors in the other colonies. parts: by knob,
-    its part of each observable's error. unsure: by observable, the difference of two references.
-    left_out: observables whose error the probe cannot resolve, with the reason. tries: the scene's
-    own settings, then every candidate, in order. runs: number of settings that ran in the first
-    probe. window: its length, h. cells: number of cells at its start. least: cells in the smallest
-    colony that has cells. finest: steps of the reference. Errors are relative, each with its
-    standard error (`Error.value`, `.noise`).
+    scene: the scene with the settings. given: the scene as it was. error: the limit that the user
+    gave. chosen: the chosen trial; its errors are those of the larger probe, if only that could
+    resolve them. own: the scene's own settings, for comparison. confirmed: errors in the other
+    colonies. parts: by knob, its part of each observable's error. unsure: by observable, the
+    difference of two references. left_out: observables whose error the probe cannot resolve, with
+    the reason. tries: the scene's own settings, then all others that ran in the first probe, in
+    order; errors in more or other colonies, where they ran there, count too. window: its length, h.
+    cells: number of cells at its start. least: cells in the smallest colony that has cells. finest:
+    steps of the reference. Errors are relative, each with its standard error (`Error.value`,
+    `.noise`).
     """
 
     scene: Scene
+    given: Scene
     settings: Settings
     error: float
     chosen: Trial
@@ -55,11 +64,22 @@ class Tuned:
     unsure: dict[str, Error]
     left_out: dict[str, str]
     tries: list[Trial]
-    runs: int
     window: float
     cells: int
     least: int
     finest: int
+
+    @property
+    def front(self) -> list[Trial]:
+        """What accuracy costs: the trials that no other beats in both error (`worst`) and time
+        (`seconds`), from fast to slow."""
+        return cost_front(self.tries)
+
+    def plot(self, out: str | Path | None = None) -> Picture:
+        """Draw error against computing time, with the front, the chosen and the scene's own
+        settings. A notebook displays the picture; with `out` it is saved there, in place of an
+        older one. Needs matplotlib (the `app` extra)."""
+        return Picture(draw_front(self), out)
 
     def __str__(self) -> str:
         return "\n".join(describe(self))
@@ -113,14 +133,17 @@ def describe(tuned: Tuned) -> list[str]:
         " check it"
         for name, why in tuned.left_out.items()
     ]
-    ratio = best.seconds / own.seconds
+    return [*lines, "", *_front_lines(tuned)]
+
+
+def _front_lines(tuned: Tuned) -> list[str]:
+    """What accuracy costs here, in lines."""
     return [
-        *lines,
-        "",
-        (
-            f"{best.seconds:.2g} s for the window, {ratio:.2g} times what the scene's own settings"
-            f" take; {tuned.runs} settings were run"
-        ),
+        f"What accuracy costs: of {len(tuned.tries)} settings, those that no other beats in both"
+        " error and time",
+        *_aligned(front_rows(tuned)),
+        "  (error: the greatest of an observable, 95 % upper bound; time: relative to the scene's"
+        f" own settings, {tuned.own.seconds:.2g} s for the window, and varies somewhat)",
     ]
 
 
@@ -146,7 +169,3 @@ def settings_text(settings: Settings) -> str:
         ", ".join(f"{name} {value:g}" for name, value in settings.given.items())
         or "the scene's own"
     )
-
-
-def percent(error: float) -> str:
-    return "failed" if math.isinf(error) else f"{100 * error:.2g} %"
