@@ -37,7 +37,10 @@ def front_rows(tuned: Tuned) -> list[tuple[str, ...]]:
     error, time, the parameters as the user types them, and which of the two it is."""
     marks = {Settings(): OWN, tuned.settings: CHOSEN}
     marked = [t for t in tuned.tries if t.settings in marks]
-    shown = sorted([*_thinned(tuned.front, marked), *marked], key=lambda t: t.seconds)
+    front = tuned.front
+    # a front point near the scene's own settings stays where it is faster than they are
+    instead = [t for t in marked if t in front or t.settings == tuned.settings]
+    shown = sorted([*_thinned(front, instead), *marked], key=lambda t: t.seconds)
     typed_each = [typed(t.settings.apply(tuned.given)) for t in shown]
     names = list(dict.fromkeys(name for values in typed_each for name in values))
     rows: list[tuple[str, ...]] = [("error", "time", *names, "")]
@@ -58,7 +61,7 @@ def _thinned(front: list[Trial], marked: list[Trial]) -> list[Trial]:
     near = lambda a, b: LESS * max(a.worst, b.worst) < min(a.worst, b.worst)
     kept: list[Trial] = []
     for tried in front:
-        if not any(near(tried, other) for other in [*kept[-1:], *marked]):
+        if tried not in marked and not any(near(tried, other) for other in [*kept[-1:], *marked]):
             kept.append(tried)
     return kept
 
