@@ -269,3 +269,21 @@ def test_circuits_of_several_tolerances_are_told_apart():
         tf.Circuit([tf.parts.constitutive("n", 1.0)], species="n", method="tau_leap", name="third"),
     )
     assert typed(two)["rtol"] == "0.001 and 0.0001"
+
+
+@pytest.mark.parametrize(
+    "name, words",
+    [
+        ("draft", {"dt": "0.032", "contact_overlap": "0.014", "tolerance": "0.28", "rtol": "0.01"}),
+        (
+            "standard",
+            {"dt": "0.02", "contact_overlap": "0.014", "tolerance": "0.07", "rtol": "0.0001"},
+        ),
+        (
+            "reference",
+            {"dt": "0.0025", "contact_overlap": "0.0042", "tolerance": "0.0014", "rtol": "1e-06"},
+        ),
+    ],
+)
+def test_presets_are_what_the_page_on_accuracy_says(name, words):
+    assert typed(tf.preset(name, scene()).apply(scene())) == words

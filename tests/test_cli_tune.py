@@ -53,7 +53,7 @@ def test_tune_prints_what_it_chose_and_writes_it_for_a_run(folder):
     assert "mine: 5 % in cells, volume" in out and "settings  s.json" in out
     assert "picture   cost.png" in out and (folder / "cost.png").stat().st_size > 0
     saved = tf.Settings.load(folder / "s.json")
-    assert f"dt {saved.dt:g} h" in out and f"rtol {saved.rtol:g}" in out
+    assert f"dt={saved.dt:g}" in out and f"rtol={saved.rtol:g}" in out
     done(
         folder,
         "run",

@@ -89,8 +89,9 @@ def test_it_says_what_it_chose_and_why(colony, search):
     assert {t.settings for t in others} < {t.settings for t in colony.tries}
     told = str(colony)
     for words in (
-        f"dt {colony.settings.dt:g} h",
-        f"tolerance {colony.settings.tolerance:g}",
+        f"dt={colony.settings.dt:g}",
+        f"contact_overlap={0.14 * colony.settings.penalty:g}",
+        f"tolerance={1.4 * colony.settings.tolerance:g}",
         "2 % in",
         "in other colonies",
         "the reference's own",
@@ -143,9 +144,9 @@ def test_only_what_is_named_counts():
     tuned = tf.tune(dividing(), 0.05, cells=8, colonies=4, of=["volume"], watch=told.append)
     assert set(tuned.chosen.errors) == {"volume"} == set(tuned.own.errors)
     settings = [words for words in told if words.startswith("setting ")]
-    assert len(settings) == len(tuned.tries) and settings[1].startswith("setting 2: dt ")
+    assert len(settings) == len(tuned.tries) and settings[1].startswith("setting 2: dt=")
     assert told[0].startswith("growing 4 colonies to 12 cells") and any(
-        words.startswith("confirming dt ") for words in told
+        words.startswith("confirming dt=") for words in told
     )
 
 
@@ -296,7 +297,7 @@ def test_what_other_colonies_never_hold_is_said_after_a_while(monkeypatch):
     probe, other = begin(dividing(), 12, 4, ["m"]), begin(dividing(), 8, 4, ["m"], seed=1)
     search = SettingsSearch(probe, Strict(**vars(other)), 0.05)
     with pytest.raises(
-        InputError, match=r"in both probes: the closest came to .*, in 'm', with dt"
+        InputError, match=r"in both probes: the closest came to .*, in 'm', with dt="
     ):
         search.run()
     assert 1 <= len(search.refuted) <= 3
@@ -470,7 +471,8 @@ def test_the_table_says_what_accuracy_costs_as_the_user_would_type_it(priced):
         ["0.8", "%", "(m)", "1.5", "0.02", "0.0042", "0.14", "0.0001", "chosen"],
         ["0.2", "%", "(m)", "4.5", "0.005", "0.014", "0.07", "0.0001"],
     ]
-    assert "2 s for the window, and" in lines[at + 6]
+    assert "2 s for the window" in lines[at + 6]
+    assert lines[at + 7] == "  dt in h, contact_overlap in radii of cells)"
 
 
 def test_the_picture_has_what_ran_the_front_and_both_settings(priced, tmp_path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,13 +22,15 @@ FORMAT = "torchfilm settings"
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(metaclass=checks.KnownKeywords):
-    """Knobs of accuracy. None keeps the scene's own value.
+    """Knobs of accuracy, for any contacts. None keeps the scene's own value.
 
-    dt: step, h. penalty: how far contacts give way; 0.1 is the default. Overlap of one-sided
-    contacts is proportional to it; for bilateral ones it is α·γ. Physically soft cells,
-    `Mechanics(stiffness=…)`, keep their own. tolerance: of the contact solve; 0.05 is the default,
-    and for one-sided contacts the error of forces is proportional to it. passes: of bilateral
-    contacts (see `Mechanics`). rtol: relative tolerance of circuits that use the stiff solver.
+    dt: step, h. penalty: how far contacts give way; 0.1 is the default. One-sided contacts, the
+    default, take it as contact_overlap = 0.14 · penalty; bilateral ones as alpha = penalty / γ.
+    Physically soft cells, `Mechanics(stiffness=…)`, keep their own. tolerance: of the contact
+    solve; 0.05 is the default. Bilateral contacts take it as it is, one-sided ones as 1.4 times as
+    much. passes: of bilateral contacts (see `Mechanics`). rtol: relative tolerance of circuits that
+    use the stiff solver. `torchfilm explain SCENE --settings FILE` prints what a scene makes of
+    them.
     """
 
     dt: float | None = None
@@ -130,6 +133,11 @@ def typed(scene: Scene) -> dict[str, str]:
             found.setdefault(name, []).append(value)
     # several circuits may have several tolerances
     return {name: " and ".join(dict.fromkeys(values)) for name, values in found.items()}
+
+
+def typed_text(values: Mapping[str, str]) -> str:
+    """Parameters with their values, as the user types them."""
+    return ", ".join(f"{name}={value}" for name, value in values.items())
 
 
 # By name: the step as a multiple of the scene's own, and the other knobs. docs/accuracy.md compares

@@ -28,8 +28,8 @@ from torchfilm.tuning.candidates import (
     smallest_colony,
 )
 from torchfilm.tuning.observables import WINDOW, AccuracyProbe, Error, Seen, WindowRun, percent
-from torchfilm.tuning.settings import Settings
-from torchfilm.tuning.tuned import Trial, Tuned, settings_text
+from torchfilm.tuning.settings import Settings, typed, typed_text
+from torchfilm.tuning.tuned import Trial, Tuned
 
 
 class SettingsSearch:
@@ -216,7 +216,7 @@ class SettingsSearch:
 
     def _errors_in(self, probe: AccuracyProbe, tried: Trial, right: Seen) -> dict[str, Error]:
         """The errors of the same settings in another probe."""
-        self.watch(f"confirming {settings_text(tried.settings)}")
+        self.watch(f"confirming {self._text(tried.settings)}")
         return probe.errors(probe.observed(tried.settings).found, right)
 
     def _undetermined(self, why: dict[str, str]) -> checks.InputError:
@@ -245,16 +245,22 @@ class SettingsSearch:
             "error",
             self.error,
             f"reached by some settings, in both probes: the closest came to {error}, at most"
-            f" {percent(error.upper_bound)}, in {name!r}, with {settings_text(closest)}",
+            f" {percent(error.upper_bound)}, in {name!r}, with {self._text(closest)}",
             "Give a larger error, probe more colonies (unless the scene's parameters give their"
             " number), or name the observables that matter (of=…).",
         )
 
     def _run(self, settings: Settings) -> WindowRun:
         if settings not in self.runs:
-            self.watch(f"setting {len(self.runs) + 1}: {settings_text(settings)}")
+            self.watch(f"setting {len(self.runs) + 1}: {self._text(settings)}")
             self.runs[settings] = self.probe.observed(settings)
         return self.runs[settings]
+
+    def _text(self, settings: Settings) -> str:
+        """Settings as the user types them."""
+        if settings == Settings():
+            return "the scene's own"
+        return typed_text(typed(settings.apply(self.probe.given)))
 
     def _try(self, settings: Settings) -> Trial:
         if settings not in self.tries:

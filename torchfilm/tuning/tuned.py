@@ -10,7 +10,10 @@ from torchfilm.pictures.picture import Picture
 from torchfilm.scene import Scene
 from torchfilm.tuning.front import cost_front, draw_front, front_rows
 from torchfilm.tuning.observables import Error, percent
-from torchfilm.tuning.settings import Settings
+from torchfilm.tuning.settings import Settings, typed, typed_text
+
+# The knob of a parameter by name; the others are of contacts.
+KNOB = {"dt": "step", "rtol": "circuits"}
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ def describe(tuned: Tuned) -> list[str]:
     head += f", {tuned.least} in the smallest colony"
     rows: list[tuple[str, ...]] = [("", "chosen", "part of the error", "of the time")]
     total = sum(best.spent.values()) or 1.0
+    values = typed(tuned.scene)
     for knob, errors in tuned.parts.items():
         name = max(errors, key=lambda n: errors[n].value)
         share = {
@@ -104,7 +108,7 @@ def describe(tuned: Tuned) -> list[str]:
         rows.append(
             (
                 knob,
-                _knob_text(knob, tuned.settings),
+                typed_text({n: v for n, v in values.items() if KNOB.get(n, "contacts") == knob}),
                 f"{percent(errors[name].value)} ({name})",
                 "" if share is None else f"{100 * share / total:.0f} %",
             )
@@ -138,13 +142,16 @@ def describe(tuned: Tuned) -> list[str]:
 
 def _front_lines(tuned: Tuned) -> list[str]:
     """What accuracy costs here, in lines."""
-    return [
+    rows = front_rows(tuned)
+    lines = [
         f"What accuracy costs: of {len(tuned.tries)} settings, those that no other beats in both"
         " error and time",
-        *_aligned(front_rows(tuned)),
+        *_aligned(rows),
         "  (error: the greatest of an observable, 95 % upper bound; time: relative to the scene's"
-        f" own settings, {tuned.own.seconds:.2g} s for the window, and varies somewhat)",
+        f" own settings, {tuned.own.seconds:.2g} s for the window, and varies somewhat;",
     ]
+    radii = ", contact_overlap in radii of cells" if "contact_overlap" in rows[0] else ""
+    return [*lines, f"  dt in h{radii})"]
 
 
 def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
@@ -152,20 +159,3 @@ def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
     return [
         "  " + "  ".join(x.ljust(w) for x, w in zip(r, wide, strict=True)).rstrip() for r in rows
     ]
-
-
-def _knob_text(knob: str, s: Settings) -> str:
-    if knob == "step":
-        return f"dt {s.dt:g} h"
-    if knob == "circuits":
-        return f"rtol {s.rtol:g}"
-    penalty = "" if s.penalty is None else f"penalty {s.penalty:g}, "
-    passes = "" if s.passes is None else f"passes {s.passes}, "
-    return f"{penalty}{passes}tolerance {s.tolerance:g}"
-
-
-def settings_text(settings: Settings) -> str:
-    return (
-        ", ".join(f"{name} {value:g}" for name, value in settings.given.items())
-        or "the scene's own"
-    )
