@@ -108,7 +108,7 @@ class SettingsSearch:
         for settings, run in self.runs.items():
             errors = self._found(settings) | self.retested.get(settings, {})
             errors = greater(errors, self.refuted.get(settings, {}))
-            tries.append(Trial(settings, errors, run.seconds, run.spent))
+            tries.append(Trial(settings, errors, run.seconds, run.spent, run.lag))
         return tries
 
     def _run_references(self) -> dict[str, str]:
@@ -265,7 +265,8 @@ class SettingsSearch:
     def _try(self, settings: Settings) -> Trial:
         if settings not in self.tries:
             run = self._run(settings)
-            self.tries[settings] = Trial(settings, self._found(settings), run.seconds, run.spent)
+            errors = self._found(settings)
+            self.tries[settings] = Trial(settings, errors, run.seconds, run.spent, run.lag)
         return self.tries[settings]
 
     def _cheapest(self) -> Trial | None:
