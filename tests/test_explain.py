@@ -4,6 +4,7 @@ estimate is the arithmetic that it claims to be."""
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,16 @@ import pytest
 import torch
 
 import torchfilm as tf
-from torchfilm.cost_estimate import COLUMNS, ROWS, Block, CostProbe, Spending, crowd, state_bytes
+from torchfilm.cost_estimate import (
+    COLUMNS,
+    ROWS,
+    Block,
+    CostProbe,
+    Spending,
+    crowd,
+    probe,
+    state_bytes,
+)
 from torchfilm.effects import KNOWN, medium_transport
 from torchfilm.effects.bound_medium import FirstHalf, GridCoverage
 from torchfilm.effects.mechanics import TOLERANCE
@@ -339,7 +349,7 @@ def test_a_fit_gives_back_what_is_linear():
     model = scene.bind()
     assert set(truth) == {e.title for e in model.effects}
     state = model.start()
-    found = CostProbe(model, blocks, state, state, "", True).fit("seconds")
+    found = CostProbe(model, blocks, state, state, "", True, 1.0).fit("seconds")
     for title, expected in truth.items():
         assert found[title] == pytest.approx(expected, rel=1e-6, abs=1e-12), title
 
@@ -353,6 +363,28 @@ def test_a_run_is_predicted_from_the_pace_of_growth():
     assert "no estimate: the probe did not grow" in tf.explain(
         tf.Scene(tf.Growth(rate=0.0)), seconds=0.01
     )
+
+
+@pytest.mark.parametrize("when", ["a step", "a division"])
+def test_what_happens_once_is_not_measured(when):
+    """As compiling does, the first step, or the first with a division, takes longer than all the
+    others together."""
+    waits = [1.0]
+
+    @dataclass(frozen=True)
+    class Once(tf.Effect):
+        stage, title = 35, "once"
+
+        def step(self, state, dt, values):
+            if waits and (state.births or when == "a step"):
+                time.sleep(waits.pop())
+            return state
+
+    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], 3.6)
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.8), Once(), founders=founders)
+    seen = probe(scene, 2, "cpu", 0.25)
+    assert not waits and seen.seconds < 1.0 and seen.last.step > 5
+    assert all(block.seconds["once"] < 0.5 for block in seen.blocks)
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ class CostProbe:
 
     first, last: the states at the start and end of the run with several colonies. failed: why a
     step failed, or "". laid: whether the colonies started as a laid-out crowd, not as the scene's
-    founders.
+    founders. seconds: how long it took, without the warm-up.
     """
 
     model: Model
@@ -90,6 +90,7 @@ class CostProbe:
     last: State
     failed: str
     laid: bool
+    seconds: float
 
     def fit(self, what: str) -> dict[str, tuple[float, float, float]]:
         """Fits "seconds" or "bytes" of a step by a + b · cells + c · colonies: (a, b, c) ≥ 0 by
@@ -135,26 +136,40 @@ def crowd(founders: Cells) -> Cells:
 
 
 def probe(scene: Scene, colonies: int, device: str | torch.device, seconds: float) -> CostProbe:
-    """Runs a scene's first steps for about `seconds`: one colony, then several. `colonies` is the
-    number of colonies to seed."""
-    begun, laid = time.perf_counter(), True
+    """Runs a scene's first steps for about `seconds`, after a warm-up: one colony, then several.
+    `colonies` is the number of colonies to seed."""
+    laid = True
     try:
         laid_out = crowd(scene.founders)
         model = scene.bind(colonies, cells=laid_out, device=device, per_colony=True)
     except checks.InputError:  # no room for a crowd, between walls or in the medium's box
         laid, model = False, scene.bind(colonies, device=device, per_colony=True)
     state = model.start()
+    _warm_up(model, state.select([0]), seconds)
+    begun = time.perf_counter()
     blocks, _, failed = _watched(model, state.select([0]), ALONE_BLOCKS, begun + seconds / 4)
     first = state.select(list(range(min(PROBE_COLONIES, state.colonies))))
     more, last, also = _watched(model, first, 10**6, begun + seconds)
-    return CostProbe(model, blocks + more, first, last, failed or also, laid)
+    took = time.perf_counter() - begun
+    return CostProbe(model, blocks + more, first, last, failed or also, laid, took)
+
+
+@torch.no_grad()
+def _warm_up(model: Model, state: State, seconds: float) -> None:
+    """One step, and as many as it takes to a first division, for at most `seconds` more. Kernels
+    are compiled when they are first called, which takes longer than all that is measured."""
+    state = model.step(state)
+    end = time.perf_counter() + seconds
+    divides = any("divide_flag" in effect.writes() for effect in model.effects)
+    while divides and not (state.births or failures(state)) and time.perf_counter() < end:
+        state = model.step(state)
 
 
 @torch.no_grad()
 def _watched(model: Model, state: State, most: int, end: float) -> tuple[list[Block], State, str]:
     """Runs blocks of steps, at least one, until there are `most`, or enough cells, or the clock
     reaches `end`. Returns the blocks, the last state, and why a step failed, or ""."""
-    state = model.step(state)  # one-time work happens here, untimed
+    state = model.step(state)  # what is worked out once for a batch is untimed
     blocks: list[Block] = []
     counted, broken = 0, failures(state)
     while not broken and (
@@ -205,9 +220,7 @@ def cost_lines(
     seconds: float,
 ) -> list[str]:
     """The estimate, in lines of text."""
-    begun = time.perf_counter()
     seen = probe(scene, seedable, device, seconds)
-    took = time.perf_counter() - begun
     if not seen.blocks:
         return [f"estimated cost: none, since the first step failed: {seen.failed}"]
     spent, allocated = seen.fit("seconds"), seen.fit("bytes")
@@ -236,7 +249,7 @@ def cost_lines(
             " step may keep all of it"
         ),
         (
-            f"  how      measured for {took:.1f} s from {start}: at most"
+            f"  how      measured for {seen.seconds:.1f} s from {start}: at most"
             f" {ALONE_BLOCKS * BLOCK_STEPS} steps of one colony, then {seen.last.step} of"
             f" {seen.last.colonies}, to {seen.last.cells} cells in all;"
         ),

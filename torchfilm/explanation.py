@@ -29,7 +29,8 @@ def explain(
 
     cells, colonies: size of the run to estimate; cells are per colony. colonies: by default as many
     as the scene's parameters and founders have, else 1. seconds: about how long to measure, by
-    running the scene's first steps on `device` in float32, rules included; 0 omits the estimate.
+    running the scene's first steps on `device` in float32, rules included; 0 omits the estimate. A
+    warm-up before, to the first division, takes at most as long again, and the time to compile.
     Raises InputError if the scene cannot be seeded.
     """
     if not isinstance(scene, Scene):

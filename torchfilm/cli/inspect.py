@@ -95,7 +95,8 @@ class Explain:
     settings: Path | None = None
     """Accuracy: a file of settings, as `torchfilm tune SCENE --out` writes it."""
     seconds: float = 2.0
-    """About how long to measure the scene's first steps, s; 0 omits the estimate."""
+    """About how long to measure the scene's first steps, after a warm-up, s; 0 omits the
+    estimate."""
 
     def __call__(self) -> None:
         scene = accurate(
