@@ -14,6 +14,7 @@ from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.doubling import late_lines
 from torchfilm.tools.numba_calls import kernels_loaded
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, places, reads_are_free
@@ -197,7 +198,10 @@ class Division(Effect):
         return least, most
 
     def numerics(self, dt: float, state: State) -> list[str]:
-        return [f"checked once a step: up to {dt:g} h late"]
+        rate = state.fields.get("growth_rate")
+        relative = rate is not None and state.declared["growth_rate"].unit.startswith("1/h")
+        fastest = float(rate.max()) if rate is not None and relative and state.cells else 0.0
+        return [f"checked once a step: up to {dt:g} h late", *late_lines(fastest, dt)]
 
     def due(self, state: State) -> Tensor:
         """Which cells divide now, (N,) bool."""
