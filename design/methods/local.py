@@ -78,6 +78,8 @@ class Descent:
             curvature = self._quasi_newton(gradient)
         self.gradient, self.curvature, self.sloped = gradient, curvature, True
         self.moved = np.zeros_like(gradient)
+        if not self._step().any():  # held by bounds, or no slope
+            self._doubt("converged")
 
     def learn(self, loss: float) -> None:
         """The loss at the proposed point."""
@@ -102,6 +104,7 @@ class Descent:
         """Slopes of more replicates; where they are of all, the descent is over."""
         if self.seen < self.most:
             self.seen, self.sloped, self.misses = min(2 * self.seen, self.most), False, 0
+            self.damping, self.growth = FIRST, 2.0  # those of slopes that misled
         else:
             self.over = why
 

@@ -49,6 +49,7 @@ class Polish(Turns):
         self._spent, self._descending, self._over = 0.0, False, False
         self._points = np.empty((0, self._started().size))
         self._loss = np.empty(0)
+        self._whole = True  # the last batch inside: no race is half-way
 
     def know(self, points: np.ndarray, loss: np.ndarray) -> None:
         """The method inside learns them, and descents may begin there."""
@@ -62,7 +63,7 @@ class Polish(Turns):
         self._loss = np.concatenate([self._loss, loss])
 
     def _next(self) -> Batch:
-        due = self._spent >= self.after and len(self._points) > 0
+        due = self._spent >= self.after and self._whole and len(self._points) > 0
         if due and not self._descending and not self._over:
             best = unlike(self._points, self._loss, self.starts)
             self._local.know(self._points[best], self._loss[best])
@@ -82,7 +83,8 @@ class Polish(Turns):
         """Count what `inner` grows, and keep its designs where they may be starts."""
         replicates = min(batch.replicates or self._replicates, self._replicates)
         self._spent += len(batch.points) * batch.size * replicates / self._replicates
-        if batch.size == 1 and replicates == self._replicates:
+        self._whole = batch.size == 1 and replicates == self._replicates
+        if self._whole:
             self._keep(batch.points, loss)
 
     def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:

@@ -115,3 +115,12 @@ def test_what_only_growth_changes():
     assert torch.equal(kept["b"], fields["b"])
     rows = torch.tensor([1])
     assert array(start.concentrations(rows)[0]) == pytest.approx([4 * 0.8**0.5, 4.0], rel=1e-12)
+
+
+def test_a_colony_without_a_value_is_refused():
+    """Not read beyond the values."""
+    scene = lambda k: alone(tf.Circuit(decay, species="a", k=torch.tensor(k)))
+    three = scene([1.0, 2.0, 3.0]).bind(3, seed=1).start()
+    model = scene([1.0]).bind(1, seed=1)
+    with pytest.raises(tf.InputError, match=r"colony_id = 2.*below 1"):
+        model.step(three, 0.25)

@@ -309,6 +309,38 @@ def test_slopes_of_few_replicates_come_first_and_of_more_where_they_mislead(repl
     assert min(losses) < 1e-12
 
 
+@pytest.mark.parametrize("replicates", [8, 16])
+def test_a_descent_recovers_from_many_slopes_that_mislead(replicates):
+    """Only the slopes of all replicates are right. The lengths of steps that the others have
+    shortened are forgotten with them."""
+    local = Local(starts=1)
+    local.start(Room((None,)), 1, replicates)
+    local.know(np.array([[0.5]]), np.array([0.16]))
+    for _ in range(40):
+        batch = local.ask()
+        apart = batch.points[:1] - 0.9
+        if batch.slopes:
+            right = 1.0 if batch.replicates == replicates else -1.0
+            local.tell(batch, (apart**2).sum(1), Slopes(2 * right * apart, 2 * np.eye(1)[None]))
+        else:
+            local.tell(batch, (apart**2).sum(1))
+        if local.idle:
+            break
+    assert local.idle and abs(apart).max() < 1e-3
+
+
+def test_a_corner_is_not_grown_again():
+    """Where bounds hold every parameter, the loss there is known."""
+    local = Local(starts=1)
+    local.start(Room((None,) * 2), 1, 8)
+    local.know(np.zeros((1, 2)), np.array([1.0]))
+    for seen in (1, 2, 4, 8):
+        batch = local.ask()
+        assert batch.slopes and batch.replicates == seen and not batch.points.any()
+        local.tell(batch, np.ones(1), Slopes(np.ones((1, 2)), np.eye(2)[None]))
+    assert local.idle
+
+
 def test_slopes_of_few_replicates_are_enough_while_they_lead_down():
     local = Local(starts=1, first=4)
     local.start(Room((None,) * 3), 1, 4)

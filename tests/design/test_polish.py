@@ -73,14 +73,23 @@ def test_a_descent_ends_on_the_floor():
 def test_small_colonies_count_by_their_size():
     """The first race is of 46 × ¼ + 16 + 5 × 4 colonies, 11.9 designs with 4 replicates."""
     inner = Racing(inner=CMAES(population=24, sigma=0.5))
-    history = run(begun(Polish(inner=inner, after=12), ROOM, replicates=4), 5)
+    history = run(begun(Polish(inner=inner, after=12), ROOM, replicates=4), 6)
     assert [(len(b.points), b.size, b.replicates, b.slopes) for b, _ in history] == [
         (46, 0.25, 1, False),
         (16, 1.0, 1, False),
         (5, 1.0, None, False),
         (73, 0.25, 1, False),
+        (24, 1.0, None, False),
         (3, 1.0, 1, True),
     ]
+
+
+def test_descents_from_known_designs_wait_for_the_end_of_a_race():
+    inner = Racing(inner=CMAES(population=24, sigma=0.5))
+    method = begun(Polish(inner=inner, after=5), ROOM, replicates=1)
+    method.know(np.full((2, len(ROOM.levels)), [[0.2], [0.8]]), np.array([1.0, 2.0]))
+    history = run(method, 3)
+    assert [(b.size, b.slopes) for b, _ in history] == [(0.25, False), (1.0, False), (1.0, True)]
 
 
 def test_descents_wait_for_a_design_of_full_size():

@@ -69,6 +69,8 @@ class KernelStep:
         read = [*compiled.columns, *compiled.numbers]
         self.constants = {n: known[n] for n in read if n in known}
         self.changing = tuple(n for n in read if n not in known)
+        # how many colonies there are values for; 0: for any number
+        self.colonies = min((len(x) for x in self.constants.values() if x.dim()), default=0)
         fixed = all(n in known for n in compiled.numbers)
         self._numbers = packed(known, compiled.numbers) if fixed else None
 

@@ -16,6 +16,7 @@ from torchfilm.effects.circuit_cells import Kind, cell_column
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.state import State
+from torchfilm.tools import checks
 
 if TYPE_CHECKING:
     from torchfilm.effects.bound_circuit import BoundCircuit
@@ -42,6 +43,13 @@ class CircuitKernels:
             step = self._step(kind, middle, of_type, medium)
             if step is None:
                 continue
+            if step.colonies and (highest := int(middle.colony_id.max())) >= step.colonies:
+                raise checks.input_error(
+                    "state.colony_id",
+                    highest,
+                    f"below {step.colonies}",
+                    f"{self.circuit.effect.value_owner()} has values for so many colonies.",
+                )
             read = {n: known(self._read(n, kind, middle, medium)) for n in step.changing}
             signals = () if medium is None else (medium.found[n] for n in step.given)
             if step.may_run(start, *read.values(), *signals):
