@@ -80,20 +80,24 @@ def infer(
         fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
     )  # fmt: skip
     found = _simulate(task, simulations, None if path is None else Path(path), executor, progress)
-    rows = found.sound
     with open_bar(flows, progress, "infer", counted="flows") as bar:
-
-        def begun(flow: int) -> None:
-            if bar is not None:
-                bar.update(flow - bar.n)
-                bar.set_postfix_str(f"learning flow {flow + 1} of {flows}")
-
-        estimator = NeuralPosterior.learn(
-            found.points[rows], found.statistics[rows], seed=seed, flows=flows, epochs=epochs,
-            begun=begun,
-        )  # fmt: skip
-        advance(bar, 1)
+        estimator = _learn(found, seed, flows, epochs, bar)
     return Posterior.of(task, found, estimator, observed, samples)
+
+
+def _learn(found: Simulations, seed: int, flows: int, epochs: int, bar: Any) -> NeuralPosterior:
+    """The density of the parameters, given statistics."""
+    rows = found.sound
+
+    def begun(flow: int) -> None:
+        if bar is not None:
+            bar.update(flow - bar.n)
+            bar.set_postfix_str(f"learning flow {flow + 1} of {flows}")
+
+    given = found.points[rows], found.statistics[rows]
+    learnt = NeuralPosterior.learn(*given, seed=seed, flows=flows, epochs=epochs, begun=begun)
+    advance(bar, 1)
+    return learnt
 
 
 def _simulate(

@@ -311,3 +311,9 @@ def test_a_species_of_a_name_that_cells_have_is_told_what_the_name_is(name, word
     with pytest.raises(tf.InputError) as caught:
         tf.Circuit(made, species=(name,), strength=1.0)
     assert words in str(caught.value) and len(str(caught.value)) < 200
+
+
+def test_a_rate_that_may_be_per_minute_is_warned_of():
+    scene = tf.scenes.microcolony(rate=0.02)
+    with pytest.warns(UserWarning, match=r"0.02 per hour: a doubling takes 35 h"):
+        scene.bind()
