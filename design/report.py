@@ -68,7 +68,7 @@ def table(report: SearchReport) -> str:
     rows.append(("cells", "", *(_cells(design.colonies) for design in (first, best)), ""))
     target = report.task.target
     old, new = (each_measured(target, design.colonies) for design in (first, best))
-    seen = {name: f"{value:.4g} ± {by:.2g}" for name, (value, by) in target.wanted.items()}
+    seen = {name: f"{value:.4g} ± {by:.2g}" for name, (value, by) in target.evidence.items()}
     if seen:
         rows = [(*row, "") for row in rows]
         rows[0] = (*rows[0][:5], "observed")
@@ -199,7 +199,7 @@ def _undefined(target: Target, found: Mapping[str, list[float]]) -> list[str]:
 
 def _poor_fit(target: Observed, best: ReportedDesign) -> str:
     """What a design that is unlike the data misses most."""
-    seen, found = target.wanted, measured(target, best.colonies)
+    seen, found = target.evidence, measured(target, best.colonies)
     apart = {n: abs(found[n] - value) / by for n, (value, by) in seen.items() if n in found}
     worst = sorted((n for n in apart if np.isfinite(apart[n])), key=lambda n: -apart[n])[:WORST]
     words = ", ".join(f"{n} by {apart[n]:.1f} spreads" for n in worst)

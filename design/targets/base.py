@@ -96,7 +96,7 @@ class Target:
         return ""
 
     @property
-    def observed(self) -> dict[str, tuple[float, float]]:
+    def evidence(self) -> dict[str, tuple[float, float]]:
         """What was observed of each measure, and its spread, where the target is data."""
         return {}
 

@@ -133,8 +133,8 @@ class Several(Target):
         return "; ".join(dict.fromkeys(part.mark for part in self.parts if part.mark))
 
     @property
-    def observed(self) -> dict[str, tuple[float, float]]:
-        return {name: seen for part in self.parts for name, seen in part.observed.items()}
+    def evidence(self) -> dict[str, tuple[float, float]]:
+        return {name: seen for part in self.parts for name, seen in part.evidence.items()}
 
     def why_undefined(self, measure: str) -> str:
         return next((why for part in self.parts if (why := part.why_undefined(measure))), "")

@@ -297,7 +297,7 @@ class Observed(Target):
         return "lines: rings" if self.plan.positions else ""
 
     @property
-    def wanted(self) -> dict[str, tuple[float, float]]:
+    def evidence(self) -> dict[str, tuple[float, float]]:
         found = dict(zip(self.plan.names, zip(self.values, self.spread, strict=True), strict=True))
         if LOG_CELLS not in found:
             return found
