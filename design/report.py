@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,9 +17,6 @@ from design.targets.goals import Goals
 from design.targets.observed import Observed
 from design.task import Task
 from design.trivial import trivial_losses
-
-if TYPE_CHECKING:
-    pass
 
 WORST = 3  # statistics that a poor fit names
 LUCKY = 0.8  # of the band on fresh seeds: a search that saw less than this was misled

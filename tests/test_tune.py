@@ -119,17 +119,20 @@ def test_a_smaller_error_asks_for_smaller_steps():
     assert steps[1] < steps[0]
 
 
-def test_what_does_not_hold_in_other_colonies_is_tightened():
-    """A probe by which all errors are a hundredth of what they are: the other's are not, and the
-    settings are those of an honest search, or finer."""
-    probe, other = begin(dividing(), 12, 4, ["m"]), begin(dividing(), 8, 4, ["m"], seed=1)
+class Flatterer(AccuracyProbe):
+    """A probe by which all errors are a hundredth of what they are."""
 
-    class Flatterer(AccuracyProbe):
-        def errors(self, found, against, apart=False):
-            return {
-                n: e if apart else Error(0.01 * e.value, 0.0)
-                for n, e in super().errors(found, against, apart).items()
-            }
+    def errors(self, found, against, apart=False):
+        return {
+            n: e if apart else Error(0.01 * e.value, 0.0)
+            for n, e in super().errors(found, against, apart).items()
+        }
+
+
+def test_what_does_not_hold_in_other_colonies_is_tightened():
+    """The errors of the other probe are not flattered, and the settings are those of an honest
+    search, or finer."""
+    probe, other = begin(dividing(), 12, 4, ["m"]), begin(dividing(), 8, 4, ["m"], seed=1)
 
     search = SettingsSearch(Flatterer(**vars(probe)), other, 1e-3)
     flattered = search.run()
@@ -498,15 +501,8 @@ def test_an_error_of_nothing_is_drawn_on_logarithmic_axes(priced):
 
 
 def test_what_other_colonies_refute_is_no_longer_on_the_front():
-    """A probe by which all errors are a hundredth: what was refuted has its other error."""
+    """What was refuted has its other error."""
     probe, other = begin(dividing(), 12, 4, ["m"]), begin(dividing(), 8, 4, ["m"], seed=1)
-
-    class Flatterer(AccuracyProbe):
-        def errors(self, found, against, apart=False):
-            return {
-                n: e if apart else Error(0.01 * e.value, 0.0)
-                for n, e in super().errors(found, against, apart).items()
-            }
 
     search = SettingsSearch(Flatterer(**vars(probe)), other, 1e-3)
     tuned = search.run()

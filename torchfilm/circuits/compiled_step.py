@@ -123,38 +123,32 @@ class KernelStep:
         """Where `gather` finds what, and how many numbers stand before the variables."""
         compiled, constants = self.compiled, self.constants
         size, begin, cells = len(compiled.equations.variables), len(start.fields), len(colony_id)
-        table: list[int] = []
+        table: list[tuple[int, ...]] = []
         for k, name in enumerate(compiled.columns):
             x = constants.get(name)
             if x is None:
-                table += _row(name, found[name], 0, k * count, 1, cells)
+                table.append(_row(name, found[name], 0, k * count, 1, cells))
             else:  # one number, or one for each colony
                 by = x.dim() and x.stride(0)
                 index = colony_id.data_ptr() if x.dim() else 0
-                table += x.data_ptr(), by, _types()[x.dtype], 0, k * count, 1, index
+                table.append((x.data_ptr(), by, _types()[x.dtype], 0, k * count, 1, index))
         rest = (len(compiled.columns) + len(signals)) * count
         for k, (name, x) in enumerate(signals.items(), len(compiled.columns)):
-            table += _row(name, x, 0, k * count, 1, cells)
+            table.append(_row(name, x, 0, k * count, 1, cells))
         factor = start.half.before.data_ptr()
         for k, (name, x) in enumerate(start.fields.items()):
-            table += _row(name, x, factor if name in start.diluted else 0, rest + k, size, cells)
+            by = factor if name in start.diluted else 0
+            table.append(_row(name, x, by, rest + k, size, cells))
         for k, (name, x) in enumerate(signals.items(), begin):
-            table += _row(name, x, 0, rest + k, size, cells)
+            table.append(_row(name, x, 0, rest + k, size, cells))
         for k in range(begin + len(signals), size):  # what a reservoir is given and gives
-            table += 0, 0, 0, 0, rest + k, size, 0
-        return np.array(table, np.int64).reshape(-1, _words()), rest
+            table.append((0, 0, 0, 0, rest + k, size, 0))
+        return np.array(table, np.int64), rest
 
 
 def known(x: Tensor) -> Tensor:
     """A column of a type that `gather` knows."""
     return x if x.dtype in _types() else x.double()
-
-
-@cache
-def _words() -> int:
-    from torchfilm.kernels import columns
-
-    return columns.WORDS
 
 
 @cache

@@ -211,7 +211,6 @@ class Resume:
             dt=dt,
             watch=self.watch,
             picture=self.picture,
-            colour=None,
         )
 
 

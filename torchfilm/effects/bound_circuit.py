@@ -265,8 +265,10 @@ class BoundCircuit(BoundEffect):
         report = Failures(state, self.effect.method, dt)
         rows = {k: x for k in self.rates if (x := cells_of_type(state, k)).numel()}
         taken = self.kernels.taken(middle, rows, medium, start) if dt else {}
-        run = self.kernels.run
-        changed = run(taken, middle, rows, medium, start, report) if taken else start.kept()
+        if taken:
+            changed = self.kernels.run(taken, middle, rows, medium, start, report)
+        else:
+            changed = start.kept()
         if left := [k for k in rows if k not in taken]:
             same = self._constants(middle)
             cells = [self.cells(middle, rows[k], k, medium=medium, same=same) for k in left]

@@ -107,28 +107,28 @@ def grid_columns(state: State, first_voxel: int = 0) -> dict[str, np.ndarray]:
 def create_framed(file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk: int) -> None:
     """Create an empty dataset of rows of this shape, compressed, to which whole frames are
     added."""
-    file.create_dataset(
-        name,
-        shape=(0, *shape),
-        maxshape=(None, *shape),
-        dtype=dtype,
-        chunks=(chunk, *(max(1, s) for s in shape)),
-        compression="gzip",
-        compression_opts=1,
-        fillvalue=BLANK.get(np.dtype(dtype).kind),
-    )
+    blank = BLANK.get(np.dtype(dtype).kind)
+    packed = {"compression": "gzip", "compression_opts": 1, "fillvalue": blank}
+    _create_empty(file, name, dtype, shape, chunk, **packed)
 
 
 def create_table(file: h5py.File, name: str, dtype: Any, shape: Sequence[int]) -> None:
     """Create an empty dataset of rows of this shape, to which a few rows at a time are added."""
     row = max(1, np.dtype(dtype).itemsize * math.prod(shape))
-    chunk = max(1, CHUNK_BYTES // row)
+    _create_empty(file, name, dtype, shape, max(1, CHUNK_BYTES // row))
+
+
+def _create_empty(
+    file: h5py.File, name: str, dtype: Any, shape: Sequence[int], chunk: int, **options: Any
+) -> None:
+    """A dataset without rows, which may grow. chunk: rows that are stored together."""
     file.create_dataset(
         name,
         shape=(0, *shape),
         maxshape=(None, *shape),
         dtype=dtype,
         chunks=(chunk, *(max(1, s) for s in shape)),
+        **options,
     )
 
 

@@ -14,7 +14,7 @@ from torchfilm.physics.contact_records import ContactReport, ContactSettings
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.step_records import MechanicsInput, MechanicsResult
 from torchfilm.physics.surfaces import FlatSurface
-from torchfilm.tools.numba_calls import as_array
+from torchfilm.tools.numba_calls import as_array, in_numpy
 from torchfilm.tools.threads import available, pool
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
@@ -22,8 +22,6 @@ WORTH_THREADS = 300
 # A large colony is solved by a team of threads, each with this many cells or more. With 3,000 cells
 # two threads gained nothing, from 5,000 to 10,000 a tenth, and with 10,000 in free growth a third.
 CELLS_A_THREAD = 4000
-
-NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 _called: set[str] = set()  # names of kernels that this process has called
 
@@ -81,7 +79,7 @@ def step(given: MechanicsInput) -> MechanicsResult:
 def _array_or_none(value: Tensor | None, dtype: torch.dtype) -> np.ndarray:
     """(N,), or (1,) of a number for all cells; (0,) for None."""
     if value is None:
-        return np.empty(0, NUMPY[dtype])
+        return np.empty(0, in_numpy(dtype))
     return as_array(value.reshape(-1), dtype)
 
 

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +16,6 @@ from torchfilm.signals.exchange import Stencil, beyond, counted, pool_volume, re
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups, expand_ranges
-from torchfilm.tools.tangents import tracked
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +82,6 @@ class Layout:
         """The positions of cells at (N, d) in the grid's three dimensions, (N, 3) float64, µm."""
         if position.shape[1] == 3:
             return position.double()
-        if position.device.type == "cpu" and not tracked(position):
-            found = np.full((len(position), 3), self.height)
-            found[:, :2] = position.detach().numpy()
-            return torch.from_numpy(found)
         return torch.cat(
             [
                 position.double(),
