@@ -229,22 +229,6 @@ def test_who_computes_contacts_is_who_is_reported(backend, contacts, monkeypatch
     assert f"conjugate gradients, {said}" in " ".join(effect.numerics(0.025, model.start()))
 
 
-def test_how_late_divisions_are_is_told_and_a_long_step_is_called_so():
-    """1 − exp(−rate·dt) of the fastest cells; a rate in µm/h says nothing of numbers."""
-    parts = tf.Division(length=4.0), tf.Mechanics(dim=2)
-    two = tf.Cells([[-4.0, 0.0], [4.0, 0.0]], [[0.0, 1.0], [0.0, 1.0]], cell_type=[0, 1])
-    said = lambda dt, **growth: tf.explain(
-        tf.Scene(tf.Growth(**growth), *parts, founders=two, dt=dt), seconds=0
-    )
-    assert "about 39 % too small at 1/h" in said(0.5, rate={0: 1.0, 1: 0.8})
-    assert "LONG STEP: take dt of 0.1 h or less (0.02 h is usual)" in said(0.5, rate=1.0)
-    assert "about 9.5 % too small at 1/h" in said(0.1, rate=1.0)
-    assert "LONG STEP" not in said(0.1, rate=1.0)
-    for growth in ({"rate": 1.0, "law": "linear"}, {"rate": 0.0}):
-        assert "checked once a step" in said(0.5, **growth)
-        assert "too small" not in said(0.5, **growth)
-
-
 def test_what_is_exchanged_is_named():
     assert "exchanges ahl with" in tf.explain(tf.scenes.quorum_sensing(), seconds=0)
     assert "exchanges" not in tf.explain(tf.scenes.toggle_switch(), seconds=0)
@@ -389,7 +373,7 @@ def test_what_happens_once_is_not_measured(when):
 
     @dataclass(frozen=True)
     class Once(tf.Effect):
-        stage, title = 35, "once"
+        stage, title = 200, "once"
 
         def step(self, state, dt, values):
             if waits and (state.births or when == "a step"):

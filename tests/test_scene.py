@@ -178,7 +178,7 @@ def test_explain_names_stages_parameters_fields_and_couplings():
     ):
         assert part in text, part
     assert "growth -> mechanics: length, elongation" in text
-    assert text.index("Division(") < text.index("Growth(") < text.index("Mechanics(")
+    assert text.index("Growth(") < text.index("Mechanics(") < text.index("Division(")
 
 
 def test_repr_shows_the_effects():

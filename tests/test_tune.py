@@ -4,7 +4,6 @@ said."""
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 
 import pytest
@@ -13,7 +12,7 @@ from helpers import step
 
 import torchfilm as tf
 from torchfilm.tools.checks import InputError
-from torchfilm.tuning.observables import AccuracyProbe, Error, Lag, begin, observables
+from torchfilm.tuning.observables import AccuracyProbe, Error, begin, observables
 from torchfilm.tuning.settings_search import SettingsSearch
 from torchfilm.tuning.tuned import Trial
 
@@ -432,7 +431,7 @@ def test_names_are_a_list():
 
 
 def trial(seconds: float, error: float, **settings) -> Trial:
-    return Trial(tf.Settings(**settings), {"m": Error(error, 0.0)}, seconds, {}, Lag(0.0, 0.0))
+    return Trial(tf.Settings(**settings), {"m": Error(error, 0.0)}, seconds, {})
 
 
 @pytest.fixture
@@ -510,44 +509,3 @@ def test_what_other_colonies_refute_is_no_longer_on_the_front():
     for tried in tuned.tries:
         if tried.settings in search.refuted:
             assert tried.worst > 1e-3 > search.tries[tried.settings].worst
-
-
-# --- the number of cells is late ------------------------------------------------------------------
-
-
-def test_the_number_of_cells_is_that_of_one_step_before():
-    """What is late at a step are the cells that the next step adds, whatever their number."""
-    probe = begin(dividing(), 30, 3)
-    for dt, steps in ((0.05, 24), (0.1, 12)):
-        state, counts = probe.start, []
-        for _ in range(steps):
-            state = step(probe.scene, state, dt)
-            counts.append(state.cells)
-        late = [1 - a / b for a, b in itertools.pairwise(counts)]
-        lag = probe.observed(tf.Settings(dt=dt)).lag
-        assert lag.mean == pytest.approx(sum(late) / len(late))
-        assert lag.most == pytest.approx(max(late)) and lag.most > 0
-
-
-def test_the_first_division_is_seen_one_to_two_steps_after_its_moment():
-    """A lone cell of length 2, radius ½ at 1/h reaches length 4 when its volume has grown by the
-    factor (4 + ⅔)/(2 + ⅔)."""
-    moment = math.log((4 + 2 / 3) / (2 + 2 / 3))
-    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0))
-    for dt in (0.1, 0.03, 0.011):
-        seen = next(s.time for s in tf.simulate(scene, cells=2, dt=dt) if s.cells == 2)
-        assert dt <= seen - moment + 1e-9 < 2 * dt
-
-
-def test_how_late_the_number_of_cells_is_is_told_beside_the_errors():
-    tuned = tf.tune(dividing(), 0.05, cells=8, colonies=4, of=["cells", "m"])
-    best, own = tuned.chosen.lag, tuned.own.lag
-    assert tuned.chosen.errors["cells"].value == 0 < own.mean < best.mean < best.most
-    assert f"Too few cells: {best} (chosen); {own} (the scene's own)." in str(tuned)
-    assert "Too few cells" not in str(tf.tune(dividing(), 0.05, cells=8, colonies=4, of=["m"]))
-
-
-def test_a_window_without_a_division_is_told():
-    two = tf.Cells([[0.0, 0.0], [9.0, 0.0]], [[1.0, 0.0], [1.0, 0.0]])
-    scene = tf.Scene(tf.Growth(rate=0.1), tf.Division(length=4.0), founders=two, dt=0.05)
-    assert "No cell divided in the window" in str(tf.tune(scene, 0.05, cells=1, colonies=2))

@@ -24,9 +24,10 @@ from torchfilm.values import CELL, ByType, PerColony, Rule, checked, is_drawn
 if TYPE_CHECKING:
     from torchfilm.tools.hot_reload import HotReload
 
-# The paper's stages, in its order; an effect says where it belongs.
-RULES, DIVISION, BEFORE_CELLS, NUTRITION, GROWTH = 10, 20, 22, 25, 30
-MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, REMOVAL = 40, 45, 50, 60, 90
+# The stages of a step; an effect says where it belongs. The order is the paper's, but for cells
+# that divide at a threshold: they do so in the step in which they get there, not in the next one.
+RULES, FLAGGED_DIVISION, BEFORE_CELLS, NUTRITION, GROWTH = 10, 20, 22, 25, 30
+MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, REMOVAL, DIVISION = 40, 45, 50, 60, 90, 100
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.

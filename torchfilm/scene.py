@@ -26,8 +26,8 @@ NO_KEYWORD = {"effects": "Effects come first, without a name: (*effects, name=�
 
 
 class Scene(metaclass=checks.KnownKeywords):
-    """Effects that act on a state in each step, in the paper's order (rules, division, growth,
-    mechanics, …), whatever order they are listed in. A scene never changes; `replace` makes another
+    """Effects that act on a state in each step, in a fixed order (rules, growth, mechanics, …,
+    division), whatever order they are listed in. A scene never changes; `replace` makes another
     one.
 
     name: for results. dt: default step, h. founders: cells that each colony starts from; by default

@@ -64,7 +64,9 @@ def test_images_give_the_statistics_of_the_colonies_that_they_show(folder):
         elif name != "log_cells":
             assert other[name] == pytest.approx(value, abs=exact.get(group, 0.005)), name
     bright = state.with_fields(gfp=GAIN * state.gfp)
-    assert found.loss(bright).tolist() == pytest.approx(wanted.loss(bright).tolist(), rel=0.02)
+    # lengths to 0.4 pixels are some hundredths of their spread between colonies: over seven seeds,
+    # losses differ by 1.9 to 4.1 %
+    assert found.loss(bright).tolist() == pytest.approx(wanted.loss(bright).tolist(), rel=0.06)
 
 
 def test_relative_levels_need_no_gain_but_the_background(folder):

@@ -39,46 +39,10 @@ def flagged(scene: tf.Scene, colonies: int = 1, which=None, **options) -> tf.Sta
     return state.with_fields(divide_flag=flag)
 
 
-def division_times(
-    division: tf.Division, steps: int, founder_length: float = 2.0, **growth
-) -> list[int]:
-    """Steps in which the number of cells changed; growth is linear, ¼ µm a step, so that every
-    length is exact in binary."""
-    scene = tf.Scene(
-        tf.Growth(rate=1.0, law="linear"), division, founders=row_of_cells(1, founder_length)
-    )
-    state, found = scene.bind().start(), []
-    for _ in range(steps):
-        new = step(scene, state, 0.25)
-        if new.cells > state.cells:
-            found.append(new.step)
-        state = new
-    return found
-
-
 # --- criteria -------------------------------------------------------------------------------------
 
 
-def test_by_length():
-    """2 + ¼k reaches 3 at the end of step 4; division comes first in step 5. Daughters start at (3
-    − 1)/2 = 1: eight steps more."""
-    assert division_times(tf.Division(length=3.0), 14) == [5, 13]
-
-
-def test_by_volume():
-    """The volume of l = 3, less a billionth so that rounding cannot put it off by a step: the same
-    times."""
-    at = math.pi * 0.25 * (3.0 + 2 / 3) * (1 - 1e-6)
-    assert division_times(tf.Division(volume=at), 14) == [5, 13]
-
-
-def test_by_added_length():
-    """2 → 3 (four steps), daughters born at 1, each again 1 µm: four steps between births."""
-    assert division_times(tf.Division(added=1.0), 14) == [5, 9, 13]
-
-
 def test_by_flag_alone():
-    assert division_times(tf.Division(), 14) == []
     scene = tf.Scene(tf.Division(), founders=row_of_cells(3))
     state = step(scene, flagged(scene, which=[1]), 0.1)
     assert state.cells == 4 and state.parent.tolist() == [-1, 1, 1, -1]

@@ -162,8 +162,10 @@ def test_daughters_begin_to_eat_anew():
     state = scene.bind(dtype=F64).start()
     while state.cells == 1:
         before, state = state, step(scene, state, 0.05)
-    assert float(before.food_eaten) > 0.2 and float(state.food_eaten.max()) < 0.1
-    assert float((state.births[-1].parents.food_eaten).max()) == float(before.food_eaten)
+    eaten = float(state.births[-1].parents.food_eaten)
+    assert eaten > float(before.food_eaten) > 0.1
+    assert state.food_eaten.tolist() == [0.0, 0.0]
+    assert 0 < float(step(scene, state, 0.05).food_eaten.max()) < 0.1
 
 
 def test_without_food_nothing_happens(dtype):

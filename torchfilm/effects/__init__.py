@@ -13,11 +13,11 @@ from torchfilm.effects.rules import Rules
 # In the order of a step, by the names that `explain` uses.
 KNOWN = {
     "rules": Rules,
-    "division": Division,
     "nutrition": Monod,
     "growth": Growth,
     "mechanics": Mechanics,
     "circuit": Circuit,
     "transport": Medium,
     "removal": Removal,
+    "division": Division,
 }

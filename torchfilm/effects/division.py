@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import ClassVar
@@ -9,12 +10,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchfilm.effect import DIVISION, Effect
+from torchfilm.effect import DIVISION, FLAGGED_DIVISION, Binding, BoundEffect, Effect
 from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.doubling import late_lines
 from torchfilm.tools.numba_calls import kernels_loaded
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, places, reads_are_free
@@ -58,8 +58,9 @@ class Division(Effect):
 
     Give at most one threshold. length: centreline length, µm. volume: µm³. added: centreline grown
     since birth, µm (the adder). Each is a number, one per colony, one per cell type, or a
-    distribution drawn for each cell at birth. Without a threshold, only cells with `divide_flag`
-    divide; the flag also works beside a threshold.
+    distribution drawn for each cell at birth. Cells divide at the end of the step in which they get
+    there, so that no state has a cell that is due; the flag also works beside a threshold. Without
+    a threshold, only cells with `divide_flag` divide, right after the rules, before cells grow.
 
     fraction: share of the length that the first daughter (at the −axis end) gets; a distribution is
     drawn at each division. axis_noise: standard deviation of the noise on each component of a
@@ -150,8 +151,8 @@ class Division(Effect):
     def check(self, state: State, values: Values) -> None:
         if self.criterion is None or state.cells == 0:
             return
-        # cells from a micrograph may exceed the threshold drawn for them, and divide at once; no
-        # cell may exceed every threshold that can be drawn
+        # cells from a micrograph may exceed the threshold drawn for them, and divide in the first
+        # step; no cell may exceed every threshold that can be drawn
         least, most = self._bounds(state)
         start = {
             "length": state.length,
@@ -197,11 +198,16 @@ class Division(Effect):
                 most = torch.where(mine, largest(value), most)
         return least, most
 
+    def bind(self, binding: Binding) -> Sequence[BoundEffect]:
+        bound = BoundEffect(self, binding)
+        if self.criterion is None:
+            bound.stage = FLAGGED_DIVISION
+        return (bound,)
+
     def numerics(self, dt: float, state: State) -> list[str]:
-        rate = state.fields.get("growth_rate")
-        relative = rate is not None and state.declared["growth_rate"].unit.startswith("1/h")
-        fastest = float(rate.max()) if rate is not None and relative and state.cells else 0.0
-        return [f"checked once a step: up to {dt:g} h late", *late_lines(fastest, dt)]
+        if self.criterion is None:
+            return ["cells that a rule has flagged, before they grow"]
+        return [f"at the end of a step: up to {dt:g} h after a cell gets there"]
 
     def due(self, state: State) -> Tensor:
         """Which cells divide now, (N,) bool."""

@@ -2,8 +2,7 @@
 
 The error of each observable:
 
-- cells: relative difference of the number of cells. A cell that is due to divide at the next step
-  counts as two: `Lag` is what this leaves out.
+- cells: relative difference of the number of cells.
 - volume: difference of the volume added in the second half of the window, relative to that volume.
   If growth without pressure or loss of cells would add more, the difference is relative to that. In
   the first half the cells settle, because other settings grew the start. A cell's volume is here
@@ -32,7 +31,7 @@ from scipy.special import stdtrit
 from torch import Tensor
 
 from torchfilm import measure
-from torchfilm.effect import DIVISION, GROWTH
+from torchfilm.effect import GROWTH
 from torchfilm.loop import Standstill, advance
 from torchfilm.model import Model
 from torchfilm.scene import Scene
@@ -89,32 +88,17 @@ def percent(error: float) -> str:
 
 
 @dataclass(frozen=True)
-class Lag:
-    """By how much the number of cells at the end of a step is too small, since cells that are due
-    divide at the start of the next step: relative, mean and greatest in a window, over all
-    colonies."""
-
-    mean: float
-    most: float
-
-    def __str__(self) -> str:
-        return f"{100 * self.mean:.2g} % on average, {100 * self.most:.2g} % at most"
-
-
-@dataclass(frozen=True)
 class WindowRun:
     """One run of the window.
 
     found: the observables in the middle and at the end. seconds: computing time (on the CPU: of the
     thread that ran it). spent: seconds by effect. several: whether a step was split into substeps.
-    lag: of the number of cells.
     """
 
     found: Seen
     seconds: float
     spent: dict[str, float]
     several: bool
-    lag: Lag
 
 
 @dataclass(frozen=True)
@@ -142,24 +126,14 @@ class AccuracyProbe:
         """Runs the window with these settings."""
         steps = self.steps(settings)
         made = settings.apply(self.scene).bind(state=self.start, per_colony=True)
-        dt, state, seen, timings, broken, several, late = (
-            self.dt * WINDOW / steps,
-            self.start,
-            [],
-            Timings(),
-            False,
-            False,
-            [],
-        )
+        dt, seen, timings = self.dt * WINDOW / steps, [], Timings()
+        broken = several = False
         # on the CPU, the time of this thread only: other work on the machine does not count
-        clock = time.thread_time if state.device.type == "cpu" else time.perf_counter
+        clock = time.thread_time if self.start.device.type == "cpu" else time.perf_counter
         begun = clock()
         last = self.start.step + steps
         stop = lambda s: s.step >= last
-        for after in advance(partial(made.step, dt=dt, timings=timings), state, stop=stop):
-            born = sum(len(births.rows) for births in after.births)
-            late.append(born / max(1, state.cells + born))
-            state = after
+        for state in advance(partial(made.step, dt=dt, timings=timings), self.start, stop=stop):
             broken = broken or any(bool((r.status != 0).any()) for r in state.reports.values())
             several = several or any(
                 bool((r.substeps > 1).any())
@@ -175,23 +149,13 @@ class AccuracyProbe:
             for name, value in (
                 parts
                 | {
-                    "cells": self._due(state),
+                    "cells": state.counts.double().cpu().unsqueeze(1),
                     "volume": torch.cat([parts["volume"], self._wanted(state)], 1),
                 }
             ).items():
                 if self.of is None or name in self.of:
                     found.setdefault(name, []).append(value * math.nan if broken else value)
-        late = late[1:]  # other settings grew the cells that are due at the start
-        lag = Lag(math.fsum(late) / len(late), max(late))
-        return WindowRun(found, seconds, timings.seconds, several, lag)
-
-    def _due(self, state: State) -> Tensor:
-        """The number of cells after the divisions at the start of the next step, (B, 1). Before
-        these divisions, the number is late by up to one step."""
-        for effect in self.model.effects:
-            if effect.stage <= DIVISION:
-                state = effect.step(state, self.dt)
-        return state.counts.double().cpu().unsqueeze(1)
+        return WindowRun(found, seconds, timings.seconds, several)
 
     def _wanted(self, state: State) -> Tensor:
         """Growth of the volume per hour without pressure, (B, 1) µm³/h."""

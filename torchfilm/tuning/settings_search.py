@@ -108,7 +108,7 @@ class SettingsSearch:
         for settings, run in self.runs.items():
             errors = self._found(settings) | self.retested.get(settings, {})
             errors = greater(errors, self.refuted.get(settings, {}))
-            tries.append(Trial(settings, errors, run.seconds, run.spent, run.lag))
+            tries.append(Trial(settings, errors, run.seconds, run.spent))
         return tries
 
     def _run_references(self) -> dict[str, str]:
@@ -266,7 +266,7 @@ class SettingsSearch:
         if settings not in self.tries:
             run = self._run(settings)
             errors = self._found(settings)
-            self.tries[settings] = Trial(settings, errors, run.seconds, run.spent, run.lag)
+            self.tries[settings] = Trial(settings, errors, run.seconds, run.spent)
         return self.tries[settings]
 
     def _cheapest(self) -> Trial | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from torchfilm.pictures.picture import Picture
 from torchfilm.scene import Scene
 from torchfilm.tuning.front import cost_front, draw_front, front_rows
-from torchfilm.tuning.observables import Error, Lag, percent
+from torchfilm.tuning.observables import Error, percent
 from torchfilm.tuning.settings import Settings, typed, typed_text
 
 # The knob of a parameter by name; the others are of contacts.
@@ -21,14 +21,13 @@ class Trial:
     """Settings that were run, with their errors by observable.
 
     seconds: computing time of the window (on the CPU: of the thread that ran it). spent: seconds by
-    effect. lag: of the number of cells (`Lag.mean`, `.most`), which is no part of the errors.
+    effect.
     """
 
     settings: Settings
     errors: dict[str, Error]
     seconds: float
     spent: dict[str, float]
-    lag: Lag
 
     @property
     def worst(self) -> float:
@@ -138,21 +137,7 @@ def describe(tuned: Tuned) -> list[str]:
         " check it"
         for name, why in tuned.left_out.items()
     ]
-    return [*lines, *_lag_lines(tuned), "", *_front_lines(tuned)]
-
-
-def _lag_lines(tuned: Tuned) -> list[str]:
-    """By how much numbers of cells are late, in lines."""
-    best, own = tuned.chosen.lag, tuned.own.lag
-    if not {"cells", "volume"} & set(tuned.chosen.errors):
-        return []
-    if not best.most and not own.most:
-        return ["No cell divided in the window, so that errors of divisions do not show."]
-    return [
-        "LATE: a cell divides in the step after it is due, so a run shows the number of cells of"
-        " one step before.",
-        f"  Too few cells: {best} (chosen); {own} (the scene's own). Errors leave this out.",
-    ]
+    return [*lines, "", *_front_lines(tuned)]
 
 
 def _front_lines(tuned: Tuned) -> list[str]:

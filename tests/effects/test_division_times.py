@@ -1,0 +1,99 @@
+"""When cells divide: in which step, and before or after they grow."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from helpers import step
+
+import torchfilm as tf
+
+
+def one_cell(length: float = 2.0) -> tf.Cells:
+    return tf.Cells([[0.0, 0.0]], [[1.0, 0.0]], length)
+
+
+def division_times(division: tf.Division, steps: int) -> list[int]:
+    """Steps in which the number of cells changed; growth is linear, ¼ µm a step, so that every
+    length is exact in binary."""
+    scene = tf.Scene(tf.Growth(rate=1.0, law="linear"), division, founders=one_cell())
+    state, found = scene.bind().start(), []
+    for _ in range(steps):
+        new = step(scene, state, 0.25)
+        if new.cells > state.cells:
+            found.append(new.step)
+        state = new
+    return found
+
+
+def test_by_length():
+    """2 + ¼k reaches 3 in step 4. Daughters start at (3 − 1)/2 = 1: eight steps more."""
+    assert division_times(tf.Division(length=3.0), 14) == [4, 12]
+
+
+def test_by_volume():
+    """The volume of l = 3, less a billionth so that rounding cannot put it off by a step: the same
+    times."""
+    at = math.pi * 0.25 * (3.0 + 2 / 3) * (1 - 1e-6)
+    assert division_times(tf.Division(volume=at), 14) == [4, 12]
+
+
+def test_by_added_length():
+    """2 → 3 (four steps), daughters born at 1, each again 1 µm: four steps between births."""
+    assert division_times(tf.Division(added=1.0), 14) == [4, 8, 12]
+
+
+def test_without_a_threshold_nothing_divides_by_itself():
+    assert division_times(tf.Division(), 14) == []
+
+
+def test_the_first_division_is_seen_less_than_a_step_after_its_moment():
+    """A lone cell of length 2, radius ½ at 1/h reaches length 4 when its volume has grown by the
+    factor (4 + ⅔)/(2 + ⅔)."""
+    moment = math.log((4 + 2 / 3) / (2 + 2 / 3))
+    scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=4.0))
+    for dt in (0.1, 0.03, 0.011):
+        seen = next(s.time for s in tf.simulate(scene, cells=2, dt=dt) if s.cells == 2)
+        assert 0 <= seen - moment + 1e-9 < dt
+
+
+def test_no_state_of_a_run_has_a_cell_that_is_due():
+    division = tf.Division(added=tf.Uniform(1.5, 2.5))
+    scene = tf.Scene(tf.Growth(rate=1.0), division, tf.Mechanics(dim=2), dt=0.1)
+    states = list(tf.simulate(scene, colonies=3, cells=20))
+    assert sum(len(b.first) for s in states for b in s.births) > 50
+    assert not any(bool(division.due(s).any()) for s in states)
+
+
+def test_cells_divide_at_a_threshold_when_they_have_grown_and_by_a_flag_before():
+    """Daughters of 3 µm are 1 µm long; these of a cell that a rule flags grow by ¼ µm at once."""
+
+    def update(cells):
+        cells.divide_flag = cells.length >= 2.75
+
+    grow = tf.Growth(rate=1.0, law="linear")
+    for division, longest in ((tf.Division(length=3.0), 1.0), (tf.Division(), 1.25)):
+        rules = () if division.criterion else (tf.Rules(update),)
+        founders = one_cell(2.75 if division.criterion else 3.0)
+        scene = tf.Scene(*rules, grow, division, founders=founders)
+        state = step(scene, scene.bind().start(), 0.25)
+        assert state.length.tolist() == [longest] * 2
+        order = [e.title for e in scene.bind().effects]
+        assert order == (["growth", "division"] if not rules else ["rules", "division", "growth"])
+
+
+def test_a_rule_at_division_acts_right_after_divisions_of_both_kinds():
+    def divide(parent, first, second):
+        first.born = first.length
+        second.born = second.length
+
+    rules = lambda: tf.Rules(divide=divide, variables={"born": 0.0})
+    for division in (tf.Division(length=3.0), tf.Division()):
+        scene = tf.Scene(rules(), tf.Growth(rate=1.0), division, founders=one_cell(2.9))
+        start = scene.bind().start()
+        state = step(scene, start.with_fields(divide_flag=torch.tensor([True])), 0.05)
+        grown = state.length if division.criterion else 0.95  # (2.9 − 1)/2, before it grows
+        assert state.cells == 2 and torch.allclose(
+            state.born, torch.as_tensor(grown, dtype=state.dtype)
+        )
