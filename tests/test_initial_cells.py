@@ -380,8 +380,9 @@ def test_two_cells_at_one_place_are_noticed():
     with pytest.warns(
         RuntimeWarning,
         match=r"cells 0 and 2 of colony 0 start at the same place, \[1\.5, 0\.0\] \(.*pairs: 1\)",
-    ):
+    ) as told:
         on_a_plane((1.5, 0.0), (9.0, 0.0), (1.5, 0.0), (9.0, 5.0))
+    assert [w.filename for w in told] == [__file__]
 
 
 def test_two_cells_at_one_place_in_a_table_are_refused():

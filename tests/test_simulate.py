@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from running import alone, scene_of
 
 import torchfilm as tf
+from torchfilm.effect import Concern
 from torchfilm.physics.problem import CONVERGED
 from torchfilm.state import PER_CELL
 
@@ -369,6 +371,35 @@ def test_a_run_that_may_never_end_is_reported():
     with pytest.warns(
         RuntimeWarning,
         match=r"colony 0: no larger than 1000 steps ago, with fewer than the 2 cells",
-    ):
+    ) as told:
         for _ in range(100):
             next(run)
+    assert [w.filename for w in told] == [__file__]
+
+
+@dataclass(frozen=True)
+class Worried:
+    """A report that all is well, but for colony 1."""
+
+    status: torch.Tensor
+
+    def concerns(self):
+        text = lambda ids, where: f"colony {ids[where].tolist()} looks odd"
+        return [Concern("odd", torch.tensor([False, True, False]), 3, text)]
+
+
+@dataclass(frozen=True)
+class Worry(tf.Effect):
+    stage, title = 15, "worry"
+
+    def step(self, state, dt, values):
+        return state.replace(reports={"worry": Worried(torch.zeros_like(state.counts))})
+
+
+def test_what_a_report_is_concerned_about_is_warned_of_once_at_the_users_line():
+    with pytest.warns(RuntimeWarning) as told:
+        for _ in tf.simulate(tf.Scene(Worry(), dt=0.1), until=1.0, colonies=3):
+            pass
+    (one,) = (w for w in told if w.category is RuntimeWarning)
+    assert str(one.message) == "step 3 (t = 0.3 h): colony [1] looks odd"
+    assert one.filename == __file__

@@ -3,7 +3,6 @@ replaying and probing all drive this one loop, and share its monitors."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from torchfilm.state import State
 from torchfilm.tools.checks import SimulationError
+from torchfilm.tools.warn_once import warn
 
 Step = Callable[[State], State]
 # looks at a state after each step; what it returns, if anything, takes the state's place
@@ -130,12 +130,11 @@ class EndlessRunWarning:
         self.warned = bool(still.any())
         if self.warned:
             names = ", ".join(map(str, state.colony_id[still].tolist()[:5]))
-            warnings.warn(
+            warn(
                 f"colony {names}: no larger than {STILL} steps ago, with fewer than the"
                 f" {self.standstill.cells} cells at which this run ends. It may continue for ever:"
                 " give a time to stop at as well (until=…, --until).",
-                RuntimeWarning,
-                stacklevel=4,
+                category=RuntimeWarning,
             )
 
 
@@ -163,6 +162,4 @@ class LastingConcerns:
             return
         self.warned.add(key)
         text = concern.text(ids, torch.isin(ids, torch.tensor(long, device=ids.device)))
-        warnings.warn(
-            f"step {state.step} (t = {state.time:g} h): {text}", RuntimeWarning, stacklevel=5
-        )
+        warn(f"step {state.step} (t = {state.time:g} h): {text}", category=RuntimeWarning)

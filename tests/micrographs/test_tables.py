@@ -158,8 +158,9 @@ def test_units_are_known_as_people_write_them(micro, angle):
 
 def test_radians_taken_for_degrees_are_noticed():
     many = {"x": np.arange(9.0), "y": np.zeros(9), "length": np.ones(9)}
-    with pytest.warns(RuntimeWarning, match=r"all 9 values.*within ±1\.5.*radians"):
+    with pytest.warns(RuntimeWarning, match=r"all 9 values.*within ±1\.5.*radians") as told:
         tf.Cells.from_table({**many, "angle": np.linspace(-1, 1.5, 9)}, angle_unit="degrees")
+    assert [w.filename for w in told] == [__file__]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         tf.Cells.from_table({**many, "angle": np.zeros(9)}, angle_unit="degrees")

@@ -112,8 +112,9 @@ def test_without_numba_contacts_are_computed_by_torch_and_it_is_said_once(monkey
     monkeypatch.setitem(sys.modules, "numba", None)
     try:
         scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2), dt=0.05)
-        with pytest.warns(RuntimeWarning, match="Numba cannot be imported.*Install numba"):
+        with pytest.warns(RuntimeWarning, match="Numba cannot be imported.*Install numba") as told:
             bound = scene.bind()
+        assert [w.filename for w in told] == [__file__]
         assert bound.step(bound.start(), 0.05).cells == 1
         scene.bind()  # no second warning: warnings are errors here
         with pytest.raises(tf.InputError, match="backend = 'compiled', but Numba"):

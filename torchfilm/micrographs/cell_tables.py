@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +14,7 @@ from torchfilm.micrographs.column_sets import COLUMN_SETS, ColumnSet, matching
 from torchfilm.micrographs.record import Micrograph, listed
 from torchfilm.tools import checks
 from torchfilm.tools.tables import Table, Units
+from torchfilm.tools.warn_once import warn
 
 PLACE, AXIS = ("x", "y", "z"), ("axis_x", "axis_y", "axis_z")
 # the quantities that a table may have, and the kind of their units
@@ -353,20 +353,18 @@ def _warn_of_units(angle: np.ndarray, unit: str, widest: float, column: str, sou
     most = float(np.abs(angle).max())
     if unit == "rad" and most > widest * (1 + 1e-6):
         beyond = int((np.abs(angle) > widest * (1 + 1e-6)).sum())
-        warnings.warn(
+        warn(
             f"{source}: the column {column!r} reaches {most:g}, and torchfilm reads it in radians"
             f" ({beyond} of {angle.size} values are over {widest:.4g}). If they are degrees, give"
             ' angle_unit="degrees", or call the column "angle_deg".',
-            RuntimeWarning,
-            stacklevel=6,
+            category=RuntimeWarning,
         )
     if unit == "deg" and angle.size >= ENOUGH and 0 < most <= math.pi:
-        warnings.warn(
+        warn(
             f"{source}: all {angle.size} values of the column {column!r} lie within ±{most:.3g},"
             " and torchfilm reads them in degrees. If they are radians, give"
             ' angle_unit="radians", or call the column "angle_rad".',
-            RuntimeWarning,
-            stacklevel=6,
+            category=RuntimeWarning,
         )
 
 

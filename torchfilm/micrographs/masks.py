@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,6 +12,7 @@ from torchfilm.micrographs.fluorescence import check_fluorescence, mean_fluoresc
 from torchfilm.micrographs.mask_files import EXTRA, read_image
 from torchfilm.micrographs.record import Micrograph, listed
 from torchfilm.tools import checks
+from torchfilm.tools.warn_once import warn
 
 # what may be wrong with a region: the words for messages, and whether a capsule can still be fitted
 PROBLEMS = {
@@ -192,11 +192,10 @@ def _report(
         said = f"{source}: {len(found)} of {len(label)} regions are"
         said += f" {words.format(least_area=least_area)}: label {listed(found)}."
         if fits:
-            warnings.warn(
+            warn(
                 f'{said} Look at tf.pictures.overlay(cells, image, "check.png"), or leave them out'
                 f" by drop={name!r}.",
-                RuntimeWarning,
-                stacklevel=5,
+                category=RuntimeWarning,
             )
             continue
         if name == "pieces":

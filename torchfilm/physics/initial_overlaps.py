@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
-
 import torch
 from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.tools.warn_once import warn
 
 # Centres nearer than this share of a radius count as one place.
 SAME_PLACE = 1e-6
@@ -60,4 +59,4 @@ def check_apart(
             " another. Push the cells apart by Cells.relaxed(); or check the unit of the table"
             " (µm) and its lengths (of the centreline, without caps)."
         )
-    warnings.warn(found, RuntimeWarning, stacklevel=2)
+    warn(found, category=RuntimeWarning)

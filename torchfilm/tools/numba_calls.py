@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
-import warnings
 from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from torchfilm.tools.warn_once import warn
 
 # Read when numba is imported. Where Intel's vector library is installed, LLVM would call it for
 # whole vectors and another one for the rest: a number's bits would depend on its place.
@@ -23,11 +24,10 @@ def unavailable() -> str:
         import numba  # noqa: F401
     except ImportError as error:
         reason = f"Numba cannot be imported ({error})"
-        warnings.warn(
+        warn(
             f"{reason}: torch computes contacts, circuits and exchange, ten times slower or more."
             " Install numba.",
-            RuntimeWarning,
-            stacklevel=2,
+            category=RuntimeWarning,
         )
         return reason
     return ""

@@ -41,17 +41,14 @@ def quietly() -> Iterator[None]:
         _QUIET.reset(token)
 
 
-def warn(
-    text: str, *, stacklevel: int | None = None, category: type[Warning] = UserWarning
-) -> None:
-    """Warn of what is probably a mistake, unless a surrounding `once` has said so already.
-    stacklevel: as for `warnings.warn`, counted from the caller; by default, of the user's line."""
+def warn(text: str, *, category: type[Warning] = UserWarning) -> None:
+    """Warn of what is probably a mistake, at the user's line, unless a surrounding `once` has said
+    so already."""
     if _QUIET.get():
         return
     said = _SAID.get()
     if said is None or text not in said:
-        level = _users_level() if stacklevel is None else stacklevel
-        warnings.warn(text, category, stacklevel=level + 1)
+        warnings.warn(text, category, stacklevel=_users_level() + 1)
     if said is not None:
         said.add(text)
 
