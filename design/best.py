@@ -17,7 +17,7 @@ from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
 from design.saved_design import write_design
 from design.study import Study
-from torchfilm import displays
+from torchfilm import checks, displays
 
 
 class SearchView(Protocol):
@@ -112,7 +112,7 @@ class Best:
     def save(self, path: str | Path) -> Path:
         """Write the design as JSON, which `torchfilm run` takes. Replaces an older file."""
         return write_design(
-            Path(path),
+            checks.file_path("path", path),
             self.objective.task,
             self.values,
             loss=self.loss,

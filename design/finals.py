@@ -32,7 +32,7 @@ RESAMPLES = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finals:
+class Finals(metaclass=checks.KnownKeywords):
     """How the best designs of a search are tested on fresh seeds.
 
     share: of the budget that the test takes, below 1. most: finalists; fewer where the budget is

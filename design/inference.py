@@ -22,6 +22,7 @@ from torchfilm import checks
 LEAST = 50  # simulations that succeeded
 
 
+@checks.known_keywords
 def infer(
     scene: Callable[..., tf.Scene] | str,
     parameters: Sequence[Parameter | Choice],
@@ -73,13 +74,14 @@ def infer(
         ("epochs", epochs, 1),
     ):  # fmt: skip
         check_whole(name, value, least)
+    kept = None if path is None else checks.file_path("path", path)
     task = Task(
         scene, parameters, observed, cells=cells,
         until=observed.time if until is None and cells is None else until,
         replicates=observed.colonies if replicates is None else replicates,
         fixed=fixed, seed=seed, dt=dt, dtype=dtype, device=device, replay=False,
     )  # fmt: skip
-    found = _simulate(task, simulations, None if path is None else Path(path), executor, progress)
+    found = _simulate(task, simulations, kept, executor, progress)
     with open_bar(flows, progress, "infer", counted="flows") as bar:
         estimator = _learn(found, seed, flows, epochs, bar)
     return Posterior.of(task, found, estimator, observed, samples)

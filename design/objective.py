@@ -67,11 +67,16 @@ class Evaluation:
 
 
 @dataclass(frozen=True, eq=False)
-class Objective:
+class Objective(metaclass=checks.KnownKeywords):
     """Maps designs of a task to their losses: how far their colonies are from the target."""
 
     task: Task
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.task, Task):
+            raise checks.input_error("task", self.task, "a Task(…)")
+
+    @checks.known_keywords
     def evaluate(
         self,
         points: np.ndarray,
@@ -94,7 +99,10 @@ class Objective:
         kind. Raises InputError for points, streams or a size that are not allowed.
         """
         begun, task = time.perf_counter(), self.task
-        points = np.asarray(points, dtype=np.float64)
+        try:
+            points = np.asarray(points, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise checks.input_error("points", points, "an array of numbers") from error
         if (
             points.ndim != 2
             or points.shape[1] != task.space.size

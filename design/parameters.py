@@ -19,7 +19,7 @@ Resolve = Callable[[Mapping[str, Value]], Mapping[str, Value]]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class Parameter(metaclass=checks.KnownKeywords):
     """A number between two bounds: `Parameter("k3", 0.1, 10, log=True)`.
 
     name: of an argument of the scene function. log: use a logarithmic scale, for a parameter whose
@@ -37,6 +37,8 @@ class Parameter:
 
     def __post_init__(self) -> None:
         _check_name("Parameter", self.name)
+        for flag in ("log", "whole"):
+            checks.choice(f"Parameter({self.name!r}).{flag}", getattr(self, flag), (True, False))
         for bound in ("low", "high"):
             object.__setattr__(
                 self,
@@ -113,7 +115,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, init=False)
-class Choice:
+class Choice(metaclass=checks.KnownKeywords):
     """One of several options, such as promoters: `Choice("promoter", ("weak", "strong"))`.
 
     name: of an argument of the scene function. options: at least two, all different, each a text, a
@@ -154,6 +156,13 @@ class Choice:
                 options,
                 "at least two different ones, such as ('weak', 'strong')",
             )
+        checks.choice(f"Choice({name!r}).per_colony", per_colony, (True, False))
+        if not (resolve is None or callable(resolve)):
+            raise checks.input_error(
+                f"Choice({name!r}).resolve",
+                resolve,
+                "a function from the values of a design, or None",
+            )
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "options", tuple(options))
         object.__setattr__(self, "per_colony", per_colony)
@@ -184,7 +193,7 @@ class Choice:
         return f"{self.name}: " + " or ".join(map(repr, self.options))
 
 
-class Space:
+class Space(metaclass=checks.KnownKeywords):
     """The parameters of a search. Points are (n, D) coordinates in [0, 1], float64.
 
     size: D; names; levels: the number of values of each dimension, None where it is continuous.
@@ -217,6 +226,8 @@ class Space:
 
     def values(self, point: np.ndarray) -> dict[str, Value]:
         """The values of one design by name, from its coordinates (D,)."""
+        if np.shape(point) != (self.size,):
+            raise checks.input_error("point", point, f"{self.size} coordinates in [0, 1]")
         return self.resolved(
             {p.name: p.value(float(u)) for p, u in zip(self.parameters, point, strict=True)}
         )
@@ -230,6 +241,10 @@ class Space:
 
     def point(self, values: Mapping[str, Value]) -> np.ndarray:
         """The coordinates (D,) of one design, from its values by name."""
+        if not isinstance(values, Mapping):
+            raise checks.input_error(
+                "values", values, "a dictionary with one for each of " + ", ".join(self.names)
+            )
         wrong = [n for n in (*values, *self.names) if n not in values or n not in self.names]
         if wrong:
             raise checks.input_error(

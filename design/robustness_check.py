@@ -35,6 +35,7 @@ class ScoredDesign(Protocol):
     def searched(self) -> np.ndarray: ...
 
 
+@checks.known_keywords
 def check_robustness(
     best: ScoredDesign,
     *,
@@ -60,6 +61,9 @@ def check_robustness(
     of seeds that reach it. executor, work_items: as in `Objective.evaluate`. Raises InputError for
     an argument that is not allowed.
     """
+    if not isinstance(getattr(best, "objective", None), Objective):
+        raise checks.input_error("best", best, "the design that a search returned, a Best")
+    whole("work_items", work_items, least=1)
     _check_arguments(seeds, sizes, change, samples, threshold)
     objective, task = best.objective, best.objective.task
     searched, dimensions = task.replicates, task.space.size

@@ -21,7 +21,7 @@ from design.objective import Objective
 from design.progress import advance, open_bar
 from design.rollout import FinishedColonies
 from design.study import Study
-from design.task import Task, TaskOptions
+from design.task import Task, TaskOptions, check_whole
 from design.turn import Turn, repeat_study
 from torchfilm import checks
 
@@ -99,6 +99,7 @@ class Search(TaskOptions):
         chosen = self._progress.chosen
         return f"{chosen.describe()} ({chosen.why})" if chosen and chosen.why else ""
 
+    @checks.known_keywords
     def run(
         self,
         colonies: int,
@@ -124,6 +125,8 @@ class Search(TaskOptions):
         study of another search, and where no design was grown to full size.
         """
         self._check_run(colonies, stop_at)
+        check_whole("work_items", work_items, 1)
+        study = None if study is None else checks.file_path("study", study)
         if self._known is not None and self._known.remark:
             print(self._known.remark, file=sys.stderr)
         chosen = self._choose(colonies, study)
@@ -254,7 +257,8 @@ class Search(TaskOptions):
     def colonies(self, point: np.ndarray) -> list[FinishedColonies]:
         """The replicates of a design (D,) at their ends, grown again once: the same colonies as
         were scored."""
-        grown, key = self._progress.grown, point.tobytes()
+        self.objective.task.space.values(point)  # raises InputError for what is no point
+        grown, key = self._progress.grown, np.asarray(point, np.float64).tobytes()
         if key not in grown:
             grown[key] = self.objective.colonies(point)
         return grown[key]
@@ -262,10 +266,10 @@ class Search(TaskOptions):
     def design(self, point: np.ndarray) -> Best:
         """A design (D,) that was grown to full size."""
         task = self.objective.task
-        fresh = None
+        values, fresh = task.space.values(point), None
         if self.finals is not None:
             fresh = fresh_losses(task, self.study, self.finals.sizes, point)
-        return Best(self, task.space.values(point), point, self.study.scored(point)[1], fresh)
+        return Best(self, values, point, self.study.scored(point)[1], fresh)
 
     def _choose(self, colonies: int, path: str | Path | None) -> Chosen:
         """The method of a run."""

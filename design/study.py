@@ -194,7 +194,7 @@ class Study:
     ) -> Study:
         """The study at a path, or a new one where there is no file. Raises InputError for the study
         of another search."""
-        path = Path(path)
+        path = checks.file_path("study", path)
         if not path.exists():
             if not path.parent.is_dir():
                 raise checks.input_error(
@@ -210,8 +210,8 @@ class Study:
     @classmethod
     def read(cls, path: str | Path) -> Study:
         """The study in a file. Raises InputError where the file cannot be read."""
-        data = read_study(Path(path))
+        path = checks.file_path("study", path)
+        data = read_study(path)
         return cls(
-            data.about, tuple(data.about["names"]), data.streams, Path(path), data.entries,
-            data.finals,
-        )  # fmt: skip
+            data.about, tuple(data.about["names"]), data.streams, path, data.entries, data.finals
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -33,7 +34,7 @@ REDUCE = ("mean", "worst")
 
 
 @dataclass(frozen=True, eq=False)
-class TaskOptions:
+class TaskOptions(metaclass=checks.KnownKeywords):
     """The arguments that describe a task; `Task` and `Search` take the same ones.
 
     scene: a function from parameters to a `tf.Scene`, or the name of a ready scene. parameters:
@@ -86,9 +87,10 @@ class Task(TaskOptions):
 
     def __post_init__(self) -> None:
         self._set(target=_one_target(self.target, self.targets), targets=None)
+        checks.device(self.device)
+        until = _check_options(self)
         function, fixed = scene_function(self.scene), dict(self.fixed or {})
         family = SceneFamily(function, Space(self.parameters), fixed, self.device)
-        until = _check_options(self)
         if of_seeds(self.target) and self.replicates < 2:
             raise checks.input_error(
                 "replicates", self.replicates, "2 or more with Spread", "It compares seeds."
@@ -155,7 +157,7 @@ class Task(TaskOptions):
 
     def streams(self, given: Sequence[int] | None) -> tuple[int, ...]:
         """Checked streams of random numbers; by default those of the replicates."""
-        found = tuple(range(self.replicates)) if given is None else tuple(int(s) for s in given)
+        found = tuple(range(self.replicates) if given is None else _whole_numbers(given))
         if not found or len(set(found)) != len(found) or not all(0 <= s < 2**32 for s in found):
             raise checks.input_error(
                 "streams", given, "different whole numbers from 0 to 2³² − 1, at least one"
@@ -256,6 +258,11 @@ def _check_options(options: TaskOptions) -> float | None:
         value = getattr(options, name)
         if value is not None or name in ("replicates", "seed"):
             check_whole(name, value, least)
+    if not isinstance(options.fixed, Mapping | None):
+        raise checks.input_error(
+            "fixed", options.fixed, 'arguments of the scene function by name, such as {"dim": 3}'
+        )
+    checks.choice("replay", options.replay, (True, False))
     reduce = options.reduce
     if reduce not in REDUCE and (
         isinstance(reduce, bool) or not isinstance(reduce, (int, float)) or not 0 < reduce <= 1
@@ -264,6 +271,15 @@ def _check_options(options: TaskOptions) -> float | None:
             "reduce", reduce, '"mean", "worst" or a quantile above 0 and at most 1'
         )
     return None if options.until is None else checks.number("until", options.until, above=0.0)
+
+
+def _whole_numbers(given: Any) -> list[int]:
+    """Whole numbers of a list, or nothing where there are others."""
+    try:
+        found = [operator.index(number) for number in given]
+    except TypeError:
+        return []
+    return found
 
 
 def check_whole(name: str, value: Any, least: int) -> None:

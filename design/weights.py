@@ -13,27 +13,31 @@ from torchfilm import checks
 FORMAT = "torchfilm weights 1"
 
 
+@checks.known_keywords
 def save_weights(module: torch.nn.Module, path: str | Path) -> Path:
     """Write the parameters and buffers of a module, each with name, dtype and shape. Replaces an
     older file. Raises InputError where a number is not finite, or a tensor holds no reals."""
-    stored = {}
+    path, stored = checks.file_path("path", path), {}
+    _check_module(module)
     for name, value in module.state_dict().items():
         if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
             raise checks.input_error(f"weights[{name!r}]", value.dtype, "finite floating numbers")
         flat = value.detach().cpu().double().flatten().tolist()
         kind = str(value.dtype).removeprefix("torch.")
         stored[name] = {"dtype": kind, "shape": list(value.shape), "values": flat}
-    Path(path).write_text(json.dumps({"format": FORMAT, "weights": stored}, indent=1) + "\n")
-    return Path(path)
+    path.write_text(json.dumps({"format": FORMAT, "weights": stored}, indent=1) + "\n")
+    return path
 
 
+@checks.known_keywords
 def load_weights(module: torch.nn.Module, path: str | Path) -> None:
     """Give a module the weights of a file, which it keeps in its own dtype and on its own device.
 
     Raises InputError for a file that holds no weights, or those of another module, and changes
     nothing then.
     """
-    stored, own = _read(Path(path)), module.state_dict()
+    _check_module(module)
+    stored, own = _read(checks.file_path("path", path)), module.state_dict()
     for name in sorted({*stored, *own}):
         shapes = [tuple(w[name].shape) if name in w else "none" for w in (stored, own)]
         if shapes[0] != shapes[1]:
@@ -41,6 +45,11 @@ def load_weights(module: torch.nn.Module, path: str | Path) -> None:
             rule = f"of shape {shapes[1]}, as in {type(module).__name__}"
             raise checks.input_error(f"weights in {path}", what, rule)
     module.load_state_dict(stored)
+
+
+def _check_module(module: object) -> None:
+    if not isinstance(module, torch.nn.Module):
+        raise checks.input_error("module", module, "a torch.nn.Module")
 
 
 def _read(path: Path) -> dict[str, Tensor]:

@@ -64,7 +64,7 @@ class Gate:
 
 
 @dataclass(frozen=True)
-class SensorDevice:
+class SensorDevice(metaclass=checks.KnownKeywords):
     """A promoter that something outside the circuit switches. ymax, ymin: its activity on and off,
     RPU, ymax > ymin > 0. promoters: equal ones, whose copies take turns. Raises InputError."""
 
@@ -74,6 +74,11 @@ class SensorDevice:
     promoters: tuple[Part, ...] = ()
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise checks.input_error("SensorDevice.name", self.name, "a text")
+        parts = self.promoters
+        if not isinstance(parts, (list, tuple)) or not all(isinstance(p, Part) for p in parts):
+            raise checks.input_error("SensorDevice.promoters", parts, "a list of parts")
         _check_levels(f"SensorDevice({self.name!r})", self.ymax, self.ymin)
 
 

@@ -66,6 +66,7 @@ class Library:
         )
 
     @classmethod
+    @checks.known_keywords
     def read(cls, *files: str | Path, gates: Sequence[str] | None = None) -> Library:
         """Read a library from its files: version 1, or version 2 with its files for inputs and
         outputs. gates: the names of those to read, all by default.
@@ -76,7 +77,7 @@ class Library:
         """
         if not files:
             raise checks.input_error("file", files, "one file or more")
-        records = Records([Path(file) for file in files])
+        records = Records([checks.file_path("file", file) for file in files])
         there = records.all("gates")
         if not there:
             hint = "A UCF has the collection 'gates'; files of inputs and outputs come with it."
@@ -95,6 +96,7 @@ class Library:
             read(read_reporter, records.all("output_devices")),
         )
 
+    @checks.known_keywords
     def wiring(
         self,
         logic: str | Mapping[str, Sequence[str]],

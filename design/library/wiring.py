@@ -25,7 +25,7 @@ Gates = Mapping[str, str | Sequence[str]]
 
 
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(metaclass=checks.KnownKeywords):
     """An input of a wiring: a promoter that follows a signal or a species s, with the activity
     ymin + (ymax − ymin) · sʰ/(halfʰ + sʰ) RPU, h = power.
 

@@ -22,7 +22,7 @@ OUTSIDE = "out."
 OF_DIVISION = ("division_threshold", "birth_length")
 
 
-class Target:
+class Target(metaclass=checks.KnownKeywords):
     """A pattern that a colony should have. The ready targets are frozen dataclasses that check
     their parameters when they are made.
 

@@ -249,9 +249,15 @@ class Constrained(Several):
     parts: tuple[Target, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.more, (list, tuple)):
+            raise checks.input_error("Constrained.more", self.more, "a list of targets")
         parts = (self.target, *self.more)
         if not all(isinstance(part, Target) for part in parts):
             raise checks.input_error("Constrained", parts, "targets, such as Stripe(…)")
+        for name in ("at_least", "at_most"):
+            if not isinstance(getattr(self, name), Mapping):
+                rule = 'bounds by measure, such as {"contrast": 10.0}'
+                raise checks.input_error(f"Constrained.{name}", getattr(self, name), rule)
         for part in parts:
             of_colonies("Constrained", part)
         if not self.at_least and not self.at_most:

@@ -21,7 +21,7 @@ from design.targets.statistics import (
     ColonyStatistics,
     SeenCells,
     birth_note,
-    from_centre,
+    known_statistics,
     resampled_spread,
     seen_cells,
 )
@@ -34,7 +34,6 @@ FARTHEST = 100.0  # spreads: a statistic that is farther off counts as so far
 ENOUGH = 3  # colonies from which on the spread between them is measured
 FINEST = 0.01  # the least spread, relative to the greatest statistic of its group
 COUNT = 0.02  # the least spread of the logarithm of a number of cells
-INNER = 0.95  # share of the cells within the outermost ring
 
 
 @dataclass(frozen=True)
@@ -72,21 +71,21 @@ class Observed(Target):
     time: float | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.plan, ColonyStatistics):
+            rule = "the plan of another Observed; make one by from_table"
+            raise checks.input_error("Observed.plan", self.plan, rule)
         names = self.plan.names
         for name in ("values", "spread"):
-            given = getattr(self, name)
-            if len(given) != len(names):
-                raise checks.input_error(f"Observed.{name}", given, f"{len(names)} numbers")
+            found = checks.vector(f"Observed.{name}", getattr(self, name), len(names))
             above = 0.0 if name == "spread" else -math.inf
-            found = [
-                checks.number(f"Observed.{name}[{n!r}]", float(v), above=above)
-                for n, v in zip(names, given, strict=True)
-            ]
-            object.__setattr__(self, name, tuple(found))
+            for n, v in zip(names, found, strict=True):
+                checks.number(f"Observed.{name}[{n!r}]", v, above=above)
+            object.__setattr__(self, name, found)
         if self.time is not None:
             checks.number("Observed.time", self.time, above=0.0)
 
     @staticmethod
+    @checks.known_keywords
     def from_table(
         table: str | Path | Mapping[str, Any],
         *,
@@ -126,10 +125,11 @@ class Observed(Target):
         names = _names(species, like)
         units = tf.tables.Units(pixel_size, length_unit, angle_unit, time_unit)
         cells = read_table(table, names, units, columns or {}, length_with_caps)
-        plan = _plan(cells, names, rings, reach, length_with_caps, relative)
+        plan = known_statistics(cells, names, rings, reach, length_with_caps, relative)
         return _observed(cells, plan if like is None else _shared(plan, like), time)
 
     @staticmethod
+    @checks.known_keywords
     def from_masks(
         masks: Any,
         *,
@@ -155,19 +155,20 @@ class Observed(Target):
         `Cells.from_masks`, which reads each of them. Lengths are those of the centreline. Else as
         `from_table`. Raises InputError for what these two refuse, and for lists of other lengths.
         """
-        if species is None:
-            species = tuple(fluorescence or ()) if like is None else like.plan.species
-        caps = like is not None and like.plan.length_with_caps
+        caps = _caps(False, like)
         table = masks_table(
             masks, fluorescence, caps, pixel_size=pixel_size, background=background, frame=frame,
             drop=drop, least_area=least_area,
         )  # fmt: skip
+        if species is None:
+            species = tuple(fluorescence or ()) if like is None else like.plan.species
         return Observed.from_table(
             table, species=species, length_with_caps=caps, relative=relative, rings=rings,
             reach=reach, time=time, like=like,
         )  # fmt: skip
 
     @staticmethod
+    @checks.known_keywords
     def from_state(
         state: tf.State,
         *,
@@ -182,8 +183,13 @@ class Observed(Target):
         """The target of the colonies of a state, each a replicate. history: the notes of
         `Observed.note` after every step, for ages. Else as `from_table`."""
         names = _names(species, like)
+        if not isinstance(state, tf.State):
+            raise checks.input_error("Observed.from_state(state)", state, "a tf.State")
         require(state, names)
-        length_with_caps = length_with_caps if like is None else like.plan.length_with_caps
+        if not isinstance(history, Tensor | None):
+            rule = "the notes of Observed.note after every step, stacked, or None"
+            raise checks.input_error("Observed.from_state(history)", history, rule)
+        length_with_caps = _caps(length_with_caps, like)
         whole = ColonyStatistics(
             True,
             history is not None,
@@ -196,11 +202,12 @@ class Observed(Target):
             relative,
         )
         cells = seen_cells(state, whole, history)
-        plan = _plan(cells, names, rings, reach, length_with_caps, relative)
+        plan = known_statistics(cells, names, rings, reach, length_with_caps, relative)
         plan = plan if like is None else _shared(plan, like)
         return _observed(cells, plan, state.time or None)
 
     @staticmethod
+    @checks.known_keywords
     def from_results(
         path: str | Path,
         frame: int = -1,
@@ -214,7 +221,7 @@ class Observed(Target):
     ) -> Observed:
         """The target of a frame of a results file, with the ages of its cells. Else as
         `from_table`."""
-        length_with_caps = length_with_caps if like is None else like.plan.length_with_caps
+        length_with_caps = _caps(length_with_caps, like)
         with tf.Results(path) as results:
             table, now = results.table(frame), float(results.times[frame])
         columns = {
@@ -334,41 +341,21 @@ class Observed(Target):
 
 def _names(species: Sequence[str], like: Observed | None) -> tuple[str, ...]:
     """The species that are compared: those given, or those of `like`."""
+    _check_like(like)
     if species:
-        return species_names("Observed.species", tuple(species))
+        return species_names("Observed.species", species)
     return () if like is None else like.plan.species
 
 
-def _plan(
-    cells: SeenCells,
-    species: tuple[str, ...],
-    rings: int,
-    reach: float,
-    length_with_caps: bool,
-    relative: bool,
-) -> ColonyStatistics:
-    """The statistics of all that is known of some cells."""
-    if isinstance(rings, bool) or not isinstance(rings, int) or not 1 <= rings <= 50:
-        raise checks.input_error("Observed(rings)", rings, "a whole number from 1 to 50")
-    checks.number("Observed(reach)", reach, above=0.0)
-    checks.choice("Observed(length_with_caps)", length_with_caps, (True, False))
-    checks.choice("Observed(relative)", relative, (True, False))
-    edges: tuple[float, ...] = ()
-    if cells.position is not None:
-        outer = float(np.quantile(from_centre(cells.position, cells).cpu().numpy(), INNER))
-        # a colony of one cell has no extent; its ring is a cell long
-        edges = tuple(np.linspace(0.0, outer or reach, rings + 1).tolist())
-    return ColonyStatistics(
-        lengths=cells.length is not None,
-        ages=cells.age is not None,
-        positions=cells.position is not None,
-        alignment=cells.position is not None and cells.axis is not None,
-        species=species,
-        edges=edges,
-        reach=reach,
-        length_with_caps=length_with_caps,
-        relative=relative,
-    )
+def _check_like(like: object) -> None:
+    if not isinstance(like, Observed | None):
+        raise checks.input_error("Observed(like)", like, "another Observed, or None")
+
+
+def _caps(length_with_caps: bool, like: Observed | None) -> bool:
+    """Whether lengths include the caps: as given, or as those of `like`."""
+    _check_like(like)
+    return length_with_caps if like is None else like.plan.length_with_caps
 
 
 def _shared(known: ColonyStatistics, like: Observed) -> ColonyStatistics:

@@ -37,6 +37,10 @@ def read_table(
     """
     given = tables.Table.read(table)
     meant = (*KIND, COLONY, *species)
+    if not isinstance(columns, Mapping):
+        raise checks.input_error(
+            "Observed(columns)", columns, 'names of columns, such as {"x": "centroid_x"}'
+        )
     for name in columns:
         checks.choice("Observed(columns)", name, meant)
     _check_one_frame(given, columns)

@@ -13,10 +13,12 @@ from torch import Tensor
 
 import torchfilm as tf
 from design.targets.base import levels, ratio
+from torchfilm import checks
 
 LOG_CELLS = "log_cells"
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 RESAMPLED = 200  # bootstrapped colonies
+INNER = 0.95  # share of the cells within the outermost ring
 STEADY = 1e-12  # variance, in squares of the mean, that rounding can cause
 
 
@@ -235,6 +237,38 @@ def _quantiles(value: Tensor, cells: SeenCells) -> Tensor:
     last = len(value)  # a colony without cells may stand at the end
     one, other = sorted_values[low.clamp(max=last)], sorted_values[high.clamp(max=last)]
     return one + (place - below) * (other - one)
+
+
+def known_statistics(
+    cells: SeenCells,
+    species: tuple[str, ...],
+    rings: int,
+    reach: float,
+    length_with_caps: bool,
+    relative: bool,
+) -> ColonyStatistics:
+    """The statistics of all that is known of some cells."""
+    if isinstance(rings, bool) or not isinstance(rings, int) or not 1 <= rings <= 50:
+        raise checks.input_error("Observed(rings)", rings, "a whole number from 1 to 50")
+    checks.number("Observed(reach)", reach, above=0.0)
+    checks.choice("Observed(length_with_caps)", length_with_caps, (True, False))
+    checks.choice("Observed(relative)", relative, (True, False))
+    edges: tuple[float, ...] = ()
+    if cells.position is not None:
+        outer = float(np.quantile(from_centre(cells.position, cells).cpu().numpy(), INNER))
+        # a colony of one cell has no extent; its ring is a cell long
+        edges = tuple(np.linspace(0.0, outer or reach, rings + 1).tolist())
+    return ColonyStatistics(
+        lengths=cells.length is not None,
+        ages=cells.age is not None,
+        positions=cells.position is not None,
+        alignment=cells.position is not None and cells.axis is not None,
+        species=species,
+        edges=edges,
+        reach=reach,
+        length_with_caps=length_with_caps,
+        relative=relative,
+    )
 
 
 def from_centre(position: Tensor, cells: SeenCells) -> Tensor:

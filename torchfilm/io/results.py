@@ -52,7 +52,7 @@ class Results(metaclass=checks.KnownKeywords):
     results file."""
 
     def __init__(self, path: str | Path):
-        self.path = Path(path)
+        self.path = checks.file_path("path", path)
         self.file = open_results(self.path)
 
     def __enter__(self) -> Results:

@@ -6,7 +6,9 @@ import difflib
 import functools
 import inspect
 import math
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import torch
@@ -281,6 +283,13 @@ def vector(name: str, given: object, size: int | None = None) -> tuple[float, ..
     if not all(map(math.isfinite, out)):
         raise input_error(name, given, "finite")
     return out
+
+
+def file_path(name: str, given: object) -> Path:
+    """The path of a file, or InputError for what is no path."""
+    if not isinstance(given, (str, os.PathLike)):
+        raise input_error(name, given, "the path of a file")
+    return Path(given)
 
 
 def device(given: str | torch.device) -> torch.device:
