@@ -128,3 +128,23 @@ def test_neighbours_are_all_pairs_of_a_colony_within_the_gap(device, dtype, dim,
 def test_neighbours_within_no_such_gap_are_refused(gap):
     with pytest.raises(tf.InputError, match="gap"):
         tf.measure.neighbours(tf.Scene(tf.Growth()).bind().start(), gap)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["overlaps", "colony_centre", "colony_radius", "depth", "nematic_order", "tilt", "neighbours"],
+)
+def test_a_measure_of_no_state_is_refused(name):
+    measure = getattr(tf.measure, name)
+    more = {"gap": 1.0} if name == "neighbours" else {}
+    with pytest.raises(tf.InputError, match=rf"{name}\(state\) = None.*a tf\.State"):
+        measure(None, **more)
+    with pytest.raises(tf.InputError, match=rf"{name} has no parameter 'unheard_of'"):
+        measure(None, unheard_of=1)
+
+
+@pytest.mark.parametrize("walls", [3, ["a"]])
+def test_walls_that_are_none_are_refused(walls):
+    state = tf.Scene(tf.Growth(rate=1.0)).bind().start()
+    with pytest.raises(tf.InputError, match=r"overlaps\(walls\) = .*a list of walls"):
+        tf.measure.overlaps(state, walls)

@@ -278,3 +278,44 @@ def test_volumes_that_were_asked_for_without_gradients_still_have_them():
     r = float(state.radius)
     assert float(slope) == pytest.approx(math.pi * r * r + 2 * math.pi * r)
     assert float(state.replace(length=2 * state.length).volume) > float(first)
+
+
+# --- wrong input ----------------------------------------------------------------------------------
+
+FIRST = torch.tensor([0])
+WRONG = {
+    "a part": (
+        lambda s: s.replace(lenght=s.length),
+        r"State\.replace has no parameter 'lenght'\. Did you mean length",
+    ),
+    "a number": (lambda s: s.with_fields(growth_rate=1.0), r"'growth_rate' = 1\.0.*a tensor"),
+    "no field": (lambda s: s.declare("gfp"), r"field = 'gfp'.*tf\.Field"),
+    "a list": (lambda s: s.take([0]), r"index = \[0\].*whole numbers from 0 to 5"),
+    "floats": (lambda s: s.take(torch.tensor([0.5])), r"index = tensor.*whole numbers from 0 to 5"),
+    "no row": (lambda s: s.take(torch.tensor([9])), r"index = \[9\].*from 0 to 5"),
+    "numbers": (lambda s: s.remove(FIRST, "left"), r"gone = tensor.*shape \(6,\).*torch\.bool"),
+    "a fate": (
+        lambda s: s.remove(torch.zeros(6, dtype=torch.bool) | True, "lost"),
+        r"fate = 'lost'.*'divided', 'removed', 'left', 'failed'",
+    ),
+    "no places": (lambda s: s.select("a"), r"colonies = 'a'.*whole numbers"),
+    "None": (lambda s: s.select(None), r"colonies = None.*whole numbers"),
+    "parts of places": (lambda s: s.select([0.5]), r"colonies = \[0\.5\].*whole numbers"),
+    "a mask": (lambda s: s.select(torch.arange(4) > 1), r"colonies = tensor.*nonzero\(mask\)"),
+    "a device": (lambda s: s.to("gpu"), r'device = \'gpu\'.*"cpu" or "cuda"'),
+    "rows": (lambda s: s.uniform([0], "x"), r"rows = \[0\].*whole numbers"),
+    "rows beyond": (lambda s: s.normal(torch.tensor([9]), "x"), r"rows = \[9\].*from 0 to 5"),
+    "a purpose": (lambda s: s.uniform(FIRST, 3), r"purpose = 3.*a text"),
+    "a medium": (lambda s: s.places, r"no medium: list a Medium"),
+    "a name": (lambda s: tf.Field(3, "three"), r"Field\.name = 3.*a text"),
+    "a shape": (lambda s: tf.Field("heat", "", shape=3), r"'heat'\)\.shape = 3.*a tuple"),
+    "a value": (lambda s: tf.Field("heat", "", initial="hot"), r"initial = 'hot'.*a number"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_is_named(case):
+    call, message = WRONG[case]
+    state = batch()
+    with pytest.raises(tf.InputError, match=message):
+        call(state)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -15,6 +17,23 @@ from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.vectors import safe_norm
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def of_a_state(function: F) -> F:
+    """Let a measure raise InputError for a keyword that it does not take, and for what is no
+    state."""
+
+    @checks.known_keywords
+    @functools.wraps(function)
+    def checked(state: State, *args: Any, **given: Any) -> Any:
+        if not isinstance(state, State):
+            hint = "Such as the last one of tf.simulate(…), or scene.bind().start()."
+            raise checks.input_error(f"{function.__name__}(state)", state, "a tf.State", hint)
+        return function(state, *args, **given)
+
+    return cast(F, checked)
 
 
 @dataclass(frozen=True)
@@ -31,6 +50,7 @@ class Overlap:
     walls: Tensor
 
 
+@of_a_state
 @one_torch_thread()  # or its others wait in a loop while the next step is computed
 @torch.no_grad()
 def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
@@ -38,6 +58,8 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
 
     An overlap with a wall is measured where the cell is deepest.
     """
+    if not isinstance(walls, (list, tuple)) or not all(isinstance(w, Wall) for w in walls):
+        raise checks.input_error("overlaps(walls)", walls, "a list of walls, such as [tf.Plane(…)]")
     axis, length, radius = state.axis.double(), state.length.double(), state.radius.double()
     i, _, gap = gaps_nearby(state.position, axis, length, radius, state.colony, state.colonies)
     depth = -gap
@@ -50,12 +72,14 @@ def overlaps(state: State, walls: Sequence[Wall] = ()) -> Overlap:
     return Overlap(mean, pairs.max(depth[deep]), count, state.groups.max(at_walls))
 
 
+@of_a_state
 def colony_centre(state: State) -> Tensor:
     """Centre of volume of each colony, (B, d) µm; NaN for a colony without cells."""
     volume = state.volume.double().unsqueeze(1)
     return state.groups.sum(state.position * volume) / state.groups.sum(volume)
 
 
+@of_a_state
 def colony_radius(state: State) -> Tensor:
     """Radius of the disc with the same second moment as the cells, (B,) µm: √2 · RMS distance.
 
@@ -66,6 +90,7 @@ def colony_radius(state: State) -> Tensor:
     return (2.0 * state.groups.sum(square).squeeze(1) / state.counts).sqrt()
 
 
+@of_a_state
 @torch.no_grad()
 def depth(state: State) -> Tensor:
     """Extent of each colony along z, caps included, (B,) µm; one cell diameter in 2-D."""
@@ -76,6 +101,7 @@ def depth(state: State) -> Tensor:
     return state.groups.max(z + half) + state.groups.max(half - z)
 
 
+@of_a_state
 @torch.no_grad()
 def nematic_order(state: State) -> Tensor:
     """Alignment of the axes of each colony in the plane, (B,): 0 for random, 1 for parallel."""
@@ -85,6 +111,7 @@ def nematic_order(state: State) -> Tensor:
     return (total[:, 0] ** 2 + total[:, 1] ** 2).sqrt() / total[:, 2]
 
 
+@of_a_state
 @torch.no_grad()
 def tilt(state: State) -> Tensor:
     """Angle between each cell's axis and the x–y plane, (N,) rad, 0 … π/2."""
@@ -93,6 +120,7 @@ def tilt(state: State) -> Tensor:
     return torch.asin(state.axis[:, 2].abs().clamp(max=1))
 
 
+@of_a_state
 @one_torch_thread()
 @torch.no_grad()
 def neighbours(state: State, gap: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,11 +13,13 @@ import torch
 from torch import Tensor
 
 from torchfilm.physics import capsule
-from torchfilm.signals.layout import Contact, Layout
-from torchfilm.tools import checks, displays, random
+from torchfilm.signals.layout import Contact, Layout, Signals
+from torchfilm.tools import checks, displays, random, row_checks
 from torchfilm.tools.ragged import Groups, offsets
 
 CELL, COLONY, GRID = "cell", "colony", "grid"
+# why cells leave a state
+FATES = ("divided", "removed", "left", "failed")
 # Signals stand among the fields under "out.NAME", beside what cells hold under the same name.
 OUTSIDE = "out."
 
@@ -48,6 +50,7 @@ class Field(metaclass=checks.KnownKeywords):
     internal: bool = False
 
     def __post_init__(self) -> None:
+        row_checks.check_declaration(self.name, self.shape, self.initial)
         checks.choice(f"Field({self.name!r}).scope", self.scope, (CELL, COLONY, GRID))
         checks.choice(f"Field({self.name!r}).at_division", self.at_division, ("copy", "reset"))
         plain = self.name.removeprefix(OUTSIDE) if self.scope == GRID else self.name
@@ -91,22 +94,6 @@ class Ended:
     colony_id: Tensor
     uid: Tensor
     fate: str
-
-
-class UnknownSignal(checks.InputError, KeyError):
-    """A state was asked for a signal that it does not have."""
-
-    __str__ = Exception.__str__  # a KeyError shows its message in quotes
-
-
-class Signals(dict[str, Tensor]):
-    """Values of signals by name."""
-
-    def __missing__(self, name: str) -> Tensor:
-        raise UnknownSignal(
-            f"the state has no signal {name!r}; its signals are"
-            f" {', '.join(self) or 'none: list a Medium in the scene'}"
-        )
 
 
 MAPPINGS = ("fields", "declared", "reports")  # parts that are kept as views that cannot change
@@ -217,7 +204,8 @@ class State:
     @property
     def places(self) -> Tensor:
         """Positions in the three dimensions of the medium, (N, 3) float64, µm."""
-        assert self.layout is not None
+        if self.layout is None:
+            raise checks.InputError("the state has no medium: list a Medium in the scene.")
         if self.position.requires_grad:
             return self.layout.places(self.position)
         if "places" not in self.__dict__:
@@ -245,7 +233,7 @@ class State:
     def replace(self, **changes: Any) -> State:
         """A state with some of its parts replaced."""
         if unknown := changes.keys() - PARTS:
-            raise TypeError(f"a state has no part {', '.join(sorted(unknown))}")
+            raise checks.unknown_keyword("State.replace", min(unknown), sorted(PARTS))
         # as dataclasses.replace, which takes twenty times as long; a step makes ten states
         made, parts = object.__new__(type(self)), dict(self.__dict__)
         for name, of in DERIVED.items():
@@ -271,6 +259,7 @@ class State:
                 sorted(unknown),
                 f"declared; known are {', '.join(self.declared) or 'none'}",
             )
+        row_checks.check_tensors(values)
         return self.replace(fields={**self.fields, **values})
 
     def check_fields(self) -> None:
@@ -288,6 +277,8 @@ class State:
 
     def declare(self, field: Field) -> State:
         """A state that has one more field, at its initial value."""
+        if not isinstance(field, Field):
+            raise checks.input_error("field", field, "a tf.Field(…)")
         declared = self.replace(declared={**self.declared, field.name: field})
         if field.scope == GRID and self.layout is None:
             raise checks.InputError(
@@ -306,12 +297,16 @@ class State:
     def take(self, index: Tensor, **known: Tensor) -> State:
         """The cells at `index` (M,), which keeps colonies side by side; colonies stay, if need be
         empty. known: parts that these cells have already, such as `length`."""
-        fields = {
-            name: value.index_select(0, index) if self.declared[name].scope == CELL else value
-            for name, value in self.fields.items()
-        }
-        left = [name for name in PER_CELL if name not in known]
-        part = {name: getattr(self, name).index_select(0, index) for name in left}
+        row_checks.check_rows("index", index, self.cells)
+        try:
+            fields = {
+                name: value.index_select(0, index) if self.declared[name].scope == CELL else value
+                for name, value in self.fields.items()
+            }
+            left = [name for name in PER_CELL if name not in known]
+            part = {name: getattr(self, name).index_select(0, index) for name in left}
+        except IndexError as error:
+            raise row_checks.out_of_range("index", index, self.cells) from error
         return self.replace(**part, **known, fields=fields)
 
     def reset_at_division(self, daughters: Tensor, names: Iterable[str]) -> State:
@@ -331,7 +326,10 @@ class State:
         return self.with_fields(**changed)
 
     def remove(self, gone: Tensor, fate: str) -> State:
-        """The state without the cells where `gone` (N,) is true, whose end is noted."""
+        """The state without the cells where `gone` (N,) is true, whose end is noted. fate: one of
+        `FATES`."""
+        row_checks.check_mask("gone", gone, self.cells)
+        checks.choice("fate", fate, FATES)
         if not bool(gone.any()):
             return self
         lost, kept = torch.nonzero(gone).squeeze(1), torch.nonzero(~gone).squeeze(1)
@@ -341,13 +339,7 @@ class State:
     def select(self, colonies: Tensor | list[int]) -> State:
         """Some colonies of the batch, by their places, in the order given. Each goes on as it would
         have in the whole."""
-        places = torch.as_tensor(colonies, dtype=torch.int64, device=self.device).reshape(-1)
-        if places.numel() == 0 or bool((places < 0).any()) or bool((places >= self.colonies).any()):
-            raise checks.input_error(
-                "colonies", places.tolist(), f"places from 0 to {self.colonies - 1}, at least one"
-            )
-        if torch.unique(places).numel() != places.numel():
-            raise checks.input_error("colonies", places.tolist(), "different places")
+        places = row_checks.checked_places("colonies", colonies, self.colonies, self.device)
         start = offsets(self.counts)
         counts = self.counts.index_select(0, places)
         owner = torch.repeat_interleave(torch.arange(places.numel(), device=self.device), counts)
@@ -372,6 +364,7 @@ class State:
 
     def to(self, device: str | torch.device) -> State:
         """The same state on another device."""
+        device = checks.device(device)
         move = {name: getattr(self, name).to(device) for name in (*PER_CELL, *PER_COLONY)}
         layout = None if self.layout is None else self.layout.to(device)
         return self.replace(
@@ -393,8 +386,14 @@ class State:
         return self._drawn(random.normal, rows, purpose)
 
     def _drawn(self, law: Callable[..., Tensor], rows: Tensor, purpose: str) -> Tensor:
-        stream = self.stream.index_select(0, self.colony.index_select(0, rows))
-        uid = self.uid.index_select(0, rows)
+        row_checks.check_rows("rows", rows, self.cells)
+        if not isinstance(purpose, str):
+            raise checks.input_error("purpose", purpose, "a text")
+        try:
+            stream = self.stream.index_select(0, self.colony.index_select(0, rows))
+            uid = self.uid.index_select(0, rows)
+        except IndexError as error:
+            raise row_checks.out_of_range("rows", rows, self.cells) from error
         return law(self.seed, stream, uid, self.step, purpose, self.dtype)
 
     def _own_fields(self) -> list[str]:

@@ -50,7 +50,6 @@ INTERNAL_BEFORE = (
     "elongation",
 )
 INTERNAL_ENDING_BEFORE = "circuit_volume"
-FATES = ("divided", "removed", "left", "failed")
 CHUNK_ROWS, CHUNK_VOXELS = 512, 32768  # at most so many voxels
 CHUNK_BYTES = 1024  # of the tables that are not compressed
 BLANK = {"f": np.nan, "i": -1}  # between frames, by the kind of dtype

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchfilm.io.layout import FATES, LINEAGE
+from torchfilm.io.layout import LINEAGE
 from torchfilm.io.reading import committed, read_dataset
 from torchfilm.io.table import Tables, data_frame, needed
+from torchfilm.state import FATES
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 

@@ -17,7 +17,6 @@ from torchfilm.io.identity import scene_attributes
 from torchfilm.io.layout import (
     AT_CELLS,
     CHUNK_ROWS,
-    FATES,
     FORMAT,
     FRAME_COLUMNS,
     LINEAGE,
@@ -38,7 +37,7 @@ from torchfilm.io.reading import committed, inode_of_open
 from torchfilm.io.results import Results
 from torchfilm.model import Model
 from torchfilm.scene import Scene
-from torchfilm.state import State
+from torchfilm.state import FATES, State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import SimulationError
 from torchfilm.version import __version__

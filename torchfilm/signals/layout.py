@@ -18,6 +18,22 @@ from torchfilm.tools import checks
 from torchfilm.tools.ragged import Groups, expand_ranges
 
 
+class UnknownSignal(checks.InputError, KeyError):
+    """A state was asked for a signal that it does not have."""
+
+    __str__ = Exception.__str__  # a KeyError shows its message in quotes
+
+
+class Signals(dict[str, Tensor]):
+    """Values of signals by name."""
+
+    def __missing__(self, name: str) -> Tensor:
+        raise UnknownSignal(
+            f"the state has no signal {name!r}; its signals are"
+            f" {', '.join(self) or 'none: list a Medium in the scene'}"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Contact:
     """Where cells meet the medium.

@@ -1,0 +1,74 @@
+"""Checks of the columns of a state, and of what picks rows of them: indices, masks and places of
+colonies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfilm.tools import checks
+
+WHOLE = (torch.int64, torch.int32)
+
+
+def check_rows(name: str, rows: Any, count: int) -> None:
+    """Raises InputError for what is no 1-D tensor of whole numbers. Their range is left to
+    `out_of_range`: to look at it would wait for a GPU."""
+    if not isinstance(rows, Tensor) or rows.dtype not in WHOLE or rows.dim() != 1:
+        raise checks.input_error(name, rows, _rule(count))
+
+
+def out_of_range(name: str, rows: Tensor, count: int) -> checks.InputError:
+    """The error for rows that are not there; raise what this returns."""
+    return checks.input_error(name, rows.tolist(), _rule(count))
+
+
+def check_mask(name: str, mask: Any, count: int) -> None:
+    """Raises InputError for what is no tensor of `count` truth values."""
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape != (count,):
+        rule = f"a tensor of shape ({count},) and dtype torch.bool"
+        raise checks.input_error(name, mask, rule, "Such as state.length > 5.0.")
+
+
+def checked_places(name: str, given: Any, count: int, device: torch.device) -> Tensor:
+    """Different places from 0 to count − 1, at least one, (M,) int64."""
+    try:
+        places = torch.as_tensor(given, device=device).reshape(-1)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise checks.input_error(name, given, "whole numbers, such as [0, 2]") from error
+    if places.numel() and places.dtype not in WHOLE:
+        hint = "torch.nonzero(mask)[:, 0] has those of a mask."
+        raise checks.input_error(name, given, "whole numbers, such as [0, 2]", hint)
+    if places.numel() == 0 or bool((places < 0).any()) or bool((places >= count).any()):
+        rule = f"places from 0 to {count - 1}, at least one"
+        raise checks.input_error(name, places.tolist(), rule)
+    if torch.unique(places).numel() != places.numel():
+        raise checks.input_error(name, places.tolist(), "different places")
+    return places.to(torch.int64)
+
+
+def check_declaration(name: Any, shape: Any, initial: Any) -> None:
+    """Raises InputError for a field whose name, shape or first value is of another type."""
+    if not isinstance(name, str):
+        raise checks.input_error("Field.name", name, "a text")
+    if not isinstance(shape, tuple) or not all(isinstance(size, int) for size in shape):
+        rule = "a tuple of whole numbers, such as (3,)"
+        raise checks.input_error(f"Field({name!r}).shape", shape, rule)
+    if not callable(initial) and not isinstance(initial, (int, float)):
+        rule = "a number, or a function of a state and rows"
+        raise checks.input_error(f"Field({name!r}).initial", initial, rule)
+
+
+def check_tensors(values: Mapping[str, Any]) -> None:
+    """Raises InputError for a field's new values that are no tensor."""
+    for name, value in values.items():
+        if not isinstance(value, Tensor):
+            rule = "a tensor with a row for each cell, or colony"
+            raise checks.input_error(f"the field {name!r}", value, rule)
+
+
+def _rule(count: int) -> str:
+    return f"a 1-D tensor of whole numbers from 0 to {count - 1}, the rows of cells"
