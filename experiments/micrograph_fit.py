@@ -99,7 +99,7 @@ def picture() -> None:
     columns = {
         "x": x,
         "y": y,
-        "angle": angle + rng.normal(0, 0.05, len(x)),
+        "angle_rad": angle + rng.normal(0, 0.05, len(x)),
         "length": length + rng.normal(0, 1.5, len(x)),
         "label": np.arange(1, len(x) + 1),
     }

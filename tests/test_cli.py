@@ -177,11 +177,34 @@ def test_rules_beside_the_scene_file_are_found_from_anywhere(command, tmp_path):
     assert frames("a.h5")["growth_rate"].tolist() == [0.5]
 
 
+@pytest.mark.parametrize(
+    "header, options",
+    [
+        ("x_um,y_um,angle_deg,length_um", ()),
+        ("x,y,angle,length", ("--length-unit", "um", "--angle-unit", "degrees")),
+        ("x,y,angle_deg,length", ("--pixel-size", 1.0)),
+    ],
+)
+def test_the_units_of_a_table_are_options(command, header, options):
+    Path("cells.csv").write_text(f"{header}\n0,0,90,2\n")
+    run = ("run", "microcolony", "--until", 0.05, "--out", "a.h5", "--no-picture")
+    command(*run, "--start", "cells.csv", *options)
+    with tf.Results("a.h5") as results:
+        first = results.frame(0)
+    assert first["length"].tolist() == [2.0]
+    assert first["axis"][0].tolist() == pytest.approx([0.0, 1.0], abs=1e-6)
+
+
 @pytest.mark.parametrize("kind", ["csv", "h5"])
 def test_start_from_a_file_of_cells(command, capsys, kind):
-    columns = {"x": [0.0, 0.0], "y": [0.0, 0.8], "angle": [0.0, 0.0], "length": [2.0, 2.2]}
+    columns = {
+        "x_um": [0.0, 0.0],
+        "y_um": [0.0, 0.8],
+        "angle_rad": [0.0, 0.0],
+        "length_um": [2.0, 2.2],
+    }
     if kind == "csv":
-        Path("cells.csv").write_text("x,y,angle,length\n0,0,0,2\n0,0.8,0,2.2\n")
+        Path("cells.csv").write_text("x_um,y_um,angle_rad,length_um\n0,0,0,2\n0,0.8,0,2.2\n")
     else:
         with h5py.File("cells.h5", "w") as file:
             for name, values in columns.items():
@@ -237,7 +260,7 @@ def test_resume_of_ones_own_scene_with_its_settings(command):
 
 
 def test_resume_a_run_from_given_cells(command):
-    Path("cells.csv").write_text("x,y,angle,length,gfp\n0,0,0,2,1\n0,1.2,0,2.2,2\n")
+    Path("cells.csv").write_text("x_um,y_um,angle_rad,length_um,gfp\n0,0,0,2,1\n0,1.2,0,2.2,2\n")
     for name, until in (("whole.h5", 3), ("parts.h5", 1)):
         command("run", "microcolony", "--start", "cells.csv", "--until", until, "--out", name)
     command("resume", "parts.h5", "--until", 3)

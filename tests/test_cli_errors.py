@@ -20,13 +20,14 @@ def spoilt(tmp_path_factory) -> Path:
     """A folder with files of every unwelcome kind, and one good results file."""
     folder = tmp_path_factory.mktemp("spoilt")
     (folder / "text.h5").write_text("no numbers here\n" * 100)
-    (folder / "text.csv").write_text("x,y,angle,length\n0,zero,0,2\n")
-    (folder / "header.csv").write_text("x,y,angle,length\n")
-    (folder / "semicolons.csv").write_text("x;y;angle;length\n0;0;0;2\n")
+    (folder / "text.csv").write_text("x_um,y_um,angle_rad,length_um\n0,zero,0,2\n")
+    (folder / "header.csv").write_text("x_um,y_um,angle_rad,length_um\n")
+    (folder / "semicolons.csv").write_text("x_um;y_um;angle_rad;length_um\n0;0;0;2\n")
+    (folder / "plain.csv").write_text("x,y,angle,length\n0,0,0,2\n")
     (folder / "nothing.csv").write_text("")
-    (folder / "negative.csv").write_text("x,y,angle,length\n0,0,0,-2\n")
+    (folder / "negative.csv").write_text("x_um,y_um,angle_rad,length_um\n0,0,0,-2\n")
     with h5py.File(folder / "foreign.h5", "w") as file:
-        file["x"] = [1.0]
+        file["x_um"] = [1.0]
     (folder / "mine.py").write_text(OWN)
     (folder / "fixed.py").write_text(
         "import torchfilm as tf\nscene = tf.Scene(tf.Growth(rate=1.0))\n"
@@ -92,11 +93,20 @@ ERRORS = {
     "run microcolony --device banana": ("device", "banana"),
     "run microcolony --start missing.csv": (r"missing\.csv", ""),
     "run microcolony --start missing.h5": (r"missing\.h5", ""),
-    "run microcolony --start text.csv": (r"text\.csv, line 2, column 'y'", "zero"),
+    "run microcolony --start text.csv": (r"text\.csv, line 2, column 'y_um'", "zero"),
     "run microcolony --start header.csv": (r"header\.csv", "no cell"),
     "run microcolony --start semicolons.csv": (r"semicolons\.csv, line 1", "commas"),
     "run microcolony --start nothing.csv": (r"nothing\.csv", "empty"),
     "run microcolony --start negative.csv": (r"length\[0\]", "-2"),
+    "run microcolony --start plain.csv": (
+        "'x' has no unit",
+        "Give --pixel-size .* or --length-unit um, or call the column",
+    ),
+    "run microcolony --start plain.csv --length-unit um": (
+        "'angle' has no unit",
+        "Give --angle-unit degrees or radians, or call the column",
+    ),
+    "run microcolony --angle-unit degrees": ("--angle-unit = 'degrees'", "without --start"),
     "run microcolony --start text.h5": (r"text\.h5", ""),
     "run microcolony --start foreign.h5": (r"foreign\.h5", "'y'"),
     "run microcolony --out good.h5": (r"--out = 'good\.h5'", r"--overwrite.*resume good\.h5"),
@@ -215,7 +225,7 @@ def test_resume_with_a_field_of_another_shape_is_reported(command):
 
 # --- notes on the cells to start from -------------------------------------------------------------
 
-CELLS = "x,y,angle,length,colony\n0,0,0,2,0\n5,0,0,2,0\n0,0,0,2,2\n"
+CELLS = "x_um,y_um,angle_rad,length_um,colony\n0,0,0,2,0\n5,0,0,2,0\n0,0,0,2,2\n"
 
 
 @pytest.mark.parametrize(
@@ -248,7 +258,7 @@ def test_fewer_colonies_than_the_file_has_are_refused(command):
 def test_a_file_whose_every_colony_has_cells_needs_no_note(command, capsys):
     Path("cells.csv").write_text(CELLS.replace(",2\n", ",1\n"))
     command("run", "microcolony", "--start", "cells.csv", "--until", 0.5)
-    Path("copies.csv").write_text("x,y,angle,length\n0,0,0,2\n")
+    Path("copies.csv").write_text("x_um,y_um,angle_rad,length_um\n0,0,0,2\n")
     command(
         "run",
         "microcolony",
@@ -265,7 +275,7 @@ def test_a_file_whose_every_colony_has_cells_needs_no_note(command, capsys):
 
 
 def test_columns_that_no_effect_uses_are_noted(command, capsys):
-    Path("cells.csv").write_text("x,y,angle,length,gfp,size\n0,0,0,2,0.5,3\n")
+    Path("cells.csv").write_text("x_um,y_um,angle_rad,length_um,gfp,size\n0,0,0,2,0.5,3\n")
     command("run", "microcolony", "--start", "cells.csv", "--until", 0.5)
     assert (
         "note: cells.csv: gfp, size are recorded as quantities per cell, which no effect uses."
@@ -274,10 +284,10 @@ def test_columns_that_no_effect_uses_are_noted(command, capsys):
 
 
 def test_a_warning_in_the_shell_is_one_line_without_code(tmp_path):
-    (tmp_path / "cells.csv").write_text("x,y,angle,length\n0,0,45,2\n")
+    (tmp_path / "cells.csv").write_text("x_um,y_um,angle_rad,length_um\n0,0,45,2\n")
     arguments = ("run", "microcolony", "--start", "cells.csv", "--until", 0.5, "--no-picture")
     done = shell(*arguments, folder=tmp_path)
     lines = [line for line in done.stderr.splitlines() if "warning" in line.lower()]
     assert done.returncode == 0 and len(lines) == 1, done.stderr
-    assert lines[0].startswith("warning: cells.csv: the column 'angle' reaches 45")
+    assert lines[0].startswith("warning: cells.csv: the column 'angle_rad' reaches 45")
     assert "warnings.warn" not in done.stderr

@@ -130,7 +130,7 @@ def test_no_cell_no_overlap():
 # --- CSV and HDF5 ---------------------------------------------------------------------------------
 
 CSV = """\
-x,y,angle,length,radius,cell_type,colony,gfp
+x_um,y_um,angle_rad,length_um,radius_um,cell_type,colony,gfp
 0,1,0,2.0,0.5,1,0,0.25
 10,1,1.5707963267948966,3.0,0.4,0,1,0.75
 """
@@ -153,7 +153,7 @@ def test_csv(tmp_path):
 
 def test_csv_in_space_with_axes(tmp_path):
     path = tmp_path / "cells.csv"
-    path.write_text("x,y,z,axis_x,axis_y,axis_z,length\n1,2,3,0,0,2,2.5\n")
+    path.write_text("x_um,y_um,z_um,axis_x,axis_y,axis_z,length_um\n1,2,3,0,0,2,2.5\n")
     cells = tf.Cells.from_table(path)
     assert cells.position.tolist() == [[1.0, 2.0, 3.0]] and cells.axis.tolist() == [[0.0, 0.0, 1.0]]
     assert cells.length.tolist() == [2.5] and cells.radius.tolist() == [0.5]
@@ -164,10 +164,10 @@ def test_hdf5(tmp_path, group):
     path = tmp_path / "cells.h5"
     with h5py.File(path, "w") as file:
         for name, values in {
-            "x": [0.0, 5.0],
-            "y": [1.0, 1.0],
-            "angle": [0.0, 0.0],
-            "length": [2.0, 3.0],
+            "x_um": [0.0, 5.0],
+            "y_um": [1.0, 1.0],
+            "angle_rad": [0.0, 0.0],
+            "length_um": [2.0, 3.0],
             "cell_type": [0, 2],
         }.items():
             file[f"{group}/{name}"] = values
@@ -179,13 +179,15 @@ def test_hdf5(tmp_path, group):
 
 
 def test_table():
-    cells = tf.Cells.from_table({"x": [0.0], "y": [0.0], "angle": [math.pi / 6], "length": [2.0]})
+    cells = tf.Cells.from_table(
+        {"x_um": [0.0], "y_um": [0.0], "angle_rad": [math.pi / 6], "length_um": [2.0]}
+    )
     assert np.allclose(cells.axis, [[math.sqrt(3) / 2, 0.5]], rtol=0, atol=1e-15)
 
 
 def test_a_run_from_a_csv_file(tmp_path):
     path = tmp_path / "cells.csv"
-    path.write_text("x,y,angle,length\n0,0,0,2\n0,1.1,0.1,2.5\n")
+    path.write_text("x_um,y_um,angle_rad,length_um\n0,0,0,2\n0,1.1,0.1,2.5\n")
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=3.0), tf.Mechanics(dim=2))
     state = scene.bind(2, cells=tf.Cells.from_table(path)).start()
     for _ in range(10):
@@ -233,26 +235,26 @@ BAD = {
     "extra reserved": (lambda: tf.Cells(P, A, extra={"volume": [1.0, 2.0]}), r"volume"),
     "extra no name": (lambda: tf.Cells(P, A, extra={"mean gfp": [1.0, 2.0]}), r"mean gfp"),
     "table without x": (
-        lambda: tf.Cells.from_table({"y": [0.0], "length": [1.0], "angle": [0.0]}),
-        r"lacks the column 'x'.*y, length",
+        lambda: tf.Cells.from_table({"y_um": [0.0], "length_um": [1.0], "angle_rad": [0.0]}),
+        r"lacks the column 'x'.*y_um, length_um",
     ),
     "table without length": (
-        lambda: tf.Cells.from_table({"x": [0.0], "y": [0.0], "angle": [0.0]}),
+        lambda: tf.Cells.from_table({"x_um": [0.0], "y_um": [0.0], "angle_rad": [0.0]}),
         r"lacks the column 'length'",
     ),
     "table without direction": (
-        lambda: tf.Cells.from_table({"x": [0.0], "y": [0.0], "length": [1.0]}),
+        lambda: tf.Cells.from_table({"x_um": [0.0], "y_um": [0.0], "length_um": [1.0]}),
         r"'angle'.*axis_x, axis_y",
     ),
     "table unequal": (
         lambda: tf.Cells.from_table(
-            {"x": [0.0, 1.0], "y": [0.0], "angle": [0.0, 0.0], "length": [2.0, 2.0]}
+            {"x_um": [0.0, 1.0], "y_um": [0.0], "angle_rad": [0.0, 0.0], "length_um": [2.0, 2.0]}
         ),
-        r"\by\b",
+        r"\by_um\b",
     ),
     "table axis unequal": (
         lambda: tf.Cells.from_table(
-            {"x": [0.0, 1.0], "y": [0.0, 1.0], "angle": [0.0], "length": [2.0, 2.0]}
+            {"x_um": [0.0, 1.0], "y_um": [0.0, 1.0], "angle_rad": [0.0], "length_um": [2.0, 2.0]}
         ),
         r"angle|axis",
     ),
@@ -267,37 +269,52 @@ def test_bad_cells_are_refused_by_name(kind):
 
 
 BAD_CSV = {
-    "text": ("x,y,angle,length\n0,0,0,2\n1,zero,0,2\n", r"line 3, column 'y'.*'zero'"),
-    "blank": ("x,y,angle,length\n0,0,0,2\n1,,0,2\n", r"line 3, column 'y'"),
-    "short row": (
-        "x,y,angle,length\n0,0,0,2\n1,0,0,2\n1,0,0\n",
-        r"line 4, column 'length'.*3 values.*4 columns",
+    "text": (
+        "x_um,y_um,angle_rad,length_um\n0,0,0,2\n1,zero,0,2\n",
+        r"line 3, column 'y_um'.*'zero'",
     ),
-    "one word": ("x,y,angle,length\n0,0,0,2\nend\n", r"line 3, column 'y'.*1 value .*4 columns"),
-    "long row": ("x,y,angle,length\n0,0,0,2\n1,0,0,2,9\n", r"line 3"),
-    "decimal commas": ("x,y,angle,length\n0,0,0,2\n1,5,0,0,2,0\n", r"line 3"),
-    "empty file": ("", r"cells\.csv.*empty.*header.*x,y,angle,length"),
+    "blank": ("x_um,y_um,angle_rad,length_um\n0,0,0,2\n1,,0,2\n", r"line 3, column 'y_um'"),
+    "short row": (
+        "x_um,y_um,angle_rad,length_um\n0,0,0,2\n1,0,0,2\n1,0,0\n",
+        r"line 4, column 'length_um'.*3 values.*4 columns",
+    ),
+    "one word": (
+        "x_um,y_um,angle_rad,length_um\n0,0,0,2\nend\n",
+        r"line 3, column 'y_um'.*1 value .*4 columns",
+    ),
+    "long row": ("x_um,y_um,angle_rad,length_um\n0,0,0,2\n1,0,0,2,9\n", r"line 3"),
+    "decimal commas": ("x_um,y_um,angle_rad,length_um\n0,0,0,2\n1,5,0,0,2,0\n", r"line 3"),
+    "empty file": ("", r"cells\.csv.*empty.*header.*x_um,y_um,angle_rad,length_um"),
     "blank lines only": ("\n\n", r"cells\.csv.*empty"),
-    "header only": ("x,y,angle,length\n", r"cells\.csv.*no cell.*header"),
-    "semicolons": ("x;y;angle;length\n0;0;0;2\n", r"cells\.csv, line 1.*semicolon.*comma"),
+    "header only": ("x_um,y_um,angle_rad,length_um\n", r"cells\.csv.*no cell.*header"),
+    "semicolons": (
+        "x_um;y_um;angle_rad;length_um\n0;0;0;2\n",
+        r"cells\.csv, line 1.*semicolon.*comma",
+    ),
     "semicolons and decimal commas": (
-        "x;y;angle;length\n0,5;0;0;2,0\n",
+        "x_um;y_um;angle_rad;length_um\n0,5;0;0;2,0\n",
         r"cells\.csv, line 1.*semicolon.*comma.*decimal point",
     ),
-    "tabs": ("x\ty\tangle\tlength\n0\t0\t0\t2\n", r"cells\.csv, line 1.*tab.*comma"),
+    "tabs": ("x_um\ty_um\tangle_rad\tlength_um\n0\t0\t0\t2\n", r"cells\.csv, line 1.*tab.*comma"),
     "angle and axis": (
-        "x,y,angle,axis_x,axis_y,length\n0,0,0,1,0,2\n",
+        "x_um,y_um,angle_rad,axis_x,axis_y,length_um\n0,0,0,1,0,2\n",
         r"cells\.csv.*'angle'.*'axis_x'.*one of the two",
     ),
     "angle and half an axis": (
-        "x,y,angle,axis_y,length\n0,0,0,1,2\n",
+        "x_um,y_um,angle_rad,axis_y,length_um\n0,0,0,1,2\n",
         r"'angle'.*'axis_y'.*one of the two",
     ),
-    "a name twice": ("x,y,angle,length,x\n0,0,0,2,1\n", r"cells\.csv, line 1.*'x' twice"),
+    "a name twice": (
+        "x_um,y_um,angle_rad,length_um,x_um\n0,0,0,2,1\n",
+        r"cells\.csv, line 1.*'x_um' twice",
+    ),
     "no header": ("0,0,0,2\n1,0,0,2\n", r"line 1: numbers instead of a header"),
-    "nan": ("x,y,angle,length\n0,0,0,2\nnan,0,0,2\n", r"line 3, column 'x': 'nan' is not a number"),
-    "negative": ("x,y,angle,length\n0,0,0,-2\n", r"length\[0\]"),
-    "zero axis": ("x,y,axis_x,axis_y,length\n0,0,0,0,2\n", r"axis\[0\]"),
+    "nan": (
+        "x_um,y_um,angle_rad,length_um\n0,0,0,2\nnan,0,0,2\n",
+        r"line 3, column 'x_um': 'nan' is not a number",
+    ),
+    "negative": ("x_um,y_um,angle_rad,length_um\n0,0,0,-2\n", r"length\[0\]"),
+    "zero axis": ("x_um,y_um,axis_x,axis_y,length_um\n0,0,0,0,2\n", r"axis\[0\]"),
 }
 
 
@@ -314,7 +331,10 @@ def test_bad_csv_files_are_refused_with_the_place(tmp_path, kind):
 
 @pytest.mark.parametrize(
     "data",
-    [b"x,y,angle,length\n0,0,0,\xff\xfe\n", b"x,y,angle,length\n0,0,\x00,2\n"],
+    [
+        b"x_um,y_um,angle_rad,length_um\n0,0,0,\xff\xfe\n",
+        b"x_um,y_um,angle_rad,length_um\n0,0,\x00,2\n",
+    ],
     ids=["not UTF-8", "a zero byte"],
 )
 def test_a_csv_file_that_is_no_text_is_reported(tmp_path, data):
@@ -326,13 +346,13 @@ def test_a_csv_file_that_is_no_text_is_reported(tmp_path, data):
 
 def test_a_table_without_cells_is_reported():
     with pytest.raises(tf.InputError, match=r"table.*no cell"):
-        tf.Cells.from_table({"x": [], "y": [], "angle": [], "length": []})
+        tf.Cells.from_table({"x_um": [], "y_um": [], "angle_rad": [], "length_um": []})
 
 
 def test_csv_lines_are_counted_as_an_editor_does(tmp_path):
     """Blank lines count: the bad number is in the fifth line of the file."""
     path = tmp_path / "cells.csv"
-    path.write_text("x,y,angle,length\n0,0,0,2\n\n\n1,zero,0,2\n")
+    path.write_text("x_um,y_um,angle_rad,length_um\n0,0,0,2\n\n\n1,zero,0,2\n")
     with pytest.raises(tf.InputError, match="line 5"):
         tf.Cells.from_table(path)
 
@@ -353,7 +373,7 @@ def test_a_file_that_is_no_hdf5_is_reported(tmp_path):
 def test_a_missing_group_is_reported(tmp_path):
     path = tmp_path / "cells.h5"
     with h5py.File(path, "w") as file:
-        file["x"] = [0.0]
+        file["x_um"] = [0.0]
     with pytest.raises(tf.InputError, match="frame"):
         tf.Cells.from_hdf5(path, "/frame")
 
@@ -361,7 +381,12 @@ def test_a_missing_group_is_reported(tmp_path):
 def test_a_data_set_of_text_is_reported(tmp_path):
     path = tmp_path / "cells.h5"
     with h5py.File(path, "w") as file:
-        file["x"], file["y"], file["angle"], file["length"] = [0.0], [0.0], [0.0], [2.0]
+        file["x_um"], file["y_um"], file["angle_rad"], file["length_um"] = (
+            [0.0],
+            [0.0],
+            [0.0],
+            [2.0],
+        )
         file["strain"] = ["K12"]
     with pytest.raises(tf.InputError, match="strain"):
         tf.Cells.from_hdf5(path)
@@ -386,7 +411,12 @@ def test_two_cells_at_one_place_are_noticed():
 
 
 def test_two_cells_at_one_place_in_a_table_are_refused():
-    columns = {"x": [4.0, 1.0, 4.0], "y": [0.0] * 3, "angle": [0.0, 0.0, 1.0], "length": [2.0] * 3}
+    columns = {
+        "x_um": [4.0, 1.0, 4.0],
+        "y_um": [0.0] * 3,
+        "angle_rad": [0.0, 0.0, 1.0],
+        "length_um": [2.0] * 3,
+    }
     with pytest.raises(
         tf.InputError, match=r"row 1: 2 cells.*\[4\.0, 0\.0\].*positions: 1.*listed twice"
     ):

@@ -200,6 +200,7 @@ class Cells(metaclass=checks.KnownKeywords):
         table: Any,
         *,
         pixel_size: float | None = None,
+        length_unit: str | None = None,
         columns: str | Mapping[str, str] | None = None,
         angle_unit: str | None = None,
         angle_turns: str | None = None,
@@ -219,10 +220,10 @@ class Cells(metaclass=checks.KnownKeywords):
         "skimage" (regionprops_table; the cell is the capsule with the same second moments, and with
         the same area where the table has it) or "matlab" (regionprops).
 
-        Lengths are in µm, or in pixels of pixel_size µm; angles in angle_unit, "radians" (the
-        default) or "degrees". A column may name its unit: x_um, x_px, angle_deg, angle_rad. y: "up"
-        (the default) or "down", as in images; then y changes its sign, so that the centre of the
-        first pixel is the origin. angle_turns: "clockwise" or "counterclockwise" as seen; default
+        Units stand in the names of columns (x_um or x_px, angle_deg or angle_rad) or in arguments:
+        pixel_size, µm a pixel; length_unit "um"; angle_unit "degrees" or "radians". y: "up" (the
+        default) or "down", as in images; then y changes its sign, so that the centre of the first
+        pixel is the origin. angle_turns: "clockwise" or "counterclockwise" as seen; default
         from +x towards the table's +y. length_with_caps: lengths include both caps, as masks
         measure them. radius: µm, of all cells, where no column gives it; default 0.5. centre: move
         the mean of the centres of each colony to the origin.
@@ -231,16 +232,17 @@ class Cells(metaclass=checks.KnownKeywords):
         fields: further columns that become fields of the cells, by name or {"field": "column"};
         without `columns`, by default all others, but never those that number cells or frames.
 
-        Raises InputError for a column that is missing, is not numbers or is used twice, for rows
-        with one label or one place, for several frames, and for arguments that nothing uses. Warns
-        of angles that cannot be in their unit, and of widths that no bacteria have.
+        Raises InputError for a column that is missing, has no unit, is not numbers or is used
+        twice, for rows with one label or one place, for several frames, and for arguments that
+        nothing uses. Warns of angles that cannot be in their unit, and of widths that no bacteria
+        have.
         """
         from torchfilm.micrographs.cell_tables import Reading, table_cells
         from torchfilm.micrographs.record import with_usual_widths
 
         reading = Reading(
-            pixel_size, columns, angle_unit, angle_turns, y, length_with_caps, radius, frame,
-            fields, centre,
+            pixel_size, length_unit, columns, angle_unit, angle_turns, y, length_with_caps, radius,
+            frame, fields, centre,
         )  # fmt: skip
         return with_usual_widths(Cells(**table_cells(Table.read(table), reading)))
 
@@ -294,9 +296,16 @@ class Cells(metaclass=checks.KnownKeywords):
 
     @staticmethod
     @checks.known_keywords
-    def from_hdf5(path: str | Path, group: str = "/") -> Cells:
-        """Cells from an HDF5 file with one data set per column in `group`, in µm and radians as
-        `from_table` takes them by default."""
+    def from_hdf5(
+        path: str | Path,
+        group: str = "/",
+        *,
+        pixel_size: float | None = None,
+        length_unit: str | None = None,
+        angle_unit: str | None = None,
+    ) -> Cells:
+        """Cells from an HDF5 file with one data set per column in `group`. Columns and units: as
+        for `from_table`."""
         import h5py
 
         try:
@@ -312,7 +321,8 @@ class Cells(metaclass=checks.KnownKeywords):
             }
         from torchfilm.micrographs.cell_tables import Reading, table_cells
 
-        return Cells(**table_cells(Table.read(columns, str(path)), Reading()))
+        reading = Reading(pixel_size, length_unit, angle_unit=angle_unit)
+        return Cells(**table_cells(Table.read(columns, str(path)), reading))
 
     def relaxed(self, depth: float = 0.01, walls: Sequence[Wall] = ()) -> Cells:
         """The same cells, pushed apart until none overlap by more than `depth` µm, and out of the

@@ -16,11 +16,6 @@ from torchfilm import checks, tables
 
 COLONY, FRAME = "colony", "frame"
 KIND = {"x": "length", "y": "length", "length": "length", "angle": "angle", "age": "time"}
-HINTS = {
-    "length": 'Give pixel_size=… (µm a pixel) or length_unit="um", or call the column "{0}_um".',
-    "angle": 'Give angle_unit="degrees" or "radians", or call the column "{0}_deg" or "{0}_rad".',
-    "time": 'Give time_unit="h" or "min", or call the column "{0}_h" or "{0}_min".',
-}
 
 
 def read_table(
@@ -39,7 +34,10 @@ def read_table(
     meant = (*KIND, COLONY, *species)
     if not isinstance(columns, Mapping):
         raise checks.input_error(
-            "Observed(columns)", columns, 'names of columns, such as {"x": "centroid_x"}'
+            "Observed(columns)",
+            columns,
+            'names of columns, such as {"x": "centroid_x"}',
+            'Cells.from_table(…, columns="skimage").table() turns the table of a program into one.',
         )
     for name in columns:
         checks.choice("Observed(columns)", name, meant)
@@ -47,20 +45,10 @@ def read_table(
     found: dict[str, Tensor] = {}
     used: set[tuple[str, str]] = set()
     for name, kind in KIND.items():
-        known = given.column(name, kind, columns)
+        known = given.quantity(name, kind, columns, units, used)
         if known is None:
             continue
-        column, unit = known
-        if not unit:
-            unit = units.stated(kind)
-            used.add((kind, unit))
-        if not unit:
-            raise tf.InputError(
-                f"{given.source}: the column {column!r} has no unit. {HINTS[kind].format(name)}"
-            )
-        factor = units.factor(kind, unit, column)
-        if tables.UNITS[kind][unit] is None:
-            used.add(("pixels", ""))
+        column, _, factor = known
         numbers = given.numbers(column)
         if name in ("length", "age"):
             _check_positive(given, column, numbers, name == "length" and length_with_caps)

@@ -260,7 +260,13 @@ def test_rates_read_the_cell(tmp_path):
 
 def test_first_cells_from_a_table(tmp_path):
     scene = tf.from_cellmodeller(written(tmp_path, GROWS))
-    table = {"x": [0.0], "y": [0.0], "length": [2.0], "angle": [0.0], "plasmids": [4.0]}
+    table = {
+        "x_um": [0.0],
+        "y_um": [0.0],
+        "length_um": [2.0],
+        "angle_rad": [0.0],
+        "plasmids": [4.0],
+    }
     state = scene.bind(cells=tf.Cells.from_table(table), dtype=torch.float64).start()
     assert state.plasmids.tolist() == [4] and 3 <= state.targetVol.item() <= 3.5
 

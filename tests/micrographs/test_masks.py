@@ -102,8 +102,8 @@ def test_widths_that_no_bacteria_have_give_a_warning(pixel_size):
     with pytest.warns(UserWarning, match=rf"µm wide.*Is pixel_size = {pixel_size:g} µm right"):
         read(masked(), pixel_size=pixel_size)
     with pytest.warns(UserWarning, match="Are the columns in µm"):
-        columns = {"x": [0.0, 40.0], "y": [0.0, 0.0], "angle": [0.0, 0.0]}
-        tf.Cells.from_table(columns | {"length": [30.0, 31.0], "width": [9.0, 9.5]})
+        columns = {"x_um": [0.0, 40.0], "y_um": [0.0, 0.0], "angle_rad": [0.0, 0.0]}
+        tf.Cells.from_table(columns | {"length_um": [30.0, 31.0], "width_um": [9.0, 9.5]})
 
 
 # --- files ----------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ TABLE = {
 def cells(**options) -> tf.Cells:
     names = {"x": "cx", "y": "cy", "angle": "a", "length": "L", "label": "id"}
     given = {"pixel_size": 0.1, "columns": names, "y": "down", "radius": 0.5, **options}
+    given["angle_unit"] = "radians"
     return tf.Cells.from_table(TABLE, **given)
 
 

@@ -12,14 +12,19 @@ import torch
 from rasterised import rasterised
 
 import torchfilm as tf
+from design import Observed
 
 SKIMAGE = ("label", "centroid", "orientation", "axis_major_length", "axis_minor_length", "area")
 
 
 def table(**columns) -> dict:
-    return {"x": [0.0, 5.0], "y": [0.0, 0.0], "angle": [0.0, 1.0], "length": [2.0, 2.0], **columns}
+    """Columns x, y, angle and length, in µm and radians."""
+    given = {"x": [0.0, 5.0], "y": [0.0, 0.0], "angle": [0.0, 1.0], "length": [2.0, 2.0], **columns}
+    units = {"x": "um", "y": "um", "length": "um", "angle": "rad"}
+    return {f"{n}_{units[n]}" if n in units else n: values for n, values in given.items()}
 
 
+IN_PIXELS = {"x_px": [0.0, 5.0], "y_px": [0.0] * 2, "angle_rad": [0.0] * 2, "length_px": [2.0] * 2}
 PIXELS = {"cx": [10.0, 40.0], "cy": [20.0, 50.0], "theta": [0.0, 30.0], "L": [40.0, 60.0]}
 NAMES = {"x": "cx", "y": "cy", "length": "L", "angle": "theta"}
 
@@ -57,19 +62,19 @@ def test_the_sense_of_angles(options, sign):
 
 def test_long_labels_have_all_their_digits():
     long = [2**60, 2**60 + 1]  # which are one float
-    found = tf.Cells.from_table(table(label=long), pixel_size=0.1, fields=[])
+    found = tf.Cells.from_table({**IN_PIXELS, "label": long}, pixel_size=0.1, fields=[])
     assert found.micrograph.label.tolist() == [str(n) for n in long]
 
 
 def test_masked_values_are_missing():
     masked = np.ma.array([0.0, 5.0], mask=[False, True])
-    with pytest.raises(tf.InputError, match="row 2, column 'x': 'nan' is not a number"):
+    with pytest.raises(tf.InputError, match="row 2, column 'x_um': 'nan' is not a number"):
         tf.Cells.from_table(table(x=masked))
 
 
 def test_axes_are_mirrored_with_y():
     columns = {"x": [0.0], "y": [3.0], "axis_x": [0.6], "axis_y": [0.8], "length": [2.0]}
-    cells = tf.Cells.from_table(columns, y="down")
+    cells = tf.Cells.from_table(columns, length_unit="um", y="down")
     assert np.allclose(cells.axis, [[0.6, -0.8]]) and cells.position.tolist() == [[0.0, -3.0]]
 
 
@@ -101,7 +106,8 @@ def test_a_data_frame_and_a_csv_file_give_the_same_cells(tmp_path):
     frame.rename(columns={v: k for k, v in NAMES.items()}).drop(columns="name").to_csv(
         tmp_path / "own.csv"
     )
-    assert set(tf.Cells.from_table(tmp_path / "own.csv", angle_unit="degrees").extra) == {"t"}
+    own = tf.Cells.from_table(tmp_path / "own.csv", length_unit="um", angle_unit="degrees")
+    assert set(own.extra) == {"t"}
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -123,7 +129,7 @@ def test_cells_are_the_same_after_a_table(dim):
 @pytest.mark.parametrize("kind", ["table", "csv", "hdf5"])
 def test_degrees_are_noticed(tmp_path, kind):
     columns = table(angle=[0.5, -87.5])
-    said = r"'angle' reaches 87\.5.*radians.*1 of 2.*degrees"
+    said = r"'angle_rad' reaches 87\.5.*radians.*1 of 2.*degrees"
     with pytest.warns(RuntimeWarning, match=said) as found:
         if kind == "table":
             tf.Cells.from_table(columns)
@@ -152,12 +158,24 @@ def test_units_are_known_as_people_write_them(micro, angle):
     cells = tf.Cells.from_table({**names, angle: [90.0]})
     assert cells.length.tolist() == [2.0] and cells.extra == {}
     assert cells.axis.tolist()[0] == pytest.approx([0.0, 1.0], abs=1e-15)
-    same = tf.Cells.from_table({**names, "angle": [90.0]}, angle_unit="deg")
-    assert same.axis.tolist() == cells.axis.tolist()
+    plain = {"x": [2.0], "y": [2.0], "length": [2.0], "angle": [90.0]}
+    same = tf.Cells.from_table(plain, length_unit=micro, angle_unit="deg")
+    assert same.axis.tolist() == cells.axis.tolist() and same.length.tolist() == [2.0]
+
+
+def test_units_are_never_guessed():
+    """`Cells` and `design.Observed` read their tables by the same rules."""
+    plain = {"x": [0.0], "y": [0.0], "length": [2.0], "angle": [0.0]}
+    for read in (tf.Cells.from_table, Observed.from_table):
+        with pytest.raises(tf.InputError, match=r"'x' has no unit.*length_unit=\"um\".*\"x_um\""):
+            read(plain, angle_unit="radians")
+        with pytest.raises(tf.InputError, match=r"'angle' has no unit.*angle_unit.*\"angle_deg\""):
+            read(plain, length_unit="um")
+        read(plain, length_unit="um", angle_unit="radians")
 
 
 def test_radians_taken_for_degrees_are_noticed():
-    many = {"x": np.arange(9.0), "y": np.zeros(9), "length": np.ones(9)}
+    many = {"x_um": np.arange(9.0), "y_um": np.zeros(9), "length_um": np.ones(9)}
     with pytest.warns(RuntimeWarning, match=r"all 9 values.*within ±1\.5.*radians") as told:
         tf.Cells.from_table({**many, "angle": np.linspace(-1, 1.5, 9)}, angle_unit="degrees")
     assert [w.filename for w in told] == [__file__]
@@ -257,7 +275,7 @@ def test_columns_that_number_cells_are_no_fields(name):
 
 
 def test_one_frame_of_several():
-    columns = table(label=[7.0, 7.0], frame=[0.0, 12.0])
+    columns = {**IN_PIXELS, "label": [7.0, 7.0], "frame": [0.0, 12.0]}
     cells = tf.Cells.from_table(columns, frame=12, pixel_size=0.1)
     assert cells.count == 1 and cells.position.tolist() == [[0.5, 0.0]]
     assert cells.micrograph.label.tolist() == ["7"]
@@ -267,7 +285,7 @@ def test_one_frame_of_several():
 
 # --- bad input ------------------------------------------------------------------------------------
 
-ONE = {"x": [0.0], "y": [0.0], "angle": [0.0], "length": [1.0]}
+ONE = {"x_um": [0.0], "y_um": [0.0], "angle_rad": [0.0], "length_um": [1.0]}
 ELLIPSES = {
     "label": [4, 9],
     "centroid-0": [5.0, 20.0],
@@ -280,6 +298,11 @@ SET = {"columns": "skimage", "pixel_size": 0.1}
 
 BAD = {
     "several frames": (table(frame=[0, 1]), {}, r"2 frames: 0, 1\. .*frame="),
+    "a length unit of a program": (
+        ELLIPSES,
+        {**SET, "length_unit": "um"},
+        r"length_unit = 'um'.*columns='skimage', which settles",
+    ),
     "no such frame": (table(frame=[0, 1]), {"frame": 3}, r"frame = 3 .*one of the frames.*: 0, 1"),
     "frame without a column": (table(), {"frame": 3}, r"lacks the column 'frame'"),
     "one label twice": (table(label=[4, 4]), {}, r"row 2, label 4.*row 1 has this label, too"),
@@ -288,37 +311,33 @@ BAD = {
         {},
         r"row 1, label 4: 2 cells have the same",
     ),
-    "a NaN": (table(y=[0.0, math.nan]), {}, r"row 2, column 'y': 'nan' is not a number"),
-    "text": (table(length=["2", "long"]), {}, r"row 2, column 'length': 'long' is not"),
-    "nothing in pixels": (
-        {"x_um": [0.0], "y_um": [0.0], "angle": [0.0], "length_um": [1.0]},
-        {"pixel_size": 0.1},
-        r"pixel_size = 0\.1.*no column is in pixels",
-    ),
+    "a NaN": (table(y=[0.0, math.nan]), {}, r"row 2, column 'y_um': 'nan' is not a number"),
+    "text": (table(length=["2", "long"]), {}, r"row 2, column 'length_um': 'long' is not"),
+    "nothing in pixels": (ONE, {"pixel_size": 0.1}, r"pixel_size = 0\.1.*no column is in pixels"),
     "pixels without a size": ({**ONE, "width_px": [9.0]}, {}, r"'width_px' is in pixels"),
     "pixel size 0": (ONE, {"pixel_size": 0.0}, r"pixel_size = 0\.0"),
     "pixel size nan": (ONE, {"pixel_size": math.nan}, r"pixel_size = nan"),
-    "two units": ({**ONE, "x_um": [0.0]}, {}, r"'x' and 'x_um': keep one"),
+    "two units": ({**ONE, "x": [0.0]}, {}, r"'x' and 'x_um': keep one"),
     "angle unit": (ONE, {"angle_unit": "turns"}, r"angle_unit = 'turns'.*'degrees', 'radians'"),
     "angle unit without angles": (
-        {"x": [0.0], "y": [0.0], "axis_x": [1.0], "axis_y": [0.0], "length": [1.0]},
+        {"x_um": [0.0], "y_um": [0.0], "axis_x": [1.0], "axis_y": [0.0], "length_um": [1.0]},
         {"angle_unit": "degrees"},
         r"angle_unit = 'degrees'.*left out",
     ),
     "turns without angles": (
-        {"x": [0.0], "y": [0.0], "axis_x": [1.0], "axis_y": [0.0], "length": [1.0]},
+        {"x_um": [0.0], "y_um": [0.0], "axis_x": [1.0], "axis_y": [0.0], "length_um": [1.0]},
         {"angle_turns": "clockwise"},
         r"angle_turns.*no column 'angle'",
     ),
     "y": (ONE, {"y": "south"}, r"y = 'south'.*'up', 'down'"),
-    "y down in space": ({**ONE, "z": [0.0]}, {"y": "down"}, r"\"up\" for cells in space"),
+    "y down in space": ({**ONE, "z_um": [0.0]}, {"y": "down"}, r"\"up\" for cells in space"),
     "caps without radius": (ONE, {"length_with_caps": True}, r"requires the radius"),
     "caps longer than cells": (
         table(label=[3, 8], length=[2.0, 0.7]),
         {"length_with_caps": True, "radius": 0.5},
         r"row 2, label 8 is 0\.7 µm long with caps.*width, 1 µm \(such cells: 1\)",
     ),
-    "two radii": ({**ONE, "width": [1.0]}, {"radius": 0.5}, r"width and radius= both"),
+    "two radii": ({**ONE, "width_um": [1.0]}, {"radius": 0.5}, r"width and radius= both"),
     "negative radius": (ONE, {"radius": -0.5}, r"radius = -0\.5"),
     "a name that the table lacks": (ONE, {"columns": {"x": "cx"}}, r"lacks the column 'cx'"),
     "a quantity that is none": (ONE, {"columns": {"xx": "x"}}, r"columns = 'xx'.*'x'"),
@@ -350,7 +369,7 @@ BAD = {
         SET,
         r"row 1, column 'orientation': 'nan' is not a number \(in 2 of 2 rows\)",
     ),
-    "complex numbers": (table(x=[1.0, 2.0j]), {}, r"column 'x': '\(1\+0j\)' is not a number"),
+    "complex numbers": (table(x=[1.0, 2.0j]), {}, r"column 'x_um': '\(1\+0j\)' is not a number"),
     "one column for two": (
         ONE,
         {"columns": {"x": "length", "length": "length"}},
@@ -361,10 +380,10 @@ BAD = {
     "a required column of text": (
         table(length=["abc", "abc"]),
         {},
-        r"column 'length': 'abc' is not a number \(in 2 of 2 rows\)\. This column is needed",
+        r"column 'length_um': 'abc' is not a number \(in 2 of 2 rows\)\. This column is needed",
     ),
-    "a radius of text": (table(radius=["abc", "abc"]), {}, r"'radius'.*Leave the column out"),
-    "a cell without a length": (table(length=[1.0, math.nan]), {}, r"'length'.*such cells out"),
+    "a radius of text": (table(radius_um=["abc", "abc"]), {}, r"'radius_um'.*Leave the column out"),
+    "a cell without a length": (table(length=[1.0, math.nan]), {}, r"'length_um'.*such cells out"),
     "a field of text": (table(strain=["a", "b"]), {}, r"'strain'.*Leave the column out"),
     "caps": (ONE, {"length_with_caps": "yes"}, r"length_with_caps = 'yes'.*True, False"),
     "centre": (ONE, {"centre": "x"}, r"centre = 'x'"),
@@ -387,7 +406,7 @@ def test_bad_tables_are_refused(kind):
         ("x,y\n1,2\n".encode("utf-16"), r"UTF-8"),
         ("x,y,länge\n1,2,3\n".encode("latin-1"), r"UTF-8"),
         (b"\x89PNG\r\n\x1a\n\x00\x00", r"UTF-8|CSV"),
-        (b"x,y,angle,length\n1,2,0,3\n4,5,0", r"line 3, column 'length': no value"),
+        (b"x_um,y_um,angle_rad,length_um\n1,2,0,3\n4,5,0", r"line 3, column 'length_um': no value"),
         (b"", r"empty"),
     ],
     ids=["UTF-16", "Latin-1", "a picture", "truncated", "empty"],

@@ -8,7 +8,7 @@ import time
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -69,7 +69,14 @@ class Run:
     seed: int | None = None
     """Seed of all random numbers; by default 0, or the seed of the design."""
     start: Path | None = None
-    """CSV or HDF5 file of cells to start from."""
+    """CSV or HDF5 file of cells to start from. Units stand in the names of its columns (x_um,
+    angle_rad, …) or in the next three options."""
+    pixel_size: float | None = None
+    """Of --start: its lengths are in pixels of this many µm."""
+    length_unit: str | None = None
+    """Of --start: um, if its lengths are in µm."""
+    angle_unit: str | None = None
+    """Of --start: degrees or radians."""
     device: str = "cpu"
     """cpu or cuda."""
     threads: int | None = None
@@ -100,7 +107,7 @@ class Run:
             if cells is None and until is None:
                 cells = 500
         double = self.double or plan.get("dtype") == "float64"
-        start = None if self.start is None else read_cells(self.start)
+        start = self._cells()
         model = scene.bind(
             self.colonies,
             seed=plan.get("seed", 0) if self.seed is None else self.seed,
@@ -134,6 +141,17 @@ class Run:
             picture=self.picture,
             colour=colour,
         )
+
+    def _cells(self) -> Cells | None:
+        """The cells to start from, if any."""
+        units = {n: getattr(self, n) for n in ("pixel_size", "length_unit", "angle_unit")}
+        if self.start is not None:
+            return read_cells(self.start, **units)
+        for name, given in units.items():
+            if given is not None:
+                option = f"--{name.replace('_', '-')}"
+                raise checks.input_error(option, given, "left out without --start")
+        return None
 
     def _results_file(self, scene: Scene, is_design: bool) -> Path:
         """The path of the results, in a folder that exists: it is made if necessary."""
@@ -214,9 +232,27 @@ class Resume:
         )
 
 
-def read_cells(path: Path) -> Cells:
-    """The cells of a CSV file, or of an HDF5 file (any other suffix)."""
-    return Cells.from_table(path) if path.suffix == ".csv" else Cells.from_hdf5(path)
+# What messages about a table tell to give, and the same on the command line.
+IN_A_SHELL = (
+    ("pixel_size=…", "--pixel-size"),
+    ('length_unit="um"', "--length-unit um"),
+    ('angle_unit="degrees" or "radians"', "--angle-unit degrees or radians"),
+    ('angle_unit="degrees"', "--angle-unit degrees"),
+    ('angle_unit="radians"', "--angle-unit radians"),
+)
+
+
+def read_cells(path: Path, **units: Any) -> Cells:
+    """The cells of a CSV file, or of an HDF5 file (any other suffix). units: pixel_size,
+    length_unit and angle_unit, as for `Cells.from_table`."""
+    try:
+        read = Cells.from_table if path.suffix == ".csv" else Cells.from_hdf5
+        return read(path, **units)
+    except InputError as error:
+        said = str(error)
+        for words, option in IN_A_SHELL:
+            said = said.replace(words, option)
+        raise InputError(said) from error
 
 
 def print_notes(path: str, cells: Cells, model: Model, state: State) -> None:

@@ -34,6 +34,7 @@ class Reading:
     """How a table is to be read; `Cells.from_table` documents it."""
 
     pixel_size: float | None = None
+    length_unit: str | None = None
     columns: str | Mapping[str, str] | None = None
     angle_unit: str | None = None
     angle_turns: str | None = None
@@ -50,6 +51,7 @@ class Reading:
             for name, idle in (
                 ("y", self.y), ("angle_turns", self.angle_turns), ("radius", self.radius),
                 ("length_with_caps", self.length_with_caps or None),
+                ("length_unit", self.length_unit),
             ):  # fmt: skip
                 if idle is not None:
                     raise checks.input_error(
@@ -198,23 +200,19 @@ def _own_columns(
     table: Table, reading: Reading, label: np.ndarray | None, used: set[str]
 ) -> dict[str, Any]:
     """Position, axis, length and radius, µm, of a table in columns x, y, length, … or as named."""
-    units = Units(pixel_size=reading.pixel_size, angle_unit=reading.angle_unit)
+    units = Units(reading.pixel_size, reading.length_unit, reading.angle_unit)
     by: set[tuple[str, str]] = set()
     found: dict[str, np.ndarray] = {}
     for name, kind in KINDS.items():
-        column = table.column(name, kind, reading.named)
-        if column is None:
+        known = table.quantity(name, kind, reading.named, units, by)
+        if known is None:
             continue
-        unit = column[1] or units.stated(kind)
-        if not column[1]:
-            by.add((kind, unit))
-        if unit == "px":
-            by.add(("pixels", ""))
-        used.add(column[0])
-        values = table.numbers(column[0], optional=name in ("radius", "width"))
+        column, unit, factor = known
+        used.add(column)
+        values = table.numbers(column, optional=name in ("radius", "width"))
         if kind == "angle":
-            _warn_of_units(values, unit or "rad", 2 * math.pi, column[0], table.source)
-        found[name] = units.factor(kind, unit, column[0]) * values if unit else values
+            _warn_of_units(values, unit, 2 * math.pi, column, table.source)
+        found[name] = factor * values
     for name in AXIS:
         if (column_name := reading.named.get(name, name)) in table.columns:
             used.add(column_name)

@@ -19,6 +19,11 @@ UNITS: dict[str, dict[str, float | None]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180.0},
     "time": {"h": 1.0, "min": 1.0 / 60.0},
 }
+HINTS = {
+    "length": 'Give pixel_size=… (µm a pixel) or length_unit="um", or call the column "{0}_um".',
+    "angle": 'Give angle_unit="degrees" or "radians", or call the column "{0}_deg" or "{0}_rad".',
+    "time": 'Give time_unit="h" or "min", or call the column "{0}_h" or "{0}_min".',
+}
 # the same units as people write them, too; there are two signs for micro
 SPELLINGS = {"µm": "um", "\u03bcm": "um", "degrees": "deg", "radians": "rad"}
 
@@ -202,6 +207,36 @@ class Table:
         end = _unit(given[0].rpartition("_")[2])
         return given[0], end if end in UNITS[kind] and "_" in given[0] else ""
 
+    def quantity(
+        self,
+        name: str,
+        kind: str,
+        columns: Mapping[str, str],
+        units: Units,
+        used: set[tuple[str, str]],
+    ) -> tuple[str, str, float] | None:
+        """The column that holds a quantity, its unit, and what turns its numbers into µm, rad or h;
+        None where the table lacks it.
+
+        name, kind, columns: as for `column`. used: gains what arguments state, for
+        `Units.check_used`. Raises InputError for a unit that neither the name of the column nor an
+        argument states.
+        """
+        known = self.column(name, kind, columns)
+        if known is None:
+            return None
+        column, unit = known
+        if not unit:
+            unit = units.stated(kind)
+            used.add((kind, unit))
+        if not unit:
+            raise checks.InputError(
+                f"{self.source}: the column {column!r} has no unit. {HINTS[kind].format(name)}"
+            )
+        if UNITS[kind][unit] is None:
+            used.add(("pixels", ""))
+        return column, unit, units.factor(kind, unit, column)
+
     def missing(self, column: str, hint: str = "") -> checks.InputError:
         """The error for a column that the table lacks; raise what this returns."""
         near = checks.nearest(column, self.columns)
@@ -235,8 +270,8 @@ def _read_csv(path: Path) -> Table:
         raise checks.InputError(f"{path} cannot be read: {error.strerror or error}.") from error
     if not rows:
         raise checks.InputError(
-            f"{path} is empty: it requires a header, such as x,y,angle,length, and one line per"
-            " cell."
+            f"{path} is empty: it requires a header, such as x_um,y_um,angle_rad,length_um, and one"
+            " line per cell."
         )
     (line, header), rows = rows[0], rows[1:]
     names = [name.strip() for name in header]
@@ -261,7 +296,7 @@ def _check_header(path: Path, line: int, names: Sequence[str]) -> None:
     if all(map(_is_number, names)):
         raise checks.InputError(
             f"{path}, line {line}: numbers instead of a header. Begin with the names of the"
-            " columns, such as x,y,angle,length."
+            " columns, such as x_um,y_um,angle_rad,length_um."
         )
     for name in names:
         if names.count(name) > 1:
