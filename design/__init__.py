@@ -18,6 +18,7 @@ from design.posterior import Posterior
 from design.robustness import Robustness
 from design.robustness_check import check_robustness
 from design.rollout import FinishedColonies
+from design.saved_design import SavedDesign, load_design
 from design.scene_family import UnfitDesign
 from design.search import Search
 from design.slopes import Slopes
@@ -78,6 +79,7 @@ __all__ = [
     "Racing",
     "Ring",
     "Robustness",
+    "SavedDesign",
     "Search",
     "Sensor",
     "SensorDevice",
@@ -94,6 +96,7 @@ __all__ = [
     "Wiring",
     "check_robustness",
     "infer",
+    "load_design",
     "load_weights",
     "save_weights",
 ]

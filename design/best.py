@@ -110,15 +110,10 @@ class Best:
         return family.function(**family.fixed, **self.values)
 
     def save(self, path: str | Path) -> Path:
-        """Write the design as JSON, which `torchfilm run` takes. Replaces an older file."""
-        return write_design(
-            checks.file_path("path", path),
-            self.objective.task,
-            self.values,
-            loss=self.loss,
-            losses=self.losses,
-            colonies=self.search.study.colonies,
-        )
+        """Write the design as JSON, which `torchfilm run` and `load_design` take. Replaces an older
+        file."""
+        checked = checks.file_path("path", path)
+        return write_design(checked, self, colonies=self.search.study.colonies)
 
     def plot(self, out: str | Path | None = None) -> tf.pictures.Picture:
         """Draw the first guess, the best design, the target and the course of the search. A

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 import torchfilm as tf
 from design.entries import Entry
 from design.parameters import Choice, Parameter, Value
+from design.saved_design import read_design
 from design.study import Study
 from design.task import Task, TaskOptions
 from torchfilm import checks
@@ -70,7 +70,7 @@ def known_designs(given: Start, task: Task) -> KnownDesigns:
     the bounds or of no parameter, and for a file that is not one of a study or of a design."""
     if isinstance(given, str | Path):
         path = Path(given)
-        given = _saved(path) if path.suffix == ".json" else Study.read(path)
+        given = read_design(path)["parameters"] if path.suffix == ".json" else Study.read(path)
     if isinstance(given, Study):
         return _of_study(given, task)
     designs = given if isinstance(given, Sequence) else [given]
@@ -78,17 +78,6 @@ def known_designs(given: Start, task: Task) -> KnownDesigns:
     if not points:
         raise checks.input_error("start", given, "at least one design")
     return KnownDesigns(np.array(points))
-
-
-def _saved(path: Path) -> Mapping[str, Value]:
-    """The parameters in the file of a saved design."""
-    try:
-        found = json.loads(path.read_text())["parameters"]
-        if not isinstance(found, dict):
-            raise TypeError("its parameters are no table")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise tf.InputError(f"start: {path} cannot be read as a saved design ({error}).") from error
-    return found
 
 
 def _point(design: Any, task: Task) -> np.ndarray:

@@ -1,33 +1,59 @@
-"""A design as JSON, which `torchfilm run` takes."""
+"""A design as JSON, which `torchfilm run` takes, and the same in another session."""
 
 from __future__ import annotations
 
 import inspect
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 import torchfilm as tf
-from design.parameters import Value
+from design.objective import Objective
+from design.parameters import Choice, Parameter, Value
+from design.plain_data import NotPlain, from_data, to_data
+from design.robustness_check import check_robustness
+from design.rollout import FinishedColonies
+from design.scene_family import scene_function
+from design.targets.base import Target
 from design.task import Task
 from torchfilm import checks
 
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
-def write_design(
-    path: Path,
-    task: Task,
-    values: dict[str, Value],
-    *,
-    loss: float,
-    losses: np.ndarray,
-    colonies: float,
-) -> Path:
-    """Write a design of a task, its losses and the number of colonies that the search simulated.
+
+class FoundDesign(Protocol):
+    """What is written of a design, such as `Best`."""
+
+    @property
+    def objective(self) -> Objective: ...
+
+    @property
+    def values(self) -> Mapping[str, Value]: ...
+
+    @property
+    def point(self) -> np.ndarray: ...
+
+    @property
+    def searched(self) -> np.ndarray: ...
+
+    @property
+    def loss(self) -> float: ...
+
+    @property
+    def losses(self) -> np.ndarray: ...
+
+
+def write_design(path: Path, design: FoundDesign, *, colonies: float) -> Path:
+    """Write a design and its losses, and the number of colonies that the search simulated.
     Replaces an older file."""
+    task = design.objective.task
     if not path.parent.is_dir():
         raise checks.input_error(
             "path", str(path), "in a folder that exists", f"Make {path.parent} first."
@@ -43,19 +69,190 @@ def write_design(
         "torchfilm": tf.__version__,
         "scene": recipe[0] if recipe else home["function"],
         **home,
-        "parameters": {**task.family.fixed, **values},
+        "parameters": {**task.family.fixed, **design.values},
         **end,
         "seed": task.seed,
         "dt": task.dt,
         "dtype": str(task.dtype)[6:],
         "target": task.target.describe(),
         "species": list(task.target.names),
-        "loss": loss,
-        "losses": losses.tolist(),
+        "loss": design.loss,
+        "losses": design.losses.tolist(),
         "colonies": colonies,
+        "search": {
+            "names": list(task.space.names),
+            "parameters": _data(task.space.parameters),
+            "point": design.point.tolist(),
+            "target": _data(task.target),
+            "replicates": task.replicates,
+            "reduce": task.reduce,
+            "replay": task.replay,
+            "losses": design.searched.tolist(),
+        },
     }
     path.write_text(json.dumps(saved, indent=1, default=_plain) + "\n")
     return path
+
+
+@checks.known_keywords
+def load_design(
+    path: str | Path,
+    *,
+    scene: Callable[..., tf.Scene] | str | None = None,
+    parameters: Sequence[Parameter | Choice] | None = None,
+    target: Target | None = None,
+) -> SavedDesign:
+    """The design in a file that `Best.save` wrote.
+
+    The file is data: no code is executed from it. scene: the scene function, for a design of your
+    own one; a ready scene is known by its name. parameters, target: those of the search, for
+    `check` and `colonies`; needed where the file cannot hold them: a target of your own class, and
+    choices that a function resolves. Raises InputError for a file that is missing or no saved
+    design, and for a scene of your own that is not given.
+    """
+    path = checks.file_path("path", path)
+    content = read_design(path)
+    if scene is None and "file" in content:
+        raise checks.input_error(
+            "scene",
+            None,
+            f"the scene function of {path}: {content['scene']} of {content['file']}",
+            f"Import it, and give scene={content['scene']}.",
+        )
+    function = scene_function(content["scene"] if scene is None else scene)
+    return SavedDesign(path, content, function, parameters, target)
+
+
+def read_design(path: Path) -> dict[str, Any]:
+    """The content of a saved design. Raises InputError for any other file."""
+    try:
+        found = json.loads(path.read_text())
+        if not isinstance(found, dict) or not isinstance(found["scene"], str):
+            raise TypeError("it names no scene")
+        if not isinstance(found["parameters"], dict):
+            raise TypeError("its parameters are no table")
+    except OSError as error:
+        why = error.strerror or error
+        raise tf.InputError(f"{path} cannot be read as a saved design: {why}.") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise tf.InputError(
+            f"{path} cannot be read as a saved design, which Best.save writes"
+            f" ({type(error).__name__}: {error})."
+        ) from error
+    return found
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SavedDesign:
+    """A design in another session: `load_design("stripe.json")`.
+
+    `tf.simulate(saved.scene(), **saved.options)` grows the first colony that was scored.
+
+    path, content: the file, and what it holds. function: the scene function. given_parameters,
+    given_target: those of the search, where they were given.
+    """
+
+    path: Path
+    content: Mapping[str, Any]
+    function: Callable[..., tf.Scene]
+    given_parameters: Sequence[Parameter | Choice] | None = None
+    given_target: Target | None = None
+
+    # `saved.check(…)` is `check_robustness(saved, …)`
+    check = check_robustness
+
+    @property
+    def loss(self) -> float:
+        """As when it was saved: on fresh seeds, or else in the search."""
+        return float(self.content["loss"])
+
+    @property
+    def losses(self) -> np.ndarray:
+        """Of each fresh seed (S,), or of each replicate in the search (R,)."""
+        return np.array(self.content["losses"])
+
+    @property
+    def values(self) -> dict[str, Value]:
+        """Its parameters by name; in a file of an earlier version with those that were fixed."""
+        every = self.content["parameters"]
+        names = self.content["search"]["names"] if "search" in self.content else every
+        return {name: every[name] for name in names}
+
+    def scene(self) -> tf.Scene:
+        """The scene with these parameters, for one colony or any number of them."""
+        return self.function(**self.content["parameters"])
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Those of `tf.simulate` that grow the colonies that were scored, to the bit: end, step,
+        seed, dtype."""
+        names = ("cells", "until", "dt", "seed")
+        saved = {n: self.content[n] for n in names if self.content.get(n) is not None}
+        return {**saved, "dtype": self.dtype}
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """In which it was searched."""
+        checks.choice(f"dtype in {self.path}", self.content["dtype"], tuple(DTYPES))
+        return DTYPES[self.content["dtype"]]
+
+    @cached_property
+    def objective(self) -> Objective:
+        """The objective that scored it. Raises InputError where the file does not hold the target
+        or the parameters of the search, and they are not given."""
+        parameters = self._part("parameters", self.given_parameters)
+        target = self._part("target", self.given_target)
+        every, names = self.content["parameters"], self._search["names"]
+        options: dict[str, Any] = {
+            "fixed": {name: value for name, value in every.items() if name not in names},
+            **{name: self._search[name] for name in ("replicates", "reduce", "replay")},
+            **{name: self.content.get(name) for name in ("cells", "until", "dt", "seed")},
+        }
+        return Objective(Task(self.function, parameters, target, dtype=self.dtype, **options))
+
+    @property
+    def point(self) -> np.ndarray:
+        """The coordinates of its parameters (D,)."""
+        return np.array(self._search["point"])
+
+    @property
+    def searched(self) -> np.ndarray:
+        """The losses of its replicates in the search (R,)."""
+        return np.array(self._search["losses"])
+
+    def colonies(self) -> list[FinishedColonies]:
+        """The replicates at their ends, grown again: the same colonies as were scored."""
+        return self.objective.colonies(self.point)
+
+    @property
+    def _search(self) -> Mapping[str, Any]:
+        if "search" not in self.content:
+            raise tf.InputError(
+                f"{self.path} is of an earlier version, which did not save the search: its scene"
+                " can be grown; for a check run the search again and save its best design."
+            )
+        return self.content["search"]
+
+    def _part(self, name: str, given: Any) -> Any:
+        if given is not None:
+            return given
+        if self._search[name] is None:
+            raise tf.InputError(
+                f"{self.path} does not hold the {name} of its search, which need code of your own:"
+                f" give load_design(…, {name}=…)."
+            )
+        return from_data(self._search[name])
+
+    def __repr__(self) -> str:
+        return f"SavedDesign({str(self.path)!r}, values={self.values}, loss={self.loss:.4g})"
+
+
+def _data(value: Any) -> Any:
+    """A value as plain data; None where it needs code of the user."""
+    try:
+        return to_data(value)
+    except NotPlain:
+        return None
 
 
 def _home(function: Callable[..., tf.Scene]) -> dict[str, Any]:

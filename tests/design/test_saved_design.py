@@ -1,0 +1,185 @@
+"""A saved design in another session: the same colonies and the same check, from data alone."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from searching import Level, lit
+
+import torchfilm as tf
+from design import (
+    Bands,
+    Burden,
+    Choice,
+    Constrained,
+    DomainSize,
+    Duration,
+    Gradient,
+    Image,
+    Lasting,
+    Observed,
+    OnFraction,
+    Oscillation,
+    Parameter,
+    Ring,
+    Search,
+    Spread,
+    Stripe,
+    Weighted,
+    load_design,
+)
+from design.plain_data import NotPlain, from_data, to_data
+
+RING = Ring("g", 5.0, 2.0)
+LIT = [Parameter("make", 0.1, 10, log=True), Parameter("decay", 0.5, 2)]
+
+
+def found(target=None, scene=lit, parameters=LIT, **options):
+    options = {"cells": 6, "replicates": 2, "finals": None, "seed": 3, **options}
+    search = Search(scene, parameters, target or OnFraction("gfp", 0.5, 1.0), **options)
+    return search.run(6, progress=False)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """A design of a scene function of the user's own, and its file."""
+    best = found()
+    return best, best.save(tmp_path_factory.mktemp("saved") / "best.json")
+
+
+def test_a_loaded_design_grows_the_colonies_that_were_scored(saved):
+    best, path = saved
+    loaded = load_design(path, scene=lit)
+    assert loaded.values == best.values and loaded.loss == best.loss
+    assert np.array_equal(loaded.losses, best.losses)
+    for one, other in zip(loaded.colonies(), best.colonies(), strict=True):
+        assert torch.equal(one.state.position, other.state.position)
+        assert torch.equal(one.state.gfp, other.state.gfp)
+    *_, state = tf.simulate(loaded.scene(), **loaded.options)
+    assert state.cells >= 6 and state.seed == 3
+    assert float(best.objective.task.target.loss(state)[0]) == best.searched[0]
+
+
+def test_a_loaded_design_is_checked_as_the_winner_itself(saved):
+    best, path = saved
+    options = {"seeds": 3, "sizes": (), "progress": False}
+    one, other = best.check(**options), load_design(path, scene=lit).check(**options)
+    assert np.array_equal(one.losses, other.losses) and one.values == other.values
+    for a, b in zip(one.changes, other.changes, strict=True):
+        assert a.name == b.name and np.array_equal(a.losses, b.losses)
+
+
+def test_a_ready_scene_is_known_by_its_name(tmp_path):
+    parameters = [Parameter("strength", 2, 8), Parameter("power", 1, 3, whole=True)]
+    best = found(
+        OnFraction("red", 0.5, 1.0), "toggle_switch", parameters, fixed={"noise": False}, dt=0.1
+    )
+    loaded = load_design(best.save(tmp_path / "best.json"))
+    assert loaded.values == best.values and set(loaded.values) == {"strength", "power"}
+    assert loaded.scene().bind().describe() == best.scene().bind().describe()
+    assert loaded.objective.task.describe() == best.objective.task.describe()
+
+
+def test_what_needs_code_of_the_user_is_given(tmp_path):
+    best = found(Level(wanted=1.0))
+    path = best.save(tmp_path / "best.json")
+    with pytest.raises(
+        tf.InputError, match=r"does not hold the target.*load_design\(…, target=…\)"
+    ):
+        load_design(path, scene=lit).check(seeds=2)
+    loaded = load_design(path, scene=lit, target=Level(wanted=1.0))
+    assert np.array_equal(loaded.objective.evaluate(loaded.point[None]).losses[0], best.searched)
+
+
+def test_a_design_of_an_earlier_version_has_a_scene_and_no_check(saved, tmp_path):
+    content = json.loads(saved[1].read_text())
+    del content["search"]
+    (tmp_path / "old.json").write_text(json.dumps(content))
+    loaded = load_design(tmp_path / "old.json", scene=lit)
+    assert loaded.scene().bind().describe() == saved[0].scene().bind().describe()
+    with pytest.raises(tf.InputError, match=r"old\.json is of an earlier version.*save its best"):
+        loaded.check(seeds=2)
+
+
+FOREIGN = {
+    "a text": ("no JSON", r"cannot be read as a saved design, which Best\.save writes"),
+    "a list": ("[]", r"it names no scene"),
+    "another table": ("{}", r"KeyError: 'scene'"),
+    "a number": ('{"scene": 3}', r"it names no scene"),
+    "no parameters": ('{"scene": "a", "parameters": 3}', r"its parameters are no table"),
+    "an unknown scene": ('{"scene": "a", "parameters": {}}', r"scene = 'a'"),
+}
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_foreign_files_are_refused(tmp_path, kind):
+    text, message = FOREIGN[kind]
+    (tmp_path / "file.json").write_text(text)
+    with pytest.raises(tf.InputError, match=message):
+        load_design(tmp_path / "file.json")
+
+
+def test_what_is_missing_is_named(saved, tmp_path):
+    with pytest.raises(tf.InputError, match=r"no\.json cannot be read.*No such file"):
+        load_design(tmp_path / "no.json")
+    with pytest.raises(tf.InputError, match=r"scene = None.*lit of .*searching\.py.*scene=lit"):
+        load_design(saved[1])
+    with pytest.raises(tf.InputError, match=r"path = 3.*path of a file"):
+        load_design(3)
+
+
+# --- plain data -----------------------------------------------------------------------------------
+
+OBSERVED = Observed.from_table({"x_um": [0.0, 1.0, 2.0], "y_um": [0.0, 1.0, 2.0]}, time=2.0)
+PLAIN = [
+    *LIT,
+    Parameter("n", 1, 3, whole=True),
+    Choice("gate", ("a", 2, True), per_colony=True),
+    RING,
+    Bands(("a", "b"), (-math.inf, 0.0, math.inf)),
+    Gradient("g", "x", 0.0, 5.0),
+    Stripe("g", at=0.0, width=3.0),
+    Image("g", ((0.0, 1.0), (1.0, 0.0)), (4.0, 4.0)),
+    Oscillation("g", 2.0),
+    DomainSize(("a", "b"), 3.0),
+    OnFraction("g", 0.5, 1.0),
+    Burden(),
+    Duration(),
+    OBSERVED,
+    Lasting(RING, since=1.0),
+    Spread(RING),
+    Weighted([(RING, 1.0), (Burden(("g",)), 0.1)]),
+    Constrained(Burden(), (RING,), at_least={"contrast": 2.0}),
+]
+
+
+@pytest.mark.parametrize("value", PLAIN, ids=lambda value: type(value).__name__)
+def test_ready_targets_and_parameters_are_plain_data(value):
+    again = from_data(json.loads(json.dumps(to_data(value))))
+    assert type(again) is type(value) and again == value and repr(again) == repr(value)
+
+
+@pytest.mark.parametrize(
+    "value", [Level(), Choice("gate", ("a", "b"), resolve=dict), [Weighted([(Level(), 1.0)])]]
+)
+def test_code_of_the_user_is_no_data(value):
+    with pytest.raises(NotPlain):
+        to_data(value)
+
+
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        ({"kind": "system"}, r"kind = 'system'.*'Parameter'"),
+        ({"kind": "Ring", "species": "g"}, r"Ring: missing .*'radius'"),
+        ({"kind": "ColonyStatistics", "size": 3}, r"no ColonyStatistics can be made"),
+        ({"kind": "Ring", "species": "g", "radius": -1, "width": 1}, r"Ring\.radius = -1"),
+    ],
+)
+def test_bad_data_are_refused(data, message):
+    with pytest.raises(tf.InputError, match=message):
+        from_data(data)
