@@ -361,7 +361,9 @@ def test_a_disk_that_is_really_full(tmp_path, every_step):
         shutil.which("unshare") is None
         or subprocess.run(trial, capture_output=True, check=False).returncode
     ):
-        pytest.skip("this system does not let us make a small disk")
+        pytest.skip(
+            "needs the right to mount a file system: `unshare -Urm` and `mount -t tmpfs` on Linux"
+        )
     (tmp_path / "disk").mkdir()
     done = subprocess.run(
         [

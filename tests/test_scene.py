@@ -324,7 +324,7 @@ def unavailable() -> list[object]:
 @pytest.mark.parametrize("device", unavailable(), ids=str)
 def test_a_device_that_is_not_there_is_refused(device):
     if device == "mps" and torch.backends.mps.is_available():
-        pytest.skip("this machine has one")
+        pytest.skip("needs a machine without the device mps, a GPU of Apple")
     with pytest.raises(tf.InputError, match="device"):
         tf.Scene(tf.Growth(rate=1.0)).bind(device=device).start()
 

@@ -20,7 +20,8 @@ from design.posterior_plot import draw_corner
 from design.simulations import simulate_designs, simulate_points
 
 RATE = [Parameter("rate", 0.8, 2.0, log=True)]
-needs_sbi = pytest.mark.skipif(find_spec("sbi") is None, reason="needs sbi")
+NEEDS_SBI = 'needs pip install -e ".[infer]"'
+needs_sbi = pytest.mark.skipif(find_spec("sbi") is None, reason=NEEDS_SBI)
 
 
 def colony(rate=1.5, make=1.0):
@@ -116,7 +117,7 @@ def test_designs_that_fail_are_left_out(data):
 @pytest.fixture(scope="module")
 def posterior(data):
     if find_spec("sbi") is None:
-        pytest.skip("needs sbi")
+        pytest.skip(NEEDS_SBI)
     state = torch.random.get_rng_state()
     found = infer(
         colony, RATE, data, simulations=300, dt=0.1, flows=2, epochs=60, samples=500,
