@@ -106,8 +106,8 @@ class Target(metaclass=checks.KnownKeywords):
         return {}
 
     def why_undefined(self, measure: str) -> str:
-        """What a colony lacks in which this measure is NaN, and what to do; "" where the target
-        does not say."""
+        """What a colony lacks in which this measure is NaN, and what to do; "" for a measure that
+        the target does not have, or that is never NaN."""
         return ""
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:

@@ -55,6 +55,10 @@ class Burden(Target):
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         return {"burden": self.loss(state)}
 
+    def why_undefined(self, measure: str) -> str:
+        lost = "the colony has no cells, or levels that are not finite"
+        return lost if measure == "burden" else ""
+
     def describe(self) -> str:
         return "little of " + (", ".join(self.species) if self.species else "all species")
 
@@ -137,7 +141,9 @@ class Several(Target):
         return {name: seen for part in self.parts for name, seen in part.evidence.items()}
 
     def why_undefined(self, measure: str) -> str:
-        return next((why for part in self.parts if (why := part.why_undefined(measure))), "")
+        # of measures with one name, `measures` has that of the last part
+        each = (part.why_undefined(measure) for part in reversed(self.parts))
+        return next(filter(None, each), "")
 
     def measures(self, state: tf.State, history: Tensor | None = None) -> dict[str, Tensor]:
         each = self._each(lambda part, own: part.measures(state, own), state, history)

@@ -296,6 +296,9 @@ class Observed(Target):
         found.pop(LOG_CELLS, None)
         return {"cells": state.counts.double(), **found}
 
+    def why_undefined(self, measure: str) -> str:
+        return "the colony has no cells" if measure in self.plan.names else ""
+
     def __str__(self) -> str:
         return self.table()
 

@@ -162,6 +162,19 @@ class Oscillation(Target):
             "synchrony": torch.where(swings, ratio(window.mean_square, whole, math.nan), math.nan),
         }
 
+    def why_undefined(self, measure: str) -> str:
+        short = (
+            f"the run has fewer than {SAMPLES} steps or is shorter than one period of"
+            f" {self.period:g} h (run for longer, or by shorter steps)"
+        )
+        steady = "all cells have one level that does not change"
+        why = {
+            "period_h": f"the mean is steady or drifts without a peak in its power, or {short}",
+            "amplitude": short,
+            "synchrony": f"{steady}, or {short}",
+        }
+        return why.get(measure, "")
+
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """Draw the mean over time in a corner, and a wave of the target period with the same
         amplitude, in phase at the maximum; nothing without history."""

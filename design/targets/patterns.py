@@ -104,6 +104,16 @@ class DomainSize(Target):
             "pairs": count,
         }
 
+    def why_undefined(self, measure: str) -> str:
+        alone = f"no cell has a neighbour with a gap under {GAP:g} µm (grow larger colonies)"
+        one, other = self.species
+        why = {
+            "domain_size_um": f"no two neighbours differ in {one} and {other}, or {alone}",
+            "unlike_share": alone,
+            "decided": alone,
+        }
+        return why.get(measure, "")
+
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """Draw a bar of the target size."""
         window = ax.get_xlim(), ax.get_ylim()
@@ -192,6 +202,14 @@ class OnFraction(Target):
             name: ratio(a, b, math.nan)
             for name, (a, b) in zip(("on_share", "on_level", "off_level"), shares, strict=True)
         }
+
+    def why_undefined(self, measure: str) -> str:
+        why = {
+            "on_share": "the colony has no cells",
+            "on_level": f"no cell has {self.species} above {self.level:g}",
+            "off_level": f"all cells have {self.species} above {self.level:g}",
+        }
+        return why.get(measure, "")
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """Draw two bars in a corner: the target share and the share found."""

@@ -45,6 +45,21 @@ if TYPE_CHECKING:
 
 LEAST = 1e-3  # a cell whose target level is below this should be dark
 WITHIN = 0.5  # cells with a target level above this are inside the pattern
+# why the measures of a profile are NaN
+UNDEFINED = {
+    "inside": (
+        "no cell lies where the pattern should be lit (grow larger colonies, or move or widen the"
+        " pattern)"
+    ),
+    "outside": (
+        "no cell lies where the pattern should be dark (grow larger colonies, or narrow the"
+        " pattern)"
+    ),
+    "contrast": (
+        "no cell lies where the pattern should be lit, or none where it should be dark (grow larger"
+        " colonies, or change the size of the pattern), or nothing is lit"
+    ),
+}
 
 
 class ProfileTarget(Target):
@@ -145,6 +160,11 @@ class ProfileTarget(Target):
             found |= {f"{before}inside": inside[:, k], f"{before}outside": outside[:, k]}
             found[f"{before}contrast"] = contrast(inside[:, k], outside[:, k])
         return found
+
+    def why_undefined(self, measure: str) -> str:
+        several = len(self.names) > 1
+        own = {f"{n}_{what}" if several else what: what for n in self.names for what in UNDEFINED}
+        return UNDEFINED.get(own.get(measure, ""), "")
 
 
 @dataclass(frozen=True)
@@ -291,6 +311,11 @@ class Ring(ProfileTarget):
             **found,
         }
 
+    def why_undefined(self, measure: str) -> str:
+        if measure == "radius_um":
+            return "no cell is brighter than the mean of the cells outside the ring"
+        return super().why_undefined(measure)
+
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         lines(ax, "radius", centre_at(state, self.centre, place), self.edges, COLOURS[0])
 
@@ -352,6 +377,14 @@ class Gradient(ProfileTarget):
             "correlation": ratio(squares[:, 0], (squares[:, 1] * squares[:, 2]).sqrt(), math.nan),
             **super().measures(state),
         }
+
+    def why_undefined(self, measure: str) -> str:
+        if measure == "correlation":
+            return (
+                f"all cells have one level, or all lie on one side of the gradient from"
+                f" {self.low:g} to {self.high:g} µm (grow larger colonies, or move the gradient)"
+            )
+        return super().why_undefined(measure)
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         for edge, style in ((self.low, "-"), (self.high, ":")):

@@ -218,7 +218,9 @@ class Stripe(ProfileTarget):
                 f"no cells that count are farther than {2 * self.width:g} µm from the middle of the"
                 " stripe (grow larger colonies, or give a narrower stripe), or nothing is lit"
             )
-        return "nothing is lit, or fewer than three cells that count lie in each strip of 1 µm"
+        if measure in ("place_um", "width_um", "peak", "straightness_um"):
+            return "nothing is lit, or fewer than three cells that count lie in each strip of 1 µm"
+        return ""
 
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """Draw the edges of the stripe and the border as lines or, where it winds, a dot on each

@@ -304,7 +304,8 @@ def test_the_table_says_why_a_measure_is_undefined():
     assert "(undefined in 2 of 2)" in text
     line = next(x for x in text.splitlines() if x.startswith("contrast is undefined: "))
     assert "farther than 40 µm" in line and "grow larger colonies" in line
-    assert "is undefined" not in searched(lit, PAIR, WIDE).table()
+    assert "outside is undefined: no cell lies where" in searched(lit, PAIR, WIDE).table()
+    assert "is undefined" not in searched(lit, PAIR, Level()).table()
 
 
 def test_trivial_answers_are_those_of_the_target():
