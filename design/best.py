@@ -92,11 +92,9 @@ class Best:
         # what is known without growing the colonies again
         found = self.search.study.first()
         assert found is not None
-        first = self.objective.task.space.values(found[0])
+        first = self.objective.task.space.values(found)
         rows = report.parameter_rows(self.objective.task.space, first, self.values)
-        losses: list[tuple[str, str]] = [
-            ("loss in the search", f"{self.searched_loss:.4f}, of the first guess {found[1]:.4f}")
-        ]
+        losses: list[tuple[str, str]] = [("loss in the search", f"{self.searched_loss:.4f}")]
         if self.fresh is not None:
             losses.append(("loss on fresh seeds", report.fresh_words(self.fresh)))
         study = self.search.study

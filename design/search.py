@@ -248,11 +248,15 @@ class Search(TaskOptions):
         return front_of(self, self.study, sizes)
 
     def first(self) -> Best:
-        """The first design that was grown to full size. Raises InputError before there is one."""
-        found = self.study.first()
-        if found is None:
+        """The first design of the search; grown now where the search grew it only small. Raises
+        InputError before there is one."""
+        point = self.study.first()
+        if point is None:
             raise _none_yet()
-        return self.design(found[0])
+        losses = self.study.scored(point)
+        if losses is None:
+            losses = self.objective.evaluate(point[None]).losses[0]
+        return self._design(point, losses)
 
     def colonies(self, point: np.ndarray) -> list[FinishedColonies]:
         """The replicates of a design (D,) at their ends, grown again once: the same colonies as
@@ -265,11 +269,20 @@ class Search(TaskOptions):
 
     def design(self, point: np.ndarray) -> Best:
         """A design (D,) that was grown to full size."""
+        self.objective.task.space.values(point)  # raises InputError for what is no point
+        losses = self.study.scored(point)
+        if losses is None:
+            raise checks.input_error(
+                "point", point.tolist(), "of a design that was grown to full size"
+            )
+        return self._design(point, losses)
+
+    def _design(self, point: np.ndarray, losses: np.ndarray) -> Best:
         task = self.objective.task
         values, fresh = task.space.values(point), None
         if self.finals is not None:
             fresh = fresh_losses(task, self.study, self.finals.sizes, point)
-        return Best(self, values, point, self.study.scored(point)[1], fresh)
+        return Best(self, values, point, losses, fresh)
 
     def _choose(self, colonies: int, path: str | Path | None) -> Chosen:
         """The method of a run."""

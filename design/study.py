@@ -76,18 +76,17 @@ class Study:
         row = int(entry.loss.argmin())
         return entry.points[row], float(entry.loss[row]), entry.losses[row]
 
-    def first(self) -> tuple[np.ndarray, float] | None:
-        """Point (D,) and loss of the first design that was grown to full size. None before there
-        is one."""
-        full = self.full()
-        return (full[0].points[0], float(full[0].loss[0])) if full else None
+    def first(self) -> np.ndarray | None:
+        """Point (D,) of the first design, at whatever size it was grown. None before there is
+        one."""
+        return self.entries[0].points[0] if self.entries else None
 
-    def scored(self, point: np.ndarray) -> tuple[float, np.ndarray]:
-        """Loss and losses (R,) of a design (D,) that was grown to full size."""
+    def scored(self, point: np.ndarray) -> np.ndarray | None:
+        """Losses (R,) of a design (D,); None for one that was not grown to full size."""
         for entry in self.full():
             for k in np.flatnonzero((entry.points == point).all(1)):
-                return float(entry.loss[k]), entry.losses[k]
-        raise checks.input_error("point", point.tolist(), "of a design that was grown to full size")
+                return entry.losses[k]
+        return None
 
     def table(self, most: int = 20) -> str:
         """The best designs that were grown to full size, the first of equal ones first: loss, its

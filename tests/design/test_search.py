@@ -58,7 +58,12 @@ def test_small_colonies_count_as_their_share():
     assert made.study.colonies == 9.0 and made.study.full() == [full]
     assert small.losses.shape == (6, 1) and (small.cells < 4).all() and (full.cells >= 4).all()
     # the brightness depends on the size: only full colonies are comparable
-    assert made.best().loss == full.loss.min() and made.first().loss == full.loss[0]
+    assert made.best().loss == full.loss.min()
+    # the first guess was grown only small, and is grown to be shown
+    first = made.first()
+    assert np.array_equal(first.point, small.points[0])
+    assert first.loss == made.objective.evaluate(small.points[:1]).loss[0]
+    assert made.study.colonies == 9.0
 
 
 def test_a_search_stops_at_the_requested_loss():
