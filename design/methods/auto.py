@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
+from design.methods.bayesian import Bayesian
 from design.methods.cmaes import CMAES
 from design.methods.nsga2 import NSGA2
 from design.methods.polish import Polish
@@ -15,8 +17,9 @@ BATCH, WIDTH = 24, 0.5
 # designs before the first descents (less than one race, whose end they await), and for each
 # parameter of a descent, so that it ends
 BEFORE, EACH, MOST_STARTS = 5, 10, 3
-# designs of a batch where every one needs many replicates
-FEW = 12
+# where every design needs many replicates: designs of a batch of a race, and of a model, whose time
+# grows as the cube of all designs that it holds
+FEW, MODEL_BATCH, MODELLED = 12, 6, 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +66,8 @@ def choose(
         Racing(inner=CMAES(population=FEW, sigma=WIDTH), small=max(chance, 1)),
         f"{designs:.0f} designs for {dimensions} parameters: small colonies first, with all"
         " replicates, since molecules are counted one by one and one colony says little; CMA-ES"
-        " learns from the best",
+        " learns from the best"
+        + ("" if find_spec("botorch") else " (with botorch installed, a model of the loss would)"),
     )
     descents = tuple(
         Chosen(
@@ -74,7 +78,14 @@ def choose(
         )
         for starts in range(1, MOST_STARTS + 1)
     )
-    for known in (few, race, lucky, *descents) if before else ():
+    modelled = lucky
+    if find_spec("botorch"):
+        modelled = Chosen(
+            Bayesian(batch=MODEL_BATCH),
+            f"{designs:.0f} designs for {dimensions} parameters: a model of the loss, which knows"
+            " that colonies differ by luck, since molecules are counted one by one",
+        )
+    for known in (few, race, lucky, modelled, *descents) if before else ():
         if known.describe() == before:
             return Chosen(known.method, "the study began with it")
     if goals:
@@ -84,6 +95,6 @@ def choose(
     if designs < 2 * BATCH:
         return few
     if chance:
-        return lucky
+        return modelled if designs <= MODELLED else lucky
     room = int((designs - BEFORE) / (EACH * dimensions))
     return descents[min(room, MOST_STARTS) - 1] if squares and room else race

@@ -9,7 +9,7 @@ from searching import Level, lit, paced
 
 import torchfilm as tf
 from design import CMAES, NSGA2, Choice, Local, Parameter, Polish, Racing, Search, Sobol, Study
-from design.methods import choose
+from design.methods import Bayesian, choose
 from design.methods.local import unlike
 from design.slopes import Slopes
 from design.targets import Bands, DomainSize
@@ -161,12 +161,23 @@ def test_auto_descends_where_the_loss_is_a_sum_of_squares():
     assert isinstance(again.method, Polish) and again.method.starts == 1
 
 
-def test_auto_races_with_all_replicates_where_molecules_are_counted():
+def test_auto_models_the_loss_where_molecules_are_counted():
+    chosen = choose(3, 200, 0, chance=8)
+    assert isinstance(chosen.method, Bayesian) and "one by one" in chosen.why
+    # a model of more designs takes too long
+    assert isinstance(choose(3, 2000, 0, chance=8).method, Racing)
+    # a study that began by racing goes on so
+    before = choose(3, 2000, 0, chance=8).describe()
+    assert isinstance(choose(3, 200, 0, chance=8, before=before).method, Racing)
+
+
+def test_without_botorch_auto_races_with_all_replicates_where_molecules_are_counted(monkeypatch):
+    monkeypatch.setattr("design.methods.auto.find_spec", lambda name: None)
     parameters = [Parameter("strength", 3.0, 30.0, log=True)]
     target = DomainSize(("red", "green"), 12.0)
     search = Search("toggle_switch", parameters, target, cells=4, replicates=2, finals=None)
     search.run(120, progress=False)
-    assert "one by one" in search.why_chosen
+    assert "one by one" in search.why_chosen and "botorch" in search.why_chosen
     assert {(e.size, e.replicates) for e in search.study.entries} == {(0.25, 2), (1.0, 2)}
     assert isinstance(choose(3, 20, 0, chance=8).method, CMAES)  # too few for races
     again = choose(3, 20, 0, chance=8, before=choose(3, 200, 0, chance=8).describe())
