@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from design import targets
 from design.parameters import Choice, Parameter
 from design.targets.statistics import ColonyStatistics
@@ -24,6 +26,8 @@ class NotPlain(TypeError):
 def to_data(value: Any) -> Any:
     """A ready target, a parameter, or a list of these, as lists, dictionaries, numbers and texts.
     Raises NotPlain for anything else."""
+    if isinstance(value, np.generic):
+        value = value.item()
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
     if isinstance(value, (list, tuple)):

@@ -112,6 +112,8 @@ def load_design(
     """
     path = checks.file_path("path", path)
     content = read_design(path)
+    if not isinstance(content.get("scene"), str):
+        raise tf.InputError(f"{path} names no scene: it is no design that Best.save wrote.")
     if scene is None and "file" in content:
         raise checks.input_error(
             "scene",
@@ -124,12 +126,11 @@ def load_design(
 
 
 def read_design(path: Path) -> dict[str, Any]:
-    """The content of a saved design. Raises InputError for any other file."""
+    """The content of a file with the parameters of a design. Raises InputError for any other
+    file."""
     try:
         found = json.loads(path.read_text())
-        if not isinstance(found, dict) or not isinstance(found["scene"], str):
-            raise TypeError("it names no scene")
-        if not isinstance(found["parameters"], dict):
+        if not isinstance(found, dict) or not isinstance(found["parameters"], dict):
             raise TypeError("its parameters are no table")
     except OSError as error:
         why = error.strerror or error

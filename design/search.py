@@ -32,12 +32,13 @@ if TYPE_CHECKING:
 @dataclass(eq=False)
 class SearchProgress:
     """What a search has found so far. chosen: its method; grown: the colonies of designs that were
-    drawn or measured, by their points."""
+    drawn or measured, and scored: the losses of those that only a report needs, by their points."""
 
     study: Study
     why_regrown: str
     chosen: Chosen | None = None
     grown: dict[bytes, list[FinishedColonies]] = field(default_factory=dict)
+    scored: dict[bytes, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,9 +254,11 @@ class Search(TaskOptions):
         point = self.study.first()
         if point is None:
             raise _none_yet()
-        losses = self.study.scored(point)
+        losses, kept = self.study.scored(point), self._progress.scored
         if losses is None:
-            losses = self.objective.evaluate(point[None]).losses[0]
+            if point.tobytes() not in kept:
+                kept[point.tobytes()] = self.objective.evaluate(point[None]).losses[0]
+            losses = kept[point.tobytes()]
         return self._design(point, losses)
 
     def colonies(self, point: np.ndarray) -> list[FinishedColonies]:

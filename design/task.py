@@ -31,6 +31,8 @@ from torchfilm import checks
 
 NONE = cast(Target, None)  # the target where `targets` are given
 REDUCE = ("mean", "worst")
+# what studies say of the course of a step: losses of another one do not compare
+ORDER = "division at the end"
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,6 +209,7 @@ class Task(TaskOptions):
         task with the same description."""
         recipe = self.tried.recipe
         return {
+            "order of a step": ORDER,
             "scene": recipe[0] if recipe else getattr(self.family.function, "__name__", "scene"),
             "fixed": {n: _without_addresses(v) for n, v in self.family.fixed.items()},
             "effects": self.tried.listing,
@@ -284,5 +287,5 @@ def _whole_numbers(given: Any) -> list[int]:
 
 def check_whole(name: str, value: Any, least: int) -> None:
     """Raises InputError unless a value is a whole number from `least`."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise checks.input_error(name, value, f"a whole number from {least}")

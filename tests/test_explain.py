@@ -340,6 +340,7 @@ def test_a_fit_gives_back_what_is_linear():
         "mechanics": (1e-3, 2e-5, 0.0),
         "transport": (3e-4, 0.0, 2e-4),
         "grid coverage": (0.0, 0.0, 1e-5),
+        "coverage of daughters": (5e-6, 0.0, 0.0),
         "division": (0.0, 0.0, 0.0),
     }
     blocks = [

@@ -262,7 +262,7 @@ def test_repr_is_one_line_of_what_matters():
     )
     one = tf.scenes.microcolony().bind().start()
     assert repr(one).startswith("State(1 colony, 1 cell, 2-D")
-    assert repr(one).endswith("fields: growth_rate, division_threshold)")
+    assert repr(one).endswith("fields: division_threshold, growth_rate)")
 
 
 def test_volumes_that_were_asked_for_without_gradients_still_have_them():

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # The stages of a step; an effect says where it belongs. The order is the paper's, but for cells
 # that divide at a threshold: they do so in the step in which they get there, not in the next one.
 RULES, FLAGGED_DIVISION, BEFORE_CELLS, NUTRITION, GROWTH = 10, 20, 22, 25, 30
-MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, REMOVAL, DIVISION = 40, 45, 50, 60, 90, 100
+MECHANICS, GRID_COVERAGE, CIRCUIT, TRANSPORT, DIVISION, REMOVAL = 40, 45, 50, 60, 80, 90
 
 GEOMETRY = ("position", "axis", "length", "radius")
 # Names that every state has and an effect may read or write beside declared fields.
@@ -43,6 +43,12 @@ class Binding:
     dt: float
     dim: int
     declared: Mapping[str, str]
+
+    @property
+    def division_stage(self) -> int:
+        """The stage at which the scene's cells divide: at a threshold, or where rules flag them."""
+        at_threshold = self.declared.get("division_threshold") == "division"
+        return DIVISION if at_threshold else FLAGGED_DIVISION
 
 
 class Effect(metaclass=checks.KnownKeywords):

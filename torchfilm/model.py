@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchfilm import binding_checks
-from torchfilm.effect import BUILT_IN, Binding, BoundEffect, parameters
+from torchfilm.effect import BUILT_IN, DIVISION, Binding, BoundEffect, parameters
 from torchfilm.initial_cells import Cells
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, Field, State
@@ -119,7 +119,8 @@ class Model:
     def _first_fields(self) -> dict[str, Field]:
         """Fields that the effects declare, those declared alike once."""
         found: dict[str, Field] = {}
-        for effect in self.effects:
+        # first values of others may go by thresholds of division, which comes late in a step
+        for effect in sorted(self.effects, key=lambda e: e.stage != DIVISION):
             for field in effect.declares():
                 found.setdefault(field.name, field)
         # first values of other fields may go by type

@@ -237,6 +237,22 @@ def test_species_can_be_set_at_division(tmp_path):
     assert state.species0[0] == 0 and state.species0[1] == pytest.approx(8.0, rel=0.06)
 
 
+def test_divide_is_called_beside_a_threshold(tmp_path):
+    """Where the user gives the scene of a script a Division of another kind."""
+    text = (
+        HEAD
+        + SETUP
+        + "def init(cell):\n    cell.gen, cell.growthRate = 0, 1.0\n"
+        + "def update(cells):\n    for cell in cells.values(): cell.seen = cell.cellAge\n"
+        + "def divide(parent, d1, d2):\n    d1.gen = d2.gen = parent.gen + 1\n"
+    )
+    scene = tf.from_cellmodeller(written(tmp_path, text))
+    effects = [e for e in scene.effects if not isinstance(e, tf.Division)]
+    state = grown(scene.replace(*effects, tf.Division(length=4.0)), until=None, cells=8)
+    # in steps; the grandmother was born at the start
+    assert (state.gen == 2).all() and float(state.cellAge.max()) < 0.6 * state.step
+
+
 def test_no_warning_for_what_is_plain(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -107,9 +107,10 @@ def test_a_design_of_an_earlier_version_has_a_scene_and_no_check(saved, tmp_path
 
 FOREIGN = {
     "a text": ("no JSON", r"cannot be read as a saved design, which Best\.save writes"),
-    "a list": ("[]", r"it names no scene"),
-    "another table": ("{}", r"KeyError: 'scene'"),
-    "a number": ('{"scene": 3}', r"it names no scene"),
+    "a list": ("[]", r"its parameters are no table"),
+    "another table": ("{}", r"KeyError: 'parameters'"),
+    "a number": ('{"scene": 3, "parameters": {}}', r"names no scene"),
+    "parameters alone": ('{"parameters": {}}', r"names no scene"),
     "no parameters": ('{"scene": "a", "parameters": 3}', r"its parameters are no table"),
     "an unknown scene": ('{"scene": "a", "parameters": {}}', r"scene = 'a'"),
 }

@@ -63,7 +63,7 @@ def test_small_colonies_count_as_their_share():
     first = made.first()
     assert np.array_equal(first.point, small.points[0])
     assert first.loss == made.objective.evaluate(small.points[:1]).loss[0]
-    assert made.study.colonies == 9.0
+    assert made.first().searched is first.searched and made.study.colonies == 9.0
 
 
 def test_a_search_stops_at_the_requested_loss():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
+import pytest
 import torch
 from helpers import step
 
@@ -97,3 +99,67 @@ def test_a_rule_at_division_acts_right_after_divisions_of_both_kinds():
         assert state.cells == 2 and torch.allclose(
             state.born, torch.as_tensor(grown, dtype=state.dtype)
         )
+
+
+def test_a_variable_of_a_rule_may_be_called_like_the_threshold():
+    """It makes no threshold: rules flag cells, and `divide` is called where these divide."""
+
+    def update(cells):
+        cells.divide_flag = cells.length > cells.division_threshold
+
+    def divide(parent, first, second):
+        first.mark = second.mark = 1.0
+
+    rules = tf.Rules(update, divide, variables={"division_threshold": 3.75, "mark": 0.0})
+    scene = tf.Scene(rules, tf.Growth(rate=1.0), tf.Division(), dim=2, dt=0.1)
+    titles = [e.title for e in scene.bind().effects]
+    assert titles == ["rules", "division", "rules at division", "growth"]
+    *_, state = tf.simulate(scene, cells=4)
+    assert (state.mark == 1).all()
+
+
+def test_a_daughter_that_is_born_beyond_its_threshold_divides_in_the_next_step():
+    division = tf.Division(length=tf.Uniform(2.2, 6.0), fraction=0.8)
+    scene = tf.Scene(tf.Growth(rate=1.0), division, dim=2, dt=0.05)
+    waited = 0
+    state = scene.bind(4).start()
+    for _ in range(80):
+        due = state.uid[division.due(state)] + 1000 * state.own_colony_id[division.due(state)]
+        state = step(scene, state, 0.05)
+        here = state.uid + 1000 * state.own_colony_id
+        assert not torch.isin(due, here).any()
+        waited += len(due)
+    assert waited > 5
+
+
+def test_daughters_are_checked_for_places_outside_the_medium():
+    """A run that ends by a division does not hand out cells that have no signal."""
+    medium = tf.Medium(a=tf.Signal(diffusion=10.0, source=1.0), box=((-1, -1), (1, 1)), spacing=0.5)
+    division = tf.Division(length=4.0, axis_noise=0.0)
+    scene = tf.Scene(tf.Growth(rate=1.0), division, tf.Mechanics(dim=2), medium, dt=0.05)
+    with pytest.raises(tf.SimulationError, match="beyond the box of the medium"):
+        list(tf.simulate(scene, cells=2))
+
+
+def test_daughters_outside_a_region_are_removed_in_the_step_of_their_birth():
+    region = tf.Removal(low=(-1, -1), high=(1, 1))
+    division = tf.Division(length=4.0, axis_noise=0.0)
+    scene = tf.Scene(tf.Growth(rate=1.0), division, region, dim=2, dt=0.05)
+    last = list(tf.simulate(scene, until=1.0))[-1]
+    assert last.cells == 0
+
+
+def test_a_first_value_may_go_by_the_threshold():
+    @dataclass(frozen=True, eq=False)
+    class Resting(tf.Effect):
+        stage, title = 35, "resting"
+
+        def declares(self, dim):
+            first = lambda state, rows, values: 0.5 * state.division_threshold[rows]
+            return [tf.Field("rest", "of the threshold", "µm", initial=first)]
+
+        def step(self, state, dt, values):
+            return state
+
+    state = tf.Scene(Resting(), tf.Division(length=4.0), dim=2).bind().start()
+    assert state.rest.tolist() == [2.0]

@@ -16,7 +16,7 @@ from torchfilm.cellmodeller.globals_watch import GlobalsWatch
 from torchfilm.cellmodeller.loading import INNER_IMPORT, importing
 from torchfilm.cellmodeller.sheets import first_fields, sheet_of, with_written
 from torchfilm.cellmodeller.variables import HISTORY
-from torchfilm.effect import FLAGGED_DIVISION, Binding, BoundEffect
+from torchfilm.effect import Binding, BoundEffect
 from torchfilm.state import Births, Field, State
 from torchfilm.tools.checks import InputError, SimulationError
 from torchfilm.tools.warn_once import warn
@@ -202,7 +202,7 @@ class ScriptDivision(_Bound):
 
     def __init__(self, effect: ScriptRules, binding: Binding):
         super().__init__(effect, binding)
-        self.stage, self.title = FLAGGED_DIVISION + 1, "script at division"
+        self.stage, self.title = binding.division_stage + 1, "script at division"
 
     def declares(self) -> list[Field]:
         return []

@@ -18,6 +18,6 @@ KNOWN = {
     "mechanics": Mechanics,
     "circuit": Circuit,
     "transport": Medium,
-    "removal": Removal,
     "division": Division,
+    "removal": Removal,
 }

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchfilm.effect import BEFORE_CELLS, GRID_COVERAGE, Binding, BoundEffect
+from torchfilm.effect import BEFORE_CELLS, DIVISION, GRID_COVERAGE, Binding, BoundEffect
 from torchfilm.effects.medium_transport import Transport
 from torchfilm.signals.exchange import spans
 from torchfilm.signals.space import MOST_VOXELS
@@ -64,6 +64,23 @@ class _MediumPart(BoundEffect):
 
     def check(self, state: State) -> None:
         pass
+
+    @torch.no_grad()
+    def _look(self, state: State) -> MediumReport | None:
+        """The report on cells outside the medium; None if such cells are allowed."""
+        layout = state.layout
+        if layout is None or (layout.reservoir is not None and layout.obstacle is None):
+            return None
+        left, first = layout.outside_medium(state.places, state.groups)
+        place = torch.nn.functional.pad(state.places, (0, 0, 0, 1))  # none: 0
+        return MediumReport((left > 0).long(), left, place.index_select(0, first))
+
+    def _looked(self, state: State) -> State:
+        """The state with the report on cells outside the medium."""
+        report = self._look(state)
+        if report is None:
+            return state
+        return state.replace(reports={**state.reports, "medium": report})
 
 
 class FirstHalf(_MediumPart):
@@ -155,26 +172,13 @@ class GridCoverage(_MediumPart):
     def step(self, state: State, dt: float) -> State:
         if self.effect.outside == "grow":
             state = self._grown(state)
-        report = self._look(state)
-        return (
-            state if report is None else state.replace(reports={**state.reports, "medium": report})
-        )
+        return self._looked(state)
 
     def numerics(self, dt: float, state: State) -> list[str]:
         return [self.effect.coverage]
 
     def summary(self) -> str:
         return "checks that every cell is on the grid of its colony"
-
-    @torch.no_grad()
-    def _look(self, state: State) -> MediumReport | None:
-        """The report on cells outside the medium; None if such cells are allowed."""
-        layout = state.layout
-        if layout is None or (layout.reservoir is not None and layout.obstacle is None):
-            return None
-        left, first = layout.outside_medium(state.places, state.groups)
-        place = torch.nn.functional.pad(state.places, (0, 0, 0, 1))  # none: 0
-        return MediumReport((left > 0).long(), left, place.index_select(0, first))
 
     @torch.no_grad()
     def _span(self, state: State) -> tuple[Tensor, Tensor]:
@@ -226,3 +230,26 @@ class GridCoverage(_MediumPart):
                 for n, v, start in zip(names, values, first, strict=True)
             }
         )
+
+
+class DaughtersCoverage(_MediumPart):
+    """Checks that daughters are on their grid: their centres lie beside that of their parent."""
+
+    def __init__(self, effect: Medium, binding: Binding, transport: Transport):
+        super().__init__(effect, binding, transport)
+        self.stage, self.title = DIVISION + 5, "coverage of daughters"
+
+    def reads(self) -> tuple[str, ...]:
+        return ("position",)
+
+    def writes(self) -> tuple[str, ...]:
+        return ()
+
+    def step(self, state: State, dt: float) -> State:
+        return self._looked(state) if state.births else state
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        return ["where cells have divided in the step"]
+
+    def summary(self) -> str:
+        return "checks that daughters are on the grid of their colony"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchfilm.effect import DIVISION, FLAGGED_DIVISION, Binding, BoundEffect
+from torchfilm.effect import Binding, BoundEffect
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS, CellsView, DivisionView, RuleError
 from torchfilm.state import Births, Field, State
 from torchfilm.tools import checks
@@ -267,9 +267,7 @@ class DivisionRule(_BoundRule):
 
     def __init__(self, effect: Rules, binding: Binding, source: HotReload):
         super().__init__(effect, binding, source)
-        at_threshold = "division_threshold" in binding.declared
-        self.stage = (DIVISION if at_threshold else FLAGGED_DIVISION) + 1
-        self.title = "rules at division"
+        self.stage, self.title = binding.division_stage + 1, "rules at division"
 
     def declares(self) -> list[Field]:
         return []

@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchfilm.effect import DIVISION, FLAGGED_DIVISION, Binding, BoundEffect, Effect
+from torchfilm.effect import DIVISION, Binding, BoundEffect, Effect
 from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import Births, Ended, Field, State
@@ -59,8 +59,9 @@ class Division(Effect):
     Give at most one threshold. length: centreline length, µm. volume: µm³. added: centreline grown
     since birth, µm (the adder). Each is a number, one per colony, one per cell type, or a
     distribution drawn for each cell at birth. Cells divide at the end of the step in which they get
-    there, so that no state has a cell that is due; the flag also works beside a threshold. Without
-    a threshold, only cells with `divide_flag` divide, right after the rules, before cells grow.
+    there, but in the next one where they are born beyond it; the flag also works beside a
+    threshold. Without a threshold, only cells with `divide_flag` divide, right after the rules,
+    before cells grow.
 
     fraction: share of the length that the first daughter (at the −axis end) gets; a distribution is
     drawn at each division. axis_noise: standard deviation of the noise on each component of a
@@ -200,8 +201,7 @@ class Division(Effect):
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         bound = BoundEffect(self, binding)
-        if self.criterion is None:
-            bound.stage = FLAGGED_DIVISION
+        bound.stage = binding.division_stage
         return (bound,)
 
     def numerics(self, dt: float, state: State) -> list[str]:

@@ -10,8 +10,15 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchfilm.effect import TRANSPORT, Binding, BoundEffect, Effect, number_range
-from torchfilm.effects.bound_medium import BLOCK, BoundMedium, FirstHalf, GridCoverage, Transport
+from torchfilm.effect import DIVISION, TRANSPORT, Binding, BoundEffect, Effect, number_range
+from torchfilm.effects.bound_medium import (
+    BLOCK,
+    BoundMedium,
+    DaughtersCoverage,
+    FirstHalf,
+    GridCoverage,
+    Transport,
+)
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
 from torchfilm.signals.space import checked_box, checked_flow
 from torchfilm.signals.transport import COMPILED, METHODS
@@ -242,7 +249,10 @@ class Medium(Effect):
         transport = Transport(self, binding)
         main = BoundMedium(self, binding, transport)
         before = [FirstHalf(self, binding, transport)] if self.halves else []
-        return (*before, GridCoverage(self, binding, transport), main)
+        # a grid that grows does so before cells exchange signals in the next step
+        late = binding.division_stage == DIVISION and self.outside != "grow"
+        after = [DaughtersCoverage(self, binding, transport)] if late else []
+        return (*before, GridCoverage(self, binding, transport), main, *after)
 
     def backend_on(self, device: torch.device) -> str:
         """Who computes transport on a device: "compiled" or "torch"."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import difflib
 import functools
 import inspect
@@ -121,9 +122,10 @@ def check_call(
         ) from None
 
 
-class KnownKeywords(type):
+class KnownKeywords(abc.ABCMeta):
     """The metaclass of classes that raise InputError, with the nearest name, for a keyword that
-    they do not take, and for an argument that is missing.
+    they do not take, and for an argument that is missing. (One of abstract classes, so that a
+    user's subclass may be one.)
 
     instead, unnamed: of such a class, what to write in place of certain keywords, such as those of
     earlier versions, and of too many arguments without a name.

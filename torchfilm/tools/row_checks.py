@@ -6,18 +6,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchfilm.tools import checks
 
-WHOLE = (torch.int64, torch.int32)
+WHOLE = (torch.int64, torch.int32)  # of which torch takes rows
 
 
 def check_rows(name: str, rows: Any, count: int) -> None:
     """Raises InputError for what is no 1-D tensor of whole numbers. Their range is left to
     `out_of_range`: to look at it would wait for a GPU."""
-    if not isinstance(rows, Tensor) or rows.dtype not in WHOLE or rows.dim() != 1:
+    if not isinstance(rows, Tensor) or rows.dtype not in WHOLE or rows.dim() > 1:
         raise checks.input_error(name, rows, _rule(count))
 
 
@@ -39,25 +40,33 @@ def checked_places(name: str, given: Any, count: int, device: torch.device) -> T
         places = torch.as_tensor(given, device=device).reshape(-1)
     except (TypeError, ValueError, RuntimeError) as error:
         raise checks.input_error(name, given, "whole numbers, such as [0, 2]") from error
-    if places.numel() and places.dtype not in WHOLE:
-        hint = "torch.nonzero(mask)[:, 0] has those of a mask."
+    mask = places.dtype == torch.bool
+    if places.numel() and (mask or places.is_floating_point() or places.is_complex()):
+        hint = "torch.nonzero(mask)[:, 0] has those of a mask." if mask else ""
         raise checks.input_error(name, given, "whole numbers, such as [0, 2]", hint)
+    places = places.to(torch.int64)
     if places.numel() == 0 or bool((places < 0).any()) or bool((places >= count).any()):
         rule = f"places from 0 to {count - 1}, at least one"
         raise checks.input_error(name, places.tolist(), rule)
     if torch.unique(places).numel() != places.numel():
         raise checks.input_error(name, places.tolist(), "different places")
-    return places.to(torch.int64)
+    return places
 
 
 def check_declaration(name: Any, shape: Any, initial: Any) -> None:
     """Raises InputError for a field whose name, shape or first value is of another type."""
     if not isinstance(name, str):
         raise checks.input_error("Field.name", name, "a text")
-    if not isinstance(shape, tuple) or not all(isinstance(size, int) for size in shape):
+    whole = lambda size: isinstance(size, (int, np.integer))
+    if not isinstance(shape, (tuple, list)) or not all(map(whole, shape)):
         rule = "a tuple of whole numbers, such as (3,)"
         raise checks.input_error(f"Field({name!r}).shape", shape, rule)
-    if not callable(initial) and not isinstance(initial, (int, float)):
+    plain = isinstance(initial, (int, float, np.number, np.bool_))
+    if (
+        not plain
+        and not callable(initial)
+        and not (isinstance(initial, Tensor) and not initial.dim())
+    ):
         rule = "a number, or a function of a state and rows"
         raise checks.input_error(f"Field({name!r}).initial", initial, rule)
 
