@@ -148,7 +148,8 @@ def _draw_row(
 
 
 def _draw_convergence(ax: Axes, report: SearchReport) -> None:
-    """The loss of every full-size design, and the lowest so far; and of the best trivial answer."""
+    """The loss of the first guess, of every full-size design, and the lowest so far; and of the
+    best trivial answer."""
     study = report.study
     spent = np.concatenate([[0.0], study.convergence()[0]])
     places, losses = [np.empty(0)], [np.empty(0)]
@@ -159,6 +160,7 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
     x, y = np.concatenate(places), np.concatenate(losses)
     ax.plot(x, y, ".", color="0.75", ms=2, zorder=0)
     ax.step(x, np.minimum.accumulate(y), where="post", color="C3")
+    ax.plot([0.0], [report.first.loss], "o", color="0.55", clip_on=False)  # as among parameters
     answers = trivial_answers(report)
     if answers:
         name = min(answers, key=lambda n: answers[n])
