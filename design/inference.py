@@ -10,13 +10,14 @@ from typing import Any
 import torch
 
 import torchfilm as tf
+from design.methods.base import whole
 from design.neural_posterior import NeuralPosterior, require_sbi
 from design.parameters import Choice, Parameter
 from design.posterior import Posterior
 from design.progress import advance, open_bar
 from design.simulations import Simulations, simulate_designs
 from design.targets.observed import Observed
-from design.task import Task, check_whole
+from design.task import Task
 from torchfilm import checks
 
 LEAST = 50  # simulations that succeeded
@@ -73,7 +74,7 @@ def infer(
         ("simulations", simulations, LEAST), ("samples", samples, 10), ("flows", flows, 1),
         ("epochs", epochs, 1),
     ):  # fmt: skip
-        check_whole(name, value, least)
+        whole(name, value, least=least)
     kept = None if path is None else checks.file_path("path", path)
     task = Task(
         scene, parameters, observed, cells=cells,

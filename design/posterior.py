@@ -9,12 +9,13 @@ import numpy as np
 
 import torchfilm as tf
 from design.calibration import Calibration
+from design.methods.base import whole
 from design.neural_posterior import NeuralPosterior
 from design.parameters import Parameter, Value, show_value
 from design.posterior_plot import draw_corner
 from design.simulations import Simulations, random_points, shown_values, simulate_points
 from design.targets.observed import Observed
-from design.task import Task, check_whole
+from design.task import Task
 from torchfilm import checks
 
 LEVEL = 0.9  # of intervals, unless a caller gives one
@@ -155,8 +156,8 @@ class Posterior:
         """Simulation-based calibration (Talts et al., arXiv 1804.06788): grow colonies of hidden,
         random parameters, and see how often the posteriors of their statistics cover these. It
         costs `truths` simulations and no learning."""
-        check_whole("truths", truths, 2)
-        check_whole("samples", samples, 9)
+        whole("truths", truths, least=2)
+        whole("samples", samples, least=9)
         points = random_points(self.task, truths, stream=STREAM)
         # random numbers that no simulation has used
         first = 2**24 + STREAM * 2**20

@@ -18,7 +18,7 @@ import torchfilm as tf
 from design.objective import Objective
 from design.parameters import Choice, Parameter, Value
 from design.plain_data import NotPlain, from_data, to_data
-from design.robustness_check import check_robustness
+from design.robustness_check import ScoredDesign, check_robustness
 from design.rollout import FinishedColonies
 from design.scene_family import scene_function
 from design.targets.base import Target
@@ -28,20 +28,8 @@ from torchfilm import checks
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
-class FoundDesign(Protocol):
+class FoundDesign(ScoredDesign, Protocol):
     """What is written of a design, such as `Best`."""
-
-    @property
-    def objective(self) -> Objective: ...
-
-    @property
-    def values(self) -> Mapping[str, Value]: ...
-
-    @property
-    def point(self) -> np.ndarray: ...
-
-    @property
-    def searched(self) -> np.ndarray: ...
 
     @property
     def loss(self) -> float: ...

@@ -17,11 +17,12 @@ from design.finals import Finals, FinalsRun, fresh_losses, winner
 from design.front import Front, front_of
 from design.known import KnownDesigns, Start, known_designs
 from design.methods import METHODS, Chosen, Method, choose, method_of
+from design.methods.base import whole
 from design.objective import Objective
 from design.progress import advance, open_bar
 from design.rollout import FinishedColonies
 from design.study import Study
-from design.task import Task, TaskOptions, check_whole
+from design.task import Task, TaskOptions
 from design.turn import Turn, repeat_study
 from torchfilm import checks
 
@@ -126,7 +127,7 @@ class Search(TaskOptions):
         study of another search, and where no design was grown to full size.
         """
         self._check_run(colonies, stop_at)
-        check_whole("work_items", work_items, 1)
+        whole("work_items", work_items, least=1)
         study = None if study is None else checks.file_path("study", study)
         if self._known is not None and self._known.remark:
             print(self._known.remark, file=sys.stderr)

@@ -17,6 +17,7 @@ import torch
 
 import torchfilm as tf
 from design.colonies import RunSettings
+from design.methods.base import whole
 from design.parameters import Choice, Parameter, Space
 from design.scene_family import (
     SceneFamily,
@@ -260,7 +261,7 @@ def _check_options(options: TaskOptions) -> float | None:
     for name, least in (("cells", 2), ("replicates", 1), ("most", 1), ("seed", 0)):
         value = getattr(options, name)
         if value is not None or name in ("replicates", "seed"):
-            check_whole(name, value, least)
+            whole(name, value, least=least)
     if not isinstance(options.fixed, Mapping | None):
         raise checks.input_error(
             "fixed", options.fixed, 'arguments of the scene function by name, such as {"dim": 3}'
@@ -283,9 +284,3 @@ def _whole_numbers(given: Any) -> list[int]:
     except TypeError:
         return []
     return found
-
-
-def check_whole(name: str, value: Any, least: int) -> None:
-    """Raises InputError unless a value is a whole number from `least`."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise checks.input_error(name, value, f"a whole number from {least}")

@@ -62,11 +62,8 @@ def check_declaration(name: Any, shape: Any, initial: Any) -> None:
         rule = "a tuple of whole numbers, such as (3,)"
         raise checks.input_error(f"Field({name!r}).shape", shape, rule)
     plain = isinstance(initial, (int, float, np.number, np.bool_))
-    if (
-        not plain
-        and not callable(initial)
-        and not (isinstance(initial, Tensor) and not initial.dim())
-    ):
+    plain = plain or (isinstance(initial, Tensor) and not initial.dim())
+    if not plain and not callable(initial):
         rule = "a number, or a function of a state and rows"
         raise checks.input_error(f"Field({name!r}).initial", initial, rule)
 
