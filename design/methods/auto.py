@@ -17,9 +17,13 @@ BATCH, WIDTH = 24, 0.5
 # designs before the first descents (less than one race, whose end they await), and for each
 # parameter of a descent, so that it ends
 BEFORE, EACH, MOST_STARTS = 5, 10, 3
-# where every design needs many replicates: designs of a batch of a race, and of a model, whose time
-# grows as the cube of all designs that it holds
-FEW, MODEL_BATCH, MODELLED = 12, 6, 400
+# designs of a batch of a race where every design needs many replicates
+FEW = 12
+# designs of a batch of a model, and at most in a search, since its time grows as the cube of all
+# designs that it holds: where it draws them all, and where the best of a race reach it
+MODEL_BATCH, MODELLED, RACED = 6, 400, 1000
+# fewer designs than these are not enough for a race and what comes after it: with a model, without
+LEAST_MODELLED, LEAST_RACED = 20, 2 * BATCH
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,22 +56,25 @@ def choose(
     there are, else 0; before: what the study of a search that is resumed says of its method,
     which goes on."""
     cloud = CMAES(population=BATCH, sigma=WIDTH)
+    botorch = find_spec("botorch") is not None
+    least = LEAST_MODELLED if botorch else LEAST_RACED
     few = Chosen(
         cloud,
-        f"{designs:.0f} designs are fewer than two batches of {BATCH}, so there is nothing to spare"
-        " for small colonies; its first batch is of Sobol points",
+        f"{designs:.0f} designs are fewer than {least}, so there is nothing to spare for small"
+        " colonies; its first batch is of Sobol points",
     )
+    better = not botorch and designs <= (MODELLED if chance else RACED)
+    hint = " (with botorch installed, a model of the loss would)" if better else ""
     race = Chosen(
         Racing(inner=cloud),
         f"{designs:.0f} designs for {dimensions} parameters: small colonies first, and CMA-ES"
-        " learns from the best",
+        f" learns from the best{hint}",
     )
     lucky = Chosen(
         Racing(inner=CMAES(population=FEW, sigma=WIDTH), small=max(chance, 1)),
         f"{designs:.0f} designs for {dimensions} parameters: small colonies first, with all"
         " replicates, since molecules are counted one by one and one colony says little; CMA-ES"
-        " learns from the best"
-        + ("" if find_spec("botorch") else " (with botorch installed, a model of the loss would)"),
+        f" learns from the best{hint}",
     )
     descents = tuple(
         Chosen(
@@ -78,23 +85,30 @@ def choose(
         )
         for starts in range(1, MOST_STARTS + 1)
     )
-    modelled = lucky
-    if find_spec("botorch"):
+    modelled, learnt = lucky, race
+    if botorch:
+        learnt = Chosen(
+            Racing(inner=Bayesian(batch=MODEL_BATCH)),
+            f"{designs:.0f} designs for {dimensions} parameters: small colonies first, and a model"
+            " of the loss learns from the best",
+        )
         modelled = Chosen(
             Bayesian(batch=MODEL_BATCH),
             f"{designs:.0f} designs for {dimensions} parameters: a model of the loss, which knows"
             " that colonies differ by luck, since molecules are counted one by one",
         )
-    for known in (few, race, lucky, modelled, *descents) if before else ():
+    for known in (few, race, learnt, lucky, modelled, *descents) if before else ():
         if known.describe() == before:
             return Chosen(known.method, "the study began with it")
     if goals:
         return Chosen(NSGA2(), f"{goals} goals side by side")
     if not pattern:
         return Chosen(cloud, "data of a colony of one size: a smaller one does not compare")
-    if designs < 2 * BATCH:
+    if designs < least:
         return few
     if chance:
         return modelled if designs <= MODELLED else lucky
     room = int((designs - BEFORE) / (EACH * dimensions))
-    return descents[min(room, MOST_STARTS) - 1] if squares and room else race
+    if squares and room:
+        return descents[min(room, MOST_STARTS) - 1]
+    return learnt if designs <= RACED else race

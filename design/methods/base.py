@@ -82,7 +82,8 @@ class Method(Protocol):
 
 class Source(Method, Protocol):
     """A method that can draw more points than it needs and learn from some of them, as `Racing`
-    requires."""
+    requires. One that draws slowly has `recall(points)`: in a search that is resumed it gets the
+    points that it drew, once it is no more `fresh`, in place of `draw`."""
 
     @property
     def wanted(self) -> int:

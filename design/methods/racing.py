@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import kendalltau
 
-from design.methods.base import Batch, Source, Turns, whole
+from design.methods.base import Batch, Source, Turns, check_kind, whole
 from design.methods.cmaes import CMAES
 from torchfilm import checks
 
@@ -22,13 +22,13 @@ class Racing(Turns):
     """Draws more points than another method needs, grows them as small colonies, and keeps the best
     at each size.
 
-    inner: the method that draws the points and learns from those grown to full size, CMAES or
-    Sobol; None is CMAES(). sizes: shares of the full size, rising, the last 1. keep: the share of
-    the points that continues from one size to the next. small: replicates at all sizes but the
-    last. agree: the race is skipped where the order of the finalists in small and full colonies
-    agrees less than this (Kendall's tau, smoothed over races, from 1). Then as many points as
-    `inner` needs are grown to full size at once. -1 never skips. A new cloud of CMAES trusts small
-    colonies again. first: finalists of a race from which a cloud is to begin, since only the best
+    inner: the method that draws the points and learns from those grown to full size, CMAES,
+    Bayesian or Sobol; None is CMAES(). sizes: shares of the full size, rising, the last 1. keep:
+    the share of the points that continues from one size to the next. small: replicates at all sizes
+    but the last. agree: the race is skipped where the order of the finalists in small and full
+    colonies agrees less than this (Kendall's tau, smoothed over races, from 1). Then as many points
+    as `inner` needs are grown to full size at once. -1 never skips. A new cloud of CMAES trusts
+    small colonies again. first: finalists of a race from which a cloud is to begin, since only the best
     of them counts there; before them, `keep` chooses among full colonies of `small` replicates. A
     cloud that needs no more losses has a race like all others.
 
@@ -57,7 +57,7 @@ class Racing(Turns):
             raise checks.input_error(
                 "Racing.inner",
                 self.inner,
-                "a method that can draw more points than it needs, such as CMAES() or Sobol()",
+                "a method that can draw more points than it needs: CMAES(), Bayesian() or Sobol()",
             )
         self.sizes = checks.vector("Racing.sizes", self.sizes)
         if (
@@ -94,8 +94,20 @@ class Racing(Turns):
         self._left = np.empty(0, dtype=np.int64)
         self._early: np.ndarray | None = None  # losses of all drawn points, at the first size
 
-    def _draw(self) -> None:
-        """Begin a race: its rungs, each a size, replicates and how many points, and the points."""
+    def _meet(self, batch: Batch) -> None:
+        """A method that draws slowly recalls the points of a race of a search that is resumed."""
+        recall = getattr(self._source, "recall", None)
+        if self._batch is not None or len(self._left) or recall is None or self._source.fresh:
+            super()._meet(batch)
+            return
+        self._plan()
+        size, replicates, count = self._rungs[0]
+        check_kind((count, self._started().size, size, replicates), batch, "Racing")
+        recall(batch.points)
+        self._enter(batch.points)
+
+    def _plan(self) -> None:
+        """The rungs of a race, each a size, replicates and how many points."""
         small, last = min(self.small, self._replicates), self._source.wanted
         rungs: list[tuple[float, int | None]] = [(size, small) for size in self.sizes[:-1]]
         if self._source.fresh:
@@ -112,12 +124,15 @@ class Racing(Turns):
         self._rungs = [(*rung, count) for rung, count in zip(rungs, counts, strict=True)]
         if self._trust < self.agree:
             self._rungs = self._rungs[-1:]
-        self._points = self._source.draw(self._rungs[0][2])
-        self._left = np.arange(len(self._points))
+
+    def _enter(self, points: np.ndarray) -> None:
+        """Begin a race of these points."""
+        self._points, self._left = points, np.arange(len(points))
 
     def _next(self) -> Batch:
         if not len(self._left):
-            self._draw()
+            self._plan()
+            self._enter(self._source.draw(self._rungs[0][2]))
         size, replicates, _ = self._rungs[self._rung]
         return Batch(self._points[self._left], size=size, replicates=replicates)
 

@@ -24,9 +24,10 @@ MAKE: dict[str, Callable] = {
 }
 if find_spec("botorch"):
     MAKE["bayesian"] = lambda: Bayesian(batch=2, first=4)
+    MAKE["racing bayesian"] = lambda: Racing(inner=Bayesian(batch=2), keep=0.5, first=3)
 made = pytest.mark.parametrize("make", MAKE.values(), ids=MAKE)
 # a batch of Bayesian takes a second, so only two spaces test it
-CASES = [(m, s) for m in MAKE for s in SPACES if m != "bayesian" or s in ("line", "mixed")]
+CASES = [(m, s) for m in MAKE for s in SPACES if "bayesian" not in m or s in ("line", "mixed")]
 everywhere = pytest.mark.parametrize(
     ("make", "space"), [(MAKE[m], SPACES[s]) for m, s in CASES], ids=[f"{m} {s}" for m, s in CASES]
 )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from asking import SPACES, Room, begun, ellipsoid, evaluate, follow, sphere
 
-from design.methods import CMAES, Bayesian, Racing, Sobol
+from design.methods import CMAES, Batch, Bayesian, Racing, Sobol
 from torchfilm.tools.checks import InputError
 
 # Sobol
@@ -255,6 +255,36 @@ if find_spec("botorch"):
         space = Room((None,) * 4)
         plain = evaluate(begun(Sobol(), space, seed), ellipsoid, 42).min()
         assert evaluate(begun(Bayesian(), space, seed), ellipsoid, 42).min() < 0.1 * plain
+
+    def test_a_race_resumes_without_drawing_from_the_model_again(monkeypatch):
+        make = lambda: begun(Racing(inner=Bayesian(batch=3)), SPACES["line"], replicates=2)
+        whole = follow(make(), ellipsoid, 6)
+        chosen, choose = [], Bayesian._choose
+        monkeypatch.setattr(
+            Bayesian, "_choose", lambda *given: [chosen.append(1), choose(*given)][1]
+        )
+        again = make()
+        for batch, loss in whole:
+            again.tell(batch, loss)
+        assert not chosen
+        other = make()
+        for _ in whole:
+            batch = other.ask()
+            other.tell(batch, ellipsoid(batch.points))
+        assert chosen and (again.ask().points == other.ask().points).all()
+
+    def test_a_race_refuses_a_batch_of_another_kind_where_the_model_draws():
+        given = begun(Racing(inner=Bayesian(batch=3)), SPACES["line"], replicates=2)
+        follow(given, ellipsoid, 2)  # the first race, which does not know the model yet
+        wrong = Batch(np.full((4, 1), 0.5), size=0.25, replicates=1)
+        with pytest.raises(InputError, match=r"\(4, 1, 0.25, 1\).*\(10, 1, 0.25, 1\), as proposed"):
+            given.tell(wrong, np.ones(4))
+
+    def test_a_race_with_a_model_needs_fewer_designs_than_one_with_a_cloud():
+        """In eight dimensions, where small colonies are best somewhere else."""
+        made = Bayesian(batch=6), CMAES(population=24, sigma=0.5)
+        model, cloud = (race(Racing(inner=m), 0, shift=0.05, target=0.04, budget=150) for m in made)
+        assert model < 0.75 * cloud
 
     def test_bayesian_tries_no_design_twice_while_others_are_left():
         """Of 12 designs it tries all before it tries one again, but for what Sobol points

@@ -149,7 +149,7 @@ def test_there_is_no_slope_among_levels_alone(method):
 def test_auto_descends_where_the_loss_is_a_sum_of_squares():
     chosen = choose(5, 500, 0, squares=True)
     assert isinstance(chosen.method, Polish) and "slope" in chosen.why
-    assert isinstance(choose(5, 500, 0).method, Racing)
+    assert isinstance(choose(5, 500, 0).method, Racing)  # without slopes
     # too few designs for descents that come to an end
     assert isinstance(choose(30, 300, 0, squares=True).method, Racing)
     # as many descents side by side as come to an end
@@ -159,6 +159,26 @@ def test_auto_descends_where_the_loss_is_a_sum_of_squares():
     assert isinstance(choose(5, 500, 0, squares=True, before=before).method, Racing)
     again = choose(5, 9000, 0, squares=True, before=choose(5, 80, 0, squares=True).describe())
     assert isinstance(again.method, Polish) and again.method.starts == 1
+
+
+def test_auto_races_with_a_model_where_there_is_no_slope():
+    chosen = choose(5, 500, 0)
+    assert isinstance(chosen.method.inner, Bayesian) and "model of the loss" in chosen.why
+    assert isinstance(choose(5, 20, 0).method.inner, Bayesian)
+    assert isinstance(choose(5, 19, 0).method, CMAES)  # the first race takes twelve
+    # a model of more designs takes too long
+    many = choose(5, 2000, 0)
+    assert isinstance(many.method.inner, CMAES) and "botorch" not in many.why
+    # a study that began without it goes on so
+    assert isinstance(choose(5, 500, 0, before=many.describe()).method.inner, CMAES)
+
+
+def test_auto_says_what_botorch_would_do(monkeypatch):
+    monkeypatch.setattr("design.methods.auto.find_spec", lambda name: None)
+    chosen = choose(5, 500, 0)
+    assert isinstance(chosen.method.inner, CMAES) and "with botorch installed" in chosen.why
+    assert "botorch" not in choose(5, 2000, 0).why  # it would not, there
+    assert isinstance(choose(5, 47, 0).method, CMAES)
 
 
 def test_auto_models_the_loss_where_molecules_are_counted():
