@@ -20,7 +20,7 @@ BEFORE, EACH, MOST_STARTS = 5, 10, 3
 # designs of a batch of a race where every design needs many replicates
 FEW = 12
 # designs of a batch of a model, and at most in a search, since its time grows as the cube of all
-# designs that it holds: where it draws them all, and where the best of a race reach it
+# designs that it holds: where it draws them all, and where it learns from the best of races
 MODEL_BATCH, MODELLED, RACED = 6, 400, 1000
 # fewer designs than these are not enough for a race and what comes after it: with a model, without
 LEAST_MODELLED, LEAST_RACED = 20, 2 * BATCH
@@ -55,60 +55,60 @@ def choose(
     with exact derivatives; chance: where molecules are counted one by one, how many replicates
     there are, else 0; before: what the study of a search that is resumed says of its method,
     which goes on."""
-    cloud = CMAES(population=BATCH, sigma=WIDTH)
-    botorch = find_spec("botorch") is not None
+    botorch, cloud = find_spec("botorch") is not None, CMAES(population=BATCH, sigma=WIDTH)
     least = LEAST_MODELLED if botorch else LEAST_RACED
+    most = MODELLED if chance or not pattern else RACED
+    about = f"{designs:.0f} designs for {dimensions} parameters"
+    hint = " (with botorch installed, a model of the loss would)"
+    hint = "" if botorch or designs > most else hint
     few = Chosen(
         cloud,
         f"{designs:.0f} designs are fewer than {least}, so there is nothing to spare for small"
         " colonies; its first batch is of Sobol points",
     )
-    better = not botorch and designs <= (MODELLED if chance else RACED)
-    hint = " (with botorch installed, a model of the loss would)" if better else ""
+    luck = "molecules are counted one by one, and one colony says little"
     race = Chosen(
-        Racing(inner=cloud),
-        f"{designs:.0f} designs for {dimensions} parameters: small colonies first, and CMA-ES"
-        f" learns from the best{hint}",
+        Racing(inner=cloud), f"{about}: small colonies first; CMA-ES learns from the best{hint}"
     )
-    lucky = Chosen(
-        Racing(inner=CMAES(population=FEW, sigma=WIDTH), small=max(chance, 1)),
-        f"{designs:.0f} designs for {dimensions} parameters: small colonies first, with all"
-        " replicates, since molecules are counted one by one and one colony says little; CMA-ES"
-        f" learns from the best{hint}",
-    )
-    descents = tuple(
-        Chosen(
-            Polish(inner=Racing(inner=cloud), after=BEFORE, starts=starts),
-            f"{designs:.0f} designs for {dimensions} parameters: one race of small colonies, then"
-            " down the slope from the best, of one replicate at first, since the loss is a sum of"
-            " squares with exact derivatives",
+    if chance:
+        race = Chosen(
+            Racing(inner=CMAES(population=FEW, sigma=WIDTH), small=chance),
+            f"{about}: {luck}; small colonies first, with all replicates; CMA-ES learns from the"
+            f" best{hint}",
         )
-        for starts in range(1, MOST_STARTS + 1)
-    )
-    modelled, learnt = lucky, race
+    data = "data of a colony of one size: a smaller one does not compare"
+    fit = Chosen(cloud, f"{data}; CMA-ES learns from all{hint}")
+    learnt, modelled = race, fit
     if botorch:
         learnt = Chosen(
             Racing(inner=Bayesian(batch=MODEL_BATCH)),
-            f"{designs:.0f} designs for {dimensions} parameters: small colonies first, and a model"
-            " of the loss learns from the best",
+            f"{about}: small colonies first; a model of the loss learns from the best",
         )
         modelled = Chosen(
             Bayesian(batch=MODEL_BATCH),
-            f"{designs:.0f} designs for {dimensions} parameters: a model of the loss, which knows"
-            " that colonies differ by luck, since molecules are counted one by one",
+            f"{about}: {luck if pattern else data}; a model of the loss knows that colonies differ"
+            " by luck",
         )
-    for known in (few, race, learnt, lucky, modelled, *descents) if before else ():
+    descents = tuple(
+        Chosen(
+            Polish(inner=Racing(inner=cloud), after=BEFORE, starts=starts),
+            f"{about}: one race of small colonies, then down the slope from the best, of one"
+            " replicate at first, since the loss is a sum of squares with exact derivatives",
+        )
+        for starts in range(1, MOST_STARTS + 1)
+    )
+    for known in (few, race, learnt, modelled, *descents) if before else ():
         if known.describe() == before:
             return Chosen(known.method, "the study began with it")
     if goals:
         return Chosen(NSGA2(), f"{goals} goals side by side")
     if not pattern:
-        return Chosen(cloud, "data of a colony of one size: a smaller one does not compare")
+        return modelled if designs <= most else fit
     if designs < least:
         return few
-    if chance:
-        return modelled if designs <= MODELLED else lucky
     room = int((designs - BEFORE) / (EACH * dimensions))
-    if squares and room:
+    if squares and room and not chance:
         return descents[min(room, MOST_STARTS) - 1]
-    return learnt if designs <= RACED else race
+    if designs > most:
+        return race
+    return modelled if chance and botorch else learnt

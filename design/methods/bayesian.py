@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from design.methods.base import Batch, Turns, check_kind, numpy_kept, snap, sobol_points, whole
-from torchfilm import checks
+from torchfilm import checks, one_torch_thread
 
 # The optimisation of the acquisition starts from the best few of many samples, and takes so many
 # steps: more made no difference to the searches, and took twice the time.
@@ -31,7 +31,7 @@ class Bayesian(Turns):
     twice the distance from the median to the best counts as that limit, so that failed designs do
     not flatten the model. Levels are rounded during the choice of points. A point already tried is
     replaced by a Sobol point. While all losses are equal, the method proposes Sobol points. The
-    same bits need the same machine, versions and number of threads.
+    same bits need the same machine and versions.
     """
 
     batch: int = 8
@@ -90,6 +90,7 @@ class Bayesian(Turns):
             return self._drawn
         with (
             warnings.catch_warnings(),
+            one_torch_thread(),  # matrices are small: another one would only wait
             torch.random.fork_rng(devices=[]),
             numpy_kept([self._seed, known]),
         ):

@@ -4,6 +4,7 @@ and few replicates say of a design, and measures designs per hour.
     python experiments/benchmarks/search.py tasks      # an hour or two on two cores
     python experiments/benchmarks/search.py tasks --tasks stripe ring --methods auto --seeds 3
     python experiments/benchmarks/search.py tasks --methods auto --stop    # minutes
+    python experiments/benchmarks/search.py tasks --methods racing bayesian modelled --seeds 2
     python experiments/benchmarks/search.py ranks --tasks "domain size"
     python experiments/benchmarks/search.py rate
 
@@ -33,7 +34,7 @@ from scipy.stats import kendalltau
 from tasks import CELLS, REPLICATES, SHARE, TASKS, UNSEEN, SearchTask
 
 import torchfilm as tf
-from design import CMAES, Local, Objective, Racing, Search, Sobol, Task
+from design import CMAES, Bayesian, Local, Objective, Racing, Search, Sobol, Task
 from design.methods.base import sobol_points
 from design.trivial import trivial_losses
 
@@ -45,6 +46,8 @@ METHODS = {
     "sobol": lambda: Sobol(batch=24),
     "cmaes": lambda: CMAES(**CLOUD),
     "racing": lambda: Racing(inner=CMAES(**CLOUD)),
+    "bayesian": lambda: Bayesian(batch=6),
+    "modelled": lambda: Racing(inner=Bayesian(batch=6)),
     "local": Local,
 }
 

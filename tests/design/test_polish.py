@@ -191,6 +191,12 @@ def test_auto_models_the_loss_where_molecules_are_counted():
     assert isinstance(choose(3, 200, 0, chance=8, before=before).method, Racing)
 
 
+def test_auto_models_the_loss_of_data():
+    chosen = choose(4, 100, 0, pattern=False)
+    assert isinstance(chosen.method, Bayesian) and "does not compare" in chosen.why
+    assert isinstance(choose(4, 401, 0, pattern=False).method, CMAES)
+
+
 def test_without_botorch_auto_races_with_all_replicates_where_molecules_are_counted(monkeypatch):
     monkeypatch.setattr("design.methods.auto.find_spec", lambda name: None)
     parameters = [Parameter("strength", 3.0, 30.0, log=True)]
