@@ -301,7 +301,8 @@ class Search(TaskOptions):
             task.goals,
             task.target.pattern,
             self.objective.least_squares,
-            task.replicates if task.tried.stochastic else 0,
+            task.tried.stochastic,
+            task.replicates,
             before,
         )
 

@@ -88,7 +88,10 @@ def repeat_study(
     """Bring a method to where the study ends: it proposes each batch again and learns its losses.
     Returns the turn of which only a part was grown, if any. Raises InputError where the method
     proposes other points."""
+    recall = getattr(method, "recall", None)
     for k, entry in enumerate(study.entries):
+        if recall is not None:  # of the last batch it may have grown only a part
+            recall(entry.points if k < len(study.entries) - 1 else None)
         turn = Turn.of_number(k, method, task, known)
         turn.entry = entry
         wanted = turn.batch.points[: turn.done]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
@@ -22,8 +23,11 @@ FEW = 12
 # designs of a batch of a model, and at most in a search, since its time grows as the cube of all
 # designs that it holds: where it draws them all, and where it learns from the best of races
 MODEL_BATCH, MODELLED, RACED = 6, 400, 1000
-# fewer designs than these are not enough for a race and what comes after it: with a model, without
-LEAST_MODELLED, LEAST_RACED = 20, 2 * BATCH
+# fewer designs than these are not enough for races of CMA-ES, and for descents
+LEAST_RACED = 2 * BATCH
+# colonies of the first race of a model and of the next one, without those of all replicates, and
+# designs that these races grow with all replicates; the rest of a budget, a fifth, is for finals
+EARLY, FINALISTS, SEARCHED = 32.25, 11, 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,25 +50,31 @@ def choose(
     goals: int,
     pattern: bool = True,
     squares: bool = False,
-    chance: int = 0,
+    chance: bool = False,
+    replicates: int = 4,
     before: str = "",
 ) -> Chosen:
     """The method of a search that leaves the choice. dimensions: parameters; designs: that the
     budget can grow with all replicates; goals: 0 for one target; pattern: whether the target is a
     pattern, of which small colonies show something; squares: whether its loss is a sum of squares
-    with exact derivatives; chance: where molecules are counted one by one, how many replicates
-    there are, else 0; before: what the study of a search that is resumed says of its method,
-    which goes on."""
+    with exact derivatives; chance: whether molecules are counted one by one; replicates: of a
+    design; before: what the study of a search that is resumed says of its method, which goes
+    on."""
     botorch, cloud = find_spec("botorch") is not None, CMAES(population=BATCH, sigma=WIDTH)
-    least = LEAST_MODELLED if botorch else LEAST_RACED
-    most = MODELLED if chance or not pattern else RACED
-    about = f"{designs:.0f} designs for {dimensions} parameters"
+    alone = chance or not pattern  # the model draws all designs
+    most, least = MODELLED if alone else RACED, LEAST_RACED if pattern else 0
+    if botorch:
+        least = math.ceil((EARLY / replicates + FINALISTS) / SEARCHED)
+        if alone:  # its first batch is of Sobol points
+            least = max(MODEL_BATCH, 2 * (dimensions + 1)) + MODEL_BATCH
+    whole = math.floor(designs)
+    about = f"{whole} designs for {dimensions} parameters"
     hint = " (with botorch installed, a model of the loss would)"
     hint = "" if botorch or designs > most else hint
     few = Chosen(
         cloud,
-        f"{designs:.0f} designs are fewer than {least}, so there is nothing to spare for small"
-        " colonies; its first batch is of Sobol points",
+        f"{whole} designs are fewer than {least}, too few to learn much from; its first batch is of"
+        " Sobol points",
     )
     luck = "molecules are counted one by one, and one colony says little"
     race = Chosen(
@@ -72,13 +82,12 @@ def choose(
     )
     if chance:
         race = Chosen(
-            Racing(inner=CMAES(population=FEW, sigma=WIDTH), small=chance),
+            Racing(inner=CMAES(population=FEW, sigma=WIDTH), small=replicates),
             f"{about}: {luck}; small colonies first, with all replicates; CMA-ES learns from the"
             f" best{hint}",
         )
     data = "data of a colony of one size: a smaller one does not compare"
     fit = Chosen(cloud, f"{data}; CMA-ES learns from all{hint}")
-    learnt, modelled = race, fit
     if botorch:
         learnt = Chosen(
             Racing(inner=Bayesian(batch=MODEL_BATCH)),
@@ -97,18 +106,17 @@ def choose(
         )
         for starts in range(1, MOST_STARTS + 1)
     )
-    for known in (few, race, learnt, modelled, *descents) if before else ():
-        if known.describe() == before:
-            return Chosen(known.method, "the study began with it")
+    known = (few, race, *descents, *((learnt, modelled) if botorch else ()))
+    for chosen in known if before else ():
+        if chosen.describe() == before:
+            return Chosen(chosen.method, "the study began with it")
     if goals:
         return Chosen(NSGA2(), f"{goals} goals side by side")
-    if not pattern:
-        return modelled if designs <= most else fit
     if designs < least:
         return few
     room = int((designs - BEFORE) / (EACH * dimensions))
-    if squares and room and not chance:
+    if squares and room and not alone and designs >= LEAST_RACED:
         return descents[min(room, MOST_STARTS) - 1]
-    if designs > most:
-        return race
-    return modelled if chance and botorch else learnt
+    if designs > most or not botorch:
+        return race if pattern else fit
+    return modelled if alone else learnt

@@ -70,7 +70,8 @@ class Method(Protocol):
     calls of `tell`: a new method resumes a stopped search from the batches and losses of its study.
     A method with `describe() -> str` is recognised when a search is resumed. One with `know(points,
     loss)` learns before its first batch of the designs from which a search starts; `loss` is as for
-    `tell`.
+    `tell`. One with `recall(points)` is told, where a search is resumed, what its next `ask` gave
+    then (None: not known), and need not work it out again.
     """
 
     def start(self, space: Dimensions, seed: int, replicates: int) -> None: ...
@@ -82,8 +83,7 @@ class Method(Protocol):
 
 class Source(Method, Protocol):
     """A method that can draw more points than it needs and learn from some of them, as `Racing`
-    requires. One that draws slowly has `recall(points)`: in a search that is resumed it gets the
-    points that it drew, once it is no more `fresh`, in place of `draw`."""
+    requires."""
 
     @property
     def wanted(self) -> int:

@@ -9,12 +9,14 @@ from importlib.util import find_spec
 import numpy as np
 import torch
 
-from design.methods.base import Batch, Turns, check_kind, numpy_kept, snap, sobol_points, whole
+from design.methods.base import Batch, Turns, numpy_kept, snap, sobol_points, whole
 from torchfilm import checks, one_torch_thread
 
 # The optimisation of the acquisition starts from the best few of many samples, and takes so many
 # steps: more made no difference to the searches, and took twice the time.
 RESTARTS, SAMPLES, STEPS = 2, 64, 20
+# Sobol points of a draw beyond its own, in place of points that were drawn before.
+MORE = 64
 
 
 @dataclass(kw_only=True, eq=False)
@@ -29,9 +31,9 @@ class Bayesian(Turns):
 
     The loss is standardised; its noise is inferred. A loss that exceeds the median by more than
     twice the distance from the median to the best counts as that limit, so that failed designs do
-    not flatten the model. Levels are rounded during the choice of points. A point already tried is
-    replaced by a Sobol point. While all losses are equal, the method proposes Sobol points. The
-    same bits need the same machine and versions.
+    not flatten the model. Levels are rounded during the choice of points. A point drawn before is
+    replaced by a Sobol point that is new, if one of many is. While all losses are equal, the method
+    proposes Sobol points. The same bits need the same machine and versions.
     """
 
     batch: int = 8
@@ -52,10 +54,14 @@ class Bayesian(Turns):
         self._loss = np.empty(0)
         self._open = self.first or max(self.batch, 2 * (size + 1))
         self._draws = 0  # points drawn so far
+        self._tried: set[bytes] = set()
+        self._recalled: np.ndarray | None = None
 
     def know(self, points: np.ndarray, loss: np.ndarray) -> None:
         """The model begins with them."""
         self._points, self._loss = points.copy(), loss.copy()
+        self._draws = len(points)  # they may be the first Sobol points
+        self._tried.update(row.tobytes() for row in self._points)
 
     @property
     def wanted(self) -> int:
@@ -65,51 +71,60 @@ class Bayesian(Turns):
     def fresh(self) -> bool:
         return not len(self._loss)
 
-    def recall(self, points: np.ndarray) -> None:
-        """Take points that it drew in a search that is resumed: to draw them again would take
-        seconds."""
-        self._drawn, self._draws = points, self._draws + len(points)
+    def recall(self, points: np.ndarray | None) -> None:
+        """The points of the next draw, where the model would choose them: to do so takes seconds.
+        None: they are not known."""
+        self._recalled = points
+
+    def draw(self, count: int) -> np.ndarray:
+        space, loss = self._started(), tamed(self._loss)
+        spare = sobol_points(space, self._seed, self._draws, count + MORE)
+        recalled, self._recalled = self._recalled, None
+        if not len(loss) or loss.min() == loss.max():
+            self._drawn = spare[:count]
+        elif recalled is not None and recalled.shape == (count, space.size):
+            self._drawn = recalled.copy()
+        else:
+            self._drawn = self._untried(self._modelled(loss, count), spare)
+        self._draws += count
+        self._tried.update(row.tobytes() for row in self._drawn)
+        return self._drawn
+
+    def _untried(self, points: np.ndarray, spare: np.ndarray) -> np.ndarray:
+        """The points, with spare ones for those that were drawn before or are twice among them."""
+        taken, left = set(self._tried), iter(spare)
+        for place in range(len(points)):
+            while points[place].tobytes() in taken and (new := next(left, None)) is not None:
+                points[place] = new
+            taken.add(points[place].tobytes())
+        return points
 
     def take(self, rows: np.ndarray, loss: np.ndarray) -> None:
         self._points = np.concatenate([self._points, self._drawn[rows]])
         self._loss = np.concatenate([self._loss, loss])
 
-    def _meet(self, batch: Batch) -> None:
-        """Check only the shape of a batch of a resumed search."""
-        if self._batch is None and not self.fresh:
-            check_kind((self.batch, self._started().size, 1.0, None), batch, "Bayesian")
-            self.recall(batch.points)
-        else:
-            super()._meet(batch)
+    def _next(self) -> Batch:
+        return Batch(self.draw(self.wanted))
 
-    def draw(self, count: int) -> np.ndarray:
-        spare = sobol_points(self._started(), self._seed, self._draws, count)
-        loss, known = tamed(self._loss), len(self._loss)
-        self.recall(spare)
-        if not known or loss.std() == 0:
-            return self._drawn
+    def _take(self, batch: Batch, loss: np.ndarray) -> None:
+        self.take(np.arange(len(loss)), loss)
+
+    def _modelled(self, loss: np.ndarray, count: int) -> np.ndarray:
+        """The points of a model of these losses, (count, D), which leave no trace in the global
+        generators."""
+        key = [self._seed, len(loss)]
         with (
             warnings.catch_warnings(),
             one_torch_thread(),  # matrices are small: another one would only wait
             torch.random.fork_rng(devices=[]),
-            numpy_kept([self._seed, known]),
+            numpy_kept(key),
         ):
             warnings.simplefilter("ignore")
             # only this generator: torch.manual_seed would change those of the devices too
             torch.default_generator.manual_seed(
-                int(np.random.SeedSequence([self._seed, known]).generate_state(1)[0])
+                int(np.random.SeedSequence(key).generate_state(1)[0])
             )
-            points = self._choose(loss, count)
-        tried = {row.tobytes() for row in self._points}
-        for place, row in enumerate(points):
-            if row.tobytes() in tried:
-                points[place] = spare[place]
-            tried.add(points[place].tobytes())
-        self._drawn = points
-        return points
-
-    def _next(self) -> Batch:
-        return Batch(self.draw(self.wanted))
+            return self._choose(loss, count)
 
     def _choose(self, loss: np.ndarray, count: int) -> np.ndarray:
         """The points with the greatest expected improvement, (count, D), chosen in turn, each given
@@ -146,9 +161,6 @@ class Bayesian(Turns):
             ).reshape(x.shape),
         )
         return snap(found.numpy(), levels)
-
-    def _take(self, batch: Batch, loss: np.ndarray) -> None:
-        self.take(np.arange(len(loss)), loss)
 
 
 def tamed(loss: np.ndarray) -> np.ndarray:

@@ -58,6 +58,12 @@ class Polish(Turns):
             know(points, loss)
         self._keep(points, loss)
 
+    def recall(self, points: np.ndarray | None) -> None:
+        """For a method inside that draws slowly: the points of its next batch."""
+        recall = getattr(self._inner, "recall", None)
+        if recall is not None:
+            recall(points)
+
     def _keep(self, points: np.ndarray, loss: np.ndarray) -> None:
         self._points = np.concatenate([self._points, points])
         self._loss = np.concatenate([self._loss, loss])

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import kendalltau
 
-from design.methods.base import Batch, Source, Turns, check_kind, whole
+from design.methods.base import Batch, Source, Turns, whole
 from design.methods.cmaes import CMAES
 from torchfilm import checks
 
@@ -28,9 +28,9 @@ class Racing(Turns):
     but the last. agree: the race is skipped where the order of the finalists in small and full
     colonies agrees less than this (Kendall's tau, smoothed over races, from 1). Then as many points
     as `inner` needs are grown to full size at once. -1 never skips. A new cloud of CMAES trusts
-    small colonies again. first: finalists of a race from which a cloud or a model is to begin,
-    since the best of them counts most there; before them, `keep` chooses among full colonies of
-    `small` replicates. A cloud that needs no more losses has a race like all others.
+    small colonies again; a model does not. first: finalists of a race from which a cloud or a model
+    is to begin, since the best of them counts most there; before them, `keep` chooses among full
+    colonies of `small` replicates. A cloud that needs no more losses has a race like all others.
 
     A race is one bracket of successive halving (Jamieson and Talwalkar, AISTATS 2016), and a
     pre-selection for CMA-ES (Ulmer, Streichert and Zell, CEC 2003): all points come from the
@@ -94,17 +94,11 @@ class Racing(Turns):
         self._left = np.empty(0, dtype=np.int64)
         self._early: np.ndarray | None = None  # losses of all drawn points, at the first size
 
-    def _meet(self, batch: Batch) -> None:
-        """A method that draws slowly recalls the points of a race of a search that is resumed."""
+    def recall(self, points: np.ndarray | None) -> None:
+        """For a method inside that draws slowly: the points of a race that is about to begin."""
         recall = getattr(self._source, "recall", None)
-        if self._batch is not None or len(self._left) or recall is None or self._source.fresh:
-            super()._meet(batch)
-            return
-        self._plan()
-        size, replicates, count = self._rungs[0]
-        check_kind((count, self._started().size, size, replicates), batch, "Racing")
-        recall(batch.points)
-        self._enter(batch.points)
+        if recall is not None:
+            recall(None if len(self._left) else points)
 
     def _plan(self) -> None:
         """The rungs of a race, each a size, replicates and how many points."""
@@ -125,14 +119,11 @@ class Racing(Turns):
         if self._trust < self.agree:
             self._rungs = self._rungs[-1:]
 
-    def _enter(self, points: np.ndarray) -> None:
-        """Begin a race of these points."""
-        self._points, self._left = points, np.arange(len(points))
-
     def _next(self) -> Batch:
         if not len(self._left):
             self._plan()
-            self._enter(self._source.draw(self._rungs[0][2]))
+            self._points = self._source.draw(self._rungs[0][2])
+            self._left = np.arange(len(self._points))
         size, replicates, _ = self._rungs[self._rung]
         return Batch(self._points[self._left], size=size, replicates=replicates)
 
@@ -144,7 +135,7 @@ class Racing(Turns):
             best = np.argsort(loss, kind="stable")[: self._rungs[self._rung][2]]
             self._left = self._left[np.sort(best)]
             return
-        if self._early is not None:
+        if self._early is not None and len(loss) > 1:
             found = float(kendalltau(self._early[self._left], loss).statistic)
             # NaN where all are equal, as where all failed: that says nothing
             if math.isfinite(found):

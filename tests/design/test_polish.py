@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 from asking import Room, begun
@@ -164,8 +166,14 @@ def test_auto_descends_where_the_loss_is_a_sum_of_squares():
 def test_auto_races_with_a_model_where_there_is_no_slope():
     chosen = choose(5, 500, 0)
     assert isinstance(chosen.method.inner, Bayesian) and "model of the loss" in chosen.why
-    assert isinstance(choose(5, 20, 0).method.inner, Bayesian)
-    assert isinstance(choose(5, 19, 0).method, CMAES)  # the first race takes twelve
+    # a first race costs the more designs, the fewer replicates these have
+    assert isinstance(choose(5, 24, 0).method.inner, Bayesian)
+    assert isinstance(choose(5, 23.9, 0).method, CMAES)
+    assert isinstance(choose(5, 33, 0, replicates=2).method, CMAES)
+    assert isinstance(choose(5, 34, 0, replicates=2).method.inner, Bayesian)
+    # descents are for as many designs as without botorch
+    assert isinstance(choose(1, 47, 0, squares=True).method, Racing)
+    assert isinstance(choose(1, 48, 0, squares=True).method, Polish)
     # a model of more designs takes too long
     many = choose(5, 2000, 0)
     assert isinstance(many.method.inner, CMAES) and "botorch" not in many.why
@@ -182,19 +190,21 @@ def test_auto_says_what_botorch_would_do(monkeypatch):
 
 
 def test_auto_models_the_loss_where_molecules_are_counted():
-    chosen = choose(3, 200, 0, chance=8)
+    chosen = choose(3, 200, 0, chance=True, replicates=8)
     assert isinstance(chosen.method, Bayesian) and "one by one" in chosen.why
     # a model of more designs takes too long
-    assert isinstance(choose(3, 2000, 0, chance=8).method, Racing)
+    assert isinstance(choose(3, 2000, 0, chance=True, replicates=8).method, Racing)
     # a study that began by racing goes on so
-    before = choose(3, 2000, 0, chance=8).describe()
-    assert isinstance(choose(3, 200, 0, chance=8, before=before).method, Racing)
+    before = choose(3, 2000, 0, chance=True, replicates=8).describe()
+    assert isinstance(choose(3, 200, 0, chance=True, replicates=8, before=before).method, Racing)
 
 
 def test_auto_models_the_loss_of_data():
     chosen = choose(4, 100, 0, pattern=False)
     assert isinstance(chosen.method, Bayesian) and "does not compare" in chosen.why
     assert isinstance(choose(4, 401, 0, pattern=False).method, CMAES)
+    few = choose(4, 15.9, 0, pattern=False)  # 10 Sobol points, and then one batch of the model
+    assert isinstance(few.method, CMAES) and "15 designs are fewer than 16" in few.why
 
 
 def test_without_botorch_auto_races_with_all_replicates_where_molecules_are_counted(monkeypatch):
@@ -205,8 +215,17 @@ def test_without_botorch_auto_races_with_all_replicates_where_molecules_are_coun
     search.run(120, progress=False)
     assert "one by one" in search.why_chosen and "botorch" in search.why_chosen
     assert {(e.size, e.replicates) for e in search.study.entries} == {(0.25, 2), (1.0, 2)}
-    assert isinstance(choose(3, 20, 0, chance=8).method, CMAES)  # too few for races
-    again = choose(3, 20, 0, chance=8, before=choose(3, 200, 0, chance=8).describe())
+    assert isinstance(
+        choose(3, 20, 0, chance=True, replicates=8).method, CMAES
+    )  # too few for races
+    again = choose(
+        3,
+        20,
+        0,
+        chance=True,
+        replicates=8,
+        before=choose(3, 200, 0, chance=True, replicates=8).describe(),
+    )
     assert again.method.small == 8
 
 
@@ -243,3 +262,26 @@ def test_a_search_polishes_and_resumes(tmp_path):
     assert again.loss == best.loss
     kept = Study.read(tmp_path / "a.h5")
     assert [e.copies for e in kept.entries] == [e.copies for e in whole.study.entries]
+
+
+if find_spec("botorch"):
+
+    def test_a_search_resumes_without_asking_its_model_again(tmp_path, monkeypatch):
+        """Also where it stopped within a race or a batch."""
+        method = lambda: Polish(inner=Racing(inner=Bayesian(batch=2, first=4), first=2), after=99)
+        make = lambda: Search(lit, TWO, EDGES, cells=8, replicates=2, finals=None, method=method())
+        whole, chosen, choose_ = make(), [], Bayesian._choose
+        monkeypatch.setattr(
+            Bayesian, "_choose", lambda *given: [chosen.append(1), choose_(*given)][1]
+        )
+        best, counts = whole.run(colonies=46, progress=False), [len(chosen)]
+        for colonies in (31, 40, 46):
+            chosen.clear()
+            again = make()
+            found = again.run(colonies=colonies, study=tmp_path / "a.h5", progress=False)
+            counts.append(len(chosen))
+        assert found.loss == best.loss
+        for mine, other in zip(again.study.entries, whole.study.entries, strict=True):
+            assert (mine.points == other.points).all() and (mine.loss == other.loss).all()
+        # a batch that was grown in part is chosen again, no other
+        assert counts[0] >= 3 and sum(counts[1:]) <= counts[0] + 2, counts
