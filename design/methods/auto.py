@@ -64,9 +64,7 @@ def choose(
     alone = chance or not pattern  # the model draws all designs
     most, least = MODELLED if alone else RACED, LEAST_RACED if pattern else 0
     if botorch:
-        least = math.ceil((EARLY / replicates + FINALISTS) / SEARCHED)
-        if alone:  # its first batch is of Sobol points
-            least = max(MODEL_BATCH, 2 * (dimensions + 1)) + MODEL_BATCH
+        least = _least_modelled(dimensions, replicates, alone)
     whole = math.floor(designs)
     about = f"{whole} designs for {dimensions} parameters"
     hint = " (with botorch installed, a model of the loss would)"
@@ -98,14 +96,7 @@ def choose(
             f"{about}: {luck if pattern else data}; a model of the loss knows that colonies differ"
             " by luck",
         )
-    descents = tuple(
-        Chosen(
-            Polish(inner=Racing(inner=cloud), after=BEFORE, starts=starts),
-            f"{about}: one race of small colonies, then down the slope from the best, of one"
-            " replicate at first, since the loss is a sum of squares with exact derivatives",
-        )
-        for starts in range(1, MOST_STARTS + 1)
-    )
+    descents = _descents(cloud, about)
     known = (few, race, *descents, *((learnt, modelled) if botorch else ()))
     for chosen in known if before else ():
         if chosen.describe() == before:
@@ -120,3 +111,23 @@ def choose(
     if designs > most or not botorch:
         return race if pattern else fit
     return modelled if alone else learnt
+
+
+def _least_modelled(dimensions: int, replicates: int, alone: bool) -> int:
+    """The designs of which a model chooses some: it draws all of them alone, where its first batch
+    is of Sobol points, or after a race."""
+    if alone:
+        return max(MODEL_BATCH, 2 * (dimensions + 1)) + MODEL_BATCH
+    return math.ceil((EARLY / replicates + FINALISTS) / SEARCHED)
+
+
+def _descents(cloud: CMAES, about: str) -> tuple[Chosen, ...]:
+    """Descents after a race, from one start and from more, side by side."""
+    return tuple(
+        Chosen(
+            Polish(inner=Racing(inner=cloud), after=BEFORE, starts=starts),
+            f"{about}: one race of small colonies, then down the slope from the best, of one"
+            " replicate at first, since the loss is a sum of squares with exact derivatives",
+        )
+        for starts in range(1, MOST_STARTS + 1)
+    )
