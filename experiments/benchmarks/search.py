@@ -6,6 +6,7 @@ and few replicates say of a design, and measures designs per hour.
     python experiments/benchmarks/search.py tasks --methods auto --stop    # minutes
     python experiments/benchmarks/search.py tasks --methods racing bayesian modelled --seeds 2
     python experiments/benchmarks/search.py ranks --tasks "domain size"
+    python experiments/benchmarks/search.py data --methods cmaes bayesian --colonies 400 --seeds 6
     python experiments/benchmarks/search.py rate
 
 `tasks` runs searches that differ by their seed: random starts and random colonies. Each has 2,000
@@ -15,9 +16,10 @@ there; a search succeeds where the design that it returns holds it. With `--stop
 soon as a design holds the threshold on fresh seeds of its own, by the same course until then, so
 that this number alone takes a tenth of the time. `tasks.py` has the tasks and
 says how the thresholds were set. `ranks` grows Sobol designs at several sizes with several
-replicates, and compares their order with that in 16 other colonies of full size. `rate` measures
-designs per hour: one design at a time, in batches, and on recorded growth. The script appends each
-run to a JSON file with its machine, versions and commit.
+replicates, and compares their order with that in 16 other colonies of full size. `data` fits the
+four parameters of `fit_colony.py` to colonies of 3.5 h. `rate` measures designs per hour: one
+design at a time, in batches, and on recorded growth. The script appends each run to a JSON file
+with its machine, versions and commit.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from scipy.stats import kendalltau
 from tasks import CELLS, REPLICATES, SHARE, TASKS, UNSEEN, SearchTask
 
 import torchfilm as tf
-from design import CMAES, Bayesian, Local, Objective, Racing, Search, Sobol, Task
+from design import CMAES, Bayesian, Local, Objective, Observed, Racing, Search, Sobol, Task
 from design.methods.base import sobol_points
 from design.trivial import trivial_losses
 
@@ -151,6 +153,28 @@ def ranks(options: argparse.Namespace) -> dict:
     return out
 
 
+def data(options: argparse.Namespace) -> dict:
+    """Returns the losses of fits of each method, in 16 colonies that no search saw."""
+    import fit_colony  # in a folder that `tasks` has put on the path
+
+    *_, state = tf.simulate(
+        fit_colony.colony(**fit_colony.TRUTH), colonies=REPLICATES, seed=77, until=3.5
+    )
+    fit = SearchTask(
+        fit_colony.colony,
+        fit_colony.PARAMETERS,
+        Observed.from_state(state, species=("gfp",)),
+        {"until": 3.5, "cells": None},
+    )
+    out: dict = {"colonies": options.colonies}
+    for method in options.methods:
+        seeds = range(options.first, options.first + options.seeds)
+        out[method] = [one_search(fit, method, k, options.colonies, 0.0, False) for k in seeds]
+        losses = " ".join(f"{r['unseen']:.2f}" for r in out[method])
+        print(f"{method:<8} {options.colonies} colonies, losses {losses}", flush=True)
+    return out
+
+
 def rate(options: argparse.Namespace) -> dict:
     """Returns designs per hour: one at a time, in batches, and in batches on recorded growth."""
     out: dict = {}
@@ -185,7 +209,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("part", choices=("tasks", "ranks", "rate"))
+    parser.add_argument("part", choices=("tasks", "ranks", "data", "rate"))
     parser.add_argument("--tasks", nargs="*", choices=list(TASKS), default=list(TASKS))
     parser.add_argument(
         "--methods", nargs="*", choices=list(METHODS), default=["auto", "sobol", "cmaes"]
@@ -202,7 +226,7 @@ def main() -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(options.threads)
     tf.keep_memory()
-    found = {"tasks": tasks, "ranks": ranks, "rate": rate}[options.part](options)
+    found = {"tasks": tasks, "ranks": ranks, "data": data, "rate": rate}[options.part](options)
     kept = json.loads(options.out.read_text()) if options.out.exists() else []
     options.out.write_text(json.dumps([*kept, {**machine(), options.part: found}], indent=1) + "\n")
 
