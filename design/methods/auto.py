@@ -67,8 +67,8 @@ def choose(
         least = _least_modelled(dimensions, replicates, alone)
     whole = math.floor(designs)
     about = f"{whole} designs for {dimensions} parameters"
-    hint = " (with botorch installed, a model of the loss would)"
-    hint = "" if botorch or designs > most else hint
+    better = not botorch and designs <= most
+    hint = " (with botorch installed, a model of the loss would)" if better else ""
     few = Chosen(
         cloud,
         f"{whole} designs are fewer than {least}, too few to learn much from; its first batch is of"
@@ -117,7 +117,7 @@ def _least_modelled(dimensions: int, replicates: int, alone: bool) -> int:
     """The designs of which a model chooses some: it draws all of them alone, where its first batch
     is of Sobol points, or after a race."""
     if alone:
-        return max(MODEL_BATCH, 2 * (dimensions + 1)) + MODEL_BATCH
+        return Bayesian(batch=MODEL_BATCH).opening(dimensions) + MODEL_BATCH
     return math.ceil((EARLY / replicates + FINALISTS) / SEARCHED)
 
 

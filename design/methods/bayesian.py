@@ -48,11 +48,15 @@ class Bayesian(Turns):
                 f"Bayesian needs the package botorch: {checks.install('bayes')}."
             )
 
+    def opening(self, size: int) -> int:
+        """The points of the first batch in so many dimensions."""
+        return self.first or max(self.batch, 2 * (size + 1))
+
     def _begin(self) -> None:
         size = self._started().size
         self._points = self._drawn = np.empty((0, size))
         self._loss = np.empty(0)
-        self._open = self.first or max(self.batch, 2 * (size + 1))
+        self._open = self.opening(size)
         self._draws = 0  # points drawn so far
         self._tried: set[bytes] = set()
         self._recalled: np.ndarray | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
@@ -189,14 +190,17 @@ def test_auto_says_what_botorch_would_do(monkeypatch):
     assert isinstance(choose(5, 47, 0).method, CMAES)
 
 
+counted = partial(choose, chance=True, replicates=8)
+
+
 def test_auto_models_the_loss_where_molecules_are_counted():
-    chosen = choose(3, 200, 0, chance=True, replicates=8)
+    chosen = counted(3, 200, 0)
     assert isinstance(chosen.method, Bayesian) and "one by one" in chosen.why
     # a model of more designs takes too long
-    assert isinstance(choose(3, 2000, 0, chance=True, replicates=8).method, Racing)
+    assert isinstance(counted(3, 2000, 0).method, Racing)
     # a study that began by racing goes on so
-    before = choose(3, 2000, 0, chance=True, replicates=8).describe()
-    assert isinstance(choose(3, 200, 0, chance=True, replicates=8, before=before).method, Racing)
+    before = counted(3, 2000, 0).describe()
+    assert isinstance(counted(3, 200, 0, before=before).method, Racing)
 
 
 def test_auto_models_the_loss_of_data():
@@ -215,17 +219,8 @@ def test_without_botorch_auto_races_with_all_replicates_where_molecules_are_coun
     search.run(120, progress=False)
     assert "one by one" in search.why_chosen and "botorch" in search.why_chosen
     assert {(e.size, e.replicates) for e in search.study.entries} == {(0.25, 2), (1.0, 2)}
-    assert isinstance(
-        choose(3, 20, 0, chance=True, replicates=8).method, CMAES
-    )  # too few for races
-    again = choose(
-        3,
-        20,
-        0,
-        chance=True,
-        replicates=8,
-        before=choose(3, 200, 0, chance=True, replicates=8).describe(),
-    )
+    assert isinstance(counted(3, 20, 0).method, CMAES)  # too few for races
+    again = counted(3, 20, 0, before=counted(3, 200, 0).describe())
     assert again.method.small == 8
 
 
