@@ -53,6 +53,26 @@ def test_exponential_is_that_of_torch(dtype, shape, faces, kind, dt):
 
 
 @DTYPES
+@pytest.mark.parametrize("method", sorted(COMPILED))
+def test_far_from_a_source_nothing_is_subnormal(dtype, method):
+    """A concentration falls without end, and subnormal numbers take a hundred times as long."""
+    if not torch.set_flush_denormal(False):
+        pytest.skip("this processor has no choice of what subnormal numbers are")
+    shape, tiny, steps = (300, 2, 1), torch.finfo(dtype).tiny, 100
+    operator = build_operator(shape, (1.0, 1.0, 1.0), diffusion=1.0, dtype=dtype)
+    stepper = prepare(operator, 0.02, method)
+    one = torch.zeros(1, *shape, dtype=dtype)
+    one[0, 0] = 1.0
+    other = one
+    for _ in range(steps):
+        one, other = stepper.step(one), by_kernel(stepper, other)
+    least = float(other[other > 0].min())
+    assert tiny <= least < 1e3 * tiny
+    allowed = steps * roundings(shape) * torch.finfo(dtype).eps
+    assert bool(((one - other).abs() <= allowed * one + steps * sum(shape) * tiny).all())
+
+
+@DTYPES
 @pytest.mark.parametrize("dt", [1e-3, 0.7, 4.0])
 @pytest.mark.parametrize("shape", [*SHAPES, *LONG], ids=str)
 @pytest.mark.parametrize("faces", BOUNDARIES)
@@ -159,7 +179,7 @@ def test_the_bits_of_a_colony_depend_on_no_other(method, dtype, own, monkeypatch
     after = colonies(9, dtype, own, method)
     together = after(list(range(9)))
     turned = after(list(range(8, -1, -1)))[::-1]
-    monkeypatch.setattr("torchfilm.signals.compiled_transport.WORTH_A_THREAD", 1)
+    monkeypatch.setattr("torchfilm.tools.threads.WORTH_WAKING", 0.0)
     monkeypatch.setattr("torch.get_num_threads", lambda: 3)
     shared = after(list(range(9)))
     for k in range(9):

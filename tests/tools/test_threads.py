@@ -39,11 +39,55 @@ def test_threads_come_back_after_an_error():
     assert torch.get_num_threads() == threads.available() == 3
 
 
-def test_work_is_shared_among_as_many_threads_as_torch_was_given():
-    ranges = []
+def ranges_of(count: int, shared: threads.Shared) -> list[tuple[int, int]]:
+    """How it divides the work on so many things."""
+    found = []
     with tf.one_torch_thread():
-        threads.shares_of(30, 10, lambda first, last: ranges.append((first, last)))
-    assert sorted(ranges) == [(0, 10), (10, 20), (20, 30)]
+        shared(count, lambda first, last: found.append((first, last)))
+    return sorted(found)
+
+
+def test_work_is_shared_among_as_many_threads_as_torch_was_given(monkeypatch):
+    monkeypatch.setattr(threads, "WORTH_WAKING", 0.0)
+    assert ranges_of(30, threads.Shared()) == [(0, 10), (10, 20), (20, 30)]
+    assert ranges_of(2, threads.Shared()) == [(0, 1), (1, 2)]
+    assert ranges_of(0, threads.Shared()) == [(0, 0)]
+
+
+def test_a_thread_is_woken_where_the_last_call_was_long_enough():
+    """A call tells how long one thing takes, and the next one goes by it."""
+    shared = threads.Shared()
+    assert ranges_of(30, shared) == [(0, 30)]
+    for seconds, parts in (
+        (0.9, 1),
+        (1.9, 1),
+        (2.1, 2),
+        (3.1, 3),
+        (1e6, 3),
+    ):  # of all, in those that are worth a thread
+        shared.seconds = seconds * threads.WORTH_WAKING / 30
+        assert len(ranges_of(30, shared)) == parts
+
+
+def test_the_time_of_one_thing_is_taken_in_this_thread(monkeypatch):
+    clock = iter((5.0, 7.0, 10.0, 13.0))
+    monkeypatch.setattr(threads.time, "perf_counter", lambda: next(clock))
+    shared = threads.Shared()
+    ranges_of(20, shared)
+    assert shared.seconds == 2.0 / 20
+    assert ranges_of(30, shared)[0] == (0, 10)
+    assert shared.seconds == 3.0 / 10
+
+
+def test_an_error_in_another_thread_is_raised_here(monkeypatch):
+    monkeypatch.setattr(threads, "WORTH_WAKING", 0.0)
+
+    def work(first, last):
+        if first:
+            raise ValueError("there")
+
+    with pytest.raises(ValueError, match="there"), tf.one_torch_thread():
+        threads.Shared()(30, work)
 
 
 def test_a_rule_has_the_threads_of_torch_and_kernels_leave_it_one(monkeypatch):

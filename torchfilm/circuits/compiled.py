@@ -23,14 +23,10 @@ from torchfilm.circuits.names import Names
 from torchfilm.circuits.stiff_text import HEAD
 from torchfilm.circuits.tracing import FULL, Column, Kind, Untraceable, apply, lowered
 from torchfilm.tools import checks
-from torchfilm.tools.threads import shares_of
+from torchfilm.tools.threads import Shared
 
 if TYPE_CHECKING:
     from torchfilm.circuits.run import CircuitCells
-
-# A thread takes this many cells at least.
-WORTH_A_THREAD = 512
-
 
 _compiled: set[str] = set()  # modules that this process has run
 
@@ -67,16 +63,20 @@ class Compiled:
         listed = "\n".join(f"{n} = {x!r}" for n, x in constants.items())
         return HEAD.format(what=f"A circuit of {names}", constants=listed)
 
-    def run(self, count: int, least: int, work: Callable[[int, int], object]) -> None:
-        """work(first, last) for all cells, in threads where each has `least` or more. It is
-        compiled by one thread, without cells; and that is said where it takes time."""
+    @cached_property
+    def _shared(self) -> Shared:
+        return Shared()
+
+    def run(self, count: int, work: Callable[[int, int], object]) -> None:
+        """work(first, last) for all cells, in threads where each has enough to do. It is compiled
+        by one thread, without cells; and that is said where it takes time."""
         if self.module.__name__ not in _compiled:
             from torchfilm.kernels.compiling import first_call
 
             with first_call(self.module.__name__, self._described()):
                 work(0, 0)
             _compiled.add(self.module.__name__)
-        shares_of(count, least, work)
+        self._shared(count, work)
 
     def _described(self) -> str:
         """What is compiled, for people: each name once."""

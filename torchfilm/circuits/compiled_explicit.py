@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.compiled import WORTH_A_THREAD, Compiled, pools, rates_of
+from torchfilm.circuits.compiled import Compiled, pools, rates_of
 from torchfilm.circuits.emission import Functions
 from torchfilm.circuits.explicit_text import method
 from torchfilm.circuits.integrators import lengths
@@ -47,7 +47,7 @@ class CompiledExplicit(Compiled):
         at = torch.empty(start.shape, dtype=self.dtype).copy_(start)
         count, run = start.shape[0], self.module.run
         given = (at.numpy(), *self.packed(values, count), lengths(dt, steps, self.method).numpy())
-        self.run(count, WORTH_A_THREAD, lambda first, last: run(first, last, *given))
+        self.run(count, lambda first, last: run(first, last, *given))
         return at
 
 

@@ -28,9 +28,6 @@ from torchfilm.tools.random import MASK
 if TYPE_CHECKING:
     from torchfilm.circuits.run import CircuitCells
 
-# A thread takes this many cells at least.
-WORTH_A_THREAD = 64
-
 
 @dataclass(frozen=True, eq=False)
 class CompiledMolecules(Compiled):
@@ -69,7 +66,7 @@ class CompiledMolecules(Compiled):
         rest = (keys_of(draw), self._codes(draw), float(dt), most, leaps)
         report = [x.numpy() for x in (steps, status, wrong)]
         work = lambda first, last: run(first, last, *given, *rest, *report)
-        self.run(count, WORTH_A_THREAD, work)
+        self.run(count, work)
         return at.to(counts.dtype), StochasticReport(steps, status, wrong)
 
     def _codes(self, draw: KeyedDraws) -> np.ndarray:

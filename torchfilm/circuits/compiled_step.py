@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.compiled import WORTH_A_THREAD, packed
+from torchfilm.circuits.compiled import packed
 from torchfilm.circuits.compiled_stiff import CompiledCircuit, limits
 from torchfilm.circuits.dilution import Start
 from torchfilm.tools import checks
@@ -113,7 +113,7 @@ class KernelStep:
             run(low, high, at, *given)
             store(low, high, of_cells, *ends)
 
-        compiled.run(count, WORTH_A_THREAD, work)
+        compiled.run(count, work)
         return report[2]
 
     def _places(

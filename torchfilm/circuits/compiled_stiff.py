@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.compiled import WORTH_A_THREAD, Compiled, packed, places, pools, rates_of
+from torchfilm.circuits.compiled import Compiled, packed, places, pools, rates_of
 from torchfilm.circuits.emission import functions, tangent_functions
 from torchfilm.circuits.expressions import Expression
 from torchfilm.circuits.graph import evaluated
@@ -114,7 +114,7 @@ class CompiledTangents(Compiled):
         rest, counts = limits(dt, rtol, atol, dtype), report.numpy()
         run = self.module.run_moved
         work = lambda first, last: run(first, last, *arrays, *rest, *counts)
-        self.run(count, WORTH_A_THREAD, work)
+        self.run(count, work)
         return with_tangent(at.to(dtype), moved.to(dtype)), RosenbrockReport(*report)
 
 

@@ -15,7 +15,7 @@ from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.step_records import MechanicsInput, MechanicsResult
 from torchfilm.physics.surfaces import FlatSurface
 from torchfilm.tools.numba_calls import as_array, in_numpy
-from torchfilm.tools.threads import available, pool
+from torchfilm.tools.threads import available, submit
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
 WORTH_THREADS = 300
@@ -125,7 +125,7 @@ def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> No
         work[least] += int(counts[colony])
         shares[least].append(colony)
     own, *others = [np.array(share, np.int64) for share in shares]
-    calls = [pool(threads).submit(kernel, share, *arguments) for share in others]
+    calls = [submit(threads, kernel, share, *arguments) for share in others]
     kernel(own, *arguments)
     for call in calls:
         call.result()
@@ -163,7 +163,7 @@ def _call_by_team(kernel, threads: int, colony: int, arguments: tuple) -> None:
     calls: list[Future] = []
     try:
         for _ in range(threads - 1):
-            calls.append(pool(available()).submit(assist))
+            calls.append(submit(available(), assist))
         kernel(board, np.array([colony]), *arguments)
     finally:
         board[OFFER] = OVER

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -219,16 +219,7 @@ class Box(Wall):
             raise checks.input_error(
                 "Box.low", tuple(self.low), f"of {dim} numbers in a {dim}-D scene"
             )
-        out: list[Surface] = []
-        for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
-            for sign, at in ((1.0, low), (-1.0, high)):
-                if isinstance(at, Tensor) or math.isfinite(at):
-                    out.append(
-                        FlatSurface(
-                            self, tuple(sign if m == k else 0.0 for m in range(dim)), sign * at
-                        )
-                    )
-        return out
+        return _sides(self, self.low, self.high)
 
 
 @dataclass(frozen=True)
@@ -274,10 +265,20 @@ class Channel(Wall):
         half = (math.inf, self.width / 2, math.inf if self.height is None else self.height / 2)
         low = [-math.inf if self.low_end is None else self.low_end] + [-h for h in half[1:dim]]
         high = [math.inf if self.high_end is None else self.high_end] + [h for h in half[1:dim]]
-        return [
-            replace(s, wall=self)
-            for s in Box(low, high, stiffness=self.stiffness, weight=self.weight).surfaces(dim)
-        ]
+        return _sides(self, low, high)
+
+
+def _sides(
+    wall: Wall, low: Sequence[float | Tensor], high: Sequence[float | Tensor]
+) -> list[Surface]:
+    """The sides of an axis-parallel box, but for those at infinity."""
+    dim, out = len(low), list[Surface]()
+    for k, pair in enumerate(zip(low, high, strict=True)):
+        for sign, at in zip((1.0, -1.0), pair, strict=True):
+            if isinstance(at, Tensor) or math.isfinite(at):
+                normal = tuple(sign if m == k else 0.0 for m in range(dim))
+                out.append(FlatSurface(wall, normal, sign * at))
+    return out
 
 
 def _vector(name: str, given: object) -> Vector:

@@ -14,11 +14,11 @@ from torchfilm.signals.stencil import SLACK, Stencil
 from torchfilm.tools.numba_calls import as_array, in_numpy, unavailable
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import both, only_forward, tracked, with_tangent
-from torchfilm.tools.threads import shares_of
+from torchfilm.tools.threads import Shared
 
 CLOSE = torch.contiguous_format
 NO_MASK = np.zeros(0, bool)
-WORTH_A_THREAD = 20_000  # cells for which another thread is worth to be woken
+_put_stencils, _read_cells = Shared(), Shared()
 
 
 def may_run(*given: Tensor) -> bool:
@@ -55,7 +55,7 @@ def stencil(
     def work(a: int, b: int) -> None:
         put_stencil(*(x[a:b] for x in cells), *grid.arrays, *fixed, *(x[a:b] for x in out))
 
-    shares_of(count, WORTH_A_THREAD, work)
+    _put_stencils(count, work)
     nodes, weights, away, within = map(torch.from_numpy, out)
     size = grid.voxel_volume, grid.nodes
     return Stencil(nodes, weights, away, *size, None if mask is None else within)
@@ -69,7 +69,7 @@ def read(values: Tensor, stencil: Stencil) -> Tensor:
     node, weight = _of_stencil(stencil, values.dtype)
     out = np.empty(len(node), found.dtype)
     work = lambda a, b: put(found, node[a:b], weight[a:b], out[a:b])
-    shares_of(len(out), WORTH_A_THREAD, work)
+    _read_cells(len(out), work)
     return torch.from_numpy(out)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -14,12 +15,7 @@ from torchfilm.signals.transport_exponential import Exponential
 from torchfilm.signals.transport_iterative import MAX_ITERATIONS
 from torchfilm.signals.transport_series import Series
 from torchfilm.tools.numba_calls import as_array
-from torchfilm.tools.threads import shares_of
-
-# A thread is worth starting for as many voxels.
-WORTH_A_THREAD = 1 << 17
-# A solve takes about as long as so many terms of the series.
-SOLVED_AS = 500
+from torchfilm.tools.threads import Shared
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +29,10 @@ class CompiledExponential:
     lasts: tuple[np.ndarray, ...]
     gained: np.ndarray
 
+    @cached_property
+    def _shared(self) -> Shared:
+        return Shared()
+
     def linear(self) -> CompiledExponential:
         """The step without what sources and boundaries add."""
         return replace(self, gained=np.empty((0, 0), self.gained.dtype))
@@ -42,10 +42,8 @@ class CompiledExponential:
         from torchfilm.kernels.transport import carry
 
         source, target = as_array(values, values.dtype), out.numpy()
-        size = self.shape[0] * self.shape[1] * self.shape[2]
-        shares_of(
+        self._shared(
             starts.size,
-            max(1, WORTH_A_THREAD // size),
             lambda begin, end: carry(
                 begin, end, starts, self.shape, self.axes, self.factors, self.firsts, self.lasts,
                 self.gained, source, target,
@@ -93,6 +91,14 @@ class CompiledSeries:
     solve: tuple[np.ndarray, ...] | None
     symmetric: bool
 
+    @cached_property
+    def _mixed(self) -> Shared:
+        return Shared()
+
+    @cached_property
+    def _solved(self) -> Shared:
+        return Shared()
+
     def linear(self) -> CompiledSeries | None:
         """The step without what sources and boundaries add; None where another method takes the
         long steps."""
@@ -106,20 +112,15 @@ class CompiledSeries:
         from torchfilm.kernels.transport import mix
 
         source, target = as_array(values, values.dtype), out.numpy()
-        size = self.shape[0] * self.shape[1] * self.shape[2]
-        shares_of(
-            starts.size,
-            max(1, WORTH_A_THREAD // (size * self.stepper.weights.shape[0])),
-            lambda begin, end: mix(begin, end, starts, *self.arrays, source, target),
+        self._mixed(
+            starts.size, lambda begin, end: mix(begin, end, starts, *self.arrays, source, target)
         )
         if self.solve is not None:
             from torchfilm.kernels.transport_solve import solve
 
             given = (*self.arrays[:7], *self.solve, self.symmetric, MAX_ITERATIONS)
-            shares_of(
-                starts.size,
-                max(1, WORTH_A_THREAD // (size * SOLVED_AS)),
-                lambda begin, end: solve(begin, end, starts, *given, source, target),
+            self._solved(
+                starts.size, lambda begin, end: solve(begin, end, starts, *given, source, target)
             )
 
 

@@ -39,7 +39,7 @@ from torchfilm.signals.transport_implicit import prepare_implicit
 from torchfilm.signals.transport_iterative import prepare_crank_nicolson, prepare_euler
 from torchfilm.signals.transport_operator import Operator
 from torchfilm.signals.transport_series import Series, prepare_series
-from torchfilm.tools import checks
+from torchfilm.tools import checks, subnormals
 from torchfilm.tools.tangents import both, with_tangent
 
 
@@ -125,7 +125,8 @@ def carry(grid: Grid, carriers: Sequence[Carrier], values: Tensor) -> Tensor:
 def _run(grid: Grid, kernels: Sequence[Kernel | None], values: Tensor) -> Tensor:
     """Values (voxels,) of all colonies after the kernel of each of `grid.batches`."""
     out = torch.empty_like(values)
-    for kernel, batch in zip(kernels, grid.batches, strict=True):
-        assert kernel is not None
-        kernel.step(values, batch.starts.numpy(), out)
+    with subnormals.as_zero():
+        for kernel, batch in zip(kernels, grid.batches, strict=True):
+            assert kernel is not None
+            kernel.step(values, batch.starts.numpy(), out)
     return out

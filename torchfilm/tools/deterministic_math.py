@@ -7,10 +7,11 @@ value depends on its place and on the tensor's size.
 Functions found to differ, on torch 2.13 (AVX-512, both precisions): pow with any exponent other
 than the plain numbers 0, 1, 2, 3, ±½, −1, −2 (also a tensor with value 2), a number to the power of
 a tensor, exp2, sinh, cosh, atanh, sigmoid, softplus, silu, elu, gelu, mish, logit (strided),
-logaddexp, hypot, atan2, gammainc.
+logaddexp, hypot, atan2, gammainc. rsqrt is that of one library, whose last bit depends on the
+processor; compiled circuits have 1/√x, and so has torch here.
 
 Functions found deterministic, with their derivatives: exp, expm1, log, log2, log10, log1p, sqrt,
-rsqrt, sin, cos, tan, asin, acos, atan, tanh, asinh, acosh, erf, erfc, erfinv, lgamma, gammaincc,
+sin, cos, tan, asin, acos, atan, tanh, asinh, acosh, erf, erfc, erfinv, lgamma, gammaincc,
 log_sigmoid and the four operations.
 """
 
@@ -156,6 +157,11 @@ def logaddexp(x: Tensor, y: Tensor) -> Tensor:
     return high + torch.log1p(torch.exp(gap))
 
 
+def rsqrt(x: Tensor) -> Tensor:
+    """1/√x."""
+    return 1.0 / torch.sqrt(x)
+
+
 def hypot(x: Tensor, y: Tensor) -> Tensor:
     """√(x² + y²)."""
     return torch.sqrt(x * x + y * y)
@@ -229,6 +235,7 @@ REPLACEMENTS: dict[Callable[..., Any], Callable[..., Tensor | None]] = {
     **dict.fromkeys((torch.atanh, Tensor.atanh, torch.arctanh, Tensor.arctanh), _floating(atanh)),
     **dict.fromkeys((torch.logaddexp, Tensor.logaddexp), _floating(logaddexp)),
     **dict.fromkeys((torch.hypot, Tensor.hypot), _floating(hypot)),
+    **dict.fromkeys((torch.rsqrt, Tensor.rsqrt), _floating(rsqrt)),
     torch.nn.functional.softplus: _floating(softplus),
     torch.nn.functional.silu: _floating(silu),
     torch.nn.functional.elu: _floating(elu),
@@ -250,8 +257,9 @@ class _DeterministicMode(TorchFunctionMode):
 def deterministic_functions() -> TorchFunctionMode:
     """Within `with deterministic_functions():` this module's functions replace torch's.
 
-    It covers pow and **, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp, hypot,
-    linear layers and products with a matrix (K, M), in the forward and reverse modes of autograd.
+    It covers pow and **, rsqrt, sigmoid, exp2, sinh, cosh, atanh, softplus, silu, elu, logaddexp,
+    hypot, linear layers and products with a matrix (K, M), in the forward and reverse modes of
+    autograd.
     It does not cover gelu, mish, logit, atan2, gammainc and products with batches of matrices.
     The cost is about a microsecond per torch call.
     """

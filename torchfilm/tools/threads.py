@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import torch
+
+from torchfilm.tools import subnormals
+
+# Seconds of work for which a thread is worth waking: until it begins it takes 0.05 to 0.3 ms.
+WORTH_WAKING = 4e-4
 
 
 class _Given(threading.local):
@@ -74,23 +81,37 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="torchfilm")
 
 
-def pool(threads: int) -> ThreadPoolExecutor:
-    """The threads of this process."""
-    return _pool(os.getpid(), threads)
+def submit(threads: int, work: Callable[..., object], *given: Any) -> Future[object]:
+    """Begin work(*given) in one of so many threads of this process. Subnormal numbers are there
+    what they are here, so that bits do not depend on the threads."""
+    zero = subnormals.are_zero()
+
+    def run() -> object:
+        subnormals.set_zero(zero)
+        return work(*given)
+
+    return _pool(os.getpid(), threads).submit(run)
 
 
-def shares_of(count: int, least: int, work: Callable[[int, int], object]) -> None:
-    """Call work(first, last) for ranges that make up 0 … count: in threads, where each has `least`
-    or more to do. The work must not depend on how it is divided."""
-    threads = min(available(), count // least)
-    if threads < 2:
-        work(0, count)
-        return
-    ends = [count * k // threads for k in range(threads + 1)]
-    (first, last), *others = pairwise(ends)
-    calls = [pool(threads).submit(work, a, b) for a, b in others]
-    try:
-        work(first, last)  # by this thread, which need not be woken
-    finally:
-        for call in calls:
-            call.result()
+class Shared:
+    """Work on many things that is done again and again: in several threads where each has enough of
+    it, by how long the last call took. It must not depend on how it is divided."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0  # of one thing, in the last call
+
+    def __call__(self, count: int, work: Callable[[int, int], object]) -> None:
+        """Call work(first, last) for ranges that make up 0 … count."""
+        threads = min(available(), count)
+        if WORTH_WAKING > 0:
+            threads = min(threads, int(count * self.seconds / WORTH_WAKING))
+        ends = [count * k // threads for k in range(threads + 1)] if threads > 1 else [0, count]
+        (first, last), *others = pairwise(ends)
+        calls = [submit(threads, work, a, b) for a, b in others]
+        begin = time.perf_counter()
+        try:
+            work(first, last)  # by this thread, which need not be woken
+            self.seconds = (time.perf_counter() - begin) / max(1, last)
+        finally:
+            for call in calls:
+                call.result()

@@ -1,0 +1,54 @@
+"""Subnormal numbers count as 0 where it is asked for, in all threads alike, and nowhere else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchfilm.tools import subnormals
+from torchfilm.tools.threads import submit
+
+# too small for the usual form of float32, and of float64
+TINY = {np.float32: 1e-40, np.float64: 1e-310}
+
+
+def are_kept() -> list[bool]:
+    """Whether a product that is subnormal is kept, by type."""
+    return [bool((np.full(3, x, t) * np.full(3, 0.5, t)).all()) for t, x in TINY.items()]
+
+
+@pytest.fixture(autouse=True)
+def there_is_a_choice():
+    if not torch.set_flush_denormal(True):
+        pytest.skip("this processor has no choice of what subnormal numbers are")
+    torch.set_flush_denormal(False)
+    yield
+    torch.set_flush_denormal(False)
+
+
+def test_they_are_zero_inside_only():
+    assert are_kept() == [True, True] and not subnormals.are_zero()
+    with subnormals.as_zero():
+        assert are_kept() == [False, False] and subnormals.are_zero()
+    assert are_kept() == [True, True] and not subnormals.are_zero()
+
+
+def test_an_error_inside_changes_nothing_outside():
+    with pytest.raises(ZeroDivisionError), subnormals.as_zero():
+        raise ZeroDivisionError
+    assert not subnormals.are_zero()
+
+
+def test_what_a_user_chose_stays():
+    torch.set_flush_denormal(True)
+    with subnormals.as_zero():
+        pass
+    assert subnormals.are_zero()
+
+
+def test_other_threads_count_as_this_one_does():
+    with subnormals.as_zero():
+        inside = submit(2, are_kept).result()
+    assert inside == [False, False]
+    assert submit(2, are_kept).result() == [True, True]
