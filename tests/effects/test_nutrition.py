@@ -154,6 +154,29 @@ def test_hunger_a_thousand_times_faster_than_the_step(dtype, device):
     assert loss > 0.2 * first
 
 
+def test_kernels_and_torch_give_the_same(dtype, monkeypatch):
+    """The same method, but for the order of a few operations, in cells that differ in all."""
+    scene = eating(
+        tf.Monod("food", rate=tf.LogNormal(1.5, 0.3), half=[0.1, 0.5], growth_yield=0.7),
+        initial=lambda at: 0.2 + 0.1 * at[:, 0].abs(),
+        cells=pack(),
+    )
+    found = []
+    for why in ("", "asked for"):
+        monkeypatch.setattr("torchfilm.effects.nutrition.unavailable", lambda why=why: why)
+        model = scene.bind(2, dtype=dtype)
+        state = model.start()
+        said = [line for e in model.effects for line in e.numerics(0.1, state)]
+        assert ("computed by torch: asked for" in said) == bool(why)
+        for _ in range(4):
+            state = model.step(state, 0.1)
+        found.append(state)
+    one, other = found
+    for name in ("growth_rate", "food_eaten", "out.food"):
+        bound = 1e-5 if dtype == torch.float32 else 1e-12
+        assert one.fields[name].tolist() == pytest.approx(other.fields[name].tolist(), rel=bound)
+
+
 def test_daughters_begin_to_eat_anew():
     scene = eating(
         tf.Monod("food", rate=1.5, half=0.1, growth_yield=2.0),

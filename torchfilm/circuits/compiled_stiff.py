@@ -18,7 +18,7 @@ from torchfilm.circuits.graph import evaluated
 from torchfilm.circuits.rosenbrock import MAX_STEPS, RosenbrockReport
 from torchfilm.circuits.stiff_text import CONSTANTS, method, step
 from torchfilm.circuits.tangent_text import tangent_method
-from torchfilm.tools.tangents import both, has_tangent, in_forward_mode, only_forward, with_tangent
+from torchfilm.tools.tangents import both, has_tangent, only_forward, tracked, with_tangent
 
 if TYPE_CHECKING:
     from torchfilm.circuits.run import CircuitCells
@@ -52,14 +52,16 @@ class CompiledCircuit(Compiled):
         entry = lambda i, k: zero + at[i, k] if (i, k) in at else zero
         return torch.stack([torch.stack([entry(i, k) for k in range(count)]) for i in range(count)])
 
-    def with_tangents(
+    def integrate(
         self, circuit: CircuitCells, start: Tensor, dt: float, rtol: float, atol: float
     ) -> tuple[Tensor, RosenbrockReport] | None:  # fmt: skip
         """As `rosenbrock.rodas3`, of the cells `circuit.rows`, with tangents in forward mode; None
-        where none is wanted, or a backward pass, and over no time."""
-        if dt == 0 or not in_forward_mode():
+        where a backward pass is wanted, and over no time."""
+        if dt == 0:
             return None
         values = self.values(circuit, circuit.rows, pools(circuit, circuit.rows))
+        if not tracked(start, *values.values()):
+            return self._rodas3(values, start, dt, rtol, atol)
         if not only_forward(start, *values.values()):
             return None
         moving = {n for n, x in values.items() if has_tangent(x)}
@@ -69,6 +71,17 @@ class CompiledCircuit(Compiled):
                 self.equations, self.literals, self.columns, self.numbers, *key, label=self.label
             )
         return self._moved[key].rodas3(values, start, dt, rtol, atol)
+
+    def _rodas3(
+        self, values: Mapping[str, Tensor], start: Tensor, dt: float, rtol: float, atol: float
+    ) -> tuple[Tensor, RosenbrockReport]:
+        count, run = start.shape[0], self.module.run
+        at = torch.empty(start.shape, dtype=torch.float64).copy_(start)
+        report = torch.zeros(3, count, dtype=torch.int64)
+        rest = *limits(dt, rtol, atol, start.dtype), *report.numpy()
+        given = at.numpy(), *self.packed(values, count), *rest
+        self.run(count, lambda first, last: run(first, last, *given))
+        return at.to(start.dtype), RosenbrockReport(*report)
 
 
 @dataclass(frozen=True, eq=False)

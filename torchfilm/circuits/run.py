@@ -215,7 +215,7 @@ def step(
         assert compiled is None or isinstance(compiled, CompiledCircuit)
         found = None
         if compiled is not None and not circuit.by_torch:
-            found = compiled.with_tangents(circuit, start, dt, rtol, atol)
+            found = compiled.integrate(circuit, start, dt, rtol, atol)
         if found is None:
             slopes = None if compiled is None else circuit.slopes
             found = rosenbrock.rodas3(circuit.rates, start, dt, rtol=rtol, atol=atol, slopes=slopes)

@@ -15,6 +15,7 @@ from torchfilm.signals.exchange import spans
 from torchfilm.signals.space import MOST_VOXELS
 from torchfilm.state import GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.reads import reads_are_free
 
 if TYPE_CHECKING:
     from torchfilm.effects.medium import Medium
@@ -72,6 +73,8 @@ class _MediumPart(BoundEffect):
         if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
         left, first = layout.outside_medium(state.places, state.groups)
+        if reads_are_free(state.device) and not bool(left.any()):
+            return MediumReport(left, left, state.places.new_zeros(state.colonies, 3))
         place = torch.nn.functional.pad(state.places, (0, 0, 0, 1))  # none: 0
         return MediumReport((left > 0).long(), left, place.index_select(0, first))
 
@@ -142,6 +145,11 @@ class GridCoverage(_MediumPart):
     def __init__(self, effect: Medium, binding: Binding, transport: Transport):
         super().__init__(effect, binding, transport)
         self.stage, self.title = GRID_COVERAGE, "grid coverage"
+        corner, end, size = effect.corners
+        # a box of one layer stays one layer
+        flat = [round((b - a) / h) == 1 for a, b, h in zip(corner, end, size, strict=True)]
+        fixed = [letter not in effect.grows for letter in "xyz"]
+        self.flat, self.fixed = torch.tensor([flat, fixed], device=binding.batch.device)
 
     def reads(self) -> tuple[str, ...]:
         return ("position", *self.writes())
@@ -186,19 +194,9 @@ class GridCoverage(_MediumPart):
         layout = state.layout
         assert layout is not None
         low, high = spans(state.places, state.groups)
-        corner, end, size = self.effect.corners
-        # a box of one layer stays one layer
-        flat = torch.tensor(
-            [round((b - a) / h) == 1 for a, b, h in zip(corner, end, size, strict=True)],
-            device=state.device,
-        )
-        margin = torch.where(flat, 0.0, MARGIN * layout.grid.step)
-        fixed = torch.tensor(
-            [letter not in self.effect.grows for letter in "xyz"], device=state.device
-        )
-        return torch.where(fixed, torch.inf, low - margin), torch.where(
-            fixed, -torch.inf, high + margin
-        )
+        margin = (MARGIN * layout.grid.step).masked_fill(self.flat, 0.0)
+        low, high = low - margin, high + margin
+        return low.masked_fill(self.fixed, torch.inf), high.masked_fill(self.fixed, -torch.inf)
 
     def _grown(self, state: State) -> State:
         layout = state.layout

@@ -3,20 +3,29 @@ dense colonies starve in the middle (Monod 1949)."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.rosenbrock import rodas3
+from torchfilm.circuits import run
+from torchfilm.circuits.compiled_stiff import CompiledCircuit, compiled_circuit
+from torchfilm.circuits.names import Names
 from torchfilm.effect import NUTRITION, Binding, BoundEffect, Effect
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.doubling import check_doubling
+from torchfilm.tools.numba_calls import unavailable
 from torchfilm.values import Value, is_drawn, numbers, physical
+
+CONSTANTS = ("rate", "half", "growth_yield")
+STIFF = run.IntegrationSettings("rosenbrock", 1, 1e-4, 1e-9, 1.0)
 
 
 @dataclass(frozen=True)
@@ -80,12 +89,6 @@ class Monod(Effect):
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
         return (_BoundMonod(self, binding),)
 
-    def numerics(self, dt: float, state: State) -> list[str]:
-        return [
-            "each cell by the stiff solver, with its default tolerances; the medium loses what"
-            " cells take up, to rounding"
-        ]
-
     def check_step(self, dt: float, divides: bool) -> None:
         if divides:
             given = numbers(self.rate)
@@ -104,46 +107,17 @@ class Monod(Effect):
                 " overwritten: write Growth()."
             )
 
-    def step(self, state: State, dt: float, values: Values) -> State:
-        medium = MediumExchange.of(state, (self.signal,))
-        if state.cells == 0 or medium is None:
-            return state
-        volume, there, in_reservoir = state.volume, medium.found[self.signal], medium.in_reservoir
-        greatest, half, gain = (
-            x.of_cells(state).expand(state.cells)
-            for x in (values.rate, values.half, values.growth_yield)
-        )
-        columns = (greatest, half, gain, volume, medium.pool)
-
-        def rates(x: Tensor, rows: Tensor) -> Tensor:
-            """Rates of the nutrient in the pool, and of the uptake. Both are variables: where
-            nutrient abounds, the uptake as a difference would be lost in rounding."""
-            rate, k, y, start, pool = (c.index_select(0, rows) for c in columns)
-            eating = rate * (start / y + x[:, 1]) * x[:, 0] / (k + x[:, 0])
-            return torch.stack([-eating / pool, eating], 1)
-
-        end, report = rodas3(rates, torch.stack([there, torch.zeros_like(there)], 1), dt)
-        eaten = end[:, 1]
-        to_reservoir, inside = None, eaten
-        if in_reservoir is not None:  # the concentration of a reservoir is constant
-            there_for_good = volume / gain * torch.expm1(greatest * there / (half + there) * dt)
-            eaten = torch.where(in_reservoir, there_for_good, eaten)
-            inside = torch.where(in_reservoir, 0.0, eaten)
-            to_reservoir = inside - eaten
-        # dV/dt = growth · V over the step, from V to V + gain · eaten
-        growth = torch.log1p(gain * eaten / volume) / dt
-        medium.give(self.signal, -inside, to_reservoir)
-        own = f"{self.signal}_eaten"
-        state = medium.settle().with_fields(growth_rate=growth, **{own: state.fields[own] + eaten})
-        uptake = state.groups.sum(eaten.unsqueeze(1)).squeeze(1)
-        note = NutritionReport(state.groups.any(report.status != 0).long(), uptake)
-        return state.replace(reports={**state.reports, "nutrition": note})
-
 
 class _BoundMonod(BoundEffect):
     """Monod bound to a batch; it also reads and writes the reservoir's field, if there is one."""
 
     effect: Monod
+
+    def __init__(self, effect: Monod, binding: Binding):
+        super().__init__(effect, binding)
+        device = binding.batch.device
+        self.by_torch = f"the device is {device.type}" if device.type != "cpu" else unavailable()
+        self.compiled: CompiledCircuit | None = None
 
     def _reservoir(self) -> tuple[str, ...]:
         name = f"{self.effect.signal}_reservoir"
@@ -154,3 +128,60 @@ class _BoundMonod(BoundEffect):
 
     def writes(self) -> tuple[str, ...]:
         return (*super().writes(), *self._reservoir())
+
+    def numerics(self, dt: float, state: State) -> list[str]:
+        return [
+            "each cell by the stiff solver, with its default tolerances; the medium loses what"
+            " cells take up, to rounding",
+            f"computed by torch: {self.by_torch}"
+            if self.by_torch
+            else "computed by compiled functions; by torch where gradients are required",
+        ]
+
+    def step(self, state: State, dt: float) -> State:
+        signal = self.effect.signal
+        medium = MediumExchange.of(state, (signal,))
+        if state.cells == 0 or medium is None:
+            return state
+        volume, there, in_reservoir = state.volume, medium.found[signal], medium.in_reservoir
+        greatest, half, gain = (self.values[n].of_cells(state) for n in CONSTANTS)
+        eaten, failed = self._eaten(state, medium, dt)
+        to_reservoir, inside = None, eaten
+        if in_reservoir is not None:  # the concentration of a reservoir is constant
+            there_for_good = volume / gain * torch.expm1(greatest * there / (half + there) * dt)
+            eaten = torch.where(in_reservoir, there_for_good, eaten)
+            inside = torch.where(in_reservoir, 0.0, eaten)
+            to_reservoir = inside - eaten
+        # dV/dt = growth · V over the step, from V to V + gain · eaten
+        growth = torch.log1p(gain * eaten / volume) / dt
+        medium.give(signal, -inside, to_reservoir)
+        own = f"{signal}_eaten"
+        state = medium.settle().with_fields(growth_rate=growth, **{own: state.fields[own] + eaten})
+        uptake = state.groups.sum(eaten.unsqueeze(1)).squeeze(1)
+        note = NutritionReport(state.groups.any(failed).long(), uptake)
+        return state.replace(reports={**state.reports, "nutrition": note})
+
+    def _eaten(self, state: State, medium: MediumExchange, dt: float) -> tuple[Tensor, Tensor]:
+        """What each cell takes from its pool, (N,) conc·µm³, and whether its integration failed.
+
+        What is eaten is a variable beside the concentration in the pool: where nutrient abounds, it
+        would be lost in the rounding of a difference."""
+        signal, count = self.effect.signal, state.cells
+        cells = run.CircuitCells(
+            partial(_uptake, signal), ("eaten",), (signal,),
+            torch.arange(count, device=state.device), {"volume": state.volume},
+            {n: self.values[n].of_cells(state) for n in CONSTANTS}, medium.found, medium.pool,
+            label=f"uptake of {signal}",
+        )  # fmt: skip
+        if self.compiled is None and not any(self.values[n].requires_grad for n in CONSTANTS):
+            self.compiled = compiled_circuit(cells)
+        cells = dataclasses.replace(cells, compiled=self.compiled, by_torch=bool(self.by_torch))
+        found = run.step(cells, torch.zeros_like(state.volume).unsqueeze(1), dt, STIFF)
+        return found.concentrations[:, 0], found.failed
+
+
+def _uptake(signal: str, u: Names, s: Names, p: Names, cell: Names) -> tuple[Any, Any]:
+    """The rates of what a cell has eaten, and of the signal in its pool, conc·µm³/h."""
+    there = s[signal]
+    eating = p.rate * (cell.volume / p.growth_yield + u.eaten) * there / (p.half + there)
+    return {"eaten": eating}, {signal: -eating}
