@@ -98,7 +98,7 @@ class Best:
         if self.fresh is not None:
             losses.append(("loss on fresh seeds", report.fresh_words(self.fresh)))
         study = self.search.study
-        losses.append(("grown", f"{study.colonies:.0f} colonies in {study.seconds:.0f} s"))
+        losses.append(("grown", f"{study.colonies:.0f} colonies in {study.time}"))
         head = ("parameter", "bounds", "first guess", "best design", "")
         return displays.card("Best design", displays.table(rows, head), displays.pairs(losses))
 

@@ -16,11 +16,12 @@ class Entry:
     """One batch and its results.
 
     points (n, D); loss (n,); losses and cells (n, R); reasons of failures, by (row, replicate);
-    size: share of the full size; seconds; values: the parameters of each point; streams (R,): of
-    random numbers, one for each replicate. slopes: where the method asked for them; copies:
-    colonies that were grown for each loss: more than 1 for its derivatives, 0 where it was known
-    before; goals (n, G): the losses of several targets side by side, NaN for a design that failed;
-    each_goals (n, R, G): those of each replicate.
+    size: share of the full size; seconds: that they took to grow; values: the parameters of each
+    point; streams (R,): of random numbers, one for each replicate. slopes: where the method asked
+    for them; copies: colonies that were grown for each loss: more than 1 for its derivatives, 0
+    where it was known before; goals (n, G): the losses of several targets side by side, NaN for a
+    design that failed; each_goals (n, R, G): those of each replicate. choosing: seconds that the
+    method took to propose them.
     """
 
     points: np.ndarray
@@ -36,6 +37,7 @@ class Entry:
     copies: int = 1
     goals: np.ndarray | None = None
     each_goals: np.ndarray | None = None
+    choosing: float = 0.0
 
     @property
     def replicates(self) -> int:

@@ -94,7 +94,7 @@ def table(report: SearchReport) -> str:
     )
     if report.why_chosen:
         lines.append(report.why_chosen)
-    spent = f"{study.colonies:.0f} colonies in {study.seconds:.0f} s"
+    spent = f"{study.colonies:.0f} colonies in {study.time}"
     lines.append(spent + (f", {failed} failed" if failed else "") + f"; {how}")
     return "\n".join(lines)
 

@@ -47,7 +47,15 @@ class Study:
 
     @property
     def seconds(self) -> float:
+        """That the colonies took to grow."""
         return sum(e.seconds for e in (*self.entries, *self.finals))
+
+    @property
+    def time(self) -> str:
+        """How long it took, in words; to choose designs, too, where that took a second or more."""
+        choosing = sum(e.choosing for e in self.entries)
+        more = f", and {choosing:.0f} s to choose designs" if choosing >= 1 else ""
+        return f"{self.seconds:.0f} s{more}"
 
     @property
     def failed(self) -> int:
@@ -135,7 +143,7 @@ class Study:
         failed = self.failed
         designs = sum(len(e.points) for e in self.entries)
         fresh = sum(e.colonies for e in self.finals)
-        grown = f"{self.colonies:.0f} colonies of {designs} designs in {self.seconds:.0f} s"
+        grown = f"{self.colonies:.0f} colonies of {designs} designs in {self.time}"
         facts = [
             ("scene", f"{about['scene']}, to {' or '.join(end)}, seed {about['seed']}"),
             ("target", about["target"]),

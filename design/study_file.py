@@ -3,7 +3,7 @@
     /             attributes: format, version, torchfilm, torch, about (JSON: scene, parameters,
                   target, method, …)
     /streams      (R,) streams of random numbers, one for each replicate
-    /batches/     rows, size, replicates, first_stream, seconds, copies: a row for each batch
+    /batches/     rows, first_stream and those of BATCH: a row for each batch
     /designs/     point (N, D), loss (N,), losses (N, R), cells (N, R); NaN and 0 where a replicate
                   was not grown; reasons, JSON by replicate; goals (N, G) and each_goals (N, R, G),
                   where there are several
@@ -32,6 +32,8 @@ from design.slopes import Slopes
 from torchfilm import checks
 
 FORMAT, VERSION = "torchfilm study", 3
+# Of a batch, by the same names in the file and in an Entry.
+BATCH = ("size", "replicates", "seconds", "copies", "choosing")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,7 @@ def _write_entries(
     """most: replicates of any batch."""
     group["batches/rows"] = [len(e.points) for e in entries]
     group["batches/first_stream"] = [e.streams[0] for e in entries]
-    for name in ("size", "replicates", "seconds", "copies"):
+    for name in BATCH:
         group[f"batches/{name}"] = [getattr(e, name) for e in entries]
     wide = lambda x, fill: np.concatenate(
         [x, np.full((len(x), most - x.shape[1], *x.shape[2:]), fill, x.dtype)], 1
@@ -118,10 +120,9 @@ def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> 
     at = 0
     batches.setdefault("copies", np.ones_like(batches["rows"]))  # version 1 has none
     batches.setdefault("first_stream", np.zeros_like(batches["rows"]))  # nor has version 2
-    columns_of = ("rows", "size", "replicates", "first_stream", "seconds", "copies")
-    for rows, size, replicates, first, seconds, copies in zip(
-        *(batches[n].tolist() for n in columns_of), strict=True
-    ):
+    batches.setdefault("choosing", np.zeros(len(batches["rows"])))  # nor have early files of 3
+    columns_of = (batches[n].tolist() for n in ("rows", "first_stream", *BATCH))
+    for rows, first, size, replicates, seconds, copies, choosing in zip(*columns_of, strict=True):
         mine = slice(at, at + rows)
         reasons = {
             (r, int(k)): words
@@ -145,6 +146,7 @@ def _read_entries(group: h5py.Group, streams: tuple[int, ...] | None = None) -> 
                 each_goals=(
                     designs["each_goals"][mine, :replicates] if "each_goals" in designs else None
                 ),
+                choosing=choosing,
             )
         )
         at += rows

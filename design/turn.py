@@ -3,6 +3,7 @@ ends within it, and what it learns."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,10 +20,12 @@ from design.task import Task
 @dataclass(eq=False)
 class Turn:
     """batch: what a method proposes; entry: the first of its designs, which have been grown. known:
-    the batch is of designs that were known before, and no method's."""
+    the batch is of designs that were known before, and no method's. choosing: seconds that the
+    method took for it."""
 
     batch: Batch
     known: bool = False
+    choosing: float = 0.0
     entry: Entry | None = None
 
     @classmethod
@@ -31,13 +34,15 @@ class Turn:
         proposes."""
         if known is not None and number == 0:
             return cls(Batch(known.points), known=True)
+        begun = time.perf_counter()
         batch = method.ask()
+        seconds = time.perf_counter() - begun
         if not isinstance(batch, Batch):
             raise tf.InputError(
                 f"{type(method).__name__}.ask must return a design.Batch of points"
                 f" (n, {task.space.size}), not {type(batch).__name__}."
             )
-        return cls(batch)
+        return cls(batch, choosing=seconds)
 
     @property
     def done(self) -> int:
@@ -62,7 +67,10 @@ class Turn:
     def take(self, entry: Entry, study: Study) -> None:
         """Keep further designs that have been grown, here and in the study."""
         first = self.entry is None
-        self.entry = entry if self.entry is None else self.entry.followed_by(entry)
+        if self.entry is None:
+            self.entry = replace(entry, choosing=self.choosing)
+        else:
+            self.entry = self.entry.followed_by(entry)
         study.add(self.entry, replace=not first)
 
     def tell(self, method: Method) -> None:

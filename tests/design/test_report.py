@@ -4,6 +4,8 @@ design and the target."""
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from types import SimpleNamespace
 
 import matplotlib.image
 import matplotlib.text
@@ -93,6 +95,19 @@ def test_the_table_says_why_growth_was_not_recorded_and_how_many_colonies_failed
     assert failed and best.table().endswith(
         f", {failed} failed; grown again for each design: replay=False"
     )
+
+
+def test_the_table_says_how_long_a_slow_method_took_to_choose(tmp_path, monkeypatch):
+    """The time is kept in the study's file, also that of a batch grown in two parts."""
+    clock = SimpleNamespace(perf_counter=itertools.count(0.0, 3.0).__next__)
+    monkeypatch.setattr("design.turn.time", clock)
+    for colonies in (12, 32):
+        search = Search(
+            lit, LIT, Level(), cells=3, replicates=2, method=Sobol(batch=8), finals=None
+        )
+        best = search.run(colonies, study=tmp_path / "study.h5", progress=False)
+    assert ", and 6 s to choose designs" in best.table().splitlines()[-1]
+    assert ", and 6 s to choose designs" in best.search.study.info
 
 
 class Given:
