@@ -277,24 +277,24 @@ class Replay(metaclass=checks.KnownKeywords):
         if number == 0:
             self._check_streams(state)
         place = self.order.index_select(0, torch.searchsorted(self.streams, state.stream))
+        followed = _Followed(place, *_repeated(place))
         changes = {change.part: change for change in self.recording.changes(number)}
         state = self.model.opened(state)
         if FIRST in changes:
-            state = self._apply(state, changes[FIRST], place)
+            state = self._apply(state, changes[FIRST], followed)
         for effect, part in self.parts:
             if part is None:
                 state = effect.run_step(state, self.dt)
             elif part in changes:
-                state = self._apply(state, changes[part], place)
+                state = self._apply(state, changes[part], followed)
         if any(step == number for step, _ in self.recording.failed.values()):
             state = self._with_failures(state, number)
         return advanced(state, self.dt)
 
-    def _apply(self, state: State, change: RecordedChange, place: Tensor) -> State:
-        """The state after a recorded change, whose colonies at `place` (B,) ours follow."""
-        unit, times = _repeated(place)
-        begin, mine = offsets(change.counts)[:-1].index_select(0, unit), change.counts[unit]
-        owner, rows = expand_ranges(begin, mine)
+    def _apply(self, state: State, change: RecordedChange, followed: _Followed) -> State:
+        """The state after a recorded change of the colonies that ours follow."""
+        place, unit, times = followed.place, followed.unit, followed.times
+        owner, rows = followed.cells(change.counts)
         taken = {
             n: _tiled(value.index_select(0, rows), times)
             for n, value in change.values.items()
@@ -336,6 +336,24 @@ class Replay(metaclass=checks.KnownKeywords):
         status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
         status[list(words)] = 1
         return state.replace(reports={**state.reports, "recording": RecordingReport(status, words)})
+
+
+class _Followed:
+    """Which recorded colonies ours follow in a step: `place` (B,), which is `unit` so many
+    times."""
+
+    def __init__(self, place: Tensor, unit: Tensor, times: int):
+        self.place, self.unit, self.times = place, unit, times
+        self._counts: Tensor | None = None
+
+    def cells(self, counts: Tensor) -> tuple[Tensor, Tensor]:
+        """The colony within `unit` of each of its cells, and their rows in the recording, which has
+        `counts` (recorded,) cells a colony; changes without divisions between them share these."""
+        if self._counts is not counts:
+            begin = offsets(counts)[:-1].index_select(0, self.unit)
+            self._cells = expand_ranges(begin, counts.index_select(0, self.unit))
+            self._counts = counts
+        return self._cells
 
 
 def _repeated(place: Tensor) -> tuple[Tensor, int]:

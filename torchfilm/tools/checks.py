@@ -135,8 +135,14 @@ class KnownKeywords(abc.ABCMeta):
     unnamed: str = ""
 
     def __call__(cls, *args: Any, **given: Any) -> Any:
-        check_call(cls.__name__, inspect.signature(cls), args, given, cls.instead, cls.unnamed)
+        check_call(cls.__name__, cls._known(), args, given, cls.instead, cls.unnamed)
         return super().__call__(*args, **given)
+
+    def _known(cls) -> inspect.Signature:
+        """Of this class, worked out once."""
+        if "_signature" not in cls.__dict__:
+            cls._signature = inspect.signature(cls)
+        return cls.__dict__["_signature"]
 
     @property
     def __signature__(cls) -> inspect.Signature:
