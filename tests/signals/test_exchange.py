@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchfilm.signals import exchange
+import torchfilm as tf
+from torchfilm.signals import compiled, exchange
 from torchfilm.signals.exchange import Stencil, pool_volume, read, stencil, write
 from torchfilm.signals.grid import Grid
 from torchfilm.tools.checks import InputError
@@ -347,3 +348,33 @@ def test_kernels_see_the_cells_that_torch_sees(periodic, monkeypatch):
     assert bool(by_torch[0].isnan().any())
     for one, other in zip(by_torch, by_kernels, strict=True):
         assert torch.equal(one.nan_to_num(nan=-7.0), other.nan_to_num(nan=-7.0))
+
+
+def test_threads_take_whole_colonies_and_no_bit_changes(monkeypatch):
+    """Four colonies, one of them empty, crowded into few voxels: their parts share none."""
+    box = {"box": ((-8.0, -8.0), (8.0, 8.0)), "spacing": 4.0}
+    medium = tf.Medium(food=tf.Signal(diffusion=5.0, initial=1.0), **box)
+    place = torch.rand(90, 2, generator=torch.Generator().manual_seed(1)) * 12 - 6
+    founders = tf.Cells(place, [[1.0, 0.0]] * 90, length=1.0)
+    monod = tf.Monod("food", rate=2.0, half=0.5)
+    scene = tf.Scene(monod, tf.Growth(), medium, founders=founders)
+    model = scene.bind(4, dtype=torch.float64)
+    first = model.start()
+    first = first.remove((first.colony == 2) | (first.uid > 20 * first.colony + 20), "removed")
+    ranges, found = [], []
+    cut = compiled._in_parts
+
+    def spied(shared, where, work):
+        noted = lambda a, b: (ranges.append((a, b)), work(a, b))
+        cut(shared, where, noted)
+
+    monkeypatch.setattr(compiled, "_in_parts", spied)
+    for threads, worth in ((1, 1.0), (3, 0.0)):
+        monkeypatch.setattr("torchfilm.tools.threads.WORTH_WAKING", worth)
+        monkeypatch.setattr("torch.get_num_threads", lambda threads=threads: threads)
+        ranges.clear()
+        found.append(model.step(first, 0.05))
+    ends = np.cumsum([0, *first.counts.tolist()])
+    assert len(ranges) == 6 and {a for pair in ranges for a in pair} <= set(ends.tolist())
+    for name, value in found[0].fields.items():
+        assert torch.equal(value, found[1].fields[name])

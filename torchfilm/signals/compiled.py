@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from torchfilm.tools.threads import Shared
 
 CLOSE = torch.contiguous_format
 NO_MASK = np.zeros(0, bool)
-_put_stencils, _read_cells = Shared(), Shared()
+_put_stencils, _read_cells, _share_pools, _write_cells = (Shared() for _ in range(4))
 
 
 def may_run(*given: Tensor) -> bool:
@@ -86,9 +87,13 @@ def pool_volume(stencil: Stencil) -> Tensor:
     from torchfilm.kernels.medium import pools
 
     node, weight = stencil.arrays
-    out, number = np.empty(len(weight), weight.dtype), weight.dtype.type
+    out, volume = np.empty(len(weight), weight.dtype), weight.dtype.type(stencil.voxel_volume)
     sums = _zeros(stencil.nodes, 1, weight.dtype).reshape(-1)
-    pools(node, weight, number(stencil.voxel_volume), sums, out)
+
+    def work(a: int, b: int) -> None:
+        pools(node[a:b], weight[a:b], volume, sums, out[a:b])
+
+    _in_parts(_share_pools, stencil, work)
     return torch.from_numpy(out)
 
 
@@ -97,10 +102,15 @@ def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps:
     from torchfilm.kernels.medium import write as put
 
     out = values.detach().clone(memory_format=CLOSE)
-    each = (as_array(x, values.dtype) for x in (amount, there))
     node, weight = _of_stencil(stencil, values.dtype)
+    cells = *(as_array(x, values.dtype) for x in (amount, there)), node, weight
     rest = *_limits(stencil, values.dtype, ulps), _zeros(values.numel(), 2, weight.dtype)
-    put(out.numpy(), *each, node, weight, *rest, _room(node.size))
+    made, seen, size = out.numpy(), _room(node.size), node.shape[1]
+
+    def work(a: int, b: int) -> None:
+        put(made, *(x[a:b] for x in cells), *rest, seen[a * size : b * size])
+
+    _in_parts(_write_cells, stencil, work)
     return out
 
 
@@ -121,6 +131,12 @@ def write_with_tangent(
         *_limits(stencil, dtype, ulps), _zeros(value.numel(), 3, weight.dtype),
     )  # fmt: skip
     return with_tangent(write(value, amount, there, stencil, ulps), moved)
+
+
+def _in_parts(shared: Shared, stencil: Stencil, work: Callable[[int, int], object]) -> None:
+    """Call work(a, b) for ranges of cells of whole colonies, which share no voxel."""
+    ends = stencil.parts.tolist()
+    shared(len(ends) - 1, lambda first, last: work(ends[first], ends[last]))
 
 
 # of each type of numbers, what the last use left as 0

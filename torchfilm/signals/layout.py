@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -137,11 +138,15 @@ class Layout:
         signals: Mapping[str, Tensor],
         dtype: torch.dtype,
     ) -> Contact:
-        """The concentration of each signal (nodes,) at cells at (N, d) µm of colonies (N,).
+        """The concentration of each signal (nodes,) at cells at (N, d) µm of colonies (N,), those
+        of one colony side by side.
 
         ids: (B,), those of the colonies.
         """
         where = self.stencil(position, colony, dtype)
+        if colony.device.type == "cpu" and len(ids) > 1:  # for threads
+            ends = np.searchsorted(colony.numpy(), np.arange(len(ids) + 1))
+            where = replace(where, ends=ends)
         found = {name: read(value, where) for name, value in signals.items()}
         if self.reservoir is None:
             return Contact(where, found, None, found)

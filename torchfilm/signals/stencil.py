@@ -25,7 +25,8 @@ class Stencil:
     that is wholly inside an obstacle. outside: (N,) bool, cells beyond the box or wholly inside an
     obstacle. Beyond the box a cell reads and writes at the edge. Inside an obstacle it reads 0 and
     its writing is lost. The caller decides what to do with either. blocked: (N,) bool, cells wholly
-    inside an obstacle, or None without obstacles.
+    inside an obstacle, or None without obstacles. ends: where the cells of each colony begin, and
+    N, where those of one colony are known to be side by side.
     """
 
     node: Tensor
@@ -34,6 +35,12 @@ class Stencil:
     voxel_volume: float
     nodes: int
     blocked: Tensor | None = None
+    ends: np.ndarray | None = None
+
+    @cached_property
+    def parts(self) -> np.ndarray:
+        """Where ranges of cells begin that share no voxel, and N."""
+        return np.array([0, len(self.weight)]) if self.ends is None else self.ends
 
     @cached_property
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
