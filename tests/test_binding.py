@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import copy
 import pickle
+import warnings
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -200,3 +202,28 @@ def test_fields_declared_alike_are_one():
         tf.InputError, match="field 'growth_rate' is declared by growth and by circuit"
     ):
         tf.Scene(tf.Growth(rate=1.0), tf.Circuit(made, species=("growth_rate",)), dim=2)
+
+
+@pytest.mark.parametrize(
+    ("stage", "division", "late"),
+    [(50, tf.Division(length=3.5), 80), (85, tf.Division(length=3.5), 0), (50, tf.Division(), 0)],
+)
+def test_an_effect_that_looks_for_divisions_too_early_is_warned_of(stage, division, late):
+    """Cells divide at stage 80 at a threshold, and at stage 20 where a rule flags them."""
+
+    @dataclass(frozen=True)
+    class Count(tf.Effect):
+        title = "count"
+
+        def step(self, state, dt, values):
+            assert len(state.births) < 2
+            return state
+
+    Count.stage = stage
+    scene = tf.Scene(tf.Growth(rate=1.0), division, Count())
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        scene.bind()
+    said = [str(w.message) for w in told if "births" in str(w.message)]
+    wanted = f"Count reads state.births at stage 50, and cells divide at stage {late}"
+    assert len(said) == (late > 0) and all(x.startswith(wanted) for x in said)

@@ -1,5 +1,5 @@
 """What is checked of the effects of a bound scene together: that the names exist which they read
-and write, that none is idle, and that a run to a number of cells can end."""
+and write, that none is idle or comes too early, and that a run to a number of cells can end."""
 
 from __future__ import annotations
 
@@ -70,6 +70,26 @@ def warn_of_idle(effects: Sequence[BoundEffect], state: State) -> None:
                 warn(text)
 
 
+def warn_of_early(effects: Sequence[BoundEffect]) -> None:
+    """Warn of a user's effect that looks for divisions of the step before cells divide."""
+    for bound in filter(_is_own, effects):
+        code = getattr(type(bound.effect).step, "__code__", None)
+        if code is None or "births" not in code.co_names:
+            continue
+        divide = max((e.stage for e in effects if _divides(e)), default=bound.stage)
+        if bound.stage < divide:
+            name = type(bound.effect).__name__
+            warn(
+                f"{name} reads state.births at stage {bound.stage:g}, and cells divide at stage"
+                f" {divide:g}: it finds no divisions. Write stage = {divide + 5:g}, or another"
+                f" number above {divide:g}, in {name}."
+            )
+
+
+def _divides(effect: BoundEffect) -> bool:
+    return any(f.name == "divide_flag" for f in effect.declares())
+
+
 def _sets(effects: Sequence[BoundEffect], name: str, effect: BoundEffect) -> bool:
     """Whether another effect may set a field, or lengthen or add cells in its own way."""
     others = [e for e in effects if e.effect is not effect.effect]
@@ -102,9 +122,8 @@ def _check_moves(effect: BoundEffect, name: str, state: State, cells: int) -> No
 
 def _check_adds(effects: Sequence[BoundEffect], state: State, cells: int) -> None:
     """Raise InputError, or warn, if a colony is to have more cells and no effect adds any."""
-    divides = any("divide_flag" in (f.name for f in e.declares()) for e in effects)
     short = (state.counts > 0) & (state.counts < cells)
-    if divides or any(map(_is_own, effects)) or not bool(short.any()):
+    if any(map(_divides, effects)) or any(map(_is_own, effects)) or not bool(short.any()):
         return
     place = int(short.nonzero()[0])
     text = (

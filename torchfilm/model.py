@@ -341,6 +341,7 @@ def bind(
         effect.check(first)
     if check_first and places is None:
         binding_checks.warn_of_idle(model.effects, first)
+    binding_checks.warn_of_early(model.effects)
     return model
 
 
