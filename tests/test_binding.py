@@ -204,6 +204,13 @@ def test_fields_declared_alike_are_one():
         tf.Scene(tf.Growth(rate=1.0), tf.Circuit(made, species=("growth_rate",)), dim=2)
 
 
+@pytest.mark.parametrize("name", ["toggle_switch", "nutrient_limited"])
+def test_a_model_that_has_run_can_be_copied(name):
+    model = tf.scenes.build(name).bind(2, seed=3)
+    state = model.step(model.start())
+    same(copy.deepcopy(model).step(state), model.step(state))
+
+
 @pytest.mark.parametrize(
     ("stage", "division", "late"),
     [(50, tf.Division(length=3.5), 80), (85, tf.Division(length=3.5), 0), (50, tf.Division(), 0)],

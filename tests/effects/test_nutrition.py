@@ -177,6 +177,25 @@ def test_kernels_and_torch_give_the_same(dtype, monkeypatch):
         assert one.fields[name].tolist() == pytest.approx(other.fields[name].tolist(), rel=bound)
 
 
+@pytest.mark.parametrize("fresh", [True, False])
+def test_gradients_by_the_first_lengths(fresh):
+    """Also where the first step of a model begins from lengths that require them."""
+    monod = tf.Monod("food", rate=1.5, half=0.3, growth_yield=0.7)
+    model = eating(monod, cells=pack(), initial=0.4).bind(dtype=F64)
+    first = model.start()
+    if not fresh:
+        model.step(first, 0.1)
+
+    def eaten(length):
+        return model.step(first.replace(length=length), 0.1).food_eaten.sum()
+
+    length = first.length.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(eaten(length), length)
+    with torch.no_grad():
+        moved = [eaten(first.length + x * torch.eye(12, dtype=F64)[4]) for x in (1e-4, -1e-4)]
+    assert float(slope[4]) == pytest.approx(float(moved[0] - moved[1]) / 2e-4, rel=1e-4)
+
+
 def test_daughters_begin_to_eat_anew():
     scene = eating(
         tf.Monod("food", rate=1.5, half=0.1, growth_yield=2.0),

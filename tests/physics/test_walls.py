@@ -370,6 +370,19 @@ def test_walls_that_make_no_sense_are_refused(make):
         make()
 
 
+@pytest.mark.parametrize("where", [4.0, [4.0, 5.0]])
+def test_a_tensor_that_turns_a_wall_inside_out_is_refused_in_the_next_step(where):
+    """As an optimiser may, which changes tensors in place."""
+    width, high = (torch.tensor(where, dtype=torch.float64) for _ in range(2))
+    channel, box = tf.Channel(width=width), tf.Box((0.0, 0.0), (high, 9.0))
+    assert len(channel.surfaces(2)) == 2 and len(box.surfaces(2)) == 4
+    width.mul_(-1.0)
+    high.mul_(-1.0)
+    for wall, axis in ((channel, "y"), (box, "x")):
+        with pytest.raises(tf.InputError, match=rf"walls of \w+ along {axis}.*inside out"):
+            wall.surfaces(2)
+
+
 def test_cells_behind_a_wall_are_refused_before_the_first_step():
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(walls=[tf.Plane(x=1.0, facing="+x")]))
     with pytest.raises(tf.InputError, match="inside out"):

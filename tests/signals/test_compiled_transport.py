@@ -180,7 +180,7 @@ def test_the_bits_of_a_colony_depend_on_no_other(method, dtype, own, monkeypatch
     together = after(list(range(9)))
     turned = after(list(range(8, -1, -1)))[::-1]
     monkeypatch.setattr("torchfilm.tools.threads.WORTH_WAKING", 0.0)
-    monkeypatch.setattr("torch.get_num_threads", lambda: 3)
+    monkeypatch.setattr("torchfilm.tools.threads.available", lambda: 3)
     shared = after(list(range(9)))
     for k in range(9):
         (alone,) = after([k])

@@ -371,7 +371,7 @@ def test_threads_take_whole_colonies_and_no_bit_changes(monkeypatch):
     monkeypatch.setattr(compiled, "_in_parts", spied)
     for threads, worth in ((1, 1.0), (3, 0.0)):
         monkeypatch.setattr("torchfilm.tools.threads.WORTH_WAKING", worth)
-        monkeypatch.setattr("torch.get_num_threads", lambda threads=threads: threads)
+        monkeypatch.setattr("torchfilm.tools.threads.available", lambda threads=threads: threads)
         ranges.clear()
         found.append(model.step(first, 0.05))
     ends = np.cumsum([0, *first.counts.tolist()])

@@ -257,6 +257,15 @@ def test_two_arguments_are_torchs(dtype):
     )
 
 
+def test_arguments_may_be_named_as_in_torch():
+    x, y = torch.tensor([0.5, 2.0]), torch.tensor([1.0, 3.0])
+    with deterministic_functions():
+        for function in (torch.rsqrt, torch.sigmoid, torch.exp2, torch.nn.functional.softplus):
+            assert torch.equal(function(input=x), function(x))
+        for function in (torch.logaddexp, torch.hypot):
+            assert torch.equal(function(x, other=y), function(x, y))
+
+
 def test_what_is_not_replaced_is_left_to_torch():
     """Integer and complex tensors, and negative bases of a number's power, are as in torch.
 

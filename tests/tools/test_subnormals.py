@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -49,6 +52,18 @@ def test_what_a_user_chose_stays():
 
 def test_other_threads_count_as_this_one_does():
     with subnormals.as_zero():
-        inside = submit(2, are_kept).result()
+        inside = submit(are_kept).result()
     assert inside == [False, False]
-    assert submit(2, are_kept).result() == [True, True]
+    assert submit(are_kept).result() == [True, True]
+
+
+def test_it_does_not_matter_what_they_were_when_it_was_imported():
+    """A subnormal number is read as 0 in a file that is compiled while they count as 0."""
+    code = (
+        "import torch; torch.set_flush_denormal(True)\n"
+        "from torchfilm.tools import subnormals as s; here = s.are_zero()\n"
+        "torch.set_flush_denormal(False)\n"
+        "print(here, s.are_zero())"
+    )
+    ran = subprocess.run([sys.executable, "-B", "-c", code], capture_output=True, text=True)
+    assert ran.stdout.split() == ["True", "False"], ran.stderr

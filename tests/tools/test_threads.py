@@ -1,5 +1,6 @@
 """Torch in one thread, where kernels compute."""
 
+import threading
 from dataclasses import dataclass
 
 import pytest
@@ -132,3 +133,11 @@ def test_an_effect_of_users_has_the_threads_of_torch():
     model = tf.Scene(Mine()).bind()
     model.step(model.start())
     assert found == [3]
+
+
+def test_work_in_few_parts_or_many_wakes_the_same_threads(monkeypatch):
+    monkeypatch.setattr(threads, "WORTH_WAKING", 0.0)
+    used = set()
+    for count in (2, 3, 2, 3):
+        threads.Shared()(count, lambda *_: used.add(threading.current_thread().name))
+    assert len(used) <= 1 + 3 and len({name.rpartition("_")[0] for name in used}) == 2

@@ -52,6 +52,10 @@ class Compiled:
     def module(self) -> ModuleType:
         return _module(self.text)
 
+    def __deepcopy__(self, _: object) -> Compiled:
+        """Itself: it never changes, and a module cannot be copied."""
+        return self
+
     def leaves(self) -> str:
         """The text of what `prepared` is given for the cell n."""
         return places(self.equations.leaves, self.columns, self.numbers)

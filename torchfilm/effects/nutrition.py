@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,6 +16,7 @@ from torch import Tensor
 from torchfilm.circuits import run
 from torchfilm.circuits.compiled_stiff import CompiledCircuit, compiled_circuit
 from torchfilm.circuits.names import Names
+from torchfilm.circuits.tracing import Untraceable
 from torchfilm.effect import NUTRITION, Binding, BoundEffect, Effect
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
@@ -119,6 +121,10 @@ class _BoundMonod(BoundEffect):
         self.by_torch = f"the device is {device.type}" if device.type != "cpu" else unavailable()
         self.compiled: CompiledCircuit | None = None
 
+    @property
+    def by_kernels(self) -> bool:
+        return not self.by_torch
+
     def _reservoir(self) -> tuple[str, ...]:
         name = f"{self.effect.signal}_reservoir"
         return (name,) if name in self.binding.declared else ()
@@ -173,8 +179,9 @@ class _BoundMonod(BoundEffect):
             {n: self.values[n].of_cells(state) for n in CONSTANTS}, medium.found, medium.pool,
             label=f"uptake of {signal}",
         )  # fmt: skip
-        if self.compiled is None and not any(self.values[n].requires_grad for n in CONSTANTS):
-            self.compiled = compiled_circuit(cells)
+        if self.compiled is None:
+            with suppress(Untraceable):  # a gradient is wanted: torch finds the slopes, too
+                self.compiled = compiled_circuit(cells)
         cells = dataclasses.replace(cells, compiled=self.compiled, by_torch=bool(self.by_torch))
         found = run.step(cells, torch.zeros_like(state.volume).unsqueeze(1), dt, STIFF)
         return found.concentrations[:, 0], found.failed

@@ -125,7 +125,7 @@ def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> No
         work[least] += int(counts[colony])
         shares[least].append(colony)
     own, *others = [np.array(share, np.int64) for share in shares]
-    calls = [submit(threads, kernel, share, *arguments) for share in others]
+    calls = [submit(kernel, share, *arguments) for share in others]
     kernel(own, *arguments)
     for call in calls:
         call.result()
@@ -163,7 +163,7 @@ def _call_by_team(kernel, threads: int, colony: int, arguments: tuple) -> None:
     calls: list[Future] = []
     try:
         for _ in range(threads - 1):
-            calls.append(submit(available(), assist))
+            calls.append(submit(assist))
         kernel(board, np.array([colony]), *arguments)
     finally:
         board[OFFER] = OVER

@@ -271,9 +271,13 @@ class Channel(Wall):
 def _sides(
     wall: Wall, low: Sequence[float | Tensor], high: Sequence[float | Tensor]
 ) -> list[Surface]:
-    """The sides of an axis-parallel box, but for those at infinity."""
+    """The sides of an axis-parallel box, but for those at infinity. Tensors may have changed since
+    the wall was made."""
     dim, out = len(low), list[Surface]()
     for k, pair in enumerate(zip(low, high, strict=True)):
+        if any(isinstance(x, Tensor) for x in pair) and not checks.below(*pair):
+            name = f"walls of {type(wall).__name__} along {AXES[k]}"
+            raise checks.input_error(name, pair, "low < high", "This wall is inside out.")
         for sign, at in zip((1.0, -1.0), pair, strict=True):
             if isinstance(at, Tensor) or math.isfinite(at):
                 normal = tuple(sign if m == k else 0.0 for m in range(dim))

@@ -147,10 +147,10 @@ def atanh(x: Tensor) -> Tensor:
     return 0.5 * (torch.log1p(x) - torch.log1p(-x))
 
 
-def logaddexp(x: Tensor, y: Tensor) -> Tensor:
+def logaddexp(x: Tensor, other: Tensor) -> Tensor:
     """log(eˣ + eʸ)."""
-    first = x >= y
-    high, low = torch.where(first, x, y), torch.where(first, y, x)
+    first = x >= other
+    high, low = torch.where(first, x, other), torch.where(first, other, x)
     gap = torch.where(
         torch.isfinite(high), low - high, 0.0
     )  # the difference of infinities is undefined
@@ -162,9 +162,9 @@ def rsqrt(x: Tensor) -> Tensor:
     return 1.0 / torch.sqrt(x)
 
 
-def hypot(x: Tensor, y: Tensor) -> Tensor:
+def hypot(x: Tensor, other: Tensor) -> Tensor:
     """√(x² + y²)."""
-    return torch.sqrt(x * x + y * y)
+    return torch.sqrt(x * x + other * other)
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
@@ -213,9 +213,11 @@ def _ipow(x: Tensor, n: float | Tensor) -> Tensor | None:
 
 
 def _floating(function: Callable[..., Tensor]) -> Callable[..., Tensor | None]:
-    return lambda x, *args, **kwargs: (
-        function(x, *args, **kwargs) if isinstance(x, Tensor) and x.is_floating_point() else None
-    )
+    def replaced(input: Tensor, *args: Any, **kwargs: Any) -> Tensor | None:
+        fits = isinstance(input, Tensor) and input.is_floating_point()
+        return function(input, *args, **kwargs) if fits else None
+
+    return replaced
 
 
 # Replacements of torch's functions. A replacement that returns None leaves the call to torch.

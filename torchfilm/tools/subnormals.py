@@ -6,17 +6,20 @@ concentration falls by a factor a voxel, without end.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 
-_SMALLEST, _ONE = 5e-324, 1.0
+# The least usual number. (A subnormal one would be read as 0 where this file is compiled while
+# they count as 0.)
+_LEAST, _HALF = sys.float_info.min, 0.5
 
 
 def are_zero() -> bool:
     """Whether they count as 0 in this thread of Python."""
-    return _SMALLEST * _ONE == 0.0
+    return _LEAST * _HALF == 0.0
 
 
 def set_zero(wanted: bool) -> None:

@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
@@ -81,16 +81,16 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="torchfilm")
 
 
-def submit(threads: int, work: Callable[..., object], *given: Any) -> Future[object]:
-    """Begin work(*given) in one of so many threads of this process. Subnormal numbers are there
-    what they are here, so that bits do not depend on the threads."""
+def submit(work: Callable[..., object], *given: Any) -> Future[object]:
+    """Begin work(*given) in another thread of this process. Subnormal numbers are there what they
+    are here, so that bits do not depend on the threads."""
     zero = subnormals.are_zero()
 
     def run() -> object:
         subnormals.set_zero(zero)
         return work(*given)
 
-    return _pool(os.getpid(), threads).submit(run)
+    return _pool(os.getpid(), available()).submit(run)
 
 
 class Shared:
@@ -107,11 +107,12 @@ class Shared:
             threads = min(threads, int(count * self.seconds / WORTH_WAKING))
         ends = [count * k // threads for k in range(threads + 1)] if threads > 1 else [0, count]
         (first, last), *others = pairwise(ends)
-        calls = [submit(threads, work, a, b) for a, b in others]
+        calls = [submit(work, a, b) for a, b in others]
         begin = time.perf_counter()
         try:
             work(first, last)  # by this thread, which need not be woken
             self.seconds = (time.perf_counter() - begin) / max(1, last)
         finally:
-            for call in calls:
-                call.result()
+            wait(calls)  # also after an error: they work on what belongs to this thread
+        for call in calls:
+            call.result()
