@@ -44,6 +44,16 @@ def pytest_collection_finish(session):
             model.step(model.start())
 
 
+@pytest.fixture(autouse=True)
+def torch_as_it_was():
+    """A test that leaves torch with other threads fails, and not one of those after it. (A patched
+    number of threads deceives `tf.one_torch_thread`: patch `tools.threads.available`.)"""
+    yield
+    left = torch.get_num_threads()
+    torch.set_num_threads(1)
+    assert left == 1, f"the test leaves torch with {left} threads"
+
+
 @pytest.fixture(params=DEVICES)
 def device(request) -> torch.device:
     return torch.device(request.param)
