@@ -277,7 +277,7 @@ class Replay(metaclass=checks.KnownKeywords):
         if number == 0:
             self._check_streams(state)
         place = self.order.index_select(0, torch.searchsorted(self.streams, state.stream))
-        followed = _Followed(place, *_repeated(place))
+        followed = _Followed(place)
         changes = {change.part: change for change in self.recording.changes(number)}
         state = self.model.opened(state)
         if FIRST in changes:
@@ -342,8 +342,9 @@ class _Followed:
     """Which recorded colonies ours follow in a step: `place` (B,), which is `unit` so many
     times."""
 
-    def __init__(self, place: Tensor, unit: Tensor, times: int):
-        self.place, self.unit, self.times = place, unit, times
+    def __init__(self, place: Tensor):
+        self.place = place
+        self.unit, self.times = _repeated(place)
         self._counts: Tensor | None = None
 
     def cells(self, counts: Tensor) -> tuple[Tensor, Tensor]:

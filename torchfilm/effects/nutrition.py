@@ -4,7 +4,7 @@ dense colonies starve in the middle (Monod 1949)."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -150,8 +150,9 @@ class _BoundMonod(BoundEffect):
         if state.cells == 0 or medium is None:
             return state
         volume, there, in_reservoir = state.volume, medium.found[signal], medium.in_reservoir
-        greatest, half, gain = (self.values[n].of_cells(state) for n in CONSTANTS)
-        eaten, failed = self._eaten(state, medium, dt)
+        constants = {n: self.values[n].of_cells(state) for n in CONSTANTS}
+        greatest, half, gain = constants.values()
+        eaten, failed = self._eaten(state, medium, constants, dt)
         to_reservoir, inside = None, eaten
         if in_reservoir is not None:  # the concentration of a reservoir is constant
             there_for_good = volume / gain * torch.expm1(greatest * there / (half + there) * dt)
@@ -167,17 +168,18 @@ class _BoundMonod(BoundEffect):
         note = NutritionReport(state.groups.any(failed).long(), uptake)
         return state.replace(reports={**state.reports, "nutrition": note})
 
-    def _eaten(self, state: State, medium: MediumExchange, dt: float) -> tuple[Tensor, Tensor]:
+    def _eaten(
+        self, state: State, medium: MediumExchange, constants: Mapping[str, Tensor], dt: float
+    ) -> tuple[Tensor, Tensor]:
         """What each cell takes from its pool, (N,) conc·µm³, and whether its integration failed.
 
         What is eaten is a variable beside the concentration in the pool: where nutrient abounds, it
         would be lost in the rounding of a difference."""
-        signal, count = self.effect.signal, state.cells
+        signal = self.effect.signal
         cells = run.CircuitCells(
             partial(_uptake, signal), ("eaten",), (signal,),
-            torch.arange(count, device=state.device), {"volume": state.volume},
-            {n: self.values[n].of_cells(state) for n in CONSTANTS}, medium.found, medium.pool,
-            label=f"uptake of {signal}",
+            torch.arange(state.cells, device=state.device), {"volume": state.volume}, constants,
+            medium.found, medium.pool, label=f"uptake of {signal}",
         )  # fmt: skip
         if self.compiled is None:
             with suppress(Untraceable):  # a gradient is wanted: torch finds the slopes, too
