@@ -9,6 +9,7 @@ from design.best import Best
 from design.calibration import Calibration
 from design.finals import Finals
 from design.front import Front
+from design.growing import FinishedColonies
 from design.inference import infer
 from design.library import Library, Sensor, SensorDevice, Wiring
 from design.methods import CMAES, NSGA2, Batch, Bayesian, Local, Method, Polish, Racing, Sobol
@@ -17,7 +18,6 @@ from design.parameters import Choice, Parameter, Space
 from design.posterior import Posterior
 from design.robustness import Robustness
 from design.robustness_check import check_robustness
-from design.rollout import FinishedColonies
 from design.saved_design import SavedDesign, load_design
 from design.scene_family import UnfitDesign
 from design.search import Search

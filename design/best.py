@@ -11,10 +11,10 @@ import numpy as np
 import torchfilm as tf
 from design import report, report_plot
 from design.finals import FreshLosses
+from design.growing import FinishedColonies
 from design.objective import Objective
 from design.parameters import Value
 from design.robustness_check import check_robustness
-from design.rollout import FinishedColonies
 from design.saved_design import write_design
 from design.study import Study
 from torchfilm import checks, displays

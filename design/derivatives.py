@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 import torchfilm as tf
+from design.growing import FinishedColonies
 from design.parameters import Parameter, Space
-from design.rollout import FinishedColonies
 from design.slopes import Slopes
 from design.targets.base import Target
 

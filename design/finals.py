@@ -15,7 +15,6 @@ from functools import partial
 import numpy as np
 from scipy.stats import t as student
 
-from design.methods.base import whole
 from design.objective import Objective
 from design.pareto import nondominated, spread
 from design.study import Study
@@ -46,7 +45,7 @@ class Finals(metaclass=checks.KnownKeywords):
 
     def __post_init__(self) -> None:
         checks.number("Finals.share", self.share, above=0.0, most=0.9)
-        whole("Finals.most", self.most, least=1)
+        checks.integer("Finals.most", self.most, least=1)
         sizes = checks.vector("Finals.sizes", self.sizes)
         if not sizes or min(sizes) <= 0 or len(set(sizes)) < len(sizes):
             raise checks.input_error(

@@ -8,7 +8,7 @@ import numpy as np
 
 import torchfilm as tf
 from design import report_plot
-from design.rollout import FinishedColonies
+from design.growing import FinishedColonies
 from design.targets.base import Target
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 
 import torchfilm as tf
-from design.methods.base import whole
 from design.neural_posterior import NeuralPosterior, require_sbi
 from design.parameters import Choice, Parameter
 from design.posterior import Posterior
@@ -74,7 +73,7 @@ def infer(
         ("simulations", simulations, LEAST), ("samples", samples, 10), ("flows", flows, 1),
         ("epochs", epochs, 1),
     ):  # fmt: skip
-        whole(name, value, least=least)
+        checks.integer(name, value, least=least)
     kept = None if path is None else checks.file_path("path", path)
     task = Task(
         scene, parameters, observed, cells=cells,

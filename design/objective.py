@@ -13,8 +13,8 @@ import numpy as np
 from design import executors
 from design.derivatives import along, differences, neighbours
 from design.entries import Entry
+from design.growing import FinishedColonies
 from design.parameters import Value
-from design.rollout import FinishedColonies
 from design.scoring import cut_work_items, finished_colonies, run_work_item
 from design.slopes import Slopes
 from design.task import Task
@@ -150,7 +150,7 @@ class Objective(metaclass=checks.KnownKeywords):
     def _grow(
         self,
         points: np.ndarray,
-        turns: list[list[dict[str, float]]] | None,
+        tangents: list[list[dict[str, float]]] | None,
         streams: tuple[int, ...],
         size: float,
         executor: Executor | None,
@@ -158,7 +158,7 @@ class Objective(metaclass=checks.KnownKeywords):
     ) -> Evaluation:
         task, count = self.task, len(streams)
         values = [task.space.values(point) for point in points]
-        items = cut_work_items(task, values, count, size, work_items, turns)
+        items = cut_work_items(task, values, count, size, work_items, tangents)
         results = (
             ((item, run_work_item(task, item, streams, size)) for item in items)
             if executor is None
@@ -179,8 +179,8 @@ class Objective(metaclass=checks.KnownKeywords):
             why_regrown = why_regrown or found.why_regrown
             if found.slopes is not None:
                 gathered.put([row * count + k for row in rows for k in range(count)], found.slopes)
-        slopes = None if turns is None else gathered.reduced(task.shares(losses))
-        copies = 1 if turns is None else len(turns[0])
+        slopes = None if tangents is None else gathered.reduced(task.shares(losses))
+        copies = 1 if tangents is None else len(tangents[0])
         return Evaluation(
             points, values, losses, task.reduced(losses), cells, reasons, size, why_regrown, 0.0,
             slopes, copies, task.reduced_goals(goals), goals if task.goals else None,

@@ -9,7 +9,6 @@ import numpy as np
 
 import torchfilm as tf
 from design.calibration import Calibration
-from design.methods.base import whole
 from design.neural_posterior import NeuralPosterior
 from design.parameters import Parameter, Value, show_value
 from design.posterior_plot import draw_corner
@@ -156,8 +155,8 @@ class Posterior:
         """Simulation-based calibration (Talts et al., arXiv 1804.06788): grow colonies of hidden,
         random parameters, and see how often the posteriors of their statistics cover these. It
         costs `truths` simulations and no learning."""
-        whole("truths", truths, least=2)
-        whole("samples", samples, least=9)
+        checks.integer("truths", truths, least=2)
+        checks.integer("samples", samples, least=9)
         points = random_points(self.task, truths, stream=STREAM)
         # random numbers that no simulation has used
         first = 2**24 + STREAM * 2**20

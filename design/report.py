@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from design.finals import FreshLosses
+from design.growing import FinishedColonies
 from design.parameters import Choice, Parameter, Space, Value, show_value
-from design.rollout import FinishedColonies
 from design.study import Study
 from design.targets.base import Target
 from design.targets.goals import Goals

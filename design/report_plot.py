@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import torchfilm as tf
+from design.growing import FinishedColonies
 from design.parameters import Parameter, show_value
 from design.report import SearchReport, trivial_answers
-from design.rollout import FinishedColonies
 from design.targets.base import Target
 
 if TYPE_CHECKING:

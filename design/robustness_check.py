@@ -10,7 +10,6 @@ from typing import Protocol
 
 import numpy as np
 
-from design.methods.base import whole
 from design.objective import Objective
 from design.parameters import Choice, Parameter, Space, Value
 from design.progress import advance, open_bar
@@ -63,7 +62,7 @@ def check_robustness(
     """
     if not isinstance(getattr(best, "objective", None), Objective):
         raise checks.input_error("best", best, "the design that a search returned, a Best")
-    whole("work_items", work_items, least=1)
+    checks.integer("work_items", work_items, least=1)
     _check_arguments(seeds, sizes, change, samples, threshold)
     objective, task = best.objective, best.objective.task
     searched, dimensions = task.replicates, task.space.size
@@ -138,7 +137,7 @@ def _resized(
 def _check_arguments(
     seeds: int, sizes: Sequence[float], change: float, samples: int, threshold: float | None
 ) -> None:
-    whole("seeds", seeds, least=1)
+    checks.integer("seeds", seeds, least=1)
     if isinstance(sizes, str) or not isinstance(sizes, Sequence):
         raise checks.input_error(
             "sizes",
@@ -155,7 +154,7 @@ def _check_arguments(
     checks.number("change", change, above=0.0, hint="0.2 changes each parameter by 20 %.")
     if change >= 1:
         raise checks.input_error("change", change, "below 1", "0.2 changes each parameter by 20 %.")
-    if whole("samples", samples, least=0) and (samples & (samples - 1) or samples == 1):
+    if checks.integer("samples", samples, least=0) and (samples & (samples - 1) or samples == 1):
         below = max(2, 1 << (samples.bit_length() - 1))
         raise checks.input_error(
             "samples",

@@ -15,11 +15,11 @@ import numpy as np
 import torch
 
 import torchfilm as tf
+from design.growing import FinishedColonies
 from design.objective import Objective
 from design.parameters import Choice, Parameter, Value
 from design.plain_data import NotPlain, from_data, to_data
 from design.robustness_check import ScoredDesign, check_robustness
-from design.rollout import FinishedColonies
 from design.scene_family import scene_function
 from design.targets.base import Target
 from design.task import Task

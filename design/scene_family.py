@@ -49,12 +49,12 @@ class SceneFamily:
         self,
         values: Sequence[Mapping[str, Value]],
         repeat: int = 1,
-        turns: Sequence[Mapping[str, float]] | None = None,
+        tangents: Sequence[Mapping[str, float]] | None = None,
     ) -> tf.Scene:
         """One scene for several designs whose structure is the same. A number, or a choice that is
-        made per colony, becomes one value per colony; each design has `repeat` colonies. turns: for
-        each design, the derivatives that its values carry as tangents, by name; those that are not
-        named carry 0."""
+        made per colony, becomes one value per colony; each design has `repeat` colonies. tangents:
+        for each design, the derivatives that its values carry, by name; those that are not named
+        carry 0."""
         arguments = dict(self.fixed)
         for parameter in self.space.parameters:
             name = parameter.name
@@ -65,9 +65,9 @@ class SceneFamily:
                 arguments[name] = [design[name] for design in values for _ in range(repeat)]
                 continue
             arguments[name] = self._column([design[name] for design in values], repeat)
-            if turns is not None:
-                turn = self._column([turn.get(name, 0.0) for turn in turns], repeat)
-                arguments[name] = tf.tangents.with_tangent(arguments[name], turn)
+            if tangents is not None:
+                column = self._column([tangent.get(name, 0.0) for tangent in tangents], repeat)
+                arguments[name] = tf.tangents.with_tangent(arguments[name], column)
         made = self.function(**arguments)
         if not isinstance(made, tf.Scene):
             raise checks.input_error("scene", made, "a function that returns a tf.Scene")

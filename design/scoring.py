@@ -15,8 +15,8 @@ import torch
 import torchfilm as tf
 from design import colonies, memory
 from design.derivatives import Gathered
+from design.growing import FinishedColonies, grow
 from design.parameters import Value
-from design.rollout import FinishedColonies, grow
 from design.scene_family import UnfitDesign, why_rough
 from design.slopes import Slopes, joined
 from design.targets.base import Target
@@ -27,17 +27,17 @@ from design.task import Task
 @dataclass(frozen=True)
 class WorkItem:
     """Part of an evaluation: the rows of designs whose scenes have the same structure, and the
-    values of their parameters. turns: for the derivatives, of each design the tangents of its
+    values of their parameters. tangents: for the derivatives, of each design the tangents of its
     copies (`derivatives.along`); None where only losses are wanted."""
 
     rows: tuple[int, ...]
     values: tuple[dict[str, Value], ...]
-    turns: tuple[list[dict[str, float]], ...] | None = None
+    tangents: tuple[list[dict[str, float]], ...] | None = None
 
     def take(self, places: Sequence[int]) -> WorkItem:
         """The designs at some places."""
         of = lambda x: tuple(x[k] for k in places)
-        return WorkItem(of(self.rows), of(self.values), self.turns and of(self.turns))
+        return WorkItem(of(self.rows), of(self.values), self.tangents and of(self.tangents))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +61,14 @@ def cut_work_items(
     replicates: int,
     size: float,
     least: int,
-    turns: Sequence[list[dict[str, float]]] | None = None,
+    tangents: Sequence[list[dict[str, float]]] | None = None,
 ) -> list[WorkItem]:
     """Cut designs into at least `least` parts, where there are as many designs. One scene can hold
-    each part, and one batch fits into memory. turns: as `WorkItem` has them."""
+    each part, and one batch fits into memory. tangents: as `WorkItem` has them."""
     whole = WorkItem(
-        tuple(range(len(values))), tuple(values), None if turns is None else tuple(turns)
+        tuple(range(len(values))), tuple(values), None if tangents is None else tuple(tangents)
     )
-    colonies_each = replicates * (1 if turns is None else len(turns[0]))
+    colonies_each = replicates * (1 if tangents is None else len(tangents[0]))
     structural = [p.name for p in task.space.parameters if p.structural]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row, design in enumerate(values):
@@ -76,7 +76,9 @@ def cut_work_items(
     out = []
     apart = (_unfit_apart(task, values, rows) for rows in groups.values())
     for rows in itertools.chain.from_iterable(apart):
-        most = task.most or _max_colonies(task, [values[r] for r in rows], size, turns is not None)
+        most = task.most or _max_colonies(
+            task, [values[r] for r in rows], size, tangents is not None
+        )
         wanted = max(
             math.ceil(len(rows) / max(1, most // colonies_each)),
             math.ceil(least * len(rows) / len(values)),
@@ -136,7 +138,7 @@ def run_work_item(task: Task, item: WorkItem, streams: tuple[int, ...], size: fl
                 np.zeros((1, replicates), np.int64),
                 {(0, k): str(error) for k in range(replicates)},
                 "",
-                None if item.turns is None else Slopes.none(replicates, task.space.size),
+                None if item.tangents is None else Slopes.none(replicates, task.space.size),
             )
     except (MemoryError, RuntimeError) as error:
         if count == 1 or not memory.is_lack_of_memory(error):
@@ -170,25 +172,25 @@ def _grow_and_score(
 ) -> WorkResult:
     """Copies of a colony, one for each derivative, stand side by side in the batch."""
     count, replicates = len(item.rows), len(streams)
-    copies = 1 if item.turns is None else len(item.turns[0])
-    with tf.tangents.forward_mode() if item.turns else contextlib.nullcontext():
+    copies = 1 if item.tangents is None else len(item.tangents[0])
+    with tf.tangents.forward_mode() if item.tangents else contextlib.nullcontext():
         scene = _scene(task, item, replicates)
         prepared = colonies.prepare(
             scene,
             [stream for _ in item.rows for stream in streams for _ in range(copies)],
             task.settings,
         )
-        if item.turns and why_rough(scene, prepared.why_regrown):
+        if item.tangents and why_rough(scene, prepared.why_regrown):
             # no slope is better than a wrong one
-            plain = _grow_and_score(task, replace(item, turns=None), streams, size)
+            plain = _grow_and_score(task, replace(item, tangents=None), streams, size)
             return replace(plain, slopes=Slopes.unknown(count * replicates, task.space.size))
         losses = np.full(count * replicates, task.target.failed, np.float64)
         goals = np.full((count * replicates, task.goals), np.nan)
         cells = np.zeros(count * replicates, np.int64)
-        gathered = Gathered(task.space, count * replicates) if item.turns else None
+        gathered = Gathered(task.space, count * replicates) if item.tangents else None
         reasons: dict[tuple[int, int], str] = {}
         most_cells, until = task.end(size)
-        note = task.target.course if item.turns else task.target.note
+        note = task.target.course if item.tangents else task.target.note
         for event in grow(prepared, cells=most_cells, until=until, note=note):
             if not isinstance(event, FinishedColonies):
                 reasons[divmod(event.colony_id // copies, replicates)] = event.reason
@@ -235,15 +237,15 @@ def _unfit(task: Task, state: tf.State, size: float) -> list[str]:
 
 def _scene(task: Task, item: WorkItem, replicates: int) -> tf.Scene:
     """The scene of all colonies of a work item."""
-    if item.turns is None:
+    if item.tangents is None:
         return task.family.scene(item.values, repeat=replicates)
     each = [
-        (values, turn)
-        for values, turns in zip(item.values, item.turns, strict=True)
+        (values, tangent)
+        for values, tangents in zip(item.values, item.tangents, strict=True)
         for _ in range(replicates)
-        for turn in turns
+        for tangent in tangents
     ]
-    return task.family.scene([v for v, _ in each], turns=[t for _, t in each])
+    return task.family.scene([v for v, _ in each], tangents=[t for _, t in each])
 
 
 def _scores(target: Target, finished: FinishedColonies) -> np.ndarray:

@@ -15,15 +15,14 @@ import torchfilm as tf
 from design.best import Best
 from design.finals import Finals, FinalsRun, fresh_losses, winner
 from design.front import Front, front_of
+from design.growing import FinishedColonies
 from design.known import KnownDesigns, Start, known_designs
 from design.methods import METHODS, Chosen, Method, choose, method_of
-from design.methods.base import whole
 from design.objective import Objective
 from design.progress import advance, open_bar
-from design.rollout import FinishedColonies
+from design.proposal import Proposal, repeat_study
 from design.study import Study
 from design.task import Task, TaskOptions
-from design.turn import Turn, repeat_study
 from torchfilm import checks
 
 if TYPE_CHECKING:
@@ -127,7 +126,7 @@ class Search(TaskOptions):
         study of another search, and where no design was grown to full size.
         """
         self._check_run(colonies, stop_at)
-        whole("work_items", work_items, least=1)
+        checks.integer("work_items", work_items, least=1)
         study = None if study is None else checks.file_path("study", study)
         if self._known is not None and self._known.remark:
             print(self._known.remark, file=sys.stderr)
@@ -168,9 +167,8 @@ class Search(TaskOptions):
 
     def _check_run(self, colonies: int, stop_at: float | None) -> None:
         least = self.objective.task.replicates
-        if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < least:
-            hint = f"One design takes replicates={least} colonies." if least > 1 else ""
-            raise checks.input_error("colonies", colonies, f"a whole number from {least}", hint)
+        hint = f"One design takes replicates={least} colonies." if least > 1 else ""
+        checks.integer("colonies", colonies, least=least, hint=hint)
         if stop_at is not None:
             checks.number("stop_at", stop_at)
             if self.objective.task.goals:
@@ -194,11 +192,13 @@ class Search(TaskOptions):
         reserved = self.finals.colonies(colonies) if self.finals else 0.0
         limit = max(colonies - reserved, task.replicates)  # one design at least
         method.start(task.space, task.seed, task.replicates)
-        turn = repeat_study(method, task, self.study, self._known)
+        proposal = repeat_study(method, task, self.study, self._known)
         while not self._reached(stop_at, finals):
-            turn = turn or Turn.of_number(len(self.study.entries), method, task, self._known)
+            proposal = proposal or Proposal.of_number(
+                len(self.study.entries), method, task, self._known
+            )
             room = min(limit - self.study.searched, colonies - self.study.colonies)
-            part = turn.part(self.objective, room)
+            part = proposal.part(self.objective, room)
             if part is None:
                 return False
             streams = task.streams(None)[: part.replicates]
@@ -210,13 +210,13 @@ class Search(TaskOptions):
                 work_items=work_items,
                 slopes=part.slopes,
             )
-            turn.take(found.entry(streams), self.study)
+            proposal.take(found.entry(streams), self.study)
             if len(self.study.entries) == 1 and (remark := task.target.remark(found.loss)):
                 print(remark, file=sys.stderr)
             self._progress.why_regrown = found.why_regrown
-            if turn.complete:
-                turn.tell(method)
-                turn = None
+            if proposal.complete:
+                proposal.tell(method)
+                proposal = None
             _show(bar, self.study)
         return True
 

@@ -20,8 +20,8 @@ import torchfilm as tf
 from design import colonies
 from design.data_file import reading, replacing, write_values
 from design.executors import check_executor
+from design.growing import FailedColony, grow
 from design.parameters import Value
-from design.rollout import FailedColony, grow
 from design.scoring import WorkItem, cut_work_items
 from design.targets.observed import Observed
 from design.task import Task

@@ -17,7 +17,6 @@ import torch
 
 import torchfilm as tf
 from design.colonies import RunSettings
-from design.methods.base import whole
 from design.parameters import Choice, Parameter, Space
 from design.scene_family import (
     SceneFamily,
@@ -261,7 +260,7 @@ def _check_options(options: TaskOptions) -> float | None:
     for name, least in (("cells", 2), ("replicates", 1), ("most", 1), ("seed", 0)):
         value = getattr(options, name)
         if value is not None or name in ("replicates", "seed"):
-            whole(name, value, least=least)
+            checks.integer(name, value, least=least)
     if not isinstance(options.fixed, Mapping | None):
         raise checks.input_error(
             "fixed", options.fixed, 'arguments of the scene function by name, such as {"dim": 3}'

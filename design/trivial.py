@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.rollout import FinishedColonies
+from design.growing import FinishedColonies
 from design.targets.base import OUTSIDE, Target
 
 BRIGHT = 1e3  # a lit cell, relative to the greatest level that was found, or to 1

@@ -4,6 +4,7 @@ a higher one."""
 from __future__ import annotations
 
 import ast
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,16 +33,17 @@ class Room:
 ROOMS = {
     "tools": Room(0, ("torchfilm.tools", "torchfilm.version")),
     # compiled loops over arrays: they know neither torch nor the rest
-    "loops": Room(0, ("torchfilm.kernels",)),
-    "kernels": Room(1, ("torchfilm.physics", "torchfilm.signals", "torchfilm.circuits")),
+    "kernels": Room(0, ("torchfilm.kernels",)),
+    "tensors": Room(1, ("torchfilm.physics", "torchfilm.signals", "torchfilm.circuits")),
     "state": Room(2, ("torchfilm.state",)),
-    # what an effect is, how values are given and resolved, what rules see, exchange with the medium
+    # what an effect is, how values are given, resolved and printed, what rules see
     "protocol": Room(
         3,
         (
             "torchfilm.values",
             "torchfilm.resolver",
             "torchfilm.distributions",
+            "torchfilm.parameters",
             "torchfilm.effect",
             "torchfilm.medium_exchange",
             "torchfilm.rule_views",
@@ -76,9 +78,9 @@ ONE_EFFECT = [
         "mechanics bound_mechanics mechanics_report",
     )
 ]
-# Kernels take tensors: they never see a state, nor what is built on one.
-TENSORS_ONLY = "kernels"
-NOT_FOR_KERNELS = ("torchfilm.state", "torchfilm.effect")
+# These take tensors: they never see a state, nor what is built on one.
+TENSORS_ONLY = "tensors"
+NOT_FOR_TENSORS = ("torchfilm.state", "torchfilm.effect")
 
 
 def name_of(path: Path) -> str:
@@ -139,8 +141,8 @@ def crossings(module: str, imported: set[str]) -> list[str]:
             and not any({module, other} <= each for each in ONE_EFFECT)
         ):
             wrong.append(f"{module} imports {other}: {name} never import each other")
-        elif name == TENSORS_ONLY and any(within(other, m) for m in NOT_FOR_KERNELS):
-            wrong.append(f"{module} imports {other}: kernels take tensors, never a state")
+        elif name == TENSORS_ONLY and any(within(other, m) for m in NOT_FOR_TENSORS):
+            wrong.append(f"{module} imports {other}: these take tensors, never a state")
     return wrong
 
 
@@ -148,6 +150,21 @@ def crossings(module: str, imported: set[str]) -> list[str]:
 def test_no_room_imports_a_higher_one(module):
     path = MODULES[module]
     assert crossings(module, imports(path.read_text(), module, path.name == "__init__.py")) == []
+
+
+def test_the_page_for_contributors_has_the_same_rooms():
+    page = (ROOT / "CONTRIBUTING.md").read_text()
+    rows = re.findall(r"^\| (\d+) \|.*\| ([^|]*) \|$", page, flags=re.MULTILINE)
+    told = {}
+    for level, modules in rows:
+        told.setdefault(int(level), set()).update(re.findall("`(.*?)`", modules))
+    listed = {}
+    for room in ROOMS.values():
+        names = {m.removeprefix("torchfilm.") for m in room.modules}
+        listed.setdefault(room.level, set()).update(names)
+    rest = next(r.level for r in ROOMS.values() if r.modules == ("torchfilm",))
+    assert {MODULES[f"torchfilm.{name}"] for name in told.pop(rest)}  # examples: they exist
+    assert told == {level: names for level, names in listed.items() if level != rest}
 
 
 @pytest.mark.parametrize(

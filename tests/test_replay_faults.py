@@ -220,3 +220,28 @@ def test_growth_by_type_is_replayed_for_a_circuit_by_type(name):
     found, full = replayed(scene, 40)
     assert full.cells > 6
     same(found, full)
+
+
+@dataclass(frozen=True, eq=False)
+class Shrinking(tf.Effect):
+    """A user's effect that changes lengths, and may not say so."""
+
+    says: bool = True
+
+    stage = 55
+    title = "shrinking"
+
+    def writes(self):
+        return ("length",) if self.says else ()
+
+    def step(self, state, dt, values):
+        return state.replace(length=state.length * 0.9)
+
+
+def test_an_effect_that_changes_growth_and_does_not_say_so_is_found():
+    """It would have counted as one that only follows, and its changes been lost."""
+    told, untold = (lit().replace(*lit().effects, Shrinking(says=s)) for s in (True, False))
+    replayed_end, full_end = replayed(told, 8)
+    same(replayed_end, full_end)
+    with pytest.raises(tf.SimulationError, match="shrinking changed 'length'.*writes"):
+        replayed(untold, 8)

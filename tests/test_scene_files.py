@@ -180,7 +180,7 @@ def test_bytes_that_are_no_text_are_no_design(folder):
     [
         ({"cells": "many"}, "cells in .*best.json = 'many'.*a whole number"),
         ({"cells": 4.5}, "cells in .*best.json = 4.5.*a whole number"),
-        ({"cells": 0}, "cells = 0.*an integer from 1"),
+        ({"cells": 0}, "cells = 0.*a whole number from 1"),
         ({"seed": "x"}, "seed in .*best.json = 'x'.*a whole number"),
         ({"seed": -1}, "seed = -1.*from 0"),
         ({"until": [1]}, r"until in .*best.json = \[1\].*a number"),

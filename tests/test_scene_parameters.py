@@ -100,3 +100,33 @@ def test_an_effect_that_makes_a_field_of_another_length_is_named():
     model = tf.Scene(tf.Growth(rate=1.0), Age(), dim=2).bind()
     with pytest.raises(tf.InputError, match=r"field 'age' = \(7,\).*each cell"):
         model.step(model.start())
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OwnChecks(tf.Effect):
+    """A user's effect with checks of its own, which does not call those of its base."""
+
+    k: float = tf.physical(1.0, unit="1/h", least=0.0)
+    most: float = 10.0
+
+    stage = 35
+    title = "own checks"
+
+    def __post_init__(self):
+        if tf.values.largest(self.k) > self.most:
+            raise ValueError("too fast")
+
+    def step(self, state, dt, values):
+        return state
+
+
+def test_values_are_checked_before_the_checks_of_ones_own():
+    with pytest.raises(tf.InputError, match=r"OwnChecks\.k = -3\.0"):
+        OwnChecks(k=-3.0)
+    with pytest.raises(ValueError, match="too fast"):
+        OwnChecks(k=[1.0, 20.0])
+    scene = tf.Scene(tf.Growth(), OwnChecks(k=[1.0, 2.0]), dim=2)
+    with pytest.raises(tf.InputError, match=r"OwnChecks\.k has 2 values"):
+        scene.bind(1)
+    model = scene.bind(2)
+    assert model.effects[-1].values.k.of_cells(model.start()).tolist() == [1.0, 2.0]

@@ -9,17 +9,19 @@ only through named fields.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import torch
 
+from torchfilm.parameters import summary
 from torchfilm.resolver import BoundBatch, Resolved, Values, drawn_field, resolve
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, hashing
 from torchfilm.tools.threads import given_torch_threads, one_torch_thread
-from torchfilm.values import CELL, ByType, PerColony, Rule, checked, is_drawn
+from torchfilm.values import CELL, ByType, Rule, checked, is_drawn
 
 if TYPE_CHECKING:
     from torchfilm.tools.hot_reload import HotReload
@@ -36,19 +38,15 @@ BUILT_IN = (*GEOMETRY, "cells")
 
 @dataclass(frozen=True)
 class Binding:
-    """What an effect sees while it is bound: the batch, the scene's step (h), its dimension, and
-    the names that its other effects declare."""
+    """What an effect sees while it is bound: the batch, the scene's step (h), its dimension, the
+    titles of its effects by the names of the fields that they declare, and the stage at which its
+    cells divide."""
 
     batch: BoundBatch
     dt: float
     dim: int
     declared: Mapping[str, str]
-
-    @property
-    def division_stage(self) -> int:
-        """The stage at which the scene's cells divide: at a threshold, or where rules flag them."""
-        at_threshold = self.declared.get("division_threshold") == "division"
-        return DIVISION if at_threshold else FLAGGED_DIVISION
+    division_stage: int
 
 
 class Effect(metaclass=checks.KnownKeywords):
@@ -70,6 +68,21 @@ class Effect(metaclass=checks.KnownKeywords):
     by_kernels: ClassVar[bool] = False
     # Its cost depends on the voxels of the grid, not on the cells.
     works_on_grid: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **given: Any) -> None:
+        """Have physical values checked before a `__post_init__` of the class's own, also where that
+        does not call this one."""
+        super().__init_subclass__(**given)
+        own = cls.__dict__.get("__post_init__")
+        if own is None:
+            return
+
+        @functools.wraps(own)
+        def checked_first(self: Effect) -> None:
+            Effect.__post_init__(self)
+            own(self)
+
+        cls.__post_init__ = checked_first  # type: ignore[method-assign]
 
     def __post_init__(self) -> None:
         for name, (given, rule) in self.physical_fields().items():
@@ -133,7 +146,7 @@ class Effect(metaclass=checks.KnownKeywords):
         return ()
 
     def needs(self) -> Sequence[str]:
-        """Those names among what it reads without which it cannot run."""
+        """Names that the scene must provide. They count as read: `reads` need not repeat them."""
         return ()
 
     def writes(self) -> Sequence[str]:
@@ -195,6 +208,12 @@ class Effect(metaclass=checks.KnownKeywords):
         return self
 
     @property
+    def divides_at_threshold(self) -> bool:
+        """Whether it divides cells at a threshold, late in a step; not only those that a rule has
+        flagged, early in it."""
+        return False
+
+    @property
     def soft_contacts(self) -> bool:
         """Whether its cells are physically soft, so that an overlap is no error."""
         return False
@@ -208,7 +227,14 @@ class BoundEffect:
     """An effect made ready for one batch. `values`: its physical values, resolved.
 
     Most effects need nothing else: `step` calls the description's own. Others override what they
-    need.
+    need. Each of these calls is made for all effects before the next one:
+
+    - `scene.bind()`: `lay`, then fields are declared, `trace` (by default `ready`), `check_others`,
+      `check`. To bind to a state: `opened`, `trace`, `check_others`.
+    - `model.start()`: `lay`, then fields are declared, `ready`.
+    - `model.step(state)`: `opened`, `run_step`.
+
+    What a step has to report it leaves in `state.reports`, by title: see `Report`.
     """
 
     def __init__(self, effect: Effect, binding: Binding):
@@ -333,6 +359,22 @@ class BoundEffect:
         return summary(self.effect)
 
 
+class Report(Protocol):
+    """What a step of an effect tells of itself. A driver raises, or drops colonies, where `status`
+    is not 0. A report may also have `concerns() -> list[Concern]`."""
+
+    @property
+    def status(self) -> torch.Tensor:
+        """(B,) int: 0 where all is well."""
+
+    @property
+    def hint(self) -> str:
+        """What may help where it is not."""
+
+    def reason(self, place: int) -> str:
+        """What went wrong in the colony at this place of the batch."""
+
+
 @dataclass(frozen=True)
 class Concern:
     """What a report warns of, once it has held for `steps` steps: in which colonies, `where` (B,)
@@ -365,76 +407,3 @@ class _DrawnValue:
 
     def __call__(self, state: State, rows: torch.Tensor) -> torch.Tensor:
         return self.value.drawn(state, rows)
-
-
-def number_range(value: torch.Tensor) -> str:
-    """One number in text, or the range of several."""
-    low, high = (float(x) for x in torch.aminmax(value.double().detach()))
-    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-
-
-def summary(effect: Any) -> str:
-    """An effect with the parameters that differ from their defaults, in a line."""
-    shown = ", ".join(f"{name}={value}" for name, value in given(effect))
-    return f"{type(effect).__name__}({shown})"
-
-
-def given(effect: Any) -> list[tuple[str, str]]:
-    """The parameters of an effect that differ from their defaults, with their values as text."""
-    shown = []
-    for f in dataclasses.fields(effect):
-        value = getattr(effect, f.name)
-        default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
-        if f.repr and not _same(value, default):
-            shown.append((f.name, shorten(value)))
-    return shown
-
-
-def _same(a: object, b: object) -> bool:
-    tensors = isinstance(a, torch.Tensor) or isinstance(b, torch.Tensor)
-    return a is b or (not tensors and a == b)
-
-
-def shorten(value: object) -> str:
-    """A value in few characters."""
-    if isinstance(value, torch.Tensor):
-        if value.dim() == 0:
-            return f"{float(value):.9g}"
-        return f"<{value.numel()} values, {float(value.min()):g} to {float(value.max()):g}>"
-    if isinstance(value, ByType):
-        return "{" + ", ".join(f"{kind}: {shorten(v)}" for kind, v in value.values.items()) + "}"
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        if not type(value).__dataclass_params__.repr:  # type: ignore[attr-defined]
-            return repr(value)  # a short one of its own
-        inner = [
-            f"{f.name}={shorten(getattr(value, f.name))}"
-            for f in dataclasses.fields(value)
-            if not _same(getattr(value, f.name), f.default)
-        ]
-        return f"{type(value).__name__}({', '.join(inner)})"
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{name}: {shorten(v)}" for name, v in value.items()) + "}"
-    if isinstance(value, (tuple, list)):
-        return "[" + ", ".join(shorten(v) for v in value) + "]"
-    return getattr(value, "__name__", None) or repr(value)
-
-
-def parameters(part: object, path: str = "") -> list[tuple[str, torch.Tensor]]:
-    """Every tensor among an effect's parameters, by name; those of its distributions, cell types
-    and walls included."""
-    if isinstance(part, torch.Tensor):
-        return [(path, part)]
-    if isinstance(part, (tuple, list)):
-        return [x for k, item in enumerate(part) for x in parameters(item, f"{path}[{k}]")]
-    if isinstance(part, ByType):
-        return [x for k, item in part.values.items() for x in parameters(item, f"{path}[{k}]")]
-    if isinstance(part, PerColony):
-        return parameters(part.values, path)
-    if isinstance(part, Mapping):
-        return [x for name, item in part.items() for x in parameters(item, f"{path}[{name!r}]")]
-    if dataclasses.is_dataclass(part) and not isinstance(part, type):
-        path = path or type(part).__name__
-        # what is not shown is not given by the user but computed
-        shown = [f.name for f in dataclasses.fields(part) if f.repr]
-        return [x for name in shown for x in parameters(getattr(part, name), f"{path}.{name}")]
-    return []

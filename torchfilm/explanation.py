@@ -36,10 +36,8 @@ def explain(
     if not isinstance(scene, Scene):
         raise checks.input_error("scene", scene, "a Scene, such as tf.scenes.microcolony()")
     for name, given in (("cells", cells), ("colonies", colonies)):
-        if given is not None and (
-            isinstance(given, bool) or not isinstance(given, int) or given < 1
-        ):
-            raise checks.input_error(name, given, "a whole number from 1")
+        if given is not None:
+            checks.integer(name, given, least=1)
     checks.number("seconds", seconds, least=0.0)
     fixed = scene.fixed_colonies
     if fixed > 1 and colonies not in (None, fixed):

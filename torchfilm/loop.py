@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfilm.effect import Concern, Report
 from torchfilm.state import State
 from torchfilm.tools.checks import SimulationError
 from torchfilm.tools.warn_once import warn
@@ -57,12 +58,10 @@ class Failure:
 
 def failures(state: State) -> list[Failure]:
     """The colonies whose last step failed, once for each reason: a solve that did not converge, a
-    cell too short to divide, a circuit whose rates are not finite.
-
-    Every report of the step has a `status` (B,), 0 where all is well, and says what went wrong,
-    `reason(place)`, and what helps, `hint`.
-    """
+    cell too short to divide, a circuit whose rates are not finite. The reports are those of
+    `torchfilm.effect.Report`."""
     found = []
+    report: Report
     for report in state.reports.values():
         for place in torch.nonzero(report.status).squeeze(1).tolist():
             id_, cells = int(state.colony_id[place]), int(state.counts[place])
@@ -151,7 +150,7 @@ class LastingConcerns:
             for concern in report.concerns() if hasattr(report, "concerns") else ():
                 self._look(state, (title, concern.name), concern)
 
-    def _look(self, state: State, key: tuple[str, str], concern) -> None:
+    def _look(self, state: State, key: tuple[str, str], concern: Concern) -> None:
         if key in self.warned:
             return
         before, ids = self.steps.get(key, {}), state.colony_id

@@ -38,14 +38,14 @@ class MediumExchange:
         self, name: str, amount: Tensor, to_reservoir: Tensor | None, rows: Tensor | None = None
     ) -> None:
         """Note what cells give to a signal (negative: take), conc·µm³: to their pools `amount`
-        (M,), and to the reservoir.
+        (M,), and to the reservoir. Gifts add up.
 
         rows: (M,) the cells; None: all of them."""
         for noted, new in ((self._given, amount), (self._to_reservoir, to_reservoir)):
             if new is None:
                 continue
             if rows is None:
-                noted[name] = new
+                noted[name] = noted[name] + new if name in noted else new
             else:
                 start = noted.get(name)
                 start = torch.zeros_like(self.pool) if start is None else start

@@ -20,8 +20,9 @@ import torch
 from torch import Tensor
 
 from torchfilm import binding_checks
-from torchfilm.effect import BUILT_IN, DIVISION, Binding, BoundEffect, parameters
+from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect
 from torchfilm.initial_cells import Cells
+from torchfilm.parameters import parameters
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, Field, State
 from torchfilm.tools import checks, displays
@@ -56,16 +57,18 @@ class Model:
     """
 
     def __init__(
-        self, scene: Scene, batch: BoundBatch, start: _Start, places: Collection[int] | None
+        self, scene: Scene, batch: BoundBatch, start: _Start, only: Collection[int] | None
     ):
         self.scene, self.batch, self.dt, self.dim = scene, batch, scene.dt, scene.dim
         self._begin, self.seed = start, start.seed
-        binding = Binding(batch, scene.dt, scene.dim, scene.declared_by)
+        late = any(e.divides_at_threshold for e in scene.effects)
+        stage = DIVISION if late else FLAGGED_DIVISION
+        binding = Binding(batch, scene.dt, scene.dim, scene.declared_by, stage)
         bound: list[BoundEffect] = []
         # a model that was bound under torch.no_grad() may be stepped with gradients
         with torch.enable_grad():
             for place, effect in enumerate(scene.effects):
-                if places is not None and place not in places:
+                if only is not None and place not in only:
                     continue
                 for part in effect.bind(binding):
                     part.place = place
@@ -316,64 +319,59 @@ def bind(
     dtype: torch.dtype = torch.float32,
     state: State | None = None,
     per_colony: bool = False,
-    places: Collection[int] | None = None,
+    only: Collection[int] | None = None,
     check_first: bool = True,
 ) -> Model:
-    """As `Scene.bind`. places: bind only the effects at these places of the scene. check_first:
+    """As `Scene.bind`. only: bind only the effects at these places of the scene. check_first:
     check whether the first cells may be where they are; not needed where a file replaces them."""
     if state is not None:
-        return _bind_to_state(scene, state, places)
+        return _bind_to_state(scene, state, only)
     founders = cells if cells is not None else scene.founders
-    count = _count(scene, colonies, founders, places)
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
-        raise checks.input_error("seed", seed, "an integer from 0")
+    count = _count(scene, colonies, founders, only)
+    seed = checks.integer("seed", seed, least=0, most=2**63 - 1)
     if dtype not in (torch.float32, torch.float64):
         raise checks.input_error("dtype", dtype, "torch.float32 or torch.float64")
     if founders.dim != scene.dim:
         raise checks.input_error("cells", f"{founders.dim}-D", f"{scene.dim}-D, as the scene is")
     batch = BoundBatch(count, dtype, checks.device(device), _types(founders), per_colony)
-    model = Model(scene, batch, _Start(count, seed, _streams(streams, count), founders), places)
+    model = Model(scene, batch, _Start(count, seed, _streams(streams, count), founders), only)
     first = model.trace(None)
-    if places is None:  # a part of a scene lacks what the rest of it declares
+    if only is None:  # a part of a scene lacks what the rest of it declares
         binding_checks.check_names(model.effects, scene.declared_by, first)
     model.check(first)
     for effect in model.effects if check_first else ():
         effect.check(first)
-    if check_first and places is None:
+    if check_first and only is None:
         binding_checks.warn_of_idle(model.effects, first)
     binding_checks.warn_of_early(model.effects)
     return model
 
 
-def _bind_to_state(scene: Scene, state: State, places: Collection[int] | None) -> Model:
+def _bind_to_state(scene: Scene, state: State, only: Collection[int] | None) -> Model:
     if not isinstance(state, State):
         raise checks.input_error("state", state, "a State, such as scene.bind(colonies=8).start()")
-    count = max(scene.fixed_colonies if places is None else 1, int(state.colony_id.max()) + 1)
+    count = max(scene.fixed_colonies if only is None else 1, int(state.colony_id.max()) + 1)
     # what lists of numbers mean was settled when the state was made
     batch = BoundBatch(count, state.dtype, state.device, _types(scene.founders), per_colony=True)
     # by colony id: the places may be others
     streams = torch.arange(count, device=state.device).index_copy(0, state.colony_id, state.stream)
-    model = Model(scene, batch, _Start(count, state.seed, streams, scene.founders), places)
+    model = Model(scene, batch, _Start(count, state.seed, streams, scene.founders), only)
     model.check(state)
     # what it can be tried on: cells that there are, or else the founders
     tried = model.trace(model.opened(state) if state.cells else None)
-    if places is None:
+    if only is None:
         there = (*scene.declared_by, *state.fields)
         binding_checks.check_names(model.effects, there, tried)
     return model
 
 
 def _count(
-    scene: Scene, colonies: int | None, founders: Cells, places: Collection[int] | None
+    scene: Scene, colonies: int | None, founders: Cells, only: Collection[int] | None
 ) -> int:
-    fixed = 1 if places is not None else scene.fixed_colonies
+    fixed = 1 if only is not None else scene.fixed_colonies
     if colonies is None:
         return max(fixed, founders.colonies)
-    if isinstance(colonies, bool) or not isinstance(colonies, int) or colonies < 1:
-        raise checks.input_error(
-            "colonies", colonies, "an integer from 1", "A batch has at least one colony."
-        )
-    return founders.batch_size(colonies)
+    return founders.batch_size(checks.integer("colonies", colonies, least=1))
 
 
 def _types(founders: Cells) -> tuple[int, ...]:

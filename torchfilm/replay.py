@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfilm.effect import BoundEffect
 from torchfilm.loop import advance
 from torchfilm.model import Model, advanced, bind
 from torchfilm.scene import Scene
@@ -100,7 +101,7 @@ class GrowthRecording(metaclass=checks.KnownKeywords):
             streams=self.streams,
             dtype=dtype,
             device=device,
-            places=design.recorded,
+            only=design.recorded,
         )
         self.state = self.model.start()
         self.steps: list[list[RecordedChange]] = []
@@ -257,6 +258,8 @@ class Replay(metaclass=checks.KnownKeywords):
         recorded = {f.name for e in recording.model.effects for f in e.declares()}
         following = [e for e, number in self.parts if number is None]
         self.own = [f.name for e in following for f in e.declares() if f.name not in recorded]
+        # what growth uses: no effect that only follows may change it
+        self.fixed = (*PER_CELL, *sorted(recorded))
 
     def start(self) -> State:
         """The first state of the model, whose colonies follow streams of the recording."""
@@ -284,12 +287,24 @@ class Replay(metaclass=checks.KnownKeywords):
             state = self._apply(state, changes[FIRST], followed)
         for effect, part in self.parts:
             if part is None:
-                state = effect.run_step(state, self.dt)
+                state = self._follow(effect, state)
             elif part in changes:
                 state = self._apply(state, changes[part], followed)
         if any(step == number for step, _ in self.recording.failed.values()):
             state = self._with_failures(state, number)
         return advanced(state, self.dt)
+
+    def _follow(self, effect: BoundEffect, state: State) -> State:
+        """The state after an effect that only follows. Raises SimulationError where it changes what
+        growth uses, and so should not have been left out of the recording."""
+        after = effect.run_step(state, self.dt)
+        for name in self.fixed:
+            if getattr(after, name) is not getattr(state, name):
+                raise checks.SimulationError(
+                    f"{effect.title} changed {name!r}, which its `writes` does not name: so growth"
+                    " was recorded without it. Name it there."
+                )
+        return after
 
     def _apply(self, state: State, change: RecordedChange, followed: _Followed) -> State:
         """The state after a recorded change of the colonies that ours follow."""

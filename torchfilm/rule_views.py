@@ -363,6 +363,16 @@ class DivisionView:
             and self._state.declared[name].scope == CELL
         )
 
+    def changed_in_place(self) -> set[str]:
+        """Fields that a rule wrote into and did not set."""
+        return {
+            name
+            for name, shown in self._work.items()
+            if name not in self._set
+            and self._writable(name)
+            and not unchanged(shown, self._copy(name))
+        }
+
     def check_unharmed(self) -> None:
         """Raises RuleError if a rule wrote into a read-only name."""
         for name, shown in self._work.items():

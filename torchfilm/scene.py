@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits.names import without_medium
-from torchfilm.effect import BUILT_IN, Effect, given, parameters, summary
+from torchfilm.effect import BUILT_IN, Effect
 from torchfilm.initial_cells import Cells
 from torchfilm.model import Model, bind
+from torchfilm.parameters import given, parameters, summary
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks, displays
 from torchfilm.tools.hashing import digest, without_addresses

@@ -122,8 +122,8 @@ def _check_options(
             "simulate needs an end: give until=… (hours) or cells=… (per colony)."
         )
     checks.choice("on_failure", on_failure, ("raise", "drop"))
-    if cells is not None and (isinstance(cells, bool) or not isinstance(cells, int) or cells < 1):
-        raise checks.input_error("cells", cells, "an integer from 1")
+    if cells is not None:
+        checks.integer("cells", cells, least=1)
 
 
 def _check_batch(scene: Scene | Model, state: State | None, batch: dict[str, Any]) -> None:

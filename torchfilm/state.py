@@ -23,9 +23,6 @@ FATES = ("divided", "removed", "left", "failed")
 # Signals stand among the fields under "out.NAME", beside what cells hold under the same name.
 OUTSIDE = "out."
 
-# How daughters get a field: as the parent had it, as the field's initial value, or by a function.
-DivisionRule = str | Callable[["State", "Tensor"], "Tensor"]
-
 
 @dataclass(frozen=True)
 class Field(metaclass=checks.KnownKeywords):
@@ -33,10 +30,11 @@ class Field(metaclass=checks.KnownKeywords):
 
     scope: "cell" (one row a cell), "colony" (one row a colony) or "grid" (one row a voxel of the
     state's layout; the name begins with "out."). shape: of one row. unit and meaning: for people.
-    initial: a number, or a function (state, rows) -> (M, *shape) tensor, called for new rows: at
-    the start and, where at_division = "reset", for daughters, when `state.births[-1]` tells of
-    their parents. at_division: "copy" or "reset". internal: it serves the numerics; tables of
-    results show it only on request.
+    initial: a number, or a function that returns a tensor (M, *shape) for the new rows (M,): at the
+    start and, where at_division = "reset", for daughters, when `state.births[-1]` tells of their
+    parents. It is called with (state, rows, values) where an effect declares the field, its values
+    resolved; else, as by `state.declare`, with (state, rows). at_division: "copy" or "reset".
+    internal: it serves the numerics; tables of results show it only on request.
     """
 
     name: str

@@ -59,7 +59,7 @@ class Batch:
         object.__setattr__(self, "points", points)
         checks.number("Batch.size", self.size, above=0.0, most=1.0)
         if self.replicates is not None:
-            whole("Batch.replicates", self.replicates, least=1)
+            checks.integer("Batch.replicates", self.replicates, least=1)
 
 
 class Method(Protocol):
@@ -101,7 +101,7 @@ class Source(Method, Protocol):
         `fresh`: their rows and losses."""
 
 
-class Turns:
+class AskTell:
     """The base class of the ready methods. `ask` returns the same batch until `tell`.
 
     A method proposes in `_next` and learns in `_take`; `start` calls `_begin`.
@@ -121,8 +121,8 @@ class Turns:
             )
         self._space = space
         self._seed, self._replicates = (
-            whole("seed", seed, least=0),
-            whole("replicates", replicates, least=1),
+            checks.integer("seed", seed, least=0),
+            checks.integer("replicates", replicates, least=1),
         )
         self._batch = None
         self._begin()
@@ -261,13 +261,6 @@ def sobol_points(space: Dimensions, seed: int, at: int, count: int) -> np.ndarra
     return snap(engine.fast_forward(at).random(count), space.levels)
 
 
-def whole(name: str, value: object, *, least: int) -> int:
-    """A whole number from `least`. Raises InputError for anything else."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise checks.input_error(name, value, f"a whole number from {least}")
-    return int(value)
-
-
 @contextmanager
 def numpy_kept(seed: Sequence[int]) -> Iterator[None]:
     """Inside, numpy's global generator starts from `seed`; afterwards it has its earlier state. For
@@ -281,4 +274,4 @@ def numpy_kept(seed: Sequence[int]) -> Iterator[None]:
 
 
 def _shown(value: object) -> str:
-    return value.describe() if isinstance(value, Turns) else repr(value)
+    return value.describe() if isinstance(value, AskTell) else repr(value)

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 import numpy as np
 import torch
 
-from design.methods.base import Batch, Turns, numpy_kept, snap, sobol_points, whole
+from design.methods.base import AskTell, Batch, numpy_kept, snap, sobol_points
 from torchfilm import checks, one_torch_thread
 
 # The optimisation of the acquisition starts from the best few of many samples, and takes so many
@@ -20,7 +20,7 @@ MORE = 64
 
 
 @dataclass(kw_only=True, eq=False)
-class Bayesian(Turns):
+class Bayesian(AskTell):
     """A Gaussian process of the loss, and the noisy expected improvement over all points tried
     (Ament et al., NeurIPS 2023), by botorch.
 
@@ -40,9 +40,9 @@ class Bayesian(Turns):
     first: int | None = None
 
     def __post_init__(self) -> None:
-        whole("Bayesian.batch", self.batch, least=1)
+        checks.integer("Bayesian.batch", self.batch, least=1)
         if self.first is not None:
-            whole("Bayesian.first", self.first, least=2)
+            checks.integer("Bayesian.first", self.first, least=2)
         if find_spec("botorch") is None:
             raise checks.InputError(
                 f"Bayesian needs the package botorch: {checks.install('bayes')}."

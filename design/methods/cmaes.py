@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from design.methods.base import Batch, Turns, numpy_kept, snap, sobol_points, whole
+from design.methods.base import AskTell, Batch, numpy_kept, snap, sobol_points
 from torchfilm import checks
 
 # A restart doubles the population, up to this many times the first: the batch must fit the machine.
@@ -25,7 +25,7 @@ SLOW = {"CMA_cmean": 0.4, "CSA_dampfac": 3.0}
 
 
 @dataclass(kw_only=True, eq=False)
-class CMAES(Turns):
+class CMAES(AskTell):
     """Covariance matrix adaptation (Hansen, "The CMA evolution strategy: a tutorial",
     arXiv:1604.00772), by the package cma.
 
@@ -51,7 +51,7 @@ class CMAES(Turns):
 
     def __post_init__(self) -> None:
         if self.population is not None:
-            whole("CMAES.population", self.population, least=4)
+            checks.integer("CMAES.population", self.population, least=4)
         checks.number("CMAES.sigma", self.sigma, above=0.0, most=1.0)
         for name in ("restarts", "noisy"):
             checks.choice(f"CMAES.{name}", getattr(self, name), (True, False))

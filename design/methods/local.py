@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from design.methods.base import Batch, Turns, sobol_points, whole
+from design.methods.base import AskTell, Batch, sobol_points
 from design.slopes import Slopes
 from torchfilm import checks
 
@@ -69,7 +69,7 @@ class Descent:
         longest = np.abs(step).max()
         return step * min(1.0, LONGEST / longest) if longest > 0 else step
 
-    def turn(self, gradient: np.ndarray, curvature: np.ndarray) -> None:
+    def set_slopes(self, gradient: np.ndarray, curvature: np.ndarray) -> None:
         """The slopes at the point."""
         if not np.isfinite(gradient).all():
             self._doubt("a derivative is no number")
@@ -138,7 +138,7 @@ def unlike(points: np.ndarray, loss: np.ndarray, most: int) -> list[int]:
 
 
 @dataclass(kw_only=True, eq=False)
-class Local(Turns):
+class Local(AskTell):
     """Least squares by Levenberg and Marquardt (Moré 1978) from several starts side by side.
 
     starts: how many descents at a time. first: Sobol designs, whose best are the starts; None is 16
@@ -158,9 +158,9 @@ class Local(Turns):
     first: int | None = None
 
     def __post_init__(self) -> None:
-        whole("Local.starts", self.starts, least=1)
+        checks.integer("Local.starts", self.starts, least=1)
         if self.first is not None:
-            whole("Local.first", self.first, least=self.starts)
+            checks.integer("Local.first", self.first, least=self.starts)
 
     def _begin(self) -> None:
         if None not in self._started().levels:
@@ -211,4 +211,4 @@ class Local(Turns):
 
     def _descend(self, loss: np.ndarray, slopes: Slopes) -> None:
         for k, descent in enumerate(self._asked):
-            descent.turn(slopes.gradient[k], slopes.curvature[k])
+            descent.set_slopes(slopes.gradient[k], slopes.curvature[k])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from design.methods.base import Batch, Turns, snap, sobol_points, whole
+from design.methods.base import AskTell, Batch, snap, sobol_points
 from design.slopes import Slopes
 from torchfilm import checks
 
@@ -16,7 +16,7 @@ SAME = 1e-9  # coordinates: less is rounding, as between the bounds of two studi
 
 
 @dataclass(kw_only=True, eq=False)
-class NSGA2(Turns):
+class NSGA2(AskTell):
     """NSGA-II (Deb et al., IEEE Trans. Evol. Comput. 6, 182, 2002), by the package pymoo, for the
     front of several goals.
 
@@ -31,7 +31,7 @@ class NSGA2(Turns):
     several = True  # goals, not one loss
 
     def __post_init__(self) -> None:
-        whole("NSGA2.population", self.population, least=4)
+        checks.integer("NSGA2.population", self.population, least=4)
         if find_spec("pymoo") is None:
             raise checks.InputError(f"NSGA2 needs the package pymoo: {checks.install('pareto')}.")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from design.methods.base import Batch, Method, Turns, whole
+from design.methods.base import AskTell, Batch, Method
 from design.methods.local import Local, unlike
 from design.methods.racing import Racing
 from design.slopes import Slopes
@@ -14,7 +14,7 @@ from torchfilm import checks
 
 
 @dataclass(kw_only=True, eq=False)
-class Polish(Turns):
+class Polish(AskTell):
     """Searches with another method, and then goes down the slope from its best designs.
 
     inner: the method that searches first; None is Racing(). after: designs that it grows before, in
@@ -39,8 +39,8 @@ class Polish(Turns):
             raise checks.input_error("Polish.inner", self.inner, "a method, such as Racing()")
         if getattr(self.inner, "several", False):
             raise checks.input_error("Polish.inner", self.inner, "a method for one target")
-        whole("Polish.after", self.after, least=1)
-        whole("Polish.starts", self.starts, least=1)
+        checks.integer("Polish.after", self.after, least=1)
+        checks.integer("Polish.starts", self.starts, least=1)
 
     def _begin(self) -> None:
         self._inner.start(self._started(), self._seed, self._replicates)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import kendalltau
 
-from design.methods.base import Batch, Source, Turns, whole
+from design.methods.base import AskTell, Batch, Source
 from design.methods.cmaes import CMAES
 from torchfilm import checks
 
@@ -18,7 +18,7 @@ RATE = 0.2
 
 
 @dataclass(kw_only=True, eq=False)
-class Racing(Turns):
+class Racing(AskTell):
     """Draws more points than another method needs, grows them as small colonies, and keeps the best
     at each size.
 
@@ -72,9 +72,9 @@ class Racing(Turns):
                 "two or more rising shares above 0, the last of them 1, such as (0.25, 1)",
             )
         checks.number("Racing.keep", self.keep, least=0.01, most=0.99)
-        whole("Racing.small", self.small, least=1)
+        checks.integer("Racing.small", self.small, least=1)
         checks.number("Racing.agree", self.agree, least=-1.0, most=1.0)
-        whole("Racing.first", self.first, least=2)
+        checks.integer("Racing.first", self.first, least=2)
 
     def _begin(self) -> None:
         self._source.start(self._started(), self._seed, self._replicates)

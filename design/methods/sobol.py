@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from design.methods.base import Batch, Turns, sobol_points, whole
+from design.methods.base import AskTell, Batch, sobol_points
+from torchfilm import checks
 
 
 @dataclass(kw_only=True, eq=False)
-class Sobol(Turns):
+class Sobol(AskTell):
     """Points of a scrambled Sobol sequence (Owen 1998; scipy.stats.qmc): the baseline of every
     other method, and a map of the whole space.
 
@@ -20,7 +21,7 @@ class Sobol(Turns):
     batch: int = 64
 
     def __post_init__(self) -> None:
-        whole("Sobol.batch", self.batch, least=1)
+        checks.integer("Sobol.batch", self.batch, least=1)
 
     @property
     def wanted(self) -> int:

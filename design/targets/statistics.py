@@ -248,8 +248,7 @@ def known_statistics(
     relative: bool,
 ) -> ColonyStatistics:
     """The statistics of all that is known of some cells."""
-    if isinstance(rings, bool) or not isinstance(rings, int) or not 1 <= rings <= 50:
-        raise checks.input_error("Observed(rings)", rings, "a whole number from 1 to 50")
+    checks.integer("Observed(rings)", rings, least=1, most=50)
     checks.number("Observed(reach)", reach, above=0.0)
     checks.choice("Observed(length_with_caps)", length_with_caps, (True, False))
     checks.choice("Observed(relative)", relative, (True, False))

@@ -64,14 +64,8 @@ class Stripe(ProfileTarget):
         if self.place is not None:
             checks.number("Stripe.place", self.place)
         checks.choice("Stripe.along", self.along, ("x", "y"))
-        if self.cell_type is not None and (
-            isinstance(self.cell_type, bool)
-            or not isinstance(self.cell_type, int)
-            or self.cell_type < 0
-        ):
-            raise checks.input_error(
-                "Stripe.cell_type", self.cell_type, "a whole number from 0, or None for all cells"
-            )
+        if self.cell_type is not None:
+            checks.integer("Stripe.cell_type", self.cell_type, least=0, hint="Or None: all cells.")
         checks.choice("Stripe.straight", self.straight, (True, False))
         check_profile("Stripe", self.floor, self.edge_width)
 

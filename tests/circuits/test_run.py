@@ -28,7 +28,7 @@ def circuit(
     pool=(8.0, 16.0, 4.0),
     signals=(1.0, 0.0, 2.0),
     in_reservoir=None,
-    given=("a",),
+    exchanged=("a",),
     rows=(0, 1, 2),
     dtype=F64,
     D1=3.0,
@@ -38,7 +38,7 @@ def circuit(
     return run.CircuitCells(
         part,
         ("a", "b"),
-        given,
+        exchanged,
         torch.tensor(rows),
         cell,
         {"D1": torch.tensor(D1, dtype=dtype)},
@@ -161,7 +161,7 @@ def test_the_trial_tells_what_is_given():
 
 def test_rates_may_be_numbers():
     found = run.step(
-        circuit(lambda u, s, p, cell: {"a": 2.0, "b": torch.tensor(1, dtype=F64)}, given=()),
+        circuit(lambda u, s, p, cell: {"a": 2.0, "b": torch.tensor(1, dtype=F64)}, exchanged=()),
         torch.zeros(3, 2, dtype=F64),
         0.5,
         settings(),

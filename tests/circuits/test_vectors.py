@@ -11,7 +11,7 @@ from traced import one_step, plain_module, row_of
 
 import torchfilm as tf
 from torchfilm.circuits import compiled
-from torchfilm.circuits.compiled_stiff import CompiledCircuit
+from torchfilm.circuits.compiled_stiff import CompiledStiff
 from torchfilm.circuits.rosenbrock import BELOW_ZERO, DONE, NOT_FINITE, TOO_MANY_STEPS
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.functions import _finite, _least, _most, _sign, inverse_cube_root
@@ -99,7 +99,7 @@ def fates(u, s, p, cell):
     return {"a": out, "b": u.a - u.b, "c": 0.1 - taken * u.c}
 
 
-def circuit() -> CompiledCircuit:
+def circuit() -> CompiledStiff:
     start = {"a": 1.0, "b": 0.5, "c": 0.01}
     found = tf.Circuit(
         fates, species=tuple(start), initial=start, fate=[0.0, 5.0], rate=[1.0, 2.0], dilution=False
@@ -109,7 +109,7 @@ def circuit() -> CompiledCircuit:
 
 
 def after(
-    made: CompiledCircuit, fate: np.ndarray, shares: list[tuple[int, int]], most_steps: int
+    made: CompiledStiff, fate: np.ndarray, shares: list[tuple[int, int]], most_steps: int
 ) -> list:
     """What becomes of cells of these fates, in two hours, computed in these shares."""
     count = len(fate)

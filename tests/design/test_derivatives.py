@@ -12,8 +12,8 @@ from searching import lit, objective_of, paced
 import torchfilm as tf
 from design import Choice, Parameter, Search, Study, colonies, scene_family
 from design.derivatives import along
+from design.growing import grow
 from design.methods import Local
-from design.rollout import grow
 from design.scoring import cut_work_items, run_work_item
 from design.slopes import Slopes
 from design.targets import Bands, Burden, Gradient, Lasting, Ring, Stripe, Weighted

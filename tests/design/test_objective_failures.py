@@ -11,9 +11,9 @@ from scored import alike, objective
 from searching import DT, Level, Spread, banned, fragile, grown, objective_of, paced, short, spots
 
 import torchfilm as tf
-from design import Lasting, Parameter, Ring, Target, Weighted, rollout, scoring
+from design import Lasting, Parameter, Ring, Target, Weighted, growing, scoring
 from design.derivatives import along
-from design.rollout import FinishedColonies
+from design.growing import FinishedColonies
 
 # --- what fails -----------------------------------------------------------------------------------
 
@@ -96,7 +96,7 @@ def test_a_loss_of_the_wrong_shape_is_an_error_of_the_target():
 
 
 def test_a_colony_that_does_not_grow_fails_alone(monkeypatch):
-    monkeypatch.setattr(rollout, "PATIENCE", 6.0)
+    monkeypatch.setattr(growing, "PATIENCE", 6.0)
     made = objective_of(paced, [Parameter("rate", 0.0, 1.0)], Level(), cells=8, replicates=2)
     found = made.evaluate(np.array([[0.0], [1.0]]))
     assert found.reasons == {
@@ -113,8 +113,8 @@ def test_patience_is_longer_than_slow_cells_need(rate):
     steps = np.arange(0, 90, 1.0)
     state = tf.Scene(tf.Growth(rate=rate)).bind(1).start()
     most, since = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.float64)
-    assert not any(bool(rollout._stuck(state.replace(time=t), most, since).any()) for t in steps)
-    assert bool(rollout._stuck(state.replace(time=100.1), most, since).all())
+    assert not any(bool(growing._stuck(state.replace(time=t), most, since).any()) for t in steps)
+    assert bool(growing._stuck(state.replace(time=100.1), most, since).all())
 
 
 def test_a_colony_without_cells_fails():
@@ -214,7 +214,7 @@ def resting(make=1.0):
 
 
 def test_cells_that_do_not_grow_reach_an_end_in_time(monkeypatch):
-    monkeypatch.setattr("design.rollout.PATIENCE", 1.0)
+    monkeypatch.setattr("design.growing.PATIENCE", 1.0)
     found = objective_of(
         resting, [Parameter("make", 0.5, 2.0)], Level(), until=5.0, replicates=1
     ).evaluate(np.array([[0.5]]))

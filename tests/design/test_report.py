@@ -100,7 +100,7 @@ def test_the_table_says_why_growth_was_not_recorded_and_how_many_colonies_failed
 def test_the_table_says_how_long_a_slow_method_took_to_choose(tmp_path, monkeypatch):
     """The time is kept in the study's file, also that of a batch grown in two parts."""
     clock = SimpleNamespace(perf_counter=itertools.count(0.0, 3.0).__next__)
-    monkeypatch.setattr("design.turn.time", clock)
+    monkeypatch.setattr("design.proposal.time", clock)
     for colonies in (12, 32):
         search = Search(
             lit, LIT, Level(), cells=3, replicates=2, method=Sobol(batch=8), finals=None

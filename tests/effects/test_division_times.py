@@ -163,3 +163,15 @@ def test_a_first_value_may_go_by_the_threshold():
 
     state = tf.Scene(Resting(), tf.Division(length=4.0), dim=2).bind().start()
     assert state.rest.tolist() == [2.0]
+
+
+class SlowDivision(tf.Division):
+    """A user's kind of division, by another title."""
+
+    title = "slow division"
+
+
+def test_division_by_another_title_divides_as_early():
+    assert division_times(SlowDivision(length=3.0), 14) == [4, 12]
+    stages = [e.stage for e in tf.Scene(tf.Growth(), SlowDivision(length=3.0)).bind().effects]
+    assert stages == [tf.effect.GROWTH, tf.effect.DIVISION]

@@ -163,7 +163,7 @@ def test_kernels_and_torch_give_the_same(dtype, monkeypatch):
     )
     found = []
     for why in ("", "asked for"):
-        monkeypatch.setattr("torchfilm.effects.nutrition.unavailable", lambda why=why: why)
+        monkeypatch.setattr("torchfilm.tools.backends.unavailable", lambda why=why: why)
         model = scene.bind(2, dtype=dtype)
         state = model.start()
         said = [line for e in model.effects for line in e.numerics(0.1, state)]

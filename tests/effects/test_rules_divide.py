@@ -215,3 +215,23 @@ def test_what_a_divide_rule_writes_is_declared():
     )
     scene.bind().start()
     assert "growth" in {r for w, _, r in scene.bind().couplings() if w.startswith("rules")}
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_what_divide_changes_in_place_is_written(in_place):
+    """A rule that writes into a field counts as one that sets it: where a rate goes by type, both
+    are refused."""
+
+    def divide(parent, daughter1, daughter2):
+        if in_place:
+            daughter1.growth_rate[:] = 2.0
+        else:
+            daughter1.growth_rate = 2.0
+
+    division, founders = tf.Division(length=3.0), tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
+    scene = tf.Scene(tf.Growth(), tf.Rules(divide=divide), division, founders=founders)
+    rules = [e for e in scene.bind().effects if e.title == "rules at division"]
+    assert rules[0].writes() == ("growth_rate",)
+    by_type = scene.replace(tf.Growth(rate={0: 1.0}), tf.Rules(divide=divide), division)
+    with pytest.raises(tf.InputError, match="growth_rate"):
+        by_type.bind()

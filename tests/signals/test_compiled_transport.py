@@ -226,7 +226,7 @@ def test_binding_chooses_and_explain_says_it(monkeypatch):
 def test_a_kernel_that_cannot_be_had_is_refused(monkeypatch):
     with pytest.raises(InputError, match=r"Medium\.backend"):
         scene(backend="numba")
-    monkeypatch.setattr("torchfilm.effects.medium.unavailable", lambda: "there is no Numba")
+    monkeypatch.setattr("torchfilm.tools.backends.unavailable", lambda: "there is no Numba")
     with pytest.raises(InputError, match=r"compiled.*there is no Numba"):
         scene(backend="compiled").bind()
     assert scene().bind() is not None

@@ -104,8 +104,8 @@ def script_rules(script: Script, loop: str, founders: Cells | None = None) -> Sc
     founders = founders or _founders(script, 2 if _is_flat(script) else 3)
     integrator, grid = script.request.integrator, script.request.grid
     options = script.request.options or {}
-    species = _count("nSpecies", integrator["species"]) if integrator else 0
-    signals = _count("nSignals", grid["signals"]) if grid else 0
+    species = checks.integer("nSpecies", integrator["species"], least=1) if integrator else 0
+    signals = checks.integer("nSignals", grid["signals"], least=1) if grid else 0
     bare = Layout({}, species, signals, bool(options.get("compNeighbours")))
     layout, first = rehearse(script, bare, founders)
     rule, reason = None, "--set loop=cells"
@@ -134,12 +134,6 @@ def _column_rule(script: Script, layout: Layout, first: State) -> ColumnRule:
         raise Uneven("it uses deathFlag")
     rule.act(first)
     return rule
-
-
-def _count(name: str, given: Any) -> int:
-    if isinstance(given, bool) or not isinstance(given, int) or given < 1:
-        raise checks.input_error(name, given, "a whole number from 1")
-    return given
 
 
 # --- geometry -----------------------------------------------------------------------------

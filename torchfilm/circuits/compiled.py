@@ -232,19 +232,19 @@ def rates_of(
     circuit: CircuitCells, dtype: torch.dtype
 ) -> tuple[Equations, dict[str, float], tuple[str, ...], tuple[str, ...]]:
     """du/dt of all variables, as `CircuitCells.rates` has them, in a type. Raises Untraceable."""
-    variables = [f"u.{n}" for n in circuit.species] + [f"s.{n}" for n in circuit.given]
+    variables = [f"u.{n}" for n in circuit.species] + [f"s.{n}" for n in circuit.exchanged]
     trace = Trace(circuit, variables, dtype)
     inside, outside = trace.called(
         lambda: traced_rates(circuit.part, trace.names, circuit.species)  # type: ignore
     )
     rates = [trace.spread(inside.get(n, 0.0)) for n in circuit.species]
-    flux = [trace.spread(outside.get(n, 0.0)) for n in circuit.given]
+    flux = [trace.spread(outside.get(n, 0.0)) for n in circuit.exchanged]
     simple = trace.simple([*rates, *flux], dtype)
     final, given = simple[: len(rates)], simple[len(rates) :]
     if given:
         final += _exchange(given, circuit, trace)
         if circuit.in_reservoir is not None:
-            more = [f"own.{way}_{n}" for way in ("to", "from") for n in circuit.given]
+            more = [f"own.{way}_{n}" for way in ("to", "from") for n in circuit.exchanged]
             trace.variables += more
             trace.kinds |= {n: (dtype, 1) for n in more}
     return trace.equations(final)

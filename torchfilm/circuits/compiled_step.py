@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits.compiled import packed
-from torchfilm.circuits.compiled_stiff import CompiledCircuit, limits
+from torchfilm.circuits.compiled_stiff import CompiledStiff, limits
 from torchfilm.circuits.dilution import Start
 from torchfilm.tools import checks
 from torchfilm.tools.tangents import tracked
@@ -56,15 +56,15 @@ class Surroundings:
 class KernelStep:
     """A stiff circuit in the cells of one type, stepped by kernels.
 
-    given: the signals that it exchanges. constants: what its names have in every state, one number,
-    (), or one for each colony by its id, (B,). Their places are found once, and those of all else
-    in every step.
+    exchanged: the signals that it gives and takes. constants: what its names have in every state,
+    one number, (), or one for each colony by its id, (B,). Their places are found once, and those
+    of all else in every step.
     """
 
     def __init__(
-        self, compiled: CompiledCircuit, given: Sequence[str], constants: Mapping[str, Tensor]
+        self, compiled: CompiledStiff, exchanged: Sequence[str], constants: Mapping[str, Tensor]
     ):
-        self.compiled, self.given = compiled, tuple(given)
+        self.compiled, self.exchanged = compiled, tuple(exchanged)
         known = dict(constants) | {f"own.{n}": x for n, x in compiled.constants.items()}
         read = [*compiled.columns, *compiled.numbers]
         self.constants = {n: known[n] for n in read if n in known}
@@ -90,7 +90,7 @@ class KernelStep:
 
         compiled, half, count = self.compiled, start.half, len(rows)
         size = len(compiled.equations.variables)
-        signals = {f"s.{n}": around.signals[n] for n in self.given}
+        signals = {f"s.{n}": around.signals[n] for n in self.exchanged}
         places, rest = self._places(start, found, around.colony_id, signals, count)
         numbers = self._numbers
         if numbers is None:
@@ -103,7 +103,7 @@ class KernelStep:
         pool = half.volume if around.pool is None else around.pool
         ends = (
             at, each[len(compiled.columns) :], pool.numpy(), half.after.numpy(), start.diluted_mask,
-            np.array([into.signals.index(n) for n in self.given], np.int64), report,
+            np.array([into.signals.index(n) for n in self.exchanged], np.int64), report,
             into.species, into.given, into.back, into.steps,
         )  # fmt: skip
         of_cells, run = rows.numpy(), compiled.module.run

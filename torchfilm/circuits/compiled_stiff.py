@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class CompiledCircuit(Compiled):
+class CompiledStiff(Compiled):
     """The stiff method."""
 
     slopes: Mapping[tuple[int, int], Expression]
@@ -138,8 +138,8 @@ def limits(dt: float, rtol: float, atol: float, dtype: torch.dtype) -> tuple[flo
     return dt, max(rtol, 4 * limits.eps), atol, limits.eps, limits.max, MAX_STEPS
 
 
-def compiled_circuit(circuit: CircuitCells) -> CompiledCircuit:
+def compiled_stiff(circuit: CircuitCells) -> CompiledStiff:
     """The circuit in these cells, of which one is enough. Raises Untraceable."""
     found = rates_of(circuit, torch.float64)
     functions(found[0])  # raises where a derivative has no compiled form
-    return CompiledCircuit(*found, slopes=found[0].slopes(), label=circuit.label)
+    return CompiledStiff(*found, slopes=found[0].slopes(), label=circuit.label)

@@ -66,5 +66,4 @@ def lengths(dt: float, steps: int, method: str) -> Tensor:
 
 
 def _check_steps(steps: int) -> None:
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise checks.input_error("steps", steps, "a whole number from 1")
+    checks.integer("steps", steps, least=1)

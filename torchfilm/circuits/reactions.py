@@ -50,8 +50,7 @@ class Reaction(metaclass=checks.KnownKeywords):
             )
         if not callable(self.rate):
             object.__setattr__(self, "rate", constant(f"{label}.rate", self.rate))
-        if isinstance(self.order, bool) or not isinstance(self.order, int) or self.order < 1:
-            raise checks.input_error(f"{label}.order", self.order, "a whole number from 1")
+        checks.integer(f"{label}.order", self.order, least=1)
         if not self.change():
             raise checks.input_error(
                 label, str(self), "a reaction that changes something", "Both sides are equal."
@@ -129,8 +128,7 @@ def _side(name: str, given: object) -> dict[str, int]:
             raise checks.input_error(
                 name, key, 'the name of a species, or "out." and that of a signal'
             )
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise checks.input_error(f"{name}[{key!r}]", count, "a whole number from 1")
+        checks.integer(f"{name}[{key!r}]", count, least=1)
     return dict(given)
 
 

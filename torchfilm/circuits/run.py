@@ -21,7 +21,7 @@ from torchfilm.circuits.columns import Columns, NoSignals, column
 from torchfilm.circuits.compiled import Compiled
 from torchfilm.circuits.compiled_explicit import CompiledExplicit
 from torchfilm.circuits.compiled_molecules import CompiledMolecules
-from torchfilm.circuits.compiled_stiff import CompiledCircuit
+from torchfilm.circuits.compiled_stiff import CompiledStiff
 from torchfilm.circuits.draws import Draw, KeyedDraws
 from torchfilm.circuits.graph import both_of, check_returned
 from torchfilm.circuits.names import Names, unknown, without_medium
@@ -51,17 +51,17 @@ class IntegrationSettings:
 class CircuitCells:
     """A circuit in M of N cells.
 
-    part: a rate function, or a network of reactions. species: its variables. given: the signals
-    that it exchanges. rows: the M cells, (M,) int64. cell, p: columns over the N cells by name.
-    compiled: the same as equations, where it could be traced; by_torch: whether torch evaluates
-    them. signals: the concentration outside each cell, (N,) by name. pool: (N,) µm³, each cell's
-    part of the medium, if the circuit exchanges a signal. in_reservoir: (N,) bool, cells whose pool
-    is a reservoir of constant concentration, or None.
+    part: a rate function, or a network of reactions. species: its variables. exchanged: the
+    signals that it gives and takes. rows: the M cells, (M,) int64. cell, p: columns over the N
+    cells by name. compiled: the same as equations, where it could be traced; by_torch: whether
+    torch evaluates them. signals: the concentration outside each cell, (N,) by name. pool: (N,)
+    µm³, each cell's part of the medium, if the circuit exchanges a signal. in_reservoir: (N,) bool,
+    cells whose pool is a reservoir of constant concentration, or None.
     """
 
     part: RateFunction | Network
     species: tuple[str, ...]
-    given: tuple[str, ...]
+    exchanged: tuple[str, ...]
     rows: Tensor
     cell: Mapping[str, Any]
     p: Mapping[str, Any]
@@ -80,7 +80,7 @@ class CircuitCells:
         columns = u.unbind(1)
         signals: dict[str, Any] = dict(self.signals)
         s = Columns(signals, rows, "s", self.seen.get("s")) if signals else NoSignals()
-        for name, value in zip(self.given, columns[size:], strict=False):
+        for name, value in zip(self.exchanged, columns[size:], strict=False):
             s.__dict__[name] = value
         return (
             Names(self.species, columns[:size], "u"),
@@ -135,16 +135,16 @@ class CircuitCells:
         inside, outside = self.changes(u, rows)
         none = torch.zeros_like(u[:, 0])
         columns = [inside.get(n, none) for n in self.species]
-        if self.given:
+        if self.exchanged:
             assert self.pool is not None
             pool = self.pool.index_select(0, rows)
-            new = [n for n in outside if n not in self.given]
+            new = [n for n in outside if n not in self.exchanged]
             if new:
                 raise InputError(
                     f"{self.label} gave {new[0]!r} to the medium, and had not in its trial: always"
                     " return it, 0 where nothing passes."
                 )
-            flux = [outside.get(n, none) for n in self.given]
+            flux = [outside.get(n, none) for n in self.exchanged]
             if self.in_reservoir is None:
                 columns += [x / pool for x in flux]
             else:
@@ -164,13 +164,13 @@ class CircuitCells:
 
     def slopes(self, u: Tensor, rows: Tensor) -> Tensor:
         """∂ rates/∂u, (V, V, m), at u (V, m) of the cells `rows` (m,) among the M."""
-        assert isinstance(self.compiled, CompiledCircuit)
+        assert isinstance(self.compiled, CompiledStiff)
         return self.compiled.slopes_by_torch(self, u, self.rows.index_select(0, rows))
 
     def start(self, concentrations: Tensor) -> Tensor:
         """The variables at the start: concentrations (M, S), then pools, then the amounts given to
         a reservoir and the amounts taken from it."""
-        columns = [self.signals[n].index_select(0, self.rows) for n in self.given]
+        columns = [self.signals[n].index_select(0, self.rows) for n in self.exchanged]
         if self.in_reservoir is not None:
             columns += [torch.zeros_like(c) for c in columns] * 2
         return (
@@ -212,7 +212,7 @@ def step(
     steps = torch.full((count,), settings.steps, dtype=torch.int64, device=start.device)
     if settings.method == "rosenbrock":
         compiled, rtol, atol = circuit.compiled, settings.rtol, settings.atol
-        assert compiled is None or isinstance(compiled, CompiledCircuit)
+        assert compiled is None or isinstance(compiled, CompiledStiff)
         found = None
         if compiled is not None and not circuit.by_torch:
             found = compiled.integrate(circuit, start, dt, rtol, atol)
@@ -230,9 +230,9 @@ def step(
         code = torch.where(torch.isfinite(end).all(1), code, rosenbrock.NOT_FINITE)
         # values below zero by less than the tolerance become 0; in other cells the step failed
         end = torch.where((end < 0) & (start >= 0), 0.0, end)
-    size, more = len(circuit.species), len(circuit.given)
+    size, more = len(circuit.species), len(circuit.exchanged)
     pools, reservoir = {}, {}
-    for k, name in enumerate(circuit.given):
+    for k, name in enumerate(circuit.exchanged):
         assert circuit.pool is not None
         pool = circuit.pool.index_select(0, circuit.rows)
         pools[name] = scaled(end[:, size + k] - start[:, size + k], pool)
@@ -366,7 +366,7 @@ def words(
     if code == rosenbrock.BELOW_ZERO:
         start, one = circuit.start(concentrations), torch.tensor([k], device=concentrations.device)
         slope = circuit.rates(start.index_select(0, one), one)[0]
-        names = (*circuit.species, *(f"out.{n}" for n in circuit.given))
+        names = (*circuit.species, *(f"out.{n}" for n in circuit.exchanged))
         first = int(torch.where(slope < 0, start[k] / -slope, torch.inf)[: len(names)].argmin())
         hint = ". Take more steps, or method='rosenbrock'" if method != "rosenbrock" else ""
         return (

@@ -13,8 +13,8 @@ def use_threads(given: int | None, colonies: int | None = None) -> None:
     """Set torch's number of threads: the given one, or one for each core that this process may use,
     but no more than the batch has colonies, if that is known. OMP_NUM_THREADS, if set, takes the
     place of the cores."""
-    if given is not None and given < 1:
-        raise checks.input_error("--threads", given, "an integer from 1")
+    if given is not None:
+        checks.integer("--threads", given, least=1)
     if given is None:
         cores = torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else available_cores()
         given = cores if colonies is None else min(cores, max(1, colonies))

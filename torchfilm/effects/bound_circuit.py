@@ -16,21 +16,23 @@ from torchfilm.circuits.columns import Lookup
 from torchfilm.circuits.compiled import Compiled
 from torchfilm.circuits.compiled_explicit import compiled_explicit
 from torchfilm.circuits.compiled_molecules import compiled_molecules
-from torchfilm.circuits.compiled_stiff import compiled_circuit
+from torchfilm.circuits.compiled_stiff import compiled_stiff
 from torchfilm.circuits.dilution import Start, half_way
 from torchfilm.circuits.draws import KeyedDraws
 from torchfilm.circuits.names import label_of, unknown
 from torchfilm.circuits.network import build_network
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.circuits.trial import try_circuit
-from torchfilm.effect import Binding, BoundEffect, number_range
+from torchfilm.effect import Binding, BoundEffect
 from torchfilm.effects.circuit_cells import Kind, cell_column, cell_names, cells_of_type
 from torchfilm.effects.circuit_kernels import CircuitKernels
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.medium_exchange import MediumExchange
+from torchfilm.parameters import number_range
 from torchfilm.resolver import Values, snapshot
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
+from torchfilm.tools.backends import why_torch
 from torchfilm.tools.tangents import scaled
 from torchfilm.tools.warn_once import warn
 from torchfilm.values import numbers
@@ -46,10 +48,6 @@ GEOMETRY = {
     "y": ("position",),
     "z": ("position",),
 }
-OPTIONS = (
-    "initial", "daughters", "method", "steps", "rtol", "atol", "molecules_per_unit", "name",
-    "shared", "backend", "dilution",
-)  # fmt: skip
 
 
 class BoundCircuit(BoundEffect):
@@ -70,7 +68,7 @@ class BoundCircuit(BoundEffect):
         # by cell type and whether there is a reservoir: the compiled circuit, or why there is none
         self.compiled: dict[tuple[Kind, bool], Compiled | str] = {}
         self.kernels = CircuitKernels(self)
-        self.by_torch = effect.why_torch(binding.batch.device)
+        self.by_torch = why_torch("Circuit", effect.backend, binding.batch.device)
         self.traced_reads: tuple[str, ...] = ()
         self.signals: tuple[str, ...] = ()  # that rates read or change
         self.fields = tuple(effect.variables.values())
@@ -165,7 +163,7 @@ class BoundCircuit(BoundEffect):
             except Untraceable as why:
                 self.compiled[key] = said = f"{cells.label}: {why}"
                 if self.effect.backend == "compiled":
-                    wanted = f"Circuit.backend = 'compiled', but {said}: leave backend out."
+                    wanted = f"Circuit.backend = 'compiled', but {said}. Leave backend out."
                     raise checks.InputError(wanted) from why
         found = self.compiled[key]
         if isinstance(found, str):
@@ -178,17 +176,19 @@ class BoundCircuit(BoundEffect):
             per_unit = cells.per_unit(self.values.molecules_per_unit.of_cells(state))
             return compiled_molecules(cells, per_unit)
         if self.effect.method == "rosenbrock":
-            return compiled_circuit(cells)
+            return compiled_stiff(cells)
         return compiled_explicit(cells, self.effect.method, state.dtype)
 
     def _check_constants(self, read: set[str]) -> None:
         """Raise InputError for a constant that looks like another name, and warn of one that no
         rate reads."""
         given = self.effect.parameters
+        own = {f.name for f in dataclasses.fields(self.effect)}
+        options = sorted(own - {"rates", "species", "parameters"})
         for name in given:
             if name in read:
                 continue
-            near = difflib.get_close_matches(name, OPTIONS, 1, 0.75)
+            near = difflib.get_close_matches(name, options, 1, 0.75)
             if near:
                 raise checks.InputError(
                     f"Circuit.{name} is a constant that no rate reads. Did you mean the option"
@@ -318,7 +318,7 @@ class BoundCircuit(BoundEffect):
             for name, value in zip(self.fields, made.concentrations.unbind(1), strict=True):
                 value = scaled(value, after) if name in start.diluted else value
                 changed[name] = value if whole else changed[name].index_copy(0, rows, value)
-            for name in c.given:
+            for name in c.exchanged:
                 assert medium is not None
                 medium.give(name, made.pools[name], made.reservoir.get(name), rows)
         return changed

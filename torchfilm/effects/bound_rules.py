@@ -285,7 +285,7 @@ class DivisionRule(_BoundRule):
         births = Births(one, one + 1, torch.cat([one, one]), state, one)
         views = _after_divide(divide, twice, births)
         self.traced_reads = tuple(sorted(_read(views)))
-        self.traced_writes = tuple(sorted(views[1]._set | views[2]._set))
+        self.traced_writes = tuple(sorted(_written_in_daughters(views, in_place=True)))
         return state
 
     def step(self, state: State, dt: float) -> State:
@@ -297,7 +297,9 @@ class DivisionRule(_BoundRule):
     def _divide(self, act: Callable[..., None], state: State, births: Births) -> State:
         views = _after_divide(act, state, births)
         daughters = views[1:]
-        self._check_written(_read(views), daughters[0]._set | daughters[1]._set)
+        # as in `_apply`, what is changed in place is compared only after an edit
+        written = _written_in_daughters(views, in_place=not self.source.proven)
+        self._check_written(_read(views), written)
         old, seen = state.fields, state
         changed: dict[str, Tensor] = {}
         for daughter, rows in zip(daughters, (births.first, births.second), strict=True):
@@ -312,6 +314,14 @@ class DivisionRule(_BoundRule):
 
     def numerics(self, dt: float, state: State) -> list[str]:
         return ["your own Python, once for all divisions of a step"]
+
+
+def _written_in_daughters(views: Sequence[DivisionView], in_place: bool) -> set[str]:
+    """What a rule wrote in the daughters, by setting it or, if asked, in place."""
+    written: set[str] = set()
+    for daughter in views[1:]:
+        written |= daughter._set | (daughter.changed_in_place() if in_place else set())
+    return written
 
 
 def _label(rule: Callable[..., None]) -> str:

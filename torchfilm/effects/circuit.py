@@ -21,7 +21,7 @@ from torchfilm.circuits.names import label_of
 from torchfilm.circuits.partition import binomial
 from torchfilm.circuits.reactions import Reaction
 from torchfilm.circuits.tracing import Untraceable
-from torchfilm.effect import CIRCUIT, Binding, BoundEffect, Effect, shorten
+from torchfilm.effect import CIRCUIT, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_circuit import BoundCircuit
 from torchfilm.effects.circuit_checks import (
     DIRECT,
@@ -38,15 +38,15 @@ from torchfilm.effects.circuit_checks import (
     no_cells_of,
     shared_fields,
 )
+from torchfilm.parameters import shorten
 from torchfilm.resolver import Values
 from torchfilm.state import CELL_TYPE, Field, State
 from torchfilm.tools import checks, displays
-from torchfilm.tools.numba_calls import unavailable
+from torchfilm.tools.backends import check_backend
 from torchfilm.values import COLONY, Rule, Value, checked
 
 Part = run.RateFunction | Sequence[Reaction | Sequence[Reaction]]
 
-BACKENDS = ("compiled", "torch")
 EVERY = "every cell"  # where a circuit runs that is not given by type
 EACH_CELL = "initial[{!r}]"  # by which name the first value of a species is resolved
 
@@ -124,8 +124,7 @@ class Circuit(Effect):
         check_initial(initial, names)
         check_constants(parameters, [f.name for f in dataclasses.fields(self)])
         check_method(method, steps, by_type)
-        if backend is not None:
-            checks.choice("Circuit.backend", backend, BACKENDS)
+        check_backend("Circuit", backend)
         checks.choice("Circuit.daughters", daughters, ("concentration", "amount"))
         if name and not (isinstance(name, str) and name.isidentifier()):
             raise checks.input_error("Circuit.name", name, 'an identifier, such as "toggle"')
@@ -310,17 +309,6 @@ class Circuit(Effect):
     def equations(self) -> dict[str, str]:
         """Those of `graphs`, by title."""
         return equations_of(self)
-
-    def why_torch(self, device: torch.device) -> str:
-        """Why torch computes the circuit on a device, or "" where compiled functions may."""
-        why = (
-            "backend='torch'" if self.backend == "torch"
-            else f"the device is {device.type}" if device.type != "cpu"
-            else unavailable()
-        )  # fmt: skip
-        if self.backend == "compiled" and why:
-            raise checks.InputError(f"Circuit.backend = 'compiled', but {why}: leave backend out.")
-        return why
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         first = Rule(least=0.0, drawn_by_effect=True)

@@ -121,8 +121,7 @@ def check_constants(given: Mapping[str, Any], options: Sequence[str]) -> None:
 
 def check_method(method: str, steps: int, by_type: Mapping[int | str, Any]) -> None:
     checks.choice("Circuit.method", method, METHODS)
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise checks.input_error("Circuit.steps", steps, "an integer from 1")
+    checks.integer("Circuit.steps", steps, least=1)
     functions = [part for part in by_type.values() if callable(part)]
     if method in (LEAP, DIRECT) and functions:
         raise checks.input_error(

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits.compiled_step import Changes, KernelStep, Surroundings, known
-from torchfilm.circuits.compiled_stiff import CompiledCircuit
+from torchfilm.circuits.compiled_stiff import CompiledStiff
 from torchfilm.circuits.dilution import Start
 from torchfilm.effects.circuit_cells import Kind, cell_column
 from torchfilm.effects.circuit_report import Failures
@@ -51,7 +51,7 @@ class CircuitKernels:
                     f"{self.circuit.effect.value_owner()} has values for so many colonies.",
                 )
             read = {n: known(self._read(n, kind, middle, medium)) for n in step.changing}
-            signals = () if medium is None else (medium.found[n] for n in step.given)
+            signals = () if medium is None else (medium.found[n] for n in step.exchanged)
             if step.may_run(start, *read.values(), *signals):
                 found[kind] = step, read
         return found
@@ -64,7 +64,7 @@ class CircuitKernels:
         The medium is told what they give to it, and the report of failures."""
         effect = self.circuit.effect
         whole = sum(rows[k].numel() for k in taken) == middle.cells
-        names = tuple(dict.fromkeys(n for step, _ in taken.values() for n in step.given))
+        names = tuple(dict.fromkeys(n for step, _ in taken.values() for n in step.exchanged))
         pool, found = (None, {}) if medium is None else (medium.pool, medium.found)
         around = Surroundings(found, pool, middle.own_colony_id)
         into = Changes.of(start, names, _has_reservoir(medium), whole)
@@ -88,11 +88,11 @@ class CircuitKernels:
         if key not in self._steps:
             circuit, step = self.circuit, None
             cells = circuit.cells(middle, rows, kind, medium=medium)
-            if isinstance(cells.compiled, CompiledCircuit) and not cells.by_torch:
+            if isinstance(cells.compiled, CompiledStiff) and not cells.by_torch:
                 values, own = circuit.values, None if isinstance(kind, str) else kind
                 found = {f"p.{n}": values[n].constant(own) for n in circuit.effect.parameters}
                 constants = {n: x for n, x in found.items() if x is not None}
-                step = KernelStep(cells.compiled, cells.given, constants)
+                step = KernelStep(cells.compiled, cells.exchanged, constants)
             self._steps[key] = step
         return self._steps[key]
 

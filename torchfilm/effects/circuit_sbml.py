@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchfilm.circuits import sbml
 from torchfilm.circuits.names import label_of, unknown
-from torchfilm.effect import shorten
 from torchfilm.effects.circuit_checks import GEOMETRY
+from torchfilm.parameters import shorten
 from torchfilm.state import RESERVED
 from torchfilm.tools import checks
 from torchfilm.values import ByType

@@ -86,7 +86,6 @@ class Division(Effect):
                 f"Division got {' and '.join(given)}: give one criterion (length, volume or added),"
                 " or none and a rule."
             )
-        super().__post_init__()
         if largest(self.fraction) >= 1.0:
             raise checks.input_error(
                 "Division.fraction", self.fraction, "between 0 and 1, both excluded"
@@ -95,6 +94,10 @@ class Division(Effect):
     @property
     def criterion(self) -> str | None:
         return next((name for name in CRITERIA if getattr(self, name) is not None), None)
+
+    @property
+    def divides_at_threshold(self) -> bool:
+        return self.criterion is not None
 
     def declares(self, dim: int) -> tuple[Field, ...]:
         fields = [

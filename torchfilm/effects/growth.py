@@ -64,7 +64,6 @@ class Growth(Effect):
 
     def __post_init__(self) -> None:
         checks.choice("Growth.law", self.law, LAWS)
-        super().__post_init__()
 
     @property
     def by_type(self) -> bool:

@@ -9,11 +9,12 @@ from typing import Any, ClassVar
 
 import torch
 
-from torchfilm.effect import MECHANICS, Binding, BoundEffect, Effect, number_range
+from torchfilm.effect import MECHANICS, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_mechanics import BoundMechanics
 from torchfilm.kernels.bilateral_scheme import CLOSE, PENALTY, TOLERANCE
 from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
+from torchfilm.parameters import number_range
 from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.initial_overlaps import check_apart
 from torchfilm.physics.one_sided_records import OneSidedSettings
@@ -22,12 +23,12 @@ from torchfilm.physics.walls import Wall
 from torchfilm.resolver import Values
 from torchfilm.state import Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.numba_calls import unavailable
+from torchfilm.tools.backends import check_backend, why_torch
 from torchfilm.values import Rule, Value, checked, numbers, physical, quotient, smallest
 
 # The default length drag: free growth, but for bilateral contacts, which do not hold in it.
 LENGTH_DRAG = {"one-sided": 1e5, "bilateral": 10.0}
-CONTACTS, BACKENDS = ("one-sided", "bilateral"), ("compiled", "torch")
+CONTACTS = ("one-sided", "bilateral")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +91,9 @@ class Mechanics(Effect):
     def __post_init__(self) -> None:
         checks.choice("Mechanics.dim", self.dim, (2, 3))
         checks.choice("Mechanics.contacts", self.contacts, CONTACTS)
-        if self.backend is not None:
-            checks.choice("Mechanics.backend", self.backend, BACKENDS)
+        check_backend("Mechanics", self.backend)
         if self.length_drag is None:
             object.__setattr__(self, "length_drag", LENGTH_DRAG[self.contacts])
-        super().__post_init__()
         if self.alpha is not None and self.stiffness is not None:
             raise checks.InputError(
                 "Mechanics got alpha and stiffness: α = 1/(stiffness·Δt), so give one of the two."
@@ -111,8 +110,7 @@ class Mechanics(Effect):
             given = getattr(self, name)
             if (name, given) == ("passes", None):
                 continue
-            if not isinstance(given, int) or given < 1:
-                raise checks.input_error(f"Mechanics.{name}", given, "an integer from 1")
+            checks.integer(f"Mechanics.{name}", given, least=1)
         if self.tolerance is not None:
             checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
         checks.number("Mechanics.max_elongation", self.max_elongation, above=0.0)
@@ -169,18 +167,7 @@ class Mechanics(Effect):
 
     def backend_on(self, device: torch.device) -> str:
         """Who computes the contacts on a device: "compiled" or "torch"."""
-        if self.backend == "torch":
-            return "torch"
-        reason = (
-            f"the device is {device.type}, and kernels are for the CPU"
-            if device.type != "cpu"
-            else unavailable()
-        )
-        if self.backend == "compiled" and reason:
-            raise checks.InputError(
-                f"Mechanics.backend = 'compiled', but {reason}. Leave backend out."
-            )
-        return "torch" if reason else "compiled"
+        return "torch" if why_torch("Mechanics", self.backend, device) else "compiled"
 
     def physical_values(self) -> dict[str, tuple[Any, Rule]]:
         found = self.physical_fields()

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchfilm.effect import DIVISION, TRANSPORT, Binding, BoundEffect, Effect, number_range
+from torchfilm.effect import DIVISION, TRANSPORT, Binding, BoundEffect, Effect
 from torchfilm.effects.bound_medium import (
     BLOCK,
     BoundMedium,
@@ -19,13 +19,14 @@ from torchfilm.effects.bound_medium import (
     GridCoverage,
     Transport,
 )
+from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
 from torchfilm.signals.space import checked_box, checked_flow
 from torchfilm.signals.transport import COMPILED, METHODS
 from torchfilm.signals.transport_series import MOST
 from torchfilm.state import COLONY, GRID, OUTSIDE, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.numba_calls import unavailable
+from torchfilm.tools.backends import check_backend, why_torch
 from torchfilm.values import PerColony, Rule, checked
 
 # A value on the grid: a number, one per colony, or a function from places (M, 3) µm to (M,).
@@ -35,7 +36,6 @@ OnGrid = float | Tensor | Callable[[Tensor], Tensor]
 Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
 SPLITTINGS = ("lie", "strang")
-BACKENDS = ("compiled", "torch")
 EXACT = ("exponential", "series")
 
 
@@ -146,8 +146,7 @@ class Medium(Effect):
         _check_signals(signals)
         low, high, voxel = checked_box(box, spacing, depth, height)
         _check_medium(boundary, outside, grows, method, steps, splitting, obstacles)
-        if backend is not None:
-            checks.choice("Medium.backend", backend, BACKENDS)
+        check_backend("Medium", backend)
         given = {
             "signals": dict(signals),
             "box": (low, high),
@@ -256,20 +255,7 @@ class Medium(Effect):
 
     def backend_on(self, device: torch.device) -> str:
         """Who computes transport on a device: "compiled" or "torch"."""
-        why = self._why_torch(device)
-        if self.backend == "compiled" and why:
-            raise checks.InputError(f"Medium.backend = 'compiled', but {why}: leave backend out.")
-        return "torch" if why else "compiled"
-
-    def _why_torch(self, device: torch.device) -> str:
-        """Why torch computes transport on a device, or "" where kernels may."""
-        if self.backend == "torch":
-            return "backend='torch'"
-        return (
-            f"the device is {device.type}, and kernels are for the CPU"
-            if device.type != "cpu"
-            else unavailable()
-        )
+        return "torch" if why_torch("Medium", self.backend, device) else "compiled"
 
     def numerics(self, dt: float, state: State) -> list[str]:
         assert state.layout is not None
@@ -375,8 +361,7 @@ def _check_medium(
         )
     if method is not None:
         checks.choice("Medium.method", method, tuple(METHODS))
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise checks.input_error("Medium.steps", steps, "a whole number from 1")
+    checks.integer("Medium.steps", steps, least=1)
     checks.choice("Medium.splitting", splitting, SPLITTINGS)
     if obstacles is not None and not callable(obstacles):
         raise checks.input_error("Medium.obstacles", obstacles, "a function of places")

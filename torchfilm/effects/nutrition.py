@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.circuits import run
-from torchfilm.circuits.compiled_stiff import CompiledCircuit, compiled_circuit
+from torchfilm.circuits.compiled_stiff import CompiledStiff, compiled_stiff
 from torchfilm.circuits.names import Names
 from torchfilm.circuits.tracing import Untraceable
 from torchfilm.effect import NUTRITION, Binding, BoundEffect, Effect
@@ -22,8 +22,8 @@ from torchfilm.medium_exchange import MediumExchange
 from torchfilm.resolver import Values
 from torchfilm.state import OUTSIDE, Field, State
 from torchfilm.tools import checks
+from torchfilm.tools.backends import why_torch
 from torchfilm.tools.doubling import check_doubling
-from torchfilm.tools.numba_calls import unavailable
 from torchfilm.values import Value, is_drawn, numbers, physical
 
 CONSTANTS = ("rate", "half", "growth_yield")
@@ -117,9 +117,8 @@ class _BoundMonod(BoundEffect):
 
     def __init__(self, effect: Monod, binding: Binding):
         super().__init__(effect, binding)
-        device = binding.batch.device
-        self.by_torch = f"the device is {device.type}" if device.type != "cpu" else unavailable()
-        self.compiled: CompiledCircuit | None = None
+        self.by_torch = why_torch("Monod", None, binding.batch.device)
+        self.compiled: CompiledStiff | None = None
 
     @property
     def by_kernels(self) -> bool:
@@ -183,7 +182,7 @@ class _BoundMonod(BoundEffect):
         )  # fmt: skip
         if self.compiled is None:
             with suppress(Untraceable):  # a gradient is wanted: torch finds the slopes, too
-                self.compiled = compiled_circuit(cells)
+                self.compiled = compiled_stiff(cells)
         cells = dataclasses.replace(cells, compiled=self.compiled, by_torch=bool(self.by_torch))
         found = run.step(cells, torch.zeros_like(state.volume).unsqueeze(1), dt, STIFF)
         return found.concentrations[:, 0], found.failed

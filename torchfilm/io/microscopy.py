@@ -170,8 +170,7 @@ class Camera:
             checks.number(name, getattr(self, name), least=0.0)
         if self.noise is not None:
             checks.number("noise", self.noise, least=0.0)
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
-            raise checks.input_error("seed", self.seed, "an integer from 0")
+        checks.integer("seed", self.seed, least=0)
 
     @property
     def dtype(self) -> np.dtype:

@@ -71,9 +71,8 @@ class Recorder(metaclass=checks.KnownKeywords):
         append: bool = False,
         changed: bool = False,
     ):
-        if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-            raise checks.input_error("every", every, "a whole number of steps from 1")
-        self.path, self.scene, self.every = Path(path), scene, every
+        self.path, self.scene = Path(path), scene
+        self.every = checks.integer("every", every, least=1)
         self.overwrite, self.append, self.changed = overwrite, append, changed
         self._check_path()
         # where a link leads; the path itself may be relative to a folder that the process leaves

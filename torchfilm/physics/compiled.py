@@ -39,36 +39,45 @@ def step(given: MechanicsInput) -> MechanicsResult:
     step_colonies, numbers = _kernel_of(settings)
     counts = given.groups.counts.numpy()
     begin = np.concatenate(([0], np.cumsum(counts)))
-    cells = (
-        as_array(given.position, torch.float64),
-        *(as_array(x, dtype) for x in (given.axis, given.length, given.elongation, given.radius,
-        given.move)), as_array(given.collapsed, torch.int64),
-        *(_array_or_none(x, dtype) for x in (given.contact_alpha, given.compression)),
-    )  # fmt: skip
-    changed = (cells[k] for k in (0, 1, 2, 5, 3, 6, 7, 8))  # in the order of `out`
+    position = as_array(given.position, torch.float64)
+    collapsed = as_array(given.collapsed, torch.int64)
+    axis, length, elongation, radius, move = (
+        as_array(x, dtype)
+        for x in (given.axis, given.length, given.elongation, given.radius, given.move)
+    )
+    alpha, compression = (
+        _array_or_none(x, dtype) for x in (given.contact_alpha, given.compression)
+    )
+    cells = position, axis, length, elongation, radius, move, collapsed, alpha, compression
+    changed = position, axis, length, move, elongation, collapsed, alpha, compression
     out = tuple(np.empty_like(a) for a in changed)
     drags = tuple(
         _array_or_none(v, dtype) for v in (given.viscosity, given.length_drag, given.drag)
     )
     reports = np.zeros((counts.size, kernels.REPORT))
     reports[:, kernels.SUBSTEPS] = 1
+    degrees = (0,) * (4 if settings.dim == 2 else 8)  # seven in space; the last column stays 0
     arguments = (
         begin, float(given.dt), float(given.longest), cells, drags, _alphas(given, dtype),
-        _walls(given), numbers, out, reports, (0,) * (4 if settings.dim == 2 else 8),
+        _walls(given), numbers, out, reports, degrees,
     )  # fmt: skip
     new = name not in _called
     with first_call(name, f"contacts ({name}), 20 s to a minute") if new else nullcontext():
-        by_team = isinstance(settings, OneSidedSettings)
-        call = _call_by_teams if by_team else _call  # shares of work do not change the result
-        call(step_colonies, np.arange(counts.size), counts, arguments)
+        every = np.arange(counts.size)  # how work is shared does not change the result
+        if isinstance(settings, OneSidedSettings):
+            kind = in_numpy(dtype), len(degrees)
+            _call_by_teams(step_colonies, kind, every, counts, arguments)
+        else:
+            _call(step_colonies, every, counts, arguments)
     _called.add(name)
     residual = torch.from_numpy(reports[:, kernels.ERROR].copy())
     reports[:, kernels.ERROR] = 0  # may be no number; the others are integers
     whole = torch.from_numpy(reports.T.astype(np.int64)).unbind()
-    x, axis, length, move, elongation, collapsed, *of_one_sided = map(torch.from_numpy, out)
-    alpha, compression = of_one_sided if given.compression is not None else (None, None)
+    # in the order of `changed`
+    x, axes, lengths, moves, growths, fallen, *of_contacts = map(torch.from_numpy, out)
+    alphas, compressions = of_contacts if given.compression is not None else (None, None)
     return MechanicsResult(
-        x, axis, length, move, elongation, collapsed, alpha, compression,
+        x, axes, lengths, moves, growths, fallen, alphas, compressions,
         ContactReport(
             whole[kernels.STATUS], whole[kernels.ITERATIONS], residual, whole[kernels.PASSES],
             whole[kernels.CLIPPED], whole[kernels.DEEPLY],
@@ -131,9 +140,11 @@ def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> No
         call.result()
 
 
-def _call_by_teams(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> None:
+def _call_by_teams(
+    kernel, kind: tuple[type, int], which: np.ndarray, counts: np.ndarray, arguments: tuple
+) -> None:
     """As `_call`, for a kernel that a team can run. A colony so large that as many others would
-    leave threads of its team idle comes first, by a team."""
+    leave threads of its team idle comes first, by a team. kind: type of numbers, columns."""
     from torchfilm.kernels.team import AVAILABLE
 
     by_one_thread = partial(kernel, np.zeros(0, np.int64))
@@ -143,18 +154,20 @@ def _call_by_teams(kernel, which: np.ndarray, counts: np.ndarray, arguments: tup
     teams = np.minimum(counts // CELLS_A_THREAD, available())
     large = (teams > 1) & (counts * teams > counts.sum())
     for colony in which[large]:
-        _call_by_team(kernel, int(teams[colony]), colony, arguments)
+        _call_by_team(kernel, int(teams[colony]), colony, kind, arguments)
     if not large.all():
         _call(by_one_thread, which[~large], counts, arguments)
 
 
-def _call_by_team(kernel, threads: int, colony: int, arguments: tuple) -> None:
+def _call_by_team(
+    kernel, threads: int, colony: int, kind: tuple[type, int], arguments: tuple
+) -> None:
     """Call the kernel for one colony, by a team of threads that this one leads. It waits for no
     thread to begin: one that comes late finds nothing to do."""
     from torchfilm.kernels.pieces import taker
     from torchfilm.kernels.team import OFFER, OVER, new_board
 
-    take = taker(arguments[3][1].dtype.type, len(arguments[-1]))
+    take = taker(*kind)
     board = new_board(threads, 2 * CELLS_A_THREAD, take.address)
 
     def assist():

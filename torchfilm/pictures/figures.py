@@ -271,9 +271,7 @@ def choose_frames(
 ) -> list[int]:
     """The indices of a strip's frames."""
     if times is None:
-        count = 4 if frames is None else frames
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise checks.input_error("frames", frames, "a whole number from 1")
+        count = checks.integer("frames", 4 if frames is None else frames, least=1)
         wanted = np.linspace(recorded[0], recorded[-1], count) if count > 1 else recorded[-1:]
         return sorted({int(np.abs(recorded - t).argmin()) for t in wanted})
     if frames is not None:

@@ -65,8 +65,7 @@ def movie(
     figure_class()
     target = Path(out)
     write = _writer(target, fps)
-    if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-        raise checks.input_error("every", every, "a whole number from 1")
+    checks.integer("every", every, least=1)
     style = PlotStyle(colour, channels, background, limits, view, section, whole)
     with opened(what) as results:
         check_not_results(results.path, out)

@@ -9,6 +9,7 @@ import inspect
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -150,6 +151,16 @@ class KnownKeywords(abc.ABCMeta):
         return own.replace(parameters=list(own.parameters.values())[1:])
 
 
+def integer(name: str, value: object, *, least: int, most: float = math.inf, hint: str = "") -> int:
+    """Returns an integer within bounds, of Python or NumPy, as one of Python, or raises
+    InputError."""
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not whole or not least <= value <= most:  # type: ignore[operator]
+        upto = "" if most == math.inf else f" to {most}"
+        raise input_error(name, value, f"a whole number from {least}{upto}", hint)
+    return int(value)  # type: ignore[call-overload]
+
+
 def number(
     name: str,
     value: object,
@@ -160,12 +171,13 @@ def number(
     hint: str = "",
 ) -> float:
     """Returns one finite number within bounds, or raises InputError."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    if isinstance(value, bool) or not isinstance(value, Real):
         raise input_error(name, value, "a number", hint)
     rule = _rule(above, least, most)
-    if not (math.isfinite(value) and value > above and least <= value <= most):
+    found = float(value)
+    if not (math.isfinite(found) and found > above and least <= found <= most):
         raise input_error(name, value, rule, hint)
-    return float(value)
+    return found
 
 
 def value(

@@ -48,10 +48,8 @@ class Settings(metaclass=checks.KnownKeywords):
         ):
             if getattr(self, name) is not None:
                 checks.number(f"Settings.{name}", getattr(self, name), above=0.0, most=most)
-        if self.passes is not None and (
-            isinstance(self.passes, bool) or not isinstance(self.passes, int) or self.passes < 1
-        ):
-            raise checks.input_error("Settings.passes", self.passes, "a whole number from 1")
+        if self.passes is not None:
+            checks.integer("Settings.passes", self.passes, least=1)
 
     @property
     def given(self) -> dict[str, float]:

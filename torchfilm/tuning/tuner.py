@@ -75,8 +75,7 @@ def tune(
             "The spread between colonies gives the standard error of each error.",
         ),
     ):
-        if isinstance(given, bool) or not isinstance(given, int) or given < least:
-            raise checks.input_error(name, given, f"a whole number from {least}", why)
+        checks.integer(name, given, least=least, hint=why)
     of = of or None
     if isinstance(of, str):
         raise checks.input_error("of", of, f"a list of names, such as {[of]}")

@@ -1,5 +1,5 @@
-"""One turn of a search method: the batch that it proposes, of which a part is left where the budget
-ends within it, and what it learns."""
+"""What a search method proposes: a batch, of which a part is left where the budget ends within it,
+and what the method learns from it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from design.task import Task
 
 
 @dataclass(eq=False)
-class Turn:
+class Proposal:
     """batch: what a method proposes; entry: the first of its designs, which have been grown. known:
     the batch is of designs that were known before, and no method's. choosing: seconds that the
     method took for it."""
@@ -29,7 +29,9 @@ class Turn:
     entry: Entry | None = None
 
     @classmethod
-    def of_number(cls, number: int, method: Method, task: Task, known: KnownDesigns | None) -> Turn:
+    def of_number(
+        cls, number: int, method: Method, task: Task, known: KnownDesigns | None
+    ) -> Proposal:
         """The batch of a number, from 0: the known designs first of all, then what a method
         proposes."""
         if known is not None and number == 0:
@@ -92,18 +94,18 @@ class Turn:
 
 def repeat_study(
     method: Method, task: Task, study: Study, known: KnownDesigns | None
-) -> Turn | None:
+) -> Proposal | None:
     """Bring a method to where the study ends: it proposes each batch again and learns its losses.
-    Returns the turn of which only a part was grown, if any. Raises InputError where the method
+    Returns the proposal of which only a part was grown, if any. Raises InputError where the method
     proposes other points."""
     recall = getattr(method, "recall", None)
     for k, entry in enumerate(study.entries):
         if recall is not None:  # of the last batch it may have grown only a part
             recall(entry.points if k < len(study.entries) - 1 else None)
-        turn = Turn.of_number(k, method, task, known)
-        turn.entry = entry
-        wanted = turn.batch.points[: turn.done]
-        whole = turn.complete or k == len(study.entries) - 1
+        proposal = Proposal.of_number(k, method, task, known)
+        proposal.entry = entry
+        wanted = proposal.batch.points[: proposal.done]
+        whole = proposal.complete or k == len(study.entries) - 1
         # another machine may round in another way
         if (
             not whole
@@ -114,7 +116,7 @@ def repeat_study(
                 f"{study.path}: the method proposes other points than its batch {k} holds; another"
                 " version of the method may have made the file. Start a new study."
             )
-        if not turn.complete:
-            return turn
-        turn.tell(method)
+        if not proposal.complete:
+            return proposal
+        proposal.tell(method)
     return None
