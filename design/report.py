@@ -154,14 +154,12 @@ def _warnings(report: SearchReport) -> list[str]:
     if answers:
         lines = ["without a pattern: " + ", ".join(f"{n} {x:.3f}" for n, x in answers.items())]
     least = min(answers, key=lambda n: answers[n], default="")
-    if least and best.loss >= answers[least]:
+    loss = best.loss if best.fresh is None else best.fresh.loss  # that of the search is luck, too
+    if least and loss >= answers[least]:
+        lines.append(f"the best design is no better than {least!r}: it has found no pattern.")
+    elif least and loss > SUCCESS * answers[least]:
         lines.append(
-            f"the best design is no better than {least!r}: it has found no pattern. Larger"
-            " colonies, or a narrower target, tell patterns apart."
-        )
-    elif least and best.loss > SUCCESS * answers[least]:
-        lines.append(
-            f"the pattern is weak: the best design has {best.loss / answers[least]:.2f} of the loss"
+            f"the pattern is weak: the best design has {loss / answers[least]:.2f} of the loss"
             f" of {least!r}, and a good one {SUCCESS:g} or less. Simulate more colonies, free more"
             " parameters, or grow larger colonies."
         )

@@ -40,7 +40,7 @@ def draw(report: SearchReport) -> Figure:
     grid = figure.add_gridspec(
         3, columns + 1, width_ratios=[1.0] * columns + [1.5], height_ratios=[1.0, 1.0, 0.05]
     )
-    limits = _limits(target, every)
+    limits = _limits(target, frames[1] or every)  # a bright first guess must not hide the winner
     scales: list[Any] = []
     for row, one in enumerate(designs):
         axes = [figure.add_subplot(grid[row, k]) for k in range(columns)]
@@ -51,7 +51,9 @@ def draw(report: SearchReport) -> Figure:
     bars = [figure.add_subplot(grid[2, k]) for k in range(columns)]
     units = {n: f.unit for d in report.best.colonies for n, f in d.state.declared.items()}
     for bar, scale in zip(bars, scales, strict=False):
-        tf.pictures.colour_bar(bar, replace(scale, unit=scale.unit or units.get(scale.name, "")))
+        over = any(float(f[scale.name].max(initial=0.0)) > scale.limits[1] for f in every)
+        unit = scale.unit or units.get(scale.name, "")
+        tf.pictures.colour_bar(bar, replace(scale, unit=unit, beyond="max" if over else "neither"))
     for bar in bars[len(scales) :]:
         bar.set_visible(False)
     _draw_convergence(figure.add_subplot(grid[0, columns]), report)
@@ -108,8 +110,8 @@ def _colour(name: str, place: int) -> str:
 
 
 def _limits(target: Target, frames: list[dict[str, np.ndarray]]) -> dict[str, tuple[float, float]]:
-    """The range of colours of each species that the target reads in cells: one for both designs, so
-    that these can be compared."""
+    """The range of colours of each species that the target reads in cells: that of these frames.
+    One for both designs, so that these can be compared."""
     names = [n for n in target.names if not n.startswith("out.")]
     return {n: (0.0, max((float(f[n].max()) for f in frames), default=1.0) or 1.0) for n in names}
 

@@ -9,8 +9,11 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
+from design.entries import Entry
 from design.growing import FinishedColonies
+from design.objective import Objective
 from design.targets.base import OUTSIDE, Target
+from torchfilm import checks
 
 BRIGHT = 1e3  # a lit cell, relative to the greatest level that was found, or to 1
 LEVELS = 25  # even levels that are tried, over six orders of magnitude
@@ -34,6 +37,27 @@ def trivial_losses(target: Target, finished: Iterable[FinishedColonies]) -> dict
     if even:
         answers["best even level"] = float(np.concatenate(even, 1).mean(1).min())
     return answers
+
+
+def check_within_reach(objective: Objective, entry: Entry) -> None:
+    """Raise InputError where no cell of the first design that grew lies in the target's pattern:
+    all designs then have the same loss. Nothing is grown where losses of the batch differ."""
+    target, losses = objective.task.target, entry.losses
+    failed = {row for row, _ in entry.reasons}
+    grew = [k for k in range(len(losses)) if k not in failed]
+    if not grew or np.ptp(losses[grew]) > 1e-9:
+        return
+    finished = objective.colonies(entry.points[grew[0]])
+    each = [part.state for part in finished]
+    inside = [target.measures(p.state, p.history).get("inside") for p in finished]
+    if not inside or any(x is None or not bool(x.isnan().all()) for x in inside):
+        return
+    cells = max(int(s.counts.max()) for s in each)
+    reach = max(float(s.position.double().norm(dim=1).max()) for s in each)
+    raise checks.InputError(
+        f"target: {target.why_undefined('inside')}. All designs have the same loss in colonies of"
+        f" up to {cells} cells, which reach {reach:.3g} µm from the origin."
+    )
 
 
 def _greatest(state: tf.State, name: str) -> float:

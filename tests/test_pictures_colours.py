@@ -9,7 +9,7 @@ from drawn import NEAR, Drawn, frame, ramp, viridis
 
 import torchfilm as tf
 from torchfilm.pictures import frame_of
-from torchfilm.pictures.colours import FLOOR, NO_VALUE, PlotStyle
+from torchfilm.pictures.colours import FLOOR, NO_VALUE, PlotStyle, ValueRange, scale_of
 from torchfilm.pictures.frames import RecordedFrames
 from torchfilm.pictures.page import plan_layout, signal_section
 from torchfilm.pictures.shapes import section
@@ -293,3 +293,20 @@ def test_a_state_is_a_frame(dtype, device):
     # centres at x = −7, −5, …, z = −1, 1, …
     assert made.signals["ahl"][2][1, 0, 1] == pytest.approx(20 - 5 + 0.1, rel=1e-6)
     assert made.units["out.ahl"] == "conc" and made.dim == 2
+
+
+@pytest.mark.parametrize(
+    "values, limits",
+    [
+        ([2.0, 2.0001], (1.99005, 2.01005)),  # differences within a solver's tolerance: no pattern
+        ([-2.0, -1.99], (-2.005, -1.985)),
+        ([2.0, 2.1], (2.0, 2.1)),
+        ([2.0, 2.0], (2.0, 4.0)),
+    ],
+)
+def test_values_that_hardly_differ_have_one_colour(values, limits):
+    seen = ValueRange()
+    seen.add(np.array(values))
+    found = scale_of("gfp", seen, PlotStyle(colour="gfp"), {})
+    assert found.limits == pytest.approx(limits, rel=1e-6)
+    assert found.beyond == "neither"

@@ -292,7 +292,7 @@ def test_a_bad_step_is_refused(dt):
 
 @pytest.mark.parametrize("colonies", [0, -1, 1.5, True, "two"])
 def test_a_bad_number_of_colonies_is_refused(colonies):
-    with pytest.raises(tf.InputError, match=r"colonies.*integer from 1"):
+    with pytest.raises(tf.InputError, match=r"colonies.*a whole number from 1"):
         tf.Scene(tf.Growth(rate=1.0)).bind(colonies).start()
 
 
@@ -330,21 +330,49 @@ def test_a_device_that_is_not_there_is_refused(device):
 
 
 @pytest.mark.parametrize(
-    "wall",
+    "wall, hint",
     [
-        tf.Plane(y=-0.5, facing="-y"),
-        tf.Plane(point=(0.0, 1.0), normal=(0.0, 1.0)),
-        tf.Sphere((0.0, 0.0), 5.0, inside=False),
-        tf.Sphere((20.0, 0.0), 5.0),
-        tf.Box((1.0, -5.0), (9.0, 5.0)),
-        tf.Channel(4.0, low_end=1.0),
+        (tf.Plane(y=-0.5, facing="-y"), r"inside out\? Turn it \(facing"),
+        (tf.Plane(point=(0.0, 1.0), normal=(0.0, 1.0)), r"inside out\? Turn it \(facing"),
+        (tf.Sphere((0.0, 0.0), 5.0, inside=False), r"inside out\? Change `inside`"),
+        (tf.Sphere((20.0, 0.0), 5.0), r"inside out\? Change `inside`"),
+        (tf.Box((1.0, -5.0), (9.0, 5.0)), "Move the cell, or the sides"),
+        (tf.Channel(4.0, low_end=1.0), "Move the cell, or the sides"),
     ],
-    ids=lambda w: type(w).__name__,
 )
-def test_a_wall_inside_out_is_reported_before_anything_runs(wall):
+def test_a_cell_behind_a_wall_is_reported_before_anything_runs(wall, hint):
     scene = tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, walls=[wall]))
-    with pytest.raises(tf.InputError, match=r"cell 0 of colony 0.*inside out"):
+    with pytest.raises(tf.InputError, match=rf"cell 0 of colony 0.*{hint}"):
         scene.bind().start()
+
+
+@pytest.mark.parametrize(
+    "walls",
+    [
+        [tf.Channel(0.9)],
+        [tf.Plane(y=-0.4, facing="+y"), tf.Plane(y=0.5, facing="-y")],
+        [tf.Box((-5.0, -0.1), (5.0, 0.8))],
+    ],
+    ids=["channel", "planes", "box"],
+)
+def test_walls_that_leave_no_room_for_a_cell_are_refused(walls):
+    made = lambda of: tf.Scene(tf.Growth(rate=1.0), tf.Mechanics(dim=2, walls=of))
+    with pytest.raises(tf.InputError, match=r"0\.9 µm between two hard sides.* 1 µm wide"):
+        made(walls).bind()
+    made([tf.Channel(1.0)]).bind()
+    made([tf.Channel(0.9, stiffness=1e6)]).bind()  # a soft wall may press
+
+
+def test_division_without_growth_is_noticed():
+    """No cell gets to a threshold: a run to a number of cells would never end."""
+    effects = tf.Division(length=4.0), tf.Mechanics(dim=2)
+    with pytest.raises(tf.InputError, match=r"cells = 50 is never reached.*tf\.Growth"):
+        next(tf.simulate(tf.Scene(*effects), cells=50))
+    with pytest.warns(UserWarning, match=r"no effect of this scene makes them longer"):
+        next(tf.simulate(tf.Scene(*effects), until=1.0))
+    next(tf.simulate(tf.Scene(tf.Growth(rate=1.0), *effects), until=1.0))
+    flagged = tf.Rules(lambda cells: None)
+    next(tf.simulate(tf.Scene(flagged, tf.Division(), tf.Mechanics(dim=2)), until=1.0))
 
 
 def test_the_colony_behind_the_wall_is_named():

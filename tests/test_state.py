@@ -64,7 +64,8 @@ def test_frozen():
 def test_fields_are_attributes_and_unknown_names_are_reported():
     state = batch()
     assert state.growth_rate is state.fields["growth_rate"]
-    with pytest.raises(AttributeError, match=r"'grwth_rate'.*growth_rate, elongation"):
+    message = r"'grwth_rate'. Did you mean 'growth_rate'.*radius it has the fields growth_rate\."
+    with pytest.raises(AttributeError, match=message):
         state.grwth_rate  # noqa: B018
     assert not hasattr(state, "displacement")
 

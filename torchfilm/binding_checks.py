@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from torchfilm.effect import BUILT_IN, BoundEffect, Effect
+from torchfilm.effect import BUILT_IN, BoundEffect, Effect, is_own, makes_longer
 from torchfilm.rule_views import KNOWN_FIELDS, MEANS
 from torchfilm.state import OUTSIDE, State
 from torchfilm.tools import checks
@@ -58,7 +58,29 @@ def check_end(effects: Sequence[BoundEffect], state: State, cells: int) -> None:
         for name in effect.effect.waits_for():
             if not _sets(effects, name, effect):
                 _check_moves(effect, name, state, cells)
+    short = (state.counts > 0) & (state.counts < cells)
+    if bool(short.any()) and (why := _why_none_divides(effects)):
+        raise checks.InputError(
+            f"cells = {cells} is never reached: {why}, or end the run by a time (until=…, --until)."
+        )
     _check_adds(effects, state, cells)
+
+
+def warn_of_no_growth(effects: Sequence[BoundEffect]) -> None:
+    """Warn where cells divide at a threshold and nothing makes them longer."""
+    if why := _why_none_divides(effects):
+        warn(f"No cell will divide but those that are long enough now: {why}.")
+
+
+def _why_none_divides(effects: Sequence[BoundEffect]) -> str:
+    """Why no cell comes to a threshold of division, and what to do; "" where cells may."""
+    waits = any(e.effect.divides_at_threshold for e in effects)
+    if not waits or any(makes_longer(e.effect) for e in effects):
+        return ""
+    return (
+        "cells divide at a threshold, and no effect of this scene makes them longer. List"
+        " tf.Growth(rate=1.0), in 1/h"
+    )
 
 
 def warn_of_idle(effects: Sequence[BoundEffect], state: State) -> None:
@@ -72,7 +94,7 @@ def warn_of_idle(effects: Sequence[BoundEffect], state: State) -> None:
 
 def warn_of_early(effects: Sequence[BoundEffect]) -> None:
     """Warn of a user's effect that looks for divisions of the step before cells divide."""
-    for bound in filter(_is_own, effects):
+    for bound in (e for e in effects if is_own(e.effect)):
         code = getattr(type(bound.effect).step, "__code__", None)
         if code is None or "births" not in code.co_names:
             continue
@@ -93,12 +115,7 @@ def _divides(effect: BoundEffect) -> bool:
 def _sets(effects: Sequence[BoundEffect], name: str, effect: BoundEffect) -> bool:
     """Whether another effect may set a field, or lengthen or add cells in its own way."""
     others = [e for e in effects if e.effect is not effect.effect]
-    return any(e.effect.writes_anything or name in e.writes() or _is_own(e) for e in others)
-
-
-def _is_own(effect: BoundEffect) -> bool:
-    """Whether the user has written the effect, which may do anything."""
-    return not type(effect.effect).__module__.startswith("torchfilm.")
+    return any(e.effect.writes_anything or name in e.writes() or is_own(e.effect) for e in others)
 
 
 def _check_moves(effect: BoundEffect, name: str, state: State, cells: int) -> None:
@@ -123,7 +140,8 @@ def _check_moves(effect: BoundEffect, name: str, state: State, cells: int) -> No
 def _check_adds(effects: Sequence[BoundEffect], state: State, cells: int) -> None:
     """Raise InputError, or warn, if a colony is to have more cells and no effect adds any."""
     short = (state.counts > 0) & (state.counts < cells)
-    if any(map(_divides, effects)) or any(map(_is_own, effects)) or not bool(short.any()):
+    own = any(is_own(e.effect) for e in effects)
+    if own or any(map(_divides, effects)) or not bool(short.any()):
         return
     place = int(short.nonzero()[0])
     text = (

@@ -359,6 +359,17 @@ class BoundEffect:
         return summary(self.effect)
 
 
+def is_own(effect: Effect) -> bool:
+    """Whether the user has written the effect, which may do anything."""
+    return not type(effect).__module__.startswith("torchfilm.")
+
+
+def makes_longer(effect: Effect) -> bool:
+    """Whether cells may become longer by this effect, or be flagged to divide at any length."""
+    grows = any(f.name == "elongation" for f in effect.declares(3))
+    return grows or effect.writes_anything or is_own(effect)
+
+
 class Report(Protocol):
     """What a step of an effect tells of itself. A driver raises, or drops colonies, where `status`
     is not 0. A report may also have `concerns() -> list[Concern]`."""

@@ -177,9 +177,13 @@ class Model:
         for effect in self.effects:
             effect.check_step(dt, any("divide_flag" in e.writes() for e in self.effects))
 
-    def check_end(self, state: State, cells: int) -> None:
-        """Raise InputError, or warn, if no run from this state would come to `cells` cells."""
-        binding_checks.check_end(self.effects, state, cells)
+    def check_end(self, state: State, cells: int | None) -> None:
+        """Raise InputError, or warn, if no run from this state would come to `cells` cells; warn if
+        a run to a time (None) has no growth that its division waits for."""
+        if cells is None:
+            binding_checks.warn_of_no_growth(self.effects)
+        else:
+            binding_checks.check_end(self.effects, state, cells)
 
     # --- what depends on what ------------------------------------------------------------
 

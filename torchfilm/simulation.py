@@ -76,9 +76,7 @@ def simulate(
     last = math.inf if until is None else _last_step(state, checks.number("until", until), dt)
     model.check(state)
     model.check_step(dt)
-    if until is None:
-        assert cells is not None
-        model.check_end(state, cells)
+    model.check_end(state, cells if until is None else None)
     recorder = _new_recorder(record, model) if isinstance(record, (str, Path)) else record
     if recorder is not None:
         recorder.attach(model, dt)

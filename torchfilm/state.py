@@ -140,8 +140,12 @@ class State:
         fields = self.__dict__.get("fields", {})
         if name in fields:
             return fields[name]
+        declared = self.__dict__.get("declared", {})
+        shown = [n for n in fields if not (n in declared and declared[n].internal)]
+        near = checks.suggestion(name, [*PER_CELL, *PER_COLONY, "volume", "area", *fields])
         raise AttributeError(
-            f"the state has no {name!r}; its fields are {', '.join(fields) or 'none'}"
+            f"the state has no {name!r}. {near + ' ' if near else ''}Beside {', '.join(PER_CELL)}"
+            f" it has the fields {', '.join(shown) or 'none'}."
         )
 
     @property

@@ -56,3 +56,15 @@ def test_copies_do_not_recurse():
         assert other.a.tolist() == [1.0, 1.0]
         with pytest.raises(tf.InputError, match="u has no"):
             _ = other.b
+
+
+def test_a_constant_that_was_not_given_says_how_to_give_it():
+    scene = tf.Scene(tf.Circuit(lambda u, s, p, cell: {"gfp": p.make}, species="gfp"), dim=2)
+    with pytest.raises(tf.InputError, match=r"p has no 'make'.*Circuit\(…, make=…\)"):
+        scene.bind()
+
+
+def test_a_reaction_with_the_name_of_a_signal_says_how_to_write_it():
+    make = tf.parts.activated("gfp", by="ahl", rate=1.0, half=1.0)
+    with pytest.raises(tf.InputError, match=r"unknown name 'ahl'.*'out.ahl' for a signal"):
+        tf.Scene(tf.Circuit(make, species="gfp"), dim=2).bind()

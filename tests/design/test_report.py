@@ -17,6 +17,7 @@ from searching import Level, Spread, banned, built, fragile, lit
 
 import torchfilm as tf
 from design import Bands, Batch, Choice, Objective, Parameter, Search, Sobol, Stripe, Target, Task
+from design.finals import FreshLosses
 from design.report import table
 from design.report_plot import draw
 from design.trivial import trivial_losses
@@ -304,12 +305,16 @@ def test_a_pattern_that_an_even_level_has_is_no_pattern():
     "share, words",
     [(1.1, "no better than"), (0.5, "is weak: the best design has 0.50 of the loss"), (0.2, "")],
 )
-def test_a_pattern_is_told_from_a_weak_one_and_from_none(share, words):
+@pytest.mark.parametrize("tested", [False, True])
+def test_a_pattern_is_told_from_a_weak_one_and_from_none(share, words, tested):
+    """By the loss on fresh seeds, where there is one: that of the search is luck, too."""
     target = Bands(("gfp",), (-1.0, 1.0), floor=0.5)
     found = searched(lit, PAIR, target, 4)._report()
     least = min(trivial_losses(target, found.best.colonies).values())
     assert least > 0.01, "every answer is good"
-    best = dataclasses.replace(found.best, loss=share * least, fresh=None)
+    lucky = FreshLosses(np.full(8, share * least), share * least, (share * least, share * least))
+    loss, fresh = (share * least, None) if not tested else (0.1 * least, lucky)
+    best = dataclasses.replace(found.best, loss=loss, fresh=fresh)
     text = table(dataclasses.replace(found, best=best))
     assert words in text and ("weak" in text or "no better" in text) == bool(words)
 

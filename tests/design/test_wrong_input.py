@@ -132,3 +132,12 @@ def test_a_value_of_another_type_is_named(case):
     call, message = WRONG[case]
     with pytest.raises(tf.InputError, match=message):
         call()
+
+
+@pytest.mark.parametrize("method", ["sobol", "auto"])
+def test_a_pattern_beyond_the_colonies_is_refused_after_the_first_batch(method):
+    """Every design would have the same loss; the budget would be spent on nothing."""
+    found = search(target=Ring("gfp", 60.0, 4.0), cells=8, replicates=2, method=method)
+    with pytest.raises(tf.InputError, match=r"no cell lies where.*lit.*cells, which reach \d"):
+        found.run(colonies=200)
+    assert 0 < found.study.colonies < 200

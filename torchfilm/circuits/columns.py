@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torchfilm.circuits.names import Names, UnknownName, unknown, without_medium
+from torchfilm.circuits.names import Names, UnknownName, has_no, without_medium
 
 
 class Columns(Names):
@@ -36,7 +36,7 @@ class Columns(Names):
         if name.startswith("__"):
             raise AttributeError(name)
         if name not in self._source:
-            raise UnknownName(unknown(f"{self._label} has no {name!r}", name, list(self._source)))
+            raise UnknownName(has_no(self._label, name, list(self._source)))
         value = self._source[name]
         if isinstance(value, Tensor) and value.dim():
             value = value.index_select(0, self._rows)

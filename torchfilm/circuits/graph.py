@@ -22,7 +22,7 @@ from torchfilm.circuits.expressions import (
     walk,
 )
 from torchfilm.circuits.formulas import latex, text
-from torchfilm.circuits.names import Names, UnknownName, unknown
+from torchfilm.circuits.names import Names, UnknownName, has_no, unknown
 from torchfilm.circuits.network import Network, build_network
 from torchfilm.circuits.reactions import OUTSIDE
 from torchfilm.circuits.tracing import LAWS, Column, common_type
@@ -56,7 +56,7 @@ class Leaves(Names):
             raise AttributeError(name)
         kind = self._kinds(name)
         if kind is None:
-            raise UnknownName(unknown(f"{self._label} has no {name!r}", name, list(self._known)))
+            raise UnknownName(has_no(self._label, name, list(self._known)))
         made = Column.of(self._make.name(f"{self._prefix}.{name}"), self._make, *kind)
         self.__dict__[name] = made
         return made

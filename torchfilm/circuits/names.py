@@ -37,7 +37,7 @@ class Names:
         # called only for unknown names
         if name.startswith("__"):
             raise AttributeError(name)
-        raise UnknownName(unknown(f"{self._label} has no {name!r}", name, list(self.__dict__)))
+        raise UnknownName(has_no(self._label, name, list(self.__dict__)))
 
     def __getitem__(self, name: str) -> Any:
         return getattr(self, name)
@@ -78,6 +78,14 @@ def label_of(part: object) -> str:
     """What messages call the rates of a circuit: a function by its name, a module by its class."""
     kind = type(part).__name__ if callable(part) else "the list of reactions"
     return getattr(part, "__name__", kind)
+
+
+def has_no(label: str, name: str, known: Sequence[str]) -> str:
+    """The message for a name that one of the arguments of a rate function does not have."""
+    message = unknown(f"{label} has no {name!r}", name, known)
+    return (
+        f"{message} Give the circuit its value: Circuit(…, {name}=…)." if label == "p" else message
+    )
 
 
 def unknown(what: str, name: str, known: Sequence[str]) -> str:

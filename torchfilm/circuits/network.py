@@ -178,14 +178,12 @@ def build_network(
                         f"the reaction {reaction.name or str(reaction)!r} needs the signal"
                         f" {signal!r}: {without_medium(signal)}"
                     )
-                raise checks.InputError(
-                    unknown(
-                        f"the reaction {reaction.name or str(reaction)!r} has the unknown name"
-                        f" {name!r}",
-                        name,
-                        names,
-                    )
+                what = (
+                    f"the reaction {reaction.name or str(reaction)!r} has the unknown name {name!r}"
                 )
+                hint = f"List it in species=…, or write {OUTSIDE + name!r} for a signal."
+                own = "" if name.startswith(OUTSIDE) else f" {hint}"
+                raise checks.InputError(unknown(what, name, names) + own)
         for name, count in reaction.change().items():
             stoichiometry[row, names.index(name)] = count
         # the names that a user's function reads are unknown, so all names count

@@ -48,7 +48,7 @@ def summary_table(scene: Scene, state: State, timings: Timings, seconds: float) 
         )
     total = sum(timings.seconds.values()) or 1.0
     lines += [
-        f"{'time for ' + name:<28}{s:.2f} s ({100 * s / total:.0f} %)"
+        f"{'time for ' + name:<27} {s:.2f} s ({100 * s / total:.0f} %)"
         for name, s in timings.seconds.items()
     ]
     if (kernels := sys.modules.get("torchfilm.kernels.compiling")) and kernels.seconds_spent():

@@ -36,6 +36,7 @@ from torchfilm.state import State
 from torchfilm.tools import checks
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.timing import Timings
+from torchfilm.tools.warn_once import warn
 from torchfilm.tuning.settings import Settings, accurate
 
 
@@ -281,6 +282,11 @@ def go(
     """Run with a progress bar; then print where the results are, and a summary."""
     sources = [effect.hot_reload for effect in model.effects]
     reloads = [source for source in sources if source is not None]
+    if watch and not any(reload.path for reload in reloads):
+        warn(
+            "--watch has nothing to watch: only rules in a file of their own, such as"
+            ' tf.Rules("rules.py"), can be edited during a run.'
+        )
     for reload in reloads:
         reload.watching = watch
     timings, begun = Timings(), time.perf_counter()

@@ -196,7 +196,14 @@ class BoundRules(_BoundRule):
         both = torch.zeros(2, dtype=torch.int64, device=state.device)
         tried = state.take(both) if twice else state
         view = CellsView(tried, TRIAL_STEP, _label(update), declaring=True)
-        _act(update, view)
+        try:
+            _act(update, view)
+        except RuleError as error:
+            if not twice or "shape" not in str(error):
+                raise
+            raise RuleError(
+                f"{error} The rule is tried on two copies of the first cell."
+            ) from error
         new = [n for n in view._work if n not in state.fields and n != "remove_flag"]
         self.variables = tuple(_variable(name, view._work[name]) for name in new)
         for variable in self.variables:

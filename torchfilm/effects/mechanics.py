@@ -16,7 +16,7 @@ from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.parameters import number_range
 from torchfilm.physics.contact_records import ContactSettings
-from torchfilm.physics.initial_overlaps import check_apart
+from torchfilm.physics.initial_overlaps import check_apart, check_room
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.surfaces import Surface
 from torchfilm.physics.walls import Wall
@@ -223,8 +223,9 @@ class Mechanics(Effect):
                     f" {int(state.own_colony_id[k])} starts at"
                     f" {[round(x, 3) for x in state.position[k].tolist()]},"
                     f" {-float(distance[k]):.3g} µm behind it (cells behind it: {behind.numel()})."
-                    " Is the wall inside out? Turn it (facing, normal, inside), or move the cells."
+                    f" {surface.wall.turn_hint}"
                 )
+        check_room(self.surfaces(), state.position, state.radius, state.own_colony_id)
         check_apart(
             state.position,
             state.axis,

@@ -47,6 +47,21 @@ try:
 except ImportError:  # not on Windows
     resource = None  # type: ignore[assignment]
 
+# Suffixes that say another format: such a name would mislead.
+OF_OTHERS = {
+    ".csv",
+    ".json",
+    ".png",
+    ".svg",
+    ".pdf",
+    ".tif",
+    ".tiff",
+    ".mp4",
+    ".gif",
+    ".npz",
+    ".txt",
+    ".py",
+}
 SPARE_BYTES = 65536  # that HDF5 may need in addition to the arrays of a frame
 
 
@@ -96,6 +111,11 @@ class Recorder(metaclass=checks.KnownKeywords):
             )
         if self.path.is_dir():
             raise checks.input_error("record", shown, "a file, not a folder")
+        if self.path.suffix.lower() in OF_OTHERS:
+            raise checks.input_error(
+                "record", shown, "a name such as results.h5: results are HDF5",
+                "Write tables and pictures of it later: torchfilm export, torchfilm show.",
+            )  # fmt: skip
         if not self.path.parent.is_dir():
             raise checks.input_error(
                 "record", shown, "in a folder that exists", f"Make {self.path.parent} first."

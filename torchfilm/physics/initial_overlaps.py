@@ -1,11 +1,16 @@
-"""The check that the first cells of a colony lie apart."""
+"""The checks that the first cells of a colony lie apart, and have room between walls."""
 
 from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
+from torchfilm.physics.surfaces import FlatSurface, Surface
+from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
 
 # Centres nearer than this share of a radius count as one place.
@@ -60,3 +65,24 @@ def check_apart(
             " (µm) and its lengths (of the centreline, without caps)."
         )
     warn(found, category=RuntimeWarning)
+
+
+@torch.no_grad()
+def check_room(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, ids: Tensor) -> None:
+    """Raise InputError where a cell is wider than what two hard, parallel planes leave it.
+
+    position (N, d); radius (N,) µm; ids (N,), of the cells' colonies.
+    """
+    flat = [s for s in surfaces if isinstance(s, FlatSurface) and not s.wall.yields]
+    for one, other in itertools.combinations(flat, 2):
+        (near, way), (far, back) = (s.gap_of_points(position, ids) for s in (one, other))
+        width, opposite = near + far, (way * back).sum(0) < -1 + 1e-9
+        narrow = torch.nonzero(opposite & (width < 2 * radius * (1 - 1e-6))).squeeze(1)
+        if narrow.numel():
+            k = int(narrow[0])
+            names = dict.fromkeys(type(s.wall).__name__ for s in (one, other))
+            raise checks.InputError(
+                f"{' and '.join(names)}: {float(width[k]):.3g} µm between two hard sides, too"
+                f" narrow for a cell that is {2 * float(radius[k]):.3g} µm wide. Place them farther"
+                " apart, or give them a stiffness."
+            )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -33,6 +33,9 @@ class Wall(metaclass=checks.KnownKeywords):
 
     stiffness: Any = field(default=None, kw_only=True)
     weight: Any = field(default=None, kw_only=True)
+
+    # what to do about a first cell that lies behind it
+    turn_hint: ClassVar[str] = "Move the cell, or the sides of the wall."
 
     def __post_init__(self) -> None:
         name = type(self).__name__
@@ -97,6 +100,8 @@ class Plane(Wall):
     or one per colony) with facing "+x" … "-z", or a point and a normal that points towards the
     cells. Point and normal are each one vector, or one per colony as an array of shape (B, d).
     """
+
+    turn_hint = "Is the wall inside out? Turn it (facing or normal), or move the cell."
 
     x: float | Tensor | None = field(default=None, kw_only=True)
     y: float | Tensor | None = field(default=None, kw_only=True)
@@ -163,7 +168,7 @@ class Plane(Wall):
             raise checks.input_error(
                 f"Plane.{AXES[axis]}",
                 getattr(self, AXES[axis]),
-                f"a position along {AXES[:dim]} in a {dim}-D scene",
+                f"a position along {' or '.join(AXES[:dim])}: the scene is {dim}-D",
             )
         sign = 1.0 if self.facing[0] == "+" else -1.0  # type: ignore[index]
         at = getattr(self, AXES[axis])
@@ -176,6 +181,8 @@ class Sphere(Wall):
 
     center: µm, one position or one per colony as an array of shape (B, d). radius: µm.
     """
+
+    turn_hint = "Is the wall inside out? Change `inside`, or move the cell."
 
     center: Sequence[float | Tensor] | Tensor
     radius: float | Tensor

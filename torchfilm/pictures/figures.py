@@ -251,7 +251,10 @@ def choose_colonies(
     """
     alive = [int(p) for p in np.flatnonzero(present)]
     if not alive:
-        raise checks.InputError("this frame has no cell to draw.")
+        raise checks.InputError(
+            "this frame has no cell to draw: its colonies have lost all cells. Draw an earlier one"
+            " (frame=…, --frame)."
+        )
     if colonies is None:
         return alive[:most], (
             f" (first {most} of {len(alive)} colonies)" if len(alive) > most else ""
