@@ -45,7 +45,7 @@ class Finals(metaclass=checks.KnownKeywords):
 
     def __post_init__(self) -> None:
         checks.number("Finals.share", self.share, above=0.0, most=0.9)
-        checks.integer("Finals.most", self.most, least=1)
+        object.__setattr__(self, "most", checks.integer("Finals.most", self.most, least=1))
         sizes = checks.vector("Finals.sizes", self.sizes)
         if not sizes or min(sizes) <= 0 or len(set(sizes)) < len(sizes):
             raise checks.input_error(

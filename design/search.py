@@ -193,7 +193,8 @@ class Search(TaskOptions):
         reserved = self.finals.colonies(colonies) if self.finals else 0.0
         limit = max(colonies - reserved, task.replicates)  # one design at least
         method.start(task.space, task.seed, task.replicates)
-        proposal, told_apart = repeat_study(method, task, self.study, self._known), False
+        proposal, within_reach = repeat_study(method, task, self.study, self._known), False
+        check_within_reach(self.objective, self.study.entries)
         while not self._reached(stop_at, finals):
             proposal = proposal or Proposal.of_number(
                 len(self.study.entries), method, task, self._known
@@ -212,9 +213,9 @@ class Search(TaskOptions):
                 slopes=part.slopes,
             )
             proposal.take(found.entry(streams), self.study)
-            if part.size == 1 and not told_apart:
-                check_within_reach(self.objective, self.study.entries[-1])
-                told_apart = True
+            if not within_reach and part.size == 1:
+                check_within_reach(self.objective, self.study.entries)
+                within_reach = True
             if len(self.study.entries) == 1 and (remark := task.target.remark(found.loss)):
                 print(remark, file=sys.stderr)
             self._progress.why_regrown = found.why_regrown

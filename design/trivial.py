@@ -39,24 +39,28 @@ def trivial_losses(target: Target, finished: Iterable[FinishedColonies]) -> dict
     return answers
 
 
-def check_within_reach(objective: Objective, entry: Entry) -> None:
-    """Raise InputError where no cell of the first design that grew lies in the target's pattern:
-    all designs then have the same loss. Nothing is grown where losses of the batch differ."""
-    target, losses = objective.task.target, entry.losses
+def check_within_reach(objective: Objective, entries: Iterable[Entry]) -> None:
+    """Raise InputError where no colony of full size reaches the target's pattern, so that all
+    designs have the same loss. It looks at the first design that grew; where growth depends on the
+    design, others may reach farther, and nothing is said."""
+    task = objective.task
+    structural = any(p.structural for p in task.space.parameters)
+    entry = next((e for e in entries if e.size == 1), None)
+    if entry is None or structural or task.tried.why_regrown:
+        return
     failed = {row for row, _ in entry.reasons}
-    grew = [k for k in range(len(losses)) if k not in failed]
-    if not grew or np.ptp(losses[grew]) > 1e-9:
+    grew = [k for k in range(len(entry.points)) if k not in failed]
+    if not grew or np.ptp(entry.losses[grew]) > 1e-9:
         return
-    finished = objective.colonies(entry.points[grew[0]])
-    each = [part.state for part in finished]
-    inside = [target.measures(p.state, p.history).get("inside") for p in finished]
-    if not inside or any(x is None or not bool(x.isnan().all()) for x in inside):
+    states = [part.state for part in objective.colonies(entry.points[grew[0]])]
+    if not states or any(bool(task.target.reaches(state).any()) for state in states):
         return
-    cells = max(int(s.counts.max()) for s in each)
-    reach = max(float(s.position.double().norm(dim=1).max()) for s in each)
+    cells = max(int(state.counts.max()) for state in states)
+    reach = max(float(state.position.norm(dim=1).max()) for state in states)
     raise checks.InputError(
-        f"target: {target.why_undefined('inside')}. All designs have the same loss in colonies of"
-        f" up to {cells} cells, which reach {reach:.3g} µm from the origin."
+        f"target: colonies of {cells} cells, which reach {reach:.3g} µm from the origin, do not"
+        f" reach the pattern ({task.target.describe()}), so that all designs have the same loss."
+        " Grow larger colonies (cells, until), or move the pattern."
     )
 
 

@@ -304,9 +304,11 @@ def test_a_state_is_a_frame(dtype, device):
         ([2.0, 2.0], (2.0, 4.0)),
     ],
 )
-def test_values_that_hardly_differ_have_one_colour(values, limits):
+def test_the_range_of_a_concentration_spans_a_hundredth(values, limits):
     seen = ValueRange()
     seen.add(np.array(values))
-    found = scale_of("gfp", seen, PlotStyle(colour="gfp"), {})
+    plain = scale_of("x", seen, PlotStyle(colour="x"), {})
+    assert plain.limits[0] == values[0], "a coordinate has no least range"
+    found = scale_of("gfp", seen, PlotStyle(colour="gfp"), {"gfp": "conc"})
     assert found.limits == pytest.approx(limits, rel=1e-6)
     assert found.beyond == "neither"

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 import torch
 
@@ -130,3 +131,35 @@ def test_values_are_checked_before_the_checks_of_ones_own():
         scene.bind(1)
     model = scene.bind(2)
     assert model.effects[-1].values.k.of_cells(model.start()).tolist() == [1.0, 2.0]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WithInitVar(tf.Effect):
+    """A user's effect with an argument that is no field."""
+
+    k: float = tf.physical(1.0, least=0.0)
+    scale: dataclasses.InitVar[float] = 2.0
+
+    stage = 35
+    title = "scaled"
+
+    def __post_init__(self, scale):
+        object.__setattr__(self, "k", self.k * scale)
+
+
+def test_arguments_that_are_no_fields_reach_the_effects_own_checks():
+    assert WithInitVar(k=3.0).k == 6.0
+    with pytest.raises(tf.InputError, match=r"WithInitVar\.k = -1\.0"):
+        WithInitVar(k=-1.0)
+
+
+def test_numbers_of_numpy_are_kept_as_pythons(tmp_path):
+    given = tf.Mechanics(dim=2, passes=np.int64(3), tolerance=np.float32(0.25))
+    assert given == tf.Mechanics(dim=2, passes=3, tolerance=0.25)
+    assert (type(given.passes), type(given.tolerance)) == (int, float)
+    tf.Settings(passes=np.int64(3), rtol=np.float64(1e-3)).save(tmp_path / "settings.json")
+    assert tf.Settings.load(tmp_path / "settings.json").passes == 3
+    scene = tf.Scene(tf.Growth(rate=1.0), dim=2)
+    assert scene.bind(np.int64(2), seed=np.int32(5)).start().seed == 5
+    with pytest.raises(tf.InputError, match=r"colonies = True.*whole number"):
+        scene.bind(True)

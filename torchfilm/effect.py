@@ -78,9 +78,9 @@ class Effect(metaclass=checks.KnownKeywords):
             return
 
         @functools.wraps(own)
-        def checked_first(self: Effect) -> None:
+        def checked_first(self: Effect, *given: Any) -> None:
             Effect.__post_init__(self)
-            own(self)
+            own(self, *given)
 
         cls.__post_init__ = checked_first  # type: ignore[method-assign]
 

@@ -25,6 +25,7 @@ from torchfilm.model import Model, advanced, bind
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, Births, State
 from torchfilm.tools import checks
+from torchfilm.tools.hot_reload import unchanged
 from torchfilm.tools.ragged import expand_ranges, offsets
 from torchfilm.tools.threads import one_torch_thread
 from torchfilm.tools.warn_once import once
@@ -295,12 +296,13 @@ class Replay(metaclass=checks.KnownKeywords):
         return advanced(state, self.dt)
 
     def _follow(self, effect: BoundEffect, state: State) -> State:
-        """The state after an effect that only follows. Raises SimulationError where it changes what
+        """The state after an effect that only follows. Raises TypeError where it changes what
         growth uses, and so should not have been left out of the recording."""
         after = effect.run_step(state, self.dt)
         for name in self.fixed:
-            if getattr(after, name) is not getattr(state, name):
-                raise checks.SimulationError(
+            new, old = getattr(after, name), getattr(state, name)
+            if new is not old and not (new.shape == old.shape and unchanged(new, old)):
+                raise TypeError(
                     f"{effect.title} changed {name!r}, which its `writes` does not name: so growth"
                     " was recorded without it. Name it there."
                 )

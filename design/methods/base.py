@@ -59,7 +59,9 @@ class Batch:
         object.__setattr__(self, "points", points)
         checks.number("Batch.size", self.size, above=0.0, most=1.0)
         if self.replicates is not None:
-            checks.integer("Batch.replicates", self.replicates, least=1)
+            object.__setattr__(
+                self, "replicates", checks.integer("Batch.replicates", self.replicates, least=1)
+            )
 
 
 class Method(Protocol):

@@ -110,6 +110,11 @@ class Target(metaclass=checks.KnownKeywords):
         the target does not have, or that is never NaN."""
         return ""
 
+    def reaches(self, state: tf.State) -> Tensor:
+        """Whether a colony reaches the place of the pattern, (B,) bool: else it has the same loss,
+        whatever its cells do."""
+        return torch.ones(state.colonies, dtype=torch.bool, device=state.device)
+
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         """Draw the target of the colony at `place` of the batch, on axes that show that colony, in
         µm."""

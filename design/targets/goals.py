@@ -149,6 +149,9 @@ class Several(Target):
         each = self._each(lambda part, own: part.measures(state, own), state, history)
         return {name: value for part in each for name, value in part.items()}
 
+    def reaches(self, state: tf.State) -> Tensor:
+        return torch.stack([part.reaches(state) for part in self.parts]).any(0)
+
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         self._each(lambda part, own: part.draw(ax, state, place, own), state, history)
 

@@ -125,6 +125,9 @@ class Lasting(Target):
     def why_undefined(self, measure: str) -> str:
         return self.target.why_undefined(measure)
 
+    def reaches(self, state: tf.State) -> Tensor:
+        return self.target.reaches(state)
+
     def draw(self, ax: Axes, state: tf.State, place: int, history: Tensor | None = None) -> None:
         self.target.draw(ax, state, place)
 

@@ -124,6 +124,10 @@ class ProfileTarget(Target):
         where the colony does not reach the edge."""
         return total(state, w * (m > self.least)) > 0
 
+    @torch.no_grad()
+    def reaches(self, state: tf.State) -> Tensor:
+        return self._reached(state, *self._weights_and_profile(state)).any(1)
+
     def residuals(self, state: tf.State, history: Tensor | None = None) -> Tensor:
         """√w (m/|m| − cos φ · y/|y|) of each cell, and cos φ · floor |m|/|y|, where cos φ =
         Σ w m y/(|m| |y|), |m|² = Σ w m² and |y|² = Σ w y² + floor² |m|²: the part of m that is at

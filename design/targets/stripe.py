@@ -65,7 +65,13 @@ class Stripe(ProfileTarget):
             checks.number("Stripe.place", self.place)
         checks.choice("Stripe.along", self.along, ("x", "y"))
         if self.cell_type is not None:
-            checks.integer("Stripe.cell_type", self.cell_type, least=0, hint="Or None: all cells.")
+            object.__setattr__(
+                self,
+                "cell_type",
+                checks.integer(
+                    "Stripe.cell_type", self.cell_type, least=0, hint="Or None: all cells."
+                ),
+            )
         checks.choice("Stripe.straight", self.straight, (True, False))
         check_profile("Stripe", self.floor, self.edge_width)
 

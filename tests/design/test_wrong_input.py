@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from searching import Level, lit
+from searching import Level, lit, paced
 
 import torchfilm as tf
 from design import (
@@ -29,6 +29,7 @@ from design import (
     Search,
     Sensor,
     SensorDevice,
+    Sobol,
     Space,
     Spread,
     Stripe,
@@ -43,6 +44,7 @@ from design import (
 
 MAKE = [Parameter("make", 0.1, 10, log=True)]
 RING = Ring("g", 5.0, 2.0)
+RING_BEYOND = Ring("gfp", 60.0, 4.0)
 TABLE = {"x_um": [0.0, 1.0, 2.0], "y_um": [0.0, 1.0, 2.0], "length_um": [2.0, 2.0, 3.0]}
 OBSERVED = Observed.from_table(TABLE)
 
@@ -137,7 +139,35 @@ def test_a_value_of_another_type_is_named(case):
 @pytest.mark.parametrize("method", ["sobol", "auto"])
 def test_a_pattern_beyond_the_colonies_is_refused_after_the_first_batch(method):
     """Every design would have the same loss; the budget would be spent on nothing."""
-    found = search(target=Ring("gfp", 60.0, 4.0), cells=8, replicates=2, method=method)
-    with pytest.raises(tf.InputError, match=r"no cell lies where.*lit.*cells, which reach \d"):
+    found = search(target=RING_BEYOND, cells=8, replicates=2, method=method)
+    with pytest.raises(tf.InputError, match="do not reach the pattern"):
         found.run(colonies=200)
     assert 0 < found.study.colonies < 200
+
+
+@pytest.mark.parametrize(
+    "scene, parameters, target, options",
+    [
+        (
+            paced,
+            [Parameter("rate", 1.0, 2.2)],
+            Ring("gfp", 12.0, 4.0, centre=(0.0, 0.0)),
+            {"until": 2.0},
+        ),
+        (lit, MAKE, Weighted([(Ring("gfp", 2.0, 3.0), 1.0), (RING_BEYOND, 1.0)]), {"cells": 8}),
+        (lit, MAKE, Ring("gfp", 5.0, 2.0, edge_width=1.5), {"cells": 8}),
+    ],
+    ids=["growth is searched", "one of two", "the edge alone"],
+)
+def test_a_pattern_that_some_colony_may_reach_is_not_refused(scene, parameters, target, options):
+    one = Sobol(batch=1)  # all losses of a batch are equal
+    found = Search(scene, parameters, target, replicates=1, method=one, finals=None, **options)
+    assert found.run(colonies=2).loss <= 2.0
+
+
+def test_a_stripe_beyond_the_colonies_is_refused_again_where_the_search_is_resumed(tmp_path):
+    for _ in range(2):
+        found = search(target=Stripe("gfp", at=200.0, width=4.0), cells=8, method=Sobol(batch=2))
+        with pytest.raises(tf.InputError, match="do not reach the pattern"):
+            found.run(colonies=40, study=tmp_path / "stripe.h5")
+        assert len(found.study.entries) == 1, "nothing more is grown"

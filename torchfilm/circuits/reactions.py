@@ -50,7 +50,8 @@ class Reaction(metaclass=checks.KnownKeywords):
             )
         if not callable(self.rate):
             object.__setattr__(self, "rate", constant(f"{label}.rate", self.rate))
-        checks.integer(f"{label}.order", self.order, least=1)
+        order = checks.integer(f"{label}.order", self.order, least=1)
+        object.__setattr__(self, "order", order)
         if not self.change():
             raise checks.input_error(
                 label, str(self), "a reaction that changes something", "Both sides are equal."
@@ -123,13 +124,12 @@ def _side(name: str, given: object) -> dict[str, int]:
         raise checks.input_error(
             name, given, 'a mapping from names to numbers of molecules, such as {"a": 2}'
         )
-    for key, count in given.items():
+    for key in given:
         if not isinstance(key, str) or not key.removeprefix(OUTSIDE).isidentifier():
             raise checks.input_error(
                 name, key, 'the name of a species, or "out." and that of a signal'
             )
-        checks.integer(f"{name}[{key!r}]", count, least=1)
-    return dict(given)
+    return {k: checks.integer(f"{name}[{k!r}]", count, least=1) for k, count in given.items()}
 
 
 def _parse(side: str, equation: str) -> dict[str, int]:

@@ -138,7 +138,7 @@ class Circuit(Effect):
             "dilution": diluted_names(dilution, names, method),
             "daughters": daughters,
             "method": method,
-            "steps": steps,
+            "steps": int(steps),
             "initial": {
                 n: checked(f"Circuit.initial[{n!r}]", v, first) for n, v in (initial or {}).items()
             },

@@ -3,6 +3,7 @@ paper's equations 1–4)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -107,16 +108,13 @@ class Mechanics(Effect):
                     "Mechanics.walls", wall, "a list of Plane, Sphere, Box or Channel"
                 )
         for name in ("passes", "max_iterations"):
-            given = getattr(self, name)
-            if (name, given) == ("passes", None):
-                continue
-            checks.integer(f"Mechanics.{name}", given, least=1)
-        if self.tolerance is not None:
-            checks.number("Mechanics.tolerance", self.tolerance, above=0.0, most=0.5)
-        checks.number("Mechanics.max_elongation", self.max_elongation, above=0.0)
-        for name in ("overlap", "contact_overlap"):
-            if getattr(self, name) is not None:
-                checks.number(f"Mechanics.{name}", getattr(self, name), above=0.0)
+            if (given := getattr(self, name)) is not None:
+                object.__setattr__(self, name, checks.integer(f"Mechanics.{name}", given, least=1))
+        for name in ("tolerance", "max_elongation", "overlap", "contact_overlap"):
+            most = 0.5 if name == "tolerance" else math.inf
+            if (given := getattr(self, name)) is not None:
+                found = checks.number(f"Mechanics.{name}", given, above=0.0, most=most)
+                object.__setattr__(self, name, found)
         if self.contact_overlap is not None and (
             self.contacts == "bilateral" or self.alpha is not None or self.stiffness is not None
         ):

@@ -159,7 +159,7 @@ class Medium(Effect):
             "outside": outside,
             "grows": grows,
             "method": method,
-            "steps": steps,
+            "steps": int(steps),
             "splitting": splitting,
             "backend": backend,
         }

@@ -111,7 +111,7 @@ class Recorder(metaclass=checks.KnownKeywords):
             )
         if self.path.is_dir():
             raise checks.input_error("record", shown, "a file, not a folder")
-        if self.path.suffix.lower() in OF_OTHERS:
+        if self.path.suffix.lower() in OF_OTHERS and not self.append:
             raise checks.input_error(
                 "record", shown, "a name such as results.h5: results are HDF5",
                 "Write tables and pictures of it later: torchfilm export, torchfilm show.",

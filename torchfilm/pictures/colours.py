@@ -23,7 +23,7 @@ FLOOR, NO_VALUE = 0.14, (0.55, 0.55, 0.55, 1.0)
 # (of Okabe and Ito, distinct for colour-blind readers).
 KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8C6BB1")
 
-# The least range of a quantity's colours, relative to its largest value.
+# The least range of colours of a concentration, relative to its largest value.
 NARROWEST = 0.01
 
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -267,18 +267,18 @@ def scale_of(
     low, high = (seen.low, seen.high) if seen.low <= seen.high else (0.0, 1.0)
     if style.channels is not None and name != style.signal:
         low = min(0.0, low)  # a dark channel means a value of 0
-    limits = given or _wide_enough(low, high)
+    limits = given or _wide_enough(low, high, NARROWEST if unit == "conc" else 0.0)
     under, over = seen.low < limits[0], seen.high > limits[1]
     beyond: Beyond = "both" if under and over else "min" if under else "max" if over else "neither"
     return Scale(name, label, unit, _colour_map(name, style), limits, beyond)
 
 
-def _wide_enough(low: float, high: float) -> tuple[float, float]:
-    """The range, or one of NARROWEST around values that differ less: the errors of solvers are no
-    pattern."""
+def _wide_enough(low: float, high: float, share: float) -> tuple[float, float]:
+    """The range, or one of this share of the largest value around values that differ less: the
+    errors of solvers are no pattern."""
     if low == high:
         return low, low + (abs(low) or 1.0)
-    least = NARROWEST * max(abs(low), abs(high))
+    least = share * max(abs(low), abs(high))
     if high - low >= least:
         return low, high
     middle = 0.5 * (low + high)

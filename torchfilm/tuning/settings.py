@@ -47,9 +47,12 @@ class Settings(metaclass=checks.KnownKeywords):
             ("rtol", 0.1),
         ):
             if getattr(self, name) is not None:
-                checks.number(f"Settings.{name}", getattr(self, name), above=0.0, most=most)
+                given = getattr(self, name)
+                found = checks.number(f"Settings.{name}", given, above=0.0, most=most)
+                object.__setattr__(self, name, found)
         if self.passes is not None:
-            checks.integer("Settings.passes", self.passes, least=1)
+            passes = checks.integer("Settings.passes", self.passes, least=1)
+            object.__setattr__(self, "passes", passes)
 
     @property
     def given(self) -> dict[str, float]:
