@@ -35,7 +35,8 @@ class MediumReport:
     first: Tensor
     hint = (
         "Make the box of the Medium larger (one that is flat is a single layer), let it grow with"
-        " the colony, Medium(…, outside='grow'), or move the obstacle. A box has at most"
+        " the colony, Medium(…, outside='grow'), remove cells before they leave it, as at the open"
+        " end of a channel, tf.Removal(low, high), or move the obstacle. A box has at most"
         f" {MOST_VOXELS / 1e6:.0f} million voxels; a larger spacing needs fewer"
     )
 
