@@ -396,7 +396,7 @@ def test_a_state_needs_its_scene_first(tmp_path):
         results.state(-1)
 
 
-@pytest.mark.parametrize("name", ["colony.csv", "colony.PNG", "colony.json"])
+@pytest.mark.parametrize("name", ["colony.csv", "colony.TXT", "colony.json"])
 def test_a_name_of_another_format_is_refused(name, tmp_path):
     with pytest.raises(tf.InputError, match=rf"{name}.*results are HDF5"):
         tf.Recorder(tmp_path / name, make_scene())

@@ -383,6 +383,7 @@ def test_case_09_soft_wall(device, dtype, measured, contacts):
 @MODES
 @pytest.mark.parametrize("height", [0.0, 0.05])
 @pytest.mark.parametrize("tilt", [0.0, 0.03])
+@pytest.mark.filterwarnings("ignore:.*between two hard sides")  # that is the case
 def test_case_10_planes_too_near(device, dtype, measured, contacts, height, tilt):
     """Two planes 0.8 µm apart, a cell of diameter 1 between them: 0.1 ± 1e-3 overlap each (given),
     no oscillation.

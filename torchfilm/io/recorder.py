@@ -47,21 +47,8 @@ try:
 except ImportError:  # not on Windows
     resource = None  # type: ignore[assignment]
 
-# Suffixes that say another format: such a name would mislead.
-OF_OTHERS = {
-    ".csv",
-    ".json",
-    ".png",
-    ".svg",
-    ".pdf",
-    ".tif",
-    ".tiff",
-    ".mp4",
-    ".gif",
-    ".npz",
-    ".txt",
-    ".py",
-}
+# Suffixes of formats that a run might be thought to write: such a name would mislead.
+OF_OTHERS = (".csv", ".tsv", ".json", ".txt", ".xml")
 SPARE_BYTES = 65536  # that HDF5 may need in addition to the arrays of a frame
 
 

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchfilm.physics.contacts import gaps_nearby
 from torchfilm.physics.surfaces import FlatSurface, Surface
-from torchfilm.tools import checks
 from torchfilm.tools.warn_once import warn
 
 # Centres nearer than this share of a radius count as one place.
@@ -69,7 +68,7 @@ def check_apart(
 
 @torch.no_grad()
 def check_room(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, ids: Tensor) -> None:
-    """Raise InputError where a cell is wider than what two hard, parallel planes leave it.
+    """Warn where a cell is wider than what two hard, parallel planes leave it.
 
     position (N, d); radius (N,) µm; ids (N,), of the cells' colonies.
     """
@@ -81,8 +80,9 @@ def check_room(surfaces: Sequence[Surface], position: Tensor, radius: Tensor, id
         if narrow.numel():
             k = int(narrow[0])
             names = dict.fromkeys(type(s.wall).__name__ for s in (one, other))
-            raise checks.InputError(
+            warn(
                 f"{' and '.join(names)}: {float(width[k]):.3g} µm between two hard sides, too"
-                f" narrow for a cell that is {2 * float(radius[k]):.3g} µm wide. Place them farther"
-                " apart, or give them a stiffness."
+                f" narrow for a cell that is {2 * float(radius[k]):.3g} µm wide: it will lie in"
+                " both. Place them farther apart, or give them a stiffness."
             )
+            return
