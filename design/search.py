@@ -193,8 +193,8 @@ class Search(TaskOptions):
         reserved = self.finals.colonies(colonies) if self.finals else 0.0
         limit = max(colonies - reserved, task.replicates)  # one design at least
         method.start(task.space, task.seed, task.replicates)
-        proposal, within_reach = repeat_study(method, task, self.study, self._known), False
-        check_within_reach(self.objective, self.study.entries)
+        proposal = repeat_study(method, task, self.study, self._known)
+        within_reach = check_within_reach(self.objective, self.study)
         while not self._reached(stop_at, finals):
             proposal = proposal or Proposal.of_number(
                 len(self.study.entries), method, task, self._known
@@ -213,9 +213,7 @@ class Search(TaskOptions):
                 slopes=part.slopes,
             )
             proposal.take(found.entry(streams), self.study)
-            if not within_reach and part.size == 1:
-                check_within_reach(self.objective, self.study.entries)
-                within_reach = True
+            within_reach = within_reach or check_within_reach(self.objective, self.study)
             if len(self.study.entries) == 1 and (remark := task.target.remark(found.loss)):
                 print(remark, file=sys.stderr)
             self._progress.why_regrown = found.why_regrown

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 import torchfilm as tf
-from design.entries import Entry
 from design.growing import FinishedColonies
 from design.objective import Objective
+from design.study import Study
 from design.targets.base import OUTSIDE, Target
 from torchfilm import checks
 
@@ -39,22 +39,23 @@ def trivial_losses(target: Target, finished: Iterable[FinishedColonies]) -> dict
     return answers
 
 
-def check_within_reach(objective: Objective, entries: Iterable[Entry]) -> None:
+def check_within_reach(objective: Objective, study: Study) -> bool:
     """Raise InputError where no colony of full size reaches the target's pattern, so that all
     designs have the same loss. It looks at the first design that grew; where growth depends on the
-    design, others may reach farther, and nothing is said."""
+    design, others may reach farther, and nothing is said. Returns whether there was a batch of full
+    size to look at."""
     task = objective.task
     structural = any(p.structural for p in task.space.parameters)
-    entry = next((e for e in entries if e.size == 1), None)
+    entry = next((e for e in study.entries if e.size == 1), None)
     if entry is None or structural or task.tried.why_regrown:
-        return
+        return entry is not None
     failed = {row for row, _ in entry.reasons}
     grew = [k for k in range(len(entry.points)) if k not in failed]
     if not grew or np.ptp(entry.losses[grew]) > 1e-9:
-        return
+        return True
     states = [part.state for part in objective.colonies(entry.points[grew[0]])]
     if not states or any(bool(task.target.reaches(state).any()) for state in states):
-        return
+        return True
     cells = max(int(state.counts.max()) for state in states)
     reach = max(float(state.position.norm(dim=1).max()) for state in states)
     raise checks.InputError(

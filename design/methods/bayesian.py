@@ -40,9 +40,9 @@ class Bayesian(AskTell):
     first: int | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "batch", checks.integer("Bayesian.batch", self.batch, least=1))
+        self.batch = checks.integer("Bayesian.batch", self.batch, least=1)
         if self.first is not None:
-            object.__setattr__(self, "first", checks.integer("Bayesian.first", self.first, least=2))
+            self.first = checks.integer("Bayesian.first", self.first, least=2)
         if find_spec("botorch") is None:
             raise checks.InputError(
                 f"Bayesian needs the package botorch: {checks.install('bayes')}."

@@ -51,9 +51,7 @@ class CMAES(AskTell):
 
     def __post_init__(self) -> None:
         if self.population is not None:
-            object.__setattr__(
-                self, "population", checks.integer("CMAES.population", self.population, least=4)
-            )
+            self.population = checks.integer("CMAES.population", self.population, least=4)
         checks.number("CMAES.sigma", self.sigma, above=0.0, most=1.0)
         for name in ("restarts", "noisy"):
             checks.choice(f"CMAES.{name}", getattr(self, name), (True, False))

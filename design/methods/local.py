@@ -158,11 +158,9 @@ class Local(AskTell):
     first: int | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "starts", checks.integer("Local.starts", self.starts, least=1))
+        self.starts = checks.integer("Local.starts", self.starts, least=1)
         if self.first is not None:
-            object.__setattr__(
-                self, "first", checks.integer("Local.first", self.first, least=self.starts)
-            )
+            self.first = checks.integer("Local.first", self.first, least=self.starts)
 
     def _begin(self) -> None:
         if None not in self._started().levels:

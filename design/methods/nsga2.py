@@ -31,9 +31,7 @@ class NSGA2(AskTell):
     several = True  # goals, not one loss
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "population", checks.integer("NSGA2.population", self.population, least=4)
-        )
+        self.population = checks.integer("NSGA2.population", self.population, least=4)
         if find_spec("pymoo") is None:
             raise checks.InputError(f"NSGA2 needs the package pymoo: {checks.install('pareto')}.")
 

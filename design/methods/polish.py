@@ -39,8 +39,8 @@ class Polish(AskTell):
             raise checks.input_error("Polish.inner", self.inner, "a method, such as Racing()")
         if getattr(self.inner, "several", False):
             raise checks.input_error("Polish.inner", self.inner, "a method for one target")
-        object.__setattr__(self, "after", checks.integer("Polish.after", self.after, least=1))
-        object.__setattr__(self, "starts", checks.integer("Polish.starts", self.starts, least=1))
+        self.after = checks.integer("Polish.after", self.after, least=1)
+        self.starts = checks.integer("Polish.starts", self.starts, least=1)
 
     def _begin(self) -> None:
         self._inner.start(self._started(), self._seed, self._replicates)

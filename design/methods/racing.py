@@ -72,9 +72,9 @@ class Racing(AskTell):
                 "two or more rising shares above 0, the last of them 1, such as (0.25, 1)",
             )
         checks.number("Racing.keep", self.keep, least=0.01, most=0.99)
-        object.__setattr__(self, "small", checks.integer("Racing.small", self.small, least=1))
+        self.small = checks.integer("Racing.small", self.small, least=1)
         checks.number("Racing.agree", self.agree, least=-1.0, most=1.0)
-        object.__setattr__(self, "first", checks.integer("Racing.first", self.first, least=2))
+        self.first = checks.integer("Racing.first", self.first, least=2)
 
     def _begin(self) -> None:
         self._source.start(self._started(), self._seed, self._replicates)

@@ -21,7 +21,7 @@ class Sobol(AskTell):
     batch: int = 64
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "batch", checks.integer("Sobol.batch", self.batch, least=1))
+        self.batch = checks.integer("Sobol.batch", self.batch, least=1)
 
     @property
     def wanted(self) -> int:
