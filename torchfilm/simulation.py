@@ -165,8 +165,9 @@ def _observe(observe: Observer, state: State) -> None:
 
 
 def _ended(last: float, cells: int | None, state: State) -> bool:
-    enough = cells is not None and bool(((state.counts >= cells) | (state.counts == 0)).all())
-    return state.step >= last or enough
+    if state.step >= last or cells is None or 0 < state.cells < cells:
+        return state.step >= last
+    return bool(((state.counts >= cells) | (state.counts == 0)).all())
 
 
 def _run(step, state, stop, first, monitors, seen) -> Generator[State, None, None]:

@@ -254,11 +254,10 @@ class State:
 
     def with_fields(self, **values: Tensor) -> State:
         """A state with some of its fields replaced; each must have been declared."""
-        unknown = set(values) - set(self.declared)
-        if unknown:
+        if not values.keys() <= self.declared.keys():
             raise checks.input_error(
                 "field",
-                sorted(unknown),
+                sorted(values.keys() - self.declared.keys()),
                 f"declared; known are {', '.join(self.declared) or 'none'}",
             )
         row_checks.check_tensors(values)

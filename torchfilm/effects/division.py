@@ -15,7 +15,7 @@ from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
 from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.numba_calls import kernels_loaded
+from torchfilm.tools.numba_calls import as_array, kernels_loaded
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, places, reads_are_free
 from torchfilm.tools.tangents import tracked
@@ -214,13 +214,14 @@ class Division(Effect):
 
     def due(self, state: State) -> Tensor:
         """Which cells divide now, (N,) bool."""
-        due = state.divide_flag
-        if self.criterion == "length":
-            return due | (state.length >= state.division_threshold)
-        if self.criterion == "volume":
-            return due | (state.volume >= state.division_threshold)
-        if self.criterion == "added":
-            return due | (state.length - state.birth_length >= state.division_threshold)
+        fields, criterion = state.fields, self.criterion
+        due = fields["divide_flag"]
+        if criterion == "length":
+            return due | (state.length >= fields["division_threshold"])
+        if criterion == "volume":
+            return due | (state.volume >= fields["division_threshold"])
+        if criterion == "added":
+            return due | (state.length - fields["birth_length"] >= fields["division_threshold"])
         return due
 
     def step(self, state: State, dt: float, values: Values) -> State:
@@ -307,7 +308,7 @@ def _placed(
         sd, draws = (share[:0], state.axis[:0]) if noise is None else noise
         given = (rows, daughters, state.length, state.radius, state.axis, share, draws, sd)
         changed = new.length, new.axis, new.position  # which no other state has
-        place_daughters(*(x.detach().contiguous().numpy() for x in (*given, *changed)))
+        place_daughters(*(as_array(x, x.dtype) for x in (*given, *changed)))
         return new
     length, radius, axis = (x.index_select(0, rows) for x in of_cells[:3])
     rest = length - 2 * radius
@@ -337,7 +338,7 @@ def _split(state: State, due: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str,
     if kernels_loaded(due):
         from torchfilm.kernels.divisions import split
 
-        found = split(*(x.contiguous().numpy() for x in given))
+        found = split(*(as_array(x, x.dtype) for x in given))
         rows, daughters, source, *ids = (torch.from_numpy(x) for x in found)
         return rows, daughters, source, dict(zip(NAMES, ids, strict=True))
     copies = due.long() + 1

@@ -37,6 +37,7 @@ from torchfilm.kernels.rows import (
     wall_rows,
 )
 from torchfilm.kernels.scheme import NOT_FINITE
+from torchfilm.kernels.team import next_of
 
 # Places in the settings. OVERLAP, TOLERANCE: below 0 where they are not given.
 OVERLAP, TOLERANCE, MOST_PASSES, COARSE_PASSES, LIMIT, SOFT = range(6)
@@ -232,12 +233,15 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, alpha, st
 
 
 @kernel(entry=True)
-def step_colonies(which, begin, dt, longest, cells, drags, alphas, walls, settings, out, reports,
-                  dof):  # fmt: skip
+def step_colonies(taken, which, begin, dt, longest, cells, drags, alphas, walls, settings, out,
+                  reports, dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments."""
     soft, limit, x, radius = settings[SOFT] > 0, int(settings[LIMIT]), cells[0], cells[4]
     kinds, places, sizes, _, is_soft = walls
-    for b in which:
+    while True:
+        b = next_of(which, taken)
+        if b < 0:
+            return
         first, end, report = begin[b], begin[b + 1], reports[b]
         if first == end:
             continue

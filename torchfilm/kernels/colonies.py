@@ -2,7 +2,8 @@
 
 The arguments of both kinds of contacts:
 
-which: (K,) int64, the colonies to step. begin: (B + 1,) int64; cells of colony b are begin[b] …
+taken: (1,) int64, how many of `which` threads have taken. which: (K,) int64, the colonies to step,
+each by the thread that takes it. begin: (B + 1,) int64; cells of colony b are begin[b] …
 begin[b + 1] − 1. dt: h. longest: µm that a cell may grow in a sub-step. cells: position (N, d)
 float64, axis (N, d), length (N,) after growth, elongation (N,), radius (N,), the last move (N, D),
 collapsed steps (N,) int64, α of the last step (N,) and compression (N,), or (0,) of bilateral

@@ -51,6 +51,7 @@ from torchfilm.kernels.scheme import (
     TOO_DEEP,
 )
 from torchfilm.kernels.solve import minimise
+from torchfilm.kernels.team import next_of
 
 # Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
 # of contacts, radii.
@@ -315,13 +316,16 @@ def _following(e, soft, hardness, target, softest):
 
 
 @kernel(entry=True)
-def step_colonies(team, which, begin, dt, longest, cells, drags, alphas, walls, settings, out,
+def step_colonies(team, taken, which, begin, dt, longest, cells, drags, alphas, walls, settings, out,
                   reports, dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments.
     team: a board of threads that assist, or (0,)."""
     x, radius, contact_alpha = cells[0], cells[4], cells[7]
     kinds, places, sizes, _, is_soft = walls
-    for b in which:
+    while True:
+        b = next_of(which, taken)
+        if b < 0:
+            return
         first, end, report = begin[b], begin[b + 1], reports[b]
         if first == end:
             continue

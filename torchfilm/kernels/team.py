@@ -109,6 +109,18 @@ def exchange(typing, board, k, old, new):
     return types.boolean(board, k, old, new), emit
 
 
+@kernel
+def next_of(which, taken):
+    """The first of the numbers `which` that no thread has taken, or −1. taken: (1,) int64, how many
+    have been."""
+    while True:
+        k = look(taken, 0)
+        if k >= which.shape[0]:
+            return -1
+        if exchange(taken, 0, k, k + 1):
+            return which[k]
+
+
 @intrinsic
 def _pointer(typing, address, like):
     """A pointer to numbers of the type `like`, or of that of the numbers in it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 from contextlib import nullcontext
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -23,22 +23,18 @@ WORTH_THREADS = 300
 # two threads gained nothing, from 5,000 to 10,000 a tenth, and with 10,000 in free growth a third.
 CELLS_A_THREAD = 4000
 
-_called: set[str] = set()  # names of kernels that this process has called
+# which kernels this process has called: type of settings, dimension, type of numbers
+_called: set[tuple[type, int, torch.dtype]] = set()
 
 
 @torch.no_grad()
 def step(given: MechanicsInput) -> MechanicsResult:
     """As `torch_step.step`."""
     from torchfilm.kernels import colonies as kernels
-    from torchfilm.kernels.compiling import first_call
 
     settings, dtype = given.settings, given.radius.dtype
-    name = f"{settings.dim}-D, {str(dtype).removeprefix('torch.')}"
-    if isinstance(settings, ContactSettings):
-        name = f"{name}, bilateral"
     step_colonies, numbers = _kernel_of(settings)
-    counts = given.groups.counts.numpy()
-    begin = np.concatenate(([0], np.cumsum(counts)))
+    begin, counts = given.groups.begin.numpy(), given.groups.counts.numpy()
     position = as_array(given.position, torch.float64)
     collapsed = as_array(given.collapsed, torch.int64)
     axis, length, elongation, radius, move = (
@@ -61,15 +57,15 @@ def step(given: MechanicsInput) -> MechanicsResult:
         begin, float(given.dt), float(given.longest), cells, drags, _alphas(given, dtype),
         _walls(given), numbers, out, reports, degrees,
     )  # fmt: skip
-    new = name not in _called
-    with first_call(name, f"contacts ({name}), 20 s to a minute") if new else nullcontext():
+    kind = type(settings), settings.dim, dtype
+    with nullcontext() if kind in _called else _first_call(*kind):
         every = np.arange(counts.size)  # how work is shared does not change the result
         if isinstance(settings, OneSidedSettings):
-            kind = in_numpy(dtype), len(degrees)
-            _call_by_teams(step_colonies, kind, every, counts, arguments)
+            of_rows = in_numpy(dtype), len(degrees)
+            _call_by_teams(step_colonies, of_rows, every, counts, arguments)
         else:
             _call(step_colonies, every, counts, arguments)
-    _called.add(name)
+    _called.add(kind)
     residual = torch.from_numpy(reports[:, kernels.ERROR].copy())
     reports[:, kernels.ERROR] = 0  # may be no number; the others are integers
     whole = torch.from_numpy(reports.T.astype(np.int64)).unbind()
@@ -83,6 +79,15 @@ def step(given: MechanicsInput) -> MechanicsResult:
             whole[kernels.CLIPPED], whole[kernels.DEEPLY],
         ), whole[kernels.SUBSTEPS],
     )  # fmt: skip
+
+
+def _first_call(settings: type, dim: int, dtype: torch.dtype):
+    """Says that a kernel is compiled, unless it was kept."""
+    from torchfilm.kernels.compiling import first_call
+
+    name = f"{dim}-D, {str(dtype).removeprefix('torch.')}"
+    name += ", bilateral" if settings is ContactSettings else ""
+    return first_call(name, f"contacts ({name}), 20 s to a minute")
 
 
 def _array_or_none(value: Tensor | None, dtype: torch.dtype) -> np.ndarray:
@@ -101,6 +106,7 @@ def _alphas(given: MechanicsInput, dtype: torch.dtype) -> tuple[int, np.ndarray]
     return GIVEN if given.alpha is not None else NOT_GIVEN, _array_or_none(given.alpha, dtype)
 
 
+@cache
 def _kernel_of(settings: OneSidedSettings | ContactSettings):
     """The kernel of this kind of contacts, and its settings as numbers."""
     overlap = -1.0 if settings.overlap is None else settings.overlap
@@ -122,22 +128,17 @@ def _kernel_of(settings: OneSidedSettings | ContactSettings):
 
 def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> None:
     """Call the kernel for the colonies `which`, shared among threads, of which this is one."""
-    threads = min(available(), which.size)
+    threads, taken = min(available(), which.size), np.zeros(1, np.int64)
     if threads < 2 or counts[which].sum() < WORTH_THREADS:
-        kernel(which, *arguments)
+        kernel(taken, which, *arguments)
         return
-    # the largest first, each to the thread with the least work
-    work = [0] * threads
-    shares: list[list[int]] = [[] for _ in range(threads)]
-    for colony in which[np.argsort(-counts[which], kind="stable")].tolist():
-        least = work.index(min(work))
-        work[least] += int(counts[colony])
-        shares[least].append(colony)
-    own, *others = [np.array(share, np.int64) for share in shares]
-    calls = [submit(kernel, share, *arguments) for share in others]
-    kernel(own, *arguments)
+    # the largest first; a thread that wakes late finds less to do, or nothing
+    which = which[np.argsort(-counts[which], kind="stable")]
+    calls = [submit(kernel, taken, which, *arguments) for _ in range(threads - 1)]
+    kernel(taken, which, *arguments)
     for call in calls:
-        call.result()
+        if not call.cancel():
+            call.result()
 
 
 def _call_by_teams(
@@ -177,7 +178,7 @@ def _call_by_team(
     try:
         for _ in range(threads - 1):
             calls.append(submit(assist))
-        kernel(board, np.array([colony]), *arguments)
+        kernel(board, np.zeros(1, np.int64), np.array([colony]), *arguments)
     finally:
         board[OFFER] = OVER
         for call in calls:
@@ -191,6 +192,8 @@ def _walls(given: MechanicsInput) -> tuple[np.ndarray, ...]:
     from torchfilm.kernels import rows
 
     surfaces, colonies = given.surfaces, given.groups.size
+    if not surfaces:
+        return _no_walls(colonies)
     kinds = np.zeros(len(surfaces), np.int64)
     places = np.zeros((len(surfaces), colonies, 3))
     sizes = np.zeros((len(surfaces), colonies))
@@ -210,6 +213,14 @@ def _walls(given: MechanicsInput) -> tuple[np.ndarray, ...]:
         if value is not None:
             roots[k] = value.detach().numpy()
     return kinds, places, sizes, roots, soft
+
+
+@cache
+def _no_walls(colonies: int) -> tuple[np.ndarray, ...]:
+    """As `_walls`, where there are none."""
+    none = np.zeros(0, np.int64)
+    places, sizes, roots = np.zeros((0, colonies, 3)), np.zeros((0, colonies)), np.ones((0, 0))
+    return none, places, sizes, roots, none.astype(np.uint8)
 
 
 def _of_colonies(given: float | Tensor, ids: Tensor):

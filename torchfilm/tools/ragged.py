@@ -89,7 +89,19 @@ class Groups:
     @cached_property
     def counts(self) -> Tensor:
         """(size,) int64, rows in each group."""
-        return self.order[0].diff().long()
+        begin = self.begin
+        if begin.device.type == "cpu":  # torch takes four times as long, in each step
+            return torch.from_numpy(np.diff(begin.numpy()))
+        return begin.diff()
+
+    @cached_property
+    def begin(self) -> Tensor:
+        """Where each group begins among the rows sorted by group, and the end of the last, (size +
+        1,) int64."""
+        if self.ordered and self.owner.device.type == "cpu":
+            begin = np.searchsorted(self.owner.numpy(), np.arange(self.size + 1))
+            return torch.from_numpy(begin)
+        return self.order[0].long()
 
     @cached_property
     def order(self) -> tuple[Tensor, Tensor]:

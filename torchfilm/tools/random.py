@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 import zlib
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.tools.numba_calls import kernels_loaded
+from torchfilm.tools.numba_calls import as_array, kernels_loaded
 
 MASK = 0xFFFFFFFF
 MULTIPLIER = (0xD2511F53, 0xCD9E8D57)
@@ -55,6 +56,7 @@ def words(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> Te
     return torch.stack(philox((*of_cells, torch.full_like(uid, step & MASK)), key))
 
 
+@lru_cache(maxsize=1000)
 def _key(seed: int, purpose: str) -> tuple[int, int]:
     mixed = (seed ^ (purpose_code(purpose) << 32)) & (2**64 - 1)
     return mixed & MASK, (mixed >> 32) & MASK
@@ -62,8 +64,10 @@ def _key(seed: int, purpose: str) -> tuple[int, int]:
 
 def _arrays(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> list:
     """The arguments of the kernels."""
-    given = [x.expand(uid.shape).contiguous().numpy() for x in (uid, stream)]
-    return [*given, *(np.uint64(x) for x in (step & MASK, *_key(seed, purpose)))]
+    if stream.shape != uid.shape:
+        stream = stream.expand(uid.shape)
+    given = [as_array(x, torch.int64) for x in (uid, stream)]
+    return [*given, *map(np.uint64, (step & MASK, *_key(seed, purpose)))]
 
 
 def uniform(

@@ -20,6 +20,8 @@ def reads_are_free(device: torch.device) -> bool:
 
 def numbers(*values: Tensor) -> list[int]:
     """Flags or whole numbers (), by one read."""
+    if all(reads_are_free(value.device) for value in values):
+        return [int(value) for value in values]
     return torch.stack([value.long() for value in values]).tolist()
 
 
