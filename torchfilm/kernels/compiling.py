@@ -21,6 +21,7 @@ except ImportError:  # not on Windows
 
 import llvmlite.binding as llvm
 import numba
+import numpy as np
 from numba.core.registry import CPUDispatcher
 
 config: Any = numba.config
@@ -167,6 +168,11 @@ def _kept_in_folder() -> Iterator[bool]:
         yield FOLDER is not None
     finally:
         config.CACHE_DIR = before
+
+
+# An index without a sign. Numba asks each other one whether it counts from the end of the array,
+# which takes up to half of the time of a short loop. To be used where indices come from arrays.
+index: Any = np.uint64
 
 
 def kernel(function=None, *, entry: bool = False, any_order: bool = False, inline: bool = False):

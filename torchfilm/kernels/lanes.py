@@ -112,6 +112,22 @@ def add_scaled(typing, a, i, t, b, j, dof):
     return types.void(a, i, t, b, j, dof), emit
 
 
+@intrinsic
+def copy_row(typing, a, i, b, j, dof):
+    """a[i] = b[j]."""
+    _check(a, b)
+
+    def emit(context, builder, signature, given):
+        kinds = signature.args
+        left = _Rows(context, builder, kinds[0], given[0], len(dof))
+        right = _Rows(context, builder, kinds[2], given[2], len(dof))
+        row = right.load(long_of(context, builder, signature, given, 3))
+        left.store(long_of(context, builder, signature, given, 1), row)
+        return context.get_dummy_value()
+
+    return types.void(a, i, b, j, dof), emit
+
+
 def _joined(builder, low, high):
     """One vector of two."""
     count = low.type.count
@@ -162,6 +178,30 @@ def keep_greatest(typing, most, z, i, dof):
         return context.get_dummy_value()
 
     return types.void(most, z, i, dof), emit
+
+
+@intrinsic
+def boxes_meet(typing, boxes, i, j, dof):
+    """Whether two boxes have a point in common. A row has the low ends of a box along each axis,
+    then the high ones times −1; of 8 columns, the last of each four stay 0."""
+    _check(boxes)
+
+    def emit(context, builder, signature, given):
+        width = len(dof)
+        rows = _Rows(context, builder, signature.args[0], given[0], width)
+        one = rows.load(long_of(context, builder, signature, given, 1))
+        other = rows.load(long_of(context, builder, signature, given, 2))
+        # low ends of each against high ends of the other
+        places = [*range(width // 2, width), *range(width // 2)]
+        swapped = builder.shuffle_vector(
+            other, other, ir.Constant(ir.VectorType(INDEX, width), places)
+        )
+        sums = builder.fadd(one, swapped)
+        below = builder.fcmp_ordered("<=", sums, ir.Constant(sums.type, [0.0] * width))
+        bits = builder.bitcast(below, ir.IntType(width))
+        return builder.icmp_unsigned("==", bits, ir.Constant(bits.type, 2**width - 1))
+
+    return types.boolean(boxes, i, j, dof), emit
 
 
 @intrinsic

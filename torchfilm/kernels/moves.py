@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.capsules import closest_points
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import index, kernel
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import MAX_TURN
 
@@ -138,7 +138,7 @@ def any_deeper(x, axis, half, radius, y, way, found, deep, dof):
     first, second, keep, _, gap = found
     d = 2 if len(dof) == 4 else 3
     for k in range(keep.shape[0]):
-        i, j = first[keep[k]], second[keep[k]]
+        i, j = index(first[index(keep[k])]), index(second[index(keep[k])])
         apart, room = 0.0, gap[k] + deep - way[i] - way[j]
         for c in range(d):
             apart += (y[i, c] - y[j, c]) ** 2

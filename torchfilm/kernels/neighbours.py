@@ -6,37 +6,42 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import index, kernel
+from torchfilm.kernels.lanes import boxes_meet, copy_row
+
+# By how much boxes are enlarged, of their distance from the colony's corner: as single numbers they
+# are rounded by less.
+ROUNDED = 4e-7
 
 
 @kernel
 def _boxes(x, axis, half, radius, margin, box, low, high, dof):
-    """Each cell's box (n, 2 d), from the colony's corner, with half of margin around it, and the
-    first and last bin of it along each axis; returns the number of bins."""
-    n, d = x.shape[0], 2 if len(dof) == 4 else 3
-    size = 0.0
+    """Each cell's box (n, len(dof)), from the colony's corner, with half of margin around it, as
+    `boxes_meet` takes it, and the first and last bin of it along each axis; returns the number of
+    bins."""
+    n, d, other = x.shape[0], 2 if len(dof) == 4 else 3, len(dof) // 2
+    size, ends = 0.0, np.empty((n, d))
     least = np.full(d, np.inf)
     for i in range(n):
         for k in range(d):
-            e = abs(axis[i, k]) * half[i] + radius[i] + 0.5 * margin
+            ends[i, k] = e = abs(axis[i, k]) * half[i] + radius[i] + 0.5 * margin
             size += e
-            box[i, k], box[i, d + k] = x[i, k] - e, x[i, k] + e
-            least[k] = min(least[k], box[i, k])
+            least[k] = min(least[k], x[i, k] - e)
     width = 3.2 * size / (n * d)  # wider: fewer bins a cell, but more cells a bin
     top = np.zeros(3, np.int64)
     for i in range(n):
         for k in range(d):
-            box[i, k] -= least[k]
-            box[i, d + k] -= least[k]
-            low[i, k], high[i, k] = math.floor(box[i, k] / width), math.floor(box[i, d + k] / width)
+            start, end = x[i, k] - ends[i, k] - least[k], x[i, k] + ends[i, k] - least[k]
+            box[i, k], box[i, other + k] = start - ROUNDED * end, -end - ROUNDED * end
+            low[i, k], high[i, k] = math.floor(start / width), math.floor(end / width)
             top[k] = max(top[k], high[i, k] + 1)
     return top
 
 
 @kernel
-def _fill_table(low, high, top, slots):
+def _fill_table(low, high, top, slots, boxes, dof):
     """Members sorted by slot, and where each slot begins. Each has 8 times the number of its bin,
-    and a bit for each axis along which this is the first bin of its box."""
+    and a bit for each axis along which this is the first bin of its box; and its box."""
     n, d = low.shape
     rows, layers = top[0], top[0] * top[1]
     begin = np.zeros(slots + 1, np.int64)
@@ -45,6 +50,7 @@ def _fill_table(low, high, top, slots):
             for s in range(slots):
                 begin[s + 1] += begin[s]
             member, key = np.empty(begin[slots], np.int32), np.empty(begin[slots], np.int64)
+            box = np.empty((begin[slots], len(dof)), np.float32)
             fill = begin[:-1].copy()
         for i in range(n):
             z0, z1 = (low[i, 2], high[i, 2]) if d == 3 else (np.int64(0), np.int64(0))
@@ -52,14 +58,16 @@ def _fill_table(low, high, top, slots):
                 for by in range(low[i, 1], high[i, 1] + 1):
                     for bx in range(low[i, 0], high[i, 0] + 1):
                         own = bx + by * rows + bz * layers
-                        s = own & (slots - 1)
+                        s = index(own & (slots - 1))
                         if turn == 0:
-                            begin[s + 1] += 1
+                            begin[s + index(1)] += 1
                         else:
                             firsts = (bx == low[i, 0]) + 2 * (by == low[i, 1]) + 4 * (bz == z0)
-                            member[fill[s]], key[fill[s]] = i, 8 * own + firsts
+                            place = index(fill[s])
+                            member[place], key[place] = i, 8 * own + firsts
+                            copy_row(box, fill[s], boxes, i, dof)
                             fill[s] += 1
-    return begin, member, key
+    return begin, member, key, box
 
 
 @kernel
@@ -71,30 +79,44 @@ def near_pairs(x, axis, half, radius, margin, dof):
     """
     n, d = x.shape[0], 2 if len(dof) == 4 else 3
     low, high = np.empty((n, d), np.int64), np.empty((n, d), np.int64)
-    box = np.empty((n, 2 * d))
-    top = _boxes(x, axis, half, radius, margin, box, low, high, dof)
+    boxes = np.zeros((n, len(dof)), np.float32)
+    top = _boxes(x, axis, half, radius, margin, boxes, low, high, dof)
     slots = 16
     while slots < 2 * n:
         slots *= 2
-    begin, member, key = _fill_table(low, high, top, slots)
-    found, most = 0, 0
+    begin, member, key, box = _fill_table(low, high, top, slots, boxes, dof)
+    most = 0
     for s in range(slots):
         most = max(most, begin[s + 1] - begin[s])
     first, second = np.empty(8 * n + most, np.int32), np.empty(8 * n + most, np.int32)
-    for s in range(slots):
-        for p in range(begin[s], begin[s + 1]):
-            if found + most > first.shape[0]:
-                first, second = _longer(first), _longer(second)
-            i, own = np.uint64(member[p]), key[p]
-            for q in range(p + 1, begin[s + 1]):  # without branches: their outcome is not foreseen
-                j = np.uint64(member[q])
-                apart = ((own ^ key[q]) >> 3) | (((own | key[q]) & 7) ^ 7)
-                near = apart == 0
-                for k in range(d):
-                    near &= (box[i, k] <= box[j, d + k]) & (box[j, k] <= box[i, d + k])
-                first[found], second[found] = member[p], member[q]
-                found += near
+    table, slot, place, found = (begin, member, key, box), 0, 0, 0
+    while place < member.shape[0]:
+        if found + most > first.shape[0]:
+            first, second = _longer(first), _longer(second)
+        slot, place, found = _search(table, slot, place, found, most, first, second, dof)
     return _by_first(first[:found], second[:found], n)
+
+
+@kernel
+def _search(table, slot, place, found, most, first, second, dof):
+    """Puts pairs of the members from `place` on, in this slot and the next ones, after the first
+    `found`, as long as there is room for `most` more. Returns slot and place to go on from, and how
+    many pairs there are."""
+    begin, member, key, box = table
+    found, one, p = index(found), index(1), index(place)
+    room = index(first.shape[0] - most)
+    for s in range(slot, begin.shape[0] - 1):
+        end = index(begin[s + 1])
+        while p < end:
+            if found > room:
+                return s, np.int64(p), np.int64(found)
+            i, own = member[p], key[p]
+            for q in range(p + one, end):  # without branches: their outcome is not foreseen
+                apart = ((own ^ key[q]) >> 3) | (((own | key[q]) & 7) ^ 7)
+                first[found], second[found] = i, member[q]
+                found += index((apart == 0) & boxes_meet(box, np.int64(p), np.int64(q), dof))
+            p += one
+    return begin.shape[0] - 1, np.int64(p), np.int64(found)
 
 
 @kernel
@@ -111,14 +133,15 @@ def _by_first(first, second, n):
     m = first.shape[0]
     place = np.zeros(n + 1, np.int64)
     for k in range(m):
-        place[first[k] + 1] += 1
+        place[index(first[k]) + index(1)] += 1
     for i in range(n):
         place[i + 1] += place[i]
     one, other = np.empty(m, np.int32), np.empty(m, np.int32)
     for k in range(m):
-        p = place[first[k]]
+        i = index(first[k])
+        p = index(place[i])
         one[p], other[p] = first[k], second[k]
-        place[first[k]] += 1
+        place[i] += 1
     return one, other
 
 

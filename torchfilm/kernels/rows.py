@@ -18,7 +18,7 @@ from torchfilm.kernels.capsules import (
     squared_distance,
     squared_sine,
 )
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import index, kernel
 
 LINE_CONTACT_SINE = 0.4  # as in `physics.contacts`
 FLAT, INSIDE, OUTSIDE = 0, 1, 2
@@ -37,9 +37,9 @@ def near_contacts(x, axis, half, radius, first, second, margin, dof):
     """The pairs nearer than margin: their number, closest points and gap, µm."""
     m, d = first.shape[0], 2 if len(dof) == 4 else 3
     keep, points, gap = np.empty(m, np.int32), np.empty((m, 2)), np.empty(m)
-    found = 0
+    found = index(0)
     for k in range(m):
-        i, j = first[k], second[k]
+        i, j = index(first[k]), index(second[k])
         bz = x[j, 2] - x[i, 2] if d == 3 else 0.0
         az = axis[i, 2] if d == 3 else 0.0
         cz = axis[j, 2] if d == 3 else 0.0
@@ -51,7 +51,7 @@ def near_contacts(x, axis, half, radius, first, second, margin, dof):
         if d2 < (touching + margin) * (touching + margin):
             keep[found], points[found, 0], points[found, 1] = k, s, t
             gap[found] = math.sqrt(d2) - touching
-            found += 1
+            found += index(1)
     return keep[:found], points[:found], gap[:found]
 
 
@@ -131,8 +131,8 @@ def _put_pair(H, gaps, r, i, j, x, axis, half, radius, scale, s, t, end_a, end_b
         end_a = np.sign(nx * ax + ny * ay + nz * az)
     if half[j] <= 1e-9:
         end_b = -np.sign(nx * cx + ny * cy + nz * cz)
-    _put_half(H, 2 * r, i, weight, s, end_a, nx, ny, nz, axis, scale, dof)
-    _put_half(H, 2 * r + 1, j, -weight, t, end_b, nx, ny, nz, axis, scale, dof)
+    _put_half(H, index(2) * r, i, weight, s, end_a, nx, ny, nz, axis, scale, dof)
+    _put_half(H, index(2) * r + index(1), j, -weight, t, end_b, nx, ny, nz, axis, scale, dof)
     gaps[r] = weight * (distance - touching)
 
 
@@ -146,9 +146,9 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
     """
     first, second, keep, points, _ = found
     H, gaps, one, two, _ = rows
-    d, r = 2 if len(dof) == 4 else 3, walls
+    d, r = 2 if len(dof) == 4 else 3, index(walls)
     for k in range(keep.shape[0]):
-        i, j = first[keep[k]], second[keep[k]]
+        i, j = index(first[index(keep[k])]), index(second[index(keep[k])])
         s0, t0 = points[k, 0], points[k, 1]
         bx, by = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1]
         ax, ay, cx, cy = axis[i, 0], axis[i, 1], axis[j, 0], axis[j, 1]
@@ -174,7 +174,7 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
                 end_of(s0, ha), end_of(t0, hb), 1.0, dof,
             )  # fmt: skip
             one[r], two[r] = i, j
-            r += 1
+            r += index(1)
             continue
         share = min((high - low) / (0.5 * (ra + rb)), 1.0)
         swing = 0.5 * (high - low) * math.sqrt(sine2)
@@ -197,8 +197,8 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
                 end_b0 + slide * (sign * side * mark_b - end_b0), math.sqrt(0.5), dof,
             )  # fmt: skip
             one[r], two[r] = i, j
-            r += 1
-    return r
+            r += index(1)
+    return np.int64(r)
 
 
 @kernel(inline=True)
@@ -293,17 +293,19 @@ def rows_of_cells(one, two, rows, n):
     """The halves of each cell, in the order of rows: where each cell's begin, and the halves."""
     begin = np.zeros(n + 1, np.int64)
     for r in range(rows):
-        begin[one[r] + 1] += 1
+        begin[index(one[r]) + index(1)] += 1
         if two[r] >= 0:
-            begin[two[r] + 1] += 1
+            begin[index(two[r]) + index(1)] += 1
     for i in range(n):
         begin[i + 1] += begin[i]
     half = np.empty(begin[n], np.int32)
     fill = begin[:-1].copy()
     for r in range(rows):
-        half[fill[one[r]]] = 2 * r
-        fill[one[r]] += 1
+        i = index(one[r])
+        half[index(fill[i])] = 2 * r
+        fill[i] += 1
         if two[r] >= 0:
-            half[fill[two[r]]] = 2 * r + 1
-            fill[two[r]] += 1
+            j = index(two[r])
+            half[index(fill[j])] = 2 * r + 1
+            fill[j] += 1
     return begin, half

@@ -6,7 +6,7 @@ the share of a block of cells: see `team`.
 
 from __future__ import annotations
 
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import index, kernel
 from torchfilm.kernels.lanes import add_scaled, dot, dot_row, invert, put_product, put_squares
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import RAISED, ROUNDING
@@ -24,26 +24,28 @@ def times_rows(H, one, two, p, q, first, end, dof):
 @kernel
 def add_forces(H, one, two, of, v, out, dof):
     """out += Jᵀ v of the rows `of`."""
-    for r in of:
-        add_scaled(out, one[r], v[r], H, 2 * r, dof)
-        add_scaled(out, two[r], v[r], H, 2 * r + 1, dof)
+    for h in of:
+        r = index(h)
+        add_scaled(out, one[r], v[r], H, 2 * h, dof)
+        add_scaled(out, two[r], v[r], H, 2 * h + 1, dof)
 
 
 @kernel
 def add_own_forces(H, one, two, of, v, out, first, end, dof):
     """As `add_forces`, to the cells first … end − 1 alone."""
-    for r in of:
+    for h in of:
+        r = index(h)
         if one[r] >= first and one[r] < end:
-            add_scaled(out, one[r], v[r], H, 2 * r, dof)
+            add_scaled(out, one[r], v[r], H, 2 * h, dof)
         if two[r] >= first and two[r] < end:
-            add_scaled(out, two[r], v[r], H, 2 * r + 1, dof)
+            add_scaled(out, two[r], v[r], H, 2 * h + 1, dof)
 
 
 @kernel
 def add_product(H, one, two, on, p, out, dof):
     """out += Jᵀ J p of the rows `on`."""
     for r in on:
-        i, j, h = one[r], two[r], 2 * r
+        i, j, h = one[index(r)], two[index(r)], 2 * r
         t = dot_row(H, r, p, i, j, dof)
         add_scaled(out, i, t, H, h, dof)
         add_scaled(out, j, t, H, h + 1, dof)
@@ -53,7 +55,7 @@ def add_product(H, one, two, on, p, out, dof):
 def add_own_product(H, one, two, on, p, out, first, end, dof):
     """As `add_product`, to the cells first … end − 1 alone."""
     for r in on:
-        i, j, h = one[r], two[r], 2 * r
+        i, j, h = one[index(r)], two[index(r)], 2 * r
         t = dot_row(H, r, p, i, j, dof)
         if i >= first and i < end:
             add_scaled(out, i, t, H, h, dof)
@@ -235,7 +237,7 @@ def put_forces(e, pushed, v, one, two, act, stale, first, end):
         push = v[r] != 0
         if push != act[r]:
             act[r] = push
-            stale[one[r]] = stale[two[r]] = 1
+            stale[index(one[r])] = stale[index(two[r])] = 1
     for r in range(pushed.shape[0]):
         v[r] -= pushed[r]
 

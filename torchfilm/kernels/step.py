@@ -316,8 +316,8 @@ def _following(e, soft, hardness, target, softest):
 
 
 @kernel(entry=True)
-def step_colonies(team, taken, which, begin, dt, longest, cells, drags, alphas, walls, settings, out,
-                  reports, dof):  # fmt: skip
+def step_colonies(team, taken, which, begin, dt, longest, cells, drags, alphas, walls, settings,
+                  out, reports, dof):  # fmt: skip
     """Steps of the colonies `which`, each by itself: `kernels.colonies` describes the arguments.
     team: a board of threads that assist, or (0,)."""
     x, radius, contact_alpha = cells[0], cells[4], cells[7]
