@@ -108,9 +108,9 @@ class Best:
         return family.function(**family.fixed, **self.values)
 
     def save(self, path: str | Path) -> Path:
-        """Write the design as JSON, which `torchfilm run` and `load_design` take. Replaces an older
-        file."""
-        checked = checks.file_path("path", path)
+        """Write the design to a `.json` file, which `torchfilm run` and `load_design` take.
+        Replaces an older one."""
+        checked = checks.file_path("path", path, ".json")
         return write_design(checked, self, colonies=self.search.study.colonies)
 
     def plot(self, out: str | Path | None = None) -> tf.pictures.Picture:

@@ -15,6 +15,7 @@ import torchfilm as tf
 from design.parameters import Value, show_value
 from design.robustness_plots import draw_changes, draw_indices, draw_losses
 from design.sensitivity import Indices
+from torchfilm import checks
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,14 +147,15 @@ class Robustness:
         ]
 
     def save(self, path: str | Path) -> Path:
-        """Write all results as JSON, with null where there is no number. Replaces an older file."""
+        """Write all results to a `.json` file, with null where there is no number. Replaces an
+        older file."""
         saved = _plain(self) | {
             "mean": self.mean,
             "median": self.median,
             "high": self.high,
             "reached": self.reached,
         }
-        path = Path(path)
+        path = checks.file_path("path", path, ".json")
         path.write_text(json.dumps(saved, indent=1) + "\n")
         return path
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.state import Field, State
-from torchfilm.tools import checks
+from torchfilm.tools import checks, displays
 from torchfilm.tools.tangents import has_tangent
 from torchfilm.values import ByType, Distribution, PerColony, is_drawn, is_inherited
 
@@ -291,9 +291,10 @@ def check_length(name: str, given: Tensor, batch: BoundBatch) -> None:
     """Raise InputError where a tensor has not one value for each colony of the batch."""
     if given.dim() and given.shape[0] != batch.colonies:
         raise checks.InputError(
-            f"{name} has {given.shape[0]} values, but the batch has {batch.colonies} colonies: give"
-            " one number, or one for each colony (scene.bind(colonies=…), tf.simulate(…,"
-            " colonies=…), run --colonies)."
+            f"{name} has {given.shape[0]} values, but the batch has"
+            f" {displays.counted(batch.colonies, 'colony', 'colonies')}: give one number, or one"
+            " for each colony (scene.bind(colonies=…), tf.simulate(…, colonies=…), run"
+            " --colonies)."
         )
 
 

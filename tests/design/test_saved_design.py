@@ -184,3 +184,11 @@ def test_code_of_the_user_is_no_data(value):
 def test_bad_data_are_refused(data, message):
     with pytest.raises(tf.InputError, match=message):
         from_data(data)
+
+
+@pytest.mark.parametrize("name", ["best", "best.csv", "best.h5"])
+def test_a_design_is_saved_under_a_name_that_tells_its_format(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(tf.InputError, match=r"ends in '\.json'.*Such as 'best\.json'"):
+        found(Level(wanted=1.0)).save(name)
+    assert not list(tmp_path.iterdir())

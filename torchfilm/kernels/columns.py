@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import index, kernel
 from torchfilm.kernels.team import array_at
 
 # What a place says: the column's address, from one of its numbers to the next, their type, the
@@ -27,17 +27,17 @@ def _copy(first, last, rows, place, like, out):
     by, begin, step = place[STRIDE], place[BEGIN], place[STEP]
     x = array_at(place, ADDRESS, like, 1)
     if place[INDEX] != 0:
-        index = array_at(place, INDEX, np.int64, 1)
+        own = array_at(place, INDEX, np.int64, 1)
         for m in range(first, last):
-            out[begin + m * step] = x[index[rows[m]] * by]
+            out[index(begin + m * step)] = x[index(own[index(rows[m])] * by)]
         return
     if place[FACTOR] == 0:
         for m in range(first, last):
-            out[begin + m * step] = x[rows[m] * by]
+            out[index(begin + m * step)] = x[index(rows[m] * by)]
         return
     factor = array_at(place, FACTOR, like, 1)
     for m in range(first, last):
-        out[begin + m * step] = x[rows[m] * by] * factor[rows[m]]
+        out[index(begin + m * step)] = x[index(rows[m] * by)] * factor[index(rows[m])]
 
 
 @kernel(entry=True)
@@ -70,7 +70,7 @@ def store(first, last, rows, at, start, pool, thinner, diluted, signals, report,
     size, count = diluted.shape[0], signals.shape[0]
     number = species.dtype.type
     for m in range(first, last):
-        n = rows[m]
+        n = index(rows[m])
         for k in range(size):
             x = number(at[m, k])
             species[k, n] = x * thinner[n] if diluted[k] else x

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.compiling import index, kernel
 
 
 @kernel(inline=True)
@@ -34,7 +34,7 @@ def put_stencil(position, colony, origin, step, shape, first, used, periodic, sl
     corners, zero, one = node.shape[1], number(0), number(1)
     ux, uy, uz = used[0], used[1], used[2]
     for i in range(position.shape[0]):
-        b = colony[i]
+        b = index(colony[i])
         nx, ny, nz = shape[b, 0], shape[b, 1], shape[b, 2]
         x = (position[i, 0] - origin[b, 0]) / step[0]
         y = (position[i, 1] - origin[b, 1]) / step[1]
@@ -71,7 +71,7 @@ def _mask(i, node, weight, mask, outside, blocked):
     corners, best = node.shape[1], 0
     total = weight.dtype.type(0)
     for c in range(corners):
-        if not mask[node[i, c]]:
+        if not mask[index(node[i, c])]:
             weight[i, c] = 0
         total += weight[i, c]
     blocked[i] = total <= 0
@@ -90,10 +90,10 @@ def _mask(i, node, weight, mask, outside, blocked):
 def read(values, node, weight, out):
     """The concentration at each cell."""
     for i in range(node.shape[0]):
-        nearest = values[node[i, 0]] if weight[i, 0] > 0 else values.dtype.type(0)
+        nearest = values[index(node[i, 0])] if weight[i, 0] > 0 else values.dtype.type(0)
         found = nearest
         for c in range(1, node.shape[1]):
-            found += weight[i, c] * (values[node[i, c]] - nearest)
+            found += weight[i, c] * (values[index(node[i, c])] - nearest)
         out[i] = found
 
 
@@ -103,16 +103,16 @@ def pools(node, weight, volume, sums, out):
     0, and so again in the end."""
     for i in range(node.shape[0]):
         for c in range(node.shape[1]):
-            sums[node[i, c]] += weight[i, c]
+            sums[index(node[i, c])] += weight[i, c]
     for i in range(node.shape[0]):
         worst = weight.dtype.type(0)
         for c in range(node.shape[1]):
             if weight[i, c] > 0:
-                worst = max(worst, sums[node[i, c]])
+                worst = max(worst, sums[index(node[i, c])])
         out[i] = volume / (worst if worst > 0 else weight.dtype.type(1))
     for i in range(node.shape[0]):
         for c in range(node.shape[1]):
-            sums[node[i, c]] = 0
+            sums[index(node[i, c])] = 0
 
 
 @kernel(entry=True)
@@ -120,20 +120,20 @@ def write(out, amount, there, node, weight, volume, near_one, sums, seen):
     """Values after secretion and uptake, in place; there: what each cell reads. sums: (nodes, 2) of
     0, and so again in the end, for the part taken and what is given. seen: (N K,), for the voxels
     where cells are: nothing is done elsewhere."""
-    zero, one, count = out.dtype.type(0), out.dtype.type(1), 0
+    zero, one, count = out.dtype.type(0), out.dtype.type(1), index(0)
     for i in range(node.shape[0]):
         wanted, more = max(-amount[i], zero), max(amount[i], zero) / volume
         part = wanted / ((there[i] if there[i] > 0 else one) * volume)
         if wanted > 0 and there[i] <= 0:
             part = out.dtype.type(np.inf)
         for c in range(node.shape[1]):
-            k = node[i, c]
-            seen[count] = k  # noted without a branch, which would be hard to foresee
-            count += sums[k, 0] == 0 and sums[k, 1] == 0
+            k = index(node[i, c])
+            seen[count] = node[i, c]  # noted without a branch, which would be hard to foresee
+            count += index((sums[k, 0] == 0) & (sums[k, 1] == 0))
             sums[k, 0] += weight[i, c] * part
             sums[k, 1] += weight[i, c] * more
     for n in range(count):
-        k = seen[n]
+        k = index(seen[n])
         share, more = sums[k, 0], sums[k, 1]
         if share == 0 and more == 0:
             continue  # nothing is done, or it is done already
@@ -163,13 +163,13 @@ def write_moved(values, out, amount, turned, there, shift, node, weight, volume,
             part = values.dtype.type(np.inf) if wanted > 0 else wanted / content
         less /= content
         for c in range(node.shape[1]):
-            k, w = node[i, c], weight[i, c]
+            k, w = index(node[i, c]), weight[i, c]
             sums[k, 0] += w * part
             sums[k, 1] += w * less
             sums[k, 2] += w * more
     for i in range(node.shape[0]):
         for c in range(node.shape[1]):
-            k = node[i, c]
+            k = index(node[i, c])
             share, less, more = sums[k, 0], sums[k, 1], sums[k, 2]
             if share == 0 and less == 0 and more == 0:
                 continue

@@ -305,11 +305,15 @@ def vector(name: str, given: object, size: int | None = None) -> tuple[float, ..
     return out
 
 
-def file_path(name: str, given: object) -> Path:
-    """The path of a file, or InputError for what is no path."""
+def file_path(name: str, given: object, suffix: str = "") -> Path:
+    """The path of a file, or InputError for what is no path, or has another suffix than this."""
     if not isinstance(given, (str, os.PathLike)):
         raise input_error(name, given, "the path of a file")
-    return Path(given)
+    path = Path(given)
+    if suffix and path.suffix.lower() != suffix:
+        hint = f"Such as {str(path.with_suffix(suffix))!r}." if path.name else ""
+        raise input_error(name, given, f"the path of a file that ends in {suffix!r}", hint)
+    return path
 
 
 def device(given: str | torch.device) -> torch.device:
