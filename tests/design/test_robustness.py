@@ -355,5 +355,5 @@ def test_a_task_is_not_resized_to_nothing(spare, factor):
 def test_results_are_saved_under_a_name_that_tells_their_format(held, tmp_path):
     with pytest.raises(tf.InputError, match=r"path = .*held\.csv.*ends in '\.json'"):
         held.save(tmp_path / "held.csv")
-    with pytest.raises(tf.InputError, match="path = 3.*the path of a file"):
+    with pytest.raises(tf.InputError, match=r"path = 3.*the path of a file"):
         held.save(3)
