@@ -111,17 +111,23 @@ def test_rows_of_two_types_are_refused():
 
 @pytest.mark.parametrize("dim", (2, 3))
 @pytest.mark.parametrize("count", (1, 2, 40, 300))
-def test_near_pairs_are_those_whose_boxes_meet(dim, count):
-    """Against all pairs; lengths differ a hundredfold."""
+@pytest.mark.parametrize("apart", (0.0, 1e4, 1e6))
+def test_near_pairs_are_those_whose_boxes_meet(dim, count, apart):
+    """Against all pairs; lengths differ a hundredfold, and half of the cells are `apart` µm away.
+    None is missed or found twice; others nearly meet, to the share of the colony's size by which
+    boxes are enlarged."""
     rng = np.random.default_rng(count)
     x, axis, half, radius = crowd(rng, count, dim)
+    x[::2] += apart
     first, second = for_python(neighbours.near_pairs)(x, axis, half, radius, 0.3, DOF[dim])
     side = np.abs(axis) * half[:, None] + radius[:, None] + 0.15
-    away = np.abs(x[:, None] - x[None]) - side[:, None] - side[None]
-    wanted = np.argwhere(np.triu((away <= 0).all(2), 1))
-    assert (np.diff(first) >= 0).all()
-    order = np.lexsort((second, first))
-    np.testing.assert_array_equal(np.stack([first, second], 1)[order], wanted)
+    away = (np.abs(x[:, None] - x[None]) - side[:, None] - side[None]).max(2)
+    found = set(zip(first.tolist(), second.tolist(), strict=True))
+    assert (np.diff(first) >= 0).all() and (first < second).all() and len(found) == len(first)
+    assert found >= set(map(tuple, np.argwhere(np.triu(away <= 0, 1)).tolist()))
+    extent = np.ptp(x, axis=0).max() + 2 * side.max()
+    # each of the two ends that are compared is moved by this share, and rounded by less
+    assert away[first, second].max(initial=0.0) <= 3 * neighbours.ROUNDED * extent
 
 
 @pytest.mark.parametrize("dim", (2, 3))

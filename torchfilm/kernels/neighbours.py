@@ -72,7 +72,7 @@ def _fill_table(low, high, top, slots, boxes, dof):
 
 @kernel
 def near_pairs(x, axis, half, radius, margin, dof):
-    """Pairs (i < j) whose boxes come nearer than margin, each once, sorted by i.
+    """Pairs (i < j) whose boxes come nearer than margin, and a few more, each once, sorted by i.
 
     Cells of any size: a long cell lies in many bins. A pair is found in the first bin that both
     cover: along each axis it is the first of one of them.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 from contextlib import nullcontext
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torchfilm.tools.numba_calls import as_array, in_numpy
 from torchfilm.tools.threads import available, submit
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
-WORTH_THREADS = 300
+WORTH_THREADS = 150
 # A large colony is solved by a team of threads, each with this many cells or more. With 3,000 cells
 # two threads gained nothing, from 5,000 to 10,000 a tenth, and with 10,000 in free growth a third.
 CELLS_A_THREAD = 4000
@@ -106,7 +106,7 @@ def _alphas(given: MechanicsInput, dtype: torch.dtype) -> tuple[int, np.ndarray]
     return GIVEN if given.alpha is not None else NOT_GIVEN, _array_or_none(given.alpha, dtype)
 
 
-@cache
+@lru_cache(maxsize=100)
 def _kernel_of(settings: OneSidedSettings | ContactSettings):
     """The kernel of this kind of contacts, and its settings as numbers."""
     overlap = -1.0 if settings.overlap is None else settings.overlap
@@ -134,11 +134,14 @@ def _call(kernel, which: np.ndarray, counts: np.ndarray, arguments: tuple) -> No
         return
     # the largest first; a thread that wakes late finds less to do, or nothing
     which = which[np.argsort(-counts[which], kind="stable")]
-    calls = [submit(kernel, taken, which, *arguments) for _ in range(threads - 1)]
-    kernel(taken, which, *arguments)
-    for call in calls:
-        if not call.cancel():
-            call.result()
+    calls: list[Future] = []
+    try:
+        for _ in range(threads - 1):
+            calls.append(submit(kernel, taken, which, *arguments))
+        kernel(taken, which, *arguments)
+    finally:
+        taken[0] = which.size  # after an error, too: nobody takes another one
+        _wait(calls)
 
 
 def _call_by_teams(
@@ -181,9 +184,14 @@ def _call_by_team(
         kernel(board, np.zeros(1, np.int64), np.array([colony]), *arguments)
     finally:
         board[OFFER] = OVER
-        for call in calls:
-            if not call.cancel():
-                call.result()
+        _wait(calls)
+
+
+def _wait(calls: list[Future]) -> None:
+    """Wait for the calls that have begun; the others are left out."""
+    for call in calls:
+        if not call.cancel():
+            call.result()
 
 
 def _walls(given: MechanicsInput) -> tuple[np.ndarray, ...]:
