@@ -203,14 +203,12 @@ def _change(part: int, before: State, after: State) -> RecordedChange:
         )
     if len(after.births) > len(before.births):
         made = after.births[-1]
-        start = offsets(after.counts)[:-1]
+        start = after.groups.begin[:-1]
         owner = after.colony.index_select(0, made.first)
         first, second = (rows - start.index_select(0, owner) for rows in (made.first, made.second))
         births = (torch.bincount(owner, minlength=after.colonies), first, second)
     within = (
-        None
-        if source is None
-        else source - offsets(before.counts)[:-1].index_select(0, after.colony)
+        None if source is None else source - before.groups.begin[:-1].index_select(0, after.colony)
     )
     return RecordedChange(part, after.counts, after.next_uid, within, values, births)
 
@@ -333,7 +331,7 @@ class Replay(metaclass=checks.KnownKeywords):
         number, firsts, seconds = change.births
         begin = offsets(number)[:-1].index_select(0, place)
         mine, at = expand_ranges(begin, number.index_select(0, place))
-        start = offsets(state.counts)[:-1].index_select(0, mine)
+        start = state.groups.begin[:-1].index_select(0, mine)
         first, second = firsts.index_select(0, at) + start, seconds.index_select(0, at) + start
         daughters = torch.cat([first, second])
         parents = source.index_select(0, first)

@@ -165,8 +165,10 @@ def _observe(observe: Observer, state: State) -> None:
 
 
 def _ended(last: float, cells: int | None, state: State) -> bool:
-    if state.step >= last or cells is None or 0 < state.cells < cells:
-        return state.step >= last
+    if state.step >= last:
+        return True
+    if cells is None or 0 < state.cells < cells:  # known without a count for each colony
+        return False
     return bool(((state.counts >= cells) | (state.counts == 0)).all())
 
 

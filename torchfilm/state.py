@@ -341,7 +341,7 @@ class State:
         """Some colonies of the batch, by their places, in the order given. Each goes on as it would
         have in the whole."""
         places = row_checks.checked_places("colonies", colonies, self.colonies, self.device)
-        start = offsets(self.counts)
+        start = self.groups.begin
         counts = self.counts.index_select(0, places)
         owner = torch.repeat_interleave(torch.arange(places.numel(), device=self.device), counts)
         begin = offsets(counts)[:-1].index_select(0, owner)

@@ -361,7 +361,7 @@ def _new_ids(new: State, daughters: Tensor, parents: Tensor) -> tuple[Tensor, Te
     before = torch.cumsum(is_new, 0) - is_new
     # new cells in each colony; offsets gives those in the colonies before
     ends = torch.cat([before.new_zeros(1), before + is_new])
-    per_colony = ends.index_select(0, offsets(new.counts)).diff()
+    per_colony = ends.index_select(0, new.groups.begin).diff()
     base = new.next_uid - offsets(per_colony)[:-1]
     uid = torch.where(is_new > 0, base.index_select(0, new.colony) + before, new.uid)
     parent = new.parent.clone()

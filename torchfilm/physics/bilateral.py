@@ -10,13 +10,12 @@ from torchfilm.kernels.bilateral_scheme import CLOSE, DEEP, PENALTY
 from torchfilm.physics.contact_records import CellProperties, ContactReport, ContactSettings, Moved
 from torchfilm.physics.contact_step import contact_step
 from torchfilm.physics.step_records import StepInput, StepResult
-from torchfilm.tools.ragged import offsets
 
 
 def contact_steps(given: StepInput[ContactSettings]) -> StepResult:
     """Grow by given.growth and part what overlaps, in given.steps (B,) sub-steps."""
     groups, steps, settings = given.groups, given.steps, given.settings
-    first = offsets(groups.counts)[:-1].clamp(max=given.position.shape[0] - 1)
+    first = groups.begin[:-1].clamp(max=given.position.shape[0] - 1)
     reference = given.position.detach().index_select(0, first).index_select(0, groups.owner)
     alpha = given.alpha
     assert alpha is not None

@@ -38,7 +38,7 @@ from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, Co
 from torchfilm.physics.solve import warn_if_loose
 from torchfilm.physics.step_records import StepInput, StepResult
 from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
-from torchfilm.tools.ragged import marked, offsets
+from torchfilm.tools.ragged import marked
 from torchfilm.tools.reads import numbers, places
 from torchfilm.tools.vectors import safe_norm
 
@@ -116,7 +116,7 @@ class _OneStep:
         """Pairs of the cells `rows` nearer than the margin, in float64, and which of them are
         nearer to walls than that and their last move."""
         given, owner = self.given, self.groups.owner
-        first = offsets(self.groups.counts)[:-1].clamp(max=owner.numel() - 1)
+        first = self.groups.begin[:-1].clamp(max=owner.numel() - 1)
         start = given.position.detach().index_select(0, first)  # only for the size of numbers
         local, axis = at.position - start.index_select(0, owner), at.axis.double()
         length, radius = at.length.double(), given.radius.double()
