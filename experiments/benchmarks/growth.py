@@ -123,7 +123,7 @@ def backend_of(model, device: str) -> str:
 def product_over_copy(cells: int = 10000) -> dict[str, float]:
     """Returns the times of a product with JᵀJ and of a copy of its rows, s, best of 50, for a
     lattice of touching cells in the plane."""
-    from torchfilm.kernels import neighbours, rows, solve
+    from torchfilm.kernels import contacts, neighbours, solve
     from torchfilm.kernels.compiling import for_python
 
     side, dof = round(cells**0.5), (0,) * 4
@@ -133,13 +133,13 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     axis, half, radius = np.tile([1.0, 0.0], (n, 1)), np.full(n, 1.5), np.full(n, 0.5)
     scale = np.ones((n, 4))
     first, second = for_python(neighbours.near_pairs)(x, axis, half, radius, 0.3, dof)
-    contacts = for_python(rows.near_contacts)(x, axis, half, radius, first, second, 0.3, dof)
-    found = (first, second, *contacts)
-    room = 2 * len(contacts[0])
+    near = for_python(contacts.near_contacts)(x, axis, half, radius, first, second, 0.3, dof)
+    found = (first, second, *near)
+    room = 2 * len(near[0])
     H, gaps = np.empty((2 * room, 4), np.float32), np.empty(room, np.float32)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
     places = H, gaps, one, two, one
-    count = for_python(rows.pair_rows)(x, axis, half, radius, scale, found, 0, places, dof)
+    count = for_python(contacts.pair_rows)(x, axis, half, radius, scale, found, 0, places, dof)
     p, out = np.ones((n, 4), np.float32), np.zeros((n, 4), np.float32)
     on = np.arange(count, dtype=np.int32)
     H = H[: 2 * count].copy()

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import torchfilm as tf
-from torchfilm.kernels import colonies, functions, lanes, moves, neighbours, rows
+from torchfilm.kernels import colonies, contacts, functions, lanes, moves, neighbours
 from torchfilm.kernels.compiling import for_python
 from torchfilm.physics import substeps
 from torchfilm.physics.problem import BAD_DRAG, CONVERGED, NOT_FINITE, TOO_FAST
@@ -61,12 +61,11 @@ def of_rows(H, p, one, two, dof):
 
 
 @numba.njit
-def inverse_of_squares(H, halves, first, act, dof):
-    B = np.ones((len(dof), len(dof)))
-    lanes.put_squares(B, H, halves, first, halves.shape[0], act, dof)
-    before = B.copy()
-    lanes.invert(B, dof)
-    return before, B
+def inverse_of_squares(H, halves, first, act, alpha, floor, held, dof):
+    blocks = np.ones((2, len(dof), len(dof)), H.dtype)
+    last = halves.shape[0]
+    own = lanes.put_inverse(blocks, 1, H, halves, act, first, last, alpha, floor, held, dof)
+    return own, blocks
 
 
 @pytest.mark.parametrize("dim", (2, 3))
@@ -94,11 +93,17 @@ def test_whole_rows_as_vectors(dim, kind):
         atol=near,
     )  # fmt: skip
     halves, act = rng.permutation(40).astype(np.int32), (rng.random(20) < 0.7).astype(np.uint8)
-    square, inverse = inverse_of_squares(H, halves, 3, act, dof)
     wide = H[halves[3:]][act[halves[3:] // 2] == 1].astype(float)
-    np.testing.assert_allclose(square, wide.T @ wide, rtol=1e-12, atol=1e-12)
-    one = inverse[:degrees, :degrees] @ square[:degrees, :degrees]
-    np.testing.assert_allclose(one, np.eye(degrees), atol=1e-9)
+    square = (wide.T @ wide)[:degrees, :degrees]
+    square += np.diag(0.01 * square.diagonal() + 0.1)
+    for held in (False, True):
+        own, (other, inverse) = inverse_of_squares(H, halves, 3, act, 0.1, 0.01, held, dof)
+        np.testing.assert_allclose(own, square[-1, -1], rtol=1e-12)
+        free = degrees - held
+        wanted = np.zeros((width, width))
+        wanted[:free, :free] = np.linalg.inv(square[:free, :free])
+        np.testing.assert_allclose(inverse, wanted, rtol=near, atol=near * abs(wanted).max())
+        assert (other == 1).all()
 
 
 def test_rows_of_two_types_are_refused():
@@ -145,7 +150,7 @@ def test_no_cells_come_nearer_than_told(dim, spread, own):
     y[:, turns.stop] = 0.1 * own * rng.uniform(-1, 1, 60)
     margin, every = 100.0, np.array(list(itertools.combinations(range(60), 2)), np.int32)
     first, second = every.T.copy()
-    near_contacts = for_python(rows.near_contacts)
+    near_contacts = for_python(contacts.near_contacts)
     gaps = lambda: near_contacts(x, axis, half, radius, first, second, margin, dof)[2]
     before, length = gaps(), 2 * half
     scale, least = np.ones_like(y), np.zeros(60)

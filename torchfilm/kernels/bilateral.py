@@ -25,17 +25,10 @@ from torchfilm.kernels.colonies import (
     taken_out,
 )
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.contacts import near_contacts, pair_rows
 from torchfilm.kernels.moves import drags
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
-from torchfilm.kernels.rows import (
-    STIFF,
-    deeply_overlapping,
-    degrees,
-    near_contacts,
-    pair_rows,
-    rows_among,
-    wall_rows,
-)
+from torchfilm.kernels.rows import STIFF, deeply_overlapping, degrees, rows_among, wall_rows
 from torchfilm.kernels.scheme import NOT_FINITE
 from torchfilm.kernels.team import next_of
 

@@ -8,9 +8,10 @@ import math
 import numpy as np
 
 from torchfilm.kernels.bilateral_scheme import POINTS_ON_MOVE
+from torchfilm.kernels.capsules import clamp
 from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.moves import move_cells, rotate
-from torchfilm.kernels.rows import FLAT, OUTSIDE, clamp, degrees, wall_gap
+from torchfilm.kernels.rows import FLAT, OUTSIDE, degrees, wall_gap
 from torchfilm.kernels.scheme import MAX_TURN
 
 

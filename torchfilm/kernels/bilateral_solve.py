@@ -21,7 +21,7 @@ from torchfilm.kernels.bilateral_scheme import (
     STEEP,
 )
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.lanes import add_scaled, dot, keep_greatest
+from torchfilm.kernels.lanes import add_scaled, dot, keep_greatest, put_inverse
 from torchfilm.kernels.rows import degrees, rows_of_cells
 from torchfilm.kernels.scheme import CONVERGED, ITERATION_LIMIT, NOT_FINITE
 from torchfilm.kernels.solve import cg_step
@@ -29,7 +29,6 @@ from torchfilm.kernels.solve_parts import (
     add_forces,
     next_direction,
     precondition,
-    put_inverse,
     second_cells,
     times_rows,
 )
@@ -66,12 +65,14 @@ def _put_gradient(H, one, two, alpha, y, e, pushed, g, dof):
 def _hold_lengths(H, begin, halves, act, alpha, y, low, rigid, g, held, inverse, dof):
     """Hold the lengths of rigid cells, and those at their bound that are pushed further; invert
     the blocks of the cells where that has changed."""
-    end, B, floor = degrees(dof) - 1, np.empty((len(dof), len(dof))), _floor(y)
+    end, floor = degrees(dof) - 1, _floor(y)
     for i in range(y.shape[0]):
         hold = rigid[i] or (y[i, end] <= low[i] and g[i, end] > 0)
         if hold != held[i]:
             held[i] = hold
-            put_inverse(H, begin, halves, act, i, alpha[i], hold, inverse, B, floor, dof)
+            put_inverse(
+                inverse, i, H, halves, act, begin[i], begin[i + 1], alpha[i], floor, hold > 0, dof
+            )
 
 
 @kernel
@@ -184,12 +185,12 @@ def minimise(H, one, two, rows, gaps, pushed, alpha, low, rigid, y, tolerance, l
     n, end = y.shape[0], degrees(dof) - 1
     gaps, act, on = gaps[:rows], np.ones(rows, np.uint8), np.arange(rows).astype(np.int32)
     g, z, d, p = np.empty_like(y), np.empty_like(y), np.zeros_like(y), np.empty_like(y)
-    inverse, B = np.empty((n, len(dof), len(dof)), y.dtype), np.empty((len(dof), len(dof)))
+    inverse, floor = np.empty((n, len(dof), len(dof)), y.dtype), _floor(y)
     begin, halves = rows_of_cells(one, two, rows, n)
     one, two = one[:rows], second_cells(H, one, two, rows)
     held = np.zeros(n, np.uint8)
     for i in range(n):
-        put_inverse(H, begin, halves, act, i, alpha[i], False, inverse, B, _floor(y), dof)
+        put_inverse(inverse, i, H, halves, act, begin[i], begin[i + 1], alpha[i], floor, False, dof)
     _put_gradient(H, one, two, alpha, d, gaps, pushed, g, dof)
     precondition(inverse, g, z, 0, z.shape[0], dof)
     scale = _worst(z, dof)

@@ -1,14 +1,17 @@
-"""The closest points of two capsules, and the line along which nearly parallel ones touch."""
+"""The closest points of two capsules, and the line along which nearly parallel ones touch: of
+numbers, or of `vectors` of them."""
 
 from __future__ import annotations
 
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.vectors import where
 
 
 @kernel(inline=True)
 def clamp(x, half):
     """x, limited to −half … half."""
-    return min(max(x, -half), half)
+    x = where(x < -half, -half, x)
+    return where(x > half, half, x)
 
 
 @kernel(inline=True)
@@ -48,9 +51,7 @@ def closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b, dof):
     on_a = dot_of(bx, by, bz, ax, ay, az, dof)
     on_b = dot_of(bx, by, bz, cx, cy, cz, dof)
     sine2 = squared_sine(ax, ay, az, cx, cy, cz, dof)
-    s = 0.0
-    if sine2 >= 1e-12:
-        s = (on_a - cosine * on_b) / sine2
+    s = where(sine2 >= 1e-12, (on_a - cosine * on_b) / sine2, 0.0)
     s = clamp(s, half_a)
     t = clamp(cosine * s - on_b, half_b)
     s = clamp(cosine * t + on_a, half_a)
@@ -63,8 +64,8 @@ def closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b, dof):
             t1 = half_b if k == 2 else -half_b
             s1 = clamp(cosine * t1 + on_a, half_a)
         d2 = squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s1, t1, dof)
-        if d2 < best:
-            best, s, t = d2, s1, t1
+        nearer = d2 < best
+        best, s, t = where(nearer, d2, best), where(nearer, s1, s), where(nearer, t1, t)
     return s, t, best
 
 
@@ -72,14 +73,13 @@ def closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b, dof):
 def end_of(s, half):
     """+1 or −1 at an end of the centreline, else 0."""
     slack = 1e-6 * half + 1e-9
-    return (1.0 if s >= half - slack else 0.0) - (1.0 if s <= slack - half else 0.0)
+    return where(s >= half - slack, 1.0, 0.0) - where(s <= slack - half, 1.0, 0.0)
 
 
 @kernel(inline=True)
 def end_while_sliding(s, free, half, radius, slide):
     """`end_of` for a contact that may be a line, as in `physics.contacts`."""
-    if slide <= 0:
-        return end_of(s, half)
     missing = (abs(free) - half) / (slide * radius + 1e-9)
-    sign = 1.0 if free > 0 else (-1.0 if free < 0 else 0.0)
-    return sign * min(max(missing, 0.0), 1.0)
+    missing = where(missing < 0.0, 0.0, missing)
+    sign = where(free > 0, 1.0, where(free < 0, -1.0, 0.0))
+    return where(slide > 0, sign * where(missing > 1.0, 1.0, missing), end_of(s, half))

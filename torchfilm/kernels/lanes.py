@@ -226,62 +226,77 @@ def put_product(typing, z, i, blocks, g, dof):
     return types.void(z, i, blocks, g, dof), emit
 
 
+def _squares(context, builder, kinds, given, ends, width):
+    """The rows of the sum of H[h] H[h]ᵀ over halves whose rows act, in float64: see
+    `put_inverse`."""
+    rows = _Rows(context, builder, kinds[0], given[0], width)
+    which, acts = (context.make_array(kinds[k])(context, builder, given[k]) for k in (1, 2))
+    one = ir.Constant(ends[0].type, 1)
+    nothing = ir.Constant(ir.VectorType(ir.DoubleType(), width), [0.0] * width)
+    sums = [cgutils.alloca_once_value(builder, nothing) for _ in range(width)]
+    with cgutils.for_range_slice(builder, ends[0], ends[1], one) as (q, _):
+        h = builder.zext(builder.load(builder.gep(which.data, [q])), ends[0].type)
+        on = builder.load(builder.gep(acts.data, [builder.lshr(h, one)]))
+        x = rows.load(h)
+        x = x if x.type == nothing.type else builder.fpext(x, nothing.type)
+        # without a branch: its outcome is not foreseen
+        x = builder.select(builder.icmp_unsigned("!=", on, ir.Constant(on.type, 0)), x, nothing)
+        for k, total in enumerate(sums):
+            new = _multiply_add(builder, _spread(builder, x, k), x, builder.load(total))
+            builder.store(new, total)
+    return [builder.load(total) for total in sums]
+
+
+def _inverted(builder, B, degrees):
+    """The inverse of rows B, symmetric and positive in their degrees of freedom: Gauss and Jordan's
+    elimination, which needs no pivots there. A row and column of padding stay as they are."""
+    one, nothing = (ir.Constant(B[0].type.element, x) for x in (1.0, 0.0))
+    for k in range(degrees):
+        pivot = builder.fdiv(one, builder.extract_element(B[k], _lane(k)))
+        row = builder.insert_element(B[k], one, _lane(k))
+        B[k] = builder.fmul(row, filled(builder, row.type, pivot))
+        for m in range(degrees):
+            if m != k:
+                factor = _spread(builder, builder.fneg(B[m]), k)
+                rest = builder.insert_element(B[m], nothing, _lane(k))
+                B[m] = _multiply_add(builder, factor, B[k], rest)
+    return B
+
+
 @intrinsic
-def put_squares(typing, B, H, halves, first, last, act, dof):
-    """B = the sum of H[h] H[h]ᵀ over the halves[first … last − 1] whose rows act, for B (len(dof),
-    len(dof)) in float64."""
-    for array in (B, H, halves, act):
+def put_inverse(typing, inverse, i, H, halves, act, first, last, alpha, floor, held, dof):
+    """inverse[i] = (S + floor · diag(S) + α)⁻¹, worked out in float64, for S the sum of H[h] H[h]ᵀ
+    over the halves[first … last − 1] whose rows act. Where `held`, without the last degree of
+    freedom: its row and column are 0. Returns the entry of that degree before it is inverted."""
+    for array in (inverse, H, halves, act):
         _check(array)
 
     def emit(context, builder, signature, given):
+        # all in registers: what was stored in parts and is loaded as a whole has to be waited for
         kinds, width = signature.args, len(dof)
+        end = 3 if width == 4 else 6
+        ends = [long_of(context, builder, signature, given, k) for k in (5, 6)]
+        B = _squares(context, builder, kinds[2:5], given[2:5], ends, width)
+        number = lambda k: context.cast(builder, given[k], kinds[k], types.float64)
+        one, nothing = (ir.Constant(B[0].type.element, x) for x in (1.0, 0.0))
+        share, drag, hold = builder.fadd(one, number(8)), number(7), given[9]
+        for k in range(end + 1):
+            entry = builder.fmul(builder.extract_element(B[k], _lane(k)), share)
+            B[k] = builder.insert_element(B[k], builder.fadd(entry, drag), _lane(k))
+        own = builder.extract_element(B[end], _lane(end))
+        alone = ir.Constant(B[0].type, [float(k == end) for k in range(width)])
+        for k in range(end):
+            B[k] = builder.select(hold, builder.insert_element(B[k], nothing, _lane(end)), B[k])
+        B[end] = builder.select(hold, alone, B[end])
+        B = _inverted(builder, B, end + 1)
+        B[end] = builder.select(hold, ir.Constant(alone.type, [0.0] * width), B[end])
         out = _Rows(context, builder, kinds[0], given[0], width)
-        rows = _Rows(context, builder, kinds[1], given[1], width)
-        which, acts = (context.make_array(kinds[k])(context, builder, given[k]) for k in (2, 5))
-        ends = [long_of(context, builder, signature, given, k) for k in (3, 4)]
-        one = ir.Constant(ends[0].type, 1)
-        nothing = ir.Constant(out.vector, [0.0] * width)
-        sums = [cgutils.alloca_once_value(builder, nothing) for _ in range(width)]
-        with cgutils.for_range_slice(builder, ends[0], ends[1], one) as (q, _):
-            h = builder.zext(builder.load(builder.gep(which.data, [q])), ends[0].type)
-            on = builder.load(builder.gep(acts.data, [builder.lshr(h, one)]))
-            with builder.if_then(builder.icmp_unsigned("!=", on, ir.Constant(on.type, 0))):
-                x = rows.load(h)
-                x = x if x.type == out.vector else builder.fpext(x, out.vector)
-                for k, total in enumerate(sums):
-                    new = _multiply_add(builder, _spread(builder, x, k), x, builder.load(total))
-                    builder.store(new, total)
-        for k, total in enumerate(sums):
-            out.store(ir.Constant(ends[0].type, k), builder.load(total))
-        return context.get_dummy_value()
+        place = long_of(context, builder, signature, given, 1)
+        top = builder.mul(place, ir.Constant(place.type, width))
+        for k in range(width):
+            row = B[k] if out.vector == B[k].type else builder.fptrunc(B[k], out.vector)
+            out.store(builder.add(top, ir.Constant(place.type, k)), row)
+        return own
 
-    return types.void(B, H, halves, first, last, act, dof), emit
-
-
-@intrinsic
-def invert(typing, B, dof):
-    """Invert B in place, symmetric and positive in its degrees of freedom: Gauss and Jordan's
-    elimination, which needs no pivots there. A row and column of padding stay as they are."""
-
-    def emit(context, builder, signature, given):
-        width = len(dof)
-        rows = _Rows(context, builder, signature.args[0], given[0], width)
-        places = [ir.Constant(ir.IntType(64), k) for k in range(width)]
-        B = [rows.load(k) for k in places]
-        one = ir.Constant(rows.vector.element, 1.0)
-        nothing = ir.Constant(rows.vector.element, 0.0)
-        degrees = range(4 if width == 4 else 7)
-        for k in degrees:
-            pivot = builder.fdiv(one, builder.extract_element(B[k], _lane(k)))
-            row = builder.insert_element(B[k], one, _lane(k))
-            B[k] = builder.fmul(row, filled(builder, rows.vector, pivot))
-            for m in degrees:
-                if m != k:
-                    factor = _spread(builder, builder.fneg(B[m]), k)
-                    rest = builder.insert_element(B[m], nothing, _lane(k))
-                    B[m] = _multiply_add(builder, factor, B[k], rest)
-        for k in degrees:
-            rows.store(places[k], B[k])
-        return context.get_dummy_value()
-
-    return types.void(B, dof), emit
+    given = inverse, i, H, halves, act, first, last, alpha, floor, held, dof
+    return types.float64(*given), emit

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.capsules import closest_points
-from torchfilm.kernels.compiling import index, kernel
+from torchfilm.kernels.compiling import kernel
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import MAX_TURN
 
@@ -113,44 +112,3 @@ def approach(x, length, radius, y, dof):
         half = 0.5 * (length[i] + abs(y[i, end]))
         own = max(own, math.sqrt(rest) + half * math.sqrt(turn) + 0.5 * abs(y[i, end]))
     return abs(stretch) * (longest + 2 * own) + 2 * own
-
-
-@kernel
-def own_ways(half, before, y, dof):
-    """How far, at most, points of each cell have come by turning and by its change of length, µm,
-    and more than y is rounded by: (n,)."""
-    d, end, way = 2 if len(dof) == 4 else 3, degrees(dof) - 1, np.empty(y.shape[0])
-    for i in range(y.shape[0]):
-        turn, far = 0.0, 1.0
-        for k in range(d, end):
-            turn += y[i, k] ** 2
-        for k in range(d):
-            far += abs(y[i, k])
-        way[i] = half[i] * math.sqrt(turn) + abs(half[i] - before[i]) + 1e-5 * far
-    return way
-
-
-@kernel
-def any_deeper(x, axis, half, radius, y, way, found, deep, dof):
-    """Whether a contact is deeper than `deep` after the move y of `move_cells`. found: the contacts
-    before it, of `near_contacts`; way: `own_ways`. Only pairs that may have come so near are looked
-    at closely."""
-    first, second, keep, _, gap = found
-    d = 2 if len(dof) == 4 else 3
-    for k in range(keep.shape[0]):
-        i, j = index(first[index(keep[k])]), index(second[index(keep[k])])
-        apart, room = 0.0, gap[k] + deep - way[i] - way[j]
-        for c in range(d):
-            apart += (y[i, c] - y[j, c]) ** 2
-        if room > 0 and apart < room * room:
-            continue
-        bz = x[j, 2] - x[i, 2] if d == 3 else 0.0
-        az = axis[i, 2] if d == 3 else 0.0
-        cz = axis[j, 2] if d == 3 else 0.0
-        _, _, d2 = closest_points(
-            x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], bz,
-            axis[i, 0], axis[i, 1], az, axis[j, 0], axis[j, 1], cz, half[i], half[j], dof,
-        )  # fmt: skip
-        if math.sqrt(d2) - (radius[i] + radius[j]) < -deep:
-            return True
-    return False

@@ -12,6 +12,9 @@ from torchfilm.kernels.lanes import boxes_meet, copy_row
 # By how much boxes are enlarged, of their distance from the colony's corner: as single numbers they
 # are rounded by less.
 ROUNDED = 4e-7
+# In colonies of so many cells or fewer each box is compared with each other one: a grid would take
+# longer.
+FEW = 64
 
 
 @kernel
@@ -81,6 +84,8 @@ def near_pairs(x, axis, half, radius, margin, dof):
     low, high = np.empty((n, d), np.int64), np.empty((n, d), np.int64)
     boxes = np.zeros((n, len(dof)), np.float32)
     top = _boxes(x, axis, half, radius, margin, boxes, low, high, dof)
+    if n <= FEW:
+        return _among_few(boxes, dof)
     slots = 16
     while slots < 2 * n:
         slots *= 2
@@ -95,6 +100,18 @@ def near_pairs(x, axis, half, radius, margin, dof):
             first, second = _longer(first), _longer(second)
         slot, place, found = _search(table, slot, place, found, most, first, second, dof)
     return _by_first(first[:found], second[:found], n)
+
+
+@kernel
+def _among_few(boxes, dof):
+    """The pairs of boxes that meet, each compared with each."""
+    n, found = boxes.shape[0], index(0)
+    first, second = np.empty(n * n, np.int32), np.empty(n * n, np.int32)
+    for i in range(n):
+        for j in range(i + 1, n):
+            first[found], second[found] = i, j
+            found += index(boxes_meet(boxes, i, j, dof))
+    return first[:found], second[:found]
 
 
 @kernel

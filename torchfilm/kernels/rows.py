@@ -10,17 +10,8 @@ import math
 
 import numpy as np
 
-from torchfilm.kernels.capsules import (
-    clamp,
-    closest_points,
-    end_of,
-    end_while_sliding,
-    squared_distance,
-    squared_sine,
-)
 from torchfilm.kernels.compiling import index, kernel
 
-LINE_CONTACT_SINE = 0.4  # as in `physics.contacts`
 FLAT, INSIDE, OUTSIDE = 0, 1, 2
 HARD, STIFF, LIGHT = 0, 1, 2  # walls: rigid, with a stiffness, with a weight below 1
 
@@ -30,29 +21,6 @@ def degrees(dof):
     """The degrees of freedom of a cell, of which the last is its length: 4 in the plane, 7 in
     space. `dof` is a tuple of as many entries as rows have columns, 4 or 8: see `lanes`."""
     return 4 if len(dof) == 4 else 7
-
-
-@kernel
-def near_contacts(x, axis, half, radius, first, second, margin, dof):
-    """The pairs nearer than margin: their number, closest points and gap, µm."""
-    m, d = first.shape[0], 2 if len(dof) == 4 else 3
-    keep, points, gap = np.empty(m, np.int32), np.empty((m, 2)), np.empty(m)
-    found = index(0)
-    for k in range(m):
-        i, j = index(first[k]), index(second[k])
-        bz = x[j, 2] - x[i, 2] if d == 3 else 0.0
-        az = axis[i, 2] if d == 3 else 0.0
-        cz = axis[j, 2] if d == 3 else 0.0
-        s, t, d2 = closest_points(
-            x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], bz,
-            axis[i, 0], axis[i, 1], az, axis[j, 0], axis[j, 1], cz, half[i], half[j], dof,
-        )  # fmt: skip
-        touching = radius[i] + radius[j]
-        if d2 < (touching + margin) * (touching + margin):
-            keep[found], points[found, 0], points[found, 1] = k, s, t
-            gap[found] = math.sqrt(d2) - touching
-            found += index(1)
-    return keep[:found], points[:found], gap[:found]
 
 
 @kernel
@@ -67,138 +35,31 @@ def deeply_overlapping(found, radius):
     return deeply.sum()
 
 
-@kernel
-def _apart(ax, ay, az, cx, cy, cz, d):
-    """A direction that separates two cells whose centrelines cross."""
-    sign = -1.0 if ax * cx + ay * cy < 0 else 1.0
-    mx, my = ax + sign * cx, ay + sign * cy
-    size = math.sqrt(mx * mx + my * my)
-    nx, ny, nz = -my / size, mx / size, 0.0
-    if d == 3:
-        mx, my, mz = ay * cz - az * cy, az * cx - ax * cz, ax * cy - ay * cx
-        size = math.sqrt(mx * mx + my * my + mz * mz)
-        if size >= 1e-6:
-            nx, ny, nz = mx / size, my / size, mz / size
-        elif abs(ax) < 0.5:
-            size = math.sqrt(ay * ay + az * az)
-            nx, ny, nz = 0.0, -az / size, ay / size
-        else:
-            size = math.sqrt(ax * ax + ay * ay)
-            nx, ny, nz = -ay / size, ax / size, 0.0
-    return nx, ny, nz
+@kernel(inline=True)
+def half_of(weight, s, end, nx, ny, nz, ax, ay, az, dof):
+    """One half of a row before it is scaled: weight · (n, q × n, ∂) for a point at arc length s. Of
+    numbers, or of vectors."""
+    along = nx * ax + ny * ay
+    if len(dof) == 4:
+        turn = weight * s * (ax * ny - ay * nx)
+        return weight * nx, weight * ny, turn, weight * 0.5 * end * along
+    along = along + nz * az
+    return (
+        weight * nx, weight * ny, weight * nz, weight * s * (ay * nz - az * ny),
+        weight * s * (az * nx - ax * nz), weight * s * (ax * ny - ay * nx),
+        weight * 0.5 * end * along,
+    )  # fmt: skip
 
 
 @kernel(inline=True)
 def _put_half(H, h, i, weight, s, end, nx, ny, nz, axis, scale, dof):
-    """One half of a row: weight · (n, q × n, ∂) · M^(−½) for a point at arc length s."""
-    D = degrees(dof)
-    ax, ay = axis[i, 0], axis[i, 1]
-    H[h, 0], H[h, 1] = weight * nx * scale[i, 0], weight * ny * scale[i, 1]
-    if D == 4:
-        H[h, 2] = weight * s * (ax * ny - ay * nx) * scale[i, 2]
-        along = nx * ax + ny * ay
-    else:
-        az = axis[i, 2]
-        H[h, 2] = weight * nz * scale[i, 2]
-        H[h, 3] = weight * s * (ay * nz - az * ny) * scale[i, 3]
-        H[h, 4] = weight * s * (az * nx - ax * nz) * scale[i, 4]
-        H[h, 5] = weight * s * (ax * ny - ay * nx) * scale[i, 5]
-        along = nx * ax + ny * ay + nz * az
+    """One half of a row, at a wall."""
+    az = axis[i, 2] if len(dof) == 8 else 0.0
+    half = half_of(weight, s, end, nx, ny, nz, axis[i, 0], axis[i, 1], az, dof)
+    for k in range(len(half)):
+        H[h, k] = half[k] * scale[i, k]
+    if len(dof) == 8:
         H[h, 7] = 0.0
-    H[h, D - 1] = weight * 0.5 * end * along * scale[i, D - 1]
-
-
-@kernel(inline=True)
-def _put_pair(H, gaps, r, i, j, x, axis, half, radius, scale, s, t, end_a, end_b, weight, dof):
-    """The row of two cells at the points s and t of their centrelines."""
-    d = 2 if len(dof) == 4 else 3
-    ax, ay, cx, cy = axis[i, 0], axis[i, 1], axis[j, 0], axis[j, 1]
-    bx, by = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1]
-    az = cz = bz = 0.0
-    if d == 3:
-        az, cz, bz = axis[i, 2], axis[j, 2], x[j, 2] - x[i, 2]
-    dx, dy, dz = bx + t * cx - s * ax, by + t * cy - s * ay, bz + t * cz - s * az
-    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-    touching = radius[i] + radius[j]
-    if distance > 1e-5 * touching:
-        nx, ny, nz = dx / distance, dy / distance, dz / distance
-    else:
-        nx, ny, nz = _apart(ax, ay, az, cx, cy, cz, d)
-        if nx * bx + ny * by + nz * bz < 0:
-            nx, ny, nz = -nx, -ny, -nz
-    # a sphere grows at both ends at once: the end nearer to the contact counts
-    if half[i] <= 1e-9:
-        end_a = np.sign(nx * ax + ny * ay + nz * az)
-    if half[j] <= 1e-9:
-        end_b = -np.sign(nx * cx + ny * cy + nz * cz)
-    _put_half(H, index(2) * r, i, weight, s, end_a, nx, ny, nz, axis, scale, dof)
-    _put_half(H, index(2) * r + index(1), j, -weight, t, end_b, nx, ny, nz, axis, scale, dof)
-    gaps[r] = weight * (distance - touching)
-
-
-@kernel
-def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
-    """Rows of the contacts `found`, after `walls` others; a line of contact has two rows of weight
-    ½. Returns how many there are in all.
-
-    found: pairs (first, second), and of their contacts the place among these, the closest points
-    and the gap, µm: see `near_contacts`.
-    """
-    first, second, keep, points, _ = found
-    H, gaps, one, two, _ = rows
-    d, r = 2 if len(dof) == 4 else 3, index(walls)
-    for k in range(keep.shape[0]):
-        i, j = index(first[index(keep[k])]), index(second[index(keep[k])])
-        s0, t0 = points[k, 0], points[k, 1]
-        bx, by = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1]
-        ax, ay, cx, cy = axis[i, 0], axis[i, 1], axis[j, 0], axis[j, 1]
-        az = cz = bz = 0.0
-        if d == 3:
-            az, cz, bz = axis[i, 2], axis[j, 2], x[j, 2] - x[i, 2]
-        sine2 = squared_sine(ax, ay, az, cx, cy, cz, dof)
-        slide = 1.0 - sine2 / (LINE_CONTACT_SINE * LINE_CONTACT_SINE)
-        ha, hb, ra, rb = half[i], half[j], radius[i], radius[j]
-        low = high = project = offset = sign = cosine = 0.0
-        if slide > 0:
-            cosine = ax * cx + ay * cy + az * cz
-            sign = -1.0 if cosine < 0 else 1.0
-            mx, my, mz = ax + sign * cx, ay + sign * cy, az + sign * cz
-            size = math.sqrt(mx * mx + my * my + mz * mz)
-            project = (ax * mx + ay * my + az * mz) / size
-            offset = (bx * mx + by * my + bz * mz) / size
-            low = max(-ha * project, offset - hb * project)
-            high = min(ha * project, offset + hb * project)
-        if slide <= 0 or high <= low:
-            _put_pair(
-                H, gaps, r, i, j, x, axis, half, radius, scale, s0, t0,
-                end_of(s0, ha), end_of(t0, hb), 1.0, dof,
-            )  # fmt: skip
-            one[r], two[r] = i, j
-            r += index(1)
-            continue
-        share = min((high - low) / (0.5 * (ra + rb)), 1.0)
-        swing = 0.5 * (high - low) * math.sqrt(sine2)
-        if swing > 1e-6 * ra:
-            apart = math.sqrt(squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s0, t0, dof))
-            share *= min(apart / swing, 1.0)
-        slide = slide * slide * share
-        end_a0 = end_while_sliding(s0, cosine * t0 + bx * ax + by * ay + bz * az, ha, ra, slide)
-        end_b0 = end_while_sliding(t0, cosine * s0 - bx * cx - by * cy - bz * cz, hb, rb, slide)
-        for side in (-1.0, 1.0):
-            at = low if side < 0 else high
-            s1 = clamp(at / project, ha)
-            t1 = clamp(sign * (at - offset) / project, hb)
-            mark_a = max(1.0 + side * (at - ha * project * side) / (0.5 * (ra + rb)), 0.0)
-            mark_b = max(1.0 + side * (at - offset - hb * project * side) / (0.5 * (ra + rb)), 0.0)
-            _put_pair(
-                H, gaps, r, i, j, x, axis, half, radius, scale,
-                s0 + slide * (s1 - s0), t0 + slide * (t1 - t0),
-                end_a0 + slide * (side * mark_a - end_a0),
-                end_b0 + slide * (sign * side * mark_b - end_b0), math.sqrt(0.5), dof,
-            )  # fmt: skip
-            one[r], two[r] = i, j
-            r += index(1)
-    return np.int64(r)
 
 
 @kernel(inline=True)

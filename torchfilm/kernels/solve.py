@@ -190,10 +190,7 @@ def _put_gradient(H, one, two, v, pushed, act, stale, alpha, low, y, g, z, d, p,
         add_forces(H, one, two, range(act.shape[0]), v, g, dof)
     else:
         add_forces(H, one, two, on[: counts[0]], v, g, dof)
-    B = np.empty((len(dof), len(dof)))
-    refresh_blocks(
-        H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, B, 0, n, dof
-    )
+    refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, 0, n, dof)
     for a in range(0, n, BLOCK):
         b = min(a + BLOCK, n)
         gz += precondition(inverse, g, z, a, b, dof)

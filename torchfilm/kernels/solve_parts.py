@@ -7,7 +7,7 @@ the share of a block of cells: see `team`.
 from __future__ import annotations
 
 from torchfilm.kernels.compiling import index, kernel
-from torchfilm.kernels.lanes import add_scaled, dot, dot_row, invert, put_product, put_squares
+from torchfilm.kernels.lanes import add_scaled, dot, dot_row, put_inverse, put_product
 from torchfilm.kernels.rows import degrees
 from torchfilm.kernels.scheme import RAISED, ROUNDING
 
@@ -63,34 +63,11 @@ def add_own_product(H, one, two, on, p, out, first, end, dof):
             add_scaled(out, j, t, H, h + 1, dof)
 
 
-@kernel(inline=True)
-def put_inverse(H, begin, halves, act, i, alpha, held, inverse, B, floor, dof):
-    """The inverse of cell i's own block of JᵀAJ + α, worked out in B in float64; 0 in its last row
-    and column where the length is held. The diagonal is raised by its share `floor`: rounding must
-    leave it positive definite. Returns the entry of the length."""
-    end = degrees(dof) - 1
-    put_squares(B, H, halves, begin[i], begin[i + 1], act, dof)
-    for k in range(end + 1):
-        B[k, k] = B[k, k] * (1 + floor) + alpha
-    own = B[end, end]
-    if held:
-        for k in range(end):
-            B[end, k] = B[k, end] = 0.0
-        B[end, end] = 1.0
-    invert(B, dof)
-    if held:
-        B[end, end] = 0.0
-    for k in range(len(dof)):
-        for m in range(len(dof)):
-            inverse[i, k, m] = B[k, m]
-    return own
-
-
 @kernel
-def refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, B, first,
+def refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, first,
                    end, dof):  # fmt: skip
     """Hold the lengths at their bound that are pushed further, and those that step alone; invert
-    the blocks of the cells that changed, in B. own: (n,) of lengths, their diagonal."""
+    the blocks of JᵀAJ + α of the cells that changed. own: (n,) of lengths, their diagonal."""
     held, alone = lengths[0], lengths[1]
     D = degrees(dof)
     for i in range(first, end):
@@ -101,8 +78,9 @@ def refresh_blocks(H, begin, halves, act, alpha, y, low, g, lengths, own, invers
             stale[i] = 1
         if stale[i]:
             own[i] = put_inverse(
-                H, begin, halves, act, i, alpha[i], held[i], inverse, B, RAISED, dof
-            )
+                inverse, i, H, halves, act, begin[i], begin[i + 1], alpha[i], RAISED, held[i] > 0,
+                dof,
+            )  # fmt: skip
             stale[i] = 0
 
 

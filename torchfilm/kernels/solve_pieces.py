@@ -139,9 +139,8 @@ def _of_cells(board, k, like, dof):
     parts.put_scaled(g, alpha, y, first, end, dof)
     forced = on[:count] if board[FREE] else mine
     parts.add_own_forces(h, one, two, forced, v, g, first, end, dof)
-    B = np.empty((len(dof), len(dof)))
     parts.refresh_blocks(
-        h, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, B, first, end, dof
+        h, begin, halves, act, alpha, y, low, g, lengths, own, inverse, stale, first, end, dof
     )
     for a in range(first, end, BLOCK):
         b = min(a + BLOCK, end)

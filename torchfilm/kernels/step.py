@@ -23,18 +23,10 @@ from torchfilm.kernels.colonies import (
     taken_out,
 )
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.moves import any_deeper, approach, drags, move_cells, own_ways
+from torchfilm.kernels.contacts import deepest_of, near_contacts, pair_rows
+from torchfilm.kernels.moves import approach, drags, move_cells
 from torchfilm.kernels.neighbours import near_pairs, spatial_order
-from torchfilm.kernels.rows import (
-    HARD,
-    STIFF,
-    deeply_overlapping,
-    degrees,
-    near_contacts,
-    pair_rows,
-    rows_among,
-    wall_rows,
-)
+from torchfilm.kernels.rows import HARD, STIFF, deeply_overlapping, degrees, rows_among, wall_rows
 from torchfilm.kernels.scheme import (
     DEEP_IN_SUBSTEPS,
     HARDEST,
@@ -106,16 +98,15 @@ def _contacts_of(x, axis, half, radius, margin, pairs, dof):
 
 
 @kernel
-def _after(x, axis, length, radius, y, before, margin, deep, found, dof):
+def _after(x, axis, length, radius, y, margin, deep, found, dof):
     """The contacts after the move y, and whether one of them is deeper than `deep`. Where none is,
-    they may be those before it, `found`: most need no closer look. before: half lengths then."""
+    they may be those before it, `found`."""
     half = 0.5 * length
-    if approach(x, length, radius, y, dof) > margin + deep:  # other pairs may have met
-        found = _contacts(x, axis, half, radius, margin, dof)
-        return found, _deepest(found[4]) < -deep
-    if any_deeper(x, axis, half, radius, y, own_ways(half, before, y, dof), found, deep, dof):
-        return _contacts(x, axis, half, radius, margin, dof), True
-    return found, False
+    near = approach(x, length, radius, y, dof) <= margin + deep  # else other pairs may have met
+    if near and deepest_of(x, axis, half, radius, found, dof) >= -deep:
+        return found, False
+    found = _contacts(x, axis, half, radius, margin, dof)
+    return found, near or _deepest(found[4]) < -deep
 
 
 @kernel
@@ -265,7 +256,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
         put(y if number == 0 else last, last)
         number, softer, rising = number + 1, 1.0, True
         if number < passes:
-            found, deeply = _after(x, axis, length, radius, y, half, margin, deep, found, dof)
+            found, deeply = _after(x, axis, length, radius, y, margin, deep, found, dof)
         if not deeply and is_soft.shape[0] == 0:
             break
         half = 0.5 * length

@@ -1,0 +1,307 @@
+"""Contacts of near cells and their rows, a block of pairs at a time.
+
+A block has the numbers of its pairs in columns, (COLUMNS, PAIRS), or as vectors, (…, WIDTH): what
+is worked out for a pair is worked out for WIDTH pairs at once, with the bits that one would have
+alone. Lanes beyond the last pair hold those of an earlier block, and nobody reads them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from torchfilm.kernels.capsules import (
+    clamp,
+    closest_points,
+    dot_of,
+    end_of,
+    end_while_sliding,
+    squared_distance,
+    squared_sine,
+)
+from torchfilm.kernels.compiling import index, kernel
+from torchfilm.kernels.rows import degrees, half_of
+from torchfilm.kernels.vectors import WIDTH, any_of, load, store, where
+
+LINE_CONTACT_SINE = 0.4  # as in `physics.contacts`
+# Centrelines nearer than this share of the distance at which cells touch cross.
+CROSSING = 1e-5
+# Pairs of a block: as many as leave its numbers in the nearest memory.
+PAIRS = 32
+VECTORS = PAIRS // WIDTH
+# Columns: from centre to centre, axes, half lengths, radii, arc lengths of the closest points, gap,
+# whether it is below the margin, and whether the contact is a line.
+B, A, C = 0, 3, 6
+HALF_A, HALF_B, RADIUS_A, RADIUS_B, S0, T0, GAP, NEAR, LINE = range(9, 18)
+# Then, of each of its two rows: arc lengths, ends, weight, distance, gap times weight, and the
+# halves, which have up to seven columns.
+FIRST_ROW = 18
+S, T, END_A, END_B, WEIGHT, DISTANCE, WEIGHTED, OWN, OTHER = (0, 1, 2, 3, 4, 5, 6, 7, 14)
+OF_ROW = 21
+COLUMNS = FIRST_ROW + 2 * OF_ROW
+
+
+@kernel(inline=True)
+def _put_cells(block, k, i, j, x, axis, half, radius, dof):
+    """Puts the cells i and j into column k."""
+    for c in range(2 if len(dof) == 4 else 3):
+        block[B + c, k] = x[j, c] - x[i, c]
+        block[A + c, k], block[C + c, k] = axis[i, c], axis[j, c]
+    block[HALF_A, k], block[HALF_B, k] = half[i], half[j]
+    block[RADIUS_A, k], block[RADIUS_B, k] = radius[i], radius[j]
+
+
+@kernel(inline=True)
+def _vector(rows, column, g):
+    return load(rows, column * VECTORS + g)
+
+
+@kernel(inline=True)
+def _put(rows, column, g, x):
+    store(rows, column * VECTORS + g, x)
+
+
+@kernel(inline=True)
+def _three(rows, column, g):
+    return _vector(rows, column, g), _vector(rows, column + 1, g), _vector(rows, column + 2, g)
+
+
+@kernel
+def _measure(rows, vectors, margin, dof):
+    """The closest points of pairs, their gap, and whether it is below the margin."""
+    for g in range(vectors):
+        bx, by, bz = _three(rows, B, g)
+        ax, ay, az = _three(rows, A, g)
+        cx, cy, cz = _three(rows, C, g)
+        half_a, half_b = _vector(rows, HALF_A, g), _vector(rows, HALF_B, g)
+        s, t, d2 = closest_points(bx, by, bz, ax, ay, az, cx, cy, cz, half_a, half_b, dof)
+        touching = _vector(rows, RADIUS_A, g) + _vector(rows, RADIUS_B, g)
+        _put(rows, S0, g, s)
+        _put(rows, T0, g, t)
+        _put(rows, GAP, g, np.sqrt(d2) - touching)
+        near = d2 < (touching + margin) * (touching + margin)
+        _put(rows, NEAR, g, where(near, 1.0, 0.0))
+
+
+@kernel
+def near_contacts(x, axis, half, radius, first, second, margin, dof):
+    """The pairs nearer than margin: their number, closest points and gap, µm."""
+    m = first.shape[0]
+    keep, points, gap = np.empty(m, np.int32), np.empty((m, 2)), np.empty(m)
+    block, found = np.zeros((FIRST_ROW, PAIRS)), index(0)
+    for start in range(0, m, PAIRS):
+        count = min(PAIRS, m - start)
+        for k in range(count):
+            i, j = index(first[start + k]), index(second[start + k])
+            _put_cells(block, k, i, j, x, axis, half, radius, dof)
+        _measure(block.reshape(-1, WIDTH), (count + WIDTH - 1) // WIDTH, margin, dof)
+        for k in range(count):  # without branches: their outcome is not foreseen
+            keep[found], gap[found] = start + k, block[GAP, k]
+            points[found, 0], points[found, 1] = block[S0, k], block[T0, k]
+            found += index(block[NEAR, k])
+    return keep[:found], points[:found], gap[:found]
+
+
+@kernel
+def deepest_of(x, axis, half, radius, found, dof):
+    """The least gap of the contacts `found` where cells are now, µm, or 0. found: as in
+    `pair_rows`."""
+    first, second, keep = found[:3]
+    block, deepest = np.zeros((FIRST_ROW, PAIRS)), 0.0
+    for start in range(0, keep.shape[0], PAIRS):
+        some = keep[start : start + PAIRS]
+        for k in range(some.shape[0]):
+            i, j = index(first[index(some[k])]), index(second[index(some[k])])
+            _put_cells(block, k, i, j, x, axis, half, radius, dof)
+        _measure(block.reshape(-1, WIDTH), (some.shape[0] + WIDTH - 1) // WIDTH, 0.0, dof)
+        for k in range(some.shape[0]):
+            deepest = min(deepest, block[GAP, k])
+    return deepest
+
+
+@kernel
+def _apart(ax, ay, az, cx, cy, cz, d):
+    """A direction that separates two cells whose centrelines cross."""
+    sign = -1.0 if ax * cx + ay * cy < 0 else 1.0
+    mx, my = ax + sign * cx, ay + sign * cy
+    size = math.sqrt(mx * mx + my * my)
+    nx, ny, nz = -my / size, mx / size, 0.0
+    if d == 3:
+        mx, my, mz = ay * cz - az * cy, az * cx - ax * cz, ax * cy - ay * cx
+        size = math.sqrt(mx * mx + my * my + mz * mz)
+        if size >= 1e-6:
+            nx, ny, nz = mx / size, my / size, mz / size
+        elif abs(ax) < 0.5:
+            size = math.sqrt(ay * ay + az * az)
+            nx, ny, nz = 0.0, -az / size, ay / size
+        else:
+            size = math.sqrt(ax * ax + ay * ay)
+            nx, ny, nz = -ay / size, ax / size, 0.0
+    return nx, ny, nz
+
+
+@kernel(inline=True)
+def _end_of_sphere(nx, ny, nz, ax, ay, az, half, end, dof):
+    """A sphere grows at both ends at once: the end nearer to the contact counts."""
+    along = dot_of(nx, ny, nz, ax, ay, az, dof)
+    sign = where(along > 0, 1.0, 0.0) - where(along < 0, 1.0, 0.0)
+    return where(half <= 1e-9, sign, end)
+
+
+@kernel(inline=True)
+def _put_row(rows, row, g, s, t, end_a, end_b, weight, dof):
+    """A row of each pair, before it is scaled, at the points s and t of the centrelines. Returns
+    whether centrelines cross."""
+    bx, by, bz = _three(rows, B, g)
+    ax, ay, az = _three(rows, A, g)
+    cx, cy, cz = _three(rows, C, g)
+    dx, dy, dz = bx + t * cx - s * ax, by + t * cy - s * ay, bz + t * cz - s * az
+    distance = np.sqrt(dot_of(dx, dy, dz, dx, dy, dz, dof))
+    touching = _vector(rows, RADIUS_A, g) + _vector(rows, RADIUS_B, g)
+    inverse = 1.0 / distance
+    nx, ny, nz = dx * inverse, dy * inverse, dz * inverse
+    end_a = _end_of_sphere(nx, ny, nz, ax, ay, az, _vector(rows, HALF_A, g), end_a, dof)
+    end_b = _end_of_sphere(-nx, -ny, -nz, cx, cy, cz, _vector(rows, HALF_B, g), end_b, dof)
+    own = half_of(weight, s, end_a, nx, ny, nz, ax, ay, az, dof)
+    other = half_of(-weight, t, end_b, nx, ny, nz, cx, cy, cz, dof)
+    for k in range(len(own)):
+        _put(rows, row + OWN + k, g, own[k])
+        _put(rows, row + OTHER + k, g, other[k])
+    given = s, t, end_a, end_b, weight, distance, weight * (distance - touching)
+    for k in range(len(given)):
+        _put(rows, row + S + k, g, given[k])
+    return any_of(distance <= CROSSING * touching)
+
+
+@kernel
+def _part(block, row, k, dof):
+    """The row of column k again, if its centrelines cross: along a direction that parts them."""
+    if block[row + DISTANCE, k] > CROSSING * (block[RADIUS_A, k] + block[RADIUS_B, k]):
+        return
+    bx, by, bz = block[B, k], block[B + 1, k], block[B + 2, k]
+    ax, ay, az = block[A, k], block[A + 1, k], block[A + 2, k]
+    cx, cy, cz = block[C, k], block[C + 1, k], block[C + 2, k]
+    nx, ny, nz = _apart(ax, ay, az, cx, cy, cz, 2 if len(dof) == 4 else 3)
+    if nx * bx + ny * by + nz * bz < 0:
+        nx, ny, nz = -nx, -ny, -nz
+    end_a, end_b = block[row + END_A, k], block[row + END_B, k]
+    end_a = _end_of_sphere(nx, ny, nz, ax, ay, az, block[HALF_A, k], end_a, dof)
+    end_b = _end_of_sphere(-nx, -ny, -nz, cx, cy, cz, block[HALF_B, k], end_b, dof)
+    weight = block[row + WEIGHT, k]
+    own = half_of(weight, block[row + S, k], end_a, nx, ny, nz, ax, ay, az, dof)
+    other = half_of(-weight, block[row + T, k], end_b, nx, ny, nz, cx, cy, cz, dof)
+    for c in range(len(own)):
+        block[row + OWN + c, k], block[row + OTHER + c, k] = own[c], other[c]
+
+
+@kernel
+def _put_rows(rows, vectors, dof):
+    """The rows of pairs, before they are scaled: one at the closest points, or where the contact is
+    a line two of weight ½, towards its ends. Returns whether centrelines cross."""
+    crossing = False
+    for g in range(vectors):
+        bx, by, bz = _three(rows, B, g)
+        ax, ay, az = _three(rows, A, g)
+        cx, cy, cz = _three(rows, C, g)
+        ha, hb = _vector(rows, HALF_A, g), _vector(rows, HALF_B, g)
+        ra, rb = _vector(rows, RADIUS_A, g), _vector(rows, RADIUS_B, g)
+        s0, t0 = _vector(rows, S0, g), _vector(rows, T0, g)
+        sine2 = squared_sine(ax, ay, az, cx, cy, cz, dof)
+        slide = 1.0 - sine2 / (LINE_CONTACT_SINE * LINE_CONTACT_SINE)
+        # the part of the line between the cells along which they lie side by side
+        cosine = dot_of(ax, ay, az, cx, cy, cz, dof)
+        sign = where(cosine < 0, -1.0, 1.0)
+        mx, my, mz = ax + sign * cx, ay + sign * cy, az + sign * cz
+        # a division costs more than anything else here
+        size = 1.0 / np.sqrt(dot_of(mx, my, mz, mx, my, mz, dof))
+        project = dot_of(ax, ay, az, mx, my, mz, dof) * size
+        offset = dot_of(bx, by, bz, mx, my, mz, dof) * size
+        unproject, width = 1.0 / project, 2.0 / (ra + rb)
+        low, high = _side_by_side(ha * project, hb * project, offset)
+        line = (slide > 0) & (high > low)
+        share = (high - low) * width
+        share = where(share > 1.0, 1.0, share)
+        swing = 0.5 * (high - low) * np.sqrt(sine2)
+        apart = np.sqrt(squared_distance(bx, by, bz, ax, ay, az, cx, cy, cz, s0, t0, dof)) / swing
+        apart = where(apart > 1.0, 1.0, apart)
+        share = where(swing > 1e-6 * ra, share * apart, share)
+        slide = slide * slide * share
+        free_a = cosine * t0 + dot_of(bx, by, bz, ax, ay, az, dof)
+        free_b = cosine * s0 - dot_of(bx, by, bz, cx, cy, cz, dof)
+        end_a0 = end_while_sliding(s0, free_a, ha, ra, slide)
+        end_b0 = end_while_sliding(t0, free_b, hb, rb, slide)
+        weight = where(line, math.sqrt(0.5), 1.0)
+        for k in range(2):
+            side, at = (1.0, high) if k else (-1.0, low)
+            s1 = clamp(at * unproject, ha)
+            t1 = clamp(sign * (at - offset) * unproject, hb)
+            end_a = _mark(side, at - ha * project * side, width)
+            end_b = _mark(side, at - offset - hb * project * side, width)
+            crossing |= _put_row(
+                rows, FIRST_ROW + k * OF_ROW, g,
+                where(line, s0 + slide * (s1 - s0), s0),
+                where(line, t0 + slide * (t1 - t0), t0),
+                where(line, end_a0 + slide * (end_a - end_a0), end_of(s0, ha)),
+                where(line, end_b0 + slide * (sign * end_b - end_b0), end_of(t0, hb)),
+                weight, dof,
+            )  # fmt: skip
+        _put(rows, LINE, g, where(line, 1.0, 0.0))
+    return crossing
+
+
+@kernel(inline=True)
+def _side_by_side(ha, hb, offset):
+    """Where two parallel segments lie side by side: from max(−ha, offset − hb) to min(ha, offset +
+    hb)."""
+    low, high = offset - hb, offset + hb
+    return where(low > -ha, low, -ha), where(high < ha, high, ha)
+
+
+@kernel(inline=True)
+def _mark(side, beyond, width):
+    """How far the end of a line of contact counts as an end of a cell."""
+    mark = 1.0 + side * beyond * width
+    return side * where(mark < 0.0, 0.0, mark)
+
+
+@kernel
+def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
+    """Rows of the contacts `found`, after `walls` others; a line of contact has two rows of weight
+    ½. Returns how many there are in all.
+
+    found: pairs (first, second), and of their contacts the place among these, the closest points
+    and the gap, µm: see `near_contacts`.
+    """
+    first, second, keep, points, _ = found
+    H, gaps, one, two, _ = rows
+    block, r = np.empty((COLUMNS, PAIRS)), index(walls)
+    for column in range(FIRST_ROW):  # the others are written before they are read
+        for k in range(PAIRS):
+            block[column, k] = 0.0
+    for start in range(0, keep.shape[0], PAIRS):
+        some = keep[start : start + PAIRS]
+        for k in range(some.shape[0]):
+            i, j = index(first[index(some[k])]), index(second[index(some[k])])
+            _put_cells(block, k, i, j, x, axis, half, radius, dof)
+            block[S0, k], block[T0, k] = points[start + k, 0], points[start + k, 1]
+        if _put_rows(block.reshape(-1, WIDTH), (some.shape[0] + WIDTH - 1) // WIDTH, dof):
+            for k in range(some.shape[0]):
+                _part(block, FIRST_ROW, k, dof)
+                _part(block, FIRST_ROW + OF_ROW, k, dof)
+        for k in range(some.shape[0]):
+            i, j = first[index(some[k])], second[index(some[k])]
+            for row in range(FIRST_ROW, FIRST_ROW + OF_ROW * (1 + int(block[LINE, k])), OF_ROW):
+                _put_scaled(H, index(2) * r, block, row + OWN, k, scale, index(i), dof)
+                _put_scaled(H, index(2) * r + index(1), block, row + OTHER, k, scale, index(j), dof)
+                gaps[r], one[r], two[r] = block[row + WEIGHTED, k], i, j
+                r += index(1)
+    return np.int64(r)
+
+
+@kernel(inline=True)
+def _put_scaled(H, h, block, half, k, scale, i, dof):
+    for c in range(degrees(dof)):
+        H[h, c] = block[half + c, k] * scale[i, c]
+    if len(dof) == 8:
+        H[h, 7] = 0.0
