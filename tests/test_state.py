@@ -307,7 +307,7 @@ WRONG = {
     "rows": (lambda s: s.uniform([0], "x"), r"rows = \[0\].*whole numbers"),
     "rows beyond": (lambda s: s.normal(torch.tensor([9]), "x"), r"rows = \[9\].*from 0 to 5"),
     "a purpose": (lambda s: s.uniform(FIRST, 3), r"purpose = 3.*a text"),
-    "a medium": (lambda s: s.places, r"no medium: list a Medium"),
+    "a medium": (lambda s: s.position_3d, r"no medium: list a Medium"),
     "a name": (lambda s: tf.Field(3, "three"), r"Field\.name = 3.*a text"),
     "a shape": (lambda s: tf.Field("heat", "", shape=3), r"'heat'\)\.shape = 3.*a tuple"),
     "a value": (lambda s: tf.Field("heat", "", initial="hot"), r"initial = 'hot'.*a number"),

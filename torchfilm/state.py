@@ -204,15 +204,15 @@ class State:
         return Signals({n.removeprefix(OUTSIDE): self.fields[n] for n in names})
 
     @property
-    def places(self) -> Tensor:
+    def position_3d(self) -> Tensor:
         """Positions in the three dimensions of the medium, (N, 3) float64, µm."""
         if self.layout is None:
             raise checks.InputError("the state has no medium: list a Medium in the scene.")
         if self.position.requires_grad:
-            return self.layout.places(self.position)
-        if "places" not in self.__dict__:
-            self.__dict__["places"] = self.layout.places(self.position)
-        return self.__dict__["places"]
+            return self.layout.position_3d(self.position)
+        if "position_3d" not in self.__dict__:
+            self.__dict__["position_3d"] = self.layout.position_3d(self.position)
+        return self.__dict__["position_3d"]
 
     def contact(self, names: Iterable[str] | None = None) -> Contact | None:
         """Where cells meet the medium and what they find there of each signal, or of these; None in
@@ -220,7 +220,9 @@ class State:
         if self.layout is None:
             return None
         values = self.signals if names is None else {n: self.fields[OUTSIDE + n] for n in names}
-        return self.layout.contact(self.places, self.colony, self.colony_id, values, self.dtype)
+        return self.layout.contact(
+            self.position_3d, self.colony, self.colony_id, values, self.dtype
+        )
 
     @property
     def own_colony_id(self) -> Tensor:
@@ -428,7 +430,7 @@ DERIVED = {
     "counts": ("colony", "colony_id"),
     "volume": ("length", "radius"),
     "area": ("length", "radius"),
-    "places": ("position", "layout"),
+    "position_3d": ("position", "layout"),
 }
 PARTS = frozenset(part.name for part in dataclasses.fields(State))
 RESERVED = PARTS | {n for n in vars(State) if not n.startswith("__")}

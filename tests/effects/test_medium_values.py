@@ -157,7 +157,7 @@ BAD = {
     ),
     "obstacles": (
         lambda: tf.Medium(ahl=AHL, obstacles=True, **GOOD),
-        r"Medium\.obstacles.*function of places",
+        r"Medium\.obstacles.*function of positions",
     ),
 }
 
@@ -176,10 +176,10 @@ AT_SEED = {
     ),
     "obstacles of a wrong shape": (
         {"obstacles": lambda at: at > 0},
-        r"obstacles\(places\).*bool tensor of shape \(64,\)",
+        r"obstacles\(positions\).*bool tensor of shape \(64,\)",
     ),
     "obstacles everywhere": ({"obstacles": lambda at: at[:, 0] < 99}, "true everywhere"),
-    "flow of a wrong shape": ({"flow": lambda at: at[:, 0]}, r"flow\(places\)"),
+    "flow of a wrong shape": ({"flow": lambda at: at[:, 0]}, r"flow\(positions\)"),
     "exponential with obstacles": (
         {"method": "exponential", "obstacles": lambda at: at[:, 0] > 8},
         "(?i)exponential|separable",
@@ -209,7 +209,8 @@ def test_bad_input_that_shows_with_the_cells_is_refused_by_seed(case):
 def test_a_function_of_places_must_give_one_good_number_for_each(signal):
     with pytest.raises(
         InputError,
-        match=r"\(places\) of the signal 'ahl'.*(one number for each place|at least 0 everywhere)",
+        match=r"\(positions\) of the signal 'ahl'.*"
+        r"(one number for each position|at least 0 everywhere)",
     ):
         tf.Scene(tf.Medium(ahl=signal, **GOOD), founders=tf.Cells.single(2)).bind().start()
 

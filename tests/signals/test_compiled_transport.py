@@ -149,7 +149,7 @@ def colonies(count: int, dtype, own: bool, method: str):
         grid = grid_of(*[shapes[k] for k in places])
         carriers = []
         for batch in grid.batches:
-            ids = [places[k] for k in batch.places.tolist()]
+            ids = [places[k] for k in batch.colonies.tolist()]
             op = build_operator(
                 batch.shape,
                 (1.0, 1.0, 1.0),

@@ -35,7 +35,7 @@ def test_what_a_grid_says_of_itself(device):
     assert g.offsets.tolist() == [0, 24, 25, 35]
     assert g.high.tolist() == [[2.0, -1.0, 0.0], [1.0, 1.0, 1.5], [6.0, 8.0, 4.5]]
     # x slowest, z fastest: voxel (2, 1, 3) of the first colony is its last
-    assert g.places[23].tolist() == [2, 1, 3] and g.owner[23] == 0
+    assert g.ijk[23].tolist() == [2, 1, 3] and g.owner[23] == 0
     assert g.centres()[23].tolist() == [1.0, -1.5, -0.25]
 
 
@@ -55,8 +55,8 @@ def test_grids_of_many_shapes_are_gathered_and_put_back(device):
     seen = []
     for batch in g.batches:
         part = batch.of(values)
-        assert part.shape == (len(batch.places), *batch.shape)
-        for k, place in enumerate(batch.places.tolist()):
+        assert part.shape == (len(batch.colonies), *batch.shape)
+        for k, place in enumerate(batch.colonies.tolist()):
             assert shapes[place] == batch.shape
             own = values[g.offsets[place] : g.offsets[place + 1]]
             assert torch.equal(part[k].reshape(-1), own)

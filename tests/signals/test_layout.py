@@ -79,16 +79,16 @@ def test_a_layout_moves_to_a_device(device):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_cells_of_a_plane_lie_at_its_height(dim, dtype):
     position = torch.tensor([[1.0, 2.0, 3.0]], dtype=dtype)[:, :dim]
-    found = Layout(grid(), height=0.25).places(position)
+    found = Layout(grid(), height=0.25).position_3d(position)
     assert found.dtype == F64 and found.tolist() == [[1.0, 2.0, 3.0 if dim == 3 else 0.25]]
 
 
 def test_the_mask_is_asked_for_once_and_without_obstacles_not_at_all():
     asked = []
 
-    def solid(places):
-        asked.append(places.shape)
-        return places[:, 0] > 0
+    def solid(positions):
+        asked.append(positions.shape)
+        return positions[:, 0] > 0
 
     assert Layout(grid()).mask is None
     layout = Layout(grid(), obstacle=solid)

@@ -58,7 +58,7 @@ class Compiled:
 
     def leaves(self) -> str:
         """The text of what `prepared` is given for the cell n."""
-        return places(self.equations.leaves, self.columns, self.numbers)
+        return values_text(self.equations.leaves, self.columns, self.numbers)
 
     def head(self, constants: Mapping[str, object]) -> str:
         """The text with which the module begins. constants: by value: the text then says all that
@@ -132,7 +132,7 @@ def packed(values: Mapping[str, Tensor], names: Sequence[str], *size: int) -> np
     return torch.stack(wide).numpy() if wide else np.zeros((1, *size))
 
 
-def places(
+def values_text(
     names: Sequence[str],
     columns: Sequence[str],
     numbers: Sequence[str],

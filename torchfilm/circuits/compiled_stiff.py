@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchfilm.circuits.compiled import Compiled, packed, places, pools, rates_of
+from torchfilm.circuits.compiled import Compiled, packed, pools, rates_of, values_text
 from torchfilm.circuits.emission import functions, tangent_functions
 from torchfilm.circuits.expressions import Expression
 from torchfilm.circuits.graph import evaluated
@@ -97,7 +97,7 @@ class CompiledTangents(Compiled):
     def text(self) -> str:  # type: ignore[override]
         equations, (text, prepared) = self.equations, functions(self.equations)
         names = [n for n in equations.leaves if n in (*self.moving, *self.moving_numbers)]
-        turns = places(names, self.moving, self.moving_numbers, ("turning", "turned"))
+        turns = values_text(names, self.moving, self.moving_numbers, ("turning", "turned"))
         size, leaves = len(equations.variables), self.leaves()
         fixed = {"c": prepared, "leaf": len(equations.leaves), "turn": len(names)}
         return "".join((

@@ -24,7 +24,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from torchfilm.circuits import linear
-from torchfilm.tools.reads import numbers, places, places_of, reads_are_free
+from torchfilm.tools.reads import known_rows_where, numbers, reads_are_free, rows_where
 from torchfilm.tools.tangents import both, forward_mode, with_tangent
 
 # rates(u, rows): du/dt (M, S), conc/h, of the cells `rows` (M,) at concentrations u (M, S). Row i
@@ -248,7 +248,7 @@ class _Tableau:
         """
         low = u.detach().clamp(max=0.0)
         new = torch.where((new < low) & (new >= low - noise), low, new)
-        (at,) = places((new < low).any(0))
+        (at,) = rows_where((new < low).any(0))
         change = torch.zeros_like(new[0])
         if at.numel() == 0:
             return new, change
@@ -317,7 +317,8 @@ def _advance(
             0, rows, torch.where(ends, DONE, torch.where(lost, failed, TOO_MANY_STEPS))
         )
         if leaving:
-            gone, stay = places_of(leave, leaving), places_of(~leave, rows.numel() - leaving)
+            gone = known_rows_where(leave, leaving)
+            stay = known_rows_where(~leave, rows.numel() - leaving)
             out.append((rows.index_select(0, gone), u.index_select(1, gone)))
             rows, u = rows.index_select(0, stay), u.index_select(1, stay)
             left, h, shortest, nonfinite = (

@@ -73,10 +73,10 @@ class _MediumPart(BoundEffect):
         layout = state.layout
         if layout is None or (layout.reservoir is not None and layout.obstacle is None):
             return None
-        left, first = layout.outside_medium(state.places, state.groups)
+        left, first = layout.outside_medium(state.position_3d, state.groups)
         if reads_are_free(state.device) and not bool(left.any()):
-            return MediumReport(left, left, state.places.new_zeros(state.colonies, 3))
-        place = torch.nn.functional.pad(state.places, (0, 0, 0, 1))  # none: 0
+            return MediumReport(left, left, state.position_3d.new_zeros(state.colonies, 3))
+        place = torch.nn.functional.pad(state.position_3d, (0, 0, 0, 1))  # none: 0
         return MediumReport((left > 0).long(), left, place.index_select(0, first))
 
     def _looked(self, state: State) -> State:
@@ -194,7 +194,7 @@ class GridCoverage(_MediumPart):
         """The lower and upper corner of the box that the cells need, (B, 3) µm each."""
         layout = state.layout
         assert layout is not None
-        low, high = spans(state.places, state.groups)
+        low, high = spans(state.position_3d, state.groups)
         margin = (MARGIN * layout.grid.step).masked_fill(self.flat, 0.0)
         low, high = low - margin, high + margin
         return low.masked_fill(self.fixed, torch.inf), high.masked_fill(self.fixed, -torch.inf)

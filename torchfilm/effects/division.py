@@ -17,7 +17,7 @@ from torchfilm.state import Births, Ended, Field, State
 from torchfilm.tools import checks
 from torchfilm.tools.numba_calls import as_array, kernels_loaded
 from torchfilm.tools.ragged import offsets, repeated
-from torchfilm.tools.reads import numbers, places, reads_are_free
+from torchfilm.tools.reads import numbers, reads_are_free, rows_where
 from torchfilm.tools.tangents import tracked
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
@@ -342,7 +342,7 @@ def _split(state: State, due: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str,
         rows, daughters, source, *ids = (torch.from_numpy(x) for x in found)
         return rows, daughters, source, dict(zip(NAMES, ids, strict=True))
     copies = due.long() + 1
-    (rows,) = places(due)
+    (rows,) = rows_where(due)
     whole = state.cells + rows.numel()
     every = torch.arange(state.cells, device=state.device)
     source = repeated(every, copies, whole)

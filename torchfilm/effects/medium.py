@@ -29,10 +29,10 @@ from torchfilm.tools import checks
 from torchfilm.tools.backends import check_backend, why_torch
 from torchfilm.values import PerColony, Rule, checked
 
-# A value on the grid: a number, one per colony, or a function from places (M, 3) µm to (M,).
+# A value on the grid: a number, one per colony, or a function from positions (M, 3) µm to (M,).
 OnGrid = float | Tensor | Callable[[Tensor], Tensor]
-# A velocity: two or three numbers (or one per colony each), or a function from places (M, 3) µm to
-# velocities (M, 3).
+# A velocity: two or three numbers (or one per colony each), or a function from positions (M, 3) µm
+# to velocities (M, 3).
 Flow = Sequence[float | Tensor] | Callable[[Tensor], Tensor] | None
 OUTSIDE_CELLS = ("error", "grow", "reservoir")
 SPLITTINGS = ("lie", "strang")
@@ -45,7 +45,7 @@ class Signal(metaclass=checks.KnownKeywords):
 
     diffusion: K, µm²/h, one number or one per colony. decay: 1/h. initial: concentration at the
     start. source: production, concentration/h. Each of these three is one number, one per colony,
-    or a function from places (M, 3) µm to (M,). boundary, flow: faces of the box, and velocity,
+    or a function from positions (M, 3) µm to (M,). boundary, flow: faces of the box, and velocity,
     µm/h, if they differ from the medium's. reservoir: the concentration outside an open box, one
     number or one per colony.
     """
@@ -86,8 +86,8 @@ class Medium(Effect):
 
     boundary: the faces of the box. Default: no flux; if the medium flows, open faces. flow:
     velocity of the medium, µm/h: two or three numbers (or one per colony each), or a function from
-    places (M, 3) µm to velocities (M, 3). obstacles: a function from places (M, 3) µm to (M,) bool,
-    true where there is no medium.
+    positions (M, 3) µm to velocities (M, 3). obstacles: a function from positions (M, 3) µm to (M,)
+    bool, true where there is no medium.
 
     outside: the meaning of cells outside the box. "error": the colony fails. "grow": the box grows
     with its colony, along the axes in `grows`. "reservoir": around the box each signal has its
@@ -364,4 +364,4 @@ def _check_medium(
     checks.integer("Medium.steps", steps, least=1)
     checks.choice("Medium.splitting", splitting, SPLITTINGS)
     if obstacles is not None and not callable(obstacles):
-        raise checks.input_error("Medium.obstacles", obstacles, "a function of places")
+        raise checks.input_error("Medium.obstacles", obstacles, "a function of positions")

@@ -59,10 +59,10 @@ class Transport:
         """The state with one grid per colony, as `box` and `spacing` give it."""
         low, high, step = self.medium.corners
         count = [round((b - a) / h) for a, b, h in zip(low, high, step, strict=True)]
-        places = (state.colonies, 3)
+        size = (state.colonies, 3)
         grid = Grid(
-            torch.tensor(low, dtype=torch.float64, device=state.device).expand(places).clone(),
-            torch.tensor(count, device=state.device).expand(places).clone(),
+            torch.tensor(low, dtype=torch.float64, device=state.device).expand(size).clone(),
+            torch.tensor(count, device=state.device).expand(size).clone(),
             step,
         )
         return state.replace(layout=Layout(grid, **self.space))
@@ -86,13 +86,13 @@ class Transport:
         assert layout is not None
         if callable(given):
             found = given(layout.grid.centres())
-            label = f"{what}(places) of the signal {name!r}"
+            label = f"{what}(positions) of the signal {name!r}"
             if not isinstance(found, Tensor) or found.shape != (layout.grid.nodes,):
                 shown = tuple(found.shape) if isinstance(found, Tensor) else found
                 raise checks.input_error(
                     label,
                     shown,
-                    f"a tensor of shape ({layout.grid.nodes},), one number for each place",
+                    f"a tensor of shape ({layout.grid.nodes},), one number for each position",
                 )
             bad = torch.nonzero(~((found >= 0) & (found < torch.inf))).squeeze(1)
             if bad.numel():
@@ -101,7 +101,7 @@ class Transport:
                     label,
                     float(found[bad[0]]),
                     "finite and at least 0 everywhere",
-                    f"It is not at {where} µm and {bad.numel() - 1} more places.",
+                    f"It is not at {where} µm and {bad.numel() - 1} more positions.",
                 )
             value = found.to(dtype=state.dtype, device=state.device)
         else:
@@ -171,7 +171,7 @@ class Transport:
     def _operator(self, name: str, state: State, batch: GridBatch) -> Operator:
         signal, layout = self.signals[name], state.layout
         assert layout is not None
-        ids = state.colony_id.index_select(0, batch.places)
+        ids = state.colony_id.index_select(0, batch.colonies)
         own = lambda x: (
             x.to(state.device).index_select(0, ids) if isinstance(x, Tensor) and x.dim() == 1 else x
         )
@@ -195,7 +195,7 @@ class Transport:
                 and signal.source == 0
                 else spread("source")
             ),
-            colonies=batch.places.numel(),
+            colonies=batch.colonies.numel(),
             dtype=state.dtype,
             device=state.device,
         )
@@ -210,7 +210,7 @@ def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any],
         parts = [
             torch.as_tensor(own(v), dtype=torch.float64, device=layout.grid.origin.device)
             .reshape(-1)
-            .expand(batch.places.numel())
+            .expand(batch.colonies.numel())
             for v in (*flow, 0.0)[:3]
         ]
         return torch.stack(parts, 1)
@@ -218,7 +218,7 @@ def _velocity(flow: Flow, layout: Layout, batch: GridBatch, own: Callable[[Any],
 
 
 def _closure_tensors(signal: Signal, flow: Flow) -> list[Tensor]:
-    """Tensors in the closures of functions of places."""
+    """Tensors in the closures of functions of positions."""
     functions = [f for f in (signal.decay, signal.source, flow) if callable(f)]
     cells = [
         cell.cell_contents for f in functions for cell in getattr(f, "__closure__", None) or ()

@@ -13,7 +13,7 @@ from torchfilm.physics.contacts import CandidateContacts, Capsules, contact_gaps
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
 from torchfilm.tools.ragged import marked
-from torchfilm.tools.reads import places
+from torchfilm.tools.reads import rows_where
 
 
 def find_contacts(
@@ -51,7 +51,7 @@ def unresolved_contacts(
         far = (2 * at.reach > overlap) & of_active
         nearer = sum_of(at.reach, pairs.first, pairs.second) - pairs.gap
         come = nearer > 0.5 * sum_of(overlap, pairs.first, pairs.second)
-        come, fast = places(come & of_active.index_select(0, pairs.first), far)
+        come, fast = rows_where(come & of_active.index_select(0, pairs.first), far)
         first, second = pairs_of(fast)
         left = at.clipped & of_active
         # soft cells, and cells at a soft wall or one of little weight, are pressed as deep as these
@@ -65,15 +65,15 @@ def unresolved_contacts(
         root, soft = wall_weights(cells, walls)
         too_deep = root * root * walls.gap < -overlap.index_select(0, walls.cell)
         left = (left | marked(left.numel(), walls.cell, ~soft & too_deep)) & of_active
-        more = pairs_of(*places(left & ~far))
+        more = pairs_of(*rows_where(left & ~far))
         # the others are known by now
-        (new,) = places(~far.index_select(0, more[1]))
+        (new,) = rows_where(~far.index_select(0, more[1]))
         first, second = (
             torch.cat([a, b.index_select(0, new)])
             for a, b in zip((first, second), more, strict=True)
         )
         theirs = left.index_select(0, first) | left.index_select(0, second)
-        theirs, at_wall = places(theirs, left.index_select(0, walls.cell))
+        theirs, at_wall = rows_where(theirs, left.index_select(0, walls.cell))
     found = CandidateContacts.among(
         capsules, first.index_select(0, theirs), second.index_select(0, theirs), include_near
     )

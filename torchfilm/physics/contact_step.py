@@ -33,7 +33,7 @@ from torchfilm.physics.jacobian import ContactJacobian
 from torchfilm.physics.problem import NOT_FINITE, ContactProblem, SolveReport
 from torchfilm.physics.solve import solve_contacts
 from torchfilm.physics.wall_contacts import WallContacts, share_to_walls
-from torchfilm.tools.reads import numbers, places, places_of
+from torchfilm.tools.reads import known_rows_where, numbers, rows_where
 
 
 def contact_step(
@@ -53,7 +53,7 @@ def contact_step(
     base, rigid = at.length, growth.detach() <= 0
     moving = active.index_select(0, cells.colony)
     most, count = numbers((passes * active).max(), moving.sum())
-    which = rows = places_of(moving, count)
+    which = rows = known_rows_where(moving, count)
     at = replace(at, length=torch.where(moving, base + growth, base))
     pairs: CandidateContacts | None = None
     for number in range(most):
@@ -65,7 +65,7 @@ def contact_step(
         else:
             pairs, walls, moving = unresolved_contacts(cells, at, active, rows, pairs)
             active = cells.groups.any(moving)
-            which, rows = places(moving, active.index_select(0, cells.colony))
+            which, rows = rows_where(moving, active.index_select(0, cells.colony))
             if not which.numel():
                 break
         contacts = contacts_of(pairs, include_near)
@@ -185,7 +185,7 @@ def _share(cells: CellProperties, at: Moved, move: Tensor) -> tuple[Tensor, Tens
     turn, way = (x.square().sum(1).sqrt() for x in (move[:, dim:-1], move[:, :dim]))
     share = (MAX_TURN / turn).clamp(max=1.0)
     reach = way + 0.5 * turn * at.length + 0.5 * move[:, -1].clamp(min=0.0)
-    far = places(share * reach > radius)[0] if cells.surfaces else radius.new_empty(0)
+    far = rows_where(share * reach > radius)[0] if cells.surfaces else radius.new_empty(0)
     if far.numel():
         pick = lambda x: x.index_select(0, far)
         position, axis, length = pick(at.position), pick(at.axis), pick(at.length)

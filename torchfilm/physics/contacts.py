@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfilm.kernels.bilateral_scheme import CANDIDATE, NEAR
 from torchfilm.physics.neighbours import Neighbourhood
-from torchfilm.tools.reads import places
+from torchfilm.tools.reads import rows_where
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
 
 # Sine of the angle between two axes at which a line of contact has shrunk to a point (see
@@ -220,7 +220,7 @@ class CandidateContacts:
     @cached_property
     def flat(self) -> Tensor:
         """The pairs that may touch along a line, (F,): only nearly parallel ones may."""
-        return places(self._parallel)[0]
+        return rows_where(self._parallel)[0]
 
     @property
     def _parallel(self) -> Tensor:
@@ -251,7 +251,7 @@ class CandidateContacts:
         """The pairs with a smaller gap than `most` (K,)."""
         with torch.no_grad():
             near = self.gap < most
-            index, flat = places(near, near & self._parallel)
+            index, flat = rows_where(near, near & self._parallel)
         pick = lambda x: x.index_select(0, index)
         made = CandidateContacts(
             pick(self.first),
@@ -297,7 +297,7 @@ def contacts_of(pairs: CandidateContacts, include_near: bool = False) -> Contact
         deep0, deep1 = point < margin, line & (ends[1] < margin.index_select(0, flat))
         either = line & (deep0.index_select(0, flat) | deep1) & (ends[0] + ends[1] < 0)
         deep0[flat] |= either
-        keep0, keep1 = places(deep0, deep1 | either)
+        keep0, keep1 = rows_where(deep0, deep1 | either)
     of_ends = _end_weights(ends, line, flat, point, margin, include_near)
     weight = torch.cat(
         [of_ends[0].index_select(0, keep0), of_ends[1].index_select(0, flat).index_select(0, keep1)]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools.ragged import Groups, WeightedRows, csr
-from torchfilm.tools.reads import places
+from torchfilm.tools.reads import rows_where
 
 
 class ContactJacobian:
@@ -70,7 +70,7 @@ class ContactJacobian:
         """
         number = torch.cumsum(moving, 0) - 1
         one, other = moving.index_select(0, self.first), moving.index_select(0, self.second)
-        both, only_one, only_other, wall = places(
+        both, only_one, only_other, wall = rows_where(
             one & other, one & ~other, other & ~one, moving.index_select(0, self.at_wall)
         )
         of = lambda cell, rows: number.index_select(0, cell.index_select(0, rows))

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchfilm.tools.ragged import Groups, expand_ranges, offsets
-from torchfilm.tools.reads import numbers, places
+from torchfilm.tools.reads import numbers, rows_where
 
 # Slices of a row per reach of a cell. Finer slices leave fewer cells out of reach to test; coarser
 # slices make the table of their starts shorter.
@@ -74,7 +74,7 @@ class Neighbourhood:
             self.grids.append((grid, everyone[:0]))
             return
         for k in range(last + 1):
-            members, larger = places(level == k, level > k)
+            members, larger = rows_where(level == k, level > k)
             if members.numel():
                 grid, _ = _CellGrid.build(position, self.reach, groups, members, level.max())
                 self.grids.append((grid, larger))
@@ -103,7 +103,7 @@ class Neighbourhood:
         for grid, _ in self.grids if cells.numel() else ():
             i, j = _keep_spheres_that_meet(self.place, self.reach, *grid.pairs_with(cells))
             # a pair of two selected cells was found twice, and each selected cell has found itself
-            (once,) = places((i < j) | ~selected.index_select(0, j))
+            (once,) = rows_where((i < j) | ~selected.index_select(0, j))
             found.append((i.index_select(0, once), j.index_select(0, once)))
         return self._keep_boxes_that_meet(found)
 
@@ -117,7 +117,7 @@ class Neighbourhood:
         for x, size in zip(self.place, self.box, strict=True):
             apart = (x.index_select(0, j) - x.index_select(0, i)).abs()
             meet &= ~(apart > size.index_select(0, i) + size.index_select(0, j))
-        (keep,) = places(meet)
+        (keep,) = rows_where(meet)
         return i.index_select(0, keep), j.index_select(0, keep)
 
 
@@ -255,7 +255,7 @@ class _CellGrid:
             counts.append(count)
         totals = numbers(*(count.sum() for count in counts))
         runs = [expand_ranges(*each) for each in zip(starts, counts, totals, strict=True)]
-        (keep,) = places(torch.cat([_spheres_meet(place, reach, *run) for run in runs]))
+        (keep,) = rows_where(torch.cat([_spheres_meet(place, reach, *run) for run in runs]))
         first, second = (torch.cat(side).index_select(0, keep) for side in zip(*runs, strict=True))
         return members.index_select(0, first), members.index_select(0, second)
 
@@ -283,7 +283,7 @@ def _keep_spheres_that_meet(
     place: Tensor, reach: Tensor, i: Tensor, j: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The pairs (i, j) whose bounding spheres meet. place: (d, N). reach: (N,)."""
-    (keep,) = places(_spheres_meet(place, reach, i, j))
+    (keep,) = rows_where(_spheres_meet(place, reach, i, j))
     return i.index_select(0, keep), j.index_select(0, keep)
 
 

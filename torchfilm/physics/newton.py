@@ -25,7 +25,7 @@ from torchfilm.physics.problem import (
 )
 from torchfilm.tools.cg import conjugate_gradients, worst_of
 from torchfilm.tools.ragged import Blocks
-from torchfilm.tools.reads import numbers, places_of
+from torchfilm.tools.reads import known_rows_where, numbers
 
 
 @dataclass(frozen=True)
@@ -179,9 +179,9 @@ def _minority(
         return None
     of_rows = going.index_select(0, problem.of_rows.owner)
     return Selection(
-        places_of(going, colonies),
-        places_of(going.index_select(0, owner), cells),
-        places_of(of_rows, pairs + walls),
+        known_rows_where(going, colonies),
+        known_rows_where(going.index_select(0, owner), cells),
+        known_rows_where(of_rows, pairs + walls),
         pairs,
     )
 

@@ -39,7 +39,7 @@ from torchfilm.physics.solve import warn_if_loose
 from torchfilm.physics.step_records import StepInput, StepResult
 from torchfilm.physics.wall_contacts import WallContacts, find_wall_contacts
 from torchfilm.tools.ragged import marked
-from torchfilm.tools.reads import numbers, places
+from torchfilm.tools.reads import numbers, rows_where
 from torchfilm.tools.vectors import safe_norm
 
 
@@ -83,7 +83,7 @@ class _OneStep:
         """The result after this step."""
         given, active = self.given, self.active
         moving = active.index_select(0, self.groups.owner)
-        (cells,) = places(moving)
+        (cells,) = rows_where(moving)
         if not cells.numel():
             return at
         rows, base = cells, at.length
@@ -101,7 +101,7 @@ class _OneStep:
                 active = active & self.groups.any(moving)
                 of_active = active.index_select(0, self.groups.owner)
                 moving = moving & of_active
-                cells, rows = places(moving, of_active)
+                cells, rows = rows_where(moving, of_active)
                 if not cells.numel():
                     break
             at = self._pass(at, pairs, walls, moving, cells, active, least, number == 0)
@@ -375,7 +375,7 @@ def near_rows(pairs: CandidateContacts) -> Contacts:
         a.take(flat), b.take(flat), s.index_select(0, flat), t.index_select(0, flat)
     )
     *ends, line = found
-    (line,) = places(line)
+    (line,) = rows_where(line)
     flat, ends = flat.index_select(0, line), [x.index_select(1, line) for x in ends]
     points = [
         torch.cat([x.index_copy(0, flat, two[0]), two[1]])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchfilm.kernels.bilateral_scheme import NEAR, POINTS_ON_MOVE
 from torchfilm.physics.surfaces import FlatSurface, Surface
-from torchfilm.tools.reads import places
+from torchfilm.tools.reads import rows_where
 from torchfilm.tools.vectors import cross, dot, safe_sqrt
 
 # Position (P, d) float64, axis (P, d) and half length (P,) of some capsules.
@@ -75,7 +75,7 @@ def find_wall_contacts(
     degrees = 4 if axis.shape[1] == 2 else 7
     none = colony_id.new_empty(0), length.new_empty(0), length.new_empty(0, degrees)
     found = [(*none, none[0])]
-    for keep, (_, *parts) in zip(places(*(near for near, *_ in tried)), tried, strict=True):
+    for keep, (_, *parts) in zip(rows_where(*(near for near, *_ in tried)), tried, strict=True):
         s, end, root, gap, way, of = (x.index_select(0, keep) for x in parts)
         n, a = way.T, axis.index_select(0, keep).T
         row = torch.cat([n, cross(s * a, n), (end * dot(n, a)).unsqueeze(0)])

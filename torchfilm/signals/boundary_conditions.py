@@ -19,8 +19,8 @@ class Face(metaclass=checks.KnownKeywords):
         """The concentration beyond the face, one number or one per colony; 0 where none enters."""
         return 0.0
 
-    def take(self, places: Tensor) -> Face:
-        """The face of the colonies at `places` (b,) int64."""
+    def take(self, colonies: Tensor) -> Face:
+        """The face of these colonies of the batch, (b,) int64."""
         return self
 
 
@@ -49,8 +49,8 @@ class Dirichlet(Face):
     def outside_value(self) -> float | Tensor:
         return self.value
 
-    def take(self, places: Tensor) -> Face:
-        return replace(self, value=_take(self.value, places))
+    def take(self, colonies: Tensor) -> Face:
+        return replace(self, value=_take(self.value, colonies))
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Open(Face):
     def outside_value(self) -> float | Tensor:
         return self.outside
 
-    def take(self, places: Tensor) -> Face:
-        return replace(self, outside=_take(self.outside, places))
+    def take(self, colonies: Tensor) -> Face:
+        return replace(self, outside=_take(self.outside, colonies))
 
 
 @dataclass(frozen=True)
@@ -118,15 +118,15 @@ class BoundaryConditions(metaclass=checks.KnownKeywords):
         x, y, z = (isinstance(low, Periodic) for low, _ in self.pairs)
         return x, y, z
 
-    def take(self, places: Tensor) -> BoundaryConditions:
-        """The faces of the colonies at `places` (b,) int64."""
-        x, y, z = ((low.take(places), high.take(places)) for low, high in self.pairs)
+    def take(self, colonies: Tensor) -> BoundaryConditions:
+        """The faces of these colonies of the batch, (b,) int64."""
+        x, y, z = ((low.take(colonies), high.take(colonies)) for low, high in self.pairs)
         return BoundaryConditions(x, y, z)
 
 
-def _take(given: float | Tensor, places: Tensor) -> float | Tensor:
+def _take(given: float | Tensor, colonies: Tensor) -> float | Tensor:
     return (
-        given.to(places.device).index_select(0, places)
+        given.to(colonies.device).index_select(0, colonies)
         if isinstance(given, Tensor) and given.dim() == 1
         else given
     )

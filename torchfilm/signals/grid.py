@@ -26,11 +26,11 @@ Shape = tuple[int, int, int]
 class GridBatch:
     """Colonies with grids of one shape.
 
-    places: (b,) int64, their indices in the batch. starts: (b,) int64, their first voxels. index:
+    colonies: (b,) int64, their indices in the batch. starts: (b,) int64, their first voxels. index:
     the positions of their values in a flat signal.
     """
 
-    places: Tensor
+    colonies: Tensor
     starts: Tensor
     shape: Shape
     index: Tensor | slice
@@ -42,7 +42,7 @@ class GridBatch:
             if isinstance(self.index, slice)
             else values.index_select(0, self.index)
         )
-        return part.view(self.places.numel(), *self.shape)
+        return part.view(self.colonies.numel(), *self.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ class Grid:
         return self.origin + self.shape * self.step
 
     @cached_property
-    def places(self) -> Tensor:
+    def ijk(self) -> Tensor:
         """(nodes, 3) int64, the indices (i, j, k) of each voxel in its colony's grid."""
         within = torch.arange(self.nodes, device=self.shape.device) - self.offsets.index_select(
             0, self.owner
@@ -154,7 +154,7 @@ class Grid:
 
     def centres(self) -> Tensor:
         """(nodes, 3) float64, µm, the centre of each voxel."""
-        return self.origin.index_select(0, self.owner) + (self.places + 0.5) * self.step
+        return self.origin.index_select(0, self.owner) + (self.ijk + 0.5) * self.step
 
     @cached_property
     def batches(self) -> tuple[GridBatch, ...]:
@@ -168,12 +168,12 @@ class Grid:
             whole = slice(0, self.nodes)
             return (GridBatch(everyone, self.offsets[:-1], self.shapes[0], whole),)
         out = []
-        for shape, places in found.items():
-            here, size = torch.tensor(places, device=device), shape[0] * shape[1] * shape[2]
+        for shape, mine in found.items():
+            here, size = torch.tensor(mine, device=device), shape[0] * shape[1] * shape[2]
             first = self.offsets.index_select(0, here)
-            if places == list(range(places[0], places[0] + len(places))):
-                begin = sum(x * y * z for x, y, z in self.shapes[: places[0]])
-                index: Tensor | slice = slice(begin, begin + size * len(places))
+            if mine == list(range(mine[0], mine[0] + len(mine))):
+                begin = sum(x * y * z for x, y, z in self.shapes[: mine[0]])
+                index: Tensor | slice = slice(begin, begin + size * len(mine))
             else:
                 index = (first.unsqueeze(1) + torch.arange(size, device=device)).reshape(-1)
             out.append(GridBatch(here, first, shape, index))
@@ -236,12 +236,12 @@ class Grid:
         larger = replace(
             self, origin=self.origin - before * self.step, shape=self.shape + before + after
         )
-        place = self.places + before.index_select(0, self.owner)
+        at = self.ijk + before.index_select(0, self.owner)
         size = larger.shape.index_select(0, self.owner)
         target = (
             larger.offsets.index_select(0, self.owner)
-            + (place[:, 0] * size[:, 1] + place[:, 1]) * size[:, 2]
-            + place[:, 2]
+            + (at[:, 0] * size[:, 1] + at[:, 1]) * size[:, 2]
+            + at[:, 2]
         )
         out = []
         for value, new in zip(values, [0.0] * len(values) if fill is None else fill, strict=True):

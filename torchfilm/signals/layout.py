@@ -84,18 +84,18 @@ class Layout:
         ):
             shown = (tuple(solid.shape), solid.dtype) if isinstance(solid, Tensor) else solid
             raise checks.input_error(
-                "obstacles(places)",
+                "obstacles(positions)",
                 shown,
                 f"a bool tensor of shape ({self.grid.nodes},), one value per position",
             )
         if not bool((~solid).any()):
             raise checks.InputError(
-                "obstacles(places) is true everywhere, so no medium remains. Return False where"
+                "obstacles(positions) is true everywhere, so no medium remains. Return False where"
                 " signals can be."
             )
         return ~solid
 
-    def places(self, position: Tensor) -> Tensor:
+    def position_3d(self, position: Tensor) -> Tensor:
         """The positions of cells at (N, d) in the grid's three dimensions, (N, 3) float64, µm."""
         if position.shape[1] == 3:
             return position.double()
@@ -111,7 +111,7 @@ class Layout:
         """The stencil of cells at (N, d) µm of colonies (N,)."""
         return stencil(
             self.grid,
-            self.places(position),
+            self.position_3d(position),
             colony,
             periodic=self.periodic,
             mask=self.mask,
@@ -125,7 +125,7 @@ class Layout:
         They are in an obstacle, or beyond a box without a reservoir.
         """
         if self.obstacle is None:
-            return beyond(self.grid, self.places(position), groups, self.periodic)
+            return beyond(self.grid, self.position_3d(position), groups, self.periodic)
         where = self.stencil(position, groups.owner, torch.float64)
         assert where.blocked is not None
         return counted(where.outside if self.reservoir is None else where.blocked, groups)
@@ -170,7 +170,7 @@ class Layout:
         nz) along x, and so on.
         """
         out = []
-        step, origin = self.grid.step, self.grid.origin.index_select(0, batch.places)
+        step, origin = self.grid.step, self.grid.origin.index_select(0, batch.colonies)
         for axis in range(3):
             counts = [n + (k == axis) for k, n in enumerate(batch.shape)]
             lines = [
@@ -184,7 +184,7 @@ class Layout:
             size = faces[..., 0].numel()
             if not isinstance(found, Tensor) or found.shape not in ((size, 2), (size, 3)):
                 raise checks.input_error(
-                    "flow(places)",
+                    "flow(positions)",
                     tuple(getattr(found, "shape", ())),
                     f"velocities of shape ({size}, 3)",
                 )
@@ -196,15 +196,15 @@ class Layout:
         """The same medium on another grid."""
         return self if grid is self.grid else replace(self, grid=grid)
 
-    def take(self, places: Tensor) -> tuple[Layout, Tensor]:
+    def take(self, colonies: Tensor) -> tuple[Layout, Tensor]:
         """The layout of some colonies (b,), and the indices (nodes,) of their voxels here."""
         grid = Grid(
-            self.grid.origin.index_select(0, places),
-            self.grid.shape.index_select(0, places),
+            self.grid.origin.index_select(0, colonies),
+            self.grid.shape.index_select(0, colonies),
             self.grid.spacing,
         )
         _, rows = expand_ranges(
-            self.grid.offsets.index_select(0, places), self.grid.counts.index_select(0, places)
+            self.grid.offsets.index_select(0, colonies), self.grid.counts.index_select(0, colonies)
         )
         return self.on(grid), rows
 

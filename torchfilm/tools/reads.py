@@ -25,16 +25,16 @@ def numbers(*values: Tensor) -> list[int]:
     return torch.stack([value.long() for value in values]).tolist()
 
 
-def places(*masks: Tensor) -> list[Tensor]:
+def rows_where(*masks: Tensor) -> list[Tensor]:
     """Where each mask (K,) is true, ascending, by one read."""
     if not masks:
         return []
     if len(masks) == 1:
         return [torch.nonzero(masks[0]).squeeze(1)]
     counts = numbers(*(mask.sum() for mask in masks))
-    return [places_of(mask, count) for mask, count in zip(masks, counts, strict=True)]
+    return [known_rows_where(mask, count) for mask, count in zip(masks, counts, strict=True)]
 
 
-def places_of(mask: Tensor, count: int) -> Tensor:
+def known_rows_where(mask: Tensor, count: int) -> Tensor:
     """Where a mask (K,) is true, ascending, if it is so `count` times: no read."""
     return torch.nonzero_static(mask, size=count).squeeze(1)
