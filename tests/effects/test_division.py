@@ -8,36 +8,13 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from dividing import flagged, row_of_cells
 from helpers import ends, seeded, step
 from recorded import assert_same_state
 
 import torchfilm as tf
 from torchfilm.effect import Effect
 from torchfilm.effects import division
-from torchfilm.physics import capsule
-
-
-def row_of_cells(
-    count: int, length: float | list[float] = 2.0, dim: int = 2, radius: float = 0.5
-) -> tf.Cells:
-    """Cells far apart, at varied angles."""
-    position = torch.zeros(count, dim, dtype=torch.float64)
-    position[:, 0] = 10.0 * torch.arange(count)
-    angle = torch.arange(count, dtype=torch.float64)
-    axis = torch.zeros_like(position)
-    axis[:, 0], axis[:, 1] = torch.cos(angle), torch.sin(angle)
-    if dim == 3:
-        axis[:, 2] = torch.sin(2 * angle)
-    return tf.Cells(position, axis, length, radius)
-
-
-def flagged(scene: tf.Scene, colonies: int = 1, which=None, **options) -> tf.State:
-    """A first state in which the cells `which` (all of them by default) are told to divide."""
-    state = scene.bind(colonies, **{"dtype": torch.float64, **options}).start()
-    flag = torch.zeros(state.cells, dtype=torch.bool, device=state.device)
-    flag[slice(None) if which is None else which] = True
-    return state.with_fields(divide_flag=flag)
-
 
 # --- criteria -------------------------------------------------------------------------------------
 
@@ -357,126 +334,6 @@ def test_gradient_passes_through_the_copying():
     )
     # centre of the first daughter: ½(l₁ − l)·a, so its x moves by ½(f − 1)
     assert float(shift) == pytest.approx(0.5 * (0.3 - 1), rel=1e-12)
-
-
-# --- bad input ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "given",
-    [{"length": 3.0, "volume": 3.0}, {"length": 3.0, "added": 1.0}, {"volume": 3.0, "added": 1.0}],
-)
-def test_two_criteria_are_refused(given):
-    with pytest.raises(tf.InputError, match="one criterion"):
-        tf.Division(**given)
-
-
-@pytest.mark.parametrize("criterion", ["length", "volume", "added"])
-@pytest.mark.parametrize(
-    "bad", [0.0, -1.0, math.nan, math.inf, "long", [3.0, -3.0], tf.Uniform(-1.0, 2.0)]
-)
-def test_bad_thresholds_are_refused(criterion, bad):
-    with pytest.raises(tf.InputError, match=rf"Division\.{criterion}"):
-        tf.Division(**{criterion: bad})
-
-
-@pytest.mark.parametrize(
-    "bad", [0.0, 1.0, -0.1, 1.5, math.nan, tf.Uniform(0.5, 1.0), tf.Uniform(0.0, 0.5), [0.5, 1.0]]
-)
-def test_bad_fractions_are_refused(bad):
-    with pytest.raises(tf.InputError, match=r"Division\.fraction"):
-        tf.Division(fraction=bad)
-
-
-@pytest.mark.parametrize("bad", [-0.1, math.nan, 3.0])
-def test_bad_axis_noise_is_refused(bad):
-    with pytest.raises(tf.InputError, match=r"Division\.axis_noise"):
-        tf.Division(axis_noise=bad)
-
-
-@pytest.mark.parametrize("threshold", [1.5, 2.0, tf.Uniform(1.2, 1.9)])
-def test_threshold_below_the_founders_length_is_refused(threshold):
-    with pytest.raises(tf.InputError, match=r"Division\.length.*cell 0 in colony 0"):
-        tf.Scene(tf.Division(length=threshold), founders=row_of_cells(1)).bind().start()
-
-
-def test_volume_threshold_below_the_founders_volume_is_refused():
-    with pytest.raises(tf.InputError, match=r"Division\.volume"):
-        tf.Scene(tf.Division(volume=2.0), founders=row_of_cells(1)).bind().start()
-
-
-def test_one_colonys_bad_threshold_is_named():
-    with pytest.raises(tf.InputError, match="colony 1"):
-        tf.Scene(tf.Division(length=[3.0, 1.9, 3.0]), founders=row_of_cells(1)).bind(3).start()
-
-
-@pytest.mark.parametrize("threshold", [0.8, tf.Uniform(0.9, 3.0)])
-def test_length_threshold_that_leaves_no_room_for_caps_is_refused(threshold):
-    with pytest.raises(tf.InputError, match=r"Division\.length.*at least 1 "):
-        tf.Scene(tf.Division(length=threshold), founders=row_of_cells(1, 0.2)).bind().start()
-
-
-@pytest.mark.parametrize(
-    "length, radius, threshold, words",
-    [
-        # the largest number of any type is not what a cell of type 0 may reach
-        (5.0, 0.5, {0: 4.0, 1: tf.Uniform(8.0, 10.0)}, r"threshold 4 of cell 0 .*birth, 5"),
-        (9.0, 0.5, {0: tf.Uniform(4.0, 8.0), 1: 10.0}, r"of cell 0 .*birth, 9"),
-        # nor the smallest what it may divide at
-        (2.0, 1.5, {0: 4.0, 1: tf.Uniform(2.2, 2.5)}, None),
-        (2.0, 1.5, {0: tf.Uniform(3.5, 4.0), 1: 2.5}, None),
-        (2.0, 1.5, {0: tf.Uniform(2.5, 4.0), 1: 5.0}, r"can be 2\.5: it must be at least 3 "),
-        (2.0, 1.5, {0: 2.5, 1: tf.Uniform(3.5, 4.0)}, r"can be 2\.5: it must be at least 3 "),
-    ],
-)
-def test_a_cell_is_compared_with_the_thresholds_of_its_own_type(length, radius, threshold, words):
-    """Numbers for some types, distributions for others. Cell 0 is of type 0; cell 1, of type 1, is
-    small enough for any of these."""
-    cells = tf.Cells(
-        [[0.0, 0.0], [20.0, 0.0]], [[1.0, 0.0]] * 2, [length, 1.2], [radius, 0.5], cell_type=[0, 1]
-    )
-    scene = tf.Scene(tf.Division(length=threshold), founders=cells)
-    if words is None:
-        assert scene.bind(2).start().cells == 4
-    else:
-        with pytest.raises(tf.InputError, match=words):
-            scene.bind(2)
-
-
-def test_volume_threshold_that_leaves_no_room_for_caps_is_refused():
-    short = float(capsule.volume(torch.tensor(0.9), torch.tensor(0.5)))
-    with pytest.raises(tf.InputError, match=r"Division\.volume"):
-        tf.Scene(tf.Division(volume=short), founders=row_of_cells(1, 0.2)).bind().start()
-
-
-def test_flagged_cell_too_short_to_divide_stops_the_run_and_names_it():
-    scene = tf.Scene(tf.Division(), founders=row_of_cells(2, 0.6))
-    state = flagged(scene, 3, which=[5])
-    with pytest.raises(tf.SimulationError, match=r"colony 2 .*cell 1 .*0\.6") as caught:
-        list(tf.simulate(scene, state, until=0.1, dt=0.1))
-    assert caught.value.colonies == (2,)
-
-
-def test_a_cell_too_short_to_divide_keeps_its_whole_colony_from_dividing():
-    """By the step itself a failure is no exception but a report for each colony, as a failed solve
-    is."""
-    scene = tf.Scene(tf.Division(), founders=row_of_cells(2, [3.0, 0.6]))
-    after = step(scene, flagged(scene, 3, which=[0, 2, 3, 4]), 0.1)
-    assert (
-        after.counts.tolist() == [3, 2, 3]
-        and after.divide_flag.tolist() == [False] * 3 + [True] * 2 + [False] * 3
-    )
-    assert after.reports["division"].status.tolist() == [0, 1, 0]
-    assert not step(scene, flagged(scene, 3, which=[3]), 0.1).births, (
-        "no division of no cell for a rule to see"
-    )
-    assert "division" not in step(scene, flagged(scene, 3, which=[0]), 0.1).reports
-
-
-def test_exactly_two_radii_may_divide():
-    """l = 2r leaves two spheres: the limit, and allowed."""
-    scene = tf.Scene(tf.Division(), founders=row_of_cells(1, 1.0))
-    assert step(scene, flagged(scene), 0.1).length.tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("dim", [2, 3])
