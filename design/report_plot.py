@@ -173,7 +173,7 @@ def _draw_convergence(ax: Axes, report: SearchReport) -> None:
             color="0.3",
         )  # fmt: skip
     ax.set(xlabel="colonies simulated", ylabel="loss", ylim=(0, None))
-    ax.set_title("every design (grey), the best so far (red)", fontsize=9)
+    ax.set_title("designs at full size (grey), the best so far (red)", fontsize=9)
 
 
 def _draw_parameters(ax: Axes, report: SearchReport) -> None:

@@ -274,6 +274,20 @@ def test_resume_of_a_run_that_is_at_its_end_is_no_error(command):
     assert_same(before, frames("a.h5"))
 
 
+def test_resume_to_fewer_cells_than_there_are_says_so(command, capsys):
+    command("run", "microcolony", "--cells", 4, "--out", "a.h5", "--no-picture")
+    command("resume", "a.h5", "--cells", 3, "--no-picture")
+    assert (
+        "note: every colony has 4 cells or more already: nothing to do" in capsys.readouterr().out
+    )
+
+
+def test_as_many_colonies_as_a_parameter_has_values(command):
+    command("run", "boundary_detector", "--set", "k1=1,2,3", "--until", 0.1, "--no-picture")
+    with tf.Results("boundary_detector.h5") as results:
+        assert results.counts.shape[1] == 3
+
+
 def started(folder: Path, results: str, *arguments: str) -> subprocess.Popen:
     """The command in a process of its own, from when its results file is there."""
     child = subprocess.Popen(

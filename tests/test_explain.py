@@ -4,6 +4,7 @@ estimate is the arithmetic that it claims to be."""
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from torchfilm.explanation import left_out, replayed
 from torchfilm.kernels.scheme import OVERLAP, PASSES
 from torchfilm.kernels.scheme import TOLERANCE as FORCE_TOLERANCE
 from torchfilm.physics import bilateral, compiled, one_sided
+from torchfilm.signals.exchange import turns_error
 
 BODY = (tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.5)), tf.Mechanics(dim=2))
 BOX = {"box": ((-32.0, -32.0), (32.0, 32.0)), "spacing": 8.0}
@@ -358,3 +360,23 @@ def test_the_command_says_what_the_function_says(command, capsys):
 
 def test_the_device_is_the_one_that_was_measured(device):
     assert f"{device.type}, float32" in tf.explain(tf.Scene(*BODY), device=device, seconds=0.02)
+
+
+def test_what_taking_turns_costs_a_signal_is_said_where_it_is_much():
+    """And not of a signal that diffuses slowly, or in short steps."""
+    fast = tf.Scene(*BODY, tf.Medium(ahl=tf.Signal(diffusion=3000.0, decay=1.0), **BOX))
+    grid = fast.bind().start().layout.grid
+    said = " ".join(tf.explain(fast, seconds=0).split())
+    found = re.search(r"signal up to ([\d.]+) % too low; below 1 % in steps of ([\d.]+) h", said)
+    low, enough = map(float, found.groups())
+    assert low == pytest.approx(-100 * turns_error(3000.0, 1.0, grid, fast.dt), rel=0.05)
+    assert (
+        turns_error(3000.0, 1.0, grid, enough) > -0.01 > turns_error(3000.0, 1.0, grid, 2 * enough)
+    )
+    assert "take turns" not in tf.explain(fast.replace(dt=enough), seconds=0)
+    assert "take turns" not in tf.explain(tf.Scene(*BODY, medium()), seconds=0)
+
+
+def test_a_depth_that_goes_by_the_spacing_is_said():
+    assert "as deep as a voxel is wide" in tf.explain(tf.Scene(*BODY, medium()), seconds=0)
+    assert "as deep as" not in tf.explain(tf.Scene(*BODY, medium(depth=8.0)), seconds=0)

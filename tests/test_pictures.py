@@ -401,3 +401,20 @@ def test_each_colonys_own_walls_are_drawn(tmp_path):
     for drawn, half, radius in ((first, 2.0, 1.0), (second, 3.0, 2.0)):
         assert sorted(abs(a.get_xy1()[1]) for a in drawn[:-1]) == [0.0, half, half]
         assert drawn[-1].get_radius() == radius and tuple(drawn[-1].get_center()) == (5.0, 0.0)
+
+
+def test_colonies_of_a_study_are_named_by_the_parameter_that_differs(tmp_path):
+    """But not where several differ."""
+    founders = tf.Cells([[0.0, 0.0]], [[1.0, 0.0]])
+    for name, noise, titles in (
+        ("one.h5", 0.001, ["rate = 0.5: 1 cell", "rate = 1.25: 1 cell"]),
+        ("two.h5", [0.0, 0.1], ["colony 0: 1 cell", "colony 1: 1 cell"]),
+    ):
+        division = tf.Division(length=9.0, axis_noise=noise)
+        scene = tf.Scene(tf.Growth(rate=[0.5, 1.25]), division, founders=founders)
+        for _ in tf.simulate(scene, until=0.1, record=tmp_path / name):
+            pass
+        with tf.Results(tmp_path / name) as results:
+            frame = RecordedFrames(results, [-1])[0]
+            assert [f"{frame.name(k)}: 1 cell" for k in range(2)] == titles
+        tf.show(tmp_path / name, out=tmp_path / f"{name}.png")

@@ -324,3 +324,23 @@ def test_a_changed_resume_of_an_earlier_file_leaves_its_frames_unknown(tmp_path)
     with tf.Results(old) as results:
         first, last = (results.parameters(k)["Circuit.parameters['k']"] for k in (0, -1))
     assert np.isnan(first).all() and last.tolist() == [5.0, 6.0]
+
+
+def test_rows_are_selected_by_the_value_that_was_typed(tmp_path):
+    """Of float32, too; and a file of an earlier version, which holds the binary number, is still of
+    the same scene."""
+    scene = tf.Scene(tf.Growth(rate=torch.tensor([0.1, 0.3])), tf.Division(length=4.0), dt=0.1)
+    for _ in tf.simulate(scene, until=0.2, record=tmp_path / "a.h5"):
+        pass
+    with tf.Results(tmp_path / "a.h5") as results:
+        assert results.parameters()["Growth.rate"].tolist() == [0.1, 0.3]
+        assert (results.to_pandas().rate == 0.1).any()
+        state = results.state(scene)
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["parameters/Growth.rate"][...] = torch.tensor([0.1, 0.3]).double().numpy()
+    for _ in tf.simulate(
+        scene, state, until=0.4, record=tf.Recorder(tmp_path / "a.h5", scene, append=True)
+    ):
+        pass
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert "parameters_until" not in file

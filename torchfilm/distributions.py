@@ -49,6 +49,7 @@ class Normal(Distribution):
     sd: float | Tensor
 
     parameters = ("mean", "sd")
+    reach = "A Normal reaches from mean − 4 sd to mean + 4 sd: give a smaller sd, or a LogNormal."
 
     def __post_init__(self) -> None:
         self._check(mean=Rule(scope=COLONY), sd=Rule(scope=COLONY, least=0.0))

@@ -104,8 +104,8 @@ def checked(name: str, given: object, rule: Rule, forms: str = FORMS) -> Any:
             name, given, f"one number, or one per colony; {kind} has no meaning for it"
         )
     if isinstance(given, Distribution):
-        checks.number(f"smallest value of {name}", given.least(), **bounds)
-        checks.number(f"largest value of {name}", given.greatest(), **bounds)
+        checks.number(f"smallest value of {name}", given.least(), hint=given.reach, **bounds)
+        checks.number(f"largest value of {name}", given.greatest(), hint=given.reach, **bounds)
         return given
     if isinstance(given, Mapping):
         for kind in given:
@@ -186,6 +186,7 @@ class Distribution(metaclass=checks.KnownKeywords):
     """
 
     parameters: ClassVar[tuple[str, ...]] = ()
+    reach: ClassVar[str] = ""  # how far it reaches, for messages, where that is not what was given
     inherited: bool = dataclasses.field(default=False, kw_only=True)
 
     def draw(self, state: State, rows: Tensor, purpose: str, values: Values) -> Tensor:

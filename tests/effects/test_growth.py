@@ -358,3 +358,10 @@ def test_volume_helper_agrees_with_the_model():
     assert float(capsule.volume(torch.tensor(2.0), torch.tensor(0.5))) == pytest.approx(
         math.pi * 0.25 * (2 + 2 / 3), rel=1e-6
     )
+
+
+def test_a_wide_normal_is_refused_with_what_to_do():
+    with pytest.raises(
+        tf.InputError, match=r"smallest value of Growth\.rate.* mean − 4 sd.*LogNor"
+    ):
+        tf.Growth(rate=tf.Normal(1.0, 0.6))

@@ -378,3 +378,42 @@ def test_threads_take_whole_colonies_and_no_bit_changes(monkeypatch):
     assert len(ranges) == 6 and {a for pair in ranges for a in pair} <= set(ends.tolist())
     for name, value in found[0].fields.items():
         assert torch.equal(value, found[1].fields[name])
+
+
+def steady_value(diffusion: float, decay: float, spacing: float, count: int) -> float:
+    """The concentration in the middle of count × count voxels, of which the one there gets 1
+    amount an hour and µm³: a dense solve."""
+    line = 2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
+    line[0, 0] = line[-1, -1] = 1
+    one = np.eye(count)
+    loss = diffusion / spacing**2 * (np.kron(line, one) + np.kron(one, line))
+    source = np.zeros(count * count)
+    source[count * count // 2] = 1.0
+    return np.linalg.solve(loss + decay * np.eye(count * count), source)[count * count // 2]
+
+
+@pytest.mark.parametrize("splitting", ["strang", "lie"])
+@pytest.mark.parametrize("diffusion", [40.0, 400.0, 4000.0])
+def test_the_error_of_taking_turns_is_that_of_a_run(diffusion, splitting):
+    """A cell in the middle that only gives, until its signal rests: the value at the end of a
+    step."""
+    count, spacing, decay, dt = 9, 4.0, 5.0, 0.05
+    half = 0.5 * count * spacing
+    scene = tf.Scene(
+        tf.Circuit(lambda u, s, p, cell: ({"m": -u.m}, {"ahl": p.q}), species="m", q=spacing**3),
+        tf.Medium(
+            ahl=tf.Signal(diffusion=diffusion, decay=decay), box=((-half, -half), (half, half)),
+            spacing=spacing, splitting=splitting,
+        ),
+        founders=tf.Cells([[0.0, 0.0]], [[1.0, 0.0]]), dt=dt,
+    )  # fmt: skip
+    *_, last = tf.simulate(scene, until=6.0, dtype=torch.float64)
+    found = float(last.signals["ahl"][count * count // 2])
+    error = exchange.turns_error(diffusion, decay, last.layout.grid, dt, splitting == "strang")
+    true = steady_value(diffusion, decay, spacing, count)
+    assert found / true - 1 == pytest.approx(error, rel=1e-6, abs=1e-9)
+    assert error < -0.004
+
+
+def test_without_diffusion_and_decay_nothing_takes_turns():
+    assert exchange.turns_error(0.0, 0.0, grid([(5, 4, 1)]), 0.1) == 0.0

@@ -53,8 +53,8 @@ class Run:
     the end of the run."""
     set: list[str] = field(default_factory=list)
     """Parameters of the scene, as NAME=VALUE, such as --set dim=3 rate=0.8."""
-    colonies: int = 1
-    """Independent colonies in the batch."""
+    colonies: int | None = None
+    """Independent colonies in the batch; by default as many as a parameter has values, or 1."""
     cells: int | None = None
     """Stop once every colony has this many cells. Without an end: 500, or the number of the
     design."""
@@ -219,6 +219,9 @@ class Resume:
             dt, every = float(results.attributes["dt"]), int(results.attributes["every"])
         if self.picture:
             own_picture(self.file)
+        least = int(state.counts.min())
+        if self.cells is not None and least >= self.cells:
+            print(f"note: every colony has {least} cells or more already: nothing to do")
         use_threads(self.threads, state.colonies)
         recorder = Recorder(self.file, scene, every=every, append=True, changed=self.changed)
         go(

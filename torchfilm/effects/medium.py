@@ -21,6 +21,7 @@ from torchfilm.effects.bound_medium import (
 )
 from torchfilm.parameters import number_range
 from torchfilm.signals.boundary_conditions import BoundaryConditions, Open
+from torchfilm.signals.exchange import turns_error
 from torchfilm.signals.space import checked_box, checked_flow
 from torchfilm.signals.transport import COMPILED, METHODS
 from torchfilm.signals.transport_series import MOST
@@ -263,7 +264,8 @@ class Medium(Effect):
         voxels = (
             f"{' × '.join(map(str, shape))} voxels of {' × '.join(f'{h:g}' for h in spacing)} µm"
         )
-        lines = [f"grid: {voxels} a colony"]
+        flat = shape[2] == 1 and self.depth is None and len(self.box[0]) == 2
+        lines = [f"grid: {voxels} a colony" + (", as deep as a voxel is wide" if flat else "")]
         sizes = [h for n, h in zip(shape, spacing, strict=True) if n > 1]
         finest = min(sizes, default=spacing[0])
         strang = "half of transport before the cells, half after (Strang)"
@@ -282,7 +284,28 @@ class Medium(Effect):
             who = self.backend_on(state.device) if method in COMPILED else "torch"
             who = "compiled; by torch where gradients are required" if who == "compiled" else who
             lines.append(f"{name}: {method}, {order} ({why}), {who}; dt·K/h² = {ratio}")
+            lines += self._cost_of_turns(name, dt, state)
         return lines
+
+    def _cost_of_turns(self, name: str, dt: float, state: State) -> list[str]:
+        """What it costs a signal that cells and transport take turns, where that is over 1 %: of
+        the colony that it concerns most. A line, or none."""
+        signal = self.signals[name]
+        if callable(signal.decay) or state.layout is None:
+            return []
+        grid, strang = state.layout.grid, self.halves
+        most = torch.broadcast_tensors(*map(torch.as_tensor, (signal.diffusion, signal.decay)))
+        pairs = {(float(k), float(d)) for k, d in zip(*(x.reshape(-1) for x in most), strict=True)}
+        error = lambda step: min(turns_error(k, d, grid, step, strang) for k, d in pairs)
+        if error(dt) > -0.01:
+            return []
+        enough = dt
+        while error(enough) < -0.01:
+            enough /= 2
+        return [
+            f"{name}: cells and transport take turns, so a cell finds its own steady signal up to"
+            f" {-100 * error(dt):.2g} % too low; below 1 % in steps of {enough:.2g} h"
+        ]
 
     def method_of(self, name: str) -> tuple[str, str]:
         """The transport method of a signal, and the reason for it: the same choice as

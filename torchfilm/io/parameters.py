@@ -26,12 +26,11 @@ def write_parameters(
     """Store the values of the colonies (B,) from `step` on. Those that the file holds, if they
     differ, stay those of the frames up to that step. changed: the frames so far are of another
     scene, so that their values are not known where the file holds none."""
-    earlier = f"{UNTIL}/{step}"
-    values = {path: numpy_of(x.double())[numpy_of(colony_id)] for path, x in scene.per_colony()}
+    earlier, own = f"{UNTIL}/{step}", numpy_of(colony_id)
+    given = {path: numpy_of(x)[own] for path, x in scene.per_colony()}
     if NOW in file:
         before = _values(file[NOW])
-        alike = before.keys() == values.keys()
-        if alike and all(np.array_equal(before[n], values[n], equal_nan=True) for n in values):
+        if before.keys() == given.keys() and all(_alike(before[n], given[n]) for n in given):
             return
         if earlier in file:
             del file[NOW]  # of a resume that ended before its first frame
@@ -40,8 +39,8 @@ def write_parameters(
     elif changed:
         file.create_group(earlier)
     group = file.create_group(NOW)
-    for path, value in values.items():
-        group.create_dataset(path.replace("/", SLASH), data=value)
+    for path, value in given.items():
+        group.create_dataset(path.replace("/", SLASH), data=_as_typed(value))
 
 
 def parameters_at(file: h5py.File, step: int) -> dict[str, np.ndarray]:
@@ -57,6 +56,17 @@ def parameters_at(file: h5py.File, step: int) -> dict[str, np.ndarray]:
             names |= set(earlier)
             found = earlier if step <= until else found
         return {name: found.get(name, np.full(size, np.nan)) for name in sorted(names)}
+
+
+def _as_typed(value: np.ndarray) -> np.ndarray:
+    """A column in float64. Of float32 it is the shortest decimal that is read as the same number,
+    0.1 and not 0.10000000149, so that rows can be selected by what was typed."""
+    return (value.astype(str) if value.dtype == np.float32 else value).astype(np.float64)
+
+
+def _alike(kept: np.ndarray, value: np.ndarray) -> bool:
+    """Whether a kept column has these values; those of earlier versions were not `_as_typed`."""
+    return np.array_equal(kept.astype(value.dtype), value, equal_nan=value.dtype.kind == "f")
 
 
 def _values(group: h5py.Group) -> dict[str, np.ndarray]:

@@ -201,7 +201,7 @@ def square(layout: PanelLayout) -> tuple[int, int]:
 def fill_sheet(axes: Sequence, frame: Frame, layout: PanelLayout) -> None:
     """Draw one panel per colony, and hide the other panels."""
     for ax, place in zip(axes, layout.places, strict=False):
-        name, count = f"colony {frame.colony_id[place]}", int(frame.counts[place])
+        name, count = frame.name(place), int(frame.counts[place])
         fill(
             ax,
             frame,
@@ -226,7 +226,7 @@ def strip_figure(frames: RecordedFrames, layout: PanelLayout, title: str, dpi: f
             words = f"{clocks[k]} h, {count} cell{'' if count == 1 else 's'}"
             titles = [words, f"{clocks[k]} h"]
             if len(layout.places) > 1:
-                name = f"colony {frame.colony_id[place]}"
+                name = frame.name(place)
                 titles = [
                     f"{name}, {words}",
                     f"{name}, {clocks[k]} h",

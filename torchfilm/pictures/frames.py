@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchfilm.io.identity import walls_of
+from torchfilm.io.parameters import column_names
 from torchfilm.io.results import Results
 from torchfilm.scene import Scene
 from torchfilm.state import CELL, PER_CELL, State
@@ -27,7 +28,8 @@ class Frame:
     h. colony_id: (B,). units: by name, signals under "out.NAME". signals: by name, one array (nx,
     ny, nz) per colony, on grids with lower corners `origin` (B, 3) and `spacing` (3,), µm. height:
     z of the plane of 2-D cells, µm, if known. walls: as in `Results.walls`. internal: the
-    quantities that serve the numerics, which messages do not list.
+    quantities that serve the numerics, which messages do not list. names: of the colonies, (B,),
+    for titles; by default their ids.
     """
 
     cells: Mapping[str, np.ndarray]
@@ -41,6 +43,11 @@ class Frame:
     height: float | None = None
     walls: Sequence[Mapping[str, Any]] = ()
     internal: Collection[str] = ()
+    names: Sequence[str] | None = None
+
+    def name(self, place: int) -> str:
+        """What a title calls the colony at this index of the batch."""
+        return f"colony {self.colony_id[place]}" if self.names is None else self.names[place]
 
     @property
     def dim(self) -> int:
@@ -126,7 +133,13 @@ class RecordedFrames(Sequence[Frame]):
         cells, ids, time = results.frame(place), results.colony_id, float(results.times[place])
         if not results.signal_names:
             return Frame(
-                cells, time, ids, self.units, walls=self.walls, internal=results.internal_fields
+                cells,
+                time,
+                ids,
+                self.units,
+                walls=self.walls,
+                internal=results.internal_fields,
+                names=_named(results.parameters(place)),
             )
         origin, shape, spacing = results.grid(place)
         signals = {} if self.signal is None else {self.signal: results.signal(self.signal, place)}
@@ -143,6 +156,7 @@ class RecordedFrames(Sequence[Frame]):
             None if height is None else float(height),
             self.walls,
             results.internal_fields,
+            _named(results.parameters(place)),
         )
 
     def __iter__(self) -> Iterator[Frame]:
@@ -162,6 +176,17 @@ class RecordedFrames(Sequence[Frame]):
     def title(self) -> str:
         """The name of the scene."""
         return str(self.results.attributes["scene"]).splitlines()[0].split(":")[0]
+
+
+def _named(parameters: Mapping[str, np.ndarray]) -> list[str] | None:
+    """Colonies named by the one parameter that differs between them, such as "half = 0.1"; None
+    where no parameter differs, or several do."""
+    found = {path: x for path, x in parameters.items() if (x != x[:1]).any()}
+    if len(found) != 1:
+        return None
+    ((path, values),) = found.items()
+    name = column_names([path], set())[path]
+    return [f"{name} = {value:.4g}" for value in values]
 
 
 def unit_of(name: str, units: Mapping[str, str]) -> str:

@@ -130,7 +130,9 @@ def describe(tuned: Tuned) -> list[str]:
     lines += _aligned(rows)
     lines += [
         "  (± standard error; the first column must pass with its 95 % upper bound; the parts may"
-        " cancel each other)"
+        " cancel each other)",
+        f"  Compared over {tuned.window:g} h. What builds up for longer, such as a steady signal,"
+        " may be off by more: run once with half of dt to see.",
     ]
     lines += [
         f"NOT CHECKED: {name}, since {why}. Its error may exceed the limit: name it (of) to"
