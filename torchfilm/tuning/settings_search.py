@@ -70,7 +70,7 @@ class SettingsSearch:
         penalty, more, tolerance = contacts
         knobs = self.knobs
         return Settings(
-            dt=self.probe.dt * WINDOW / steps,
+            dt=float(f"{self.probe.dt * WINDOW / steps:.12g}"),  # 0.0375, not 0.037500000000000006
             rtol=rtol if self.stiff else None,
             tolerance=tolerance if "tolerance" in knobs else None,
             passes=int(knobs["passes"]) + more if more and "passes" in knobs else None,
