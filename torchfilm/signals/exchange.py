@@ -288,9 +288,11 @@ def turns_error(
     diffusion: K, µm²/h. decay: 1/h. The cell is in the middle of the first colony's grid, whose
     faces let nothing pass. Its signal is a sum of cosines; one that relaxes at a rate a has at the
     end of a step (aΔt/2)/sinh(aΔt/2) of its value, or aΔt/(exp(aΔt) − 1) where transport comes last
-    and in one piece (not `strang`). Without decay the mean over the grid never rests, and is left
-    out.
+    and in one piece (not `strang`). Of the mean over the grid, which without decay never rests, it
+    takes what an hour brings.
     """
+    if diffusion == 0:
+        return 0.0
     rate, weight = np.full((1, 1, 1), decay), np.ones((1, 1, 1))
     for axis, (count, step) in enumerate(zip(grid.shapes[0], grid.spacing, strict=True)):
         count = min(count, 65)  # farther faces change nothing
@@ -301,9 +303,7 @@ def turns_error(
         share = np.where(wave == 0, 1, 2) / count * height**2
         rate = rate + (2 * diffusion / step**2 * (1 - np.cos(np.pi * wave / count))).reshape(size)
         weight = weight * share.reshape(size)
-    rate, weight = rate[rate > 0], weight[rate > 0]
-    if rate.size == 0:
-        return 0.0
+    rate[0, 0, 0] = max(decay, 1.0)
     turn = np.minimum(rate * dt, 500.0)
     found = turn / (2 * np.sinh(turn / 2)) if strang else turn / np.expm1(turn)
     return float((weight * found / rate).sum() / (weight / rate).sum() - 1)
