@@ -83,6 +83,20 @@ def _deep_cells(found, rows, walls, deep, n):
 
 
 @kernel
+def _found_by(numbers, found):
+    """The contacts `found` of numbered cells; all, where no numbers are given."""
+    first, second, keep, points, gap = found
+    if numbers.shape[0] == 0:
+        return found
+    some, new = (np.empty_like(keep), np.empty_like(points), np.empty_like(gap)), 0
+    for k in range(keep.shape[0]):
+        some[0][new], some[2][new] = keep[k], gap[k]
+        some[1][new, 0], some[1][new, 1] = points[k, 0], points[k, 1]
+        new += numbers[first[keep[k]]] >= 0 or numbers[second[keep[k]]] >= 0
+    return first, second, some[0][:new], some[1][:new], some[2][:new]
+
+
+@kernel
 def _contacts(x, axis, half, radius, margin, dof):
     """Near pairs (first, second), and the contacts among them: see `near_contacts`."""
     pairs = near_pairs(x, axis, half, radius, margin, dof)
@@ -228,7 +242,8 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
             found, deeply = _contacts_of(x, axis, half, radius, margin, found, dof), True
             continue
         numbers, count = _deep_cells(found, rows, at_walls, deep, 0 if number == 0 else y.shape[0])
-        m = pair_rows(x, axis, half, radius, scale, found, at_walls, rows, dof)
+        mine = _found_by(numbers, found)  # others make no row that counts
+        m = pair_rows(x, axis, half, radius, scale, mine, at_walls, rows, dof)
         error, e = _minimise_some(
             rows, m, numbers, count, alpha, low, y, 2 * target, settings, report, team, dof
         )
