@@ -53,11 +53,12 @@ DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
 @kernel
 def _deep_cells(found, rows, walls, deep, n):
     """Numbers of those of n cells that lie deeper than `deep` in others, of those up to HOPS
-    contacts away, and of those so deep in a hard wall; −1 for the others; and how many."""
+    contacts away, and of those so deep in a hard wall; −1 for the others; how many; and their
+    contacts, as others make no row that counts. n is 0: all contacts."""
     first, second, keep, _, gap = found
     _, gaps, one, _, soft = rows
     if n == 0:
-        return np.empty(0, np.int32), 0
+        return np.empty(0, np.int32), 0, found
     mark = np.zeros(n, np.int64)
     for k in range(keep.shape[0]):
         if gap[k] < -deep:
@@ -79,15 +80,13 @@ def _deep_cells(found, rows, walls, deep, n):
         if soft[r] == HARD and gaps[r] < -deep and numbers[one[r]] < 0:
             numbers[one[r]] = count
             count += 1
-    return numbers, count
+    return numbers, count, _found_by(numbers, found)
 
 
 @kernel
 def _found_by(numbers, found):
-    """The contacts `found` of numbered cells; all, where no numbers are given."""
+    """The contacts `found` of numbered cells."""
     first, second, keep, points, gap = found
-    if numbers.shape[0] == 0:
-        return found
     some, new = (np.empty_like(keep), np.empty_like(points), np.empty_like(gap)), 0
     for k in range(keep.shape[0]):
         some[0][new], some[2][new] = keep[k], gap[k]
@@ -241,8 +240,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
                 break
             found, deeply = _contacts_of(x, axis, half, radius, margin, found, dof), True
             continue
-        numbers, count = _deep_cells(found, rows, at_walls, deep, 0 if number == 0 else y.shape[0])
-        mine = _found_by(numbers, found)  # others make no row that counts
+        numbers, count, mine = _deep_cells(found, rows, at_walls, deep, len(y) * (number > 0))
         m = pair_rows(x, axis, half, radius, scale, mine, at_walls, rows, dof)
         error, e = _minimise_some(
             rows, m, numbers, count, alpha, low, y, 2 * target, settings, report, team, dof
