@@ -12,7 +12,8 @@ from torch import Tensor
 
 from torchfilm.physics import capsule
 from torchfilm.tools.numba_calls import as_array, unavailable
-from torchfilm.tools.tangents import both, scaled, tracked
+from torchfilm.tools.tangents import scaled, tracked
+from torchfilm.tools.vectors import nearest_root
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,20 +41,11 @@ def half_way(length: Tensor, radius: Tensor, volume: Tensor) -> HalfWay:
         put(*arrays, *out)
         return HalfWay(*map(torch.from_numpy, out))
     end = capsule.volume(length, radius)
-    middle = _root(volume * end)
+    middle = nearest_root(volume * end)
     longer = middle / (torch.pi * radius * radius) - radius * (4.0 / 3.0)
     own = torch.where(volume == end, length, longer.clamp(min=0.0))
     middle = capsule.volume(own, radius)
     return HalfWay(own, middle, capsule.area(own, radius), volume / middle, middle / end)
-
-
-def _root(x: Tensor) -> Tensor:
-    """√x to the nearest number, as kernels have it; torch's own may be the next one."""
-    found = x.sqrt()
-    if x.device.type != "cpu":
-        return found
-    plain, nearest = both(found)[0], torch.from_numpy(np.sqrt(both(x)[0].numpy()))
-    return found + torch.where(nearest == plain, 0.0, nearest - plain)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from torchfilm.tools.numba_calls import as_array, kernels_loaded
 from torchfilm.tools.ragged import offsets, repeated
 from torchfilm.tools.reads import numbers, reads_are_free, rows_where
 from torchfilm.tools.tangents import tracked
+from torchfilm.tools.vectors import nearest_root
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 CRITERIA = ("length", "volume", "added")
@@ -320,10 +321,10 @@ def _placed(
     if noise is not None:
         sd, draws = noise[0].unsqueeze(1), noise[1][:, : new.dim]
         turned = axis + sd * draws
-        # not sqrt, for which torch wakes all threads on the CPU, nor sum, whose order may vary
+        # not sum, whose order may vary
         first, *others = (turned * turned).split(1, dim=1)
         square = reduce(torch.add, others, first)
-        axis = torch.where(sd > 0, turned * square.rsqrt(), axis)
+        axis = torch.where(sd > 0, turned * (1.0 / nearest_root(square)), axis)
     return new.replace(
         length=new.length.index_copy(0, daughters, lengths),
         position=new.position.index_add(0, daughters, moved),

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from torchfilm.kernels.compiling import kernel
+from torchfilm.kernels.series import COSINE, LOG, LOG_TWO, SINE, SMALL, TURN
 
 
 @kernel(inline=True)
@@ -48,16 +49,40 @@ def uniforms(uid, stream, step, k0, k1):
 
 
 @kernel(entry=True)
-def box_muller_pairs(uid, stream, step, k0, k1):
-    """Two numbers in (0, 1), less 1, and two angles in (0, 2π), each (M, 2)."""
-    less_one, angle = np.empty((uid.shape[0], 2)), np.empty((uid.shape[0], 2))
+def normals(uid, stream, step, k0, k1):
+    """Four standard normal numbers for each cell, (M, 4)."""
+    out = np.empty((uid.shape[0], 4))
     for i in range(uid.shape[0]):
-        a, b, c, d = _words_of(uid[i], stream[i], step, k0, k1)
-        less_one[i, 0] = (np.float64(a) + 0.5) * 2.0**-32 - 1.0
-        less_one[i, 1] = (np.float64(c) + 0.5) * 2.0**-32 - 1.0
-        angle[i, 0] = 2 * math.pi * ((np.float64(b) + 0.5) * 2.0**-32)
-        angle[i, 1] = 2 * math.pi * ((np.float64(d) + 0.5) * 2.0**-32)
-    return less_one, angle
+        own = _words_of(uid[i], stream[i], step, k0, k1)
+        out[i, 0], out[i, 1] = box_muller(own[0], own[1])
+        out[i, 2], out[i, 3] = box_muller(own[2], own[3])
+    return out
+
+
+@kernel
+def _polynomial(coefficients, z):
+    found = coefficients[0]
+    for k in range(1, len(coefficients)):
+        found = found * z + coefficients[k]
+    return found
+
+
+@kernel
+def box_muller(first, second):
+    """As `tools.random.box_muller`, of one pair of words."""
+    u, turn = (np.float64(first) + 0.5) * 2.0**-32, (np.float64(second) + 0.5) * 2.0**-32
+    mantissa, exponent = math.frexp(u)
+    if mantissa < SMALL:
+        mantissa, exponent = mantissa + mantissa, exponent - 1
+    s = (mantissa - 1.0) / (mantissa + 1.0)
+    log = exponent * LOG_TWO + (s + s) * _polynomial(LOG, s * s)
+    root = np.sqrt(-2.0 * log)
+    quarter = math.floor(4.0 * turn + 0.5)
+    x = (turn - 0.25 * quarter) * TURN
+    sine, cosine = x * _polynomial(SINE, x * x), _polynomial(COSINE, x * x)
+    odd, back = quarter == 1 or quarter == 3, quarter == 2 or quarter == 3
+    along, across = (sine, cosine) if odd else (cosine, sine)
+    return root * (-along if odd != back else along), root * (-across if back else across)
 
 
 @kernel(inline=True)

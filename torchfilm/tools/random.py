@@ -7,7 +7,6 @@ products wrap without harm.
 
 from __future__ import annotations
 
-import math
 import zlib
 from functools import lru_cache
 
@@ -15,7 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.kernels.series import COSINE, LOG, LOG_TWO, SINE, SMALL, TURN
 from torchfilm.tools.numba_calls import as_array, kernels_loaded
+from torchfilm.tools.vectors import nearest_root
 
 MASK = 0xFFFFFFFF
 MULTIPLIER = (0xD2511F53, 0xCD9E8D57)
@@ -87,17 +88,41 @@ def normal(
     seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str, dtype: torch.dtype
 ) -> Tensor:
     """Four standard normal draws per cell, (M, 4), by the Box–Muller method from four words."""
-    # two pairs of uniform numbers, the first of each less 1, which is exact
     if kernels_loaded(uid):
-        from torchfilm.kernels.random import box_muller_pairs
+        from torchfilm.kernels.random import normals
 
-        pairs = box_muller_pairs(*_arrays(seed, stream, uid, step, purpose))
-        less_one, angle = (torch.from_numpy(x) for x in pairs)
-    else:
-        w = (words(seed, stream, uid, step, purpose).T.to(torch.float64) + 0.5) * 2.0**-32
-        less_one, angle = w[:, ::2] - 1.0, 2 * math.pi * w[:, 1::2]
-    # Not log, sqrt, cos and sin: on the CPU torch wakes all threads for these, for a few numbers,
-    # too, and on a busy machine it waits milliseconds for them.
-    square = -2.0 * torch.log1p(less_one)
-    drawn = torch.polar(square * torch.rsqrt(square), angle)
-    return torch.view_as_real(drawn).reshape(-1, 4).to(dtype)
+        return torch.from_numpy(normals(*_arrays(seed, stream, uid, step, purpose))).to(dtype)
+    drawn = box_muller(words(seed, stream, uid, step, purpose).T)
+    return drawn.reshape(-1, 4).to(dtype)
+
+
+def box_muller(w: Tensor) -> Tensor:
+    """Two standard normal numbers for each of two pairs of words: (…, 4) int64 -> (…, 2, 2).
+
+    By the four operations and square roots alone, which are rounded alike everywhere: the bits are
+    those of the kernels, on every processor.
+    """
+    u = (w.to(torch.float64) + 0.5) * 2.0**-32
+    mantissa, exponent = torch.frexp(u[..., ::2])
+    small = mantissa < SMALL
+    mantissa = torch.where(small, mantissa + mantissa, mantissa)
+    exponent = (exponent - small.int()).to(torch.float64)
+    s = (mantissa - 1.0) / (mantissa + 1.0)
+    log = exponent * LOG_TWO + (s + s) * _polynomial(LOG, s * s)
+    root = nearest_root(-2.0 * log)
+    turn = u[..., 1::2]
+    quarter = torch.floor(4.0 * turn + 0.5)
+    x = (turn - 0.25 * quarter) * TURN
+    sine, cosine = x * _polynomial(SINE, x * x), _polynomial(COSINE, x * x)
+    odd, back = (quarter == 1) | (quarter == 3), (quarter == 2) | (quarter == 3)
+    along, across = torch.where(odd, sine, cosine), torch.where(odd, cosine, sine)
+    along = torch.where(odd ^ back, -along, along)
+    across = torch.where(back, -across, across)
+    return torch.stack([root * along, root * across], -1)
+
+
+def _polynomial(coefficients: tuple[float, ...], z: Tensor) -> Tensor:
+    found = torch.full_like(z, coefficients[0])
+    for c in coefficients[1:]:
+        found = found * z + c
+    return found

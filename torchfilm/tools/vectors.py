@@ -7,8 +7,11 @@ vectors in the array.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from torchfilm.tools.tangents import both
 
 
 def dot(u: Tensor, v: Tensor) -> Tensor:
@@ -56,3 +59,12 @@ def safe_sqrt(x: Tensor, eps: float = 1e-30) -> Tensor:
     return torch.where(
         positive, torch.where(positive, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x)
     )
+
+
+def nearest_root(x: Tensor) -> Tensor:
+    """√x to the nearest number, as kernels have it; torch's own may be the next one."""
+    found = x.sqrt()
+    if x.device.type != "cpu":
+        return found
+    plain, nearest = both(found)[0], torch.from_numpy(np.sqrt(both(x)[0].numpy()))
+    return found + torch.where(nearest == plain, 0.0, nearest - plain)
