@@ -73,6 +73,7 @@ ONE_EFFECT = [
     for names in (
         "circuit bound_circuit circuit_cells circuit_checks circuit_kernels circuit_report"
         " circuit_sbml",
+        "division compiled_division",
         "medium bound_medium medium_transport",
         "rules bound_rules",
         "mechanics bound_mechanics mechanics_report",

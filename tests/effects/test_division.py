@@ -14,7 +14,7 @@ from recorded import assert_same_state
 
 import torchfilm as tf
 from torchfilm.effect import Effect
-from torchfilm.effects import division
+from torchfilm.effects import compiled_division, division
 
 # --- criteria -------------------------------------------------------------------------------------
 
@@ -354,10 +354,12 @@ def test_cells_divide_alike_by_kernels_and_by_torch(dim, axis_noise, dtype, monk
         position=50 * draw(12, dim).double(),
     )  # fmt: skip
     due = torch.tensor([0, 0, 0, 1, 0, 1, 1, 0, 1, 1, 1, 1], dtype=torch.bool)
-    values = next(e for e in model.effects if e.title == "division").values
-    by_kernels = division.divide(state, due, values.fraction, values.axis_noise)
-    monkeypatch.setattr(division, "kernels_loaded", lambda value: False)
-    by_torch = division.divide(state, due, values.fraction, values.axis_noise)
+    bound = next(e for e in model.effects if e.title == "division")
+    (rows,), fresh = torch.nonzero(due, as_tuple=True), bound._fresh(state)
+    given = bound.values.fraction, bound.values.axis_noise, fresh
+    by_kernels = division.divide(state, rows, *given)
+    monkeypatch.setattr(compiled_division, "kernels_loaded", lambda value: False)
+    by_torch = division.divide(state, rows, *given)
     assert by_kernels.births[-1].rows.tolist() == [3, 5, 6, 8, 9, 10, 11]
     assert_same_state(by_kernels, by_torch)
     for name in ("first", "second", "uid", "rows"):

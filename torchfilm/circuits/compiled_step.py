@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torchfilm.circuits.compiled import packed
 from torchfilm.circuits.compiled_stiff import CompiledStiff, limits
 from torchfilm.circuits.dilution import Start
 from torchfilm.tools import checks
+from torchfilm.tools.numba_calls import column_types
 from torchfilm.tools.tangents import tracked
 
 
@@ -131,7 +131,7 @@ class KernelStep:
             else:  # one number, or one for each colony
                 by = x.dim() and x.stride(0)
                 index = colony_id.data_ptr() if x.dim() else 0
-                table.append((x.data_ptr(), by, _types()[x.dtype], 0, k * count, 1, index))
+                table.append((x.data_ptr(), by, column_types()[x.dtype], 0, k * count, 1, index))
         rest = (len(compiled.columns) + len(signals)) * count
         for k, (name, x) in enumerate(signals.items(), len(compiled.columns)):
             table.append(_row(name, x, 0, k * count, 1, cells))
@@ -148,17 +148,7 @@ class KernelStep:
 
 def known(x: Tensor) -> Tensor:
     """A column of a type that `gather` knows."""
-    return x if x.dtype in _types() else x.double()
-
-
-@cache
-def _types() -> dict[torch.dtype, int]:
-    from torchfilm.kernels import columns
-
-    return {
-        torch.float32: columns.FLOAT32, torch.float64: columns.FLOAT64, torch.int64: columns.INT64,
-        torch.int32: columns.INT32, torch.bool: columns.BOOL,
-    }  # fmt: skip
+    return x if x.dtype in column_types() else x.double()
 
 
 def _row(
@@ -168,4 +158,4 @@ def _row(
     if column.shape != (cells,):
         shape, wanted = tuple(column.shape), f"({cells},): one number for each cell"
         raise checks.input_error(f"shape of {name}", shape, wanted)
-    return column.data_ptr(), column.stride(0), _types()[column.dtype], factor, begin, step, 0
+    return column.data_ptr(), column.stride(0), column_types()[column.dtype], factor, begin, step, 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import ClassVar
@@ -11,20 +11,18 @@ import torch
 from torch import Tensor
 
 from torchfilm.effect import DIVISION, Binding, BoundEffect, Effect
+from torchfilm.effects.compiled_division import Drawn, can_divide, divided, due_rows, evenly_drawn
 from torchfilm.physics import capsule
 from torchfilm.resolver import Resolved, Values
-from torchfilm.state import Births, Ended, Field, State
+from torchfilm.state import CELL, Births, Ended, Field, State
 from torchfilm.tools import checks
-from torchfilm.tools.numba_calls import as_array, kernels_loaded
+from torchfilm.tools.numba_calls import kernels_loaded
 from torchfilm.tools.ragged import offsets, repeated
-from torchfilm.tools.reads import numbers, reads_are_free, rows_where
-from torchfilm.tools.tangents import tracked
+from torchfilm.tools.reads import numbers, rows_where
 from torchfilm.tools.vectors import nearest_root
 from torchfilm.values import ByType, Value, is_drawn, is_inherited, largest, physical, smallest
 
 CRITERIA = ("length", "volume", "added")
-NAMES = ("uid", "parent", "next_uid")  # what a division numbers anew
-
 TOO_SHORT = 1
 PIXELS = 10.0  # µm; for a longer first cell, messages say that lengths may be in pixels
 
@@ -204,43 +202,71 @@ class Division(Effect):
         return least, most
 
     def bind(self, binding: Binding) -> Sequence[BoundEffect]:
-        bound = BoundEffect(self, binding)
-        bound.stage = binding.division_stage
-        return (bound,)
+        return (_BoundDivision(self, binding),)
 
     def numerics(self, dt: float, state: State) -> list[str]:
         if self.criterion is None:
             return ["cells that a rule has flagged, before they grow"]
         return [f"at the end of a step: up to {dt:g} h after a cell gets there"]
 
+    def size(self, state: State) -> Tensor | None:
+        """What is compared with the threshold of each cell, (N,); None where there is none."""
+        if self.criterion == "added":
+            return state.length - state.fields["birth_length"]
+        return getattr(state, self.criterion) if self.criterion else None
+
     def due(self, state: State) -> Tensor:
         """Which cells divide now, (N,) bool."""
-        fields, criterion = state.fields, self.criterion
-        due = fields["divide_flag"]
-        if criterion == "length":
-            return due | (state.length >= fields["division_threshold"])
-        if criterion == "volume":
-            return due | (state.volume >= fields["division_threshold"])
-        if criterion == "added":
-            return due | (state.length - fields["birth_length"] >= fields["division_threshold"])
-        return due
+        size, flag = self.size(state), state.fields["divide_flag"]
+        return flag if size is None else flag | (size >= state.fields["division_threshold"])
 
-    def step(self, state: State, dt: float, values: Values) -> State:
+
+class _BoundDivision(BoundEffect):
+    """Division with what kernels need to know of its threshold."""
+
+    effect: Division
+
+    def __init__(self, effect: Division, binding: Binding):
+        super().__init__(effect, binding)
+        self.stage = binding.division_stage
+        name = effect.criterion
+        self.drawn = None if name is None else evenly_drawn(self.values[name])
+
+    def step(self, state: State, dt: float) -> State:
         with torch.no_grad():
-            due = self.due(state)
-            if reads_are_free(state.device) and not bool(due.any()):
-                return state
-            short = due & (state.length < 2 * state.radius)
-            some_due, some_short = numbers(due.any(), short.any())
-            if not some_due:
+            rows, some_short = self._due(state)
+            if rows is None:
                 return state
             if some_short:
-                report = _too_short(state, short)
-                state = state.replace(reports={**state.reports, "division": report})
-                due = due & (report.status != TOO_SHORT).index_select(0, state.colony)
-                if not bool(due.any()):
+                state, rows = _without_short(state, rows)
+                if not rows.numel():
                     return state
-        return divide(state, due, values.fraction, values.axis_noise)
+        return divide(state, rows, self.values.fraction, self.values.axis_noise, self._fresh(state))
+
+    def _due(self, state: State) -> tuple[Tensor | None, int]:
+        """The rows of the cells that divide, None for none; and whether some are too short."""
+        if kernels_loaded(state.length):
+            rows, count = due_rows(state, self.effect.size(state))
+            return (rows if rows.numel() else None), count
+        due = self.effect.due(state)
+        short = due & (state.length < 2 * state.radius)
+        some_due, some_short = numbers(due.any(), short.any())
+        return (rows_where(due)[0] if some_due else None), some_short
+
+    def _fresh(self, state: State) -> dict[str, float | Drawn] | None:
+        """With what daughters begin in the fields that a division resets, if all do so by numbers
+        or by even draws."""
+        found: dict[str, float | Drawn] = {}
+        for name, field in state.declared.items():
+            if field.scope != CELL or field.at_division != "reset":
+                continue
+            if not callable(field.initial):
+                found[name] = float(field.initial)
+            elif self.drawn and isinstance(getattr(field.initial, "initial", 0), _FirstThreshold):
+                found[name] = self.drawn
+            else:
+                return None
+        return found
 
 
 def _pixels_hint(length: float, radius: float) -> str:
@@ -253,105 +279,92 @@ def _pixels_hint(length: float, radius: float) -> str:
     )
 
 
-def _too_short(state: State, short: Tensor) -> DivisionReport:
-    """The report on cells that are due but too short, (N,) bool."""
-    number = torch.arange(state.cells, device=state.device)
-    first = state.cells - state.groups.max(torch.where(short, state.cells - number, 0))
+def _without_short(state: State, rows: Tensor) -> tuple[State, Tensor]:
+    """The state that reports those of the cells `rows` (M,) that are too short to divide, and the
+    rows of other colonies."""
+    too_short = (state.length < 2 * state.radius).index_select(0, rows)
+    number = torch.arange(state.cells, 0, -1, device=state.device)
+    marks = torch.zeros_like(number).index_copy(0, rows, torch.where(too_short, number[rows], 0))
+    first = state.cells - state.groups.max(marks)
     status = torch.where(first < state.cells, TOO_SHORT, 0)
     row = first.clamp(max=state.cells - 1)
-    length, radius = state.length.detach(), state.radius.detach()
-    return DivisionReport(
-        status,
-        state.uid.index_select(0, row),
-        length.index_select(0, row),
-        2 * radius.index_select(0, row),
-    )
+    pick = lambda x: x.detach().index_select(0, row)
+    report = DivisionReport(status, pick(state.uid), pick(state.length), 2 * pick(state.radius))
+    sound = (status != TOO_SHORT).index_select(0, state.colony.index_select(0, rows))
+    return state.replace(reports={**state.reports, "division": report}), rows[sound]
 
 
-def divide(state: State, due: Tensor, fraction: Resolved, axis_noise: Resolved) -> State:
-    """Divides the cells that are due, (N,) bool. The daughters are neighbours in the batch; the
-    first lies at the parent's −axis end.
+def divide(
+    state: State,
+    rows: Tensor,
+    fraction: Resolved,
+    axis_noise: Resolved,
+    fresh: Mapping[str, float | Drawn] | None,
+) -> State:
+    """Divides the cells `rows` (M,), ascending. The daughters are neighbours in the batch; the
+    first lies at the parent's −axis end. fresh: with what daughters begin in all fields that a
+    division resets, if that is known; kernels then see to it.
 
     Their lengths are (l − 2r)f and (l − 2r)(1 − f). Their outer ends are those of the parent.
     Gradients pass through.
     """
-    rows, daughters, source, ids = _split(state, due)
-    new = state.take(source, **ids)
-    share = fraction.of_rows(state, rows, "Division.fraction")
-    noise = None
-    if not axis_noise.is_zero:
-        sd = axis_noise.of_rows(new, daughters, "axis_noise")
-        noise = sd, new.normal(daughters, "Division.axis_noise")
-    new = _placed(new, state, rows, daughters, share, noise)
+    share = _of_rows(fraction, state, rows, "Division.fraction")
+    by_kernels = can_divide(state, share, axis_noise)
+    if by_kernels:
+        noise = _of_rows(axis_noise, state, rows)
+        new, daughters = divided(state, rows, share, noise, fresh or {})
+    else:
+        new, daughters = _divided(state, rows, share, axis_noise)
     first, second = daughters.chunk(2)
     births = Births(first, second, new.uid.index_select(0, daughters), state, rows)
     colony_id = state.colony_id.index_select(0, state.colony.index_select(0, rows))
     note = Ended(colony_id, state.uid.index_select(0, rows), "divided")
     new = new.replace(births=(*new.births, births), ended=(*new.ended, note))
+    if by_kernels and fresh is not None:
+        return new
     return new.reset_at_division(daughters, new.declared)
 
 
-def _placed(
-    new: State,
-    state: State,
-    rows: Tensor,
-    daughters: Tensor,
-    share: Tensor,
-    noise: tuple[Tensor, Tensor] | None,
-) -> State:
-    """The new state with its daughters (2M,) as long as they are, where they lie, in which as yet
-    they are as their parents, `rows` (M,) of the state before. share: (M,). noise: of the axes, sd
-    (2M,) and standard normal draws (2M, 4)."""
-    of_cells = state.length, state.radius, state.axis, state.position
-    if kernels_loaded(share) and not tracked(*of_cells, share, *(noise or ())):
-        from torchfilm.kernels.divisions import place_daughters
+def _of_rows(value: Resolved, state: State, rows: Tensor, purpose: str | None = None) -> Tensor:
+    """(M,), or () where it is the same for all cells."""
+    same = value.value
+    return same if same is not None and not same.dim() else value.of_rows(state, rows, purpose)
 
-        sd, draws = (share[:0], state.axis[:0]) if noise is None else noise
-        given = (rows, daughters, state.length, state.radius, state.axis, share, draws, sd)
-        changed = new.length, new.axis, new.position  # which no other state has
-        place_daughters(*(as_array(x, x.dtype) for x in (*given, *changed)))
-        return new
-    length, radius, axis = (x.index_select(0, rows) for x in of_cells[:3])
+
+def _divided(
+    state: State, rows: Tensor, share: Tensor, axis_noise: Resolved
+) -> tuple[State, Tensor]:
+    """As `compiled_division.divided`, by torch, with daughters whose fields are their parents'."""
+    due = torch.zeros_like(state.colony).index_fill(0, rows, 1)
+    whole = state.cells + rows.numel()
+    every = torch.arange(state.cells, device=state.device)
+    first = torch.cumsum(due + 1, 0).index_select(0, rows) - 2
+    daughters = torch.cat([first, first + 1])
+    new = state.take(repeated(every, due + 1, whole))
+    uid, parent, next_uid = _new_ids(new, daughters, state.uid.index_select(0, rows))
+    new = new.replace(uid=uid, parent=parent, next_uid=next_uid)
+    length, radius, axis = (
+        x.index_select(0, rows) for x in (state.length, state.radius, state.axis)
+    )
     rest = length - 2 * radius
     lengths = torch.cat([rest * share, rest * (1 - share)])
     shift = 0.5 * (lengths - torch.cat([length, length]))
     shift = torch.cat([shift[: rows.numel()], -shift[rows.numel() :]]).unsqueeze(1)
     axis = torch.cat([axis, axis])
     moved = (shift * axis).to(new.position.dtype)
-    if noise is not None:
-        sd, draws = noise[0].unsqueeze(1), noise[1][:, : new.dim]
-        turned = axis + sd * draws
+    if not axis_noise.is_zero:
+        sd = axis_noise.of_rows(new, daughters, "axis_noise").unsqueeze(1)
+        turned = axis + sd * new.normal(daughters, "Division.axis_noise")[:, : new.dim]
         # not sum, whose order may vary
         first, *others = (turned * turned).split(1, dim=1)
         square = reduce(torch.add, others, first)
         axis = torch.where(sd > 0, turned * (1.0 / nearest_root(square)), axis)
-    return new.replace(
+    made = new.replace(
         length=new.length.index_copy(0, daughters, lengths),
         position=new.position.index_add(0, daughters, moved),
         axis=new.axis.index_copy(0, daughters, axis),
     )
-
-
-def _split(state: State, due: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
-    """The rows of the parents (M,), of their daughters in the new batch (2M,), from which row each
-    new cell comes (N + M,), and the new uid, parent and next_uid: see `kernels.divisions.split`."""
-    given = due, state.colony, state.uid, state.parent, state.next_uid
-    if kernels_loaded(due):
-        from torchfilm.kernels.divisions import split
-
-        found = split(*(as_array(x, x.dtype) for x in given))
-        rows, daughters, source, *ids = (torch.from_numpy(x) for x in found)
-        return rows, daughters, source, dict(zip(NAMES, ids, strict=True))
-    copies = due.long() + 1
-    (rows,) = rows_where(due)
-    whole = state.cells + rows.numel()
-    every = torch.arange(state.cells, device=state.device)
-    source = repeated(every, copies, whole)
-    first = torch.cumsum(copies, 0).index_select(0, rows) - 2
-    daughters = torch.cat([first, first + 1])
-    parents = state.uid.index_select(0, rows)
-    new_ids = _new_ids(state.take(source), daughters, parents)
-    return rows, daughters, source, dict(zip(NAMES, new_ids, strict=True))
+    return made, daughters
 
 
 def _new_ids(new: State, daughters: Tensor, parents: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -22,7 +22,7 @@ def philox_block(a, b, c, d, p, q):
 
 
 @kernel
-def _words_of(uid, stream, step, k0, k1):
+def words_of(uid, stream, step, k0, k1):
     """The four words of a cell."""
     mask, own = np.uint64(0xFFFFFFFF), np.uint64(uid)
     return philox_block(own & mask, own >> np.uint64(32), np.uint64(stream) & mask, step, k0, k1)
@@ -34,7 +34,7 @@ def philox_words(uid, stream, step, k0, k1):
     int64."""
     out = np.empty((4, uid.shape[0]), np.int64)
     for i in range(uid.shape[0]):
-        out[0, i], out[1, i], out[2, i], out[3, i] = _words_of(uid[i], stream[i], step, k0, k1)
+        out[0, i], out[1, i], out[2, i], out[3, i] = words_of(uid[i], stream[i], step, k0, k1)
     return out
 
 
@@ -43,9 +43,13 @@ def uniforms(uid, stream, step, k0, k1):
     """A number in (0, 1) for each cell, (M,), of the 23 upper bits of its first word."""
     out = np.empty(uid.shape[0])
     for i in range(uid.shape[0]):
-        first = _words_of(uid[i], stream[i], step, k0, k1)[0]
-        out[i] = (np.float64(first >> np.uint64(9)) + 0.5) * 2.0**-23
+        out[i] = uniform_of(words_of(uid[i], stream[i], step, k0, k1)[0])
     return out
+
+
+@kernel(inline=True)
+def uniform_of(word):
+    return (np.float64(word >> np.uint64(9)) + 0.5) * 2.0**-23
 
 
 @kernel(entry=True)
@@ -53,7 +57,7 @@ def normals(uid, stream, step, k0, k1):
     """Four standard normal numbers for each cell, (M, 4)."""
     out = np.empty((uid.shape[0], 4))
     for i in range(uid.shape[0]):
-        own = _words_of(uid[i], stream[i], step, k0, k1)
+        own = words_of(uid[i], stream[i], step, k0, k1)
         out[i, 0], out[i, 1] = box_muller(own[0], own[1])
         out[i, 2], out[i, 3] = box_muller(own[2], own[3])
     return out

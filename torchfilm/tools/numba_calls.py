@@ -49,3 +49,14 @@ def as_array(value: Tensor, dtype: torch.dtype) -> np.ndarray:
 def in_numpy(dtype: torch.dtype) -> type:
     """NumPy's numbers of this type."""
     return np.float32 if dtype == torch.float32 else np.float64
+
+
+@cache
+def column_types() -> dict[torch.dtype, int]:
+    """How `kernels.columns` names the types of columns that kernels can take."""
+    from torchfilm.kernels import columns
+
+    return {
+        torch.float32: columns.FLOAT32, torch.float64: columns.FLOAT64, torch.int64: columns.INT64,
+        torch.int32: columns.INT32, torch.bool: columns.BOOL,
+    }  # fmt: skip

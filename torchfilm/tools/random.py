@@ -63,12 +63,17 @@ def _key(seed: int, purpose: str) -> tuple[int, int]:
     return mixed & MASK, (mixed >> 32) & MASK
 
 
+def counters(seed: int, step: int, purpose: str) -> tuple[int, int, int]:
+    """The words of a step's draws that are alike for all cells, as kernels take them."""
+    return step & MASK, *_key(seed, purpose)
+
+
 def _arrays(seed: int, stream: Tensor, uid: Tensor, step: int, purpose: str) -> list:
     """The arguments of the kernels."""
     if stream.shape != uid.shape:
         stream = stream.expand(uid.shape)
     given = [as_array(x, torch.int64) for x in (uid, stream)]
-    return [*given, *map(np.uint64, (step & MASK, *_key(seed, purpose)))]
+    return [*given, *map(np.uint64, counters(seed, step, purpose))]
 
 
 def uniform(

@@ -1,0 +1,105 @@
+"""Divisions by compiled kernels: the same, to the bit, as `division` has them by torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfilm.distributions import Uniform
+from torchfilm.resolver import Resolved
+from torchfilm.state import CELL, State
+from torchfilm.tools.numba_calls import as_array, column_types, kernels_loaded
+from torchfilm.tools.random import counters
+from torchfilm.tools.tangents import tracked
+
+IDS = ("colony", "uid", "parent", "next_uid", "stream")  # as `kernels.divisions.divide` takes them
+MADE = ("uid", "parent", "next_uid", "position", "axis", "length")  # and what it returns
+KEPT = ("colony", "radius")  # what daughters have as their parents, beside the fields
+# With what daughters begin: a number, or an even draw: its purpose, low, high.
+Drawn = tuple[str, float, float]
+
+
+def can_divide(state: State, share: Tensor, axis_noise: Resolved) -> bool:
+    """Whether kernels may divide cells of this state: no derivative is wanted, and all types are
+    known to them."""
+    if not kernels_loaded(share) or axis_noise.value is None or axis_noise.types is not None:
+        return False
+    given = (state.position, state.axis, state.length, state.radius, *state.fields.values())
+    types = column_types()
+    return all(x.dtype in types for x in given) and not tracked(*given, share, axis_noise.value)
+
+
+def evenly_drawn(value: Resolved | None) -> Drawn | None:
+    """How a value is drawn, evenly between the same two numbers for all cells; None where it is
+    not."""
+    if value is None or value.draw is None:
+        return None
+    kind, part = value.draw.parts[0]
+    if kind is not None or isinstance(part, Resolved) or type(part[0]) is not Uniform:
+        return None
+    low, high = (part[1][name].value for name in Uniform.parameters)
+    if any(x is None or x.dim() or x.requires_grad for x in (low, high)):
+        return None
+    return value.name, float(low), float(high)
+
+
+def due_rows(state: State, size: Tensor | None) -> tuple[Tensor, int]:
+    """The rows (M,) of the cells that divide, and how many of them are too short: see
+    `kernels.divisions.due_rows`. size: (N,) or None."""
+    from torchfilm.kernels import divisions
+
+    fields, dtype = state.fields, state.dtype
+    none = size is None
+    size = state.length[:0] if size is None else size
+    given = size, size if none else fields["division_threshold"], state.length, state.radius
+    flag = as_array(fields["divide_flag"], torch.bool)
+    rows, short = divisions.due_rows(flag, *(as_array(x, dtype) for x in given))
+    return torch.from_numpy(rows), short
+
+
+def divided(
+    state: State, rows: Tensor, share: Tensor, noise: Tensor, fresh: Mapping[str, float | Drawn]
+) -> tuple[State, Tensor]:
+    """The state in which the cells `rows` (M,) are divided, and the rows of their daughters (2 M,),
+    first daughters first. share: (M,) or (), of the length. noise: (M,) or (), of the axes. fresh:
+    with what daughters begin in some of the fields; in the others with what their parents have."""
+    from torchfilm.kernels import divisions
+
+    fields, declared = state.fields, state.declared
+    columns = {n: x.contiguous() for n, x in fields.items() if declared[n].scope == CELL}
+    columns |= {n: getattr(state, n).contiguous() for n in KEPT}
+    total, types = state.cells + rows.numel(), column_types()
+    new = {n: torch.empty((total, *x.shape[1:]), dtype=x.dtype) for n, x in columns.items()}
+    noise_key = counters(state.seed, state.step, "Division.axis_noise")
+    places: list[int] = []
+    numbers: list[float] = []
+    for name, x in columns.items():
+        begin, kind, key, of_range = fresh.get(name), divisions.COPY, noise_key, (0.0, 0.0)
+        if isinstance(begin, tuple):
+            purpose, low, high = begin
+            kind, of_range = divisions.UNIFORM, (low, high)
+            key = counters(state.seed, state.step, purpose)
+        elif begin is not None:
+            kind, of_range = divisions.NUMBER, (begin, 0.0)
+        width = math.prod(x.shape[1:])
+        places += (x.data_ptr(), new[name].data_ptr(), width, types[x.dtype], kind, *key)
+        numbers += of_range
+    array = lambda x, dtype=torch.int64: as_array(x, dtype)
+    real = lambda x: as_array(x, state.dtype)
+    daughters, of_ids, of_cells = divisions.divide(
+        array(rows),
+        (array(state.position, torch.float64), real(state.axis), real(state.length),
+         real(state.radius)),
+        tuple(array(getattr(state, n)) for n in IDS),
+        real(share.reshape(-1)), real(noise.reshape(-1)),
+        np.array(noise_key), np.array(places).reshape(len(new), -1),
+        np.array(numbers).reshape(len(new), 2),
+    )  # fmt: skip
+    found = zip(MADE, map(torch.from_numpy, (*of_ids, *of_cells)), strict=True)
+    kept = {n: new.pop(n) for n in KEPT}
+    made = state.replace(**dict(found), **kept, fields={**fields, **new})
+    return made, torch.from_numpy(daughters)
