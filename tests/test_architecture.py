@@ -55,6 +55,7 @@ ROOMS = {
         (
             "torchfilm.scene",
             "torchfilm.model",
+            "torchfilm.joined_step",
             "torchfilm.binding_checks",
             "torchfilm.initial_cells",
             "torchfilm.micrographs",

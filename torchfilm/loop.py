@@ -63,6 +63,8 @@ def failures(state: State) -> list[Failure]:
     found = []
     report: Report
     for report in state.reports.values():
+        if not bool(report.status.any()):
+            continue
         for place in torch.nonzero(report.status).squeeze(1).tolist():
             id_, cells = int(state.colony_id[place]), int(state.counts[place])
             found.append(Failure(place, id_, cells, report.reason(place), report.hint))

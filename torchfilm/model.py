@@ -12,6 +12,7 @@ be recorded once (`recorded`), while the others only follow (`following`).
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -22,6 +23,7 @@ from torch import Tensor
 from torchfilm import binding_checks
 from torchfilm.effect import BUILT_IN, DIVISION, FLAGGED_DIVISION, Binding, BoundEffect
 from torchfilm.initial_cells import Cells
+from torchfilm.joined_step import JoinedStep, joined
 from torchfilm.parameters import parameters
 from torchfilm.resolver import BoundBatch
 from torchfilm.state import CELL, Field, State
@@ -88,9 +90,13 @@ class Model:
     def step(self, state: State, dt: float | None = None, timings: Timings | None = None) -> State:
         """The state dt hours later (by default the scene's step): each effect in turn."""
         dt, state = self.dt if dt is None else dt, self.opened(state)
-        with once(self._said) as self._said:
-            for effect in self.effects:
-                if timings is None:
+        # torch's threads are set once a step, not once an effect
+        alone = one_torch_thread() if self._by_kernels else nullcontext()
+        with alone, once(self._said) as self._said:
+            for effect in self._parts:
+                if isinstance(effect, JoinedStep):
+                    state = effect.run_step(state, dt, timings)
+                elif timings is None:
                     state = effect.run_step(state, dt)
                 else:
                     with timings.of(effect.title, state.device):
@@ -101,9 +107,24 @@ class Model:
         """The state as a step of this model begins, also where another model made it."""
         declared = {**state.declared, **self._first_fields}
         state = state.replace(births=(), ended=(), reports={}, declared=declared)
-        for effect in self.effects:
+        for effect in self._openers:
             state = effect.opened(state)
         return state
+
+    @cached_property
+    def _parts(self) -> list[BoundEffect | JoinedStep]:
+        """What a step runs: the effects, some of them joined."""
+        return joined(self.effects)
+
+    @cached_property
+    def _openers(self) -> list[BoundEffect]:
+        """The effects that do something as a step begins."""
+        return [e for e in self.effects if type(e).opened is not BoundEffect.opened]
+
+    @cached_property
+    def _by_kernels(self) -> bool:
+        """Whether kernels compute some effect, on the CPU."""
+        return self.batch.device.type == "cpu" and any(e.by_kernels for e in self.effects)
 
     def _laid(self) -> State:
         start = self._begin

@@ -169,7 +169,8 @@ def _ended(last: float, cells: int | None, state: State) -> bool:
         return True
     if cells is None or 0 < state.cells < cells:  # known without a count for each colony
         return False
-    return bool(((state.counts >= cells) | (state.counts == 0)).all())
+    counts = state.counts.cpu().numpy()
+    return bool(((counts >= cells) | (counts == 0)).all())
 
 
 def _run(step, state, stop, first, monitors, seen) -> Generator[State, None, None]:

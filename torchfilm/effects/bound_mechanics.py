@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,13 +15,18 @@ from torchfilm.physics.contact_records import ContactSettings
 from torchfilm.physics.one_sided_records import OneSidedSettings
 from torchfilm.physics.step_records import MechanicsInput
 from torchfilm.physics.surfaces import Surface
-from torchfilm.resolver import snapshot
+from torchfilm.resolver import Resolved, snapshot
 from torchfilm.state import State
 from torchfilm.tools import checks
-from torchfilm.tools.tangents import has_tangent, tracked
+from torchfilm.tools.numba_calls import as_array
+from torchfilm.tools.tangents import has_tangent, in_forward_mode
 
 if TYPE_CHECKING:
     from torchfilm.effects.mechanics import Mechanics
+
+# What a step reads, as far as derivatives may pass through it.
+PARTS = ("position", "axis", "length", "radius")
+FIELDS = ("elongation", "displacement", "contact_alpha", "compression", "drag")
 
 
 class BoundMechanics(BoundEffect):
@@ -39,6 +45,13 @@ class BoundMechanics(BoundEffect):
             for w in self.walls
         ]
         self.compiled = effect.backend_on(binding.batch.device) == "compiled"
+        surfaces = [s for wall in self.walls for s in wall.surfaces(effect.dim)]
+        entries = [tensor for surface in surfaces for tensor in _tensors(surface)]
+        self.needs_gradient = self.values.requires_grad or any(x.requires_grad for x in entries)
+        dtype, values = binding.batch.dtype, self.values
+        self.drags = [_same(values[n], dtype) for n in ("viscosity", "length_drag")]
+        follows = self.compiled and effect.alpha is None and effect.stiffness is None
+        self.alphas = compiled.alpha_arrays(None, None, dtype) if follows else None
 
     @property
     def by_kernels(self) -> bool:
@@ -47,19 +60,96 @@ class BoundMechanics(BoundEffect):
     def step(self, state: State, dt: float) -> State:
         if state.cells == 0:
             return state
-        given = self._given(state, dt)
-        by_kernels = not _tracked(given) and self.compiled
-        found = (compiled if by_kernels else torch_step).step(given)
-        fields = {"displacement": found.move, "collapsed_steps": found.collapsed}
-        if "elongation" in state.fields:
+        if not self.derivatives_wanted(state) and self.compiled:
+            length, growth = state.length, state.fields.get("elongation")
+            growth = torch.zeros_like(length) if growth is None else growth
+            return self.parted(state, dt, *(as_array(x, state.dtype) for x in (growth, length)))
+        found = torch_step.step(self._given(state, dt))
+        fields = {
+            **state.fields, "displacement": found.move, "collapsed_steps": found.collapsed
+        }  # fmt: skip
+        if "elongation" in fields:
             fields["elongation"] = found.elongation
         if found.contact_alpha is not None and found.compression is not None:
             fields |= {"contact_alpha": found.contact_alpha, "compression": found.compression}
         report = MechanicsReport(**vars(found.report), substeps=found.substeps)
-        return state.with_fields(**fields).replace(
-            position=found.position, axis=found.axis, length=found.length,
+        return state.replace(
+            position=found.position, axis=found.axis, length=found.length, fields=fields,
             reports={**state.reports, "mechanics": report},
         )  # fmt: skip
+
+    @torch.no_grad()
+    def parted(self, state: State, dt: float, growth: np.ndarray, length: np.ndarray) -> State:
+        """The state after a step by kernels, of at least one cell. length: (N,) µm after growth,
+        and growth: (N,) µm in this step, of the state's type; the state's own do not count."""
+        fields, one_sided, dtype = state.fields, self.effect.one_sided, state.dtype
+        axis, radius, move = (
+            as_array(x, dtype) for x in (state.axis, state.radius, fields["displacement"])
+        )
+        alpha, compression = (
+            compiled.array_or_none(fields[n] if one_sided else None, dtype)
+            for n in ("contact_alpha", "compression")
+        )
+        cells = (
+            as_array(state.position, torch.float64), axis, length, growth, radius, move,
+            as_array(fields["collapsed_steps"], torch.int64), alpha, compression,
+        )  # fmt: skip
+        walls = compiled.wall_arrays(*self._surfaces(state), state.colony_id, state.cells)
+        made, report, substeps = compiled.step(
+            self.settings, state.groups, dt, self.effect.max_elongation, cells, self._drags(state),
+            self._alphas(state), walls,
+        )  # fmt: skip
+        x, axes, lengths, moves, growths, fallen, *of_contacts = map(torch.from_numpy, made)
+        new = {**fields, "displacement": moves, "collapsed_steps": fallen}
+        if "elongation" in fields:
+            new["elongation"] = growths
+        if one_sided:
+            new["contact_alpha"], new["compression"] = of_contacts
+        of_step = MechanicsReport(**vars(report), substeps=substeps)
+        return state.replace(
+            position=x, axis=axes, length=lengths, fields=new,
+            reports={**state.reports, "mechanics": of_step},
+        )  # fmt: skip
+
+    def derivatives_wanted(self, state: State) -> bool:
+        """Whether gradients are required through the step. Raises InputError for forward mode."""
+        if in_forward_mode():
+            self._refuse_tangents(state)
+        if not torch.is_grad_enabled():
+            return False
+        fields = state.fields
+        return (
+            self.needs_gradient
+            or any(getattr(state, n).requires_grad for n in PARTS)
+            or any(fields[n].requires_grad for n in FIELDS if n in fields)
+        )
+
+    def _refuse_tangents(self, state: State) -> None:
+        surfaces, walls = self._surfaces(state)
+        given = [value for value in vars(self._given(state, 0.0)).values()]
+        given += [value for _, value in walls] + [x for s in surfaces for x in _tensors(s)]
+        if has_tangent(*(x for x in given if isinstance(x, Tensor))):
+            raise checks.InputError(
+                "Mechanics: contacts have a backward pass and no forward mode. Use backward(), or"
+                " recorded growth, which does not depend on what is differentiated."
+            )
+
+    def _drags(self, state: State) -> tuple[np.ndarray, ...]:
+        """Viscosity and length drag, (N,) or (1,), and their factor (N,) or (0,)."""
+        own = (
+            compiled.array_or_none(self.values[n].of_cells(state), state.dtype) if x is None else x
+            for n, x in zip(("viscosity", "length_drag"), self.drags, strict=True)
+        )
+        return *own, compiled.array_or_none(state.fields.get("drag"), state.dtype)
+
+    def _alphas(self, state: State) -> tuple[int, np.ndarray]:
+        if self.alphas is not None:
+            return self.alphas
+        alpha, stiffness = (
+            None if value is None else value.of_cells(state)
+            for value in (self.values.alpha, self.values.stiffness)
+        )
+        return compiled.alpha_arrays(alpha, stiffness, state.dtype)
 
     def _given(self, state: State, dt: float) -> MechanicsInput:
         fields, values = state.fields, self.values
@@ -90,17 +180,13 @@ class BoundMechanics(BoundEffect):
         return surfaces, walls
 
 
-def _tracked(given: MechanicsInput) -> bool:
-    """Whether gradients are required through the step. Raises InputError for forward mode."""
-    parts = [v for v in vars(given).values() if isinstance(v, Tensor)]
-    parts += [value for _, value in given.walls if value is not None]
-    for surface in given.surfaces:
-        for entry in vars(surface).values():
-            parts += entry if isinstance(entry, tuple) else [entry]
-    tensors = [part for part in parts if isinstance(part, Tensor)]
-    if has_tangent(*tensors):
-        raise checks.InputError(
-            "Mechanics: contacts have a backward pass and no forward mode. Use backward(), or"
-            " recorded growth, which does not depend on what is differentiated."
-        )
-    return tracked(*tensors)
+def _tensors(surface: Surface) -> list[Tensor]:
+    """The tensors that say where a surface is."""
+    parts = (x if isinstance(x, tuple) else (x,) for x in vars(surface).values())
+    return [x for part in parts for x in part if isinstance(x, Tensor)]
+
+
+def _same(value: Resolved, dtype: torch.dtype) -> np.ndarray | None:
+    """The one value that all cells have, (1,), or None."""
+    same = value.value
+    return None if same is None or same.dim() else compiled.array_or_none(same, dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import nullcontext
 from functools import cache, lru_cache, partial
@@ -12,9 +13,9 @@ from torch import Tensor
 
 from torchfilm.physics.contact_records import ContactReport, ContactSettings
 from torchfilm.physics.one_sided_records import OneSidedSettings
-from torchfilm.physics.step_records import MechanicsInput, MechanicsResult
-from torchfilm.physics.surfaces import FlatSurface
+from torchfilm.physics.surfaces import FlatSurface, Surface
 from torchfilm.tools.numba_calls import as_array, in_numpy
+from torchfilm.tools.ragged import Groups
 from torchfilm.tools.threads import available, submit
 
 # Batches with fewer cells than this take one thread: to start the others costs more.
@@ -23,45 +24,39 @@ WORTH_THREADS = 150
 # two threads gained nothing, from 5,000 to 10,000 a tenth, and with 10,000 in free growth a third.
 CELLS_A_THREAD = 4000
 
+# A tuple as long as rows have columns: seven in space, and the last column stays 0.
+DEGREES = {2: (0,) * 4, 3: (0,) * 8}
+
 # which kernels this process has called: type of settings, dimension, type of numbers
-_called: set[tuple[type, int, torch.dtype]] = set()
+_called: set[tuple[type, int, np.dtype]] = set()
 
 
-@torch.no_grad()
-def step(given: MechanicsInput) -> MechanicsResult:
-    """As `torch_step.step`."""
+def step(
+    settings: OneSidedSettings | ContactSettings, groups: Groups, dt: float, longest: float,
+    cells: tuple[np.ndarray, ...], drags: tuple[np.ndarray, ...], alphas: tuple[int, np.ndarray],
+    walls: tuple[np.ndarray, ...],
+) -> tuple[tuple[np.ndarray, ...], ContactReport, Tensor]:  # fmt: skip
+    """As `torch_step.step`, from arrays to arrays: see `kernels.colonies`. Returns what the cells
+    in the groups become, the report, and the sub-steps of each colony."""
     from torchfilm.kernels import colonies as kernels
 
-    settings, dtype = given.settings, given.radius.dtype
+    position, axis, length, elongation, _, move, collapsed, alpha, compression = cells
+    kind = type(settings), settings.dim, length.dtype
     step_colonies, numbers = _kernel_of(settings)
-    begin, counts = given.groups.begin.numpy(), given.groups.counts.numpy()
-    position = as_array(given.position, torch.float64)
-    collapsed = as_array(given.collapsed, torch.int64)
-    axis, length, elongation, radius, move = (
-        as_array(x, dtype)
-        for x in (given.axis, given.length, given.elongation, given.radius, given.move)
-    )
-    alpha, compression = (
-        _array_or_none(x, dtype) for x in (given.contact_alpha, given.compression)
-    )
-    cells = position, axis, length, elongation, radius, move, collapsed, alpha, compression
     changed = position, axis, length, move, elongation, collapsed, alpha, compression
     out = tuple(np.empty_like(a) for a in changed)
-    drags = tuple(
-        _array_or_none(v, dtype) for v in (given.viscosity, given.length_drag, given.drag)
-    )
-    reports = np.zeros((counts.size, kernels.REPORT))
+    reports = np.zeros((groups.size, kernels.REPORT))
     reports[:, kernels.SUBSTEPS] = 1
-    degrees = (0,) * (4 if settings.dim == 2 else 8)  # seven in space; the last column stays 0
+    degrees = DEGREES[settings.dim]
     arguments = (
-        begin, float(given.dt), float(given.longest), cells, drags, _alphas(given, dtype),
-        _walls(given), numbers, out, reports, degrees,
+        groups.begin.numpy(), float(dt), float(longest), cells, drags, alphas, walls, numbers, out,
+        reports, degrees,
     )  # fmt: skip
-    kind = type(settings), settings.dim, dtype
+    counts, every = groups.counts.numpy(), np.arange(groups.size)
     with nullcontext() if kind in _called else _first_call(*kind):
-        every = np.arange(counts.size)  # how work is shared does not change the result
+        # how work is shared does not change the result
         if isinstance(settings, OneSidedSettings):
-            of_rows = in_numpy(dtype), len(degrees)
+            of_rows = length.dtype.type, len(degrees)
             _call_by_teams(step_colonies, of_rows, every, counts, arguments)
         else:
             _call(step_colonies, every, counts, arguments)
@@ -69,41 +64,40 @@ def step(given: MechanicsInput) -> MechanicsResult:
     residual = torch.from_numpy(reports[:, kernels.ERROR].copy())
     reports[:, kernels.ERROR] = 0  # may be no number; the others are integers
     whole = torch.from_numpy(reports.T.astype(np.int64)).unbind()
-    # in the order of `changed`
-    x, axes, lengths, moves, growths, fallen, *of_contacts = map(torch.from_numpy, out)
-    alphas, compressions = of_contacts if given.compression is not None else (None, None)
-    return MechanicsResult(
-        x, axes, lengths, moves, growths, fallen, alphas, compressions,
-        ContactReport(
-            whole[kernels.STATUS], whole[kernels.ITERATIONS], residual, whole[kernels.PASSES],
-            whole[kernels.CLIPPED], whole[kernels.DEEPLY],
-        ), whole[kernels.SUBSTEPS],
+    report = ContactReport(
+        whole[kernels.STATUS], whole[kernels.ITERATIONS], residual, whole[kernels.PASSES],
+        whole[kernels.CLIPPED], whole[kernels.DEEPLY],
     )  # fmt: skip
+    return out, report, whole[kernels.SUBSTEPS]
 
 
-def _first_call(settings: type, dim: int, dtype: torch.dtype):
+def _first_call(settings: type, dim: int, dtype: np.dtype):
     """Says that a kernel is compiled, unless it was kept."""
     from torchfilm.kernels.compiling import first_call
 
-    name = f"{dim}-D, {str(dtype).removeprefix('torch.')}"
+    name = f"{dim}-D, {dtype.name}"
     name += ", bilateral" if settings is ContactSettings else ""
     return first_call(name, f"contacts ({name}), 20 s to a minute")
 
 
-def _array_or_none(value: Tensor | None, dtype: torch.dtype) -> np.ndarray:
+def array_or_none(value: Tensor | None, dtype: torch.dtype) -> np.ndarray:
     """(N,), or (1,) of a number for all cells; (0,) for None."""
     if value is None:
         return np.empty(0, in_numpy(dtype))
-    return as_array(value.reshape(-1), dtype)
+    if value.dim() == 0:
+        return np.array([value.item()], in_numpy(dtype))
+    return as_array(value, dtype)
 
 
-def _alphas(given: MechanicsInput, dtype: torch.dtype) -> tuple[int, np.ndarray]:
+def alpha_arrays(
+    alpha: Tensor | None, stiffness: Tensor | None, dtype: torch.dtype
+) -> tuple[int, np.ndarray]:
     """How α is given, and its values or stiffness: see `kernels.colonies`."""
     from torchfilm.kernels.colonies import GIVEN, NOT_GIVEN, OF_STIFFNESS
 
-    if given.stiffness is not None:
-        return OF_STIFFNESS, _array_or_none(given.stiffness, dtype)
-    return GIVEN if given.alpha is not None else NOT_GIVEN, _array_or_none(given.alpha, dtype)
+    if stiffness is not None:
+        return OF_STIFFNESS, array_or_none(stiffness, dtype)
+    return GIVEN if alpha is not None else NOT_GIVEN, array_or_none(alpha, dtype)
 
 
 @lru_cache(maxsize=100)
@@ -194,21 +188,22 @@ def _wait(calls: list[Future]) -> None:
             call.result()
 
 
-def _walls(given: MechanicsInput) -> tuple[np.ndarray, ...]:
+def wall_arrays(
+    surfaces: Sequence[Surface], walls: Sequence[tuple[str, Tensor | None]], ids: Tensor, cells: int
+) -> tuple[np.ndarray, ...]:
     """Kinds (S,), places (S, B, 3), sizes (S, B), D or stiffness (S, N), and which are soft
-    (S,)."""
+    (S,), for the colonies `ids` (B,) of N cells."""
     from torchfilm.kernels import rows
 
-    surfaces, colonies = given.surfaces, given.groups.size
+    colonies = ids.numel()
     if not surfaces:
         return _no_walls(colonies)
     kinds = np.zeros(len(surfaces), np.int64)
     places = np.zeros((len(surfaces), colonies, 3))
     sizes = np.zeros((len(surfaces), colonies))
-    roots = np.ones((len(surfaces), given.radius.shape[0]))
+    roots = np.ones((len(surfaces), cells))
     soft = np.zeros(len(surfaces), np.uint8)
-    ids = given.colony_id
-    for k, (surface, (kind, value)) in enumerate(zip(surfaces, given.walls, strict=True)):
+    for k, (surface, (kind, value)) in enumerate(zip(surfaces, walls, strict=True)):
         if isinstance(surface, FlatSurface):
             place, size, kinds[k] = surface.normal, surface.offset, rows.FLAT
         else:
@@ -225,7 +220,7 @@ def _walls(given: MechanicsInput) -> tuple[np.ndarray, ...]:
 
 @cache
 def _no_walls(colonies: int) -> tuple[np.ndarray, ...]:
-    """As `_walls`, where there are none."""
+    """As `wall_arrays`, where there are none."""
     none = np.zeros(0, np.int64)
     places, sizes, roots = np.zeros((0, colonies, 3)), np.zeros((0, colonies)), np.ones((0, 0))
     return none, places, sizes, roots, none.astype(np.uint8)

@@ -1,0 +1,88 @@
+"""Growth and contacts, one after the other, without a state in between.
+
+In small colonies kernels take less time than what is done around them: states, checks, tensors. So
+where compiled contacts follow growth, and no derivative is wanted, both are one step here, to the
+same bits.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from torchfilm.effect import BoundEffect, Effect
+from torchfilm.effects.bound_mechanics import BoundMechanics
+from torchfilm.effects.growth import Growth
+from torchfilm.state import State
+from torchfilm.tools.numba_calls import as_array
+from torchfilm.tools.timing import Timings
+
+# radii at the caps that grow with the length, where the volume grows evenly
+CAPS = 4.0 / 3.0
+
+
+class JoinedStep:
+    """Growth by a law, and compiled contacts right after it."""
+
+    def __init__(self, growth: BoundEffect, mechanics: BoundMechanics):
+        assert isinstance(growth.effect, Growth)
+        self.growth, self.law, self.mechanics = growth, growth.effect.law, mechanics
+
+    def run_step(self, state: State, dt: float, timings: Timings | None) -> State:
+        """The state after growth and contacts."""
+        begin = time.perf_counter()
+        found = self._lengthened(state, dt)
+        grown = self.growth.run_step(state, dt) if found is None else state
+        between = time.perf_counter()
+        if found is None:
+            state = self.mechanics.run_step(grown, dt)
+        else:
+            state = self.mechanics.parted(state, dt, *found)
+        if timings is not None:
+            timings.add(self.growth.title, between - begin)
+            timings.add(self.mechanics.title, time.perf_counter() - between)
+        return state
+
+    def _lengthened(self, state: State, dt: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """How much longer cells become and how long they then are, (N,), as `Growth` has it; None
+        where there are no cells, a derivative is wanted, or one would be of no finite length."""
+        rate, dtype = state.fields["growth_rate"], state.dtype
+        derivative = rate.requires_grad and torch.is_grad_enabled()
+        if not state.cells or derivative or self.mechanics.derivatives_wanted(state):
+            return None
+        wanted = rate * dt
+        growth = as_array(wanted if self.law == "linear" else torch.expm1(wanted), dtype)
+        length = as_array(state.length, dtype)
+        with np.errstate(all="ignore"):
+            if self.law == "volume":
+                growth = growth * (length + as_array(state.radius, dtype) * CAPS)
+            elif self.law == "length":
+                growth = growth * length
+            after = length + growth
+        return (growth, after) if after.max() < math.inf else None
+
+
+def joined(effects: Sequence[BoundEffect]) -> list[BoundEffect | JoinedStep]:
+    """The effects, in which growth and contacts right after it are joined where they can be."""
+    found: list[BoundEffect | JoinedStep] = []
+    for effect in effects:
+        before = found[-1] if found else None
+        if (
+            isinstance(before, BoundEffect)
+            and _grows_plainly(before.effect)
+            and isinstance(effect, BoundMechanics)
+            and effect.compiled
+        ):
+            found[-1] = JoinedStep(before, effect)
+        else:
+            found.append(effect)
+    return found
+
+
+def _grows_plainly(effect: Effect) -> bool:
+    """Whether the field growth_rate alone tells how cells grow."""
+    return type(effect) is Growth and not effect.by_type
