@@ -364,3 +364,41 @@ def test_cells_divide_alike_by_kernels_and_by_torch(dim, axis_noise, dtype, monk
     assert_same_state(by_kernels, by_torch)
     for name in ("first", "second", "uid", "rows"):
         assert torch.equal(*(getattr(s.births[-1], name) for s in (by_kernels, by_torch)))
+
+
+@pytest.mark.parametrize("called", [False, True])
+def test_fields_of_any_type_divide_alike_by_kernels_and_by_torch(called, dtype, monkeypatch):
+    """Rows of one number and of several, copied or begun anew, also where a function of the state
+    gives the first values of a field, which may read the others before these begin anew."""
+    pytest.importorskip("numba")
+    fields = [
+        tf.Field("mark", "whole numbers, two a cell", shape=(2,), dtype=torch.int64),
+        tf.Field("age", "steps", dtype=torch.int32, initial=7, at_division="reset"),
+        tf.Field("new", "yes or no", dtype=torch.bool, initial=True, at_division="reset"),
+        tf.Field("single", "one type for all", dtype=torch.float32, initial=0.1,
+                 at_division="reset"),
+        tf.Field("matrix", "three by two", shape=(3, 2), initial=2.5, at_division="reset"),
+        tf.Field("of_colony", "one a colony", scope="colony"),
+    ]  # fmt: skip
+    if called:
+        first = lambda state, rows: state.age.index_select(0, rows).to(dtype) + 0.5
+        fields.append(tf.Field("told", "from age", initial=first, at_division="reset"))
+    model = tf.Scene(tf.Growth(rate=1.0), tf.Division(length=tf.Uniform(3.5, 4.0))).bind(
+        3, seed=2, dtype=dtype
+    )
+    state = model.start()
+    for field in fields:
+        state = state.declare(field)
+    state = state.with_fields(
+        mark=torch.arange(6).reshape(3, 2) - 2**40, age=torch.arange(3, dtype=torch.int32)
+    ).replace(length=torch.full((3,), 4.5, dtype=dtype))
+    bound = next(e for e in model.effects if e.title == "division")
+    assert (bound._fresh(state) is None) == called
+    by_kernels = bound.step(state, 0.1)
+    for module in (division, compiled_division):
+        monkeypatch.setattr(module, "kernels_loaded", lambda value: False)
+    by_torch = bound.step(state, 0.1)
+    assert by_kernels.cells == 6
+    assert_same_state(by_kernels, by_torch)
+    assert by_kernels.age.tolist() == [7] * 6 and bool(by_kernels.new.all())
+    assert by_kernels.mark[0].tolist() == by_kernels.mark[1].tolist() == [-(2**40), 1 - 2**40]
