@@ -135,11 +135,11 @@ def product_over_copy(cells: int = 10000) -> dict[str, float]:
     first, second = for_python(neighbours.near_pairs)(x, axis, half, radius, 0.3, dof)
     near = for_python(contacts.near_contacts)(x, axis, half, radius, first, second, 0.3, dof)
     found = (first, second, *near)
-    room = 2 * len(near[0])
+    room = contacts.ROWS * len(near[0])
     H, gaps = np.empty((2 * room, 4), np.float32), np.empty(room, np.float32)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
     places = H, gaps, one, two, one
-    count = for_python(contacts.pair_rows)(x, axis, half, radius, scale, found, 0, places, dof)
+    count = for_python(contacts.pair_rows)(x, axis, half, radius, scale, found, 0, places, 0.3, dof)
     p, out = np.ones((n, 4), np.float32), np.zeros((n, 4), np.float32)
     on = np.arange(count, dtype=np.int32)
     H = H[: 2 * count].copy()

@@ -22,6 +22,7 @@ from torchfilm.kernels.capsules import (
 )
 from torchfilm.kernels.compiling import index, kernel
 from torchfilm.kernels.rows import degrees, half_of
+from torchfilm.kernels.scheme import BEYOND
 from torchfilm.kernels.vectors import WIDTH, any_of, load, store, where
 
 LINE_CONTACT_SINE = 0.4  # as in `physics.contacts`
@@ -31,15 +32,17 @@ CROSSING = 1e-5
 PAIRS = 32
 VECTORS = PAIRS // WIDTH
 # Columns: from centre to centre, axes, half lengths, radii, arc lengths of the closest points, gap,
-# whether it is below the margin, and whether the contact is a line.
+# whether it is below the margin, and which of its rows a pair has: one at the contact, or two where
+# it is a line, and one at each end of the stretch along which its cells lie side by side.
 B, A, C = 0, 3, 6
-HALF_A, HALF_B, RADIUS_A, RADIUS_B, S0, T0, GAP, NEAR, LINE = range(9, 18)
-# Then, of each of its two rows: arc lengths, ends, weight, distance, gap times weight, and the
-# halves, which have up to seven columns.
-FIRST_ROW = 18
+HALF_A, HALF_B, RADIUS_A, RADIUS_B, S0, T0, GAP, NEAR, HAS = range(9, 18)
+ROWS = 4
+# Then, of each row: arc lengths, ends, weight, distance, gap times weight, and the halves, which
+# have up to seven columns.
+FIRST_ROW = HAS + ROWS
 S, T, END_A, END_B, WEIGHT, DISTANCE, WEIGHTED, OWN, OTHER = (0, 1, 2, 3, 4, 5, 6, 7, 14)
 OF_ROW = 21
-COLUMNS = FIRST_ROW + 2 * OF_ROW
+COLUMNS = FIRST_ROW + ROWS * OF_ROW
 
 
 @kernel(inline=True)
@@ -195,10 +198,26 @@ def _part(block, row, k, dof):
         block[row + OWN + c, k], block[row + OTHER + c, k] = own[c], other[c]
 
 
+@kernel(inline=True)
+def _put_far_row(rows, k, g, far, s, t, end_a, end_b, margin, dof):
+    """A row of weight ½ at an end of the stretch, for pairs `far` that are near there, too."""
+    row, has = FIRST_ROW + (2 + k) * OF_ROW, where(far, 1.0, 0.0)
+    if margin > 0 and any_of(far):
+        _put_row(rows, row, g, s, t, end_a, end_b, math.sqrt(0.5) * has, dof)
+        distance = _vector(rows, row + DISTANCE, g)
+        touching = _vector(rows, RADIUS_A, g) + _vector(rows, RADIUS_B, g)
+        near = (distance < touching + margin) & (distance > CROSSING * touching)
+        _put(rows, HAS + 2 + k, g, where(near, has, 0.0))
+    else:
+        _put(rows, HAS + 2 + k, g, 0.0 * has)
+
+
 @kernel
-def _put_rows(rows, vectors, dof):
+def _put_rows(rows, vectors, margin, dof):
     """The rows of pairs, before they are scaled: one at the closest points, or where the contact is
-    a line two of weight ½, towards its ends. Returns whether centrelines cross."""
+    a line two of weight ½, towards its ends; and where the stretch along which cells lie side by
+    side goes on, one at its end, if that is nearer than margin. Returns whether centrelines cross.
+    """
     crossing = False
     for g in range(vectors):
         bx, by, bz = _three(rows, B, g)
@@ -238,15 +257,18 @@ def _put_rows(rows, vectors, dof):
             t1 = clamp(sign * (at - offset) * unproject, hb)
             end_a = _mark(side, at - ha * project * side, width)
             end_b = _mark(side, at - offset - hb * project * side, width)
+            s2 = where(line, s0 + slide * (s1 - s0), s0)
+            t2 = where(line, t0 + slide * (t1 - t0), t0)
             crossing |= _put_row(
-                rows, FIRST_ROW + k * OF_ROW, g,
-                where(line, s0 + slide * (s1 - s0), s0),
-                where(line, t0 + slide * (t1 - t0), t0),
+                rows, FIRST_ROW + k * OF_ROW, g, s2, t2,
                 where(line, end_a0 + slide * (end_a - end_a0), end_of(s0, ha)),
                 where(line, end_b0 + slide * (sign * end_b - end_b0), end_of(t0, hb)),
                 weight, dof,
             )  # fmt: skip
-        _put(rows, LINE, g, where(line, 1.0, 0.0))
+            far = (high > low) & ((abs(s1 - s2) + abs(t1 - t2)) * width > 2.0 * BEYOND)
+            _put_far_row(rows, k, g, far, s1, t1, end_a, sign * end_b, margin, dof)
+        _put(rows, HAS, g, where(line, 1.0, 1.0))
+        _put(rows, HAS + 1, g, where(line, 1.0, 0.0))
     return crossing
 
 
@@ -266,9 +288,10 @@ def _mark(side, beyond, width):
 
 
 @kernel
-def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
+def pair_rows(x, axis, half, radius, scale, found, walls, rows, margin, dof):
     """Rows of the contacts `found`, after `walls` others; a line of contact has two rows of weight
-    ½. Returns how many there are in all.
+    ½, and a pair as many more where a turn would bring it together: where it is nearer than margin.
+    Returns how many there are in all.
 
     found: pairs (first, second), and of their contacts the place among these, the closest points
     and the gap, µm: see `near_contacts`.
@@ -285,13 +308,17 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, dof):
             i, j = index(first[index(some[k])]), index(second[index(some[k])])
             _put_cells(block, k, i, j, x, axis, half, radius, dof)
             block[S0, k], block[T0, k] = points[start + k, 0], points[start + k, 1]
-        if _put_rows(block.reshape(-1, WIDTH), (some.shape[0] + WIDTH - 1) // WIDTH, dof):
+        vectors = (some.shape[0] + WIDTH - 1) // WIDTH
+        if _put_rows(block.reshape(-1, WIDTH), vectors, margin, dof):
             for k in range(some.shape[0]):
                 _part(block, FIRST_ROW, k, dof)
                 _part(block, FIRST_ROW + OF_ROW, k, dof)
         for k in range(some.shape[0]):
             i, j = first[index(some[k])], second[index(some[k])]
-            for row in range(FIRST_ROW, FIRST_ROW + OF_ROW * (1 + int(block[LINE, k])), OF_ROW):
+            for c in range(ROWS):
+                if block[HAS + c, k] == 0.0:
+                    continue
+                row = FIRST_ROW + c * OF_ROW
                 _put_scaled(H, index(2) * r, block, row + OWN, k, scale, index(i), dof)
                 _put_scaled(H, index(2) * r + index(1), block, row + OTHER, k, scale, index(j), dof)
                 gaps[r], one[r], two[r] = block[row + WEIGHTED, k], i, j

@@ -84,7 +84,8 @@ def move_cells(x, axis, length, y, scale, about, bound, least, dof):
 
 @kernel
 def approach(x, length, radius, y, dof):
-    """How much nearer, at most, any two cells can have come by the move y of `move_cells`, µm.
+    """How much nearer, at most, cells can have come by the move y of `move_cells`, µm: any two that
+    are near, and what each adds to that, (n,).
 
     Cells of a growing colony move far, but neighbours almost alike: they part in proportion to
     their distance, and the rest is what each moves by itself.
@@ -102,7 +103,7 @@ def approach(x, length, radius, y, dof):
             away = x[i, k] - centre[k]
             along += away * (y[i, k] - mean[k])
             square += away * away
-    stretch, own = along / square, 0.0
+    stretch, own, most = along / square, np.empty(n), 0.0
     for i in range(n):
         rest, turn = 0.0, 0.0
         for k in range(d):
@@ -110,5 +111,6 @@ def approach(x, length, radius, y, dof):
         for k in range(d, end):
             turn += y[i, k] ** 2
         half = 0.5 * (length[i] + abs(y[i, end]))
-        own = max(own, math.sqrt(rest) + half * math.sqrt(turn) + 0.5 * abs(y[i, end]))
-    return abs(stretch) * (longest + 2 * own) + 2 * own
+        own[i] = math.sqrt(rest) + half * math.sqrt(turn) + 0.5 * abs(y[i, end])
+        most = max(most, own[i])
+    return abs(stretch) * (longest + 2 * most), own

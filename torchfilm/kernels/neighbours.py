@@ -42,9 +42,27 @@ def _boxes(x, axis, half, radius, margin, box, low, high, dof):
 
 
 @kernel
-def _fill_table(low, high, top, slots, boxes, dof):
-    """Members sorted by slot, and where each slot begins. Each has 8 times the number of its bin,
-    and a bit for each axis along which this is the first bin of its box; and its box."""
+def _slots_of(low, high, top, slots, some):
+    """Which slots have to be filled, (slots,): those of the cells marked in `some`, (n,)."""
+    n, d = low.shape
+    used = np.zeros(slots, np.uint8)
+    for i in range(n):
+        if some[i]:
+            z0, z1 = (low[i, 2], high[i, 2]) if d == 3 else (np.int64(0), np.int64(0))
+            for bz in range(z0, z1 + 1):
+                for by in range(low[i, 1], high[i, 1] + 1):
+                    for bx in range(low[i, 0], high[i, 0] + 1):
+                        own = bx + by * top[0] + bz * top[0] * top[1]
+                        used[index(own & (slots - 1))] = 1
+    return used
+
+
+@kernel
+def _fill_table(low, high, top, used, boxes, dof):
+    """Members sorted by slot, of the slots that are used, and where each slot begins. Each has 8
+    times the number of its bin, and a bit for each axis along which this is the first bin of its
+    box; and its box."""
+    slots = used.shape[0]
     n, d = low.shape
     rows, layers = top[0], top[0] * top[1]
     begin = np.zeros(slots + 1, np.int64)
@@ -62,6 +80,8 @@ def _fill_table(low, high, top, slots, boxes, dof):
                     for bx in range(low[i, 0], high[i, 0] + 1):
                         own = bx + by * rows + bz * layers
                         s = index(own & (slots - 1))
+                        if not used[s]:
+                            continue
                         if turn == 0:
                             begin[s + index(1)] += 1
                         else:
@@ -80,26 +100,50 @@ def near_pairs(x, axis, half, radius, margin, dof):
     Cells of any size: a long cell lies in many bins. A pair is found in the first bin that both
     cover: along each axis it is the first of one of them.
     """
+    return near_pairs_of(x, axis, half, radius, margin, np.empty(0, np.uint8), dof)
+
+
+@kernel
+def near_pairs_of(x, axis, half, radius, margin, some, dof):
+    """Those of `near_pairs` of which a cell is marked in `some`, (n,) uint8; (0,) for all."""
     n, d = x.shape[0], 2 if len(dof) == 4 else 3
     low, high = np.empty((n, d), np.int64), np.empty((n, d), np.int64)
     boxes = np.zeros((n, len(dof)), np.float32)
     top = _boxes(x, axis, half, radius, margin, boxes, low, high, dof)
     if n <= FEW:
-        return _among_few(boxes, dof)
+        first, second = _among_few(boxes, dof)
+        return _with_some(first, second, some)
     slots = 16
     while slots < 2 * n:
         slots *= 2
-    begin, member, key, box = _fill_table(low, high, top, slots, boxes, dof)
+    used = np.ones(slots, np.uint8)
+    if some.shape[0]:
+        used = _slots_of(low, high, top, slots, some)
+    begin, member, key, box = _fill_table(low, high, top, used, boxes, dof)
     most = 0
     for s in range(slots):
         most = max(most, begin[s + 1] - begin[s])
-    first, second = np.empty(8 * n + most, np.int32), np.empty(8 * n + most, np.int32)
+    room = most + min(8 * n, 8 * member.shape[0])
+    first, second = np.empty(room, np.int32), np.empty(room, np.int32)
     table, slot, place, found = (begin, member, key, box), 0, 0, 0
     while place < member.shape[0]:
         if found + most > first.shape[0]:
             first, second = _longer(first), _longer(second)
         slot, place, found = _search(table, slot, place, found, most, first, second, dof)
-    return _by_first(first[:found], second[:found], n)
+    first, second = _with_some(first[:found], second[:found], some)
+    return _by_first(first, second, n)
+
+
+@kernel
+def _with_some(first, second, some):
+    """The pairs of which a cell is marked in `some`, in place; all where it is (0,)."""
+    if some.shape[0] == 0:
+        return first, second
+    new = 0
+    for k in range(first.shape[0]):
+        first[new], second[new] = first[k], second[k]
+        new += (some[first[k]] | some[second[k]]) > 0
+    return first[:new], second[:new]
 
 
 @kernel

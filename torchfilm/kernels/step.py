@@ -23,9 +23,9 @@ from torchfilm.kernels.colonies import (
     taken_out,
 )
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.contacts import deepest_of, near_contacts, pair_rows
+from torchfilm.kernels.contacts import ROWS, deepest_of, near_contacts, pair_rows
 from torchfilm.kernels.moves import approach, drags, move_cells
-from torchfilm.kernels.neighbours import near_pairs, spatial_order
+from torchfilm.kernels.neighbours import near_pairs, near_pairs_of, spatial_order
 from torchfilm.kernels.rows import HARD, STIFF, deeply_overlapping, degrees, rows_among, wall_rows
 from torchfilm.kernels.scheme import (
     DEEP_IN_SUBSTEPS,
@@ -45,6 +45,8 @@ from torchfilm.kernels.scheme import (
 from torchfilm.kernels.solve import minimise
 from torchfilm.kernels.team import next_of
 
+# A search of all pairs takes no longer than one of the pairs of so many of the cells.
+MOST_SOME = 0.3
 # Places in the settings. DEEP ≤ 0: TOO_DEEP radii. YIELD: mean overlap
 # of contacts, radii.
 DEEP, TOLERANCE, MOST_PASSES, LIMIT, SOFT, YIELD = range(6)
@@ -115,11 +117,22 @@ def _after(x, axis, length, radius, y, margin, deep, found, dof):
     """The contacts after the move y, and whether one of them is deeper than `deep`. Where none is,
     they may be those before it, `found`."""
     half = 0.5 * length
-    near = approach(x, length, radius, y, dof) <= margin + deep  # else other pairs may have met
-    if near and deepest_of(x, axis, half, radius, found, dof) >= -deep:
-        return found, False
+    if deepest_of(x, axis, half, radius, found, dof) >= -deep:
+        # others were farther than margin: of those that met, one has come half of the way
+        together, own = approach(x, length, radius, y, dof)
+        some, count = np.zeros(own.shape[0], np.uint8), 0
+        for i in range(own.shape[0]):
+            some[i] = own[i] > 0.5 * (margin + deep - together)
+            count += some[i]
+        if count == 0:
+            return found, False
+        if count <= MOST_SOME * own.shape[0]:
+            pairs = near_pairs_of(x, axis, half, radius, 0.0, some, dof)
+            met = _contacts_of(x, axis, half, radius, 0.0, pairs, dof)
+            if _deepest(met[4]) >= -deep:
+                return found, False
     found = _contacts(x, axis, half, radius, margin, dof)
-    return found, near or _deepest(found[4]) < -deep
+    return found, _deepest(found[4]) < -deep
 
 
 @kernel
@@ -136,7 +149,7 @@ def _wall_contacts(x, axis, half, radius, scale, at, found, like, dof):
     `found`; how many there are, and the deepest gap. at: kinds, places and sizes of walls and
     which are soft, and weight and reach by cell."""
     (kinds, places, sizes, is_soft), root, reach = at
-    room = 2 * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
+    room = ROWS * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
     H, gaps = np.empty((2 * room, len(dof)), like.dtype), np.empty(room, like.dtype)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
     rows = H, gaps, one, two, np.zeros(room, np.uint8)
@@ -241,7 +254,7 @@ def step_colony(x, axis, base, growth, radius, viscosity, length_drag, shortest,
             found, deeply = _contacts_of(x, axis, half, radius, margin, found, dof), True
             continue
         numbers, count, mine = _deep_cells(found, rows, at_walls, deep, len(y) * (number > 0))
-        m = pair_rows(x, axis, half, radius, scale, mine, at_walls, rows, dof)
+        m = pair_rows(x, axis, half, radius, scale, mine, at_walls, rows, margin, dof)
         error, e = _minimise_some(
             rows, m, numbers, count, alpha, low, y, 2 * target, settings, report, team, dof
         )

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchfilm.kernels.bilateral_scheme import CANDIDATE, NEAR
 from torchfilm.physics.neighbours import Neighbourhood
+from torchfilm.physics.stretches import stretch_of
 from torchfilm.tools.reads import rows_where
 from torchfilm.tools.vectors import cross, dot, perpendicular, safe_norm, safe_sqrt
 
@@ -139,22 +140,14 @@ def line_points(
     turn, cosine, between = cross(a.axis, b.axis), dot(a.axis, b.axis), b.centre - a.centre
     sine2 = dot(turn, turn)
     slide = slide_of(sine2)
-    # the common part of the two segments, measured along the mean axis so that neither cell is
-    # preferred
-    sign = torch.where(cosine < 0, -1.0, 1.0).to(a.half.dtype)
-    mean = a.axis + sign * b.axis
-    mean = mean / safe_norm(mean)
-    project = dot(a.axis, mean)
-    offset = dot(between, mean)
-    low = torch.maximum(-a.half * project, offset - b.half * project)
-    high = torch.minimum(a.half * project, offset + b.half * project)
-    line = (slide > 0) & (high > low)
+    along = stretch_of(a, b)
+    line = (slide > 0) & (along.length > 0)
     # a line shorter than the cells' thickness counts as less of a line, so that it vanishes
     # smoothly as cells slide apart, as it does when they turn
-    share = ((high - low) / (0.5 * (a.radius + b.radius))).clamp(max=1.0)
+    share = (along.length / (0.5 * (a.radius + b.radius))).clamp(max=1.0)
     # so does the line of two centrelines that cross, whose ends lie on opposite sides: the contact
     # is near the crossing
-    swing = 0.5 * (high - low) * safe_sqrt(sine2)
+    swing = 0.5 * along.length * safe_sqrt(sine2)
     crossed = swing > 1e-6 * a.radius
     apart = safe_sqrt(_distance2(between, a.axis, b.axis, s0, t0))
     share = share * torch.where(crossed, apart / torch.where(crossed, swing, 1.0), 1.0).clamp(
@@ -163,22 +156,9 @@ def line_points(
     slide = torch.where(line, slide * slide * share, 0.0)
     end_a0 = _end_while_sliding(s0, cosine * t0 + dot(between, a.axis), a, slide)
     end_b0 = _end_while_sliding(t0, cosine * s0 - dot(between, b.axis), b, slide)
-    s_all, t_all, end_a, end_b = [], [], [], []
-    for at, side in ((low, -1.0), (high, 1.0)):
-        s1 = _clamp(at / project, a.half)
-        t1 = _clamp(sign * (at - offset) / project, b.half)
-        s_all.append(s0 + slide * (s1 - s0))
-        t_all.append(t0 + slide * (t1 - t0))
-        # the line ends where the first of the two cells ends; the further the other cell continues,
-        # the less its own end matters
-        beyond = (
-            side * (at - a.half * project * side),
-            side * (at - offset - b.half * project * side),
-        )
-        mark_a, mark_b = ((1.0 + x / (0.5 * (a.radius + b.radius))).clamp(min=0.0) for x in beyond)
-        end_a.append(end_a0 + slide * (side * mark_a - end_a0))
-        end_b.append(end_b0 + slide * (sign * side * mark_b - end_b0))
-    return torch.stack(s_all), torch.stack(t_all), torch.stack(end_a), torch.stack(end_b), line
+    start = s0, t0, end_a0, end_b0
+    s, t, end_a, end_b = (x0 + slide * (x - x0) for x, x0 in zip(along.points, start, strict=True))
+    return s, t, end_a, end_b, line
 
 
 def _end_while_sliding(s: Tensor, free: Tensor, cell: Capsules, slide: Tensor) -> Tensor:

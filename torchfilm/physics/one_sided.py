@@ -23,15 +23,9 @@ from torchfilm.kernels.scheme import (
 )
 from torchfilm.physics import capsule
 from torchfilm.physics.adjoint import attach_gradient
-from torchfilm.physics.contacts import (
-    CandidateContacts,
-    Capsules,
-    Contacts,
-    end_of,
-    line_points,
-    rows_at,
-)
+from torchfilm.physics.contacts import CandidateContacts, Capsules
 from torchfilm.physics.jacobian import ContactJacobian
+from torchfilm.physics.near_rows import near_rows
 from torchfilm.physics.neighbours import Neighbourhood
 from torchfilm.physics.one_sided_solve import Minimum, minimise
 from torchfilm.physics.problem import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ContactProblem
@@ -184,7 +178,8 @@ class _OneStep:
         """One solve of the moving cells, (N,) bool and their places, among the others at rest, and
         their moves."""
         given, settings = self.given, self.given.settings
-        contacts = near_rows(pairs)
+        owner = self.groups.owner.index_select(0, pairs.first)
+        contacts = near_rows(pairs, MARGIN * self.wide.index_select(0, owner))
         solved = self._solved(at, contacts, walls, moving, cells, active, least, first_pass)
         part, end = solved.problem, solved.end
         y = self._with_gradient(part, end)
@@ -364,30 +359,3 @@ class _Solved:
     hardness: Tensor
     spent: Tensor
     fell: Tensor
-
-
-def near_rows(pairs: CandidateContacts) -> Contacts:
-    """The rows of all pairs, gaps as they are: one at the closest points, or, where two cells touch
-    along a line, two of weight ½ at its ends."""
-    a, b, s, t = pairs.a, pairs.b, pairs.s, pairs.t
-    flat = pairs.flat
-    found = line_points(
-        a.take(flat), b.take(flat), s.index_select(0, flat), t.index_select(0, flat)
-    )
-    *ends, line = found
-    (line,) = rows_where(line)
-    flat, ends = flat.index_select(0, line), [x.index_select(1, line) for x in ends]
-    points = [
-        torch.cat([x.index_copy(0, flat, two[0]), two[1]])
-        for x, two in zip((s, t, end_of(s, a.half), end_of(t, b.half)), ends, strict=True)
-    ]
-    weight = torch.ones_like(s).index_fill(0, flat, 0.5)
-    keep = torch.cat([torch.arange(s.numel(), device=s.device), flat])
-    order = torch.argsort(keep, stable=True)  # the two rows of a line side by side
-    keep = keep.index_select(0, order)
-    points = [x.index_select(0, order) for x in points]
-    gap, row_first, row_second, normal = rows_at(a.take(keep), b.take(keep), *points)
-    pick = lambda x: x.index_select(0, keep)
-    return Contacts(
-        pick(pairs.first), pick(pairs.second), gap, pick(weight), row_first, row_second, normal
-    )
