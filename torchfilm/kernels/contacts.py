@@ -21,7 +21,7 @@ from torchfilm.kernels.capsules import (
     squared_sine,
 )
 from torchfilm.kernels.compiling import index, kernel
-from torchfilm.kernels.rows import degrees, half_of
+from torchfilm.kernels.rows import FAR, HARD, degrees, half_of
 from torchfilm.kernels.scheme import BEYOND
 from torchfilm.kernels.vectors import WIDTH, any_of, load, store, where
 
@@ -297,7 +297,7 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, margin, dof):
     and the gap, µm: see `near_contacts`.
     """
     first, second, keep, points, _ = found
-    H, gaps, one, two, _ = rows
+    H, gaps, one, two, kind = rows
     block, r = np.empty((COLUMNS, PAIRS)), index(walls)
     for column in range(FIRST_ROW):  # the others are written before they are read
         for k in range(PAIRS):
@@ -322,6 +322,7 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, margin, dof):
                 _put_scaled(H, index(2) * r, block, row + OWN, k, scale, index(i), dof)
                 _put_scaled(H, index(2) * r + index(1), block, row + OTHER, k, scale, index(j), dof)
                 gaps[r], one[r], two[r] = block[row + WEIGHTED, k], i, j
+                kind[r] = HARD if c < 2 else FAR
                 r += index(1)
     return np.int64(r)
 

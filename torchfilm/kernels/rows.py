@@ -13,7 +13,9 @@ import numpy as np
 from torchfilm.kernels.compiling import index, kernel
 
 FLAT, INSIDE, OUTSIDE = 0, 1, 2
-HARD, STIFF, LIGHT = 0, 1, 2  # walls: rigid, with a stiffness, with a weight below 1
+# Rows: of rigid contacts, of walls with a stiffness and with a weight below 1, and of two cells at
+# an end of the stretch along which they lie side by side.
+HARD, STIFF, LIGHT, FAR = 0, 1, 2, 3
 
 
 @kernel

@@ -318,7 +318,8 @@ def _of_colony(base, growth, radius, viscosity, settings):
 @kernel
 def _following(e, soft, hardness, target, softest):
     """α at which the mean overlap of the contacts that push, with cells and with hard walls, is
-    `target`, µm: harder at once, softer by a factor of two a step."""
+    `target`, µm: harder at once, softer by a factor of two a step. Rows at the ends of stretches do
+    not count: they push little, and would make the mean of the others larger."""
     total, count = 0.0, 0
     for r in range(e.shape[0]):
         if e[r] < 0 and soft[r] == HARD:

@@ -52,7 +52,8 @@ class Contacts:
 
     first, second: (K,) the cells. gap: (K,) µm. weight: D², (K,). `row_first`, `row_second`: (K, 4)
     in 2-D [n, q×n, ∂] and (K, 7) in 3-D. The gap after moves x is gap − row_first·x_first −
-    row_second·x_second. `normal`: (d, K) from first to second.
+    row_second·x_second. `normal`: (d, K) from first to second. far: (K,) bool, rows of one-sided
+    contacts at the ends of stretches, not at the contact; None if there are none.
     """
 
     first: Tensor
@@ -62,6 +63,7 @@ class Contacts:
     row_first: Tensor
     row_second: Tensor
     normal: Tensor
+    far: Tensor | None = None
 
 
 def closest_points(a: Capsules, b: Capsules) -> tuple[Tensor, Tensor]:

@@ -38,6 +38,7 @@ def near_rows(pairs: CandidateContacts, margin: Tensor) -> Contacts:
         two = torch.zeros_like(s, dtype=torch.bool).index_copy(0, flat, line)
         far = _far(pairs, along.length, along.points, points, margin)
         kept = rows_where(torch.ones_like(two), two, *far)
+        none, all_ = torch.zeros_like(two), torch.ones_like(two)
     weight = torch.full_like(s, 0.5)
     weights = [torch.where(two, weight, 1.0), weight, weight, weight]
     keep = torch.cat(kept)
@@ -51,8 +52,9 @@ def near_rows(pairs: CandidateContacts, margin: Tensor) -> Contacts:
     gap, row_first, row_second, normal = rows_at(a.take(keep), b.take(keep), *at)
     pick = lambda x: x.index_select(0, keep)
     return Contacts(
-        pick(pairs.first), pick(pairs.second), gap, weight, row_first, row_second, normal
-    )
+        pick(pairs.first), pick(pairs.second), gap, weight, row_first, row_second, normal,
+        picked([none, none, all_, all_]),
+    )  # fmt: skip
 
 
 def _far(

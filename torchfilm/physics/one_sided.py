@@ -189,7 +189,7 @@ class _OneStep:
         status = torch.where(end.error < torch.inf, status, NOT_FINITE)
         if first_pass and given.alpha is None:
             after = part.gap_after(y) if y.requires_grad else end.after
-            followed = self._followed(solved.hardness, part, after, walls)
+            followed = self._followed(solved.hardness, part, after, contacts, walls)
             followed = torch.where(solved.fell, solved.hardness, followed)
             good = sound & (end.error <= settings.tolerance)
             at = replace(at, hardness=torch.where(good, followed, at.hardness))
@@ -245,7 +245,7 @@ class _OneStep:
                 fell = fell | falls
                 lags = again & ~failed & ~down & (end.error < torch.inf) & follows
                 if follows:
-                    wanted = self._followed(hardness, part, end.after, walls)
+                    wanted = self._followed(hardness, part, end.after, contacts, walls)
                     lags = lags & (wanted < LAG * hardness)
                 end = end if kept is None else kept.where(falls, end, part)
                 kept = end if kept is None else end.where(down | lags, kept, part)
@@ -255,7 +255,7 @@ class _OneStep:
             if follows and some_lag:
                 y = self._with_gradient(part, end)
                 after = part.gap_after(y) if y.requires_grad else end.after
-                wanted = self._followed(hardness, part, after, walls)
+                wanted = self._followed(hardness, part, after, contacts, walls)
                 hardness = torch.where(lags, wanted, hardness)
             hardness = torch.where(falls, was, hardness)
             factor = torch.where(up, SOFTER, torch.where(down, 1.0 / SOFTER, 1.0))
@@ -305,12 +305,12 @@ class _OneStep:
         alphas = alpha.unsqueeze(1).expand_as(scale).to(dtype).contiguous()
         return ContactProblem(rows, gap, applied, alphas, low, scale, rigid, self.groups)
 
-    def _followed(self, hardness: Tensor, problem, after: Tensor, walls: WallContacts) -> Tensor:
+    def _followed(self, hardness: Tensor, problem, after: Tensor, contacts, walls) -> Tensor:
         """α of each colony at which the mean overlap of its contacts, with cells and with hard
-        walls, is the target: harder at once, softer by a factor of two a step."""
+        walls, is the target: harder at once, softer by a factor of two a step. Rows at the ends of
+        stretches do not count."""
         root, soft = self._wall_roots(walls, torch.ones_like(self.given.radius))
-        hard = torch.ones_like(after, dtype=torch.bool)  # all rows: the first pass moves all
-        hard[problem.rows.pairs :] = ~soft & (root >= 1)
+        hard = torch.cat([~contacts.far, ~soft & (root >= 1)])  # all: the first pass moves all
         overlap = torch.where(hard, -after, 0.0).clamp(min=0.0).double()
         both = torch.stack([overlap, (overlap > 0).double()], 1)
         total = problem.of_rows.sum(both)
