@@ -3,13 +3,19 @@ One service that circuits and nutrition share."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchfilm.signals.exchange import write
+from torchfilm.signals.exchange import ULPS, write
+from torchfilm.signals.stencil import Stencil
 from torchfilm.state import OUTSIDE, State
+from torchfilm.tools.threads import Course, Loop
+
+_found_outside = Course()
 
 
 class MediumExchange:
@@ -17,22 +23,54 @@ class MediumExchange:
 
     found: concentration of each signal at each cell, (N,) by name. pool: (N,) µm³, the part of the
     medium from which each cell may draw all that there is. in_reservoir: (N,) bool, cells outside
-    the box, whose pool is a reservoir that nothing changes, or None.
+    the box, whose pool is a reservoir that nothing changes, or None. in_loops: whether loops of
+    kernels find them, and may write; found and pool then have their numbers after `find`, or when
+    the caller has run the loops that it took.
     """
 
     def __init__(self, state: State, signals: Sequence[str]):
-        contact = state.contact(signals)
-        assert contact is not None
-        self.state, self.stencil, self.found = state, contact.stencil, contact.found
-        self.pool, self.in_reservoir = contact.pool, contact.in_reservoir
-        self._in_voxels = contact.in_voxels
+        layout = state.layout
+        assert layout is not None
+        self.state, self._loops, self._meeting = state, [], None
+        self.in_reservoir: Tensor | None = None
+        if state.device.type == "cpu":
+            values = {n: state.fields[OUTSIDE + n] for n in signals}
+            self._meeting = layout.meeting(
+                state.position_3d, state.colony, state.groups.ends, values, state.dtype
+            )
+        self.in_loops = self._meeting is not None
+        if self._meeting is not None:
+            self._loops = self._meeting.loops
+            self.pool = torch.from_numpy(self._meeting.pool)
+            self.found = {n: torch.from_numpy(x) for n, x in self._meeting.found.items()}
+            self._in_voxels = self.found
+        else:
+            contact = state.contact(signals)
+            assert contact is not None
+            self._contact, self.found, self.pool = contact, contact.found, contact.pool
+            self.in_reservoir, self._in_voxels = contact.in_reservoir, contact.in_voxels
         self._given: dict[str, Tensor] = {}
         self._to_reservoir: dict[str, Tensor] = {}
+        self._written: dict[str, Tensor] = {}
 
     @staticmethod
     def of(state: State, signals: Sequence[str]) -> MediumExchange | None:
         """The medium of a state, for these of its signals; None where no signal or no medium is."""
         return MediumExchange(state, signals) if signals and state.layout is not None else None
+
+    @cached_property
+    def stencil(self) -> Stencil:
+        return self._contact.stencil if self._meeting is None else self._meeting.stencil
+
+    def take_loops(self) -> list[Loop]:
+        """The loops that have yet to be run, for the caller to run."""
+        loops, self._loops = self._loops, []
+        return loops
+
+    def find(self) -> None:
+        """Run the loops that have yet to be run."""
+        if loops := self.take_loops():
+            _found_outside(loops, self.stencil.parts)
 
     def give(
         self, name: str, amount: Tensor, to_reservoir: Tensor | None, rows: Tensor | None = None
@@ -51,14 +89,25 @@ class MediumExchange:
                 start = torch.zeros_like(self.pool) if start is None else start
                 noted[name] = start.index_add(0, rows, new)
 
-    def settle(self) -> State:
-        """The state in which the medium has what was given to it."""
+    def write_in_loops(self, given: Mapping[str, np.ndarray]) -> list[Loop]:
+        """The loops that write all that cells give to their pools, (N,) by name: what will be there
+        when they are run. Only where `in_loops`, without other gifts."""
+        loops, meeting = [], self._meeting
+        assert meeting is not None
+        for name, amount in given.items():
+            self._written[OUTSIDE + name], loop = meeting.written(name, amount, ULPS)
+            loops.append(loop)
+        return loops
+
+    def settle(self, **more: Tensor) -> State:
+        """The state in which the medium has what was given to it. more: other fields to
+        change."""
         state = self.state
-        changed = {
+        changed = self._written | {
             OUTSIDE + n: write(state.fields[OUTSIDE + n], x, self.stencil, self._in_voxels[n])
             for n, x in self._given.items()
         }
         for name, amount in self._to_reservoir.items():
             total = state.groups.sum(amount.unsqueeze(1)).squeeze(1)
             changed[f"{name}_reservoir"] = state.fields[f"{name}_reservoir"] + total
-        return state.with_fields(**changed)
+        return state.with_fields(**changed, **more)

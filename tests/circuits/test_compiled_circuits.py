@@ -233,12 +233,13 @@ def test_same_bits_in_any_batch(plain):
 def test_same_bits_in_any_order(plain):
     cells, start, concentrations = one_step(alone(toggle(k=tf.LogNormal(4.0, 0.3))))
     step, found = KernelStep(cells.compiled, (), {}), cells.compiled.sources(cells, {})
-    around = Surroundings({}, None, torch.zeros_like(cells.rows))
+    around = Surroundings(start, {}, None, torch.zeros(1).long(), torch.zeros_like(cells.rows))
     ends = []
     for order in (range(len(cells.rows)), (7, 2, 9, 0)):
         some = dataclasses.replace(cells, rows=torch.tensor(order))
         into = Changes.of(start, (), reservoir=False, whole=True)
-        code = step(some.rows, start, found, around, 0.4, 1e-4, 1e-9, into)
+        loop, code = step.loop(some.rows, found, around, 0.4, 1e-4, 1e-9, into)
+        loop.work(0, len(cells.rows))
         assert len(code) == len(order) and not code.any()
         ends.append(torch.from_numpy(into.species[:, [7, 2, 9, 0]]))
     assert torch.equal(*ends) and not torch.equal(ends[0].t(), concentrations[[7, 2, 9, 0]])

@@ -98,7 +98,7 @@ def test_half_way_between_two_volumes(dtype):
     assert torch.equal(made.length[:1], length[:1]) and float(made.length[2]) == 0.0
     grown = length.clone().requires_grad_()
     again = half_way(grown, radius, before)  # by torch, for a gradient
-    for name in ("length", "volume", "area", "before", "after"):
+    for name in ("length", "volume", "area", "before", "after", "end"):
         one, other = getattr(made, name), getattr(again, name)
         assert array(one) == pytest.approx(array(other.detach()), rel=close)
     assert again.volume.requires_grad

@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import torchfilm as tf
-from torchfilm.signals import compiled, exchange
+from torchfilm.signals import exchange
 from torchfilm.signals.exchange import Stencil, pool_volume, read, stencil, write
 from torchfilm.signals.grid import Grid
 from torchfilm.tools.checks import InputError
 from torchfilm.tools.ragged import Groups
+from torchfilm.tools.threads import Shared
 
 SPACING = (2.0, 1.0, 0.5)
 SHAPES = {"3-D": (5, 4, 6), "2-D": (5, 4, 1), "1-D": (7, 1, 1), "0-D": (1, 1, 1)}
@@ -350,32 +351,39 @@ def test_kernels_see_the_cells_that_torch_sees(periodic, monkeypatch):
         assert torch.equal(one.nan_to_num(nan=-7.0), other.nan_to_num(nan=-7.0))
 
 
-def test_threads_take_whole_colonies_and_no_bit_changes(monkeypatch):
+def eating(u, s, p, cell):
+    eaten = 2.0 * s.food / (0.5 + s.food) * cell.area
+    return {"a": eaten / cell.volume}, {"food": -eaten}
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [(tf.Monod("food", rate=2.0, half=0.5), tf.Growth()), (tf.Circuit(eating, species="a"),)],
+)
+def test_threads_take_whole_colonies_and_no_bit_changes(monkeypatch, cells):
     """Four colonies, one of them empty, crowded into few voxels: their parts share none."""
     box = {"box": ((-8.0, -8.0), (8.0, 8.0)), "spacing": 4.0}
     medium = tf.Medium(food=tf.Signal(diffusion=5.0, initial=1.0), **box)
     place = torch.rand(90, 2, generator=torch.Generator().manual_seed(1)) * 12 - 6
     founders = tf.Cells(place, [[1.0, 0.0]] * 90, length=1.0)
-    monod = tf.Monod("food", rate=2.0, half=0.5)
-    scene = tf.Scene(monod, tf.Growth(), medium, founders=founders)
-    model = scene.bind(4, dtype=torch.float64)
+    model = tf.Scene(*cells, medium, founders=founders).bind(4, dtype=torch.float64)
     first = model.start()
     first = first.remove((first.colony == 2) | (first.uid > 20 * first.colony + 20), "removed")
     ranges, found = [], []
-    cut = compiled._in_parts
+    share = Shared.__call__
 
-    def spied(shared, where, work):
-        noted = lambda a, b: (ranges.append((a, b)), work(a, b))
-        cut(shared, where, noted)
+    def spied(shared, count, work, ends=None):
+        noted = lambda a, b: (ranges.append((a, b)) if ends is not None else None, work(a, b))
+        share(shared, count, noted, ends)
 
-    monkeypatch.setattr(compiled, "_in_parts", spied)
+    monkeypatch.setattr(Shared, "__call__", spied)
     for threads, worth in ((1, 1.0), (3, 0.0)):
         monkeypatch.setattr("torchfilm.tools.threads.WORTH_WAKING", worth)
         monkeypatch.setattr("torchfilm.tools.threads.available", lambda threads=threads: threads)
         ranges.clear()
         found.append(model.step(first, 0.05))
     ends = np.cumsum([0, *first.counts.tolist()])
-    assert len(ranges) == 6 and {a for pair in ranges for a in pair} <= set(ends.tolist())
+    assert len(set(ranges)) > 1 and {a for pair in ranges for a in pair} <= set(ends.tolist())
     for name, value in found[0].fields.items():
         assert torch.equal(value, found[1].fields[name])
 

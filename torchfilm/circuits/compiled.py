@@ -72,15 +72,20 @@ class Compiled:
         return Shared()
 
     def run(self, count: int, work: Callable[[int, int], object]) -> None:
-        """work(first, last) for all cells, in threads where each has enough to do. It is compiled
-        by one thread, without cells; and that is said where it takes time."""
-        if self.module.__name__ not in _compiled:
+        """work(first, last) for all cells, in threads where each has enough to do."""
+        self.compile(work)
+        self._shared(count, work)
+
+    def compile(self, work: Callable[[int, int], object]) -> None:
+        """Before the first work(first, last), do it once without cells: it is compiled by one
+        thread; and that is said where it takes time."""
+        name = self.module.__name__
+        if name not in _compiled:
             from torchfilm.kernels.compiling import first_call
 
-            with first_call(self.module.__name__, self._described()):
+            with first_call(name, self._described()):
                 work(0, 0)
-            _compiled.add(self.module.__name__)
-        self._shared(count, work)
+            _compiled.add(name)
 
     def _described(self) -> str:
         """What is compiled, for people: each name once."""

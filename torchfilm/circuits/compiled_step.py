@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -14,8 +15,9 @@ from torchfilm.circuits.compiled import packed
 from torchfilm.circuits.compiled_stiff import CompiledStiff, limits
 from torchfilm.circuits.dilution import Start
 from torchfilm.tools import checks
-from torchfilm.tools.numba_calls import column_types
+from torchfilm.tools.numba_calls import column_types, in_numpy
 from torchfilm.tools.tangents import tracked
+from torchfilm.tools.threads import Loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +35,7 @@ class Changes:
     @staticmethod
     def of(start: Start, signals: Sequence[str], reservoir: bool, whole: bool) -> Changes:
         """Nothing given so far, no steps. whole: the circuits will fill in all cells."""
-        volume = start.half.volume.numpy()
-        count, dtype = len(volume), volume.dtype
+        count, dtype = start.half.volume.shape[0], np.dtype(in_numpy(start.half.volume.dtype))
         species = np.empty((len(start.fields), count), dtype)
         if not whole:
             torch.stack(list(start.kept().values()), out=torch.from_numpy(species))
@@ -45,12 +46,46 @@ class Changes:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What N cells find: the concentration of each signal, (N,) by name; the pool, (N,) µm³, where
-    there is a medium; and the ids of their colonies, (N,)."""
+    """What N cells start with and find, as all circuits of a step read it: the concentration of
+    each signal, (N,) by name; the pool, (N,) µm³, where there is a medium; the colonies' ids,
+    (B,), and the colony of each cell, (N,)."""
 
+    start: Start
     signals: Mapping[str, Tensor]
     pool: Tensor | None
     colony_id: Tensor
+    colony: Tensor
+
+    @cached_property
+    def own_colony_id(self) -> np.ndarray:
+        """(N,)."""
+        return self.colony_id.numpy()[self.colony.numpy()]
+
+    @cached_property
+    def highest(self) -> int:
+        """Of the colonies' ids."""
+        return int(self.colony_id.max())
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """For `store`: the pool, and by which growth multiplies concentrations, (N,) each."""
+        half = self.start.half
+        return (half.volume if self.pool is None else self.pool).numpy(), half.after.numpy()
+
+    @cached_property
+    def cells(self) -> int:
+        return self.start.half.before.shape[0]
+
+    @cached_property
+    def species(self) -> np.ndarray:
+        """Where `gather` finds the species, (S, WORDS)."""
+        start, factor = self.start, self.start.half.before.data_ptr()
+        each, own = start.fields.items(), start.diluted
+        return _table([_row(n, x, self.cells, factor if n in own else 0) for n, x in each])
+
+    def at(self, signals: Sequence[str]) -> np.ndarray:
+        """Where it finds these signals, (E, WORDS)."""
+        return _table([_row(f"s.{n}", self.signals[n], self.cells) for n in signals])
 
 
 class KernelStep:
@@ -74,76 +109,90 @@ class KernelStep:
         fixed = all(n in known for n in compiled.numbers)
         self._numbers = packed(known, compiled.numbers) if fixed else None
 
-    def may_run(self, start: Start, *read: Tensor) -> bool:
-        """Whether no derivative is wanted."""
-        constants = self.constants.values()
-        return not tracked(*start.fields.values(), start.half.before, *read, *constants)
+    @cached_property
+    def _places(self) -> np.ndarray:
+        """The places of `gather`, with those of the constants: of the columns, of the signals, and
+        of the variables; those that a reservoir is given and gives begin as 0."""
+        from torchfilm.kernels.columns import WORDS
 
-    def __call__(
-        self, rows: Tensor, start: Start, found: Mapping[str, Tensor], around: Surroundings,
-        dt: float, rtol: float, atol: float, into: Changes,
-    ) -> np.ndarray:  # fmt: skip
-        """The circuit over dt hours in the cells `rows` (M,) from `start`. found: what is
-        `changing`, by name: columns (N,) and numbers (). Returns the status of each cell, (M,), as
-        `rosenbrock` has it."""
+        columns, size = self.compiled.columns, len(self.compiled.equations.variables)
+        places = np.zeros((len(columns) + len(self.exchanged) + size, WORDS), np.int64)
+        for k, name in enumerate(columns):
+            x = self.constants.get(name)
+            if x is not None:
+                by = x.stride(0) if x.dim() else 0
+                places[k] = x.data_ptr(), by, column_types()[x.dtype], 0, 0
+        return places
+
+    @cached_property
+    def _by_colony(self) -> list[int]:
+        """Which columns have one number for each colony."""
+        return [
+            k
+            for k, n in enumerate(self.compiled.columns)
+            if n in self.constants and self.constants[n].dim()
+        ]
+
+    @cached_property
+    def _by_cell(self) -> list[tuple[int, str]]:
+        """Which columns change, and their names."""
+        return [(k, n) for k, n in enumerate(self.compiled.columns) if n not in self.constants]
+
+    def may_run(self, *read: Tensor) -> bool:
+        """Whether no derivative is wanted by what it reads, or by its constants."""
+        return not tracked(*read, *self.constants.values())
+
+    def loop(
+        self, rows: Tensor, found: Mapping[str, Tensor], around: Surroundings, dt: float,
+        rtol: float, atol: float, into: Changes,
+    ) -> tuple[Loop, np.ndarray]:  # fmt: skip
+        """What takes the circuit over dt hours in the cells `rows` (M,), ascending; and the status
+        of each of them, (M,), as `rosenbrock` has it, when it is done. found: what is `changing`,
+        by name: columns (N,) and numbers ()."""
         from torchfilm.kernels.columns import gather, store
 
-        compiled, half, count = self.compiled, start.half, len(rows)
-        size = len(compiled.equations.variables)
-        signals = {f"s.{n}": around.signals[n] for n in self.exchanged}
-        places, rest = self._places(start, found, around.colony_id, signals, count)
-        numbers = self._numbers
+        compiled, start, of_cells = self.compiled, around.start, rows.numpy()
+        count, size = len(of_cells), len(compiled.equations.variables)
+        places, numbers = self._places_of(found, around), self._numbers
         if numbers is None:
             numbers = packed({**self.constants, **found}, compiled.numbers)
-        memory = np.empty(rest + size * count)
-        at = memory[rest:].reshape(count, size)
-        each = memory[:rest].reshape(-1, count)  # columns, then signals at the start
+        first = len(places) - size  # columns, then signals at the start
+        memory = np.empty(len(places) * count)
+        each, at = memory[: first * count].reshape(-1, count), memory[first * count :]
+        at, columns = at.reshape(count, size), len(compiled.columns)
         report = np.zeros((3, count), np.int64)
-        given = (each, numbers, *limits(dt, rtol, atol, half.after.dtype), *report)
-        pool = half.volume if around.pool is None else around.pool
+        given = (at, each, numbers, *limits(dt, rtol, atol, start.half.after.dtype), *report)
         ends = (
-            at, each[len(compiled.columns) :], pool.numpy(), half.after.numpy(), start.diluted_mask,
-            np.array([into.signals.index(n) for n in self.exchanged], np.int64), report,
-            into.species, into.given, into.back, into.steps,
+            at, each[columns:], *around.arrays, _mask(tuple(start.fields), tuple(start.diluted)),
+            _indices(tuple(into.signals), self.exchanged), report, into.species, into.given,
+            into.back, into.steps,
         )  # fmt: skip
-        of_cells, run = rows.numpy(), compiled.module.run
+        cells, run = around.cells, compiled.module.run
 
-        def work(low: int, high: int) -> None:
-            gather(low, high, of_cells, places, memory)
-            run(low, high, at, *given)
+        def part(low: int, high: int) -> None:
+            gather(low, high, of_cells, places, first, memory)
+            run(low, high, *given)
             store(low, high, of_cells, *ends)
 
-        compiled.run(count, work)
-        return report[2]
+        def work(low: int, high: int) -> None:
+            whole = low == 0 and high == cells
+            part(*((0, count) if whole else np.searchsorted(of_cells, (low, high)).tolist()))
 
-    def _places(
-        self, start: Start, found: Mapping[str, Tensor], colony_id: Tensor,
-        signals: Mapping[str, Tensor], count: int,
-    ) -> tuple[np.ndarray, int]:  # fmt: skip
-        """Where `gather` finds what, and how many numbers stand before the variables."""
-        compiled, constants = self.compiled, self.constants
-        size, begin, cells = len(compiled.equations.variables), len(start.fields), len(colony_id)
-        table: list[tuple[int, ...]] = []
-        for k, name in enumerate(compiled.columns):
-            x = constants.get(name)
-            if x is None:
-                table.append(_row(name, found[name], 0, k * count, 1, cells))
-            else:  # one number, or one for each colony
-                by = x.dim() and x.stride(0)
-                index = colony_id.data_ptr() if x.dim() else 0
-                table.append((x.data_ptr(), by, column_types()[x.dtype], 0, k * count, 1, index))
-        rest = (len(compiled.columns) + len(signals)) * count
-        for k, (name, x) in enumerate(signals.items(), len(compiled.columns)):
-            table.append(_row(name, x, 0, k * count, 1, cells))
-        factor = start.half.before.data_ptr()
-        for k, (name, x) in enumerate(start.fields.items()):
-            by = factor if name in start.diluted else 0
-            table.append(_row(name, x, by, rest + k, size, cells))
-        for k, (name, x) in enumerate(signals.items(), begin):
-            table.append(_row(name, x, 0, rest + k, size, cells))
-        for k in range(begin + len(signals), size):  # what a reservoir is given and gives
-            table.append((0, 0, 0, 0, rest + k, size, 0))
-        return np.array(table, np.int64), rest
+        compiled.compile(part)
+        return Loop(work), report[2]
+
+    def _places_of(self, found: Mapping[str, Tensor], around: Surroundings) -> np.ndarray:
+        """Where `gather` finds what, (K, WORDS)."""
+        places, species, signals = self._places.copy(), around.species, around.at(self.exchanged)
+        begin = len(self.compiled.columns)
+        if self._by_colony:
+            places[self._by_colony, -1] = around.own_colony_id.ctypes.data
+        for k, name in self._by_cell:
+            places[k] = _row(name, found[name], around.cells)
+        for x in (signals, species, signals):
+            places[begin : begin + len(x)] = x
+            begin += len(x)
+        return places
 
 
 def known(x: Tensor) -> Tensor:
@@ -151,11 +200,28 @@ def known(x: Tensor) -> Tensor:
     return x if x.dtype in column_types() else x.double()
 
 
-def _row(
-    name: str, column: Tensor, factor: int, begin: int, step: int, cells: int
-) -> tuple[int, ...]:
+def _row(name: str, column: Tensor, cells: int, factor: int = 0) -> tuple[int, ...]:
     """A place, as `gather` takes it, of a column (N,) of this name."""
     if column.shape != (cells,):
         shape, wanted = tuple(column.shape), f"({cells},): one number for each cell"
         raise checks.input_error(f"shape of {name}", shape, wanted)
-    return column.data_ptr(), column.stride(0), column_types()[column.dtype], factor, begin, step, 0
+    by = 1 if column.is_contiguous() else column.stride(0)
+    return column.data_ptr(), by, column_types()[column.dtype], factor, 0
+
+
+def _table(rows: Sequence[tuple[int, ...]]) -> np.ndarray:
+    from torchfilm.kernels.columns import WORDS
+
+    return np.array(rows, np.int64).reshape(-1, WORDS)
+
+
+@lru_cache(64)
+def _mask(names: tuple[str, ...], chosen: tuple[str, ...]) -> np.ndarray:
+    """Which names are among the chosen ones, bool."""
+    return np.array([n in chosen for n in names], bool)
+
+
+@lru_cache(64)
+def _indices(names: tuple[str, ...], chosen: tuple[str, ...]) -> np.ndarray:
+    """Where the chosen names stand among all, int64."""
+    return np.array([names.index(n) for n in chosen], np.int64)

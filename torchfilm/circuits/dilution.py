@@ -20,13 +20,14 @@ from torchfilm.tools.vectors import nearest_root
 class HalfWay:
     """N cells half way, in time, between the volume that their concentrations refer to and their
     own. length: µm, volume: µm³, area: µm². before, after: by which growth up to there, and from
-    there on, multiplies concentrations. (N,) each."""
+    there on, multiplies concentrations. end: their own volume, µm³. (N,) each."""
 
     length: Tensor
     volume: Tensor
     area: Tensor
     before: Tensor
     after: Tensor
+    end: Tensor
 
 
 def half_way(length: Tensor, radius: Tensor, volume: Tensor) -> HalfWay:
@@ -37,15 +38,15 @@ def half_way(length: Tensor, radius: Tensor, volume: Tensor) -> HalfWay:
         from torchfilm.kernels.columns import half_way as put
 
         arrays = [as_array(x, length.dtype) for x in given]
-        out = [np.empty_like(arrays[0]) for _ in range(5)]
-        put(*arrays, *out)
-        return HalfWay(*map(torch.from_numpy, out))
+        out = np.empty((6, len(arrays[0])), arrays[0].dtype)
+        put(*arrays, out)
+        return HalfWay(*torch.from_numpy(out).unbind())
     end = capsule.volume(length, radius)
     middle = nearest_root(volume * end)
     longer = middle / (torch.pi * radius * radius) - radius * (4.0 / 3.0)
     own = torch.where(volume == end, length, longer.clamp(min=0.0))
     middle = capsule.volume(own, radius)
-    return HalfWay(own, middle, capsule.area(own, radius), volume / middle, middle / end)
+    return HalfWay(own, middle, capsule.area(own, radius), volume / middle, middle / end, end)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +57,6 @@ class Start:
     fields: Mapping[str, Tensor]
     diluted: Sequence[str]
     half: HalfWay
-
-    @cached_property
-    def diluted_mask(self) -> np.ndarray:
-        """(S,) bool."""
-        return np.array([n in self.diluted for n in self.fields])
 
     @cached_property
     def _half_way(self) -> dict[str, Tensor]:

@@ -16,6 +16,7 @@ from torchfilm.circuits.columns import Lookup
 from torchfilm.circuits.compiled import Compiled
 from torchfilm.circuits.compiled_explicit import compiled_explicit
 from torchfilm.circuits.compiled_molecules import compiled_molecules
+from torchfilm.circuits.compiled_step import Surroundings
 from torchfilm.circuits.compiled_stiff import compiled_stiff
 from torchfilm.circuits.dilution import Start, half_way
 from torchfilm.circuits.draws import KeyedDraws
@@ -148,6 +149,8 @@ class BoundCircuit(BoundEffect):
         self.traced_reads = tuple(sorted({*geometry, *outside}))
         self.compiled, self.kernels = {}, CircuitKernels(self)
         medium = MediumExchange.of(state, self.signals)
+        if medium is not None:
+            medium.find()
         for kind in self.rates:
             self.cells(state, cells_of_type(state, kind), kind, medium=medium)
         return state
@@ -264,25 +267,29 @@ class BoundCircuit(BoundEffect):
         middle, start = self.begun(state)
         report = Failures(state, self.effect.method, dt)
         rows = {k: x for k in self.rates if (x := cells_of_type(state, k)).numel()}
-        taken = self.kernels.taken(middle, rows, medium, start) if dt else {}
+        signals, pool = ({}, None) if medium is None else (medium.found, medium.pool)
+        around = Surroundings(start, signals, pool, state.colony_id, state.colony)
+        taken = self.kernels.taken(middle, rows, medium, around) if dt else {}
         if taken:
-            changed = self.kernels.run(taken, middle, rows, medium, start, report)
+            changed = self.kernels.run(taken, middle, rows, medium, around, report)
         else:
             changed = start.kept()
         if left := [k for k in rows if k not in taken]:
+            if medium is not None:
+                medium.find()
             same = self._constants(middle)
             cells = [self.cells(middle, rows[k], k, medium=medium, same=same) for k in left]
             changed = self._by_torch(state, start, cells, medium, report, changed)
-        if medium is not None:
-            state = medium.settle()
-        state = state.with_fields(**{self.effect.volume_field: state.volume}, **changed)
+        changed[self.effect.volume_field] = start.half.end
+        state = state.with_fields(**changed) if medium is None else medium.settle(**changed)
         return state.replace(reports={**state.reports, self.title: report.report()})
 
     def begun(self, state: State) -> tuple[State, Start]:
         """The cells as they are half way through their growth, and what a step begins with."""
         circuit = self.effect
         half = half_way(state.length, state.radius, state.fields[circuit.volume_field])
-        fields = {n: state.fields[n].to(state.dtype) for n in self.fields}
+        each, dtype = ((n, state.fields[n]) for n in self.fields), state.dtype
+        fields = {n: x if x.dtype == dtype else x.to(dtype) for n, x in each}
         return (
             state.with_length(half.length, half.volume, half.area),
             Start(fields, circuit.diluted_fields, half),

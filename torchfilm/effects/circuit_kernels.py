@@ -11,12 +11,12 @@ from torch import Tensor
 
 from torchfilm.circuits.compiled_step import Changes, KernelStep, Surroundings, known
 from torchfilm.circuits.compiled_stiff import CompiledStiff
-from torchfilm.circuits.dilution import Start
 from torchfilm.effects.circuit_cells import Kind, cell_column
 from torchfilm.effects.circuit_report import Failures
 from torchfilm.medium_exchange import MediumExchange
 from torchfilm.state import State
 from torchfilm.tools import checks
+from torchfilm.tools.threads import Course
 
 if TYPE_CHECKING:
     from torchfilm.effects.bound_circuit import BoundCircuit
@@ -32,53 +32,65 @@ class CircuitKernels:
         self.circuit = circuit
         # by cell type and whether there is a reservoir; None where torch takes it
         self._steps: dict[tuple[Kind, bool], KernelStep | None] = {}
+        self._course = Course()
 
     def taken(
         self, middle: State, rows: Mapping[Kind, Tensor], medium: MediumExchange | None,
-        start: Start,
+        around: Surroundings,
     ) -> Taken:  # fmt: skip
         """The steps of these cells, by type, that kernels take. middle: the state half way."""
-        found = {}
+        found, half = {}, around.start.half
+        given = (*around.start.fields.values(), half.before, *around.signals.values())
+        columns: dict[str, Tensor] = {}  # that do not depend on the type
         for kind, of_type in rows.items():
             step = self._step(kind, middle, of_type, medium)
             if step is None:
                 continue
-            if step.colonies and (highest := int(middle.colony_id.max())) >= step.colonies:
+            if step.colonies and around.highest >= step.colonies:
                 raise checks.input_error(
                     "state.colony_id",
-                    highest,
+                    around.highest,
                     f"below {step.colonies}",
                     f"{self.circuit.effect.value_owner()} has values for so many colonies.",
                 )
-            read = {n: known(self._read(n, kind, middle, medium)) for n in step.changing}
-            signals = () if medium is None else (medium.found[n] for n in step.exchanged)
-            if step.may_run(start, *read.values(), *signals):
+            read = {}
+            for n in step.changing:
+                if n not in columns or n.startswith("p."):
+                    columns[n] = known(self._read(n, kind, middle, medium))
+                read[n] = columns[n]
+            if step.may_run(*given, *read.values()):
                 found[kind] = step, read
         return found
 
     def run(
         self, taken: Taken, middle: State, rows: Mapping[Kind, Tensor],
-        medium: MediumExchange | None, start: Start, report: Failures,
+        medium: MediumExchange | None, around: Surroundings, report: Failures,
     ) -> dict[str, Tensor]:  # fmt: skip
         """The species of all cells, (N,), after these steps; in cells of others after growth alone.
         The medium is told what they give to it, and the report of failures."""
-        effect = self.circuit.effect
+        effect, start, codes = self.circuit.effect, around.start, {}
         whole = sum(rows[k].numel() for k in taken) == middle.cells
         names = tuple(dict.fromkeys(n for step, _ in taken.values() for n in step.exchanged))
-        pool, found = (None, {}) if medium is None else (medium.pool, medium.found)
-        around = Surroundings(found, pool, middle.own_colony_id)
         into = Changes.of(start, names, _has_reservoir(medium), whole)
+        loops = [] if medium is None else medium.take_loops()
         for kind, (step, read) in taken.items():
             settings = report.dt, effect.rtol, effect.atol
-            code = step(rows[kind], start, read, around, *settings, into)
+            loop, codes[kind] = step.loop(rows[kind], read, around, *settings, into)
+            loops.append(loop)
+        given = dict(zip(names, into.given, strict=True))
+        at_once = medium is not None and medium.in_loops and len(taken) == len(rows)
+        if medium is not None and at_once:  # nobody else gives anything
+            loops += medium.write_in_loops(given)
+        self._course(loops, middle.groups.ends)
+        for kind, code in codes.items():
             if np.count_nonzero(code):
                 cells = self.circuit.cells(middle, rows[kind], kind, medium=medium)
                 report.note(start, cells, torch.from_numpy(code))
         report.steps = torch.from_numpy(into.steps)
-        given, back = torch.from_numpy(into.given), torch.from_numpy(into.back)
-        for k, name in enumerate(names):
+        for k, name in enumerate(() if at_once else names):
             assert medium is not None
-            medium.give(name, given[k], back[k] if len(back) else None)
+            back = torch.from_numpy(into.back[k]) if len(into.back) else None
+            medium.give(name, torch.from_numpy(given[name]), back)
         return dict(zip(start.fields, torch.from_numpy(into.species).unbind(), strict=True))
 
     def _step(

@@ -35,7 +35,7 @@ class Failures:
     def __init__(self, state: State, method: str, dt: float):
         self.state, self.method, self.dt = state, method, dt
         self.status = torch.zeros(state.colonies, dtype=torch.int64, device=state.device)
-        self.steps = torch.zeros(state.cells, dtype=torch.int64, device=state.device)
+        self.steps: Tensor | None = None
         self.words: dict[int, tuple[int, str]] = {}  # the first cell of a colony, and its words
 
     def note(
@@ -44,7 +44,7 @@ class Failures:
         """code: (M,), what `run.step` says of each cell, which began with `start`. steps: (M,)."""
         state = self.state
         if steps is not None:
-            self.steps = self.steps.index_copy(0, cells.rows, steps)
+            self.steps = self._steps().index_copy(0, cells.rows, steps)
         if not bool(code.any()):
             return
         at = torch.nonzero(code).squeeze(1)
@@ -64,6 +64,12 @@ class Failures:
             self.words[place] = min((row, text), self.words.get(place, (row, text)))
             self.status[place] = 1
 
+    def _steps(self) -> Tensor:
+        """Those that are known; 0 in other cells."""
+        if self.steps is None:
+            return torch.zeros_like(self.state.colony)
+        return self.steps
+
     def report(self) -> CircuitReport:
         words = {place: text for place, (_, text) in self.words.items()}
-        return CircuitReport(self.status, self.steps, words)
+        return CircuitReport(self.status, self._steps(), words)

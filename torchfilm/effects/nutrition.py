@@ -148,6 +148,7 @@ class _BoundMonod(BoundEffect):
         medium = MediumExchange.of(state, (signal,))
         if state.cells == 0 or medium is None:
             return state
+        medium.find()
         volume, there, in_reservoir = state.volume, medium.found[signal], medium.in_reservoir
         constants = {n: self.values[n].of_cells(state) for n in CONSTANTS}
         greatest, half, gain = constants.values()
@@ -162,7 +163,7 @@ class _BoundMonod(BoundEffect):
         growth = torch.log1p(gain * eaten / volume) / dt
         medium.give(signal, -inside, to_reservoir)
         own = f"{signal}_eaten"
-        state = medium.settle().with_fields(growth_rate=growth, **{own: state.fields[own] + eaten})
+        state = medium.settle(growth_rate=growth, **{own: state.fields[own] + eaten})
         uptake = state.groups.sum(eaten.unsqueeze(1)).squeeze(1)
         note = NutritionReport(state.groups.any(failed).long(), uptake)
         return state.replace(reports={**state.reports, "nutrition": note})

@@ -14,17 +14,18 @@ from torchfilm.kernels.compiling import index, kernel
 from torchfilm.kernels.team import array_at
 
 # What a place says: the column's address, from one of its numbers to the next, their type, the
-# address of factors or 0; in the result, where its first number stands, and from one to the next;
-# the address of each cell's place in the column, int64, or 0 where it has one number for each cell.
-ADDRESS, STRIDE, TYPE, FACTOR, BEGIN, STEP, INDEX = range(7)
-WORDS = 7
+# address of factors or 0; the address of each cell's place in the column, int64, or 0 where it has
+# one number for each cell.
+ADDRESS, STRIDE, TYPE, FACTOR, INDEX = range(5)
+WORDS = 5
 ZERO, FLOAT32, FLOAT64, INT64, INT32, BOOL = range(6)  # types; ZERO: there is no column
 
 
 @kernel
-def _copy(first, last, rows, place, like, out):
-    """One column; the product with a factor is one of its type."""
-    by, begin, step = place[STRIDE], place[BEGIN], place[STEP]
+def _copy(first, last, rows, place, like, begin, step, out):
+    """One column, to out[begin], out[begin + step] …; the product with a factor is one of its
+    type."""
+    by = place[STRIDE]
     x = array_at(place, ADDRESS, like, 1)
     if place[INDEX] != 0:
         own = array_at(place, INDEX, np.int64, 1)
@@ -41,24 +42,29 @@ def _copy(first, last, rows, place, like, out):
 
 
 @kernel(entry=True)
-def gather(first, last, rows, places, out):
-    """Put the columns of the cells rows[first … last − 1] into out, float64. places (K, WORDS)."""
+def gather(first, last, rows, places, columns, out):
+    """Put the columns of the cells rows[first … last − 1] into out, float64: of so many the numbers
+    of all M rows side by side, then of the others those of one row. places (K, WORDS)."""
+    count, size = rows.shape[0], places.shape[0] - columns
     for k in range(places.shape[0]):
+        begin, step = k * count, 1
+        if k >= columns:
+            begin, step = columns * count + k - columns, size
         place = places[k]
         kind = place[TYPE]
         if kind == FLOAT32:
-            _copy(first, last, rows, place, np.float32, out)
+            _copy(first, last, rows, place, np.float32, begin, step, out)
         elif kind == FLOAT64:
-            _copy(first, last, rows, place, np.float64, out)
+            _copy(first, last, rows, place, np.float64, begin, step, out)
         elif kind == INT64:
-            _copy(first, last, rows, place, np.int64, out)
+            _copy(first, last, rows, place, np.int64, begin, step, out)
         elif kind == INT32:
-            _copy(first, last, rows, place, np.int32, out)
+            _copy(first, last, rows, place, np.int32, begin, step, out)
         elif kind == BOOL:
-            _copy(first, last, rows, place, np.uint8, out)
+            _copy(first, last, rows, place, np.uint8, begin, step, out)
         else:
             for m in range(first, last):
-                out[place[BEGIN] + m * place[STEP]] = 0.0
+                out[begin + m * step] = 0.0
 
 
 @kernel(entry=True)
@@ -89,9 +95,10 @@ def _volume(length, radius, number):
 
 
 @kernel(entry=True)
-def half_way(length, radius, before, own_length, own_volume, own_area, thicker, thinner):
-    """Put the lengths, volumes and areas of cells half way, in time, between the volume `before`
-    and their own, and the ratios of the volumes before, half way and in the end."""
+def half_way(length, radius, before, out):
+    """Put into out (6, N) the lengths, volumes and areas of cells half way, in time, between the
+    volume `before` and their own; the ratios of the volumes before, half way and in the end; and
+    the volumes in the end."""
     number = length.dtype.type
     for i in range(length.shape[0]):
         r, end = radius[i], _volume(length[i], radius[i], number)
@@ -101,6 +108,6 @@ def half_way(length, radius, before, own_length, own_volume, own_area, thicker, 
             longer = volume / (number(math.pi) * r * r) - r * number(4.0 / 3.0)
             middle = max(longer, number(0.0)) if longer == longer else longer
         volume = _volume(middle, r, number)
-        own_length[i], own_volume[i] = middle, volume
-        own_area[i] = number(2.0 * math.pi) * r * (middle + number(2.0) * r)
-        thicker[i], thinner[i] = before[i] / volume, volume / end
+        out[0, i], out[1, i] = middle, volume
+        out[2, i] = number(2.0 * math.pi) * r * (middle + number(2.0) * r)
+        out[3, i], out[4, i], out[5, i] = before[i] / volume, volume / end, end

@@ -99,20 +99,20 @@ def read(values, node, weight, out):
 
 @kernel(entry=True)
 def pools(node, weight, volume, sums, out):
-    """The voxel's volume over the greatest sum of weights at each cell's voxels. sums: (nodes,) of
-    0, and so again in the end."""
+    """The voxel's volume over the greatest sum of weights at each cell's voxels. sums: as `write`
+    has them."""
     for i in range(node.shape[0]):
         for c in range(node.shape[1]):
-            sums[index(node[i, c])] += weight[i, c]
+            sums[index(node[i, c]), 0] += weight[i, c]
     for i in range(node.shape[0]):
         worst = weight.dtype.type(0)
         for c in range(node.shape[1]):
             if weight[i, c] > 0:
-                worst = max(worst, sums[index(node[i, c])])
+                worst = max(worst, sums[index(node[i, c]), 0])
         out[i] = volume / (worst if worst > 0 else weight.dtype.type(1))
     for i in range(node.shape[0]):
         for c in range(node.shape[1]):
-            sums[index(node[i, c])] = 0
+            sums[index(node[i, c]), 0] = 0
 
 
 @kernel(entry=True)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,10 @@ from torchfilm.signals.stencil import SLACK, Stencil
 from torchfilm.tools.numba_calls import as_array, in_numpy, unavailable
 from torchfilm.tools.ragged import Groups
 from torchfilm.tools.tangents import both, only_forward, tracked, with_tangent
-from torchfilm.tools.threads import Shared
+from torchfilm.tools.threads import Loop, Shared
+
+# what does a range of cells
+Work = Callable[[int, int], object]
 
 CLOSE = torch.contiguous_format
 NO_MASK = np.zeros(0, bool)
@@ -43,35 +47,62 @@ def stencil(
     dtype: torch.dtype,
 ) -> Stencil:
     """As `exchange.stencil`."""
+    out, work = stencil_loop(grid, position, colony, periodic, mask, dtype)
+    _put_stencils(len(out[0]), work)
+    return as_stencil(grid, out, mask is not None)
+
+
+# node, weight, outside and blocked of a stencil
+StencilArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def as_stencil(
+    grid: Grid, arrays: StencilArrays, masked: bool, ends: np.ndarray | None = None
+) -> Stencil:
+    nodes, weights, away, within = map(torch.from_numpy, arrays)
+    size = grid.voxel_volume, grid.nodes
+    return Stencil(nodes, weights, away, *size, within if masked else None, ends)
+
+
+def stencil_loop(
+    grid: Grid,
+    position: Tensor,
+    colony: Tensor,
+    periodic: tuple[bool, bool, bool],
+    mask: Tensor | None,
+    dtype: torch.dtype,
+) -> tuple[StencilArrays, Work]:
+    """Arrays of a stencil, and what fills them for a range of cells."""
     from torchfilm.kernels.medium import put_stencil
 
     count, number = position.shape[0], in_numpy(dtype)
     shape = count, 2 ** sum(grid.used)
     node, weight = np.empty(shape, np.int64), np.empty(shape, number)
     outside, blocked = np.empty(count, bool), np.zeros(count, bool)
-    cells = as_array(position, torch.float64), as_array(colony, torch.int64)
-    fixed = np.array(periodic), SLACK, NO_MASK if mask is None else mask.numpy()
     out = node, weight, outside, blocked
+    at, own = as_array(position, torch.float64), as_array(colony, torch.int64)
+    fixed = *grid.arrays, periodic, SLACK, NO_MASK if mask is None else mask.numpy()
 
     def work(a: int, b: int) -> None:
-        put_stencil(*(x[a:b] for x in cells), *grid.arrays, *fixed, *(x[a:b] for x in out))
+        put_stencil(at[a:b], own[a:b], *fixed, *(x[a:b] for x in out))
 
-    _put_stencils(count, work)
-    nodes, weights, away, within = map(torch.from_numpy, out)
-    size = grid.voxel_volume, grid.nodes
-    return Stencil(nodes, weights, away, *size, None if mask is None else within)
+    return out, work
 
 
 def read(values: Tensor, stencil: Stencil) -> Tensor:
     """As `exchange.read`."""
-    from torchfilm.kernels.medium import read as put
-
     found = as_array(values, values.dtype)
-    node, weight = _of_stencil(stencil, values.dtype)
-    out = np.empty(len(node), found.dtype)
-    work = lambda a, b: put(found, node[a:b], weight[a:b], out[a:b])
+    out, work = read_loop(found, *_of_stencil(stencil, values.dtype))
     _read_cells(len(out), work)
     return torch.from_numpy(out)
+
+
+def read_loop(values: np.ndarray, node: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, Work]:
+    """What `read` gives, and what fills it."""
+    from torchfilm.kernels.medium import read as put
+
+    out = np.empty(len(node), values.dtype)
+    return out, lambda a, b: put(values, node[a:b], weight[a:b], out[a:b])
 
 
 def read_with_tangent(values: Tensor, stencil: Stencil) -> Tensor:
@@ -84,34 +115,51 @@ def read_with_tangent(values: Tensor, stencil: Stencil) -> Tensor:
 
 def pool_volume(stencil: Stencil) -> Tensor:
     """As `exchange.pool_volume`."""
+    out, work = pool_loop(*stencil.arrays, stencil.voxel_volume, stencil.nodes)
+    _share_pools(len(out), work, stencil.parts)
+    return torch.from_numpy(out)
+
+
+def pool_loop(
+    node: np.ndarray, weight: np.ndarray, voxel_volume: float, nodes: int
+) -> tuple[np.ndarray, Work]:
+    """What `pool_volume` gives, and what fills it for a range of whole colonies."""
     from torchfilm.kernels.medium import pools
 
-    node, weight = stencil.arrays
-    out, volume = np.empty(len(weight), weight.dtype), weight.dtype.type(stencil.voxel_volume)
-    sums = _zeros(stencil.nodes, 1, weight.dtype).reshape(-1)
-
-    def work(a: int, b: int) -> None:
-        pools(node[a:b], weight[a:b], volume, sums, out[a:b])
-
-    _in_parts(_share_pools, stencil, work)
-    return torch.from_numpy(out)
+    out, volume = np.empty(len(weight), weight.dtype), weight.dtype.type(voxel_volume)
+    sums = _zeros(nodes, 2, weight.dtype)
+    return out, lambda a, b: pools(node[a:b], weight[a:b], volume, sums, out[a:b])
 
 
 def write(values: Tensor, amount: Tensor, there: Tensor, stencil: Stencil, ulps: int) -> Tensor:
     """As `exchange.write`; there: what `read` gives."""
+    given = as_array(amount, values.dtype), as_array(there, values.dtype)
+    arrays = _of_stencil(stencil, values.dtype)
+    out, work = write_loop(values, *given, *arrays, stencil.voxel_volume, ulps)
+    _write_cells(len(amount), work, stencil.parts)
+    return out
+
+
+def write_loop(
+    values: Tensor, amount: np.ndarray, there: np.ndarray, node: np.ndarray, weight: np.ndarray,
+    voxel_volume: float, ulps: int,
+) -> tuple[Tensor, Work]:  # fmt: skip
+    """What `write` gives, so far only where no cell writes, and what puts the rest there for a
+    range of whole colonies. All arrays are of one type."""
     from torchfilm.kernels.medium import write as put
 
     out = values.detach().clone(memory_format=CLOSE)
-    node, weight = _of_stencil(stencil, values.dtype)
-    cells = *(as_array(x, values.dtype) for x in (amount, there)), node, weight
-    rest = *_limits(stencil, values.dtype, ulps), _zeros(values.numel(), 2, weight.dtype)
-    made, seen, size = out.numpy(), _room(node.size), node.shape[1]
+    # each colony has its own part of these, which all loops of an exchange use
+    sums, seen = _zeros(values.numel(), 2, weight.dtype), _room(node.size)
+    fixed, made, size = _limits(voxel_volume, values.dtype, ulps), out.numpy(), node.shape[1]
 
     def work(a: int, b: int) -> None:
-        put(made, *(x[a:b] for x in cells), *rest, seen[a * size : b * size])
+        put(
+            made, amount[a:b], there[a:b], node[a:b], weight[a:b], *fixed, sums,
+            seen[a * size : b * size],
+        )  # fmt: skip
 
-    _in_parts(_write_cells, stencil, work)
-    return out
+    return out, work
 
 
 def write_with_tangent(
@@ -128,15 +176,43 @@ def write_with_tangent(
     node, weight = _of_stencil(stencil, dtype)
     put(
         *(as_array(x, dtype) for x in (value, moved, *each)), node, weight,
-        *_limits(stencil, dtype, ulps), _zeros(value.numel(), 3, weight.dtype),
+        *_limits(stencil.voxel_volume, dtype, ulps), _zeros(value.numel(), 3, weight.dtype),
     )  # fmt: skip
     return with_tangent(write(value, amount, there, stencil, ulps), moved)
 
 
-def _in_parts(shared: Shared, stencil: Stencil, work: Callable[[int, int], object]) -> None:
-    """Call work(a, b) for ranges of cells of whole colonies, which share no voxel."""
-    ends = stencil.parts.tolist()
-    shared(len(ends) - 1, lambda first, last: work(ends[first], ends[last]))
+class Meeting:
+    """Cells that meet the medium, and what they find there and give to it, by loops over cells
+    side by side in their colonies. What it tells has its numbers when its loops have been run.
+
+    ends: where the cells of each colony begin, and N. values: of each signal, (nodes,) by name; all
+    of one type.
+    """
+
+    def __init__(
+        self, grid: Grid, position: Tensor, colony: Tensor, ends: np.ndarray,
+        periodic: tuple[bool, bool, bool], mask: Tensor | None, values: Mapping[str, Tensor],
+        dtype: torch.dtype,
+    ):  # fmt: skip
+        self.values, self.ends, self._grid, self._masked = values, ends, grid, mask is not None
+        self._arrays, find = stencil_loop(grid, position, colony, periodic, mask, dtype)
+        node, weight, _, _ = self._arrays
+        self.loops, self.found = [Loop(find)], {}
+        for name, value in values.items():
+            self.found[name], find = read_loop(as_array(value, dtype), node, weight)
+            self.loops.append(Loop(find))
+        self.pool, find = pool_loop(node, weight, grid.voxel_volume, grid.nodes)
+        self.loops.append(Loop(find, whole=True))
+
+    @cached_property
+    def stencil(self) -> Stencil:
+        return as_stencil(self._grid, self._arrays, self._masked, self.ends)
+
+    def written(self, name: str, amount: np.ndarray, ulps: int) -> tuple[Tensor, Loop]:
+        """Values (nodes,) of a signal after cells have given amounts (N,) to it, and the loop."""
+        made = self.values[name], amount, self.found[name], *self._arrays[:2]
+        out, work = write_loop(*made, self._grid.voxel_volume, ulps)
+        return out, Loop(work, whole=True)
 
 
 # of each type of numbers, what the last use left as 0
@@ -172,11 +248,12 @@ def _of_stencil(stencil: Stencil, dtype: torch.dtype) -> tuple[np.ndarray, np.nd
     return node, weight.astype(in_numpy(dtype), copy=False)
 
 
-def _limits(stencil: Stencil, dtype: torch.dtype, ulps: int) -> tuple[Any, Any]:
+@lru_cache(16)
+def _limits(voxel_volume: float, dtype: torch.dtype, ulps: int) -> tuple[Any, Any]:
     """The volume of a voxel, and the share up to which a voxel counts as emptied, as kernels take
     them."""
     number = in_numpy(dtype)
-    return number(stencil.voxel_volume), number(1 + ulps * torch.finfo(dtype).eps)
+    return number(voxel_volume), number(1 + ulps * torch.finfo(dtype).eps)
 
 
 def spans(position: Tensor, groups: Groups) -> tuple[Tensor, Tensor]:
@@ -202,7 +279,6 @@ def beyond(
     first = torch.full_like(left, position.shape[0])
     put(
         as_array(position, torch.float64), as_array(groups.owner, torch.int64), *grid.arrays[:3],
-        torch.tensor(periodic).numpy(), SLACK, left.numpy(),
-        first.numpy(),
+        periodic, SLACK, left.numpy(), first.numpy(),
     )  # fmt: skip
     return left, first

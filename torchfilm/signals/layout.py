@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfilm.signals import compiled
 from torchfilm.signals.exchange import Stencil, beyond, counted, pool_volume, read, stencil
 from torchfilm.signals.grid import Grid, GridBatch
 from torchfilm.tools import checks
@@ -160,6 +161,26 @@ class Layout:
                 in_reservoir, given.index_select(0, own) if given.dim() else given, value
             )
         return Contact(where, found, in_reservoir, in_voxels)
+
+    def meeting(
+        self,
+        position: Tensor,
+        colony: Tensor,
+        ends: np.ndarray,
+        signals: Mapping[str, Tensor],
+        dtype: torch.dtype,
+    ) -> compiled.Meeting | None:
+        """What `contact` finds, by loops of kernels; None where torch must find it, or where it
+        depends on it what is to be done.
+
+        position: (N, 3). ends: where the cells of each colony begin, and N."""
+        alike = all(x.dtype == dtype for x in signals.values())
+        if self.reservoir is not None or not alike:
+            return None
+        if not compiled.may_run(position, *signals.values()):
+            return None
+        space = self.periodic, self.mask
+        return compiled.Meeting(self.grid, position, colony, ends, *space, signals, dtype)
 
     def on_faces(
         self, flow: Callable[[Tensor], Tensor], batch: GridBatch

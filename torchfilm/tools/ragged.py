@@ -104,6 +104,11 @@ class Groups:
         return self.order[0].long()
 
     @cached_property
+    def ends(self) -> np.ndarray:
+        """`begin` on the CPU, for kernels."""
+        return self.begin.numpy()
+
+    @cached_property
     def order(self) -> tuple[Tensor, Tensor]:
         """The rows sorted by group, in their own order within each group.
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
-from itertools import pairwise
-from typing import Any
+from itertools import groupby, pairwise
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from torchfilm.tools import subnormals
@@ -100,19 +101,64 @@ class Shared:
     def __init__(self) -> None:
         self.seconds = 0.0  # of one thing, in the last call
 
-    def __call__(self, count: int, work: Callable[[int, int], object]) -> None:
-        """Call work(first, last) for ranges that make up 0 … count."""
+    def __call__(
+        self, count: int, work: Callable[[int, int], object], ends: np.ndarray | None = None
+    ) -> None:
+        """Call work(first, last) for ranges that make up 0 … count; they begin only at `ends`,
+        ascending, if these are given: 0, where things begin that belong together, and count."""
         threads = min(available(), count)
         if WORTH_WAKING > 0:
             threads = min(threads, int(count * self.seconds / WORTH_WAKING))
-        ends = [count * k // threads for k in range(threads + 1)] if threads > 1 else [0, count]
-        (first, last), *others = pairwise(ends)
-        calls = [submit(work, a, b) for a, b in others]
+        cuts = [count * k // threads for k in range(threads + 1)] if threads > 1 else [0, count]
+        if ends is not None and threads > 1:
+            cuts = ends[np.searchsorted(ends, cuts)].tolist()
+        (first, last), *others = pairwise(cuts)
+        calls = [submit(work, a, b) for a, b in others if a < b]
         begin = time.perf_counter()
         try:
             work(first, last)  # by this thread, which need not be woken
             self.seconds = (time.perf_counter() - begin) / max(1, last)
         finally:
-            wait(calls)  # also after an error: they work on what belongs to this thread
+            if calls:
+                wait(calls)  # also after an error: they work on what belongs to this thread
         for call in calls:
             call.result()
+
+
+class Loop(NamedTuple):
+    """work(first, last) for a range of cells. whole: only for ranges of whole colonies."""
+
+    work: Callable[[int, int], object]
+    whole: bool = False
+
+
+class Course:
+    """Loops over cells, one after the other, that are done again and again: each thread does all of
+    them for colonies of its own, since to hand over each loop would cost more than the loop. The
+    cells of a single colony are shared out loop by loop, where they may be."""
+
+    def __init__(self) -> None:
+        self._all, self._each = Shared(), [Shared()]
+
+    def __call__(self, loops: Sequence[Loop], ends: np.ndarray) -> None:
+        """ends: where the cells of each colony begin, and how many cells there are, (B + 1,)."""
+        count = int(ends[-1])
+        if len(ends) > 2 or available() == 1:
+            self._all(count, _in_turn(loops), ends)
+            return
+        parts = [(whole, list(part)) for whole, part in groupby(loops, key=lambda x: x.whole)]
+        while len(self._each) < len(parts):
+            self._each.append(Shared())
+        for shared, (whole, part) in zip(self._each, parts, strict=False):
+            if whole:
+                _in_turn(part)(0, count)
+            else:
+                shared(count, _in_turn(part))
+
+
+def _in_turn(loops: Sequence[Loop]) -> Callable[[int, int], object]:
+    def work(first: int, last: int) -> None:
+        for loop in loops:
+            loop.work(first, last)
+
+    return work
