@@ -51,7 +51,8 @@ def stretch_of(a: Capsules, b: Capsules) -> Stretch:
         mark_a, mark_b = ((1.0 + x / (0.5 * (a.radius + b.radius))).clamp(min=0.0) for x in beyond)
         end_a.append(side * mark_a)
         end_b.append(sign * side * mark_b)
-    return Stretch(high - low, tuple(map(torch.stack, (s, t, end_a, end_b))))
+    points = torch.stack(s), torch.stack(t), torch.stack(end_a), torch.stack(end_b)
+    return Stretch(high - low, points)
 
 
 def _clamp(x: Tensor, half: Tensor) -> Tensor:
