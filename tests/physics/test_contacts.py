@@ -268,8 +268,9 @@ def test_rows_foresee_what_a_turn_brings_together(dim):
     """Rods that overlap, up to 0.3 rad from parallel, of which one turns by 0.2 rad.
 
     Rows are linear: a point at a lever of up to 1.5 µm comes off its line by 1.5 · 0.2²/2 = 0.03
-    µm. The part of a stretch that has no row of its own is 0.5 radii long, and turns by 0.05 µm.
-    With rows at the contact only, nobody would foresee overlaps in space that are deeper than 0.1.
+    µm. In space the part of a stretch that has no row of its own is 0.5 radii long, and turns by
+    0.05 µm; with rows at the contact only, nobody would foresee overlaps deeper than 0.1. In the
+    plane the rows of the contact are enough.
     """
     rng, count = np.random.default_rng(3), 4000
     cells = side_by_side(rng, count, dim, 0.3, dtype=torch.float64)
@@ -288,7 +289,7 @@ def test_rows_foresee_what_a_turn_brings_together(dim):
         least = torch.full_like(after, torch.inf).scatter_reduce(0, rows.first, told, "amin")
         worst[margin] = float((least - after).max())
     assert worst[0.3] < 0.08
-    assert dim == 2 or worst[-np.inf] > 0.1
+    assert worst[-np.inf] > 0.1 if dim == 3 else worst[-np.inf] == worst[0.3]
 
 
 def forces(cells: Capsules) -> np.ndarray:

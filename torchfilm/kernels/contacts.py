@@ -33,7 +33,8 @@ PAIRS = 32
 VECTORS = PAIRS // WIDTH
 # Columns: from centre to centre, axes, half lengths, radii, arc lengths of the closest points, gap,
 # whether it is below the margin, and which of its rows a pair has: one at the contact, or two where
-# it is a line, and one at each end of the stretch along which its cells lie side by side.
+# it is a line; and in space one at each end of the stretch along which its cells lie side by
+# side.
 B, A, C = 0, 3, 6
 HALF_A, HALF_B, RADIUS_A, RADIUS_B, S0, T0, GAP, NEAR, HAS = range(9, 18)
 ROWS = 4
@@ -43,6 +44,12 @@ FIRST_ROW = HAS + ROWS
 S, T, END_A, END_B, WEIGHT, DISTANCE, WEIGHTED, OWN, OTHER = (0, 1, 2, 3, 4, 5, 6, 7, 14)
 OF_ROW = 21
 COLUMNS = FIRST_ROW + ROWS * OF_ROW
+
+
+@kernel(inline=True)
+def most_rows(dof):
+    """Of a pair."""
+    return ROWS if len(dof) == 8 else 2
 
 
 @kernel(inline=True)
@@ -215,8 +222,9 @@ def _put_far_row(rows, k, g, far, s, t, end_a, end_b, margin, dof):
 @kernel
 def _put_rows(rows, vectors, margin, dof):
     """The rows of pairs, before they are scaled: one at the closest points, or where the contact is
-    a line two of weight ½, towards its ends; and where the stretch along which cells lie side by
-    side goes on, one at its end, if that is nearer than margin. Returns whether centrelines cross.
+    a line two of weight ½, towards its ends; and in space, where the stretch along which cells lie
+    side by side goes on, one at its end, if that is nearer than margin. Returns whether centrelines
+    cross.
     """
     crossing = False
     for g in range(vectors):
@@ -265,8 +273,9 @@ def _put_rows(rows, vectors, margin, dof):
                 where(line, end_b0 + slide * (sign * end_b - end_b0), end_of(t0, hb)),
                 weight, dof,
             )  # fmt: skip
-            far = (high > low) & ((abs(s1 - s2) + abs(t1 - t2)) * width > 2.0 * BEYOND)
-            _put_far_row(rows, k, g, far, s1, t1, end_a, sign * end_b, margin, dof)
+            if len(dof) == 8:
+                far = (high > low) & ((abs(s1 - s2) + abs(t1 - t2)) * width > 2.0 * BEYOND)
+                _put_far_row(rows, k, g, far, s1, t1, end_a, sign * end_b, margin, dof)
         _put(rows, HAS, g, where(line, 1.0, 1.0))
         _put(rows, HAS + 1, g, where(line, 1.0, 0.0))
     return crossing
@@ -290,15 +299,15 @@ def _mark(side, beyond, width):
 @kernel
 def pair_rows(x, axis, half, radius, scale, found, walls, rows, margin, dof):
     """Rows of the contacts `found`, after `walls` others; a line of contact has two rows of weight
-    ½, and a pair as many more where a turn would bring it together: where it is nearer than margin.
-    Returns how many there are in all.
+    ½, and in space a pair has more where a turn would bring it together: where it is nearer than
+    margin. Returns how many there are in all.
 
     found: pairs (first, second), and of their contacts the place among these, the closest points
     and the gap, µm: see `near_contacts`.
     """
     first, second, keep, points, _ = found
     H, gaps, one, two, kind = rows
-    block, r = np.empty((COLUMNS, PAIRS)), index(walls)
+    block, r, most = np.empty((COLUMNS, PAIRS)), index(walls), most_rows(dof)
     for column in range(FIRST_ROW):  # the others are written before they are read
         for k in range(PAIRS):
             block[column, k] = 0.0
@@ -315,7 +324,7 @@ def pair_rows(x, axis, half, radius, scale, found, walls, rows, margin, dof):
                 _part(block, FIRST_ROW + OF_ROW, k, dof)
         for k in range(some.shape[0]):
             i, j = first[index(some[k])], second[index(some[k])]
-            for c in range(ROWS):
+            for c in range(most):
                 if block[HAS + c, k] == 0.0:
                     continue
                 row = FIRST_ROW + c * OF_ROW

@@ -11,11 +11,12 @@ hard as leaves a small mean overlap, at any drag and any pressure.
 # most MARGIN away from its last move; a pass is repeated where cells lie deeper than TOO_DEEP;
 # contacts are as hard as leaves a mean overlap of OVERLAP.
 MARGIN, TOO_DEEP, OVERLAP = 0.6, 0.2, 0.014
-# Where two cells lie side by side at a small angle they touch at a point, and may turn about it.
-# That brings other parts of them together, which the row of the point does not foresee: a turn of
-# 0.2 rad on a lever of 0.6 µm makes an overlap as deep as TOO_DEEP, and a squeezed cell would turn
-# to and fro, pass after pass. So the ends of the stretch along which they lie have rows of their
-# own, where they are farther than BEYOND radii from the contact and nearer than MARGIN.
+# In space two cells side by side at a small angle touch at a point, and may turn about it. That
+# brings other parts of them together, which the row of the point does not foresee: a turn of 0.2
+# rad makes overlaps of up to 0.12 µm, deeper than TOO_DEEP, and a squeezed cell would turn to and
+# fro, pass after pass. So the ends of the stretch along which they lie have rows of their own,
+# where they are farther than BEYOND radii from the contact and nearer than MARGIN. In the plane,
+# where an end of a cell is at the contact, its two rows foresee such a turn to 0.04 µm.
 BEYOND = 0.5
 # The same in sub-steps: a colony that takes them is not seen between them.
 DEEP_IN_SUBSTEPS = 0.08

@@ -23,7 +23,7 @@ from torchfilm.kernels.colonies import (
     taken_out,
 )
 from torchfilm.kernels.compiling import kernel
-from torchfilm.kernels.contacts import ROWS, deepest_of, near_contacts, pair_rows
+from torchfilm.kernels.contacts import deepest_of, most_rows, near_contacts, pair_rows
 from torchfilm.kernels.moves import approach, drags, move_cells
 from torchfilm.kernels.neighbours import near_pairs, near_pairs_of, spatial_order
 from torchfilm.kernels.rows import HARD, STIFF, deeply_overlapping, degrees, rows_among, wall_rows
@@ -149,7 +149,7 @@ def _wall_contacts(x, axis, half, radius, scale, at, found, like, dof):
     `found`; how many there are, and the deepest gap. at: kinds, places and sizes of walls and
     which are soft, and weight and reach by cell."""
     (kinds, places, sizes, is_soft), root, reach = at
-    room = ROWS * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
+    room = most_rows(dof) * found[4].shape[0] + 3 * kinds.shape[0] * x.shape[0]
     H, gaps = np.empty((2 * room, len(dof)), like.dtype), np.empty(room, like.dtype)
     one, two = np.empty(room, np.int32), np.empty(room, np.int32)
     rows = H, gaps, one, two, np.zeros(room, np.uint8)

@@ -22,8 +22,9 @@ from torchfilm.tools.reads import rows_where
 
 def near_rows(pairs: CandidateContacts, margin: Tensor) -> Contacts:
     """The rows of all pairs, gaps as they are: one at the closest points, or, where two cells touch
-    along a line, two of weight ½ at its ends. And one of weight ½ at each end of the stretch along
-    which two cells lie side by side, where it is far from those and nearer than `margin` (K,)."""
+    along a line, two of weight ½ at its ends. And in space one of weight ½ at each end of the
+    stretch along which two cells lie side by side, where it is far from those and nearer than
+    `margin` (K,)."""
     a, b, s, t = pairs.a, pairs.b, pairs.s, pairs.t
     flat = pairs.flat
     *of_lines, line = line_points(
@@ -33,27 +34,31 @@ def near_rows(pairs: CandidateContacts, margin: Tensor) -> Contacts:
         torch.stack([x, x]).index_copy(1, flat, two)
         for x, two in zip((s, t, end_of(s, a.half), end_of(t, b.half)), of_lines, strict=True)
     ]
-    along = stretch_of(a, b)
-    with torch.no_grad():
-        two = torch.zeros_like(s, dtype=torch.bool).index_copy(0, flat, line)
-        far = _far(pairs, along.length, along.points, points, margin)
-        kept = rows_where(torch.ones_like(two), two, *far)
-        none, all_ = torch.zeros_like(two), torch.ones_like(two)
-    weight = torch.full_like(s, 0.5)
-    weights = [torch.where(two, weight, 1.0), weight, weight, weight]
+    one = torch.ones_like(s, dtype=torch.bool)
+    two = torch.zeros_like(one).index_copy(0, flat, line)
+    marks, ends = [one, two], [x.new_empty(0, x.shape[1]) for x in points]
+    if a.axis.shape[0] == 3:
+        along = stretch_of(a, b)
+        ends = list(along.points)
+        with torch.no_grad():
+            marks += _far(pairs, along.length, ends, points, margin)
+    kept = rows_where(*marks)
+    half = torch.full_like(s, 0.5)
+    weights = [torch.where(two, half, 1.0), half, half, half]
+    far = [~one, ~one, one, one]
     keep = torch.cat(kept)
     order = torch.argsort(keep, stable=True)  # the rows of a pair side by side
     picked = lambda rows: torch.cat(
-        [x.index_select(0, k) for x, k in zip(rows, kept, strict=True)]
+        [x.index_select(0, k) for x, k in zip(rows, kept, strict=False)]
     ).index_select(0, order)
     weight = picked(weights)
-    at = [picked([*x, *ends]) for x, ends in zip(points, along.points, strict=True)]
+    at = [picked([*x, *e]) for x, e in zip(points, ends, strict=True)]
     keep = keep.index_select(0, order)
     gap, row_first, row_second, normal = rows_at(a.take(keep), b.take(keep), *at)
     pick = lambda x: x.index_select(0, keep)
     return Contacts(
         pick(pairs.first), pick(pairs.second), gap, weight, row_first, row_second, normal,
-        picked([none, none, all_, all_]),
+        picked(far),
     )  # fmt: skip
 
 
